@@ -1,0 +1,55 @@
+"""Gymnasium's MuJoCo tasks on MJX, exactly.
+
+``make(id)`` builds one, ``names()`` lists them, ``register(id, ...)`` adds one.
+An environment is a ``brax.envs.base.Env`` whose ``reset`` and ``step`` call MJX
+directly. Nothing heavy is imported before ``make``.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from mjx_reinforce.registry import check_name, load
+
+_PENDULUM = "mjx_reinforce.envs.inverted_pendulum:InvertedPendulum"
+
+#: id -> ("module:Class" or a callable, constructor arguments). One line a task.
+_TABLE: dict[str, tuple[str | Callable[..., Any], dict[str, Any]]] = {
+    "InvertedPendulum-v5": (_PENDULUM, {}),
+    "InvertedPendulum-v4": (_PENDULUM, {"reward_at_fall": 1.0}),
+}
+
+
+def names() -> list[str]:
+    """Returns the ids that ``make`` knows, in order."""
+    return sorted(_TABLE)
+
+
+def make(id: str, **kwargs: Any) -> Any:
+    """Builds an environment.
+
+    Args:
+      id: one of ``names()``.
+      **kwargs: arguments of the environment's class, over the table's.
+
+    Raises:
+      ValueError: the id is unknown; the message lists the known ones.
+    """
+    check_name("environment", id, _TABLE)
+    entry, settings = _TABLE[id]
+    return load(entry)(**(settings | kwargs))
+
+
+def register(id: str, entry: Callable[..., Any], **kwargs: Any) -> None:
+    """Adds an environment to ``make`` and ``names``.
+
+    Args:
+      id: a new id.
+      entry: a class or function that returns an environment.
+      **kwargs: arguments for it, which ``make`` may override.
+
+    Raises:
+      ValueError: the id is taken.
+    """
+    if id in _TABLE:
+        raise ValueError(f"environment {id!r} is already registered; choose another id")
+    _TABLE[id] = (entry, kwargs)

@@ -1,0 +1,165 @@
+"""What every MuJoCo task shares: the model, the physics of one env step, the state."""
+
+import abc
+import contextlib
+import importlib.resources
+import io
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from mjx_reinforce.types import Box
+
+# MJX prints two lines when its optional Warp backend is not installed; this
+# package asks for the JAX implementation by name, so they only worry people.
+with contextlib.redirect_stdout(io.StringIO()):
+    from brax.envs.base import Env, State
+    from mujoco import mjx
+
+
+@struct.dataclass(kw_only=True)
+class Physics:
+    """What the next physics step needs to know; all else of mjx.Data follows from it.
+
+    qpos: [nq] generalised positions (m, rad)
+    qvel: [nv] generalised velocities (m/s, rad/s)
+    qacc_warmstart: [nv] where the constraint solver starts (m/s^2, rad/s^2)
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+    qacc_warmstart: jax.Array
+
+
+class MujocoEnv(Env):
+    """A task on one MuJoCo model, stepped by MJX as Gymnasium steps MuJoCo.
+
+    One env step is ``frame_skip`` physics steps under the same control. The
+    action is not clipped here: MuJoCo clamps it inside the actuator
+    (gymnasium/envs/mujoco/mujoco_env.py, ``do_simulation``). Truncation is the
+    trainer's: ``max_episode_steps`` says when.
+
+    Subclasses define ``initial`` and ``outcome``.
+    """
+
+    def __init__(
+        self,
+        *,
+        xml_file: str,
+        frame_skip: int,
+        max_episode_steps: int,
+        reward_threshold: float | None,
+    ):
+        """Compiles the model.
+
+        Args:
+          xml_file: a file of this package's assets, or a path with a folder in it.
+          frame_skip: physics steps an env step.
+          max_episode_steps: the time limit, in env steps.
+          reward_threshold: the return at which the task counts as solved, if any.
+        """
+        self.mj_model = _load(xml_file)
+        self.model = mjx.put_model(self.mj_model, impl="jax")
+        self.frame_skip = frame_skip
+        self.max_episode_steps = max_episode_steps
+        self.reward_threshold = reward_threshold
+        low, high = np.array(self.mj_model.actuator_ctrlrange).T
+        limited = np.array(self.mj_model.actuator_ctrllimited, bool)
+        self.action_space = Box(np.where(limited, low, -np.inf), np.where(limited, high, np.inf))
+
+    @abc.abstractmethod
+    def initial(self, rng: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Draws the start of an episode: qpos [nq] and qvel [nv]; consumes the key."""
+
+    @abc.abstractmethod
+    def outcome(
+        self, before: mjx.Data, data: mjx.Data, action: jax.Array
+    ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
+        """Returns the reward [], whether the episode terminated [], and the reward's terms.
+
+        Args:
+          before: the simulation at the start of the env step, positions and velocities only.
+          data: the simulation after it.
+          action: [A] as the policy gave it.
+        """
+
+    def observe(self, data: mjx.Data) -> jax.Array:
+        """Returns the observation [O]; by default qpos, then qvel."""
+        return jnp.concatenate([data.qpos, data.qvel])
+
+    def reset(self, rng: jax.Array) -> State:
+        """Returns the start of an episode; consumes the key."""
+        return self.set_state(*self.initial(rng))
+
+    def set_state(self, qpos: jax.Array, qvel: jax.Array) -> State:
+        """Returns the state at given positions and velocities, as Gymnasium's ``set_state``.
+
+        Args:
+          qpos: [nq] generalised positions (m, rad).
+          qvel: [nv] generalised velocities (m/s, rad/s).
+        """
+        physics = Physics(
+            qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros(self.mj_model.nv, qpos.dtype)
+        )
+        data = mjx.forward(self.model, self._data(physics))
+        zero = jnp.zeros((), qpos.dtype)
+        action = jnp.zeros(self.action_size, qpos.dtype)
+        terms = jax.tree.map(jnp.zeros_like, self.outcome(data, data, action)[2])
+        return State(physics, self.observe(data), zero, zero, terms)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Returns the state one env step later under ``action`` [A]."""
+        before = self._data(state.pipeline_state).replace(ctrl=action)
+        data = jax.lax.fori_loop(
+            0, self.frame_skip, lambda _, data: mjx.step(self.model, data), before
+        )
+        reward, terminated, terms = self.outcome(before, data, action)
+        dtype = state.reward.dtype
+        return state.replace(
+            pipeline_state=Physics(
+                qpos=data.qpos, qvel=data.qvel, qacc_warmstart=data.qacc_warmstart
+            ),
+            obs=self.observe(data),
+            reward=jnp.asarray(reward, dtype),
+            done=jnp.asarray(terminated, dtype),
+            metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
+        )
+
+    def _data(self, physics: Physics) -> mjx.Data:
+        """Returns a fresh simulation at the given state."""
+        data = mjx.make_data(self.mj_model, impl="jax")
+        return data.replace(
+            qpos=physics.qpos, qvel=physics.qvel, qacc_warmstart=physics.qacc_warmstart
+        )
+
+    @property
+    def dt(self) -> float:
+        """The duration of one env step (s)."""
+        return self.frame_skip * self.mj_model.opt.timestep
+
+    @property
+    def observation_size(self) -> int:
+        """The number O of entries of an observation."""
+        return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[0]
+
+    @property
+    def action_size(self) -> int:
+        """The number A of entries of an action."""
+        return self.mj_model.nu
+
+    @property
+    def backend(self) -> str:
+        """The physics engine, for brax's interface."""
+        return "mjx"
+
+
+def _load(xml_file: str) -> Any:
+    """Compiles an MJCF file of the package's assets or of the user's."""
+    if "/" in xml_file or "\\" in xml_file:
+        return mujoco.MjModel.from_xml_path(xml_file)
+    asset = importlib.resources.files(__package__) / "assets" / xml_file
+    return mujoco.MjModel.from_xml_string(asset.read_text(encoding="utf-8"))

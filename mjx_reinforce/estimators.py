@@ -1,0 +1,238 @@
+"""Estimators of the policy gradient: the weight of every log-probability.
+
+REINFORCE ascends ``(1/N) sum_n sum_t weight[t, n] * grad log pi(a[t, n] | o[t, n])``
+(Williams 1992, equation 8). An estimator turns a trajectory into that weight
+and never sees the policy. With the discounted return to go written
+
+    G[t] = r[t] + discount * G[t + 1],
+
+every estimator here is unbiased for the same gradient (the critic's up to its
+own step, ``standardize`` up to a positive factor); they differ in variance.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax import lax
+
+from mjx_reinforce.gradients import accumulate_gradient
+from mjx_reinforce.networks import MLP
+from mjx_reinforce.types import Trajectory
+
+
+class Estimator(NamedTuple):
+    """A pair of pure functions, as in optax, and what they require.
+
+    init: (key, observation_size) -> state; consumes the key
+    update: (state, trajectory) -> (weight [T, N], next state, metrics); the weight
+      is zero outside the mask, and the trajectory's observations are normalised
+    min_episodes: the least N that ``update`` accepts
+    """
+
+    init: Callable[[jax.Array, int], Any]
+    update: Callable[[Any, Trajectory], tuple[jax.Array, Any, dict[str, jax.Array]]]
+    min_episodes: int = 1
+
+
+def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Array:
+    """Returns G [T, N] with ``G[t] = reward[t] + discount * G[t + 1]`` and ``G[T] = 0``.
+
+    Args:
+      reward: [T, N], zero where the episode is over.
+      discount: in [0, 1].
+    """
+
+    def combine(later, earlier):
+        factor, total = later
+        inner_factor, inner_total = earlier
+        return factor * inner_factor, inner_total + inner_factor * total
+
+    factors = jnp.full_like(reward, discount)
+    return lax.associative_scan(combine, (factors, reward), reverse=True)[1]
+
+
+def total_return(discount: float | jax.Array = 0.99) -> Estimator:
+    """Weights every action of an episode by the return of the whole, G[0] (Williams 1992)."""
+    _check_discount(discount)
+
+    def weigh(trajectory):
+        returns = discounted_returns(trajectory.reward, discount)
+        return jnp.broadcast_to(returns[0], returns.shape)
+
+    return _stateless(weigh)
+
+
+def reward_to_go(discount: float | jax.Array = 0.99) -> Estimator:
+    """Weights an action by what came after it, G[t] (Sutton et al. 1999, theorem 1)."""
+    _check_discount(discount)
+    return _stateless(lambda trajectory: discounted_returns(trajectory.reward, discount))
+
+
+def leave_one_out(discount: float | jax.Array = 0.99, *, ended: str = "zero") -> Estimator:
+    """Weights an action by G[t] less the mean G[t] of the other episodes.
+
+    The others are independent of the action, so the baseline adds no bias
+    (Kool et al. 2019, "Buy 4 REINFORCE samples"; the mean over all N episodes
+    would shrink the gradient by (N - 1) / N).
+
+    Args:
+      discount: in [0, 1].
+      ended: "zero" counts an episode that is over as the 0 it will still earn;
+        "skip" averages over the episodes alive at t alone, 0 where there is none.
+
+    Raises:
+      ValueError: ``ended`` is unknown or the discount is not in [0, 1].
+    """
+    _check_discount(discount)
+    if ended not in ("zero", "skip"):
+        raise ValueError(f"ended must be 'zero' or 'skip', got {ended!r}")
+
+    def weigh(trajectory):
+        returns = discounted_returns(trajectory.reward, discount)
+        counted = jnp.ones_like(trajectory.mask) if ended == "zero" else trajectory.mask
+        others = jnp.sum(counted, axis=1, keepdims=True) - counted
+        sums = jnp.sum(jnp.where(counted, returns, 0.0), axis=1, keepdims=True)
+        baseline = (sums - jnp.where(counted, returns, 0.0)) / jnp.maximum(others, 1)
+        return returns - jnp.where(others > 0, baseline, 0.0)
+
+    return _stateless(weigh, min_episodes=2)
+
+
+class _Critic(NamedTuple):
+    """State of ``value_baseline``: the network's parameters and its optimiser's state."""
+
+    params: Any
+    opt_state: Any
+
+
+def value_baseline(
+    discount: float | jax.Array = 0.99,
+    *,
+    network: Any = None,
+    optimizer: optax.GradientTransformation | None = None,
+    num_fits: int = 10,
+) -> Estimator:
+    """Weights an action by G[t] - V(o[t]), V learned (Sutton and Barto 2018, section 13.4).
+
+    V is fitted to G after its values were used, so a weight never depends on its
+    own episode through V.
+
+    Args:
+      discount: in [0, 1].
+      network: a flax module from [..., O] to [..., 1]; by default an MLP of 64
+        and 64 tanh units.
+      optimizer: what fits it; by default Adam at 3e-3.
+      num_fits: full-batch gradient steps on the mean squared error, each update.
+
+    Raises:
+      ValueError: ``num_fits`` is less than one or the discount is not in [0, 1].
+    """
+    _check_discount(discount)
+    if num_fits < 1:
+        raise ValueError(f"num_fits must be at least 1, got {num_fits}")
+    network = MLP((64, 64), 1) if network is None else network
+    optimizer = optax.adam(3e-3) if optimizer is None else optimizer
+
+    def value(params, observation):
+        return network.apply(params, observation)[..., 0]
+
+    def squared_error(params, chunk):
+        observation, returns, mask = chunk
+        return jnp.sum(jnp.where(mask, (value(params, observation) - returns) ** 2, 0.0)), {}
+
+    def init(key, observation_size):
+        params = network.init(key, jnp.zeros(observation_size))
+        return _Critic(params, optimizer.init(params))
+
+    def update(critic, trajectory):
+        returns = discounted_returns(trajectory.reward, discount)
+        values = value(critic.params, trajectory.observation)
+        weight = jnp.where(trajectory.mask, returns - values, 0.0)
+        steps = jnp.maximum(jnp.sum(trajectory.mask), 1)
+        data = (trajectory.observation, returns, trajectory.mask)
+
+        def fit(critic, _):
+            loss, grads, _ = accumulate_gradient(squared_error, critic.params, data)
+            grads = jax.tree.map(lambda g: g / steps, grads)
+            updates, opt_state = optimizer.update(grads, critic.opt_state, critic.params)
+            return _Critic(optax.apply_updates(critic.params, updates), opt_state), loss / steps
+
+        critic, losses = lax.scan(fit, critic, length=num_fits)
+        metrics = {"explained_variance": _explained(weight, returns, trajectory.mask)}
+        return weight, critic, metrics | {"value_loss": losses[0]}
+
+    return Estimator(init, update)
+
+
+def standardize(
+    estimator: Estimator, *, floor: float | jax.Array = 1e-8, center: bool = False
+) -> Estimator:
+    """Divides an estimator's weights by their standard deviation plus ``floor``.
+
+    A floor of the order of the return's own noise lets a solved policy, whose
+    weights are all noise, stand still instead of being torn apart by it.
+
+    Args:
+      estimator: whose weights are divided.
+      floor: added to the standard deviation, in the unit of the return.
+      center: also subtract the mean over all steps; the root mean square is
+        taken about zero otherwise.
+    """
+
+    def update(state, trajectory):
+        weight, state, metrics = estimator.update(state, trajectory)
+        mask = trajectory.mask
+        steps = jnp.maximum(jnp.sum(mask), 1)
+        mean = jnp.sum(jnp.where(mask, weight, 0.0)) / steps if center else 0.0
+        variance = jnp.sum(jnp.where(mask, (weight - mean) ** 2, 0.0)) / steps
+        scaled = jnp.where(mask, (weight - mean) / (jnp.sqrt(variance) + floor), 0.0)
+        return scaled, state, metrics | {"weight_std": jnp.sqrt(variance)}
+
+    return estimator._replace(update=update)
+
+
+def discount_weights(estimator: Estimator, discount: float | jax.Array = 0.99) -> Estimator:
+    """Multiplies the weight at step t by discount^t.
+
+    Without that factor the gradient is not that of the discounted return from
+    the start, nor of any other objective (Nota and Thomas 2020,
+    arXiv:1906.07073); with it, late steps hardly count. Most programs leave it
+    out, and so does everything here unless wrapped in this.
+    """
+    _check_discount(discount)
+
+    def update(state, trajectory):
+        weight, state, metrics = estimator.update(state, trajectory)
+        powers = discount ** jnp.arange(weight.shape[0], dtype=weight.dtype)
+        return weight * powers[:, None], state, metrics
+
+    return estimator._replace(update=update)
+
+
+def _stateless(weigh: Callable[[Trajectory], jax.Array], min_episodes: int = 1) -> Estimator:
+    """An estimator that learns nothing, from its weights [T, N]."""
+
+    def update(state, trajectory):
+        return jnp.where(trajectory.mask, weigh(trajectory), 0.0), state, {}
+
+    return Estimator(lambda key, observation_size: (), update, min_episodes)
+
+
+def _explained(residual: jax.Array, returns: jax.Array, mask: jax.Array) -> jax.Array:
+    """Returns 1 - Var(residual) / Var(returns) over the mask: 1 is a perfect critic."""
+
+    def variance(x):
+        steps = jnp.maximum(jnp.sum(mask), 1)
+        mean = jnp.sum(jnp.where(mask, x, 0.0)) / steps
+        return jnp.sum(jnp.where(mask, (x - mean) ** 2, 0.0)) / steps
+
+    return 1.0 - variance(residual) / jnp.maximum(variance(returns), 1e-8)
+
+
+def _check_discount(discount: float | jax.Array) -> None:
+    """Raises ValueError for a discount outside [0, 1]; a traced one is taken on trust."""
+    if not isinstance(discount, jax.core.Tracer) and not 0.0 <= float(discount) <= 1.0:
+        raise ValueError(f"the discount must lie in [0, 1], got {discount}")

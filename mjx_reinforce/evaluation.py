@@ -1,0 +1,48 @@
+"""Playing a policy without training it, on keys that no training uses."""
+
+import jax
+import jax.numpy as jnp
+
+from mjx_reinforce.learner import Actor, Learner
+from mjx_reinforce.rollouts import episode_lengths, episode_returns, rollout
+from mjx_reinforce.types import Environment
+
+
+def evaluate(
+    env: Environment,
+    learner: Learner,
+    actor: Actor,
+    key: jax.Array,
+    *,
+    num_episodes: int,
+    horizon: int,
+) -> dict[str, jax.Array]:
+    """Plays N episodes with the policy's mode and N with its samples.
+
+    Args:
+      env: what is played.
+      learner: whose policy it is.
+      actor: the parameters and observation statistics.
+      key: consumed; pass the same one each time to see the same start states.
+      num_episodes: N, of each kind.
+      horizon: T, the time limit in steps.
+
+    Returns:
+      ``eval_return`` and ``eval_length`` [], means over the deterministic
+      episodes, and ``eval_return_stochastic`` [], over the sampled ones.
+    """
+    trajectory = rollout(
+        env,
+        lambda observation: learner.act(actor, observation),
+        learner.policy.distribution,
+        key,
+        num_episodes=2 * num_episodes,
+        horizon=horizon,
+        num_deterministic=num_episodes,
+    )
+    returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
+    return {
+        "eval_return": jnp.mean(returns[:num_episodes]),
+        "eval_return_stochastic": jnp.mean(returns[num_episodes:]),
+        "eval_length": jnp.mean(lengths[:num_episodes]),
+    }

@@ -1,0 +1,255 @@
+"""REINFORCE as a pair of pure functions, ``init`` and ``step``, over one state pytree."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from mjx_reinforce import normalize
+from mjx_reinforce.distributions import normal
+from mjx_reinforce.estimators import Estimator, leave_one_out, standardize
+from mjx_reinforce.gradients import accumulate_gradient
+from mjx_reinforce.policies import Policy, mlp_policy
+from mjx_reinforce.rollouts import episode_lengths, episode_returns, rollout
+from mjx_reinforce.types import Environment, Trajectory, action_space, observation_size
+
+Metrics = dict[str, jax.Array]
+
+
+@struct.dataclass(kw_only=True)
+class Actor:
+    """All that playing needs.
+
+    params: the policy's parameters
+    normalizer: the statistics that scale its observations
+    """
+
+    params: Any
+    normalizer: normalize.Normalizer
+
+
+@struct.dataclass(kw_only=True)
+class TrainState:
+    """All that the next update needs; no environment state is among it.
+
+    key: [] the seed's own random key; it never changes, updates fold into it
+    update: [] how many updates were made
+    actor: the policy's parameters and the observation statistics
+    opt_state: the optimiser's state
+    estimator_state: the estimator's, such as a critic
+    """
+
+    key: jax.Array
+    update: jax.Array
+    actor: Actor
+    opt_state: Any
+    estimator_state: Any
+
+
+class Learner(NamedTuple):
+    """REINFORCE on one environment.
+
+    init: (key) -> TrainState; consumes the key
+    step: (TrainState) -> (TrainState, metrics), one update on N fresh episodes
+    act: (Actor, observation [..., O]) -> outputs [..., K] of the distribution
+    policy: the policy that is trained
+    """
+
+    init: Callable[[jax.Array], TrainState]
+    step: Callable[[TrainState], tuple[TrainState, Metrics]]
+    act: Callable[[Actor, jax.Array], jax.Array]
+    policy: Policy
+
+
+def default_optimizer(
+    learning_rate: Any = 1e-2, max_grad_norm: float | jax.Array = 1.0
+) -> optax.GradientTransformation:
+    """Adam on the gradient scaled down to a norm of at most ``max_grad_norm``.
+
+    Args:
+      learning_rate: a number or an optax schedule over updates.
+      max_grad_norm: bound of the Euclidean norm of the whole gradient.
+    """
+    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(learning_rate))
+
+
+def reinforce(
+    env: Environment,
+    *,
+    policy: Policy | None = None,
+    estimator: Estimator | None = None,
+    optimizer: optax.GradientTransformation | None = None,
+    num_episodes: int = 16,
+    horizon: int | None = None,
+    entropy_cost: float | jax.Array = 0.0,
+    loss_per: str = "episode",
+    normalize_observations: bool = True,
+) -> Learner:
+    """Builds REINFORCE (Williams 1992) for an environment.
+
+    One update plays N complete episodes and follows the gradient of
+
+        (1/N) sum_n sum_t weight[t, n] log pi(a[t, n] | o[t, n]) + entropy_cost H[t, n]
+
+    Numbers such as ``entropy_cost``, the estimator's discount and the optimiser's
+    learning rate may be traced: build the learner inside a function to vmap over them.
+
+    Args:
+      env: what is played; any brax-style environment.
+      policy: by default an MLP of 32 and 32 tanh units with a Normal.
+      estimator: by default leave-one-out on the return to go (discount 0.99),
+        divided by its standard deviation plus 5.
+      optimizer: by default Adam at 1e-2 with the gradient's norm clipped at 1.
+      num_episodes: N, episodes an update.
+      horizon: T, steps after which an episode ends; by default the environment's
+        ``max_episode_steps``.
+      entropy_cost: weight of the policy's entropy H, in return per nat.
+      loss_per: "episode" divides the sum by N, as the formula says; "step" by the
+        number of steps played, which makes the step shrink as episodes grow.
+      normalize_observations: scale observations by their running mean and
+        standard deviation; each update uses the statistics its episodes were
+        played with.
+
+    Returns:
+      The learner: ``init(key)`` makes a state, ``train_step(learner, state)`` moves it on.
+
+    Raises:
+      ValueError: an argument makes no sense for this environment.
+    """
+    horizon = check_horizon(env, horizon)
+    size = observation_size(env)
+    if policy is None:
+        policy = mlp_policy(size, normal(action_space(env)))
+    estimator = standardize(leave_one_out(), floor=5.0) if estimator is None else estimator
+    optimizer = default_optimizer() if optimizer is None else optimizer
+    if num_episodes < estimator.min_episodes:
+        raise ValueError(
+            f"this estimator needs at least {estimator.min_episodes} episodes an update, "
+            f"got num_episodes={num_episodes}"
+        )
+    if loss_per not in ("episode", "step"):
+        raise ValueError(f"loss_per must be 'episode' or 'step', got {loss_per!r}")
+    distribution = policy.distribution
+
+    def act(actor, observation):
+        return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))
+
+    def init(key):
+        policy_key, estimator_key, key = jax.random.split(key, 3)
+        params = policy.init(policy_key)
+        return TrainState(
+            key=key,
+            update=jnp.zeros((), jnp.int32),
+            actor=Actor(params=params, normalizer=normalize.init(size)),
+            opt_state=optimizer.init(params),
+            estimator_state=estimator.init(estimator_key, size),
+        )
+
+    def surrogate(params, chunk):
+        observation, action, weight, mask = chunk
+        outputs = policy.apply(params, observation)
+        entropy = distribution.entropy(outputs)
+        terms = distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
+        loss = -jnp.sum(jnp.where(mask, terms, 0.0))
+        return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
+
+    def step(state):
+        actor = state.actor
+        trajectory = rollout(
+            env,
+            lambda observation: act(actor, observation),
+            distribution,
+            jax.random.fold_in(state.key, state.update),
+            num_episodes=num_episodes,
+            horizon=horizon,
+        )
+        seen = trajectory.replace(
+            observation=normalize.apply(actor.normalizer, trajectory.observation)
+        )
+        weight, estimator_state, estimator_metrics = estimator.update(state.estimator_state, seen)
+        data = (seen.observation, trajectory.action, weight, trajectory.mask)
+        _, grads, sums = accumulate_gradient(surrogate, actor.params, data)
+        steps = jnp.maximum(jnp.sum(trajectory.mask), 1)
+        divisor = num_episodes if loss_per == "episode" else steps
+        grads = jax.tree.map(lambda g: g / divisor, grads)
+        updates, opt_state = optimizer.update(grads, state.opt_state, actor.params)
+        normalizer = actor.normalizer
+        if normalize_observations:
+            normalizer = normalize.update(normalizer, trajectory.observation, trajectory.mask)
+        proposed = state.replace(
+            actor=Actor(params=optax.apply_updates(actor.params, updates), normalizer=normalizer),
+            opt_state=opt_state,
+            estimator_state=estimator_state,
+        )
+        state, skipped = _keep_finite(proposed, state)
+        metrics = _metrics(trajectory) | estimator_metrics
+        metrics |= {
+            "entropy": sums["entropy"] / steps,
+            "gradient_norm": optax.tree.norm(grads),
+            "skipped_update": skipped,
+        }
+        return state.replace(update=state.update + 1), metrics
+
+    return Learner(init, step, act, policy)
+
+
+def _train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics]:
+    """Plays N episodes and makes one update, compiled.
+
+    Nothing is donated: ``state`` stays usable. For many seeds,
+    ``jax.vmap(functools.partial(train_step, learner))(states)``.
+
+    Args:
+      learner: from ``reinforce``; another learner compiles anew.
+      state: from ``learner.init`` or the step before.
+
+    Returns:
+      The next state, and metrics, each []: ``episode_return`` (mean over the N
+      episodes; with ``_min`` and ``_max``), ``episode_length``, ``env_steps``
+      (played in this update), ``useful_step_fraction`` (of N times T up to the
+      last chunk simulated), ``entropy``, ``gradient_norm``,
+      ``nonfinite_episodes``, ``skipped_update`` (1 where the proposed state was
+      not finite and the old one was kept), and the estimator's own.
+    """
+    return learner.step(state)
+
+
+train_step = jax.jit(_train_step, static_argnums=0)
+
+
+def check_horizon(env: Environment, horizon: int | None) -> int:
+    """Returns the time limit in steps, or raises ValueError."""
+    horizon = getattr(env, "max_episode_steps", None) if horizon is None else horizon
+    if horizon is None:
+        raise ValueError("this environment declares no max_episode_steps: pass horizon=...")
+    if horizon < 1:
+        raise ValueError(f"the horizon must be at least one step, got {horizon}")
+    return horizon
+
+
+def _keep_finite(proposed: TrainState, state: TrainState) -> tuple[TrainState, jax.Array]:
+    """Returns the proposed state if all of it is finite, else the old one, and whether it is old.
+
+    A broken update must cost one seed one update, not the seed, and nothing else.
+    """
+    leaves = [x for x in jax.tree.leaves(proposed) if jnp.issubdtype(x.dtype, jnp.floating)]
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))
+    kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), proposed, state)
+    return kept, jnp.where(finite, 0, 1)
+
+
+def _metrics(trajectory: Trajectory) -> Metrics:
+    """Returns what a person wants to know of the episodes."""
+    returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
+    return {
+        "episode_return": jnp.mean(returns),
+        "episode_return_min": jnp.min(returns),
+        "episode_return_max": jnp.max(returns),
+        "episode_length": jnp.mean(lengths),
+        "env_steps": jnp.sum(lengths),
+        "useful_step_fraction": jnp.mean(lengths) / jnp.maximum(jnp.max(lengths), 1),
+        "nonfinite_episodes": jnp.sum(trajectory.nonfinite),
+    }

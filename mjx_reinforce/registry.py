@@ -1,0 +1,43 @@
+"""Tables from the names a user types to the definitions, imported only when chosen."""
+
+import difflib
+import importlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+#: Action distributions: name -> "module:function" of an action space.
+DISTRIBUTIONS = {
+    "normal": "mjx_reinforce.distributions:normal",
+    "normal-softplus": "mjx_reinforce.distributions:normal_softplus",
+}
+
+#: Gradient estimators: name -> "module:function" of a discount.
+ESTIMATORS = {
+    "total-return": "mjx_reinforce.estimators:total_return",
+    "reward-to-go": "mjx_reinforce.estimators:reward_to_go",
+    "leave-one-out": "mjx_reinforce.estimators:leave_one_out",
+    "value-baseline": "mjx_reinforce.estimators:value_baseline",
+}
+
+
+def check_name(kind: str, name: str, known: Mapping[str, Any]) -> None:
+    """Raises ValueError for a name that is not known, with the known ones and the nearest.
+
+    Args:
+      kind: what is named, for the message.
+      name: what the user typed.
+      known: the table.
+    """
+    if name in known:
+        return
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(known))}.")
+
+
+def load(entry: str | Callable[..., Any]) -> Callable[..., Any]:
+    """Returns a definition: itself, or imported from "module:name"."""
+    if not isinstance(entry, str):
+        return entry
+    module, _, name = entry.partition(":")
+    return getattr(importlib.import_module(module), name)

@@ -1,0 +1,85 @@
+"""The data that flows through the library, and the environments it accepts.
+
+Axes are named throughout: S seeds, T time steps, N episodes, O observation
+entries, A action entries.
+"""
+
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import jax
+import numpy as np
+from flax import struct
+
+
+class Box(NamedTuple):
+    """The actions a continuous environment accepts, entry by entry.
+
+    low: [A] the least value of each entry, -inf where unbounded
+    high: [A] the greatest value of each entry, inf where unbounded
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+
+
+@runtime_checkable
+class Environment(Protocol):
+    """What the trainer reads of an environment; brax and Playground environments satisfy it.
+
+    ``reset`` and ``step`` are pure functions on one environment. The state they
+    return has at least ``obs`` [O], ``reward`` [] and ``done`` [].
+    """
+
+    def reset(self, rng: jax.Array) -> Any:
+        """Returns the state at the start of an episode; consumes the key."""
+        ...
+
+    def step(self, state: Any, action: jax.Array) -> Any:
+        """Returns the state one time step later under ``action`` [A]."""
+        ...
+
+    @property
+    def action_size(self) -> int:
+        """The number A of entries of an action."""
+        ...
+
+
+@struct.dataclass(kw_only=True)
+class Trajectory:
+    """N complete episodes, time first.
+
+    observation: [T, N, O] what the policy saw; zero where the episode is over
+    action: [T, N, A] what the policy drew; zero where the episode is over
+    reward: [T, N] what the action earned; zero where the episode is over
+    mask: [T, N] True while the episode runs, its last step included
+    nonfinite: [N] True where the simulation left the finite numbers
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    mask: jax.Array
+    nonfinite: jax.Array
+
+
+def action_space(env: Environment) -> Box:
+    """Returns the bounds an environment declares, or brax's convention of [-1, 1]."""
+    declared = getattr(env, "action_space", None)
+    if isinstance(declared, Box):
+        return declared
+    return Box(np.full(env.action_size, -1.0), np.full(env.action_size, 1.0))
+
+
+def observation_size(env: Environment) -> int:
+    """Returns O, from the shapes alone: nothing is simulated.
+
+    Raises:
+      ValueError: the observation is not one vector.
+    """
+    obs = jax.eval_shape(env.reset, jax.random.key(0)).obs
+    if not hasattr(obs, "shape") or len(obs.shape) != 1:
+        raise ValueError(
+            f"the observation must be one vector, this environment's is {obs}; "
+            "flatten it in a wrapper"
+        )
+    return obs.shape[0]
