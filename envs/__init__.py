@@ -24,7 +24,7 @@ def names() -> list[str]:
     return sorted(_TABLE)
 
 
-def make(id: str, **kwargs: Any) -> Any:
+def make(id: str, /, **kwargs: Any) -> Any:
     """Builds an environment.
 
     Args:
@@ -39,7 +39,7 @@ def make(id: str, **kwargs: Any) -> Any:
     return load(entry)(**(settings | kwargs))
 
 
-def register(id: str, entry: Callable[..., Any], **kwargs: Any) -> None:
+def register(id: str, entry: Callable[..., Any], /, **kwargs: Any) -> None:
     """Adds an environment to ``make`` and ``names``.
 
     Args:

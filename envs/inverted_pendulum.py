@@ -29,6 +29,7 @@ class InvertedPendulum(MujocoEnv):
         frame_skip: int = 2,
         reset_noise_scale: float = 0.01,
         reward_at_fall: float = 0.0,
+        solver: str = "exact",
     ):
         """Builds the task.
 
@@ -37,9 +38,14 @@ class InvertedPendulum(MujocoEnv):
           frame_skip: physics steps of 0.02 s an env step.
           reset_noise_scale: half the width of the start distribution (m, rad, m/s, rad/s).
           reward_at_fall: the reward of the step that ends the episode: 0 is v5, 1 is v4.
+          solver: "exact" or "mjx", see ``MujocoEnv``.
         """
         super().__init__(
-            xml_file=xml_file, frame_skip=frame_skip, max_episode_steps=1000, reward_threshold=950.0
+            xml_file=xml_file,
+            frame_skip=frame_skip,
+            max_episode_steps=1000,
+            reward_threshold=950.0,
+            solver=solver,
         )
         self._noise = reset_noise_scale
         self._reward_at_fall = reward_at_fall

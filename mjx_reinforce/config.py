@@ -47,8 +47,8 @@ class Config:
     """Weight of the policy's entropy in the objective."""
     loss_per: Literal["episode", "step"] = "episode"
     """Average the gradient over episodes (the definition) or over steps."""
-    normalize_observations: bool = True
-    """Scale observations by their running mean and standard deviation."""
+    normalize_steps: int = 20_000
+    """Scale observations by the statistics of about the first so many steps; 0 does not."""
 
     learning_rate: float = 1e-2
     """Adam's learning rate at the start."""
@@ -81,6 +81,7 @@ def check(config: Config) -> None:
         _require(config, name, lambda x: x >= 1, "at least 1")
     _require(config, "eval_episodes", lambda x: x >= 1, "at least 1")
     _require(config, "horizon", lambda x: x is None or x >= 1, "at least 1")
+    _require(config, "normalize_steps", lambda x: x >= 0, "at least 0")
     _require(config, "env_steps", lambda x: x < 2**30, "less than 2^30, for each seed")
     for name in ("seed", "eval_seed"):
         _require(config, name, lambda x: 0 <= x < 2**32, "in [0, 2^32)")

@@ -1,5 +1,8 @@
 """Playing a policy without training it, on keys that no training uses."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -16,6 +19,7 @@ def evaluate(
     *,
     num_episodes: int,
     horizon: int,
+    vmap: Callable[..., Any] = jax.vmap,
 ) -> dict[str, jax.Array]:
     """Plays N episodes with the policy's mode and N with its samples.
 
@@ -26,6 +30,7 @@ def evaluate(
       key: consumed; pass the same one each time to see the same start states.
       num_episodes: N, of each kind.
       horizon: T, the time limit in steps.
+      vmap: how one env step becomes 2N, see ``rollout``.
 
     Returns:
       ``eval_return`` and ``eval_length`` [], means over the deterministic
@@ -33,12 +38,14 @@ def evaluate(
     """
     trajectory = rollout(
         env,
-        lambda observation: learner.act(actor, observation),
+        learner.act,
+        actor,
         learner.policy.distribution,
         key,
         num_episodes=2 * num_episodes,
         horizon=horizon,
         num_deterministic=num_episodes,
+        vmap=vmap,
     )
     returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
     return {

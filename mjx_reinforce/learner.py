@@ -35,7 +35,7 @@ class Actor:
 class TrainState:
     """All that the next update needs; no environment state is among it.
 
-    key: [] the seed's own random key; it never changes, updates fold into it
+    key: [] the seed's own random key, split by every update
     update: [] how many updates were made
     actor: the policy's parameters and the observation statistics
     opt_state: the optimiser's state
@@ -86,7 +86,8 @@ def reinforce(
     horizon: int | None = None,
     entropy_cost: float | jax.Array = 0.0,
     loss_per: str = "episode",
-    normalize_observations: bool = True,
+    normalize_steps: int = 20_000,
+    vmap: Callable[..., Any] = jax.vmap,
 ) -> Learner:
     """Builds REINFORCE (Williams 1992) for an environment.
 
@@ -109,9 +110,12 @@ def reinforce(
       entropy_cost: weight of the policy's entropy H, in return per nat.
       loss_per: "episode" divides the sum by N, as the formula says; "step" by the
         number of steps played, which makes the step shrink as episodes grow.
-      normalize_observations: scale observations by their running mean and
-        standard deviation; each update uses the statistics its episodes were
-        played with.
+      normalize_steps: observations are scaled by the mean and standard deviation
+        of about the first so many steps, then the scale stands still: one that
+        follows a policy which learns to keep near the middle drives up its gain
+        until it fails. 0 leaves them as they are. Each update uses the statistics
+        that its episodes were played with.
+      vmap: ``jax.vmap`` or ``mjx_reinforce.fused.vmap``, how one env step becomes N.
 
     Returns:
       The learner: ``init(key)`` makes a state, ``train_step(learner, state)`` moves it on.
@@ -158,13 +162,16 @@ def reinforce(
 
     def step(state):
         actor = state.actor
+        key, episodes_key = jax.random.split(state.key)
         trajectory = rollout(
             env,
-            lambda observation: act(actor, observation),
+            act,
+            actor,
             distribution,
-            jax.random.fold_in(state.key, state.update),
+            episodes_key,
             num_episodes=num_episodes,
             horizon=horizon,
+            vmap=vmap,
         )
         seen = trajectory.replace(
             observation=normalize.apply(actor.normalizer, trajectory.observation)
@@ -176,22 +183,27 @@ def reinforce(
         divisor = num_episodes if loss_per == "episode" else steps
         grads = jax.tree.map(lambda g: g / divisor, grads)
         updates, opt_state = optimizer.update(grads, state.opt_state, actor.params)
-        normalizer = actor.normalizer
-        if normalize_observations:
-            normalizer = normalize.update(normalizer, trajectory.observation, trajectory.mask)
-        proposed = state.replace(
-            actor=Actor(params=optax.apply_updates(actor.params, updates), normalizer=normalizer),
+        normalizer = normalize.update(
+            actor.normalizer, trajectory.observation, trajectory.mask, normalize_steps
+        )
+        params = optax.apply_updates(actor.params, updates)
+        learned = Actor(params=params, normalizer=normalizer), opt_state, estimator_state
+        known = actor, state.opt_state, state.estimator_state
+        (actor, opt_state, estimator_state), skipped = _keep_finite(learned, known)
+        state = TrainState(
+            key=key,
+            update=state.update + 1,
+            actor=actor,
             opt_state=opt_state,
             estimator_state=estimator_state,
         )
-        state, skipped = _keep_finite(proposed, state)
         metrics = _metrics(trajectory) | estimator_metrics
         metrics |= {
             "entropy": sums["entropy"] / steps,
             "gradient_norm": optax.tree.norm(grads),
             "skipped_update": skipped,
         }
-        return state.replace(update=state.update + 1), metrics
+        return state, metrics
 
     return Learner(init, step, act, policy)
 
@@ -230,14 +242,14 @@ def check_horizon(env: Environment, horizon: int | None) -> int:
     return horizon
 
 
-def _keep_finite(proposed: TrainState, state: TrainState) -> tuple[TrainState, jax.Array]:
-    """Returns the proposed state if all of it is finite, else the old one, and whether it is old.
+def _keep_finite(learned: Any, known: Any) -> tuple[Any, jax.Array]:
+    """Returns what was learned if all of it is finite, else what was known, and 1 in that case.
 
     A broken update must cost one seed one update, not the seed, and nothing else.
     """
-    leaves = [x for x in jax.tree.leaves(proposed) if jnp.issubdtype(x.dtype, jnp.floating)]
+    leaves = [x for x in jax.tree.leaves(learned) if jnp.issubdtype(x.dtype, jnp.floating)]
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))
-    kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), proposed, state)
+    kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), learned, known)
     return kept, jnp.where(finite, 0, 1)
 
 

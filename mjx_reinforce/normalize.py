@@ -1,4 +1,4 @@
-"""Running mean and standard deviation of observations, exact over any batch order."""
+"""Mean and standard deviation of the first observations, exact over any batch order."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ _MIN_STD = 1e-4
 
 @struct.dataclass(kw_only=True)
 class Normalizer:
-    """Sufficient statistics of every observation seen so far.
+    """Sufficient statistics of the observations counted so far.
 
     count: [] how many observations
     mean: [O] their mean
@@ -28,8 +28,10 @@ def init(observation_size: int) -> Normalizer:
     return Normalizer(count=jnp.zeros(()), mean=zeros, m2=zeros)
 
 
-def update(normalizer: Normalizer, observation: jax.Array, mask: jax.Array) -> Normalizer:
-    """Merges a batch into the statistics.
+def update(
+    normalizer: Normalizer, observation: jax.Array, mask: jax.Array, at_most: int
+) -> Normalizer:
+    """Merges a batch into the statistics, unless enough is counted already.
 
     The parallel rule of Chan, Golub and LeVeque (1979), which stays accurate in
     float32 where sums of squares cancel.
@@ -38,10 +40,12 @@ def update(normalizer: Normalizer, observation: jax.Array, mask: jax.Array) -> N
       normalizer: the statistics so far.
       observation: [T, N, O]; entries outside the mask have no effect.
       mask: [T, N] True where the observation counts.
+      at_most: a batch is merged while fewer observations than this are counted.
 
     Returns:
-      The statistics of both together.
+      The statistics of both together, or those so far.
     """
+    mask = mask & (normalizer.count < at_most)
     kept = mask[..., None]
     count = jnp.sum(mask, dtype=normalizer.count.dtype)
     divisor = jnp.maximum(count, 1.0)

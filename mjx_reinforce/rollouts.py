@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,13 +18,15 @@ CHUNK_STEPS = 50
 
 def rollout(
     env: Environment,
-    act: Callable[[jax.Array], jax.Array],
+    act: Callable[[Any, jax.Array], jax.Array],
+    actor: Any,
     distribution: Distribution,
     key: jax.Array,
     *,
     num_episodes: int,
     horizon: int,
     num_deterministic: int = 0,
+    vmap: Callable[..., Any] = jax.vmap,
 ) -> Trajectory:
     """Plays N episodes from fresh resets, each to its end or to the horizon.
 
@@ -32,72 +35,85 @@ def rollout(
     simulation stops.
 
     Args:
-      env: what is played; its reset and step are vmapped.
-      act: (observation [N, O]) -> outputs [N, K] of the distribution.
+      env: what is played.
+      act: (actor, observation [N, O]) -> outputs [N, K] of the distribution.
+      actor: what ``act`` reads.
       distribution: what the outputs index.
       key: consumed.
       num_episodes: N.
       horizon: T, the time limit in steps; reaching it ends an episode.
       num_deterministic: how many episodes, the first ones, take the mode.
+      vmap: ``jax.vmap`` or ``fused.vmap``, how one env step becomes N.
 
     Returns:
       The episodes. A non-finite observation or reward ends its episode, with
       reward 0 for that step, and is told apart in ``nonfinite``.
     """
-    keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(jnp.arange(num_episodes))
-    reset_keys, noise_keys = jnp.moveaxis(jax.vmap(jax.random.split)(keys), 1, 0)
+    # Inside, episodes are the last axis: each scalar of the state is a contiguous row.
+    start = jax.vmap(functools.partial(_begin, env, key), out_axes=(-1, 0))
+    state, noise_keys = start(jnp.arange(num_episodes))
+    env_step = vmap(env.step, in_axes=-1, out_axes=-1)
     deterministic = jnp.arange(num_episodes) < num_deterministic
     length = largest_divisor(horizon, CHUNK_STEPS)
 
-    def draw(chunk):
-        def one(noise_key):
-            return distribution.noise(jax.random.fold_in(noise_key, chunk), (length,))
-
-        return jnp.moveaxis(jax.vmap(one)(noise_keys), 0, 1)
-
     def step(carry, noise):
         state, alive, bad = carry
-        observation = _where(alive, state.obs, jnp.zeros_like(state.obs))
-        outputs = act(observation)
+        observation = jnp.where(alive, state.obs, 0.0)
+        outputs = act(actor, observation.T)
         action = distribution.sample(outputs, noise)
         if num_deterministic:
             action = _where(deterministic, distribution.mode(outputs), action)
         # A finished episode repeats its last step: its state must not run off to
         # infinity, where the solver of plain MJX needs all its iterations.
-        after = jax.tree.map(
-            functools.partial(_where, alive), jax.vmap(env.step)(state, action), state
-        )
-        broken = alive & ~(jnp.all(jnp.isfinite(after.obs), axis=-1) & jnp.isfinite(after.reward))
+        after = env_step(state, jnp.moveaxis(action, 0, -1))
+        after = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, state)
+        broken = alive & ~(jnp.all(jnp.isfinite(after.obs), axis=0) & jnp.isfinite(after.reward))
         reward = jnp.where(alive & ~broken, after.reward, 0.0)
         record = (observation, _where(alive, action, jnp.zeros_like(action)), reward, alive)
         alive = alive & ~broken & (after.done == 0)
         return (after, alive, bad | broken), record
 
     def advance(carry):
-        chunk, simulation, records = carry
-        simulation, new = lax.scan(step, simulation, draw(chunk))
-        start = chunk * length
+        chunk, keys, simulation, records = carry
+        keys, noise = jax.vmap(
+            functools.partial(_draw, distribution, length), out_axes=(0, 1)
+        )(keys)
+        simulation, new = lax.scan(step, simulation, noise)
         records = jax.tree.map(
-            lambda old, x: lax.dynamic_update_slice_in_dim(old, x, start, 0), records, new
+            lambda old, x: lax.dynamic_update_slice_in_dim(old, x, chunk * length, 0), records, new
         )
-        return chunk + 1, simulation, records
+        return chunk + 1, keys, simulation, records
 
     def unfinished(carry):
-        chunk, (_, alive, _), _ = carry
+        chunk, _, (_, alive, _), _ = carry
         return (chunk < horizon // length) & jnp.any(alive)
 
-    state = jax.vmap(env.reset)(reset_keys)
     none = jnp.zeros(num_episodes, bool)
-    simulation = (state, ~none, none)
-    _, one_step = jax.eval_shape(lambda: step(simulation, draw(0)[0]))
+    carry = (state, ~none, none)
+    noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), (num_episodes,)))
+    _, one_step = jax.eval_shape(step, carry, noise)
     records = jax.tree.map(lambda x: jnp.zeros((horizon, *x.shape), x.dtype), one_step)
-    _, (_, _, bad), records = while_any(
-        unfinished, advance, (jnp.zeros((), jnp.int32), simulation, records)
-    )
-    observation, action, reward, mask = records
+    init = (jnp.zeros((), jnp.int32), noise_keys, carry, records)
+    _, _, (_, _, bad), (observation, action, reward, mask) = while_any(unfinished, advance, init)
     return Trajectory(
-        observation=observation, action=action, reward=reward, mask=mask, nonfinite=bad
+        observation=jnp.swapaxes(observation, 1, 2),
+        action=action,
+        reward=reward,
+        mask=mask,
+        nonfinite=bad,
     )
+
+
+def _begin(env: Environment, key: jax.Array, episode: jax.Array) -> tuple[Any, jax.Array]:
+    """Returns an episode's start state and the key of its noise."""
+    reset_key, noise_key = jax.random.split(jax.random.fold_in(key, episode))
+    return env.reset(reset_key), noise_key
+
+
+def _draw(distribution: Distribution, length: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns the next key of an episode's noise, and its noise [length, E] for a chunk."""
+    key, noise_key = jax.random.split(key)
+    return key, distribution.noise(noise_key, (length,))
 
 
 def _where(mask: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:

@@ -90,7 +90,7 @@ def build(env: Any, config: Config) -> tuple[Any, int]:
         horizon=horizon,
         entropy_cost=config.entropy_cost,
         loss_per=config.loss_per,
-        normalize_observations=config.normalize_observations,
+        normalize_steps=config.normalize_steps,
     )
     return built, horizon
 

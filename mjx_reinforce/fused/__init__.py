@@ -1,0 +1,31 @@
+"""A drop-in for `jax.vmap` that turns wiring into nothing and leaves only arithmetic.
+
+A function such as `mjx.step` on a small model is thousands of operations on vectors of three and
+matrices of two by two, most of them slices and reshapes. Under `jax.vmap` each becomes a pass over
+memory. Here the function is traced for one example, written out in scalars, its constants folded
+in NumPy, and evaluated with one array over the batch (a *lane*) for each scalar. What is left is
+elementwise arithmetic that XLA fuses, and loops and branches that stay loops and branches.
+
+What to know before using it:
+
+- The arithmetic is that of the function, in its order, with two exceptions. A product with a
+  constant zero is zero and zero divided by anything is zero, even where the other operand is
+  infinite or NaN, and the sign of a zero is not kept. A NaN in one lane never reaches another.
+- Sums and matrix products are added up in index order, so results differ from `jax.vmap` in the
+  last bits.
+- A `while` ends when no lane goes on, and a lane that is done keeps its values. An expensive
+  branch of `cond` runs only if some lane needs it. Under an outer `jax.vmap` both stay as they
+  are: see `any_lane`.
+- Everything is written out, so it is for small states: tens to hundreds of scalars. A matrix
+  product of n × m × k becomes 2nmk operations.
+- Differentiation works where JAX's does: not in reverse through a `while`. Rules of
+  `jax.custom_jvp` and `jax.custom_vjp` are not kept; the function itself is differentiated.
+- A primitive without a rule raises `UnsupportedPrimitive`, which names the line it came from.
+"""
+
+from mjx_reinforce.fused.errors import UnsupportedPrimitive
+from mjx_reinforce.fused.lanes import any_lane
+from mjx_reinforce.fused.scalarized import Scalarized, scalarize
+from mjx_reinforce.fused.vmap import vmap
+
+__all__ = ["Scalarized", "UnsupportedPrimitive", "any_lane", "scalarize", "vmap"]

@@ -1,0 +1,62 @@
+"""Arrays of scalars: numeric where every element is a constant, of dtype object otherwise."""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.fused import ops
+
+
+def is_numeric(array: np.ndarray) -> bool:
+    """Tells whether every element is a constant."""
+    return array.dtype != object
+
+
+def elements(array: np.ndarray) -> list[Any]:
+    """Returns the scalars in row-major order."""
+    return list(array.flat)
+
+
+def pack(scalars: Iterable[Any], shape: Sequence[int], dtype: Any) -> np.ndarray:
+    """Returns the array of these scalars."""
+    scalars = list(scalars)
+    if dtype is not object and all(map(ops.is_constant, scalars)):
+        return np.array(scalars, dtype).reshape(shape)
+    return np.fromiter(scalars, object, len(scalars)).reshape(shape)
+
+
+def lift(array: np.ndarray) -> np.ndarray:
+    """Returns the array with dtype object."""
+    if not is_numeric(array):
+        return array
+    # Assigning to an object array would turn NumPy scalars into Python ones and lose the dtype.
+    return np.fromiter(array.flat, object, array.size).reshape(array.shape)
+
+
+def settle(array: np.ndarray, dtype: Any) -> np.ndarray:
+    """Returns the array as a numeric one if every element is a constant."""
+    return array if is_numeric(array) else pack(array.flat, array.shape, dtype)
+
+
+def together(arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Returns arrays of which either all are numeric or all have dtype object."""
+    if all(map(is_numeric, arrays)):
+        return list(arrays)
+    return [lift(array) for array in arrays]
+
+
+def take(array: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """Returns the elements at these row-major positions, in the positions' shape."""
+    return array.reshape(-1)[positions.reshape(-1)].reshape(positions.shape)
+
+
+def zeros(aval: Any) -> np.ndarray:
+    """Returns zeros of an abstract value's shape and dtype."""
+    return np.zeros(aval.shape, aval.dtype)
+
+
+def map_elements(function: Callable, shape: Sequence[int], dtype: Any, *arrays: Any) -> np.ndarray:
+    """Applies a scalar function element by element; axes of size 1 are shared."""
+    columns = [elements(np.broadcast_to(array, shape)) for array in arrays]
+    return pack(map(function, *columns), shape, dtype)

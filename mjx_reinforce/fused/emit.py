@@ -1,0 +1,146 @@
+"""Turns the scalar graph back into JAX: one elementwise operation for each node."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax import lax
+
+from mjx_reinforce.fused import liveness, ops
+from mjx_reinforce.fused.branches import Gate
+from mjx_reinforce.fused.graph import Captured, Node, Scalar, Scope
+from mjx_reinforce.fused.loops import Loop
+
+Environment = dict[Node, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class Emitter:
+    """Emits the operations of a schedule.
+
+    Attributes:
+        schedule: what to compute.
+        read: the lane of an input, from its position.
+        batch_shape: the shape of one lane.
+        any_lane: reduces a lane of bools to one bool.
+    """
+
+    schedule: liveness.Schedule
+    read: Callable[[Any], Any]
+    batch_shape: tuple[int, ...]
+    any_lane: Callable[[Any], Any]
+
+    def results(self, root: Scope, scalars: Sequence[Scalar]) -> list[Any]:
+        """Returns the value of each scalar: a lane, a shared value or a constant."""
+        env: Environment = {}
+        self._run(root, env)
+        return [self._value(scalar, env) for scalar in scalars]
+
+    def _run(self, scope: Scope | None, env: Environment) -> None:
+        for step in self.schedule.steps.get(scope, ()) if scope else ():
+            if isinstance(step, Loop):
+                self._loop(step, env)
+            elif isinstance(step, Gate):
+                self._gate(step, env)
+            else:
+                env[step] = self._apply(step, env)
+
+    def _apply(self, node: Node, env: Environment) -> Any:
+        values = [self._value(arg, env) for arg in node.args]
+        if node.op.takes_scalars:
+            values = [
+                value if ops.is_constant(arg) else self._spread(value, node.varying)
+                for arg, value in zip(node.args, values, strict=True)
+            ]
+        else:
+            values = [self._spread(value, node.varying) for value in values]
+        return node.op.bind(*values)
+
+    def _value(self, scalar: Scalar, env: Environment) -> Any:
+        """Returns a scalar's value, reading inputs when they are first needed."""
+        if ops.is_constant(scalar):
+            return scalar
+        if scalar not in env:
+            if isinstance(scalar.owner, Captured):
+                env[scalar] = scalar.owner.element(scalar.position)
+            else:
+                env[scalar] = self.read(scalar.position)
+        return env[scalar]
+
+    def _spread(self, value: Any, varying: bool) -> Any:
+        """Gives a constant or a shared value the shape of a lane."""
+        if varying and np.shape(value) != self.batch_shape:
+            return lax.broadcast(value, self.batch_shape)
+        return value
+
+    def _materialize(self, scalar: Scalar, varying: bool, env: Environment) -> Any:
+        return self._spread(self._value(scalar, env), varying)
+
+    def _gate(self, gate: Gate, env: Environment) -> None:
+        live = [out for out in gate.outs if out in self.schedule.wanted]
+
+        def branch(scalars: list[Scalar], scope: Scope | None) -> list[Any]:
+            inner = dict(env)
+            self._run(scope, inner)
+            return [self._materialize(scalars[o.position], o.varying, inner) for o in live]
+
+        predicate = ops.any_of(self._value(gate.predicate, env), self.any_lane)
+        cold = branch(gate.cold, None)
+        hot = functools.partial(branch, gate.hot, gate.body)
+        env.update(zip(live, lax.cond(predicate, hot, lambda: cold), strict=True))
+
+    def _loop(self, loop: Loop, env: Environment) -> None:
+        carries = self.schedule.carries.get(loop, [])
+        live_ys = self.schedule.ys.get(loop, [])
+        elements = self.schedule.elements.get(loop, [])
+        outs = [loop.outs[i] for i in carries]
+        varying = [out.varying for out in outs]
+        init = [
+            self._materialize(loop.inits[i], v, env) for i, v in zip(carries, varying, strict=True)
+        ]
+
+        def body(carry: list[Any], row: Sequence[Any] = ()) -> tuple[list[Any], list[Any]]:
+            inner = dict(env)
+            inner.update(zip([loop.carries[i] for i in carries], carry, strict=True))
+            inner.update(zip([loop.elements[j] for j in elements], row, strict=True))
+            self._run(loop.body, inner)
+            nexts = [
+                self._materialize(loop.nexts[i], v, inner)
+                for i, v in zip(carries, varying, strict=True)
+            ]
+            return nexts, [self._value(loop.ys[j], inner) for j in live_ys]
+
+        if live_ys or elements:
+            rows = [self._stack(loop.xs[j], loop.elements[j].varying, env) for j in elements]
+            final, stacked = lax.scan(body, init, rows, length=loop.length)
+            for j, values in zip(live_ys, stacked, strict=True):
+                env.update((leaf, values[t]) for t, leaf in enumerate(loop.stacked[j]))
+        else:
+            final = self._repeat(loop, carries, body, init)
+        env.update(zip(outs, final, strict=True))
+
+    def _stack(self, row: list[Scalar], varying: bool, env: Environment) -> jax.Array:
+        return jax.numpy.stack([self._materialize(x, varying, env) for x in row])
+
+    def _repeat(self, loop: Loop, carries: list[int], body: Callable, init: list) -> list:
+        """Runs a loop that neither reads xs nor makes ys."""
+        if loop.active is None:
+            return lax.fori_loop(0, loop.length, lambda _, carry: body(carry)[0], init)
+        switch = carries.index(loop.active)
+        if loop.length is None:
+            return lax.while_loop(
+                lambda carry: ops.any_of(carry[switch], self.any_lane),
+                lambda carry: body(carry)[0],
+                init,
+            )
+
+        def goes_on(state: tuple[Any, list]) -> Any:
+            count, carry = state
+            return (count < loop.length) & ops.any_of(carry[switch], self.any_lane)
+
+        start = (np.int32(0), init)
+        step = lambda state: (state[0] + 1, body(state[1])[0])  # noqa: E731
+        return lax.while_loop(goes_on, step, start)[1]

@@ -1,0 +1,73 @@
+"""Evaluates a program on arrays of scalars, equation by equation."""
+
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.fused import (
+    arrays,
+    branches,
+    elementwise,
+    indexing,
+    jaxprs,
+    linear,
+    loops,
+    reductions,
+    structural,
+)
+from mjx_reinforce.fused.errors import UnsupportedPrimitive
+from mjx_reinforce.fused.graph import Graph
+
+_RULES = {
+    **structural.RULES,
+    **elementwise.RULES,
+    **reductions.RULES,
+    **linear.RULES,
+    **indexing.RULES,
+}
+_CONTROL = {"while": loops.while_rule, "scan": loops.scan_rule, "cond": branches.cond_rule}
+
+
+def run(
+    graph: Graph, program: jaxprs.Program, args: list[np.ndarray], used: list[bool] | None = None
+) -> list[np.ndarray]:
+    """Returns a program's outputs; those not used are zeros and nothing is computed for them."""
+    jaxpr = program.jaxpr
+    used = [True] * len(jaxpr.outvars) if used is None else used
+    values = dict(zip(jaxpr.invars, args, strict=True))
+    for variable, const in zip(jaxpr.constvars, program.consts, strict=True):
+        values[variable] = graph.constant(const)
+
+    def read(atom: Any) -> np.ndarray:
+        return jaxprs.literal(atom) if jaxprs.is_literal(atom) else values[atom]
+
+    for eqn, needed in jaxprs.live_equations(jaxpr, used):
+        results = _apply(graph, eqn, needed, [read(atom) for atom in eqn.invars])
+        values.update(zip(eqn.outvars, results, strict=True))
+    return [
+        read(out) if use else arrays.zeros(out.aval)
+        for out, use in zip(jaxpr.outvars, used, strict=True)
+    ]
+
+
+def _apply(graph: Graph, eqn: Any, used: list[bool], operands: list[np.ndarray]) -> list:
+    """Finds and applies the rule for one equation."""
+    name = eqn.primitive.name
+    if name in _CONTROL:
+        return _CONTROL[name](run, graph, eqn, used, *operands)
+    if name in _RULES:
+        return _settled(eqn, _RULES[name](graph, eqn, *operands))
+    program = jaxprs.callee(eqn)
+    if program is not None:
+        return run(graph, program, operands, used)
+    if all(map(arrays.is_numeric, operands)):
+        return jaxprs.evaluate(eqn.primitive, eqn.params, operands)
+    raise UnsupportedPrimitive(name, jaxprs.source(eqn))
+
+
+def _settled(eqn: Any, results: list[np.ndarray]) -> list[np.ndarray]:
+    """Turns results that became constants into numeric arrays."""
+    return [
+        arrays.settle(result, out.aval.dtype)
+        for result, out in zip(results, eqn.outvars, strict=True)
+    ]

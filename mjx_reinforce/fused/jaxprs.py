@@ -1,0 +1,125 @@
+"""Reading jaxprs: the one file that knows what differs between JAX releases.
+
+Written against JAX 0.10.2, 0.11.2 and 0.12.0. jaxprs are not a frozen interface; when a release
+moves something, it moves here.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend import core
+
+# The parameter under which a call-like primitive keeps the jaxpr that it calls.
+_CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+
+
+class Program(NamedTuple):
+    """A jaxpr with the values of its constant variables.
+
+    Attributes:
+        jaxpr: the equations.
+        consts: one array for each constant variable; may be tracers.
+    """
+
+    jaxpr: core.Jaxpr
+    consts: list[Any]
+
+
+class ScanParts(NamedTuple):
+    """How the operands and results of a `scan` equation divide.
+
+    Attributes:
+        num_consts: the leading operands, the same in every iteration.
+        num_carry: the operands after them, and the leading results; the rest are xs and ys.
+    """
+
+    num_consts: int
+    num_carry: int
+
+
+def trace(fn: Callable, *examples: Any) -> tuple[Program, Any]:
+    """Returns fn's program for one example and the pytree of its output shapes."""
+    closed, out_shape = jax.make_jaxpr(fn, return_shape=True)(*examples)
+    return program(closed), out_shape
+
+
+def program(closed: Any) -> Program:
+    """Returns the program of a closed or an open jaxpr."""
+    return Program(getattr(closed, "jaxpr", closed), list(getattr(closed, "consts", ())))
+
+
+def callee(eqn: Any) -> Program | None:
+    """Returns the program that a call-like equation calls, or None."""
+    for name in _CALLEE_PARAMS:
+        if name in eqn.params:
+            return program(eqn.params[name])
+    if eqn.primitive.name == "call_hi_primitive":  # JAX 0.12: composite primitives
+        avals = [variable.aval for variable in eqn.invars]
+        return program(jax.make_jaxpr(eqn.params["_prim"].expand)(*avals))
+    return None
+
+
+def scan_parts(eqn: Any) -> ScanParts:
+    """Returns how a `scan` equation's operands divide."""
+    if "num_consts" in eqn.params:  # JAX 0.10
+        return ScanParts(eqn.params["num_consts"], eqn.params["num_carry"])
+    consts, carry, _ = eqn.params["ft_in"].update(list(eqn.invars)).unpack()
+    return ScanParts(len(list(consts)), len(list(carry)))
+
+
+def is_literal(atom: Any) -> bool:
+    """Tells whether an operand is a literal."""
+    return isinstance(atom, core.Literal)
+
+
+def literal(atom: Any) -> np.ndarray:
+    """Returns a literal's value in its own dtype."""
+    return np.asarray(atom.val, atom.aval.dtype)
+
+
+def as_numpy(value: Any) -> np.ndarray | None:
+    """Returns a constant's value, or None for a tracer, which has none yet."""
+    if isinstance(value, jax.core.Tracer):
+        return None
+    return np.asarray(value)
+
+
+def live_equations(jaxpr: core.Jaxpr, used: Iterable[bool]) -> list[Any]:
+    """Returns the equations that the used outputs need, in order.
+
+    Equations are pure here: one with an effect (a print, a callback) is dropped like any other
+    when nothing reads it.
+    """
+    needed = {out for out, use in zip(jaxpr.outvars, used, strict=True) if use and _named(out)}
+    kept = []
+    for eqn in reversed(jaxpr.eqns):
+        if any(out in needed for out in eqn.outvars):
+            kept.append((eqn, [out in needed for out in eqn.outvars]))
+            needed.update(atom for atom in eqn.invars if _named(atom))
+    return kept[::-1]
+
+
+def source(eqn: Any) -> str:
+    """Returns 'file:line (function)' of the user's code that an equation came from."""
+    try:
+        from jax._src import source_info_util  # no public equivalent
+
+        return source_info_util.summarize(eqn.source_info)
+    except (ImportError, AttributeError):
+        return "an unknown line"
+
+
+def evaluate(primitive: Any, params: dict, operands: list[np.ndarray]) -> list[np.ndarray]:
+    """Runs one primitive on constants; slow (about 1 ms), for what NumPy has no word for."""
+    with jax.ensure_compile_time_eval():
+        arrays = [jax.numpy.asarray(operand) for operand in operands]
+        results = primitive.bind(*arrays, **params)
+        results = results if primitive.multiple_results else [results]
+        return [np.asarray(result) for result in results]
+
+
+def _named(atom: Any) -> bool:
+    """Tells whether an atom is a variable (literals are not hashable in every release)."""
+    return not is_literal(atom)

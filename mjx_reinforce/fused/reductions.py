@@ -1,0 +1,116 @@
+"""Rules that combine the elements of an array: reductions, prefix sums, order."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.fused import arrays
+
+
+def _reduce(graph: Any, eqn: Any, x: np.ndarray, *, combine: str, empty: float) -> list:
+    """Combines the elements along some axes, from the first to the last."""
+    axes, aval = tuple(eqn.params["axes"]), eqn.outvars[0].aval
+    if x.size == 0:
+        return [np.full(aval.shape, empty, aval.dtype)]
+    kept = [axis for axis in range(x.ndim) if axis not in axes]
+    rows = x.transpose([*kept, *axes]).reshape([int(np.prod(aval.shape, dtype=int)), -1])
+    function = functools.partial(graph.call, combine)
+    reduced = (functools.reduce(function, arrays.elements(row)) for row in rows)
+    return [arrays.pack(reduced, aval.shape, aval.dtype)]
+
+
+def _cumulate(graph: Any, eqn: Any, x: np.ndarray, *, combine: Callable) -> list[np.ndarray]:
+    """Combines each element with all before it (after it, if reversed)."""
+    step = -1 if eqn.params["reverse"] else 1
+    lines = np.moveaxis(arrays.lift(x), eqn.params["axis"], -1)[..., ::step].copy()
+    for line in lines.reshape(-1, lines.shape[-1]):
+        for i in range(1, line.size):
+            line[i] = combine(graph, line[i - 1], line[i])
+    lines = np.moveaxis(lines[..., ::step], -1, eqn.params["axis"])
+    return [arrays.settle(lines, eqn.outvars[0].aval.dtype)]
+
+
+def _named(name: str) -> Callable:
+    return lambda graph, x, y: graph.call(name, x, y)
+
+
+def _logaddexp(graph: Any, x: Any, y: Any) -> Any:
+    largest = graph.call("max", x, y)
+    terms = [graph.call("exp", graph.call("sub", term, largest)) for term in (x, y)]
+    return graph.call("add", largest, graph.call("log", graph.call("add", *terms)))
+
+
+def _arg_extreme(graph: Any, eqn: Any, x: np.ndarray, *, better: str) -> list[np.ndarray]:
+    """The position of the first extreme element; the first NaN counts as extreme."""
+    (axis,), aval = eqn.params["axes"], eqn.outvars[0].aval
+    rows = np.moveaxis(x, axis, -1).reshape(-1, x.shape[axis])
+    positions = [_first_extreme(graph, arrays.elements(row), better, aval.dtype) for row in rows]
+    return [arrays.pack(positions, aval.shape, aval.dtype)]
+
+
+def _first_extreme(graph: Any, row: list, better: str, dtype: np.dtype) -> Any:
+    best, where = row[0], dtype.type(0)
+    for i, value in enumerate(row[1:], 1):
+        wins = graph.call("or", graph.call(better, value, best), graph.call("ne", value, value))
+        wins = graph.call("and", wins, graph.call("eq", best, best))
+        best = graph.select(wins, value, best)
+        where = graph.select(wins, dtype.type(i), where)
+    return where
+
+
+def _sort(graph: Any, eqn: Any, *operands: np.ndarray) -> list[np.ndarray]:
+    """Sorts short arrays by exchanging neighbours, which is stable; NaN comes last."""
+    axis, num_keys = eqn.params["dimension"], eqn.params["num_keys"]
+    columns = [np.moveaxis(arrays.lift(x), axis, -1).copy() for x in operands]
+    size = columns[0].shape[-1]
+    for lines in zip(*(column.reshape(-1, size) for column in columns), strict=True):
+        for start in range(size):
+            for i in range(start % 2, size - 1, 2):
+                _exchange(graph, lines, i, num_keys)
+    return [
+        arrays.settle(np.moveaxis(column, -1, axis), out.aval.dtype)
+        for column, out in zip(columns, eqn.outvars, strict=True)
+    ]
+
+
+def _exchange(graph: Any, lines: Any, i: int, num_keys: int) -> None:
+    """Puts elements i and i + 1 in order, in place."""
+    swap = np.False_
+    for line in reversed(lines[:num_keys]):
+        less = _precedes(graph, line[i + 1], line[i])
+        equal = graph.call("not", graph.call("or", less, _precedes(graph, line[i], line[i + 1])))
+        swap = graph.call("or", less, graph.call("and", equal, swap))
+    for line in lines:
+        low, high = line[i], line[i + 1]
+        line[i], line[i + 1] = graph.select(swap, high, low), graph.select(swap, low, high)
+
+
+def _precedes(graph: Any, x: Any, y: Any) -> Any:
+    """Tells whether x < y, where NaN is above everything."""
+    number, nan = graph.call("eq", x, x), graph.call("ne", y, y)
+    return graph.call("or", graph.call("lt", x, y), graph.call("and", number, nan))
+
+
+def _reducer(combine: str, empty: float) -> Callable:
+    return functools.partial(_reduce, combine=combine, empty=empty)
+
+
+RULES = {
+    "reduce_sum": _reducer("add", 0),
+    "reduce_prod": _reducer("mul", 1),
+    "reduce_max": _reducer("max", -np.inf),
+    "reduce_min": _reducer("min", np.inf),
+    "reduce_and": _reducer("and", True),
+    "reduce_or": _reducer("or", False),
+    "reduce_xor": _reducer("xor", False),
+    "cumsum": functools.partial(_cumulate, combine=_named("add")),
+    "cumprod": functools.partial(_cumulate, combine=_named("mul")),
+    "cummax": functools.partial(_cumulate, combine=_named("max")),
+    "cummin": functools.partial(_cumulate, combine=_named("min")),
+    "cumlogsumexp": functools.partial(_cumulate, combine=_logaddexp),
+    "argmax": functools.partial(_arg_extreme, better="gt"),
+    "argmin": functools.partial(_arg_extreme, better="lt"),
+    "sort": _sort,
+}

@@ -1,0 +1,152 @@
+"""`scalarize`: a function of one example, written out in scalars."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax import lax
+
+from mjx_reinforce.fused import arrays, emit, evaluate, jaxprs, lanes, liveness
+from mjx_reinforce.fused.graph import Graph, Scalar, Scope
+
+
+@dataclasses.dataclass(frozen=True)
+class Scalarized:
+    """A function written out in scalars.
+
+    Attributes:
+        in_tree: the structure of its arguments.
+        in_shapes: the shape of each leaf of the arguments.
+        out_tree: the structure of its result.
+        out_avals: shape and dtype of each leaf of the result.
+        root: the scope of the whole program.
+        outputs: the scalars of each leaf of the result.
+        schedule: what they need.
+    """
+
+    in_tree: Any
+    in_shapes: list[tuple[int, ...]]
+    out_tree: Any
+    out_avals: list[Any]
+    root: Scope
+    outputs: list[list[Scalar]]
+    schedule: liveness.Schedule
+
+    @property
+    def operations(self) -> Counter:
+        """How many scalar operations it takes, by primitive; a loop's body counts once."""
+        steps = [step for scope in self.schedule.steps.values() for step in scope]
+        return Counter(step.op.name for step in steps if getattr(step, "op", None) is not None)
+
+    def emit(
+        self,
+        read: Callable[[tuple[int, int]], Any],
+        batch_shape: tuple[int, ...],
+        any_lane: Callable,
+    ) -> list[list[Any]]:
+        """Emits the operations.
+
+        Args:
+            read: returns the lane of an argument from (number of the leaf, row-major position).
+            batch_shape: the shape of one lane.
+            any_lane: reduces a lane of bools to one bool.
+
+        Returns:
+            For each leaf of the result, its elements: lanes, shared values and constants.
+        """
+        emitter = emit.Emitter(self.schedule, read, batch_shape, any_lane)
+        values = iter(emitter.results(self.root, [x for leaf in self.outputs for x in leaf]))
+        return [[next(values) for _ in leaf] for leaf in self.outputs]
+
+    def __call__(self, *args: Any, any_lane: Callable = lanes.any_lane) -> Any:
+        """Evaluates the function on lanes.
+
+        Args:
+            *args: like the examples, but each leaf is an object array or a nested list of lanes.
+            any_lane: reduces a lane of bools to one bool; a Pallas kernel on a GPU has no
+                `jnp.any` and passes a maximum over int32.
+
+        Returns:
+            The result, each leaf an object array of lanes.
+        """
+        leaves = [
+            _lanes(leaf, shape)
+            for leaf, shape in zip(self.in_tree.flatten_up_to(args), self.in_shapes, strict=True)
+        ]
+        batch_shape = np.broadcast_shapes(*(np.shape(lane) for leaf in leaves for lane in leaf))
+
+        def read(position: tuple[int, int]) -> Any:
+            return full(leaves[position[0]][position[1]], batch_shape)
+
+        results = []
+        values = self.emit(read, batch_shape, any_lane)
+        for scalars, aval in zip(values, self.out_avals, strict=True):
+            filled = (full(scalar, batch_shape) for scalar in scalars)
+            results.append(np.fromiter(filled, object, len(scalars)).reshape(aval.shape))
+        return jax.tree.unflatten(self.out_tree, results)
+
+
+def scalarize(fn: Callable, *examples: Any, branch_cost: int = 400) -> Scalarized:
+    """Writes a function out in scalars, to be evaluated on lanes that live anywhere.
+
+    What comes back emits only elementwise operations, loops and branches, and constants only as
+    NumPy scalars, so a Pallas kernel can call it on values in registers.
+
+    Args:
+        fn: a function of one example.
+        *examples: its arguments, or their `jax.ShapeDtypeStruct`s.
+        branch_cost: a branch of `cond` with more operations than this, or with a loop, is skipped
+            where no lane needs it; others are computed for every lane.
+    """
+    return build(fn, examples, [True] * len(jax.tree.leaves(examples)), branch_cost)
+
+
+def build(
+    fn: Callable, examples: Sequence[Any], varying: Sequence[bool], branch_cost: int
+) -> Scalarized:
+    """Writes a function out; `varying` tells which leaves differ from lane to lane."""
+    program, out_shape = jaxprs.trace(fn, *examples)
+    leaves, in_tree = jax.tree.flatten(tuple(examples))
+    graph = Graph(branch_cost)
+    inputs = [
+        _inputs(graph, number, variable.aval, varies)
+        for number, (variable, varies) in enumerate(zip(program.jaxpr.invars, varying, strict=True))
+    ]
+    with np.errstate(all="ignore"):
+        results = evaluate.run(graph, program, inputs)
+    outputs = [arrays.elements(result) for result in results]
+    out_avals, out_tree = jax.tree.flatten(out_shape)
+    return Scalarized(
+        in_tree=in_tree,
+        in_shapes=[np.shape(leaf) for leaf in leaves],
+        out_tree=out_tree,
+        out_avals=out_avals,
+        root=graph.scope,
+        outputs=outputs,
+        schedule=liveness.schedule(x for leaf in outputs for x in leaf),
+    )
+
+
+def full(value: Any, batch_shape: tuple[int, ...]) -> jax.Array:
+    """Gives a shared value or a constant the shape of a lane."""
+    if np.shape(value) == batch_shape and not isinstance(value, np.generic):
+        return value
+    return lax.broadcast(value, batch_shape)
+
+
+def _inputs(graph: Graph, number: int, aval: Any, varying: bool) -> np.ndarray:
+    size = int(np.prod(aval.shape, dtype=int))
+    leaves = [graph.leaf(aval.dtype, varying, position=(number, k)) for k in range(size)]
+    return arrays.pack(leaves, aval.shape, aval.dtype)
+
+
+def _lanes(leaf: Any, shape: tuple[int, ...]) -> list[Any]:
+    """Lists the lanes of an object array or of a list nested as deep as the shape says."""
+    if isinstance(leaf, np.ndarray) and leaf.dtype == object:
+        return list(leaf.flat)
+    if not shape:
+        return [leaf]
+    return [lane for part in leaf for lane in _lanes(part, shape[1:])]

@@ -1,0 +1,253 @@
+"""Algebra on scalars: what need not be computed.
+
+Everything here keeps IEEE results, but for two deviations that the speed comes from:
+  - x * 0 is 0 and 0 / x is 0, also where x is infinite or NaN;
+  - the sign of a zero is not kept (x + 0 is x, 0 - x is -x, a masked product is +0).
+
+A division by a constant becomes a product only where the reciprocal is exact.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.fused import ops
+
+_LARGEST_POWER = 8  # of repeated multiplication; beyond it `pow` is no dearer
+
+
+def simplify(graph: Any, op: ops.Op, args: tuple, dtype: np.dtype) -> Any:
+    """Returns a simpler scalar equal to op(*args), or None; at least one operand is a node."""
+    rule = _RULES.get(op.name)
+    simpler = rule(graph, *args) if rule else None
+    if simpler is None and op is not ops.SELECT:
+        simpler = _through_select(graph, op, args, dtype)
+    return simpler
+
+
+def power(graph: Any, base: Any, exponent: int) -> Any:
+    """Returns an integer power by repeated multiplication."""
+    one = base.dtype.type(1)
+    if exponent < 0:
+        return graph.call("div", one, power(graph, base, -exponent))
+    result, square = one, base
+    while exponent:
+        if exponent & 1:
+            result = graph.call("mul", result, square)
+        exponent >>= 1
+        if exponent:
+            square = graph.call("mul", square, square)
+    return result
+
+
+def _is(value: Any, number: float) -> bool:
+    return ops.is_constant(value) and bool(value == number)
+
+
+def _args(value: Any, name: str) -> tuple | None:
+    """Returns the operands of a node that the named operation computes."""
+    op = getattr(value, "op", None)
+    return value.args if op is not None and op.name == name else None
+
+
+def _negated(value: Any) -> Any:
+    """Returns x where value is -x, else None."""
+    operands = _args(value, "neg")
+    return operands[0] if operands else None
+
+
+def _add(graph: Any, x: Any, y: Any) -> Any:
+    for left, right in ((x, y), (y, x)):
+        if _is(right, 0):
+            return left
+        if _negated(right) is not None:
+            return graph.call("sub", left, _negated(right))
+    return None
+
+
+def _sub(graph: Any, x: Any, y: Any) -> Any:
+    if _is(y, 0):
+        return x
+    if _is(x, 0):
+        return graph.call("neg", y)
+    if _negated(y) is not None:
+        return graph.call("add", x, _negated(y))
+    return None
+
+
+def _mul(graph: Any, x: Any, y: Any) -> Any:
+    for left, right in ((x, y), (y, x)):
+        if _is(right, 0):
+            return right.dtype.type(0)
+        if _is(right, 1):
+            return left
+        if _is(right, -1) and not np.issubdtype(right.dtype, np.unsignedinteger):
+            return graph.call("neg", left)
+        if _negated(left) is not None:
+            if ops.is_constant(right):
+                return graph.call("mul", _negated(left), -right)
+            return graph.call("neg", graph.call("mul", _negated(left), right))
+        masked = _mask(graph, left, right)
+        if masked is not None:
+            return masked
+    return None
+
+
+def _mask(graph: Any, mask: Any, value: Any) -> Any:
+    """Turns a product with a bool's 1 or 0 into a selection."""
+    operands = _args(mask, "select_n")
+    if operands and not ops.is_constant(value):
+        predicate, on_false, on_true = operands
+        zero = value.dtype.type(0)
+        if _is(on_false, 0) and _is(on_true, 1):
+            return graph.select(predicate, value, zero)
+        if _is(on_false, 1) and _is(on_true, 0):
+            return graph.select(predicate, zero, value)
+    return None
+
+
+def _div(graph: Any, x: Any, y: Any) -> Any:
+    if _is(x, 0):
+        return x
+    if ops.is_constant(y) and np.issubdtype(y.dtype, np.floating):
+        mantissa, exponent = np.frexp(y)
+        if abs(mantissa) == 0.5 and abs(exponent) < 100:
+            return graph.call("mul", x, y.dtype.type(1) / y)
+    return x if _is(y, 1) else None
+
+
+def _pow(graph: Any, x: Any, y: Any) -> Any:
+    if ops.is_constant(y) and y == int(y if np.isfinite(y) else 0.5) and abs(y) <= _LARGEST_POWER:
+        return power(graph, x, int(y))
+    return None
+
+
+def _neg(graph: Any, x: Any) -> Any:
+    if _negated(x) is not None:
+        return _negated(x)
+    operands = _args(x, "sub")
+    return graph.call("sub", operands[1], operands[0]) if operands else None
+
+
+def _abs(graph: Any, x: Any) -> Any:
+    return graph.call("abs", _negated(x)) if _negated(x) is not None else None
+
+
+def _max(graph: Any, x: Any, y: Any) -> Any:
+    return _extreme(x, y, -np.inf)
+
+
+def _min(graph: Any, x: Any, y: Any) -> Any:
+    return _extreme(x, y, np.inf)
+
+
+def _extreme(x: Any, y: Any, neutral: float) -> Any:
+    if x is y or _is(y, neutral):
+        return x
+    return y if _is(x, neutral) else None
+
+
+def _and(graph: Any, x: Any, y: Any) -> Any:
+    return _bitwise(x, y, absorbing=False)
+
+
+def _or(graph: Any, x: Any, y: Any) -> Any:
+    return _bitwise(x, y, absorbing=True)
+
+
+def _bitwise(x: Any, y: Any, absorbing: bool) -> Any:
+    """Simplifies `and` (absorbing False) and `or` (absorbing True) of bools."""
+    if x.dtype != np.bool_:
+        return None
+    for left, right in ((x, y), (y, x)):
+        if ops.is_constant(right):
+            return right if bool(right) is absorbing else left
+    return x if x is y else None
+
+
+def _not(graph: Any, x: Any) -> Any:
+    operands = _args(x, "not")
+    return operands[0] if operands else None
+
+
+def _select(graph: Any, predicate: Any, *cases: Any) -> Any:
+    if len(cases) != 2:
+        return cases[int(predicate)] if ops.is_constant(predicate) else None
+    on_false, on_true = cases
+    if ops.is_constant(predicate):
+        return on_true if predicate else on_false
+    if on_true is on_false or _equal_constants(on_true, on_false):
+        return on_true
+    inverse = _args(predicate, "not")
+    if inverse:
+        return graph.select(inverse[0], on_false, on_true)
+    if on_true.dtype == np.bool_:
+        simpler = _select_bool(graph, predicate, on_true, on_false)
+        if simpler is not None:
+            return simpler
+    return _select_again(graph, predicate, on_true, on_false)
+
+
+def _equal_constants(x: Any, y: Any) -> bool:
+    both = ops.is_constant(x) and ops.is_constant(y)
+    return both and x.tobytes() == y.tobytes()
+
+
+def _select_bool(graph: Any, predicate: Any, on_true: Any, on_false: Any) -> Any:
+    if _is(on_true, True):
+        return predicate if _is(on_false, False) else graph.call("or", predicate, on_false)
+    if _is(on_false, False):
+        return graph.call("and", predicate, on_true)
+    if _is(on_true, False):
+        opposite = graph.call("not", predicate)
+        return opposite if _is(on_false, True) else graph.call("and", opposite, on_false)
+    if _is(on_false, True):
+        return graph.call("or", graph.call("not", predicate), on_true)
+    return None
+
+
+def _select_again(graph: Any, predicate: Any, on_true: Any, on_false: Any) -> Any:
+    """Drops the case of an inner selection that the same predicate rules out."""
+    inner = _args(on_true, "select_n")
+    if inner and len(inner) == 3 and inner[0] is predicate:
+        return graph.select(predicate, inner[2], on_false)
+    inner = _args(on_false, "select_n")
+    if inner and len(inner) == 3 and inner[0] is predicate:
+        return graph.select(predicate, on_true, inner[1])
+    return None
+
+
+def _through_select(graph: Any, op: ops.Op, args: tuple, dtype: np.dtype) -> Any:
+    """Folds an operation whose operands are constants and selections among constants."""
+    nodes = [arg for arg in args if not ops.is_constant(arg)]
+    if op.name == "convert_element_type" and nodes[0].dtype == np.bool_ != dtype:
+        return graph.select(nodes[0], dtype.type(1), dtype.type(0))
+    choices = [_args(node, "select_n") for node in nodes]
+    for choice in choices:
+        if not choice or len(choice) != 3 or choice[0] is not choices[0][0]:
+            return None
+        if not (ops.is_constant(choice[1]) and ops.is_constant(choice[2])):
+            return None
+    cases = []
+    for case in (1, 2):
+        chosen = [arg if ops.is_constant(arg) else arg.args[case] for arg in args]
+        cases.append(ops.fold(op, chosen, dtype))
+    return graph.select(choices[0][0], cases[1], cases[0])
+
+
+_RULES: dict[str, Callable] = {
+    "add": _add,
+    "sub": _sub,
+    "mul": _mul,
+    "div": _div,
+    "pow": _pow,
+    "neg": _neg,
+    "abs": _abs,
+    "max": _max,
+    "min": _min,
+    "and": _and,
+    "or": _or,
+    "not": _not,
+    "select_n": _select,
+}

@@ -1,0 +1,135 @@
+"""`vmap`: a drop-in for `jax.vmap` that leaves only elementwise work."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from mjx_reinforce.fused import lanes, scalarized
+
+
+def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 32) -> Callable:
+    """Maps a function over a batch, like `jax.vmap`, one array over the batch for each scalar.
+
+    The function is traced for one example and evaluated element by element; see the package's
+    docstring for what that costs and which floating-point promises it loosens. Call the result
+    under `jax.jit`. The fastest layout keeps the batch last (axes of -1): then each scalar's lane
+    is one contiguous row.
+
+    Args:
+        fn: a function of one example; pytrees in and out.
+        in_axes: for each argument an axis, None for one that all lanes share, or a pytree prefix.
+        out_axes: the same for the result; None only for what does not depend on the lane.
+        branch_cost: a branch of `cond` with more scalar operations than this, or with a loop, is
+            skipped where no lane needs it; others are computed for every lane. XLA's CPU backend
+            computes shared values again in each fusion, and a real branch also stops that.
+
+    Returns:
+        The mapped function. Keyword arguments are mapped over their first axis.
+
+    Raises:
+        ValueError: if no argument is mapped, the mapped sizes differ, or an axis does not fit.
+        UnsupportedPrimitive: if fn uses a primitive that has no rule.
+    """
+
+    @functools.wraps(fn)
+    def mapped(*args: Any, **kwargs: Any) -> Any:
+        axes = [*_axes(in_axes, args), *_axes(0, kwargs)]
+        leaves, in_tree = jax.tree.flatten((args, kwargs))
+        leaves = [jnp.asarray(leaf) for leaf in leaves]
+        axes = [
+            None if axis is None else _axis(axis, leaf.ndim)
+            for axis, leaf in zip(axes, leaves, strict=True)
+        ]
+        batch = _batch_size(leaves, axes)
+        examples = [_example(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
+
+        def flat_fn(*flat: Any) -> Any:
+            inner_args, inner_kwargs = jax.tree.unflatten(in_tree, flat)
+            return fn(*inner_args, **inner_kwargs)
+
+        varying = [axis is not None for axis in axes]
+        written = scalarized.build(flat_fn, examples, varying, branch_cost)
+        rows = [_rows(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
+        values = written.emit(lambda place: _row(rows, *place), (batch,), lanes.any_lane)
+        out_tree = written.out_tree
+        target = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
+        ends = _axes(out_axes, target)
+        outputs = [
+            _assemble(scalars, aval, axis, batch)
+            for scalars, aval, axis in zip(values, written.out_avals, ends, strict=True)
+        ]
+        return jax.tree.unflatten(out_tree, outputs)
+
+    return mapped
+
+
+def _is_none(x: Any) -> bool:
+    return x is None
+
+
+def _axes(prefix: Any, tree: Any) -> list[Any]:
+    """Returns the axis of each leaf of the tree, as a pytree prefix says."""
+    if isinstance(prefix, list) and isinstance(tree, tuple):
+        prefix = tuple(prefix)
+    axes: list[Any] = []
+
+    def note(axis: Any, subtree: Any) -> None:
+        axes.extend([axis] * len(jax.tree.leaves(subtree)))
+
+    jax.tree.map(note, prefix, tree, is_leaf=_is_none)
+    return axes
+
+
+def _axis(axis: int, ndim: int) -> int:
+    """Returns a mapped axis counted from the front."""
+    if not -ndim <= axis < ndim:
+        raise ValueError(f"axis {axis} does not exist in an argument of {ndim} dimensions")
+    return axis % ndim
+
+
+def _batch_size(leaves: list[jax.Array], axes: list[int | None]) -> int:
+    sizes = {x.shape[axis] for x, axis in zip(leaves, axes, strict=True) if axis is not None}
+    if len(sizes) != 1:
+        raise ValueError(
+            f"fused.vmap needs mapped arguments of one size, got sizes {sorted(sizes)}"
+        )
+    return sizes.pop()
+
+
+def _example(x: jax.Array, axis: int | None) -> jax.ShapeDtypeStruct:
+    """Returns the shape of one example."""
+    shape = tuple(size for i, size in enumerate(x.shape) if i != axis)
+    return jax.ShapeDtypeStruct(shape, x.dtype)
+
+
+def _rows(x: jax.Array, axis: int | None) -> jax.Array:
+    """Returns an argument as [elements, batch], or [elements] where lanes share it."""
+    if axis is None:
+        return x.reshape(-1)
+    return jnp.moveaxis(x, axis, -1).reshape(-1, x.shape[axis])
+
+
+def _row(rows: list[jax.Array], number: int, position: int) -> jax.Array:
+    return lax.index_in_dim(rows[number], position, keepdims=False)
+
+
+def _assemble(scalars: list[Any], aval: Any, axis: int | None, batch: int) -> jax.Array:
+    """Puts one leaf of the result together."""
+    shared = all(np.ndim(scalar) == 0 for scalar in scalars)
+    if axis is None and not shared:
+        raise ValueError("out_axes is None for a result that differs from lane to lane")
+    if not scalars:
+        stacked = jnp.zeros((0,) if axis is None else (0, batch), aval.dtype)
+    elif axis is None:
+        stacked = jnp.stack([jnp.asarray(scalar, aval.dtype) for scalar in scalars])
+    else:
+        stacked = jnp.stack([scalarized.full(scalar, (batch,)) for scalar in scalars])
+    if axis is None:
+        return stacked.reshape(aval.shape)
+    ndim = len(aval.shape) + 1
+    return jnp.moveaxis(stacked.reshape((*aval.shape, batch)), -1, _axis(axis, ndim))

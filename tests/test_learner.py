@@ -1,0 +1,249 @@
+"""The learner: exact gradients, probes, one trace, keys used once, seeds kept apart."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from toys import Late, Signed, SignedTarget, Survive, Target, Toy
+
+from mjx_reinforce import (
+    estimators,
+    gradients,
+    mlp_policy,
+    normal,
+    reinforce,
+    rollout,
+    train_step,
+)
+
+
+def train(env, num_updates, **settings):
+    learner = reinforce(env, num_episodes=32, **settings)
+    state = learner.init(jax.random.key(0))
+
+    def body(state, _):
+        return learner.step(state)
+
+    return learner, *jax.jit(lambda s: jax.lax.scan(body, s, length=num_updates))(state)
+
+
+def critic():
+    return estimators.value_baseline(0.5, optimizer=optax.adam(1e-2))
+
+
+def value(learner, state, obs):
+    from mjx_reinforce import normalize
+    from mjx_reinforce.networks import MLP
+
+    scaled = normalize.apply(state.actor.normalizer, jnp.asarray(obs))
+    return MLP((64, 64), 1).apply(state.estimator_state.params, scaled)[..., 0]
+
+
+def test_probe_1_a_constant_reward_is_valued():
+    learner, state, _ = train(Toy(), 60, estimator=critic())
+    assert float(value(learner, state, [0.0])) == pytest.approx(1.0, abs=0.05)
+
+
+def test_probe_2_the_value_depends_on_the_observation():
+    learner, state, _ = train(Signed(), 60, estimator=critic())
+    np.testing.assert_allclose(value(learner, state, [[-1.0], [1.0]]), [-1.0, 1.0], atol=0.1)
+
+
+def test_probe_3_a_late_reward_is_discounted():
+    learner, state, _ = train(Late(), 60, estimator=critic())
+    np.testing.assert_allclose(value(learner, state, [[0.0], [1.0]]), [0.5, 1.0], atol=0.1)
+
+
+@pytest.mark.parametrize("estimator", [None, critic()])
+def test_probe_4_the_best_action_is_found(estimator):
+    learner, state, _ = train(Target(), 200, estimator=estimator)
+    mode = learner.policy.distribution.mode(learner.act(state.actor, jnp.zeros(1)))
+    assert float(mode[0]) == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize("estimator", [None, critic()])
+def test_probe_5_the_best_action_depends_on_the_observation(estimator):
+    learner, state, _ = train(SignedTarget(), 300, estimator=estimator)
+    obs = jnp.array([[-1.0], [1.0]])
+    mode = learner.policy.distribution.mode(learner.act(state.actor, obs))
+    np.testing.assert_allclose(mode[:, 0], [-0.5, 0.5], atol=0.15)
+
+
+def test_update_is_the_finite_difference_of_the_surrogate():
+    """SGD at rate 1 moves the parameters by minus the gradient of the formula in reinforce()."""
+    with jax.enable_x64(True):
+        env, cost = Survive(), 0.1
+        policy = mlp_policy(1, normal(env.action_space), (3,))
+        learner = reinforce(
+            env,
+            policy=policy,
+            estimator=estimators.reward_to_go(0.9),
+            optimizer=optax.sgd(1.0),
+            num_episodes=4,
+            entropy_cost=cost,
+            normalize_steps=0,
+        )
+        state = learner.init(jax.random.key(3))
+        after, _ = learner.step(state)
+        trajectory = rollout(
+            env,
+            policy.apply,
+            state.actor.params,
+            policy.distribution,
+            jax.random.split(state.key)[1],
+            num_episodes=4,
+            horizon=20,
+        )
+        weight = estimators.discounted_returns(trajectory.reward, 0.9)
+
+        def surrogate(params):
+            outputs = policy.apply(params, trajectory.observation)
+            log_prob = policy.distribution.log_prob(outputs, trajectory.action)
+            terms = log_prob * weight + cost * policy.distribution.entropy(outputs)
+            return np.sum(np.asarray(terms)[np.asarray(trajectory.mask)]) / 4
+
+        flat, unflatten = jax.flatten_util.ravel_pytree(state.actor.params)
+        moved = jax.flatten_util.ravel_pytree(after.actor.params)[0] - flat
+        for i in range(flat.size):
+            shift = np.zeros(flat.size)
+            shift[i] = 1e-5
+            difference = surrogate(unflatten(flat + shift)) - surrogate(unflatten(flat - shift))
+            assert difference / 2e-5 == pytest.approx(float(moved[i]), abs=1e-7, rel=1e-6)
+
+
+@pytest.mark.parametrize("samples", [1, 40, 10**6])
+def test_chunks_do_not_change_the_gradient(samples, monkeypatch):
+    """Time is summed in chunks of as many steps as fit; any size gives the same sum."""
+    monkeypatch.setattr(gradients, "MAX_SAMPLES", samples)
+    data = jax.random.normal(jax.random.key(0), (20, 8))
+    mask = jnp.arange(20)[:, None] < jnp.arange(3, 11)
+
+    def loss(w, chunk):
+        x, kept = chunk
+        return jnp.sum(jnp.where(kept, jnp.tanh(w * x), 0.0)), {"n": jnp.sum(kept)}
+
+    total, grad, sums = gradients.accumulate_gradient(loss, jnp.array(0.7), (data, mask))
+    expected, slope = jax.value_and_grad(lambda w: loss(w, (data, mask))[0])(jnp.array(0.7))
+    assert float(total) == pytest.approx(float(expected), rel=1e-5)
+    assert float(grad) == pytest.approx(float(slope), rel=1e-5)
+    assert int(sums["n"]) == int(mask.sum())
+
+
+def test_one_trace_and_nothing_donated():
+    learner = reinforce(Survive(), num_episodes=4)
+    before = train_step._cache_size()
+    state = learner.init(jax.random.key(0))
+    first = train_step(learner, state)
+    again = train_step(learner, state)
+    train_step(learner, first[0])
+    assert train_step._cache_size() == before + 1
+    jax.tree.map(
+        lambda x, y: np.testing.assert_array_equal(x, y),
+        (first[0].actor, first[1]),
+        (again[0].actor, again[1]),
+    )
+
+
+def test_no_key_is_used_twice():
+    with jax.debug_key_reuse(True):
+        learner = reinforce(Survive(), num_episodes=4, estimator=critic())
+        state = jax.jit(learner.init)(jax.random.key(0))
+        state, _ = train_step(learner, state)
+        train_step(learner, state)
+
+
+def test_seeds_together_are_the_seeds_alone():
+    """Up to the last bits: the width of a batch changes XLA's reductions."""
+    learner = reinforce(Survive(), num_episodes=8)
+    keys = jax.random.split(jax.random.key(0), 3)
+    states = jax.vmap(learner.init)(keys)
+    together, metrics = jax.vmap(functools.partial(train_step, learner))(states)
+    assert metrics["episode_return"].shape == (3,)
+    for s in range(3):
+        alone, _ = train_step(learner, learner.init(keys[s]))
+        jax.tree.map(
+            lambda x, y, s=s: np.testing.assert_allclose(x[s], y, rtol=1e-4, atol=1e-6),
+            together.actor,
+            alone.actor,
+        )
+
+
+def test_an_episode_does_not_depend_on_how_many_there_are():
+    env, policy = Survive(), mlp_policy(1, normal(Survive.action_space))
+    params = policy.init(jax.random.key(0))
+
+    def play(num_episodes):
+        return rollout(
+            env,
+            lambda obs: policy.apply(params, obs),
+            policy.distribution,
+            jax.random.key(1),
+            num_episodes=num_episodes,
+            horizon=20,
+        )
+
+    few, many = play(3), play(50)
+    np.testing.assert_allclose(few.action, many.action[:, :3], rtol=1e-6)
+
+
+def test_hyperparameters_vmap():
+    env = Target()
+
+    def step(learning_rate):
+        learner = reinforce(env, optimizer=optax.sgd(learning_rate), num_episodes=4)
+        state = learner.init(jax.random.key(0))
+        after, _ = learner.step(state)
+        return after.actor.params["constants"] - state.actor.params["constants"]
+
+    moves = jax.vmap(step)(jnp.array([0.1, 0.2]))
+    np.testing.assert_allclose(2 * moves[0], moves[1], rtol=1e-4)
+
+
+class Breaks(Survive):
+    """Leaves the finite numbers at once when ``broken``, which the reset key decides."""
+
+    def __init__(self, broken):
+        self.broken = broken
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return after.replace(obs=jnp.where(self.broken, jnp.nan, after.obs))
+
+
+def test_a_broken_simulation_is_counted_and_stays_in_its_seed():
+    def step(broken, key):
+        learner = reinforce(Breaks(broken), num_episodes=4)
+        return learner.step(learner.init(key))
+
+    keys = jax.random.split(jax.random.key(0), 2)
+    healthy, metrics = jax.vmap(step)(jnp.array([False, False]), keys)
+    assert np.all(metrics["nonfinite_episodes"] == 0)
+    mixed, metrics = jax.vmap(step)(jnp.array([True, False]), keys)
+    np.testing.assert_array_equal(metrics["nonfinite_episodes"], [4, 0])
+    jax.tree.map(
+        lambda x, y: np.testing.assert_array_equal(x[1], y[1]), healthy.actor, mixed.actor
+    )
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(mixed.actor))
+
+
+def test_a_gradient_that_is_not_finite_is_skipped():
+    estimator = estimators.reward_to_go()
+    bad = estimator._replace(update=lambda s, t: (jnp.full_like(t.reward, jnp.nan), s, {}))
+    learner = reinforce(Survive(), num_episodes=4, estimator=bad)
+    state = learner.init(jax.random.key(0))
+    after, metrics = train_step(learner, state)
+    assert int(metrics["skipped_update"]) == 1
+    assert int(after.update) == 1
+    jax.tree.map(np.testing.assert_array_equal, state.actor, after.actor)
+
+
+def test_nonsense_is_refused():
+    with pytest.raises(ValueError, match="horizon must be at least one"):
+        reinforce(Toy(), horizon=0)
+    with pytest.raises(ValueError, match="'episode' or 'step'"):
+        reinforce(Toy(), loss_per="batch")
+    with pytest.raises(ValueError, match="at least one unit"):
+        mlp_policy(1, normal(Toy.action_space), (32, 0))

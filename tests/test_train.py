@@ -1,0 +1,167 @@
+"""The command line, end to end on toy environments: files, statistics, errors, Ctrl-C."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import Survive
+
+from mjx_reinforce import envs, load_policy, normalize
+from mjx_reinforce import train as train_module
+
+ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path):
+    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["train", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            train_module.main()
+        return stop.value.code
+
+    return run
+
+
+def read(directory):
+    with (directory / "metrics.csv").open(newline="") as file:
+        return list(csv.DictReader(file)), json.loads((directory / "summary.json").read_text())
+
+
+def test_a_run_leaves_its_files(run, tmp_path):
+    assert run(*ARGUMENTS, "--output", "out", "--hidden-sizes", "4") == 0
+    out = tmp_path / "out"
+    rows, summary = read(out)
+    assert {(row["seed"], row["update"]) for row in rows[:3]} == {("0", "0"), ("1", "0"), ("2", "0")}
+    last = rows[-3:]
+    assert [float(row["eval_return"]) for row in last] == summary["final_returns"]
+    assert all(int(row["env_steps"]) >= 1500 for row in last)
+    assert summary["env"] == "Survive-v0"
+    assert summary["num_seeds"] == 3
+    assert len(summary["env_steps_to_solve"]) == 3
+    assert summary["iqm_ci"][0] <= summary["iqm"] <= summary["iqm_ci"][1]
+    assert 0 < summary["useful_step_fraction"] <= 1
+    for name in ("compile_seconds", "run_seconds", "env_steps_per_second", "engine", "solve_rate"):
+        assert name in summary
+    config = json.loads((out / "config.json").read_text())
+    assert config["hidden_sizes"] == [4]
+    assert config["horizon"] == 20
+    assert config["packages"]["jax"] == jax.__version__
+    assert (out / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+    assert not list(out.glob(".*"))
+
+
+def test_a_seed_does_not_depend_on_how_many_there_are(run, tmp_path):
+    run(*ARGUMENTS, "--output", "three")
+    run("--env", "Survive-v0", "--num-seeds", "1", "--env-steps", "1500", "--output", "one")
+    three, one = read(tmp_path / "three")[0], read(tmp_path / "one")[0]
+    ours = [row for row in three if row["seed"] == "0"][: len(one)]
+    for name in ("update", "env_steps", "eval_return"):
+        assert [row[name] for row in ours] == [row[name] for row in one]
+
+
+def test_the_saved_policy_plays_like_the_trained_one(run, tmp_path):
+    run(*ARGUMENTS, "--output", "out", "--policy", "normal-softplus")
+    policy, actor = load_policy(tmp_path / "out" / "policy", seed=1)
+    outputs = policy.apply(actor.params, normalize.apply(actor.normalizer, jnp.zeros(1)))
+    survives = bool(jnp.abs(policy.distribution.mode(outputs)[0]) <= 0.5)
+    final = read(tmp_path / "out")[1]["final_returns"][1]
+    assert final == (20.0 if survives else 1.0)
+    with pytest.raises(ValueError, match="seed 3 is not among the 3"):
+        load_policy(tmp_path / "out" / "policy", seed=3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", "InvertedPendulm-v5"], "Did you mean 'InvertedPendulum-v5'"),
+        (["--policy", "gaussian"], "unknown policy 'gaussian'"),
+        (["--estimator", "leave-one"], "Did you mean 'leave-one-out'"),
+        (["--num-seeds", "0"], "--num-seeds must be at least 1, got 0"),
+        (["--num-episodes", "1"], "at least two episodes"),
+        (["--env-steps", "-5"], "--env-steps must be at least 1"),
+        (["--learning-rate", "nan"], "--learning-rate must be positive and finite, got nan"),
+        (["--discount", "1.5"], r"--discount must be in [0, 1], got 1.5"),
+        (["--hidden-sizes", "32", "0"], "positive in every layer"),
+        (["--horizon", "0"], "--horizon must be at least 1"),
+        (["--output", "taken"], "is not empty"),
+        (["--output", "taken/file"], "cannot write"),
+        (["--output", "/proc/no"], "cannot write"),
+    ],
+)
+def test_bad_input_is_explained_before_anything_starts(run, tmp_path, capsys, arguments, message):
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "file").write_text("mine")
+    assert run(*arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") <= 2
+    assert not (tmp_path / "runs").exists()
+    assert (tmp_path / "taken" / "file").read_text() == "mine"
+
+
+def test_overwrite_is_by_request_alone(run, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "mine.txt").write_text("mine")
+    assert run(*ARGUMENTS, "--output", "out") == 2
+    assert run(*ARGUMENTS, "--output", "out", "--overwrite") == 0
+    assert (tmp_path / "out" / "mine.txt").read_text() == "mine"
+
+
+def test_ctrl_c_leaves_a_readable_run(tmp_path):
+    code = (
+        "import sys; sys.path.insert(0, sys.argv.pop(1))\n"
+        "from toys import Survive\n"
+        "from mjx_reinforce import envs, train\n"
+        "envs.register('Survive-v0', Survive)\n"
+        "train.main()"
+    )
+    arguments = ["--env", "Survive-v0", "--env-steps", "1000000000", "--output", "out"]
+    here = str(Path(__file__).parent)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, here, *arguments], cwd=tmp_path, stdout=subprocess.DEVNULL
+    )
+    metrics = tmp_path / "out" / "metrics.csv"
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and not (
+        metrics.exists() and metrics.read_text().count("\n") > 20
+    ):
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=60) == 130
+    rows, summary = read(tmp_path / "out")
+    assert len(rows) >= 20
+    assert len(summary["final_returns"]) == 4
+    _, actor = load_policy(tmp_path / "out" / "policy")
+    assert np.all(np.isfinite(actor.normalizer.mean))
+
+
+class Fragile(Survive):
+    """Breaks down in one episode of about a hundred."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        bad = (action[0] > 1.1) & (action[0] < 1.15)
+        return after.replace(obs=jnp.where(bad, jnp.nan, after.obs))
+
+
+def test_a_broken_simulation_is_named(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(envs._TABLE, "Fragile-v0", (Fragile, {}))
+    assert run("--env", "Fragile-v0", "--env-steps", "1500", "--output", "out") == 0
+    _, summary = read(tmp_path / "out")
+    assert summary["nonfinite"]
+    event = summary["nonfinite"][0]
+    assert f"seed {event['seed']}, update {event['update']}" in capsys.readouterr().out
+    assert np.all(np.isfinite(summary["final_returns"]))

@@ -1,0 +1,150 @@
+"""Environments small enough to know everything about, and a categorical distribution."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from mjx_reinforce import Box, Distribution
+
+
+@struct.dataclass
+class ToyState:
+    obs: jax.Array
+    reward: jax.Array
+    done: jax.Array
+    info: Any = None
+
+
+class Toy:
+    """One step, one observation, one action; subclasses say what it earns."""
+
+    max_episode_steps = 1
+    action_size = 1
+    action_space = Box(np.array([-1.0]), np.array([1.0]))
+    reward_threshold = None
+
+    def observe(self, key):
+        del key
+        return jnp.zeros(1)
+
+    def earn(self, obs, action):
+        del obs, action
+        return jnp.ones(())
+
+    def reset(self, rng):
+        return ToyState(self.observe(rng), jnp.zeros(()), jnp.zeros(()))
+
+    def step(self, state, action):
+        return state.replace(reward=self.earn(state.obs, action), done=jnp.ones(()))
+
+
+class Signed(Toy):
+    """The observation is -1 or 1, and so is the reward."""
+
+    def observe(self, key):
+        return jax.random.rademacher(key, (1,)).astype(jnp.float32)
+
+    def earn(self, obs, action):
+        return obs[0]
+
+
+class Late(Toy):
+    """Two steps, told apart by the observation; only the second pays."""
+
+    max_episode_steps = 2
+
+    def step(self, state, action):
+        second = state.obs[0] > 0
+        return state.replace(
+            obs=state.obs + 1.0,
+            reward=jnp.where(second, 1.0, 0.0),
+            done=jnp.where(second, 1.0, 0.0),
+        )
+
+
+class Target(Toy):
+    """The best action is 0.5."""
+
+    def earn(self, obs, action):
+        return -((action[0] - 0.5) ** 2)
+
+
+class SignedTarget(Signed):
+    """The best action is half the observation."""
+
+    def earn(self, obs, action):
+        return -((action[0] - 0.5 * obs[0]) ** 2)
+
+
+class Survive(Toy):
+    """Up to 20 steps, ended by an action beyond the threshold; one reward a step."""
+
+    max_episode_steps = 20
+    reward_threshold = 15.0
+
+    def step(self, state, action):
+        fell = jnp.abs(action[0]) > 0.5
+        return state.replace(reward=jnp.ones(()), done=fell.astype(jnp.float32))
+
+
+class Chain:
+    """Two arms, up to three pulls; arm 0 may end the episode. Rewards depend on pull and arm.
+
+    The expected return of a policy is a sum over 2^3 sequences, so its gradient is exact.
+    """
+
+    max_episode_steps = 3
+    action_size = 1
+    rewards = np.array([[1.0, -0.5], [2.0, 0.7], [-1.0, 3.0]])
+
+    def reset(self, rng):
+        del rng
+        return ToyState(jnp.eye(3)[0], jnp.zeros(()), jnp.zeros(()))
+
+    def step(self, state, action):
+        t = jnp.argmax(state.obs)
+        reward = jnp.asarray(self.rewards, state.obs.dtype)[t, action]
+        done = (t == 2) | ((t == 1) & (action == 0))
+        obs = jnp.roll(state.obs, 1)
+        return state.replace(obs=obs, reward=reward, done=done.astype(state.obs.dtype))
+
+
+def expected_return(logits, discount):
+    """The exact discounted return of Chain under softmax ``logits`` [3, 2]."""
+    log_probs = jax.nn.log_softmax(logits)
+    total = 0.0
+    for first in range(2):
+        for second in range(2):
+            for third in range(2):
+                arms = (first, second) if second == 0 else (first, second, third)
+                if second == 0 and third == 1:
+                    continue
+                probability = jnp.exp(sum(log_probs[t, arm] for t, arm in enumerate(arms)))
+                earned = sum(discount**t * Chain.rewards[t, arm] for t, arm in enumerate(arms))
+                total = total + probability * earned
+    return total
+
+
+def categorical(num_actions):
+    """A softmax over arms; the noise is Gumbel."""
+
+    def log_prob(outputs, action):
+        chosen = jnp.take_along_axis(jax.nn.log_softmax(outputs), action[..., None], axis=-1)
+        return chosen[..., 0]
+
+    def entropy(outputs):
+        log_probs = jax.nn.log_softmax(outputs)
+        return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
+
+    return Distribution(
+        num_outputs=num_actions,
+        constants=(),
+        noise=lambda key, shape: jax.random.gumbel(key, (*shape, num_actions)),
+        sample=lambda outputs, noise: jnp.argmax(outputs + noise, axis=-1),
+        mode=lambda outputs: jnp.argmax(outputs, axis=-1),
+        log_prob=log_prob,
+        entropy=entropy,
+    )
