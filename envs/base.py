@@ -2,15 +2,17 @@
 
 import abc
 import contextlib
+import dataclasses
+import functools
 import importlib.resources
 import io
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from flax import struct
+from mujoco import MjModel  # pyright: ignore[reportAttributeAccessIssue] - a C extension
 
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Box
@@ -74,9 +76,11 @@ class MujocoEnv(Env):
           ValueError: ``solver`` is unknown.
         """
         check_name("solver", solver, _STEPS)
-        self._physics_step = _STEPS[solver]
         self.mj_model = _load(xml_file)
         self.model = mjx.put_model(self.mj_model, impl="jax")
+        # Tracing the physics takes a second of Python; jit does it once.
+        self._forward = jax.jit(functools.partial(physics.forward, self.model))
+        self._physics_step = jax.jit(functools.partial(_STEPS[solver], self.model))
         self.frame_skip = frame_skip
         self.max_episode_steps = max_episode_steps
         self.reward_threshold = reward_threshold
@@ -115,24 +119,25 @@ class MujocoEnv(Env):
           qpos: [nq] generalised positions (m, rad).
           qvel: [nv] generalised velocities (m/s, rad/s).
         """
-        physics = Physics(
+        start = Physics(
             qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros(self.mj_model.nv, qpos.dtype)
         )
-        data = mjx.forward(self.model, self._data(physics))
+        data = self._forward(self._data(start))
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
         terms = jax.tree.map(jnp.zeros_like, self.outcome(data, data, action)[2])
-        return State(physics, self.observe(data), zero, zero, terms)
+        return State(cast(Any, start), self.observe(data), zero, zero, terms)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Returns the state one env step later under ``action`` [A]."""
-        before = self._data(state.pipeline_state).replace(ctrl=action)
+        before = self._data(cast(Any, state.pipeline_state)).replace(ctrl=action)
         data = jax.lax.fori_loop(
-            0, self.frame_skip, lambda _, data: self._physics_step(self.model, data), before
+            0, self.frame_skip, lambda _, data: self._physics_step(data), before
         )
         reward, terminated, terms = self.outcome(before, data, action)
         dtype = state.reward.dtype
-        return state.replace(
+        return dataclasses.replace(
+            state,
             pipeline_state=Physics(
                 qpos=data.qpos, qvel=data.qvel, qacc_warmstart=data.qacc_warmstart
             ),
@@ -173,6 +178,6 @@ class MujocoEnv(Env):
 def _load(xml_file: str) -> Any:
     """Compiles an MJCF file of the package's assets or of the user's."""
     if "/" in xml_file or "\\" in xml_file:
-        return mujoco.MjModel.from_xml_path(xml_file)
-    asset = importlib.resources.files(__package__) / "assets" / xml_file
-    return mujoco.MjModel.from_xml_string(asset.read_text(encoding="utf-8"))
+        return MjModel.from_xml_path(xml_file)
+    asset = importlib.resources.files("mjx_reinforce.envs") / "assets" / xml_file
+    return MjModel.from_xml_string(asset.read_text(encoding="utf-8"))

@@ -12,13 +12,13 @@ Everything else is MJX's own stages in MJX's order. Solver options are untouched
 does not read `iterations` and `tolerance`, nor the warm start, because it is exact.
 """
 
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import constraint, sensor, smooth, solver
+from mujoco.mjx._src import constraint, sensor, smooth, solver, types
 from mujoco.mjx._src import forward as stages
 
 _MAX_ROWS_TOGETHER = 2
@@ -60,39 +60,45 @@ def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = sensor.sensor_vel(model, data)
     data = stages.fwd_actuation(model, data)
     data = stages.fwd_acceleration(model, data)
-    if data._impl.efc_J.size == 0:  # MJX skips the acceleration sensors here too
+    if _impl(data).efc_J.size == 0:  # MJX skips the acceleration sensors here too
         return data.replace(qacc=data.qacc_smooth)
     return sensor.sensor_acc(model, _solve(model, data))
+
+
+def _impl(data: mjx.Data) -> types.DataJAX:
+    """Returns the fields of the JAX implementation, which `step` insists on."""
+    return cast(types.DataJAX, data._impl)
 
 
 def _solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Finds the constraint forces and the acceleration."""
     joints = _limited_joints(model)
     groups = _coupled_rows(model, joints)
-    if data._impl.efc_J.shape[0] == joints.size and max(map(len, groups)) <= _MAX_ROWS_TOGETHER:
+    if _impl(data).efc_J.shape[0] == joints.size and max(map(len, groups)) <= _MAX_ROWS_TOGETHER:
         reached, solve = _limit_reached(model, data, joints), _solve_limits
-    elif data._impl.ne or data._impl.nf:  # rows that are always active
+    elif _impl(data).ne or _impl(data).nf:  # rows that are always active
         return solver.solve(model, data)
     else:  # inactive rows have a Jacobian of zero
-        reached, solve = jnp.any(data._impl.efc_J != 0), _solve_any
+        reached, solve = jnp.any(_impl(data).efc_J != 0), _solve_any
     qacc, qfrc_constraint, efc_force = jax.lax.cond(
         reached,
         lambda: solve(model, data),
         lambda: (
             data.qacc_smooth,
             jnp.zeros_like(data.qfrc_constraint),
-            jnp.zeros_like(data._impl.efc_force),
+            jnp.zeros_like(_impl(data).efc_force),
         ),
     )
-    return data.tree_replace(
+    solved = data.tree_replace(
         {"qacc": qacc, "qfrc_constraint": qfrc_constraint, "_impl.efc_force": efc_force}
     )
+    return cast(mjx.Data, solved)  # flax types it as any PyTreeNode
 
 
 def _solve_any(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
     """MJX's solver; returns acceleration, joint forces and row forces."""
     data = solver.solve(model, data)
-    return data.qacc, data.qfrc_constraint, data._impl.efc_force
+    return data.qacc, data.qfrc_constraint, _impl(data).efc_force
 
 
 def _limited_joints(model: mjx.Model) -> np.ndarray:
@@ -133,7 +139,7 @@ def _solve_limits(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Arra
     A limit's row is plus or minus one at its joint, or zero while the limit is not reached.
     """
     # The rows are made again here, so that nothing outside this branch needs them.
-    impl = constraint.make_constraint(model, data)._impl
+    impl = _impl(constraint.make_constraint(model, data))
     joints = _limited_joints(model)
     dofs = np.asarray(model.jnt_dofadr)[joints]
     sign = [impl.efc_J[i, dof] for i, dof in enumerate(dofs)]

@@ -29,7 +29,8 @@ def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None
     """
     flat = traverse_util.flatten_dict(serialization.to_state_dict(actor), sep="/")
     archive = io.BytesIO()
-    np.savez(archive, **{name: np.asarray(value) for name, value in flat.items()})
+    arrays: dict[str, Any] = {name: np.asarray(value) for name, value in flat.items()}
+    np.savez(archive, allow_pickle=False, **arrays)
     directory.mkdir(parents=True, exist_ok=True)
     write_bytes(directory / "actor.npz", archive.getvalue())
     write_json(directory / "policy.json", settings)

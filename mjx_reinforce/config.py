@@ -26,6 +26,9 @@ class Config:
     horizon: int | None = None
     """Steps after which an episode ends; the environment's own limit if not given."""
 
+    engine: Literal["auto", "mjx", "fused"] = "auto"
+    """How episodes are played: mjx (plain jax.vmap), fused (the step written out), or the best."""
+
     policy: str = "normal"
     """Action distribution: normal (one trained std) or normal-softplus (std from the state)."""
     hidden_sizes: tuple[int, ...] = (32, 32)
@@ -41,13 +44,13 @@ class Config:
     """Multiply the weight at step t by discount^t, which most programs leave out."""
     standardize: bool = True
     """Divide the weights by their standard deviation plus the floor below."""
-    standardize_floor: float = 5.0
+    standardize_floor: float = 10.0
     """Added to that standard deviation, in units of return."""
     entropy_cost: float = 0.0
     """Weight of the policy's entropy in the objective."""
     loss_per: Literal["episode", "step"] = "episode"
     """Average the gradient over episodes (the definition) or over steps."""
-    normalize_steps: int = 20_000
+    normalize_steps: int = 1000
     """Scale observations by the statistics of about the first so many steps; 0 does not."""
 
     learning_rate: float = 1e-2

@@ -74,7 +74,7 @@ def normal(space: Box, *, std: str = "parameter", initial_std: float = 0.5) -> D
     shift = float(np.log(np.expm1(initial_std)))
 
     def split(outputs):
-        mean = middle + half * outputs[..., :size]
+        mean = outputs[..., :size] * half + middle
         raw = outputs[..., size:]
         if std == "parameter":
             return mean, jnp.exp(raw)

@@ -1,13 +1,10 @@
 """Playing a policy without training it, on keys that no training uses."""
 
-from collections.abc import Callable
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 
 from mjx_reinforce.learner import Actor, Learner
-from mjx_reinforce.rollouts import episode_lengths, episode_returns, rollout
+from mjx_reinforce.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.types import Environment
 
 
@@ -19,24 +16,22 @@ def evaluate(
     *,
     num_episodes: int,
     horizon: int,
-    vmap: Callable[..., Any] = jax.vmap,
 ) -> dict[str, jax.Array]:
     """Plays N episodes with the policy's mode and N with its samples.
 
     Args:
       env: what is played.
-      learner: whose policy it is.
+      learner: whose policy and engine it is.
       actor: the parameters and observation statistics.
       key: consumed; pass the same one each time to see the same start states.
       num_episodes: N, of each kind.
       horizon: T, the time limit in steps.
-      vmap: how one env step becomes 2N, see ``rollout``.
 
     Returns:
       ``eval_return`` and ``eval_length`` [], means over the deterministic
       episodes, and ``eval_return_stochastic`` [], over the sampled ones.
     """
-    trajectory = rollout(
+    trajectory = learner.engine.rollout(
         env,
         learner.act,
         actor,
@@ -45,7 +40,6 @@ def evaluate(
         num_episodes=2 * num_episodes,
         horizon=horizon,
         num_deterministic=num_episodes,
-        vmap=vmap,
     )
     returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
     return {

@@ -1,5 +1,6 @@
 """REINFORCE as a pair of pure functions, ``init`` and ``step``, over one state pytree."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -8,12 +9,12 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from mjx_reinforce import normalize
+from mjx_reinforce import engines, normalize
 from mjx_reinforce.distributions import normal
 from mjx_reinforce.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.gradients import accumulate_gradient
 from mjx_reinforce.policies import Policy, mlp_policy
-from mjx_reinforce.rollouts import episode_lengths, episode_returns, rollout
+from mjx_reinforce.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.types import Environment, Trajectory, action_space, observation_size
 
 Metrics = dict[str, jax.Array]
@@ -56,12 +57,14 @@ class Learner(NamedTuple):
     step: (TrainState) -> (TrainState, metrics), one update on N fresh episodes
     act: (Actor, observation [..., O]) -> outputs [..., K] of the distribution
     policy: the policy that is trained
+    engine: how its episodes are played
     """
 
     init: Callable[[jax.Array], TrainState]
     step: Callable[[TrainState], tuple[TrainState, Metrics]]
     act: Callable[[Actor, jax.Array], jax.Array]
     policy: Policy
+    engine: engines.Engine
 
 
 def default_optimizer(
@@ -86,8 +89,8 @@ def reinforce(
     horizon: int | None = None,
     entropy_cost: float | jax.Array = 0.0,
     loss_per: str = "episode",
-    normalize_steps: int = 20_000,
-    vmap: Callable[..., Any] = jax.vmap,
+    normalize_steps: int = 1000,
+    engine: str = "auto",
 ) -> Learner:
     """Builds REINFORCE (Williams 1992) for an environment.
 
@@ -102,7 +105,7 @@ def reinforce(
       env: what is played; any brax-style environment.
       policy: by default an MLP of 32 and 32 tanh units with a Normal.
       estimator: by default leave-one-out on the return to go (discount 0.99),
-        divided by its standard deviation plus 5.
+        divided by its standard deviation plus 10.
       optimizer: by default Adam at 1e-2 with the gradient's norm clipped at 1.
       num_episodes: N, episodes an update.
       horizon: T, steps after which an episode ends; by default the environment's
@@ -115,7 +118,7 @@ def reinforce(
         follows a policy which learns to keep near the middle drives up its gain
         until it fails. 0 leaves them as they are. Each update uses the statistics
         that its episodes were played with.
-      vmap: ``jax.vmap`` or ``mjx_reinforce.fused.vmap``, how one env step becomes N.
+      engine: how episodes are played: "auto", "mjx" or "fused", see ``engines``.
 
     Returns:
       The learner: ``init(key)`` makes a state, ``train_step(learner, state)`` moves it on.
@@ -127,7 +130,7 @@ def reinforce(
     size = observation_size(env)
     if policy is None:
         policy = mlp_policy(size, normal(action_space(env)))
-    estimator = standardize(leave_one_out(), floor=5.0) if estimator is None else estimator
+    estimator = standardize(leave_one_out(), floor=10.0) if estimator is None else estimator
     optimizer = default_optimizer() if optimizer is None else optimizer
     if num_episodes < estimator.min_episodes:
         raise ValueError(
@@ -137,6 +140,7 @@ def reinforce(
     if loss_per not in ("episode", "step"):
         raise ValueError(f"loss_per must be 'episode' or 'step', got {loss_per!r}")
     distribution = policy.distribution
+    chosen = engines.choose(engine, env)
 
     def act(actor, observation):
         return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))
@@ -163,7 +167,7 @@ def reinforce(
     def step(state):
         actor = state.actor
         key, episodes_key = jax.random.split(state.key)
-        trajectory = rollout(
+        trajectory = chosen.rollout(
             env,
             act,
             actor,
@@ -171,13 +175,11 @@ def reinforce(
             episodes_key,
             num_episodes=num_episodes,
             horizon=horizon,
-            vmap=vmap,
         )
-        seen = trajectory.replace(
-            observation=normalize.apply(actor.normalizer, trajectory.observation)
-        )
+        scaled = normalize.apply(actor.normalizer, trajectory.observation)
+        seen = dataclasses.replace(trajectory, observation=scaled)
         weight, estimator_state, estimator_metrics = estimator.update(state.estimator_state, seen)
-        data = (seen.observation, trajectory.action, weight, trajectory.mask)
+        data = (scaled, trajectory.action, weight, trajectory.mask)
         _, grads, sums = accumulate_gradient(surrogate, actor.params, data)
         steps = jnp.maximum(jnp.sum(trajectory.mask), 1)
         divisor = num_episodes if loss_per == "episode" else steps
@@ -205,7 +207,7 @@ def reinforce(
         }
         return state, metrics
 
-    return Learner(init, step, act, policy)
+    return Learner(init, step, act, policy, chosen)
 
 
 def _train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics]:

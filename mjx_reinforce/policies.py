@@ -51,7 +51,7 @@ def mlp_policy(
         }
 
     def apply(params, observation):
-        outputs = network.apply(params["network"], observation)
+        outputs = jnp.asarray(network.apply(params["network"], observation))
         fixed = jnp.broadcast_to(params["constants"], (*outputs.shape[:-1], len(constants)))
         return jnp.concatenate([outputs, fixed], axis=-1)
 

@@ -89,7 +89,7 @@ def provenance() -> dict[str, Any]:
         "device": str(jax.devices()[0].device_kind),
         "num_devices": jax.device_count(),
         "cpu_count": os.cpu_count(),
-        "x64": bool(jax.config.jax_enable_x64),
+        "x64": jax.numpy.zeros(()).dtype == "float64",
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
 

@@ -26,7 +26,7 @@ def rollout(
     num_episodes: int,
     horizon: int,
     num_deterministic: int = 0,
-    vmap: Callable[..., Any] = jax.vmap,
+    env_step: Callable[[Any, jax.Array], Any] | None = None,
 ) -> Trajectory:
     """Plays N episodes from fresh resets, each to its end or to the horizon.
 
@@ -43,7 +43,8 @@ def rollout(
       num_episodes: N.
       horizon: T, the time limit in steps; reaching it ends an episode.
       num_deterministic: how many episodes, the first ones, take the mode.
-      vmap: ``jax.vmap`` or ``fused.vmap``, how one env step becomes N.
+      env_step: the environment's step over a batch on the last axis of every leaf;
+        by default ``jax.vmap`` of it.
 
     Returns:
       The episodes. A non-finite observation or reward ends its episode, with
@@ -52,7 +53,8 @@ def rollout(
     # Inside, episodes are the last axis: each scalar of the state is a contiguous row.
     start = jax.vmap(functools.partial(_begin, env, key), out_axes=(-1, 0))
     state, noise_keys = start(jnp.arange(num_episodes))
-    env_step = vmap(env.step, in_axes=-1, out_axes=-1)
+    if env_step is None:
+        env_step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
     deterministic = jnp.arange(num_episodes) < num_deterministic
     length = largest_divisor(horizon, CHUNK_STEPS)
 
@@ -75,9 +77,9 @@ def rollout(
 
     def advance(carry):
         chunk, keys, simulation, records = carry
-        keys, noise = jax.vmap(
-            functools.partial(_draw, distribution, length), out_axes=(0, 1)
-        )(keys)
+        keys, noise = jax.vmap(functools.partial(_draw, distribution, length), out_axes=(0, 1))(
+            keys
+        )
         simulation, new = lax.scan(step, simulation, noise)
         records = jax.tree.map(
             lambda old, x: lax.dynamic_update_slice_in_dim(old, x, chunk * length, 0), records, new
@@ -89,11 +91,16 @@ def rollout(
         return (chunk < horizon // length) & jnp.any(alive)
 
     none = jnp.zeros(num_episodes, bool)
-    carry = (state, ~none, none)
-    noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), (num_episodes,)))
-    _, one_step = jax.eval_shape(step, carry, noise)
-    records = jax.tree.map(lambda x: jnp.zeros((horizon, *x.shape), x.dtype), one_step)
-    init = (jnp.zeros((), jnp.int32), noise_keys, carry, records)
+
+    def first(noise_keys):
+        noise = jax.vmap(functools.partial(_draw, distribution, 1), out_axes=(0, 1))(noise_keys)[1]
+        action = distribution.sample(act(actor, state.obs.T), noise[0])
+        return state.obs, action, state.reward, none
+
+    records = jax.tree.map(
+        lambda x: jnp.zeros((horizon, *x.shape), x.dtype), jax.eval_shape(first, noise_keys)
+    )
+    init = (jnp.zeros((), jnp.int32), noise_keys, (state, ~none, none), records)
     _, _, (_, _, bad), (observation, action, reward, mask) = while_any(unfinished, advance, init)
     return Trajectory(
         observation=jnp.swapaxes(observation, 1, 2),

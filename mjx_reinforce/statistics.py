@@ -67,6 +67,4 @@ def steps_to_solve(
         return [None] * returns.shape[1]
     solved = returns >= threshold
     first = np.argmax(solved, axis=0)
-    return [
-        int(env_steps[e, s]) if solved[e, s] else None for s, e in enumerate(first)
-    ]
+    return [int(env_steps[e, s]) if solved[e, s] else None for s, e in enumerate(first)]

@@ -50,10 +50,11 @@ def _configure_jax() -> None:
     import jax
 
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    if jax.config.jax_compilation_cache_dir is None:
+    settings = jax.config.values
+    if settings["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "mjx_reinforce"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
-    if jax.config.jax_default_matmul_precision is None:
+    if settings["jax_default_matmul_precision"] is None:
         jax.config.update("jax_default_matmul_precision", "highest")
 
 
@@ -91,6 +92,7 @@ def build(env: Any, config: Config) -> tuple[Any, int]:
         entropy_cost=config.entropy_cost,
         loss_per=config.loss_per,
         normalize_steps=config.normalize_steps,
+        engine=config.engine,
     )
     return built, horizon
 
@@ -185,9 +187,10 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
         started = time.perf_counter()
         programs = Programs(env, learner, horizon, config)
         compile_seconds = time.perf_counter() - started
+        display.say(f"engine {learner.engine.name}: {learner.engine.why}")
         display.say(f"compiled in {compile_seconds:.1f} s")
         display.start()
-        log = _Log(config, directory, display)
+        log = _Log(config, directory, display, learner.engine.name)
         while not interrupt.is_set():
             log.evaluation(programs)
             if np.all(log.used >= config.env_steps):
@@ -204,9 +207,10 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
 class _Log:
     """Everything measured so far, and the files it goes to."""
 
-    def __init__(self, config: Config, directory: Path, display: Any):
+    def __init__(self, config: Config, directory: Path, display: Any, engine: str):
         self.used = np.zeros(config.num_seeds, np.int64)
         self._config, self._directory, self._display = config, directory, display
+        self._engine = engine
         self._rows: list[dict[str, Any]] = []
         self._evaluations: list[dict[str, np.ndarray]] = []
         self._broken: list[dict[str, Any]] = []
@@ -294,7 +298,7 @@ class _Log:
         }
         summary = {
             "env": self._config.env,
-            "engine": "mjx",
+            "engine": self._engine,
             "num_seeds": self._config.num_seeds,
             **report.summarize(history, threshold),
             "env_steps": self.used.tolist(),

@@ -3,6 +3,7 @@
 import functools
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import optax
@@ -178,7 +179,8 @@ def test_an_episode_does_not_depend_on_how_many_there_are():
     def play(num_episodes):
         return rollout(
             env,
-            lambda obs: policy.apply(params, obs),
+            policy.apply,
+            params,
             policy.distribution,
             jax.random.key(1),
             num_episodes=num_episodes,
@@ -223,9 +225,7 @@ def test_a_broken_simulation_is_counted_and_stays_in_its_seed():
     assert np.all(metrics["nonfinite_episodes"] == 0)
     mixed, metrics = jax.vmap(step)(jnp.array([True, False]), keys)
     np.testing.assert_array_equal(metrics["nonfinite_episodes"], [4, 0])
-    jax.tree.map(
-        lambda x, y: np.testing.assert_array_equal(x[1], y[1]), healthy.actor, mixed.actor
-    )
+    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[1], y[1]), healthy.actor, mixed.actor)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(mixed.actor))
 
 

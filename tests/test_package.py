@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = [
     {"__init__", "registry", "types", "networks", "statistics", "control"},
     {"distributions", "estimators", "gradients", "rollouts", "normalize", "fused", "envs"},
-    {"policies", "learner", "evaluation"},
+    {"policies", "kernel", "engines", "learner", "evaluation"},
     {"checkpoint", "config", "records", "report", "display"},
     {"train"},
 ]
@@ -33,7 +33,9 @@ def level(module):
     return next(i for i, names in enumerate(LEVELS) if module in names)
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "mjx_reinforce").glob("*.py")), ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / "mjx_reinforce").glob("*.py")), ids=lambda p: p.stem
+)
 def test_imports_point_one_way(path):
     for module in imported(path):
         assert level(module) <= level(path.stem), f"{path.stem} imports {module}"

@@ -68,7 +68,10 @@ def test_one_step_equals_gymnasium(id):
         expected = [
             np.array(column)
             for column in zip(
-                *(gymnasium_step(reference, *case) for case in zip(qpos, qvel, action, strict=True)),
+                *(
+                    gymnasium_step(reference, *case)
+                    for case in zip(qpos, qvel, action, strict=True)
+                ),
                 strict=True,
             )
         ]
@@ -103,7 +106,9 @@ def test_broken_state_ends_the_episode():
     assert float(after.reward) == 0.0
 
 
-@pytest.mark.parametrize(("id", "at_fall"), [("InvertedPendulum-v5", 0.0), ("InvertedPendulum-v4", 1.0)])
+@pytest.mark.parametrize(
+    ("id", "at_fall"), [("InvertedPendulum-v5", 0.0), ("InvertedPendulum-v4", 1.0)]
+)
 def test_reward_of_the_fall(id, at_fall):
     env = envs.make(id)
     after = env.step(env.set_state(jnp.array([0.0, 0.25]), jnp.zeros(2)), jnp.zeros(1))

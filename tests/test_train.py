@@ -44,7 +44,11 @@ def test_a_run_leaves_its_files(run, tmp_path):
     assert run(*ARGUMENTS, "--output", "out", "--hidden-sizes", "4") == 0
     out = tmp_path / "out"
     rows, summary = read(out)
-    assert {(row["seed"], row["update"]) for row in rows[:3]} == {("0", "0"), ("1", "0"), ("2", "0")}
+    assert {(row["seed"], row["update"]) for row in rows[:3]} == {
+        ("0", "0"),
+        ("1", "0"),
+        ("2", "0"),
+    }
     last = rows[-3:]
     assert [float(row["eval_return"]) for row in last] == summary["final_returns"]
     assert all(int(row["env_steps"]) >= 1500 for row in last)

@@ -38,7 +38,7 @@ def cond_rule(
 ) -> list[np.ndarray]:
     """Evaluates the branches that lanes may take and picks each lane's own."""
     branches = [jaxprs.program(branch) for branch in eqn.params["branches"]]
-    choice = index[()]
+    (choice,) = arrays.elements(index)
     if ops.is_constant(choice):
         taken = branches[min(max(int(choice), 0), len(branches) - 1)]
         return run(graph, taken, list(operands), used)

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import jax
 import numpy as np
@@ -49,15 +49,16 @@ class Emitter:
                 env[step] = self._apply(step, env)
 
     def _apply(self, node: Node, env: Environment) -> Any:
+        op = cast(ops.Op, node.op)  # leaves are not scheduled
         values = [self._value(arg, env) for arg in node.args]
-        if node.op.takes_scalars:
+        if op.takes_scalars:
             values = [
                 value if ops.is_constant(arg) else self._spread(value, node.varying)
                 for arg, value in zip(node.args, values, strict=True)
             ]
         else:
             values = [self._spread(value, node.varying) for value in values]
-        return node.op.bind(*values)
+        return op.bind(*values)
 
     def _value(self, scalar: Scalar, env: Environment) -> Any:
         """Returns a scalar's value, reading inputs when they are first needed."""
@@ -80,7 +81,7 @@ class Emitter:
         return self._spread(self._value(scalar, env), varying)
 
     def _gate(self, gate: Gate, env: Environment) -> None:
-        live = [out for out in gate.outs if out in self.schedule.wanted]
+        live = [out for out in gate.outs if out is not None and out in self.schedule.wanted]
 
         def branch(scalars: list[Scalar], scope: Scope | None) -> list[Any]:
             inner = dict(env)
@@ -96,7 +97,9 @@ class Emitter:
         carries = self.schedule.carries.get(loop, [])
         live_ys = self.schedule.ys.get(loop, [])
         elements = self.schedule.elements.get(loop, [])
-        outs = [loop.outs[i] for i in carries]
+        outs = _leaves(loop.outs, carries)
+        carry_leaves = _leaves(loop.carries, carries)
+        element_leaves = _leaves(loop.elements, elements)
         varying = [out.varying for out in outs]
         init = [
             self._materialize(loop.inits[i], v, env) for i, v in zip(carries, varying, strict=True)
@@ -104,8 +107,8 @@ class Emitter:
 
         def body(carry: list[Any], row: Sequence[Any] = ()) -> tuple[list[Any], list[Any]]:
             inner = dict(env)
-            inner.update(zip([loop.carries[i] for i in carries], carry, strict=True))
-            inner.update(zip([loop.elements[j] for j in elements], row, strict=True))
+            inner.update(zip(carry_leaves, carry, strict=True))
+            inner.update(zip(element_leaves, row, strict=True))
             self._run(loop.body, inner)
             nexts = [
                 self._materialize(loop.nexts[i], v, inner)
@@ -114,7 +117,10 @@ class Emitter:
             return nexts, [self._value(loop.ys[j], inner) for j in live_ys]
 
         if live_ys or elements:
-            rows = [self._stack(loop.xs[j], loop.elements[j].varying, env) for j in elements]
+            rows = [
+                self._stack(loop.xs[j], leaf.varying, env)
+                for j, leaf in zip(elements, element_leaves, strict=True)
+            ]
             final, stacked = lax.scan(body, init, rows, length=loop.length)
             for j, values in zip(live_ys, stacked, strict=True):
                 env.update((leaf, values[t]) for t, leaf in enumerate(loop.stacked[j]))
@@ -144,3 +150,8 @@ class Emitter:
         start = (np.int32(0), init)
         step = lambda state: (state[0] + 1, body(state[1])[0])  # noqa: E731
         return lax.while_loop(goes_on, step, start)[1]
+
+
+def _leaves(leaves: Sequence[Node | None], positions: Sequence[int]) -> list[Node]:
+    """Returns the leaves at these positions; what is scheduled has one."""
+    return [leaf for i in positions if (leaf := leaves[i]) is not None]

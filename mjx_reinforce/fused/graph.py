@@ -100,6 +100,11 @@ class Graph:
         """The innermost scope."""
         return self._scopes[-1]
 
+    @property
+    def captures(self) -> bool:
+        """Whether the program closes over an array whose value is not known yet."""
+        return bool(self._captured)
+
     @contextlib.contextmanager
     def loop_body(self) -> Iterator[Scope]:
         """Opens a scope that invariant nodes leave."""

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.fused import arrays, emit, evaluate, jaxprs, lanes, liveness
+from mjx_reinforce.fused import arrays, emit, evaluate, jaxprs, lanes, liveness, ops
 from mjx_reinforce.fused.graph import Graph, Scalar, Scope
 
 
@@ -25,6 +25,7 @@ class Scalarized:
         root: the scope of the whole program.
         outputs: the scalars of each leaf of the result.
         schedule: what they need.
+        captures: whether it closes over an array that an outer transformation traces.
     """
 
     in_tree: Any
@@ -34,6 +35,7 @@ class Scalarized:
     root: Scope
     outputs: list[list[Scalar]]
     schedule: liveness.Schedule
+    captures: bool
 
     @property
     def operations(self) -> Counter:
@@ -127,12 +129,13 @@ def build(
         root=graph.scope,
         outputs=outputs,
         schedule=liveness.schedule(x for leaf in outputs for x in leaf),
+        captures=graph.captures,
     )
 
 
 def full(value: Any, batch_shape: tuple[int, ...]) -> jax.Array:
     """Gives a shared value or a constant the shape of a lane."""
-    if np.shape(value) == batch_shape and not isinstance(value, np.generic):
+    if np.shape(value) == batch_shape and not ops.is_constant(value):
         return value
     return lax.broadcast(value, batch_shape)
 

@@ -223,9 +223,9 @@ def _through_select(graph: Any, op: ops.Op, args: tuple, dtype: np.dtype) -> Any
     nodes = [arg for arg in args if not ops.is_constant(arg)]
     if op.name == "convert_element_type" and nodes[0].dtype == np.bool_ != dtype:
         return graph.select(nodes[0], dtype.type(1), dtype.type(0))
-    choices = [_args(node, "select_n") for node in nodes]
+    choices: list[tuple] = [_args(node, "select_n") or () for node in nodes]
     for choice in choices:
-        if not choice or len(choice) != 3 or choice[0] is not choices[0][0]:
+        if len(choice) != 3 or choice[0] is not choices[0][0]:
             return None
         if not (ops.is_constant(choice[1]) and ops.is_constant(choice[2])):
             return None

@@ -29,31 +29,44 @@ def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 3
             computes shared values again in each fusion, and a real branch also stops that.
 
     Returns:
-        The mapped function. Keyword arguments are mapped over their first axis.
+        The mapped function. Keyword arguments are mapped over their first axis. Its `write`
+        takes the same arguments, or their shapes, and returns the `Scalarized` that it evaluates.
 
     Raises:
         ValueError: if no argument is mapped, the mapped sizes differ, or an axis does not fit.
         UnsupportedPrimitive: if fn uses a primitive that has no rule.
     """
+    programs: dict[Any, scalarized.Scalarized] = {}  # writing one out takes about a second
 
-    @functools.wraps(fn)
-    def mapped(*args: Any, **kwargs: Any) -> Any:
+    def write(*args: Any, **kwargs: Any) -> tuple[scalarized.Scalarized, list[int | None]]:
         axes = [*_axes(in_axes, args), *_axes(0, kwargs)]
         leaves, in_tree = jax.tree.flatten((args, kwargs))
-        leaves = [jnp.asarray(leaf) for leaf in leaves]
         axes = [
             None if axis is None else _axis(axis, leaf.ndim)
             for axis, leaf in zip(axes, leaves, strict=True)
         ]
-        batch = _batch_size(leaves, axes)
         examples = [_example(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
 
         def flat_fn(*flat: Any) -> Any:
             inner_args, inner_kwargs = jax.tree.unflatten(in_tree, flat)
             return fn(*inner_args, **inner_kwargs)
 
-        varying = [axis is not None for axis in axes]
-        written = scalarized.build(flat_fn, examples, varying, branch_cost)
+        varying = tuple(axis is not None for axis in axes)
+        precision = jnp.result_type(float)  # constants inside depend on it
+        seen = (in_tree, tuple((x.shape, x.dtype) for x in examples), varying, precision)
+        written = programs.get(seen)
+        if written is None:
+            written = scalarized.build(flat_fn, examples, varying, branch_cost)
+            if not written.captures:
+                programs[seen] = written
+        return written, axes
+
+    @functools.wraps(fn)
+    def mapped(*args: Any, **kwargs: Any) -> Any:
+        args, kwargs = jax.tree.map(jnp.asarray, (args, kwargs))
+        written, axes = write(*args, **kwargs)
+        leaves = jax.tree.leaves((args, kwargs))
+        batch = _batch_size(leaves, axes)
         rows = [_rows(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
         values = written.emit(lambda place: _row(rows, *place), (batch,), lanes.any_lane)
         out_tree = written.out_tree
@@ -65,6 +78,8 @@ def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 3
         ]
         return jax.tree.unflatten(out_tree, outputs)
 
+    # The type that `wraps` gives a function has no room for attributes.
+    mapped.write = lambda *args, **kwargs: write(*args, **kwargs)[0]  # pyright: ignore[reportAttributeAccessIssue]
     return mapped
 
 
