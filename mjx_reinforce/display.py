@@ -1,5 +1,7 @@
 """What a person sees while a run goes on and when it ends."""
 
+import signal
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +73,27 @@ class Display:
         self._progress.update(self._task, completed=steps, description=text)
         if not self.console.is_terminal:
             self.say(f"update {update:5d}  {steps:12,.0f} env steps a seed  {text}")
+
+
+class Interrupt(threading.Event):
+    """Ctrl-C asks the run to stop after the present block; a second one stops at once."""
+
+    def __init__(self, display: Display):
+        super().__init__()
+        self._display = display
+
+    def __enter__(self) -> "Interrupt":
+        self._previous = signal.signal(signal.SIGINT, self._handle)
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        signal.signal(signal.SIGINT, self._previous)
+
+    def _handle(self, number: int, frame: Any) -> None:
+        del number, frame
+        self.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        self._display.say("stopping after this block of updates; Ctrl-C again stops at once")
 
 
 def print_summary(console: Console, summary: dict[str, Any], directory: Path) -> None:

@@ -2,9 +2,7 @@
 
 import dataclasses
 import os
-import signal
 import sys
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -178,163 +176,33 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
     Returns:
       Whether it was interrupted.
     """
-    from mjx_reinforce import records
-    from mjx_reinforce.display import Display, print_summary
+    from mjx_reinforce import checkpoint, records
+    from mjx_reinforce.display import Display, Interrupt, print_summary
+    from mjx_reinforce.runlog import RunLog
 
     settings = dataclasses.asdict(config) | {"horizon": horizon, "output": str(directory)}
     records.write_json(directory / "config.json", settings | records.provenance())
-    with Display(config.env_steps) as display, _Interrupt(display) as interrupt:
+    with Display(config.env_steps) as display, Interrupt(display) as interrupt:
         started = time.perf_counter()
         programs = Programs(env, learner, horizon, config)
         compile_seconds = time.perf_counter() - started
         display.say(f"engine {learner.engine.name}: {learner.engine.why}")
         display.say(f"compiled in {compile_seconds:.1f} s")
         display.start()
-        log = _Log(config, directory, display, learner.engine.name)
+        log = RunLog(config, directory, display, learner.engine.name)
         while not interrupt.is_set():
-            log.evaluation(programs)
+            log.evaluation(programs.evaluate())
             if np.all(log.used >= config.env_steps):
                 break
             programs.carry, metrics = programs.advance(programs.carry)
             log.updates(_to_numpy(metrics))
         else:
-            log.evaluation(programs)
-    summary = log.finish(env, programs, compile_seconds, policy_settings(env, config))
+            log.evaluation(programs.evaluate())
+        actor = programs.carry[0].actor
+    checkpoint.save_policy(directory / "policy", actor, policy_settings(env, config))
+    summary = log.finish(compile_seconds, getattr(env, "reward_threshold", None))
     print_summary(display.console, summary, directory)
     return interrupt.is_set()
-
-
-class _Log:
-    """Everything measured so far, and the files it goes to."""
-
-    def __init__(self, config: Config, directory: Path, display: Any, engine: str):
-        self.used = np.zeros(config.num_seeds, np.int64)
-        self._config, self._directory, self._display = config, directory, display
-        self._engine = engine
-        self._rows: list[dict[str, Any]] = []
-        self._evaluations: list[dict[str, np.ndarray]] = []
-        self._broken: list[dict[str, Any]] = []
-        self._last: dict[str, np.ndarray] = {}
-        self._simulated = 0.0
-        self._update = np.zeros(config.num_seeds, np.int64)
-        self._started = time.perf_counter()
-
-    @property
-    def seconds(self) -> float:
-        return time.perf_counter() - self._started
-
-    def updates(self, metrics: dict[str, np.ndarray]) -> None:
-        """Takes in the metrics [K, S] of a block of updates."""
-        active = metrics["active"]
-        steps = np.where(active, metrics["env_steps"], 0)
-        self.used += steps.sum(axis=0)
-        self._simulated += np.sum(steps / np.maximum(metrics["useful_step_fraction"], 1e-9))
-        self._last = {name: values[-1] for name, values in metrics.items()}
-        for k, s in zip(*np.nonzero(active), strict=True):
-            episodes, skipped = metrics["nonfinite_episodes"][k, s], metrics["skipped_update"][k, s]
-            if episodes or skipped:
-                self._report_broken(int(s), int(self._update[s] + k), int(episodes), bool(skipped))
-        self._update += active.sum(axis=0)
-
-    def _report_broken(self, seed: int, update: int, episodes: int, skipped: bool) -> None:
-        self._broken.append(
-            {"seed": seed, "update": update, "episodes": episodes, "skipped": skipped}
-        )
-        what = f"{episodes} non-finite episodes" + (", update skipped" if skipped else "")
-        self._display.say(f"[yellow]seed {seed}, update {update}: {what}[/yellow]")
-
-    def evaluation(self, programs: Programs) -> None:
-        """Evaluates, shows it, and writes metrics.csv."""
-        from mjx_reinforce import records
-        from mjx_reinforce.statistics import iqm
-
-        result = programs.evaluate()
-        self._evaluations.append(result | {"env_steps": self.used.copy()})
-        for s in range(self._config.num_seeds):
-            self._rows.append(self._row(s, result))
-        records.write_csv(self._directory / "metrics.csv", self._rows)
-        returns = result["eval_return"]
-        rate = self.used.sum() / self.seconds
-        self._display.evaluated(
-            int(self._update.max()),
-            float(self.used.mean()),
-            float(iqm(returns)),
-            float(returns.min()),
-            float(rate),
-        )
-
-    def _row(self, seed: int, result: dict[str, np.ndarray]) -> dict[str, Any]:
-        def last(name):
-            return self._last[name][seed].item() if self._last else ""
-
-        return {
-            "seed": seed,
-            "update": int(self._update[seed]),
-            "env_steps": int(self.used[seed]),
-            "wall_seconds": round(self.seconds, 3),
-            "train_return": last("episode_return"),
-            "eval_return": result["eval_return"][seed].item(),
-            "eval_return_stochastic": result["eval_return_stochastic"][seed].item(),
-            "eval_length": result["eval_length"][seed].item(),
-            "train_length": last("episode_length"),
-            "entropy": last("entropy"),
-            "gradient_norm": last("gradient_norm"),
-            "useful_step_fraction": last("useful_step_fraction"),
-            "nonfinite_episodes": last("nonfinite_episodes"),
-            "skipped_update": last("skipped_update"),
-        }
-
-    def finish(
-        self, env: Any, programs: Programs, compile_seconds: float, settings: dict[str, Any]
-    ) -> dict[str, Any]:
-        """Writes the summary, the picture and the policies; returns the summary."""
-        from mjx_reinforce import checkpoint, records, report
-
-        seconds = self.seconds
-        threshold = getattr(env, "reward_threshold", None)
-        history = {
-            name: np.stack([evaluation[name] for evaluation in self._evaluations])
-            for name in ("eval_return", "env_steps")
-        }
-        summary = {
-            "env": self._config.env,
-            "engine": self._engine,
-            "num_seeds": self._config.num_seeds,
-            **report.summarize(history, threshold),
-            "env_steps": self.used.tolist(),
-            "compile_seconds": compile_seconds,
-            "run_seconds": seconds,
-            "env_steps_per_second": float(self.used.sum() / seconds),
-            "useful_step_fraction": float(self.used.sum() / max(self._simulated, 1.0)),
-            "nonfinite": self._broken,
-        }
-        checkpoint.save_policy(self._directory / "policy", programs.carry[0].actor, settings)
-        report.draw_learning_curve(
-            self._directory / "learning_curve.png", history, self._config.env, threshold
-        )
-        records.write_json(self._directory / "summary.json", summary)
-        return summary
-
-
-class _Interrupt(threading.Event):
-    """Ctrl-C asks the run to stop after the present block; a second one stops at once."""
-
-    def __init__(self, display: Any):
-        super().__init__()
-        self._display = display
-
-    def __enter__(self) -> "_Interrupt":
-        self._previous = signal.signal(signal.SIGINT, self._handle)
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        signal.signal(signal.SIGINT, self._previous)
-
-    def _handle(self, number: int, frame: Any) -> None:
-        del number, frame
-        self.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        self._display.say("stopping after this block of updates; Ctrl-C again stops at once")
 
 
 def _to_numpy(tree: dict[str, Any]) -> dict[str, np.ndarray]:

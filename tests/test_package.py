@@ -14,7 +14,7 @@ LEVELS = [
     {"__init__", "registry", "types", "networks", "statistics", "control"},
     {"distributions", "estimators", "gradients", "rollouts", "normalize", "fused", "envs"},
     {"policies", "kernel", "engines", "learner", "evaluation"},
-    {"checkpoint", "config", "records", "report", "display"},
+    {"checkpoint", "config", "records", "report", "display", "runlog"},
     {"train"},
 ]
 

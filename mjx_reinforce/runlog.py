@@ -1,0 +1,123 @@
+"""What a run has measured so far, and the files it goes to."""
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce import records, report
+from mjx_reinforce.config import Config
+from mjx_reinforce.display import Display
+from mjx_reinforce.statistics import iqm
+
+
+class RunLog:
+    """Everything measured so far, and the files it goes to."""
+
+    def __init__(self, config: Config, directory: Path, display: Display, engine: str):
+        self.used = np.zeros(config.num_seeds, np.int64)
+        self._config, self._directory, self._display = config, directory, display
+        self._engine = engine
+        self._rows: list[dict[str, Any]] = []
+        self._evaluations: list[dict[str, np.ndarray]] = []
+        self._broken: list[dict[str, Any]] = []
+        self._last: dict[str, np.ndarray] = {}
+        self._simulated = 0.0
+        self._update = np.zeros(config.num_seeds, np.int64)
+        self._started = time.perf_counter()
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since compilation ended."""
+        return time.perf_counter() - self._started
+
+    def updates(self, metrics: dict[str, np.ndarray]) -> None:
+        """Takes in the metrics [K, S] of a block of updates."""
+        active = metrics["active"]
+        steps = np.where(active, metrics["env_steps"], 0)
+        self.used += steps.sum(axis=0)
+        self._simulated += np.sum(steps / np.maximum(metrics["useful_step_fraction"], 1e-9))
+        self._remember(metrics)
+        broken = (metrics["nonfinite_episodes"] + metrics["skipped_update"]) * active
+        for k, s in zip(*np.nonzero(broken), strict=True):
+            episodes, skipped = metrics["nonfinite_episodes"][k, s], metrics["skipped_update"][k, s]
+            self._report_broken(int(s), int(self._update[s] + k), int(episodes), bool(skipped))
+        self._update += active.sum(axis=0)
+
+    def _remember(self, metrics: dict[str, np.ndarray]) -> None:
+        """Keeps each seed's metrics of its last update; a seed that stands still makes none."""
+        made = metrics["active"].sum(axis=0)
+        last = np.maximum(made - 1, 0)
+        for name, values in metrics.items():
+            newest = np.take_along_axis(values, last[None], axis=0)[0]
+            self._last[name] = np.where(made > 0, newest, self._last.get(name, newest))
+
+    def _report_broken(self, seed: int, update: int, episodes: int, skipped: bool) -> None:
+        self._broken.append(
+            {"seed": seed, "update": update, "episodes": episodes, "skipped": skipped}
+        )
+        what = f"{episodes} non-finite episodes" + (", update skipped" if skipped else "")
+        self._display.say(f"[yellow]seed {seed}, update {update}: {what}[/yellow]")
+
+    def evaluation(self, result: dict[str, np.ndarray]) -> None:
+        """Takes in an evaluation [S], shows it, and writes metrics.csv."""
+        self._evaluations.append(result | {"env_steps": self.used.copy()})
+        for s in range(self._config.num_seeds):
+            self._rows.append(self._row(s, result))
+        records.write_csv(self._directory / "metrics.csv", self._rows)
+        returns = result["eval_return"]
+        rate = self.used.sum() / self.seconds
+        self._display.evaluated(
+            int(self._update.max()),
+            float(self.used.mean()),
+            float(iqm(returns)),
+            float(returns.min()),
+            float(rate),
+        )
+
+    def _row(self, seed: int, result: dict[str, np.ndarray]) -> dict[str, Any]:
+        def last(name):
+            return self._last[name][seed].item() if self._last else ""
+
+        return {
+            "seed": seed,
+            "update": int(self._update[seed]),
+            "env_steps": int(self.used[seed]),
+            "wall_seconds": round(self.seconds, 3),
+            "train_return": last("episode_return"),
+            "eval_return": result["eval_return"][seed].item(),
+            "eval_return_stochastic": result["eval_return_stochastic"][seed].item(),
+            "eval_length": result["eval_length"][seed].item(),
+            "train_length": last("episode_length"),
+            "entropy": last("entropy"),
+            "gradient_norm": last("gradient_norm"),
+            "useful_step_fraction": last("useful_step_fraction"),
+            "nonfinite_episodes": last("nonfinite_episodes"),
+            "skipped_update": last("skipped_update"),
+        }
+
+    def finish(self, compile_seconds: float, threshold: float | None) -> dict[str, Any]:
+        """Writes the summary and the picture; returns the summary."""
+        seconds = self.seconds
+        history = {
+            name: np.stack([evaluation[name] for evaluation in self._evaluations])
+            for name in ("eval_return", "env_steps")
+        }
+        summary = {
+            "env": self._config.env,
+            "engine": self._engine,
+            "num_seeds": self._config.num_seeds,
+            **report.summarize(history, threshold),
+            "env_steps": self.used.tolist(),
+            "compile_seconds": compile_seconds,
+            "run_seconds": seconds,
+            "env_steps_per_second": float(self.used.sum() / seconds),
+            "useful_step_fraction": float(self.used.sum() / max(self._simulated, 1.0)),
+            "nonfinite": self._broken,
+        }
+        report.draw_learning_curve(
+            self._directory / "learning_curve.png", history, self._config.env, threshold
+        )
+        records.write_json(self._directory / "summary.json", summary)
+        return summary
