@@ -38,7 +38,7 @@ class InvertedPendulum(MujocoEnv):
           frame_skip: physics steps of 0.02 s an env step.
           reset_noise_scale: half the width of the start distribution (m, rad, m/s, rad/s).
           reward_at_fall: the reward of the step that ends the episode: 0 is v5, 1 is v4.
-          solver: "exact" or "mjx", see ``MujocoEnv``.
+          solver: "exact", "mjx" or "fast", see ``MujocoEnv``.
         """
         super().__init__(
             xml_file=xml_file,

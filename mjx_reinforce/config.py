@@ -21,6 +21,8 @@ class Config:
     """Root of all randomness; the seeds' keys are split from it."""
     env_steps: int = 300_000
     """Training budget of each seed in env steps; it stops after the update that reaches it."""
+    max_updates: int | None = None
+    """Stop all seeds after this many updates, to the next evaluation, whatever their env steps."""
     num_episodes: int = 16
     """Complete episodes played for one update, for each seed."""
     horizon: int | None = None
@@ -83,6 +85,7 @@ def check(config: Config) -> None:
     for name in ("num_seeds", "num_episodes", "env_steps", "decay_updates", "eval_every"):
         _require(config, name, lambda x: x >= 1, "at least 1")
     _require(config, "eval_episodes", lambda x: x >= 1, "at least 1")
+    _require(config, "max_updates", lambda x: x is None or x >= 1, "at least 1")
     _require(config, "horizon", lambda x: x is None or x >= 1, "at least 1")
     _require(config, "normalize_steps", lambda x: x >= 0, "at least 0")
     _require(config, "env_steps", lambda x: x < 2**30, "less than 2^30, for each seed")

@@ -19,6 +19,8 @@ from mjx_reinforce.types import Environment, Trajectory
 
 #: An env step of more operations takes minutes to compile and runs slower than plain MJX.
 MAX_OPERATIONS = 20_000
+#: On a CPU, branches of more operations are skipped where no episode needs them.
+_CPU_BRANCH_COST = 32
 
 
 class Engine(NamedTuple):
@@ -46,7 +48,9 @@ def choose(name: str, env: Environment) -> Engine:
     check_name("engine", name, dict.fromkeys(NAMES))
     if name == "mjx":
         return Engine(name, "chosen by name", rollout)
-    step = fused.vmap(env.step, in_axes=-1, out_axes=-1)
+    # On a GPU a branch costs a look at the predicate by the host, and computing it nothing.
+    cost = _CPU_BRANCH_COST if jax.default_backend() == "cpu" else MAX_OPERATIONS
+    step = fused.vmap(env.step, in_axes=-1, out_axes=-1, branch_cost=cost)
     reason = unsupported_by_fused(env, step)
     if not reason:
         why = "the env step is small enough to write out" if name == "auto" else "chosen by name"

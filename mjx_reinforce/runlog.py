@@ -45,6 +45,12 @@ class RunLog:
             self._report_broken(int(s), int(self._update[s] + k), int(episodes), bool(skipped))
         self._update += active.sum(axis=0)
 
+    def finished(self) -> bool:
+        """Whether every seed has used its budget, or the updates are used up."""
+        limit = self._config.max_updates
+        exhausted = limit is not None and self._update.max() >= limit
+        return bool(exhausted or np.all(self.used >= self._config.env_steps))
+
     def _remember(self, metrics: dict[str, np.ndarray]) -> None:
         """Keeps each seed's metrics of its last update; a seed that stands still makes none."""
         made = metrics["active"].sum(axis=0)

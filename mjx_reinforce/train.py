@@ -192,7 +192,7 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
         log = RunLog(config, directory, display, learner.engine.name)
         while not interrupt.is_set():
             log.evaluation(programs.evaluate())
-            if np.all(log.used >= config.env_steps):
+            if log.finished():
                 break
             programs.carry, metrics = programs.advance(programs.carry)
             log.updates(_to_numpy(metrics))
