@@ -19,7 +19,7 @@ class Config:
     """How many independent seeds are trained together, in one compiled program."""
     seed: int = 0
     """Root of all randomness; the seeds' keys are split from it."""
-    env_steps: int = 300_000
+    env_steps: int = 280_000
     """Training budget of each seed in env steps; it stops after the update that reaches it."""
     max_updates: int | None = None
     """Stop all seeds after this many updates, to the next evaluation, whatever their env steps."""
@@ -59,7 +59,7 @@ class Config:
     """Adam's learning rate at the start."""
     final_learning_rate: float = 1e-3
     """Learning rate after the decay, which is linear."""
-    decay_updates: int = 200
+    decay_updates: int = 100
     """Updates over which the learning rate decays."""
     max_grad_norm: float = 1.0
     """The gradient is scaled down to at most this Euclidean norm."""

@@ -51,7 +51,7 @@ def _configure_jax() -> None:
     settings = jax.config.values
     if settings["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "mjx_reinforce"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if settings["jax_default_matmul_precision"] is None:
         jax.config.update("jax_default_matmul_precision", "highest")
 
