@@ -295,7 +295,8 @@ def measure(candidates: list[Candidate], repeats: int) -> list[dict[str, Any]]:
     rows = []
     for candidate, taken in zip(candidates, times, strict=True):
         speed = candidate.env_steps / statistics.median(taken)
-        row = {"compile_seconds": None, "peak_memory_bytes": None} | candidate.row
+        row: dict[str, Any] = {"compile_seconds": None, "peak_memory_bytes": None}
+        row |= candidate.row
         row["env_steps_per_second"] = speed
         row["physics_steps_per_second"] = speed * row.pop("frame_skip")
         rows.append(row)

@@ -57,7 +57,7 @@ class RunLog:
         last = np.maximum(made - 1, 0)
         for name, values in metrics.items():
             newest = np.take_along_axis(values, last[None], axis=0)[0]
-            self._last[name] = np.where(made > 0, newest, self._last.get(name, newest))
+            self._last[name] = np.asarray(np.where(made > 0, newest, self._last.get(name, newest)))
 
     def _report_broken(self, seed: int, update: int, episodes: int, skipped: bool) -> None:
         self._broken.append(
