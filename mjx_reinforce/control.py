@@ -4,27 +4,11 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import jax
-import jax.numpy as jnp
 from jax import lax
 
+from mjx_reinforce.fused import any_lane
+
 Carry = TypeVar("Carry")
-
-
-@jax.custom_batching.custom_vmap
-def any_lane(x: jax.Array) -> jax.Array:
-    """Returns whether any entry of ``x`` is True, over the axes of outer vmaps too.
-
-    ``jnp.any`` under ``vmap`` gives one answer a seed, and a ``while_loop`` on it
-    then selects between the old and the new value of its whole carry. This gives
-    one answer for all seeds.
-    """
-    return jnp.any(x)
-
-
-@any_lane.def_vmap
-def _any_lane_batched(axis_size, in_batched, x):
-    del axis_size, in_batched
-    return any_lane(x), False
 
 
 def while_any(

@@ -223,8 +223,8 @@ def _train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metric
     Returns:
       The next state, and metrics, each []: ``episode_return`` (mean over the N
       episodes; with ``_min`` and ``_max``), ``episode_length``, ``env_steps``
-      (played in this update), ``useful_step_fraction`` (of N times T up to the
-      last chunk simulated), ``entropy``, ``gradient_norm``,
+      (played in this update), ``useful_step_fraction`` (of N times the
+      longest episode), ``entropy``, ``gradient_norm``,
       ``nonfinite_episodes``, ``skipped_update`` (1 where the proposed state was
       not finite and the old one was kept), and the estimator's own.
     """
