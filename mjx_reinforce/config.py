@@ -28,8 +28,9 @@ class Config:
     horizon: int | None = None
     """Steps after which an episode ends; the environment's own limit if not given."""
 
-    engine: Literal["auto", "mjx", "fused"] = "auto"
-    """How episodes are played: mjx (plain jax.vmap), fused (the step written out), or the best."""
+    engine: Literal["auto", "mjx", "fused", "kernel"] = "auto"
+    """How episodes are played: mjx (plain jax.vmap), fused (the step written out), kernel (all in
+    one GPU kernel), or the fastest of them here."""
 
     policy: str = "normal"
     """Action distribution: normal (one trained std) or normal-softplus (std from the state)."""

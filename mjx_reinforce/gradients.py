@@ -11,6 +11,8 @@ from mjx_reinforce.control import largest_divisor, while_any
 
 #: Samples whose activations are held at once; 2**18 of them take 64 MB a 64-unit layer.
 MAX_SAMPLES = 2**18
+#: A GPU holds so many times as many: it made an H200's gradients 1.2 times as fast.
+GPU_FACTOR = 4
 #: Steps a chunk covers at most, so that short episodes cost little.
 MAX_STEPS = 128
 
@@ -33,7 +35,8 @@ def accumulate_gradient(
     """
     mask = data[-1]
     horizon, num_episodes = mask.shape
-    length = largest_divisor(horizon, min(MAX_STEPS, max(1, MAX_SAMPLES // num_episodes)))
+    samples = MAX_SAMPLES * (1 if jax.default_backend() == "cpu" else GPU_FACTOR)
+    length = largest_divisor(horizon, min(MAX_STEPS, max(1, samples // num_episodes)))
     chunks = jax.tree.map(lambda x: x.reshape(horizon // length, length, *x.shape[1:]), data)
     needed = jnp.any(chunks[-1], axis=(1, 2))
     differentiate = jax.value_and_grad(loss, has_aux=True)

@@ -14,7 +14,7 @@ from mjx_reinforce.distributions import normal
 from mjx_reinforce.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.gradients import accumulate_gradient
 from mjx_reinforce.policies import Policy, mlp_policy
-from mjx_reinforce.rollouts import episode_lengths, episode_returns
+from mjx_reinforce.rollouts import episode_lengths, episode_returns, simulated_steps
 from mjx_reinforce.types import Environment, Trajectory, action_space, observation_size
 
 Metrics = dict[str, jax.Array]
@@ -54,14 +54,15 @@ class Learner(NamedTuple):
     """REINFORCE on one environment.
 
     init: (key) -> TrainState; consumes the key
-    step: (TrainState) -> (TrainState, metrics), one update on N fresh episodes
+    step: (TrainState, active=True) -> (TrainState, metrics), one update on N fresh
+      episodes; where ``active`` [] is False nothing is played and the state stays
     act: (Actor, observation [..., O]) -> outputs [..., K] of the distribution
     policy: the policy that is trained
     engine: how its episodes are played
     """
 
     init: Callable[[jax.Array], TrainState]
-    step: Callable[[TrainState], tuple[TrainState, Metrics]]
+    step: Callable[..., tuple[TrainState, Metrics]]
     act: Callable[[Actor, jax.Array], jax.Array]
     policy: Policy
     engine: engines.Engine
@@ -118,7 +119,7 @@ def reinforce(
         follows a policy which learns to keep near the middle drives up its gain
         until it fails. 0 leaves them as they are. Each update uses the statistics
         that its episodes were played with.
-      engine: how episodes are played: "auto", "mjx" or "fused", see ``engines``.
+      engine: how episodes are played: "auto", "mjx", "fused" or "kernel", see ``engines``.
 
     Returns:
       The learner: ``init(key)`` makes a state, ``train_step(learner, state)`` moves it on.
@@ -139,75 +140,92 @@ def reinforce(
         )
     if loss_per not in ("episode", "step"):
         raise ValueError(f"loss_per must be 'episode' or 'step', got {loss_per!r}")
-    distribution = policy.distribution
-    chosen = engines.choose(engine, env)
+    surrogate = _surrogate(policy, entropy_cost)
 
     def act(actor, observation):
         return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))
 
+    def first_actor(key):
+        return Actor(params=policy.init(key), normalizer=normalize.init(size))
+
     def init(key):
         policy_key, estimator_key, key = jax.random.split(key, 3)
-        params = policy.init(policy_key)
+        actor = first_actor(policy_key)
         return TrainState(
             key=key,
             update=jnp.zeros((), jnp.int32),
-            actor=Actor(params=params, normalizer=normalize.init(size)),
-            opt_state=optimizer.init(params),
+            actor=actor,
+            opt_state=optimizer.init(actor.params),
             estimator_state=estimator.init(estimator_key, size),
         )
 
-    def surrogate(params, chunk):
-        observation, action, weight, mask = chunk
-        outputs = policy.apply(params, observation)
-        entropy = distribution.entropy(outputs)
-        terms = distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
-        loss = -jnp.sum(jnp.where(mask, terms, 0.0))
-        return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
+    shapes = jax.eval_shape(first_actor, jax.random.key(0))
+    player = engines.Player(act, shapes, policy.distribution)
+    chosen = engines.choose(engine, env, player)
 
-    def step(state):
-        actor = state.actor
-        key, episodes_key = jax.random.split(state.key)
-        trajectory = chosen.rollout(
+    def play(actor, key, active):
+        return chosen.rollout(
             env,
             act,
             actor,
-            distribution,
-            episodes_key,
+            policy.distribution,
+            key,
             num_episodes=num_episodes,
             horizon=horizon,
+            active=active,
         )
+
+    def learn(state, trajectory):
+        """Returns the actor, optimiser state and estimator state that the episodes lead to."""
+        actor, mask = state.actor, trajectory.mask
         scaled = normalize.apply(actor.normalizer, trajectory.observation)
         seen = dataclasses.replace(trajectory, observation=scaled)
-        weight, estimator_state, estimator_metrics = estimator.update(state.estimator_state, seen)
-        data = (scaled, trajectory.action, weight, trajectory.mask)
+        weight, estimator_state, metrics = estimator.update(state.estimator_state, seen)
+        data = (scaled, trajectory.action, weight, mask)
         _, grads, sums = accumulate_gradient(surrogate, actor.params, data)
-        steps = jnp.maximum(jnp.sum(trajectory.mask), 1)
+        steps = jnp.maximum(jnp.sum(mask), 1)
         divisor = num_episodes if loss_per == "episode" else steps
         grads = jax.tree.map(lambda g: g / divisor, grads)
         updates, opt_state = optimizer.update(grads, state.opt_state, actor.params)
-        normalizer = normalize.update(
-            actor.normalizer, trajectory.observation, trajectory.mask, normalize_steps
-        )
         params = optax.apply_updates(actor.params, updates)
-        learned = Actor(params=params, normalizer=normalizer), opt_state, estimator_state
-        known = actor, state.opt_state, state.estimator_state
-        (actor, opt_state, estimator_state), skipped = _keep_finite(learned, known)
-        state = TrainState(
+        normalizer = normalize.update(
+            actor.normalizer, trajectory.observation, mask, normalize_steps
+        )
+        metrics |= {"entropy": sums["entropy"] / steps, "gradient_norm": optax.tree.norm(grads)}
+        return (Actor(params=params, normalizer=normalizer), opt_state, estimator_state), metrics
+
+    def step(state, active=True):
+        key, episodes_key = jax.random.split(state.key)
+        trajectory = play(state.actor, episodes_key, active)
+        learned, metrics = learn(state, trajectory)
+        known = state.actor, state.opt_state, state.estimator_state
+        (actor, opt_state, estimator_state), skipped = keep_finite(learned, known)
+        proposed = TrainState(
             key=key,
             update=state.update + 1,
             actor=actor,
             opt_state=opt_state,
             estimator_state=estimator_state,
         )
-        metrics = _metrics(trajectory) | estimator_metrics
-        metrics |= {
-            "entropy": sums["entropy"] / steps,
-            "gradient_norm": optax.tree.norm(grads),
-            "skipped_update": skipped,
-        }
-        return state, metrics
+        if active is not True:
+            proposed = jax.tree.map(lambda new, old: jnp.where(active, new, old), proposed, state)
+        return proposed, episode_metrics(trajectory) | metrics | {"skipped_update": skipped}
 
     return Learner(init, step, act, policy, chosen)
+
+
+def _surrogate(policy: Policy, entropy_cost: float | jax.Array) -> Callable[..., Any]:
+    """Returns the sum over samples whose gradient is followed, and the entropy's sum."""
+
+    def surrogate(params, chunk):
+        observation, action, weight, mask = chunk
+        outputs = policy.apply(params, observation)
+        entropy = policy.distribution.entropy(outputs)
+        terms = policy.distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
+        loss = -jnp.sum(jnp.where(mask, terms, 0.0))
+        return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
+
+    return surrogate
 
 
 def _train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics]:
@@ -223,8 +241,8 @@ def _train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metric
     Returns:
       The next state, and metrics, each []: ``episode_return`` (mean over the N
       episodes; with ``_min`` and ``_max``), ``episode_length``, ``env_steps``
-      (played in this update), ``useful_step_fraction`` (of N times the
-      longest episode), ``entropy``, ``gradient_norm``,
+      (played in this update), ``simulated_steps`` (with those in which an
+      episode was over already), ``entropy``, ``gradient_norm``,
       ``nonfinite_episodes``, ``skipped_update`` (1 where the proposed state was
       not finite and the old one was kept), and the estimator's own.
     """
@@ -244,7 +262,7 @@ def check_horizon(env: Environment, horizon: int | None) -> int:
     return horizon
 
 
-def _keep_finite(learned: Any, known: Any) -> tuple[Any, jax.Array]:
+def keep_finite(learned: Any, known: Any) -> tuple[Any, jax.Array]:
     """Returns what was learned if all of it is finite, else what was known, and 1 in that case.
 
     A broken update must cost one seed one update, not the seed, and nothing else.
@@ -255,7 +273,7 @@ def _keep_finite(learned: Any, known: Any) -> tuple[Any, jax.Array]:
     return kept, jnp.where(finite, 0, 1)
 
 
-def _metrics(trajectory: Trajectory) -> Metrics:
+def episode_metrics(trajectory: Trajectory) -> Metrics:
     """Returns what a person wants to know of the episodes."""
     returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
     return {
@@ -264,6 +282,6 @@ def _metrics(trajectory: Trajectory) -> Metrics:
         "episode_return_max": jnp.max(returns),
         "episode_length": jnp.mean(lengths),
         "env_steps": jnp.sum(lengths),
-        "useful_step_fraction": jnp.mean(lengths) / jnp.maximum(jnp.max(lengths), 1),
+        "simulated_steps": simulated_steps(trajectory),
         "nonfinite_episodes": jnp.sum(trajectory.nonfinite),
     }

@@ -26,6 +26,7 @@ def rollout(
     num_episodes: int,
     horizon: int,
     num_deterministic: int = 0,
+    active: bool | jax.Array = True,
     env_step: Callable[[Any, jax.Array], Any] | None = None,
 ) -> Trajectory:
     """Plays N episodes from fresh resets, each to its end or to the horizon.
@@ -43,6 +44,7 @@ def rollout(
       num_episodes: N.
       horizon: T, the time limit in steps; reaching it ends an episode.
       num_deterministic: how many episodes, the first ones, take the mode.
+      active: [] False plays nothing, for a seed that stands still among others.
       env_step: the environment's step over a batch on the last axis of every leaf;
         by default ``jax.vmap`` of it.
 
@@ -51,7 +53,7 @@ def rollout(
       reward 0 for that step, and is told apart in ``nonfinite``.
     """
     # Inside, episodes are the last axis: each scalar of the state is a contiguous row.
-    start = jax.vmap(functools.partial(_begin, env, key), out_axes=(-1, 0))
+    start = jax.vmap(functools.partial(begin, env, key), out_axes=(-1, 0))
     state, noise_keys = start(jnp.arange(num_episodes))
     if env_step is None:
         env_step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
@@ -77,9 +79,8 @@ def rollout(
 
     def advance(carry):
         chunk, keys, simulation, records = carry
-        keys, noise = jax.vmap(functools.partial(_draw, distribution, length), out_axes=(0, 1))(
-            keys
-        )
+        draw = functools.partial(draw_noise, distribution, length)
+        keys, noise = jax.vmap(draw, out_axes=(0, 1))(keys)
         simulation, new = lax.scan(step, simulation, noise)
         records = jax.tree.map(
             lambda old, x: lax.dynamic_update_slice_in_dim(old, x, chunk * length, 0), records, new
@@ -93,14 +94,14 @@ def rollout(
     none = jnp.zeros(num_episodes, bool)
 
     def first(noise_keys):
-        noise = jax.vmap(functools.partial(_draw, distribution, 1), out_axes=(0, 1))(noise_keys)[1]
+        noise = jax.vmap(lambda key: draw_noise(distribution, 1, key)[1], out_axes=1)(noise_keys)
         action = distribution.sample(act(actor, state.obs.T), noise[0])
         return state.obs, action, state.reward, none
 
     records = jax.tree.map(
         lambda x: jnp.zeros((horizon, *x.shape), x.dtype), jax.eval_shape(first, noise_keys)
     )
-    init = (jnp.zeros((), jnp.int32), noise_keys, (state, ~none, none), records)
+    init = (jnp.zeros((), jnp.int32), noise_keys, (state, none | active, none), records)
     _, _, (_, _, bad), (observation, action, reward, mask) = while_any(unfinished, advance, init)
     return Trajectory(
         observation=jnp.swapaxes(observation, 1, 2),
@@ -111,13 +112,15 @@ def rollout(
     )
 
 
-def _begin(env: Environment, key: jax.Array, episode: jax.Array) -> tuple[Any, jax.Array]:
+def begin(env: Environment, key: jax.Array, episode: jax.Array) -> tuple[Any, jax.Array]:
     """Returns an episode's start state and the key of its noise."""
     reset_key, noise_key = jax.random.split(jax.random.fold_in(key, episode))
     return env.reset(reset_key), noise_key
 
 
-def _draw(distribution: Distribution, length: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+def draw_noise(
+    distribution: Distribution, length: int, key: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Returns the next key of an episode's noise, and its noise [length, E] for a chunk."""
     key, noise_key = jax.random.split(key)
     return key, distribution.noise(noise_key, (length,))
@@ -136,3 +139,14 @@ def episode_returns(trajectory: Trajectory) -> jax.Array:
 def episode_lengths(trajectory: Trajectory) -> jax.Array:
     """Returns how many steps [N] every episode took."""
     return jnp.sum(trajectory.mask, axis=0)
+
+
+def simulated_steps(trajectory: Trajectory) -> jax.Array:
+    """Returns how many env steps [] were simulated: N times the longest episode, in whole chunks.
+
+    Beside other seeds, it is the seed with the longest episode that decides.
+    """
+    horizon, num_episodes = trajectory.mask.shape
+    length = largest_divisor(horizon, CHUNK_STEPS)
+    longest = jnp.max(episode_lengths(trajectory))
+    return num_episodes * length * ((longest + length - 1) // length)

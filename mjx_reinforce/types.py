@@ -22,6 +22,12 @@ class Box(NamedTuple):
     high: np.ndarray
 
 
+class Discrete(NamedTuple):
+    """The actions a discrete environment accepts: one integer [], 0 to ``num_actions`` - 1."""
+
+    num_actions: int
+
+
 @runtime_checkable
 class Environment(Protocol):
     """What the trainer reads of an environment; brax and Playground environments satisfy it.
@@ -35,12 +41,12 @@ class Environment(Protocol):
         ...
 
     def step(self, state: Any, action: jax.Array) -> Any:
-        """Returns the state one time step later under ``action`` [A]."""
+        """Returns the state one time step later under ``action``: [A], or [] if discrete."""
         ...
 
     @property
     def action_size(self) -> int:
-        """The number A of entries of an action."""
+        """The number A of entries of an action; of a discrete one, of actions to choose from."""
         ...
 
 
@@ -49,7 +55,7 @@ class Trajectory:
     """N complete episodes, time first.
 
     observation: [T, N, O] what the policy saw; zero where the episode is over
-    action: [T, N, A] what the policy drew; zero where the episode is over
+    action: [T, N, A], or [T, N] if discrete: what the policy drew; zero where the episode is over
     reward: [T, N] what the action earned; zero where the episode is over
     mask: [T, N] True while the episode runs, its last step included
     nonfinite: [N] True where the simulation left the finite numbers
@@ -62,12 +68,19 @@ class Trajectory:
     nonfinite: jax.Array
 
 
-def action_space(env: Environment) -> Box:
-    """Returns the bounds an environment declares, or brax's convention of [-1, 1]."""
+def action_space(env: Environment) -> Box | Discrete:
+    """Returns the actions an environment declares, or brax's convention of [-1, 1]."""
     declared = getattr(env, "action_space", None)
-    if isinstance(declared, Box):
+    if isinstance(declared, Box | Discrete):
         return declared
     return Box(np.full(env.action_size, -1.0), np.full(env.action_size, 1.0))
+
+
+def null_action(env: Environment) -> np.ndarray:
+    """Returns an action of zeros: float [A], or int32 [] if discrete."""
+    if isinstance(action_space(env), Discrete):
+        return np.zeros((), np.int32)
+    return np.zeros(env.action_size, np.float32)
 
 
 def observation_size(env: Environment) -> int:

@@ -9,6 +9,7 @@ import pytest
 from jax import lax
 
 from mjx_reinforce import fused
+from mjx_reinforce.fused import scalarized
 
 BATCH = 6
 
@@ -394,3 +395,34 @@ def test_pallas_kernel_in_interpreter():
     out = jax.ShapeDtypeStruct(x.shape, x.dtype)
     y = pallas.pallas_call(kernel, out_shape=out, interpret=True)(x)
     np.testing.assert_allclose(y, jax.vmap(lambda x: line_search(x)[0] + 0.1)(x), rtol=1e-6)
+
+
+def test_a_loop_over_an_argument_reads_it_one_by_one():
+    def weigh(weights, x):
+        add = lambda total, w: (total + w[0] * jnp.tanh(w[1] * x), None)  # noqa: E731
+        return lax.scan(add, x, (weights[:, 0], weights[:, 1]))[0]
+
+    weights = jnp.arange(12.0).reshape(6, 2) / 10
+    x = jnp.linspace(-1, 1, 5)
+    examples = (weights, jnp.ones(()))
+    written = scalarized.build(weigh, examples, [False, True], branch_cost=400)
+    places = []
+
+    def read(place):
+        places.append(place)
+        return weights.reshape(-1)[place[1]] if place[0] == 0 else x
+
+    values = written.emit(read, x.shape, fused.any_lane, read_anywhere=True)
+    np.testing.assert_allclose(values[0][0], jax.vmap(lambda x: weigh(weights, x))(x), rtol=1e-6)
+    assert len(places) == 3  # one place for each column, and x
+
+
+def test_short_loops_can_stay_loops():
+    step = lambda _, x: jnp.sin(x) + x  # noqa: E731
+    counts = [
+        scalarized.build(
+            lambda x: lax.fori_loop(0, 3, step, x), (jnp.ones(()),), [True], 400, unrolled
+        ).operations["sin"]
+        for unrolled in (4, 1)
+    ]
+    assert counts == [3, 1]

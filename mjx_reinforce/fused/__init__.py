@@ -24,8 +24,9 @@ What to know before using it:
 """
 
 from mjx_reinforce.fused.errors import UnsupportedPrimitive
+from mjx_reinforce.fused.jaxprs import prune
 from mjx_reinforce.fused.lanes import any_lane
 from mjx_reinforce.fused.scalarized import Scalarized, scalarize
 from mjx_reinforce.fused.vmap import vmap
 
-__all__ = ["Scalarized", "UnsupportedPrimitive", "any_lane", "scalarize", "vmap"]
+__all__ = ["Scalarized", "UnsupportedPrimitive", "any_lane", "prune", "scalarize", "vmap"]

@@ -2,8 +2,9 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -26,12 +27,14 @@ class Emitter:
         read: the lane of an input, from its position.
         batch_shape: the shape of one lane.
         any_lane: reduces a lane of bools to one bool.
+        read_anywhere: whether `read` takes traced positions too.
     """
 
     schedule: liveness.Schedule
     read: Callable[[Any], Any]
     batch_shape: tuple[int, ...]
     any_lane: Callable[[Any], Any]
+    read_anywhere: bool = False
 
     def results(self, root: Scope, scalars: Sequence[Scalar]) -> list[Any]:
         """Returns the value of each scalar: a lane, a shared value or a constant."""
@@ -116,7 +119,15 @@ class Emitter:
             ]
             return nexts, [self._value(loop.ys[j], inner) for j in live_ys]
 
-        if live_ys or elements:
+        places = self._places([loop.xs[j] for j in elements])
+        if places and not live_ys:
+            final = lax.fori_loop(
+                0,
+                loop.length,
+                lambda t, carry: body(carry, [self.read(place.at(t)) for place in places])[0],
+                init,
+            )
+        elif live_ys or elements:
             rows = [
                 self._stack(loop.xs[j], leaf.varying, env)
                 for j, leaf in zip(elements, element_leaves, strict=True)
@@ -127,6 +138,13 @@ class Emitter:
         else:
             final = self._repeat(loop, carries, body, init)
         env.update(zip(outs, final, strict=True))
+
+    def _places(self, rows: list[list[Scalar]]) -> list["_Places"]:
+        """Returns where each row's elements are; nothing if not all can be read in a loop."""
+        if not self.read_anywhere:
+            return []
+        places = [place for row in rows if (place := _evenly_spaced(row))]
+        return places if len(places) == len(rows) else []
 
     def _stack(self, row: list[Scalar], varying: bool, env: Environment) -> jax.Array:
         return jax.numpy.stack([self._materialize(x, varying, env) for x in row])
@@ -150,6 +168,29 @@ class Emitter:
         start = (np.int32(0), init)
         step = lambda state: (state[0] + 1, body(state[1])[0])  # noqa: E731
         return lax.while_loop(goes_on, step, start)[1]
+
+
+class _Places(NamedTuple):
+    """Evenly spaced elements of one input."""
+
+    leaf: int
+    start: int
+    stride: int
+
+    def at(self, t: Any) -> tuple[int, Any]:
+        """Returns the t-th place; t may be traced."""
+        return self.leaf, self.start + self.stride * t
+
+
+def _evenly_spaced(row: Sequence[Scalar]) -> _Places | None:
+    """Tells where the elements of a row are, if they are evenly spaced in one input."""
+    if not all(isinstance(x, Node) and x.op is None and x.owner is None for x in row):
+        return None
+    leaves = {x.position[0] for x in row}
+    strides = {b.position[1] - a.position[1] for a, b in itertools.pairwise(row)}
+    if len(leaves) != 1 or len(strides) != 1:
+        return None
+    return _Places(leaves.pop(), row[0].position[1], strides.pop())
 
 
 def _leaves(leaves: Sequence[Node | None], positions: Sequence[int]) -> list[Node]:

@@ -85,11 +85,13 @@ class Graph:
 
     Attributes:
         branch_cost: a branch of more scalar operations than this is skipped where no lane needs it.
+        unrolled: a scan that reads and makes no arrays is written out up to this length.
         certain: predicates known to hold in some lane, because we are where nothing runs otherwise.
     """
 
-    def __init__(self, branch_cost: int):
+    def __init__(self, branch_cost: int, unrolled: int):
         self.branch_cost = branch_cost
+        self.unrolled = unrolled
         self.certain: set[Node] = set()
         self._scopes = [Scope(depth=0, floor=0)]
         self._count = 0

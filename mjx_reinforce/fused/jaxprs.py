@@ -4,6 +4,7 @@ Written against JAX 0.10.2, 0.11.2 and 0.12.0. jaxprs are not a frozen interface
 moves something, it moves here.
 """
 
+import functools
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ import jax
 import jax.core
 import numpy as np
 from jax.extend import core
+from jax.interpreters import partial_eval
 
 # The parameter under which a call-like primitive keeps the jaxpr that it calls.
 _CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
@@ -85,6 +87,25 @@ def as_numpy(value: Any) -> np.ndarray | None:
     if isinstance(value, jax.core.Tracer):
         return None
     return np.asarray(value)
+
+
+def prune(fn: Callable) -> Callable:
+    """Returns fn without the operations that its results do not need; to be called under `jax.jit`.
+
+    Simulators compute much that one task does not read, and `jax.vmap` and the compiler pay for
+    all of it.
+    """
+
+    @functools.wraps(fn)
+    def pruned(*args: Any) -> Any:
+        leaves, in_tree = jax.tree.flatten(args)
+        (jaxpr, consts), out_shape = trace(lambda *flat: fn(*in_tree.unflatten(flat)), *leaves)
+        outs = [True] * len(jaxpr.outvars)
+        jaxpr, _ = partial_eval.dce_jaxpr(jaxpr, outs, instantiate=True)
+        results = jax.core.eval_jaxpr(jaxpr, consts, *leaves)
+        return jax.tree.structure(out_shape).unflatten(results)
+
+    return pruned
 
 
 def live_equations(jaxpr: core.Jaxpr, used: Iterable[bool]) -> list[Any]:

@@ -10,7 +10,7 @@ from mjx_reinforce.fused import arrays, jaxprs, ops
 from mjx_reinforce.fused.graph import Graph, Node, Scalar, Scope, same
 
 # Scans at most this long are written out; their constants then fold iteration by iteration.
-_UNROLLED_LENGTH = 4
+UNROLLED_LENGTH = 4
 
 Step = Callable[[list[Scalar], list[Scalar]], tuple[list[Scalar], list[Scalar]]]
 
@@ -174,7 +174,9 @@ def scan_rule(run: Callable, graph: Graph, eqn: Any, used: Any, *operands: np.nd
         return carry.unpack(results[: parts.num_carry]), outs.unpack(results[parts.num_carry :])
 
     rows = [ins.unpack([x[t : t + 1] for x in operands[split:]]) for t in order]
-    if length <= max(_UNROLLED_LENGTH, 0 if eqn.params["unroll"] < length else length):
+    has_arrays = len(operands) > split or len(eqn.outvars) > parts.num_carry
+    limit = UNROLLED_LENGTH if has_arrays else graph.unrolled
+    if length <= max(limit, 0 if eqn.params["unroll"] < length else length):
         final, table = _unroll(step, carry.unpack(init), rows)
     else:
         final, table = _as_loop(graph, step, carry.unpack(init), rows, length)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.fused import arrays, emit, evaluate, jaxprs, lanes, liveness, ops
+from mjx_reinforce.fused import arrays, emit, evaluate, jaxprs, lanes, liveness, loops, ops
 from mjx_reinforce.fused.graph import Graph, Scalar, Scope
 
 
@@ -48,6 +48,7 @@ class Scalarized:
         read: Callable[[tuple[int, int]], Any],
         batch_shape: tuple[int, ...],
         any_lane: Callable,
+        read_anywhere: bool = False,
     ) -> list[list[Any]]:
         """Emits the operations.
 
@@ -55,11 +56,13 @@ class Scalarized:
             read: returns the lane of an argument from (number of the leaf, row-major position).
             batch_shape: the shape of one lane.
             any_lane: reduces a lane of bools to one bool.
+            read_anywhere: whether `read` also takes a position that is a traced integer; then a
+                loop over the elements of an argument reads them one by one.
 
         Returns:
             For each leaf of the result, its elements: lanes, shared values and constants.
         """
-        emitter = emit.Emitter(self.schedule, read, batch_shape, any_lane)
+        emitter = emit.Emitter(self.schedule, read, batch_shape, any_lane, read_anywhere)
         values = iter(emitter.results(self.root, [x for leaf in self.outputs for x in leaf]))
         return [[next(values) for _ in leaf] for leaf in self.outputs]
 
@@ -107,12 +110,24 @@ def scalarize(fn: Callable, *examples: Any, branch_cost: int = 400) -> Scalarize
 
 
 def build(
-    fn: Callable, examples: Sequence[Any], varying: Sequence[bool], branch_cost: int
+    fn: Callable,
+    examples: Sequence[Any],
+    varying: Sequence[bool],
+    branch_cost: int,
+    unrolled: int = loops.UNROLLED_LENGTH,
 ) -> Scalarized:
-    """Writes a function out; `varying` tells which leaves differ from lane to lane."""
+    """Writes a function out.
+
+    Args:
+        fn: a function of one example.
+        examples: its arguments, or their shapes.
+        varying: which of their leaves differ from lane to lane.
+        branch_cost: as in `scalarize`.
+        unrolled: a scan that reads and makes no arrays is written out up to this length.
+    """
     program, out_shape = jaxprs.trace(fn, *examples)
     leaves, in_tree = jax.tree.flatten(tuple(examples))
-    graph = Graph(branch_cost)
+    graph = Graph(branch_cost, unrolled)
     inputs = [
         _inputs(graph, number, variable.aval, varies)
         for number, (variable, varies) in enumerate(zip(program.jaxpr.invars, varying, strict=True))
