@@ -10,6 +10,12 @@ from mjx_reinforce.records import write_bytes
 from mjx_reinforce.statistics import iqm, iqm_interval, steps_to_solve
 
 
+def load_libraries() -> None:
+    """Imports what the report needs, half a second of work, while something else runs."""
+    import matplotlib.figure  # noqa: F401
+    import scipy.stats  # noqa: F401
+
+
 def summarize(history: dict[str, np.ndarray], threshold: float | None) -> dict[str, Any]:
     """Returns the statistics over seeds of a run.
 

@@ -37,7 +37,8 @@ class RunLog:
         active = metrics["active"]
         steps = np.where(active, metrics["env_steps"], 0)
         self.used += steps.sum(axis=0)
-        self._simulated += np.sum(steps / np.maximum(metrics["useful_step_fraction"], 1e-9))
+        # All seeds step on until the slowest is done, also those whose budget is used.
+        self._simulated += metrics["simulated_steps"].max(axis=1).sum() * steps.shape[1]
         self._remember(metrics)
         broken = (metrics["nonfinite_episodes"] + metrics["skipped_update"]) * active
         for k, s in zip(*np.nonzero(broken), strict=True):
@@ -98,7 +99,7 @@ class RunLog:
             "train_length": last("episode_length"),
             "entropy": last("entropy"),
             "gradient_norm": last("gradient_norm"),
-            "useful_step_fraction": last("useful_step_fraction"),
+            "simulated_steps": last("simulated_steps"),
             "nonfinite_episodes": last("nonfinite_episodes"),
             "skipped_update": last("skipped_update"),
         }

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -128,15 +129,10 @@ class Programs:
         from mjx_reinforce.evaluation import evaluate
 
         def update(carry, _):
-            state, used = carry
-            proposed, metrics = jax.vmap(learner.step)(state)
+            states, used = carry
             active = used < config.env_steps
-
-            def choose(new, old):
-                return jnp.where(active.reshape(active.shape + (1,) * (new.ndim - 1)), new, old)
-
-            used = used + jnp.where(active, metrics["env_steps"], 0)
-            return (jax.tree.map(choose, proposed, state), used), metrics | {"active": active}
+            states, metrics = jax.vmap(learner.step)(states, active)
+            return (states, used + metrics["env_steps"]), metrics | {"active": active}
 
         def advance(carry):
             return lax.scan(update, carry, length=config.eval_every)
@@ -158,12 +154,11 @@ class Programs:
         self.eval_key = jax.random.fold_in(jax.random.key(config.eval_seed), 1)
         states = jax.jit(jax.vmap(learner.init))(jax.random.split(train_key, config.num_seeds))
         self.carry = (states, jnp.zeros(config.num_seeds, jnp.int32))
-        lowered = [
-            jax.jit(advance, donate_argnums=0).lower(self.carry),
-            jax.jit(look).lower(states.actor, self.eval_key),
-        ]
-        with ThreadPoolExecutor() as pool:
-            self.advance, self._look = pool.map(lambda program: program.compile(), lowered)
+        with ThreadPoolExecutor() as pool:  # the first compiles while the second is traced
+            look_program = pool.submit(jax.jit(look).lower(states.actor, self.eval_key).compile)
+            lowered = jax.jit(advance, donate_argnums=0).lower(self.carry)
+            self.advance = lowered.compile()
+            self._look = look_program.result()
 
     def evaluate(self) -> dict[str, np.ndarray]:
         """Returns the evaluation of the present policies, [S] each."""
@@ -176,7 +171,7 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
     Returns:
       Whether it was interrupted.
     """
-    from mjx_reinforce import checkpoint, records
+    from mjx_reinforce import checkpoint, records, report
     from mjx_reinforce.display import Display, Interrupt, print_summary
     from mjx_reinforce.runlog import RunLog
 
@@ -189,6 +184,7 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
         display.say(f"engine {learner.engine.name}: {learner.engine.why}")
         display.say(f"compiled in {compile_seconds:.1f} s")
         display.start()
+        threading.Thread(target=report.load_libraries, daemon=True).start()
         log = RunLog(config, directory, display, learner.engine.name)
         while not interrupt.is_set():
             log.evaluation(programs.evaluate())
