@@ -10,12 +10,29 @@ from typing import Any
 
 from mjx_reinforce.registry import check_name, load
 
+_CART_POLE = "mjx_reinforce.envs.cart_pole:CartPole"
 _PENDULUM = "mjx_reinforce.envs.inverted_pendulum:InvertedPendulum"
 
 #: id -> ("module:Class" or a callable, constructor arguments). One line a task.
 _TABLE: dict[str, tuple[str | Callable[..., Any], dict[str, Any]]] = {
     "InvertedPendulum-v5": (_PENDULUM, {}),
     "InvertedPendulum-v4": (_PENDULUM, {"reward_at_fall": 1.0}),
+    "InvertedDoublePendulum-v5": (
+        "mjx_reinforce.envs.inverted_double_pendulum:InvertedDoublePendulum",
+        {},
+    ),
+    "Reacher-v5": ("mjx_reinforce.envs.reacher:Reacher", {}),
+    "Pusher-v5": ("mjx_reinforce.envs.pusher:Pusher", {}),
+    "Swimmer-v5": ("mjx_reinforce.envs.swimmer:Swimmer", {}),
+    "HalfCheetah-v5": ("mjx_reinforce.envs.half_cheetah:HalfCheetah", {}),
+    "Hopper-v5": ("mjx_reinforce.envs.hopper:Hopper", {}),
+    "Walker2d-v5": ("mjx_reinforce.envs.walker2d:Walker2d", {}),
+    "Ant-v5": ("mjx_reinforce.envs.ant:Ant", {}),
+    "Humanoid-v5": ("mjx_reinforce.envs.humanoid:Humanoid", {}),
+    "HumanoidStandup-v5": ("mjx_reinforce.envs.humanoid_standup:HumanoidStandup", {}),
+    "CartPole-v1": (_CART_POLE, {}),
+    "CartPole-v0": (_CART_POLE, {"max_episode_steps": 200, "reward_threshold": 195.0}),
+    "ContinuousCartPole-v0": ("mjx_reinforce.envs.cart_pole:ContinuousCartPole", {}),
 }
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 from mujoco import MjModel  # pyright: ignore[reportAttributeAccessIssue] - a C extension
 
+from mjx_reinforce.fused import prune
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Box
 
@@ -24,8 +25,9 @@ with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
     from mjx_reinforce.envs import physics
+    from mjx_reinforce.envs.fences import fenced
 
-_STEPS = {"exact": physics.step, "mjx": mjx.step, "fast": mjx.step}
+SOLVERS = ("exact", "mjx", "fast")
 
 
 @struct.dataclass(kw_only=True)
@@ -35,11 +37,13 @@ class Physics:
     qpos: [nq] generalised positions (m, rad)
     qvel: [nv] generalised velocities (m/s, rad/s)
     qacc_warmstart: [nv] where the constraint solver starts (m/s^2, rad/s^2)
+    carried: fields of the last step's mjx.Data that the next outcome reads, by name
     """
 
     qpos: jax.Array
     qvel: jax.Array
     qacc_warmstart: jax.Array
+    carried: dict[str, jax.Array] = struct.field(default_factory=dict)
 
 
 class MujocoEnv(Env):
@@ -52,6 +56,12 @@ class MujocoEnv(Env):
 
     Subclasses define ``initial`` and ``outcome``.
     """
+
+    #: Fields of mjx.Data that ``outcome`` reads of ``before`` besides qpos and qvel. They are as
+    #: the last step left them: those of its last forward pass, older than qpos, as in Gymnasium.
+    carried: tuple[str, ...] = ()
+    #: Whether ``outcome`` or ``observe`` reads ``cfrc_ext``: zero at a start, as in Gymnasium.
+    contact_forces = False
 
     def __init__(
         self,
@@ -76,14 +86,17 @@ class MujocoEnv(Env):
         Raises:
           ValueError: ``solver`` is unknown.
         """
-        check_name("solver", solver, _STEPS)
+        check_name("solver", solver, dict.fromkeys(SOLVERS))
         self.mj_model = _load(xml_file)
         if solver == "fast":
             self.mj_model.opt.iterations, self.mj_model.opt.ls_iterations = 1, 4
         self.model = mjx.put_model(self.mj_model, impl="jax")
         # Tracing the physics takes a second of Python; jit does it once.
-        self._forward = jax.jit(functools.partial(physics.forward, self.model))
-        self._physics_step = jax.jit(functools.partial(_STEPS[solver], self.model))
+        self._forward = jax.jit(functools.partial(fenced(physics.forward), self.model))
+        exact = functools.partial(physics.step, evaluate=self._forward)
+        step = exact if solver == "exact" else mjx.step
+        self._physics_step = jax.jit(functools.partial(step, self.model))
+        self._start = jax.jit(prune(self._forward_state))
         self.frame_skip = frame_skip
         self.max_episode_steps = max_episode_steps
         self.reward_threshold = reward_threshold
@@ -102,7 +115,7 @@ class MujocoEnv(Env):
         """Returns the reward [], whether the episode terminated [], and the reward's terms.
 
         Args:
-          before: the simulation at the start of the env step, positions and velocities only.
+          before: the simulation at the start of the env step: qpos, qvel and what is ``carried``.
           data: the simulation after it.
           action: [A] as the policy gave it.
         """
@@ -122,10 +135,16 @@ class MujocoEnv(Env):
           qpos: [nq] generalised positions (m, rad).
           qvel: [nv] generalised velocities (m/s, rad/s).
         """
+        return self._start(qpos, qvel)
+
+    def _forward_state(self, qpos: jax.Array, qvel: jax.Array) -> State:
+        """Returns the state at positions and velocities, from one forward pass."""
         start = Physics(
             qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros(self.mj_model.nv, qpos.dtype)
         )
-        data = self._forward(self._data(start))
+        # MJX normalises quaternions in qpos itself; MuJoCo does so when it steps.
+        data = self._forward(self._data(start)).replace(qpos=qpos)
+        start = self._physics(data)
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
         terms = jax.tree.map(jnp.zeros_like, self.outcome(data, data, action)[2])
@@ -135,15 +154,15 @@ class MujocoEnv(Env):
         """Returns the state one env step later under ``action`` [A]."""
         before = self._data(cast(Any, state.pipeline_state)).replace(ctrl=action)
         data = jax.lax.fori_loop(
-            0, self.frame_skip, lambda _, data: self._physics_step(data), before
+            0, self.frame_skip, lambda _, data: _like(self._physics_step(data), data), before
         )
+        if self.contact_forces:
+            data = mjx.rne_postconstraint(self.model, data)
         reward, terminated, terms = self.outcome(before, data, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
-            pipeline_state=Physics(
-                qpos=data.qpos, qvel=data.qvel, qacc_warmstart=data.qacc_warmstart
-            ),
+            pipeline_state=self._physics(data),
             obs=self.observe(data),
             reward=jnp.asarray(reward, dtype),
             done=jnp.asarray(terminated, dtype),
@@ -154,7 +173,19 @@ class MujocoEnv(Env):
         """Returns a fresh simulation at the given state."""
         data = mjx.make_data(self.mj_model, impl="jax")
         return data.replace(
-            qpos=physics.qpos, qvel=physics.qvel, qacc_warmstart=physics.qacc_warmstart
+            qpos=physics.qpos,
+            qvel=physics.qvel,
+            qacc_warmstart=physics.qacc_warmstart,
+            **physics.carried,
+        )
+
+    def _physics(self, data: mjx.Data) -> Physics:
+        """Returns what the next env step needs to know of a simulation."""
+        return Physics(
+            qpos=data.qpos,
+            qvel=data.qvel,
+            qacc_warmstart=data.qacc_warmstart,
+            carried={name: getattr(data, name) for name in self.carried},
         )
 
     @property
@@ -176,6 +207,11 @@ class MujocoEnv(Env):
     def backend(self) -> str:
         """The physics engine, for brax's interface."""
         return "mjx"
+
+
+def _like(new: mjx.Data, old: mjx.Data) -> mjx.Data:
+    """Returns new data in the old one's types; MJX makes tendon indices int64 under x64."""
+    return jax.tree.map(lambda x, y: x.astype(y.dtype), new, old)
 
 
 def _load(xml_file: str) -> Any:
