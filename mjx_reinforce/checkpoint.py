@@ -15,7 +15,7 @@ from mjx_reinforce.normalize import Normalizer
 from mjx_reinforce.policies import Policy, mlp_policy
 from mjx_reinforce.records import write_bytes, write_json
 from mjx_reinforce.registry import DISTRIBUTIONS, check_name, load
-from mjx_reinforce.types import Box
+from mjx_reinforce.types import Box, Discrete
 
 
 def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None:
@@ -25,7 +25,8 @@ def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None
       directory: made if it does not exist; ``actor.npz`` and ``policy.json`` in it.
       actor: every leaf with a leading seed axis [S, ...].
       settings: ``policy`` (a name), ``hidden_sizes``, ``initial_std``, ``observation_size``,
-        ``action_low``, ``action_high``: what ``build_policy`` reads.
+        ``action_low`` and ``action_high`` or, if discrete, ``num_actions``; optionally
+        ``shared_trunk``, ``initializer``, ``rescale``: what ``build_policy`` reads.
     """
     flat = traverse_util.flatten_dict(serialization.to_state_dict(actor), sep="/")
     archive = io.BytesIO()
@@ -66,10 +67,28 @@ def load_policy(directory: str | Path, seed: int | None = None) -> tuple[Policy,
 
 
 def build_policy(settings: dict[str, Any]) -> Policy:
-    """Returns the policy that ``settings`` of ``save_policy`` describe."""
+    """Returns the policy that ``settings`` of ``save_policy`` describe.
+
+    What an older file does not say is as it was then: one trunk, orthogonal
+    weights, means scaled to the action's range.
+    """
     check_name("policy", settings["policy"], DISTRIBUTIONS)
-    space = Box(np.asarray(settings["action_low"]), np.asarray(settings["action_high"]))
     distribution = load(DISTRIBUTIONS[settings["policy"]])(
-        space, initial_std=settings["initial_std"]
+        _space(settings),
+        initial_std=settings["initial_std"],
+        rescale=settings.get("rescale", True),
     )
-    return mlp_policy(settings["observation_size"], distribution, settings["hidden_sizes"])
+    return mlp_policy(
+        settings["observation_size"],
+        distribution,
+        settings["hidden_sizes"],
+        shared_trunk=settings.get("shared_trunk", True),
+        initializer=settings.get("initializer", "orthogonal"),
+    )
+
+
+def _space(settings: dict[str, Any]) -> Box | Discrete:
+    """Returns the action space: ``num_actions``, or ``action_low`` and ``action_high``."""
+    if "num_actions" in settings:
+        return Discrete(settings["num_actions"])
+    return Box(np.asarray(settings["action_low"]), np.asarray(settings["action_high"]))

@@ -5,6 +5,11 @@ from collections.abc import Sequence
 import jax
 from flax import linen as nn
 
+from mjx_reinforce.registry import check_name
+
+#: Ways to draw initial weights.
+INITIALIZERS = ("orthogonal", "torch")
+
 # TF32, the default of NVIDIA's matrix units, breaks small policies quietly.
 _PRECISION = jax.lax.Precision.HIGHEST
 
@@ -17,16 +22,36 @@ class MLP(nn.Module):
     output_scale: gain of the last layer's orthogonal initial weights; 0.01 makes
       every fresh policy nearly the same in all states (Andrychowicz et al. 2020,
       arXiv:2006.05990, section 3.2)
+    initializer: "orthogonal", with LeCun's normal weights in the hidden layers and
+      zero biases; or "torch" for that of ``torch.nn.Linear``, all weights and biases
+      uniform within 1 / sqrt(fan-in), whatever ``output_scale``
     """
 
     hidden_sizes: Sequence[int]
     num_outputs: int
     output_scale: float = 1.0
+    initializer: str = "orthogonal"
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Returns [..., num_outputs] from ``x`` [..., O]."""
+        """Returns [..., num_outputs] from ``x`` [..., O]; ValueError for another initialiser."""
+        check_name("initializer", self.initializer, dict.fromkeys(INITIALIZERS))
         for size in self.hidden_sizes:
-            x = nn.tanh(nn.Dense(size, precision=_PRECISION)(x))
-        initializer = nn.initializers.orthogonal(self.output_scale)
-        return nn.Dense(self.num_outputs, kernel_init=initializer, precision=_PRECISION)(x)
+            x = nn.tanh(self._dense(x, size, nn.initializers.lecun_normal()))
+        return self._dense(x, self.num_outputs, nn.initializers.orthogonal(self.output_scale))
+
+    def _dense(self, x: jax.Array, size: int, kernel_init: nn.initializers.Initializer):
+        bias_init = nn.initializers.zeros
+        if self.initializer == "torch":
+            kernel_init = bias_init = _symmetric_uniform(x.shape[-1] ** -0.5)
+        return nn.Dense(size, kernel_init=kernel_init, bias_init=bias_init, precision=_PRECISION)(x)
+
+
+def _symmetric_uniform(bound: float) -> nn.initializers.Initializer:
+    """Draws from U(-bound, bound)."""
+
+    def draw(key, shape, dtype=float, out_sharding=None):
+        del out_sharding
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return draw

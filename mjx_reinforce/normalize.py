@@ -29,7 +29,7 @@ def init(observation_size: int) -> Normalizer:
 
 
 def update(
-    normalizer: Normalizer, observation: jax.Array, mask: jax.Array, at_most: int
+    normalizer: Normalizer, observation: jax.Array, mask: jax.Array, at_most: float
 ) -> Normalizer:
     """Merges a batch into the statistics, unless enough is counted already.
 

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from mjx_reinforce.distributions import Distribution
-from mjx_reinforce.networks import MLP
+from mjx_reinforce.networks import INITIALIZERS, MLP
+from mjx_reinforce.registry import check_name
 
 
 class Policy(NamedTuple):
@@ -24,7 +25,12 @@ class Policy(NamedTuple):
 
 
 def mlp_policy(
-    observation_size: int, distribution: Distribution, hidden_sizes: Sequence[int] = (32, 32)
+    observation_size: int,
+    distribution: Distribution,
+    hidden_sizes: Sequence[int] = (32, 32),
+    *,
+    shared_trunk: bool = True,
+    initializer: str = "orthogonal",
 ) -> Policy:
     """A policy whose distribution is indexed by an MLP with tanh units.
 
@@ -32,27 +38,51 @@ def mlp_policy(
       observation_size: O.
       distribution: what the network's outputs index.
       hidden_sizes: units of each hidden layer; empty for a linear policy.
+      shared_trunk: whether one network computes means and standard deviations;
+        else the standard deviations have one of their own, of the same sizes.
+      initializer: of the weights, see ``networks.MLP``.
 
     Returns:
-      The policy; its params are ``{"network": ..., "constants": [K - num_outputs]}``.
+      The policy; its params are ``{"network": ..., "constants": [K - num_outputs]}``,
+      and ``"scale_network"`` without a shared trunk.
 
     Raises:
-      ValueError: a layer has no units.
+      ValueError: a layer has no units, the initialiser is unknown, or there is
+        nothing for a second network to compute.
     """
     if any(size < 1 for size in hidden_sizes):
         raise ValueError(f"every hidden layer needs at least one unit, got {tuple(hidden_sizes)}")
-    network = MLP(tuple(hidden_sizes), distribution.num_outputs, output_scale=0.01)
+    check_name("initializer", initializer, dict.fromkeys(INITIALIZERS))
+    num_outputs, num_scales = distribution.num_outputs, distribution.num_scales
+    if not (shared_trunk or num_scales):
+        raise ValueError(
+            "without a shared trunk the standard deviation must come from the state, "
+            "as in normal-softplus; this distribution's is a constant, or it has none"
+        )
+    sizes = {"network": num_outputs}
+    if not shared_trunk:
+        sizes = {"network": num_outputs - num_scales, "scale_network": num_scales}
+    networks = {
+        name: MLP(tuple(hidden_sizes), size, output_scale=0.01, initializer=initializer)
+        for name, size in sizes.items()
+    }
     constants = distribution.constants
 
     def init(key):
-        return {
-            "network": network.init(key, jnp.zeros(observation_size)),
-            "constants": jnp.asarray(constants, jnp.result_type(float)),
+        keys = [key] if len(networks) == 1 else jax.random.split(key, len(networks))
+        params = {
+            name: network.init(key, jnp.zeros(observation_size))
+            for (name, network), key in zip(networks.items(), keys, strict=True)
         }
+        return params | {"constants": jnp.asarray(constants, jnp.result_type(float))}
 
     def apply(params, observation):
-        outputs = jnp.asarray(network.apply(params["network"], observation))
-        fixed = jnp.broadcast_to(params["constants"], (*outputs.shape[:-1], len(constants)))
-        return jnp.concatenate([outputs, fixed], axis=-1)
+        outputs = [
+            jnp.asarray(network.apply(params[name], observation))
+            for name, network in networks.items()
+        ]
+        batch = outputs[0].shape[:-1]
+        fixed = jnp.broadcast_to(params["constants"], (*batch, len(constants)))
+        return jnp.concatenate([*outputs, fixed], axis=-1)
 
     return Policy(init, apply, distribution)
