@@ -114,8 +114,8 @@ class Emitter:
             inner.update(zip(element_leaves, row, strict=True))
             self._run(loop.body, inner)
             nexts = [
-                self._materialize(loop.nexts[i], v, inner)
-                for i, v in zip(carries, varying, strict=True)
+                _computed(self._materialize(loop.nexts[i], v, inner), before)
+                for i, v, before in zip(carries, varying, carry, strict=True)
             ]
             return nexts, [self._value(loop.ys[j], inner) for j in live_ys]
 
@@ -168,6 +168,11 @@ class Emitter:
         start = (np.int32(0), init)
         step = lambda state: (state[0] + 1, body(state[1])[0])  # noqa: E731
         return lax.while_loop(goes_on, step, start)[1]
+
+
+def _computed(value: Any, before: Any) -> Any:
+    """Makes a constant something computed: Triton's lowering takes no literal from a loop."""
+    return lax.select(lax.eq(before, before), value, value) if ops.is_constant(value) else value
 
 
 class _Places(NamedTuple):
