@@ -9,27 +9,28 @@ rows of one run with each other, not with another machine's.
 """
 
 import dataclasses
-import importlib.util
 import json
-import os
 import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import tyro
 from flax import struct
 from rich.console import Console
 from rich.table import Table
 
-from mjx_reinforce import envs, load_policy, mlp_policy, normal, reinforce
-from mjx_reinforce.engines import choose
-from mjx_reinforce.learner import Actor
+from mjx_reinforce import envs, load_policy, mlp_policy, reinforce
+from mjx_reinforce.engines import Player, choose
+from mjx_reinforce.learner import Actor, default_distribution
 from mjx_reinforce.normalize import apply, init
+from mjx_reinforce.types import action_space, observation_size
+
+# A script's own folder is where Python looks first.
+from peers import Candidate, peers  # isort: skip
 
 #: Name in the table -> engine, and the solver of the environment's physics.
 ENGINES = {
@@ -81,19 +82,6 @@ class Settings:
     """InvertedPendulum on mjx, fused and C MuJoCo only, in under two minutes."""
 
 
-class Candidate(NamedTuple):
-    """Something to time.
-
-    row: what the table says of it so far
-    run: plays once and waits for the end
-    env_steps: how many env steps that is
-    """
-
-    row: dict[str, Any]
-    run: Callable[[], Any]
-    env_steps: int
-
-
 @struct.dataclass
 class LoopState:
     """A state of a looping environment, and where it starts again."""
@@ -110,7 +98,7 @@ class Loop:
 
     def __init__(self, env: Any, steps: int):
         self.env, self.max_episode_steps = env, steps
-        self.action_size, self.action_space = env.action_size, env.action_space
+        self.action_size, self.action_space = env.action_size, action_space(env)
 
     def reset(self, rng):
         """Starts an episode, and remembers the start."""
@@ -140,7 +128,11 @@ def main() -> None:
     jax.config.update("jax_default_matmul_precision", "highest")
     rows = []
     for env in settings.env:
-        candidates = [*rollouts(env, settings), *trainings(env, settings), *peers(env, settings)]
+        candidates = [
+            *rollouts(env, settings),
+            *trainings(env, settings),
+            *peers(env, settings.quick),
+        ]
         rows += measure(candidates, settings.repeats)
     show(rows)
     draw(rows, settings.png)
@@ -153,17 +145,21 @@ def rollouts(env_id: str, settings: Settings) -> list[Candidate]:
     candidates = []
     for name in settings.engine:
         engine_name, solver = ENGINES[name]
-        env = Loop(envs.make(env_id, solver=solver), settings.steps)
-        engine = choose(engine_name, env)
+        env = Loop(make(env_id, solver), settings.steps)
         policy, actor = the_policy(env, settings.policy)
+
+        def act(actor, obs, policy=policy):
+            return policy.apply(actor.params, apply(actor.normalizer, obs))
+
+        engine = choose(engine_name, env, Player(act, actor, policy.distribution))
         for batch in settings.batch:
             if engine_name == "mjx" and batch > settings.max_mjx_batch:
                 continue
 
-            def play(actor, key, env=env, engine=engine, policy=policy, batch=batch):
+            def play(actor, key, env=env, act=act, engine=engine, policy=policy, batch=batch):
                 return engine.rollout(
                     env,
-                    lambda actor, obs: policy.apply(actor.params, apply(actor.normalizer, obs)),
+                    act,
                     actor,
                     policy.distribution,
                     key,
@@ -187,8 +183,9 @@ def trainings(env_id: str, settings: Settings) -> list[Candidate]:
         if engine_name == "mjx":
             batch = min(batch, settings.max_mjx_batch)
         for sizes in ((16, 32), (64, 64)):
-            env = Loop(envs.make(env_id, solver=solver), settings.steps)
-            policy = mlp_policy(observation(env), normal(env.action_space), sizes)
+            env = Loop(make(env_id, solver), settings.steps)
+            distribution = default_distribution(action_space(env))
+            policy = mlp_policy(observation_size(env), distribution, sizes)
             learner = reinforce(env, policy=policy, num_episodes=batch, engine=engine_name)
             state = learner.init(jax.random.key(0))
 
@@ -202,17 +199,18 @@ def trainings(env_id: str, settings: Settings) -> list[Candidate]:
     return candidates
 
 
-def observation(env: Any) -> int:
-    """Returns the number of entries of an observation."""
-    return jax.eval_shape(env.reset, jax.random.key(0)).obs.shape[0]
+def make(env_id: str, solver: str) -> Any:
+    """Builds an environment; one without a MuJoCo model has no solver."""
+    env = envs.make(env_id)
+    return envs.make(env_id, solver=solver) if hasattr(env, "mj_model") else env
 
 
 def the_policy(env: Any, directory: Path | None) -> tuple[Any, Actor]:
     """A trained policy's first seed, or a fresh 16-32 network."""
     if directory is not None:
         return load_policy(directory, seed=0)
-    size = observation(env)
-    policy = mlp_policy(size, normal(env.action_space), (16, 32))
+    size = observation_size(env)
+    policy = mlp_policy(size, default_distribution(action_space(env)), (16, 32))
     return policy, Actor(params=policy.init(jax.random.key(0)), normalizer=init(size))
 
 
@@ -230,57 +228,9 @@ def compiled(
         else None
     )
     row["device"] = jax.devices()[0].device_kind
-    row["frame_skip"] = env.frame_skip
+    row["frame_skip"] = getattr(env, "frame_skip", 1)
     keys = iter(jax.random.split(jax.random.key(1), 1000))
     return Candidate(row, lambda: jax.block_until_ready(program(argument, next(keys))), env_steps)
-
-
-def peers(env_id: str, settings: Settings) -> list[Candidate]:
-    """C MuJoCo on all threads and, where installed, Gymnasium's vector environment."""
-    candidates = [c_mujoco(env_id)]
-    if not settings.quick and importlib.util.find_spec("gymnasium"):
-        candidates.append(gymnasium_vector(env_id))
-    return candidates
-
-
-def c_mujoco(env_id: str, batch: int = 1024, steps: int = 20) -> Candidate:
-    """``mujoco.rollout`` under random actions, for as long as a pendulum takes to fall."""
-    from mujoco import MjData, mj_getState, mj_stateSize, mjtState, rollout  # type: ignore
-
-    env = envs.make(env_id)
-    model, threads = env.mj_model, os.cpu_count() or 1
-    full = mjtState.mjSTATE_FULLPHYSICS
-    start = np.empty(mj_stateSize(model, full))
-    mj_getState(model, MjData(model), start, full)
-    data = [MjData(model) for _ in range(threads)]
-    low, high = env.action_space
-    control = np.random.default_rng(0).uniform(low, high, (batch, steps, model.nu))
-    control = np.repeat(control, env.frame_skip, axis=1)
-    pool = rollout.Rollout(nthread=threads)
-
-    def run():
-        pool.rollout(model, data, np.tile(start, (batch, 1)), control)
-
-    row = {"what": "rollout", "engine": f"C MuJoCo, {threads} threads", "env": env_id}
-    row |= {"batch": batch, "device": "cpu", "frame_skip": env.frame_skip}
-    return Candidate(row, run, batch * steps)
-
-
-def gymnasium_vector(env_id: str, batch: int = 8, steps: int = 200) -> Candidate:
-    """Gymnasium's synchronous vector environment under random actions."""
-    import gymnasium
-
-    env = gymnasium.make_vec(env_id, num_envs=batch, vectorization_mode="sync")
-    env.reset(seed=0)
-    actions = [env.action_space.sample() for _ in range(steps)]
-
-    def run():
-        for action in actions:
-            env.step(action)
-
-    row = {"what": "rollout", "engine": "Gymnasium vector", "env": env_id, "batch": batch}
-    row |= {"device": "cpu", "frame_skip": envs.make(env_id).frame_skip}
-    return Candidate(row, run, batch * steps)
 
 
 def measure(candidates: list[Candidate], repeats: int) -> list[dict[str, Any]]:

@@ -1,0 +1,114 @@
+"""What a user would otherwise pick, as far as it is installed here, for `benchmark.py` to time."""
+
+import importlib.util
+import os
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from mjx_reinforce import envs
+
+
+class Candidate(NamedTuple):
+    """Something to time.
+
+    row: what the table says of it so far
+    run: plays once and waits for the end
+    env_steps: how many env steps that is
+    """
+
+    row: dict[str, Any]
+    run: Callable[[], Any]
+    env_steps: int
+
+
+def peers(env_id: str, quick: bool) -> list[Candidate]:
+    """C MuJoCo on all threads and, where installed, Gymnasium's vector env and brax's PPO."""
+    candidates = []
+    if hasattr(envs.make(env_id), "mj_model"):
+        candidates.append(c_mujoco(env_id))
+    if quick:
+        return candidates
+    if importlib.util.find_spec("gymnasium") and _in_gymnasium(env_id):
+        candidates.append(gymnasium_vector(env_id))
+    # brax 0.14.2's trainers call what JAX 0.11 no longer has.
+    if env_id == "InvertedPendulum-v5" and hasattr(jax, "device_put_replicated"):
+        candidates.append(brax_ppo())
+    return candidates
+
+
+def c_mujoco(env_id: str, batch: int = 1024, steps: int = 20) -> Candidate:
+    """``mujoco.rollout`` under random actions, for as long as a pendulum takes to fall."""
+    from mujoco import MjData, mj_getState, mj_stateSize, mjtState, rollout  # type: ignore
+
+    env = envs.make(env_id)
+    model, threads = env.mj_model, os.cpu_count() or 1
+    full = mjtState.mjSTATE_FULLPHYSICS
+    start = np.empty(mj_stateSize(model, full))
+    mj_getState(model, MjData(model), start, full)
+    data = [MjData(model) for _ in range(threads)]
+    low, high = env.action_space
+    control = np.random.default_rng(0).uniform(low, high, (batch, steps, model.nu))
+    control = np.repeat(control, env.frame_skip, axis=1)
+    pool = rollout.Rollout(nthread=threads)
+
+    def run():
+        pool.rollout(model, data, np.tile(start, (batch, 1)), control)
+
+    row = {"what": "rollout", "engine": f"C MuJoCo, {threads} threads", "env": env_id}
+    row |= {"batch": batch, "device": "cpu", "frame_skip": env.frame_skip}
+    return Candidate(row, run, batch * steps)
+
+
+def gymnasium_vector(env_id: str, batch: int = 8, steps: int = 200) -> Candidate:
+    """Gymnasium's synchronous vector environment under random actions."""
+    import gymnasium
+
+    env = gymnasium.make_vec(env_id, num_envs=batch, vectorization_mode="sync")
+    env.reset(seed=0)
+    actions = [env.action_space.sample() for _ in range(steps)]
+
+    def run():
+        for action in actions:
+            env.step(action)
+
+    row = {"what": "rollout", "engine": "Gymnasium vector", "env": env_id, "batch": batch}
+    frame_skip = getattr(envs.make(env_id), "frame_skip", 1)
+    row |= {"device": "cpu", "frame_skip": frame_skip}
+    return Candidate(row, run, batch * steps)
+
+
+def brax_ppo(batch: int = 2048, env_steps: int = 1_000_000) -> Candidate:
+    """PPO of brax with its own networks and inverted pendulum, in MJX; compiled in each run."""
+    from brax import envs as brax_envs
+    from brax.training.agents.ppo import train as ppo
+
+    env = brax_envs.get_environment("inverted_pendulum", backend="mjx")
+
+    def run():
+        ppo.train(
+            environment=env,
+            num_timesteps=env_steps,
+            num_envs=batch,
+            episode_length=1000,
+            num_evals=1,
+            num_eval_envs=1,
+            run_evals=False,
+            unroll_length=5,
+            num_minibatches=32,
+            num_updates_per_batch=4,
+            batch_size=1024,
+            normalize_observations=True,
+        )
+
+    row = {"what": "train", "engine": "brax PPO, compiling", "env": "InvertedPendulum-v5"}
+    row |= {"batch": batch, "device": jax.devices()[0].device_kind, "frame_skip": 4}
+    return Candidate(row, run, env_steps)
+
+
+def _in_gymnasium(env_id: str) -> bool:
+    import gymnasium
+
+    return env_id in gymnasium.registry
