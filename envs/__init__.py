@@ -45,15 +45,21 @@ def make(id: str, /, **kwargs: Any) -> Any:
     """Builds an environment.
 
     Args:
-      id: one of ``names()``.
+      id: one of ``names()``, or "module:Class" for one of your own, importable from here.
       **kwargs: arguments of the environment's class, over the table's.
 
     Raises:
       ValueError: the id is unknown; the message lists the known ones.
     """
-    check_name("environment", id, _TABLE)
-    entry, settings = _TABLE[id]
+    check_id(id)
+    entry, settings = (id, {}) if ":" in id else _TABLE[id]
     return load(entry)(**(settings | kwargs))
+
+
+def check_id(id: str) -> None:
+    """Raises ValueError for an id that ``make`` does not know; imports nothing."""
+    if ":" not in id:
+        check_name("environment", id, _TABLE)
 
 
 def register(id: str, entry: Callable[..., Any], /, **kwargs: Any) -> None:

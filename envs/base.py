@@ -4,7 +4,6 @@ import abc
 import contextlib
 import dataclasses
 import functools
-import importlib.resources
 import io
 from typing import Any, cast
 
@@ -12,7 +11,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from mujoco import MjModel  # pyright: ignore[reportAttributeAccessIssue] - a C extension
 
 from mjx_reinforce.fused import prune
 from mjx_reinforce.registry import check_name
@@ -24,7 +22,7 @@ with contextlib.redirect_stdout(io.StringIO()):
     from brax.envs.base import Env, State
     from mujoco import mjx
 
-    from mjx_reinforce.envs import physics
+    from mjx_reinforce.envs import models, physics
     from mjx_reinforce.envs.fences import fenced
 
 SOLVERS = ("exact", "mjx", "fast")
@@ -79,18 +77,18 @@ class MujocoEnv(Env):
           frame_skip: physics steps an env step.
           max_episode_steps: the time limit, in env steps.
           reward_threshold: the return at which the task counts as solved, if any.
-          solver: "exact" is ``physics.step``, with MJX's answer and no loops where it has
-            a closed form; "mjx" is ``mjx.step`` as it is; "fast" is ``mjx.step`` with one
+          solver: "exact" is ``physics.step``, which is C MuJoCo 4.0's answer, with no loops
+            where it has a closed form; "mjx" is ``mjx.step`` as it is; "fast" is ``mjx.step`` with one
             solver iteration of four line-search steps, which is not exact.
 
         Raises:
-          ValueError: ``solver`` is unknown.
+          ValueError: ``solver`` is unknown, or MJX cannot run the model.
         """
         check_name("solver", solver, dict.fromkeys(SOLVERS))
-        self.mj_model = _load(xml_file)
+        self.mj_model = models.load(xml_file)
         if solver == "fast":
             self.mj_model.opt.iterations, self.mj_model.opt.ls_iterations = 1, 4
-        self.model = mjx.put_model(self.mj_model, impl="jax")
+        self.model = models.to_mjx(self.mj_model, xml_file)
         # Tracing the physics takes a second of Python; jit does it once.
         self._forward = jax.jit(functools.partial(fenced(physics.forward), self.model))
         exact = functools.partial(physics.step, evaluate=self._forward)
@@ -212,11 +210,3 @@ class MujocoEnv(Env):
 def _like(new: mjx.Data, old: mjx.Data) -> mjx.Data:
     """Returns new data in the old one's types; MJX makes tendon indices int64 under x64."""
     return jax.tree.map(lambda x, y: x.astype(y.dtype), new, old)
-
-
-def _load(xml_file: str) -> Any:
-    """Compiles an MJCF file of the package's assets or of the user's."""
-    if "/" in xml_file or "\\" in xml_file:
-        return MjModel.from_xml_path(xml_file)
-    asset = importlib.resources.files("mjx_reinforce.envs") / "assets" / xml_file
-    return MjModel.from_xml_string(asset.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""`mjx.step` with a constraint solver that costs next to nothing.
+"""C MuJoCo's step in MJX, with a constraint solver that costs next to nothing.
 
 MJX's Newton solver is a loop around a line search that is another loop, in every forward pass,
 also where no constraint is active. Two cases are cheaper and lead to the same answer:
@@ -6,12 +6,22 @@ also where no constraint is active. Two cases are cheaper and lead to the same a
 - Where the only constraint rows are limits of slide and hinge joints, at most two of them to a
   kinematic tree, the optimum has a closed form: `_solve_limits`.
 - Otherwise the solver is entered only if some row is active; without one, the acceleration is the
-  unconstrained one: `_solve_if_active`.
+  unconstrained one: `_solve`.
 
-Everything else is MJX's own stages in MJX's order. Solver options are untouched; the closed form
-does not read `iterations` and `tolerance`, nor the warm start, because it is exact.
+Everything else is MJX's own stages in MJX's order, but for two places in which MJX 3.17 departs
+from C MuJoCo 4.0, which Gymnasium runs, and in which the answer here is C's:
+
+- Runge-Kutta on the orientations of free and ball joints: `_runge_kutta_4`.
+- Contacts of capsules: `contacts`.
+
+With neither, as in InvertedPendulum, a step is equal to `mjx.step`. Solver options are untouched;
+the closed form does not read `iterations` and `tolerance`, nor the warm start, because it is exact.
+C's Newton solver has one more reason to stop than MJX's (the decrement it predicts is below
+`tolerance`), so that MJX's now and then takes an iteration more, nearer to the optimum.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any, cast
 
 import jax
@@ -21,19 +31,31 @@ from mujoco import mjx
 from mujoco.mjx._src import constraint, sensor, smooth, solver, types
 from mujoco.mjx._src import forward as stages
 
+from mjx_reinforce.envs import contacts
+
 _MAX_ROWS_TOGETHER = 2
 
 # Runge-Kutta 4: where each later stage is evaluated, and what each stage counts.
 _STAGE_POSITIONS = (0.5, 0.5, 1.0)
 _STAGE_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
 
+# Below this square of an angle a series in it replaces the closed form in `_rotation_rate`.
+_SMALL_SQUARE = 0.01
+_BORTZ_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600)
 
-def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Advances the simulation by one timestep; equal to `mjx.step(model, data)`.
+Forward = Callable[[mjx.Data], mjx.Data]
+
+
+def step(model: mjx.Model, data: mjx.Data, evaluate: Forward | None = None) -> mjx.Data:
+    """Advances the simulation by one timestep, as `mj_step` of C MuJoCo 4.0.
+
+    Equal to `mjx.step(model, data)` where the model has no contacts of capsules and, if its
+    integrator is Runge-Kutta, no free or ball joints.
 
     Args:
         model: an MJX model made with impl='jax'.
         data: its data, with `ctrl` set.
+        evaluate: `forward` of this model, where the caller has it jitted.
 
     Raises:
         ValueError: if the model is not of MJX's JAX implementation.
@@ -41,10 +63,12 @@ def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """
     if model.impl != mjx.Impl.JAX:
         raise ValueError(f"physics.step needs mjx.put_model(model, impl='jax'), got {model.impl}")
-    data = forward(model, data)
+    # Traced once for all stages of Runge-Kutta; the model stays constant, so that it folds.
+    evaluate = evaluate or jax.jit(functools.partial(forward, model))
+    data = evaluate(data)
     integrator = model.opt.integrator
     if integrator == mjx.IntegratorType.RK4:
-        return _runge_kutta_4(model, data)
+        return _runge_kutta_4(model, data, evaluate)
     if integrator == mjx.IntegratorType.EULER:
         return stages.euler(model, data)
     if integrator == mjx.IntegratorType.IMPLICITFAST:
@@ -53,8 +77,8 @@ def step(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Computes accelerations; equal to `mjx.forward(model, data)`."""
-    data = stages.fwd_position(model, data)
+    """Computes accelerations; equal to `mjx.forward(model, data)` but for contacts of capsules."""
+    data = contacts.fwd_position(model, data)
     data = sensor.sensor_pos(model, data)
     data = stages.fwd_velocity(model, data)
     data = sensor.sensor_vel(model, data)
@@ -184,14 +208,20 @@ def _complementary(matrix: list[list[Any]], target: list[Any]) -> list[Any]:
     ]
 
 
-def _runge_kutta_4(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """MJX's Runge-Kutta of order 4, through this module's `forward`."""
+def _runge_kutta_4(model: mjx.Model, data: mjx.Data, evaluate: Forward) -> mjx.Data:
+    """Runge-Kutta of order 4 as `mj_RungeKutta` of MuJoCo 4.0, with this module's `forward`.
+
+    It is MJX's, but for the orientations of free and ball joints. MJX averages the stages' angular
+    velocities, though each is in its own stage's frame; MuJoCo, from 4.0 on, averages the rates of
+    one rotation vector (Runge-Kutta-Munthe-Kaas), without which the order is 2.
+    """
     start, stage, timestep = data, data, model.opt.timestep
-    qvel, qacc, act_dot = (_STAGE_WEIGHTS[0] * x for x in (data.qvel, data.qacc, data.act_dot))
+    rate = data.qvel
+    qvel, qacc, act_dot = (_STAGE_WEIGHTS[0] * x for x in (rate, data.qacc, data.act_dot))
     for position, weight in zip(_STAGE_POSITIONS, _STAGE_WEIGHTS[1:], strict=True):
         advanced = start.replace(qacc=position * stage.qacc)
         advanced = stages._advance(
-            model, advanced, position * stage.act_dot, advanced.qacc, position * stage.qvel
+            model, advanced, position * stage.act_dot, advanced.qacc, position * rate
         )
         stage = stage.replace(
             qpos=advanced.qpos,
@@ -199,9 +229,57 @@ def _runge_kutta_4(model: mjx.Model, data: mjx.Data) -> mjx.Data:
             act=start.act + position * stage.act_dot * timestep,
             time=start.time + position * timestep,
         )
-        stage = forward(model, stage)
-        qvel = qvel + weight * stage.qvel
+        stage = evaluate(stage)
+        rate = _displacement_rate(model, stage.qvel, rate, position)
+        qvel = qvel + weight * rate
         qacc = qacc + weight * stage.qacc
         act_dot = act_dot + weight * stage.act_dot
     end = stage.replace(qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time)
     return stages._advance(model, end, act_dot, qacc, qvel)
+
+
+def _displacement_rate(
+    model: mjx.Model, qvel: jax.Array, last_rate: jax.Array, position: float
+) -> jax.Array:
+    """Returns how fast the displacement since the step's start grows at a stage, [nv].
+
+    Args:
+        model: an MJX model; without free and ball joints, the answer is `qvel`.
+        qvel: [nv] the stage's velocity.
+        last_rate: [nv] the rate that led to the stage.
+        position: the stage's place in the timestep, from 0 to 1.
+    """
+    rate = qvel
+    for kind, dof in zip(model.jnt_type, model.jnt_dofadr, strict=True):
+        if kind not in (mjx.JointType.FREE, mjx.JointType.BALL):
+            continue
+        first = int(dof) + (3 if kind == mjx.JointType.FREE else 0)
+        turn = slice(first, first + 3)
+        rotation = position * model.opt.timestep * last_rate[turn]
+        rate = rate.at[turn].set(_rotation_rate(rotation, qvel[turn]))
+    return rate
+
+
+def _rotation_rate(rotation: jax.Array, velocity: jax.Array) -> jax.Array:
+    r"""Returns the time derivative of a rotation vector r under angular velocity w, [3].
+
+    Bortz (1971), with w in the rotated frame; `mju_derivExpmap` of MuJoCo 4.0:
+
+        r' = w + r x w / 2 + c(|r|) r x (r x w),   c(x) = (1 - (x/2) cot(x/2)) / x^2
+
+    c is singular at multiples of 2 pi, so that r is first replaced by the same rotation of an
+    angle in (-pi, pi].
+    """
+    square = jnp.sum(rotation**2)
+    large = square > jnp.pi**2
+    angle = jnp.sqrt(jnp.where(large, square, 1))
+    excess = 2 * jnp.pi * jnp.floor(angle / (2 * jnp.pi) + 0.5)
+    rotation = jnp.where(large, rotation * (1 - excess / angle), rotation)
+    square = jnp.sum(rotation**2)
+    small = square < _SMALL_SQUARE
+    safe = jnp.where(small, 1, square)
+    half = jnp.sqrt(safe) / 2
+    series = sum(c * square**i for i, c in enumerate(_BORTZ_SERIES))
+    coefficient = jnp.where(small, series, (1 - half / jnp.tan(half)) / safe)
+    across = jnp.cross(rotation, velocity)
+    return velocity + across / 2 + coefficient * jnp.cross(rotation, across)

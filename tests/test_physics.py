@@ -1,4 +1,4 @@
-"""`physics.step` against `mjx.step`: the same answer, near the limits too."""
+"""`physics.step` against `mjx.step`, and against C MuJoCo where MJX departs from it."""
 
 import os
 import types
@@ -11,9 +11,11 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco import mjx
+from mujoco.mjx._src import collision_driver, collision_primitive
+from scipy.spatial.transform import Rotation
 
 from mjx_reinforce import fused
-from mjx_reinforce.envs import physics
+from mjx_reinforce.envs import contacts, physics
 
 ASSETS = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
 
@@ -223,3 +225,160 @@ def test_operations_of_a_step():
 def test_other_implementations_are_refused():
     with pytest.raises(ValueError, match="impl='jax'"):
         physics.step(cast(Any, types.SimpleNamespace(impl=mjx.Impl.C)), cast(Any, None))
+
+
+# ------------------------------------------------------------------ equal to C MuJoCo, not to MJX
+
+TUMBLERS = """
+<mujoco>
+  <option integrator="RK4" timestep="0.02"/>
+  <default><geom type="box" contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body>
+      <freejoint/>
+      <geom size="0.1 0.2 0.3"/>
+      <body pos="0.1 0 0.3">
+        <joint type="ball"/>
+        <geom size="0.3 0.05 0.1" pos="0.2 0 0"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+
+# A margin of 10 m, so that every pair of geoms is in contact.
+TOUCHING = """
+<mujoco>
+  <default><geom margin="10"/></default>
+  <worldbody>
+    <geom type="plane" size="0 0 1" euler="20 30 0"/>
+    <body><freejoint/><geom type="capsule" size="0.07 0.5"/></body>
+    <body><freejoint/><geom type="capsule" size="0.1 0.3"/></body>
+    <body><freejoint/><geom type="sphere" size="0.2"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+UPRIGHT, LYING = [1, 0, 0, 0], [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
+TILTED, STEEP = (  # as the plane, and 29 degrees from it: MJX's frames do not follow it there
+    Rotation.from_euler("XYZ", (20, angle, 0), degrees=True).as_quat(scalar_first=True).tolist()
+    for angle in (30, 59)
+)
+
+
+def compiled(xml):
+    """Returns C MuJoCo's model and data, and MJX's."""
+    model = mujoco.MjModel.from_xml_string(xml)  # pyright: ignore[reportAttributeAccessIssue]
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    return model, data, mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
+
+
+def mj_contact(model, data, qpos):
+    """Returns C MuJoCo's contacts."""
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+    return data.contact
+
+
+def test_tumbling_bodies_turn_as_in_mujoco():
+    speeds = 1e-6, 1.0, 10.0
+    with jax.enable_x64(True):
+        model, data, mx, start = compiled(TUMBLERS)
+        moving = np.outer(speeds, np.random.default_rng(0).normal(size=model.nv))
+        at_rest = np.tile(data.qpos, (3, 1))
+
+        def advance(qpos, qvel):
+            end = physics.step(mx, start.replace(qpos=qpos, qvel=qvel))
+            return end.qpos, end.qvel
+
+        advance = jax.jit(jax.vmap(advance), compiler_options=UNOPTIMIZED)
+        states = [(jnp.array(at_rest), jnp.array(moving))]
+        for _ in range(5):
+            states.append(advance(*states[-1]))
+        for lane, speed in enumerate(speeds):
+            data.qpos[:], data.qvel[:] = at_rest[lane], moving[lane]
+            for qpos, qvel in states[1:]:
+                mujoco.mj_step(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+                np.testing.assert_allclose(qpos[lane], data.qpos, rtol=0, atol=1e-12)
+                np.testing.assert_allclose(qvel[lane], data.qvel, rtol=0, atol=1e-12 * (1 + speed))
+
+
+@pytest.mark.parametrize(("double", "tolerance"), [(False, 1e-6), (True, 1e-14)])
+def test_rotation_rate_at_every_angle(double, tolerance):
+    """Against the derivative of the rotation's logarithm, in closed form in double precision."""
+    axis, velocity = np.array([2.0, -1.0, 2.0]) / 3, np.array([0.3, 0.5, -0.7])
+    angles = np.array([0.0, 1e-20, 1e-9, 1e-5, 1e-3, 0.0999, 0.1001, 1.0, 3.1, 3.2, 6.0, 9.0])
+    principal = (angles + np.pi) % (2 * np.pi) - np.pi
+    half, small = principal / 2, np.abs(principal) < 1e-4
+    cotangent = np.where(small, 1 - half**2 / 3, half / np.tan(np.where(small, 1, half)))
+    along = axis * (axis @ velocity)
+    across = np.cross(axis, velocity)
+    expected = along + cotangent[:, None] * (velocity - along) + principal[:, None] / 2 * across
+    with jax.enable_x64(double):
+        rate = jax.vmap(lambda x: physics._rotation_rate(x * jnp.array(axis), jnp.array(velocity)))
+        np.testing.assert_allclose(rate(jnp.array(angles)), expected, rtol=0, atol=tolerance)
+
+
+def poses():
+    """Random poses of two capsules and a sphere, then chosen ones of the capsules, [N, 3, 7]."""
+    rng = np.random.default_rng(0)
+    position = rng.normal(size=(64, 3, 3)) * 0.4
+    turn = rng.normal(size=(64, 3, 4))
+    turn[16:32, 1] = turn[16:32, 0] + rng.normal(size=(16, 4)) * 0.01
+    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
+    chosen = [
+        (TILTED, [0, 0, 1], UPRIGHT),  # on end on the plane
+        (STEEP, [1, 0, 1], LYING),
+        (UPRIGHT, [0.15, 0, 1], LYING),  # crossing
+        (UPRIGHT, [0, 0, 1], LYING),  # crossing, with no distance between the axes
+        (UPRIGHT, [0, 0.3, 1.5], LYING),  # end-on
+        (LYING, [0.1, 0.9, 1.3], UPRIGHT),
+    ]
+    for row, (first, place, second) in enumerate(chosen):
+        position[row, :2], turn[row, :2] = ([0, 0, 1], place), (first, second)
+    return np.concatenate([position, turn], axis=2)
+
+
+def contacts_in_order(contact):
+    """Returns geoms, distances, places and frames, by pair of geoms."""
+    order = np.argsort(np.asarray(contact.geom) @ [10, 1], stable=True)
+    frame = np.reshape(contact.frame, (-1, 3, 3))
+    return [np.asarray(x)[order] for x in (contact.geom, contact.dist, contact.pos, frame)]
+
+
+def test_contacts_are_those_of_mujoco():
+    parallel = np.array([[0, 0, 1, *TILTED], [0.1, 0, 1.4, *TILTED], [1, 1, 1, *UPRIGHT]])
+    qpos = np.concatenate([poses(), parallel[None]]).reshape(-1, 21)
+    with jax.enable_x64(True):
+        model, data, mx, start = compiled(TOUCHING)
+
+        def collide(qpos):
+            return cast(Any, contacts.fwd_position(mx, start.replace(qpos=qpos)))._impl.contact
+
+        found = jax.jit(jax.vmap(collide), compiler_options=UNOPTIMIZED)(qpos)
+        ours = [contacts_in_order(jax.tree.map(lambda x, i=i: x[i], found)) for i in range(65)]
+    for actual, place in zip(ours[:-1], qpos, strict=False):
+        theirs = contacts_in_order(mj_contact(model, data, place))
+        for quantity, exact in zip(actual, theirs, strict=True):
+            np.testing.assert_allclose(quantity, exact, rtol=0, atol=1e-12)
+    # Parallel capsules: C has contacts at both ends of their overlap, ours is at its middle.
+    (_, dist, pos, _), theirs = ours[-1], contacts_in_order(mj_contact(model, data, qpos[-1]))
+    ends, middle = (np.all(x[0] == [1, 2], axis=1) for x in (theirs, ours[-1]))
+    assert (ends.sum(), middle.sum()) == (2, 1)
+    np.testing.assert_allclose(theirs[1][ends], dist[middle][0], atol=1e-12)
+    np.testing.assert_allclose(theirs[2][ends].mean(axis=0), pos[middle][0], atol=1e-12)
+
+
+def test_mjx_is_left_as_it_is():
+    _, _, mx, start = compiled(TOUCHING)
+
+    def program(position):
+        return str(jax.make_jaxpr(lambda data: position(mx, data)._impl.contact.frame)(start))
+
+    table = dict(collision_driver._COLLISION_FUNC)
+    before = program(mjx.fwd_position)
+    assert program(contacts.fwd_position) != before
+    assert program(mjx.fwd_position) == before
+    assert table == collision_driver._COLLISION_FUNC
+    capsules = mjx.GeomType.CAPSULE, mjx.GeomType.CAPSULE
+    assert table[capsules] is collision_primitive.capsule_capsule

@@ -1,0 +1,67 @@
+"""A user's own MJCF: the 20-line script trains, and what MJX cannot run is explained."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import mujoco
+import pytest
+
+from mjx_reinforce import envs
+from mjx_reinforce.envs import models
+
+SCRIPT = Path(__file__).parents[1] / "experiments" / "own_model.py"
+ONE_JOINT = """
+<mujoco>
+  <option {option}/>
+  <worldbody>
+    <geom type="{floor}" size="1 1 1"/>
+    <body><joint/><geom type="ellipsoid" size=".1 .2 .3"/></body>
+  </worldbody>
+</mujoco>
+"""
+
+
+def test_the_script_learns():
+    command = [sys.executable, "-W", "ignore", str(SCRIPT)]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    returns = [float(x) for x in re.findall(r"return +(-?[\d.]+)", printed)]
+    assert len(returns) == 4
+    assert returns[-1] > returns[0] / 3
+
+
+@pytest.mark.parametrize(
+    ("option", "floor", "message"),
+    [
+        ('solver="PGS"', "plane", "SOL_PGS.*Newton"),
+        ('integrator="implicit"', "plane", "implicitfast"),
+        ('integrator="implicitfast" density="1"', "plane", "fluid drag.*Euler"),
+    ],
+)
+def test_what_mjx_lacks_is_named_with_a_remedy(option, floor, message):
+    MjModel = mujoco.MjModel  # pyright: ignore[reportAttributeAccessIssue] # noqa: N806
+    model = MjModel.from_xml_string(ONE_JOINT.format(option=option, floor=floor))
+    with pytest.raises(ValueError, match=message):
+        models.to_mjx(model, "mine.xml")
+
+
+@pytest.mark.parametrize(
+    ("xml_file", "message"),
+    [("mine.xml", r"'\./mine.xml'"), ("./mine.xml", "there is no model")],
+)
+def test_missing_files_are_explained(xml_file, message):
+    with pytest.raises(ValueError, match=message):
+        envs.make("InvertedPendulum-v5", xml_file=xml_file)
+
+
+def test_a_model_without_actuators_is_explained(tmp_path):
+    path = tmp_path / "still.xml"
+    path.write_text(ONE_JOINT.format(option="", floor="plane"), encoding="utf-8")
+    with pytest.raises(ValueError, match="no actuators"):
+        envs.make("InvertedPendulum-v5", xml_file=str(path))
+
+
+def test_a_class_of_ones_own_by_module_and_name(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    assert envs.make("own_model:Crane").max_episode_steps == 100
