@@ -53,7 +53,14 @@ def make(id: str, /, **kwargs: Any) -> Any:
     """
     check_id(id)
     entry, settings = (id, {}) if ":" in id else _TABLE[id]
-    return load(entry)(**(settings | kwargs))
+    try:
+        build = load(entry)
+    except (ImportError, AttributeError) as error:
+        raise ValueError(
+            f"cannot import the environment {id!r}: {error}; write module:Class of a module "
+            "that is in this folder or installed"
+        ) from error
+    return build(**(settings | kwargs))
 
 
 def check_id(id: str) -> None:

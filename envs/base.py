@@ -78,8 +78,8 @@ class MujocoEnv(Env):
           max_episode_steps: the time limit, in env steps.
           reward_threshold: the return at which the task counts as solved, if any.
           solver: "exact" is ``physics.step``, which is C MuJoCo 4.0's answer, with no loops
-            where it has a closed form; "mjx" is ``mjx.step`` as it is; "fast" is ``mjx.step`` with one
-            solver iteration of four line-search steps, which is not exact.
+            where it has a closed form; "mjx" is ``mjx.step`` as it is; "fast" is ``mjx.step``
+            with one solver iteration of four line-search steps, which is not exact.
 
         Raises:
           ValueError: ``solver`` is unknown, or MJX cannot run the model.

@@ -21,14 +21,8 @@ from rich.table import Table
 class Display:
     """A progress bar on a terminal, one line an evaluation elsewhere."""
 
-    def __init__(self, budget: int):
-        """Prepares the display.
-
-        Args:
-          budget: env steps that each seed trains for.
-        """
+    def __init__(self):
         self.console = Console()
-        self._budget = budget
         self._progress = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
@@ -57,12 +51,15 @@ class Display:
 
     def start(self) -> None:
         """Marks the end of compilation, from where the time left is counted."""
-        self._progress.reset(self._task, total=self._budget, description="training")
+        self._progress.reset(self._task, total=1.0, description="training")
 
-    def evaluated(self, update: int, steps: float, value: float, low: float, rate: float) -> None:
+    def evaluated(
+        self, done: float, update: int, steps: float, value: float, low: float, rate: float
+    ) -> None:
         """Shows an evaluation.
 
         Args:
+          done: the fraction of the budget that is used.
           update: how many updates were made.
           steps: env steps of the mean seed.
           value: interquartile mean of the return over seeds.
@@ -70,7 +67,7 @@ class Display:
           rate: env steps a second, all seeds together.
         """
         text = f"return {value:7.1f}  worst {low:7.1f}  {rate:,.0f} steps/s"
-        self._progress.update(self._task, completed=steps, description=text)
+        self._progress.update(self._task, completed=done, description=text)
         if not self.console.is_terminal:
             self.say(f"update {update:5d}  {steps:12,.0f} env steps a seed  {text}")
 
@@ -108,7 +105,9 @@ def print_summary(console: Console, summary: dict[str, Any], directory: Path) ->
         solved = [steps for steps in summary["env_steps_to_solve"] if steps is not None]
         table.add_row("seeds solved at the end", f"{summary['solve_rate']:.0%}")
         if solved:
+            episodes = [number for number in summary["episodes_to_solve"] if number is not None]
             table.add_row("env steps to solve", f"{min(solved):,} to {max(solved):,}")
+            table.add_row("episodes to solve", f"{min(episodes):,} to {max(episodes):,}")
     table.add_row("env steps a second", f"{summary['env_steps_per_second']:,.0f}")
     table.add_row("useful steps of those simulated", f"{summary['useful_step_fraction']:.0%}")
     table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")

@@ -6,8 +6,10 @@ and never sees the policy. With the discounted return to go written
 
     G[t] = r[t] + discount * G[t + 1],
 
-every estimator here is unbiased for the same gradient (the critic's up to its
-own step, ``standardize`` up to a positive factor); they differ in variance.
+every estimator here but two is unbiased for the same gradient (the critic's up to
+its own step, ``standardize`` up to a positive factor); they differ in variance.
+``mean_log_prob`` and ``normalized_returns`` are of published programs, and say
+what they follow instead.
 """
 
 from collections.abc import Callable
@@ -100,6 +102,47 @@ def leave_one_out(discount: float | jax.Array = 0.99, *, ended: str = "zero") ->
         return returns - jnp.where(others > 0, baseline, 0.0)
 
     return _stateless(weigh, min_episodes=2)
+
+
+def mean_log_prob(discount: float | jax.Array = 0.99) -> Estimator:
+    """Weights every action of an episode of L steps by sum_t G[t] / L.
+
+    That is what the loss ``-sum(mean(log_probs) * returns)`` of Gymnasium's first
+    REINFORCE tutorial comes to, though its comment promises the sum of the
+    products log pi[t] G[t]: the mean over log-probabilities is taken before the
+    product. Its gradient is unbiased, but for E[sum_t G[t] / L], which counts a
+    reward the more often the later it comes; and no action is told what came after
+    it from what came before, which makes it noisy besides.
+    """
+    _check_discount(discount)
+
+    def weigh(trajectory):
+        returns = discounted_returns(trajectory.reward, discount)
+        return jnp.broadcast_to(_episode_mean(returns, trajectory.mask), returns.shape)
+
+    return _stateless(weigh)
+
+
+def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
+    """Weights an action by G[t], normalised within its episode.
+
+    The weight is ``(G[t] - mean) / (std + 1.19e-7)``, with the mean and the
+    unbiased standard deviation over the steps of the episode, and 0 in an episode
+    of one step. It is biased: the mean depends on the action, and as every episode
+    is scaled to the same spread, a long one teaches nothing by being long. Where
+    each step earns the same, the weight is a function of the time that is left:
+    early actions are always encouraged, late ones always discouraged.
+    """
+    _check_discount(discount)
+
+    def weigh(trajectory):
+        mask = trajectory.mask
+        returns = discounted_returns(trajectory.reward, discount)
+        centred = jnp.where(mask, returns - _episode_mean(returns, mask), 0.0)
+        variance = jnp.sum(centred**2, axis=0) / jnp.maximum(jnp.sum(mask, axis=0) - 1, 1)
+        return centred / (jnp.sqrt(variance) + float(jnp.finfo(jnp.float32).eps))
+
+    return _stateless(weigh)
 
 
 class _Critic(NamedTuple):
@@ -220,6 +263,11 @@ def _stateless(weigh: Callable[[Trajectory], jax.Array], min_episodes: int = 1) 
         return jnp.where(trajectory.mask, weigh(trajectory), 0.0), state, {}
 
     return Estimator(lambda key, observation_size: (), update, min_episodes)
+
+
+def _episode_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
+    """Returns the mean [N] of ``x`` [T, N] over the steps of every episode."""
+    return jnp.sum(jnp.where(mask, x, 0.0), axis=0) / jnp.maximum(jnp.sum(mask, axis=0), 1)
 
 
 def _explained(residual: jax.Array, returns: jax.Array, mask: jax.Array) -> jax.Array:

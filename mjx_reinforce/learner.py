@@ -1,6 +1,7 @@
 """REINFORCE as a pair of pure functions, ``init`` and ``step``, over one state pytree."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -10,12 +11,19 @@ import optax
 from flax import struct
 
 from mjx_reinforce import engines, normalize
-from mjx_reinforce.distributions import normal
+from mjx_reinforce.distributions import Distribution, categorical, normal
 from mjx_reinforce.estimators import Estimator, leave_one_out, standardize
-from mjx_reinforce.gradients import accumulate_gradient
 from mjx_reinforce.policies import Policy, mlp_policy
 from mjx_reinforce.rollouts import episode_lengths, episode_returns, simulated_steps
-from mjx_reinforce.types import Environment, Trajectory, action_space, observation_size
+from mjx_reinforce.types import (
+    Box,
+    Discrete,
+    Environment,
+    Trajectory,
+    action_space,
+    observation_size,
+)
+from mjx_reinforce.updates import Problem, Update, full_batch, make_optimizer
 
 Metrics = dict[str, jax.Array]
 
@@ -41,6 +49,7 @@ class TrainState:
     actor: the policy's parameters and the observation statistics
     opt_state: the optimiser's state
     estimator_state: the estimator's, such as a critic
+    start_key: [] what every episode is reset with, where all start alike; else None
     """
 
     key: jax.Array
@@ -48,6 +57,7 @@ class TrainState:
     actor: Actor
     opt_state: Any
     estimator_state: Any
+    start_key: jax.Array | None = None
 
 
 class Learner(NamedTuple):
@@ -68,16 +78,9 @@ class Learner(NamedTuple):
     engine: engines.Engine
 
 
-def default_optimizer(
-    learning_rate: Any = 1e-2, max_grad_norm: float | jax.Array = 1.0
-) -> optax.GradientTransformation:
-    """Adam on the gradient scaled down to a norm of at most ``max_grad_norm``.
-
-    Args:
-      learning_rate: a number or an optax schedule over updates.
-      max_grad_norm: bound of the Euclidean norm of the whole gradient.
-    """
-    return optax.chain(optax.clip_by_global_norm(max_grad_norm), optax.adam(learning_rate))
+def default_distribution(space: Box | Discrete) -> Distribution:
+    """Returns a Normal with a trained std, or a categorical distribution if discrete."""
+    return categorical(space) if isinstance(space, Discrete) else normal(space)
 
 
 def reinforce(
@@ -86,11 +89,13 @@ def reinforce(
     policy: Policy | None = None,
     estimator: Estimator | None = None,
     optimizer: optax.GradientTransformation | None = None,
+    update: Update | None = None,
     num_episodes: int = 16,
     horizon: int | None = None,
     entropy_cost: float | jax.Array = 0.0,
     loss_per: str = "episode",
-    normalize_steps: int = 1000,
+    normalize_steps: float = 1000,
+    one_start: bool = False,
     engine: str = "auto",
 ) -> Learner:
     """Builds REINFORCE (Williams 1992) for an environment.
@@ -104,10 +109,11 @@ def reinforce(
 
     Args:
       env: what is played; any brax-style environment.
-      policy: by default an MLP of 32 and 32 tanh units with a Normal.
+      policy: by default an MLP of 32 and 32 tanh units with ``default_distribution``.
       estimator: by default leave-one-out on the return to go (discount 0.99),
         divided by its standard deviation plus 10.
       optimizer: by default Adam at 1e-2 with the gradient's norm clipped at 1.
+      update: how the gradient is spent, from ``updates``; by default in one step.
       num_episodes: N, episodes an update.
       horizon: T, steps after which an episode ends; by default the environment's
         ``max_episode_steps``.
@@ -117,8 +123,10 @@ def reinforce(
       normalize_steps: observations are scaled by the mean and standard deviation
         of about the first so many steps, then the scale stands still: one that
         follows a policy which learns to keep near the middle drives up its gain
-        until it fails. 0 leaves them as they are. Each update uses the statistics
-        that its episodes were played with.
+        until it fails. 0 leaves them as they are, inf never stops. Each update uses
+        the statistics that its episodes were played with.
+      one_start: reset every episode of a seed with the same key, drawn at ``init``: it
+        knows a single start, which is easier, and not the task. Seeds differ in theirs.
       engine: how episodes are played: "auto", "mjx", "fused" or "kernel", see ``engines``.
 
     Returns:
@@ -130,9 +138,8 @@ def reinforce(
     horizon = check_horizon(env, horizon)
     size = observation_size(env)
     if policy is None:
-        policy = mlp_policy(size, normal(action_space(env)))
+        policy = mlp_policy(size, default_distribution(action_space(env)))
     estimator = standardize(leave_one_out(), floor=10.0) if estimator is None else estimator
-    optimizer = default_optimizer() if optimizer is None else optimizer
     if num_episodes < estimator.min_episodes:
         raise ValueError(
             f"this estimator needs at least {estimator.min_episodes} episodes an update, "
@@ -140,67 +147,83 @@ def reinforce(
         )
     if loss_per not in ("episode", "step"):
         raise ValueError(f"loss_per must be 'episode' or 'step', got {loss_per!r}")
-    surrogate = _surrogate(policy, entropy_cost)
+    parts = _Reinforce(
+        env=env,
+        policy=policy,
+        estimator=estimator,
+        optimizer=make_optimizer() if optimizer is None else optimizer,
+        update=full_batch() if update is None else update,
+        num_episodes=num_episodes,
+        horizon=horizon,
+        entropy_cost=entropy_cost,
+        per_step=loss_per == "step",
+        normalize_steps=normalize_steps,
+        one_start=one_start,
+        size=size,
+    )
+    actor = jax.eval_shape(parts.first_actor, jax.random.key(0))
+    chosen = engines.choose(engine, env, engines.Player(parts.act, actor, policy.distribution))
+    step = functools.partial(parts.step, chosen.rollout)
+    return Learner(parts.init, step, parts.act, policy, chosen)
 
-    def act(actor, observation):
-        return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))
 
-    def first_actor(key):
-        return Actor(params=policy.init(key), normalizer=normalize.init(size))
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class _Reinforce:
+    """The arguments of ``reinforce``, and what it does with them; ``size`` is O."""
 
-    def init(key):
+    env: Environment
+    policy: Policy
+    estimator: Estimator
+    optimizer: optax.GradientTransformation
+    update: Update
+    num_episodes: int
+    horizon: int
+    entropy_cost: float | jax.Array
+    per_step: bool
+    normalize_steps: float
+    one_start: bool
+    size: int
+
+    def act(self, actor: Actor, observation: jax.Array) -> jax.Array:
+        return self.policy.apply(actor.params, normalize.apply(actor.normalizer, observation))
+
+    def first_actor(self, key: jax.Array) -> Actor:
+        return Actor(params=self.policy.init(key), normalizer=normalize.init(self.size))
+
+    def init(self, key: jax.Array) -> TrainState:
         policy_key, estimator_key, key = jax.random.split(key, 3)
-        actor = first_actor(policy_key)
+        start_key = None
+        if self.one_start:
+            key, start_key = jax.random.split(key)
+        actor = self.first_actor(policy_key)
         return TrainState(
             key=key,
             update=jnp.zeros((), jnp.int32),
             actor=actor,
-            opt_state=optimizer.init(actor.params),
-            estimator_state=estimator.init(estimator_key, size),
+            opt_state=self.optimizer.init(actor.params),
+            estimator_state=self.estimator.init(estimator_key, self.size),
+            start_key=start_key,
         )
 
-    shapes = jax.eval_shape(first_actor, jax.random.key(0))
-    player = engines.Player(act, shapes, policy.distribution)
-    chosen = engines.choose(engine, env, player)
-
-    def play(actor, key, active):
-        return chosen.rollout(
-            env,
-            act,
-            actor,
-            policy.distribution,
-            key,
-            num_episodes=num_episodes,
-            horizon=horizon,
+    def step(
+        self, rollout: Callable[..., Trajectory], state: TrainState, active: Any = True
+    ) -> tuple[TrainState, Metrics]:
+        key, episodes_key, update_key = jax.random.split(state.key, 3)
+        trajectory = rollout(
+            self.env if state.start_key is None else _OneStart(self.env, state.start_key),
+            self.act,
+            state.actor,
+            self.policy.distribution,
+            episodes_key,
+            num_episodes=self.num_episodes,
+            horizon=self.horizon,
             active=active,
         )
-
-    def learn(state, trajectory):
-        """Returns the actor, optimiser state and estimator state that the episodes lead to."""
-        actor, mask = state.actor, trajectory.mask
-        scaled = normalize.apply(actor.normalizer, trajectory.observation)
-        seen = dataclasses.replace(trajectory, observation=scaled)
-        weight, estimator_state, metrics = estimator.update(state.estimator_state, seen)
-        data = (scaled, trajectory.action, weight, mask)
-        _, grads, sums = accumulate_gradient(surrogate, actor.params, data)
-        steps = jnp.maximum(jnp.sum(mask), 1)
-        divisor = num_episodes if loss_per == "episode" else steps
-        grads = jax.tree.map(lambda g: g / divisor, grads)
-        updates, opt_state = optimizer.update(grads, state.opt_state, actor.params)
-        params = optax.apply_updates(actor.params, updates)
-        normalizer = normalize.update(
-            actor.normalizer, trajectory.observation, mask, normalize_steps
-        )
-        metrics |= {"entropy": sums["entropy"] / steps, "gradient_norm": optax.tree.norm(grads)}
-        return (Actor(params=params, normalizer=normalizer), opt_state, estimator_state), metrics
-
-    def step(state, active=True):
-        key, episodes_key = jax.random.split(state.key)
-        trajectory = play(state.actor, episodes_key, active)
-        learned, metrics = learn(state, trajectory)
+        learned, metrics = self._learn(state, trajectory, update_key)
         known = state.actor, state.opt_state, state.estimator_state
         (actor, opt_state, estimator_state), skipped = keep_finite(learned, known)
-        proposed = TrainState(
+        proposed = dataclasses.replace(
+            state,
             key=key,
             update=state.update + 1,
             actor=actor,
@@ -211,7 +234,40 @@ def reinforce(
             proposed = jax.tree.map(lambda new, old: jnp.where(active, new, old), proposed, state)
         return proposed, episode_metrics(trajectory) | metrics | {"skipped_update": skipped}
 
-    return Learner(init, step, act, policy, chosen)
+    def _learn(
+        self, state: TrainState, trajectory: Trajectory, key: jax.Array
+    ) -> tuple[tuple[Actor, Any, Any], Metrics]:
+        """Returns the actor, optimiser state and estimator state that the episodes lead to."""
+        actor, mask = state.actor, trajectory.mask
+        scaled = normalize.apply(actor.normalizer, trajectory.observation)
+        seen = dataclasses.replace(trajectory, observation=scaled)
+        weight, estimator_state, metrics = self.estimator.update(state.estimator_state, seen)
+        problem = Problem(
+            surrogate=_surrogate(self.policy, self.entropy_cost),
+            optimizer=self.optimizer,
+            samples=(scaled, trajectory.action, weight, mask),
+            divisor=jnp.maximum(jnp.sum(mask), 1) if self.per_step else self.num_episodes,
+        )
+        params, opt_state, spent = self.update(problem, key, actor.params, state.opt_state)
+        normalizer = normalize.update(
+            actor.normalizer, trajectory.observation, mask, self.normalize_steps
+        )
+        actor = Actor(params=params, normalizer=normalizer)
+        return (actor, opt_state, estimator_state), metrics | spent
+
+
+class _OneStart:
+    """An environment whose every episode starts with the same key."""
+
+    def __init__(self, env: Environment, key: jax.Array):
+        self._env, self._key = env, key
+
+    def reset(self, rng: jax.Array) -> Any:
+        del rng
+        return self._env.reset(self._key)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
 
 
 def _surrogate(policy: Policy, entropy_cost: float | jax.Array) -> Callable[..., Any]:

@@ -63,8 +63,9 @@ def update(
 def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
     """Returns ``observation`` [..., O] in standard deviations from the mean, clipped at 10.
 
-    With no observation counted yet it comes back unchanged but for the clip.
+    With no observation counted yet it comes back unchanged.
     """
     variance = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
-    std = jnp.where(normalizer.count > 0, jnp.maximum(jnp.sqrt(variance), _MIN_STD), 1.0)
-    return jnp.clip((observation - normalizer.mean) / std, -_CLIP, _CLIP)
+    std = jnp.maximum(jnp.sqrt(variance), _MIN_STD)
+    scaled = jnp.clip((observation - normalizer.mean) / std, -_CLIP, _CLIP)
+    return jnp.where(normalizer.count > 0, scaled, observation)

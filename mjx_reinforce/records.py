@@ -29,7 +29,7 @@ def prepare(output: Path | None, env: str, overwrite: bool) -> Path:
       ValueError: it exists and is not empty, is no directory, or cannot be written.
     """
     stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")[:-3]
-    directory = Path("runs") / f"{env}-{stamp}" if output is None else output
+    directory = Path("runs") / f"{env.replace(':', '.')}-{stamp}" if output is None else output
     try:
         directory.mkdir(parents=True, exist_ok=True)
         if any(directory.iterdir()) and not overwrite:

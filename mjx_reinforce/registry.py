@@ -9,6 +9,12 @@ from typing import Any
 DISTRIBUTIONS = {
     "normal": "mjx_reinforce.distributions:normal",
     "normal-softplus": "mjx_reinforce.distributions:normal_softplus",
+    "normal-sigmoid": "mjx_reinforce.distributions:normal_sigmoid",
+    "truncated-normal": "mjx_reinforce.distributions:truncated_normal",
+    "clipped-normal": "mjx_reinforce.distributions:clipped_normal",
+    "tanh-normal": "mjx_reinforce.distributions:tanh_normal",
+    "deterministic": "mjx_reinforce.distributions:deterministic",
+    "categorical": "mjx_reinforce.distributions:categorical",
 }
 
 #: Gradient estimators: name -> "module:function" of a discount.
@@ -17,6 +23,8 @@ ESTIMATORS = {
     "reward-to-go": "mjx_reinforce.estimators:reward_to_go",
     "leave-one-out": "mjx_reinforce.estimators:leave_one_out",
     "value-baseline": "mjx_reinforce.estimators:value_baseline",
+    "mean-log-prob": "mjx_reinforce.estimators:mean_log_prob",
+    "normalized-returns": "mjx_reinforce.estimators:normalized_returns",
 }
 
 

@@ -15,12 +15,20 @@ from mjx_reinforce.statistics import iqm
 class RunLog:
     """Everything measured so far, and the files it goes to."""
 
-    def __init__(self, config: Config, directory: Path, display: Display, engine: str):
+    def __init__(
+        self,
+        config: Config,
+        directory: Path,
+        display: Display,
+        engine: str,
+        threshold: float | None,
+    ):
         self.used = np.zeros(config.num_seeds, np.int64)
         self._config, self._directory, self._display = config, directory, display
-        self._engine = engine
+        self._engine, self._threshold = engine, threshold
         self._rows: list[dict[str, Any]] = []
         self._evaluations: list[dict[str, np.ndarray]] = []
+        self._training: list[dict[str, np.ndarray]] = []
         self._broken: list[dict[str, Any]] = []
         self._last: dict[str, np.ndarray] = {}
         self._simulated = 0.0
@@ -36,7 +44,18 @@ class RunLog:
         """Takes in the metrics [K, S] of a block of updates."""
         active = metrics["active"]
         steps = np.where(active, metrics["env_steps"], 0)
-        self.used += steps.sum(axis=0)
+        made = active.any(axis=1)
+        returns = np.where(active, metrics["episode_return"], np.nan)
+        used = self.used + np.cumsum(steps, axis=0, dtype=np.int64)
+        updates = self._update + np.cumsum(active, axis=0)
+        self._training.append(
+            {
+                "episode_return": returns[made],
+                "env_steps": used[made],
+                "episodes": updates[made] * self._config.episodes_per_update,
+            }
+        )
+        self.used = used[-1]
         # All seeds step on until the slowest is done, also those whose budget is used.
         self._simulated += metrics["simulated_steps"].max(axis=1).sum() * steps.shape[1]
         self._remember(metrics)
@@ -47,10 +66,19 @@ class RunLog:
         self._update += active.sum(axis=0)
 
     def finished(self) -> bool:
-        """Whether every seed has used its budget, or the updates are used up."""
-        limit = self._config.max_updates
-        exhausted = limit is not None and self._update.max() >= limit
-        return bool(exhausted or np.all(self.used >= self._config.env_steps))
+        """Whether the budget is used, or was asked to end early by what is solved."""
+        last = self._evaluations[-1]["eval_return"] if self._evaluations else np.array(-np.inf)
+        solved = self._threshold is not None and np.all(last >= self._threshold)
+        return bool(self._done() >= 1.0 or (self._config.stop_when_solved and solved))
+
+    def _done(self) -> float:
+        """Returns the fraction of the budget that the seed furthest from its end has used."""
+        done = np.zeros(self._config.num_seeds)
+        if self._config.env_steps is not None:
+            done = self.used / self._config.env_steps
+        if self._config.max_updates is not None:
+            done = np.maximum(done, self._update / self._config.max_updates)
+        return float(done.min())
 
     def _remember(self, metrics: dict[str, np.ndarray]) -> None:
         """Keeps each seed's metrics of its last update; a seed that stands still makes none."""
@@ -69,13 +97,15 @@ class RunLog:
 
     def evaluation(self, result: dict[str, np.ndarray]) -> None:
         """Takes in an evaluation [S], shows it, and writes metrics.csv."""
-        self._evaluations.append(result | {"env_steps": self.used.copy()})
+        episodes = self._update * self._config.episodes_per_update
+        self._evaluations.append(result | {"env_steps": self.used.copy(), "episodes": episodes})
         for s in range(self._config.num_seeds):
             self._rows.append(self._row(s, result))
         records.write_csv(self._directory / "metrics.csv", self._rows)
         returns = result["eval_return"]
         rate = self.used.sum() / self.seconds
         self._display.evaluated(
+            self._done(),
             int(self._update.max()),
             float(self.used.mean()),
             float(iqm(returns)),
@@ -90,6 +120,7 @@ class RunLog:
         return {
             "seed": seed,
             "update": int(self._update[seed]),
+            "episodes": int(self._update[seed]) * self._config.episodes_per_update,
             "env_steps": int(self.used[seed]),
             "wall_seconds": round(self.seconds, 3),
             "train_return": last("episode_return"),
@@ -104,18 +135,20 @@ class RunLog:
             "skipped_update": last("skipped_update"),
         }
 
-    def finish(self, compile_seconds: float, threshold: float | None) -> dict[str, Any]:
-        """Writes the summary and the picture; returns the summary."""
+    def finish(self, compile_seconds: float) -> dict[str, Any]:
+        """Writes the training returns, the summary and the picture; returns the summary."""
         seconds = self.seconds
         history = {
             name: np.stack([evaluation[name] for evaluation in self._evaluations])
-            for name in ("eval_return", "env_steps")
+            for name in ("eval_return", "env_steps", "episodes")
         }
+        training = self._training_returns()
+        records.write_bytes(self._directory / "returns.npz", report.to_npz(training))
         summary = {
             "env": self._config.env,
             "engine": self._engine,
             "num_seeds": self._config.num_seeds,
-            **report.summarize(history, threshold),
+            **report.summarize(history, self._threshold),
             "env_steps": self.used.tolist(),
             "compile_seconds": compile_seconds,
             "run_seconds": seconds,
@@ -124,7 +157,23 @@ class RunLog:
             "nonfinite": self._broken,
         }
         report.draw_learning_curve(
-            self._directory / "learning_curve.png", history, self._config.env, threshold
+            self._directory / "learning_curve.png",
+            history,
+            training,
+            self._config.env,
+            self._threshold,
+            "episodes" if self._config.env_steps is None else "env_steps",
         )
         records.write_json(self._directory / "summary.json", summary)
         return summary
+
+    def _training_returns(self) -> dict[str, np.ndarray]:
+        """Returns ``episode_return`` and the ``env_steps`` and ``episodes`` after it, [U, S]."""
+        types = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
+        return {
+            name: np.concatenate(
+                [np.zeros((0, self._config.num_seeds), kind)]
+                + [block[name] for block in self._training]
+            )
+            for name, kind in types.items()
+        }

@@ -1,11 +1,14 @@
 """``python -m mjx_reinforce.train`` trains many seeds at once and reports over them."""
 
 import dataclasses
+import gc
 import os
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +16,26 @@ import numpy as np
 import tyro
 
 from mjx_reinforce import envs
-from mjx_reinforce.config import Config, check
+from mjx_reinforce.build import build, policy_settings
+from mjx_reinforce.config import GROUPS, Config, check
+from mjx_reinforce.presets import PRESETS
+from mjx_reinforce.registry import check_name
 
-_FILES = "config.json", "metrics.csv", "summary.json", "learning_curve.png", "policy/"
+_FILES = (
+    "config.json",
+    "metrics.csv",
+    "returns.npz",
+    "summary.json",
+    "learning_curve.png",
+    "policy/",
+)
 
 
 def main() -> None:
     """Reads the command line, trains, and exits: 0 done, 2 bad input, 130 interrupted."""
-    config = tyro.cli(Config, prog="python -m mjx_reinforce.train", description=_description())
+    gc.disable()  # imports and tracing make many objects and no garbage: a second in eight
     try:
+        config = parse(sys.argv[1:])
         check(config)
         from mjx_reinforce import records
 
@@ -36,10 +50,40 @@ def main() -> None:
     sys.exit(130 if interrupted else 0)
 
 
+def parse(arguments: Sequence[str]) -> Config:
+    """Returns the settings that a command line asks for; --help and bad flags exit.
+
+    Args:
+      arguments: a preset's name, if any, then flags.
+
+    Raises:
+      ValueError: there is no such preset.
+    """
+    default, prog = Config(), "python -m mjx_reinforce.train"
+    if arguments and not arguments[0].startswith("-"):
+        name, *arguments = arguments
+        check_name("preset", name, PRESETS)
+        default, prog = PRESETS[name][1], f"{prog} {name}"
+    else:
+        prog = f"{prog} [PRESET]"
+    groups = [
+        (title, group, group(**{f.name: getattr(default, f.name) for f in fields(group)}))
+        for title, group in GROUPS.items()
+    ]
+    form = tyro.conf.OmitArgPrefixes[dataclasses.make_dataclass("Arguments", groups, frozen=True)]
+    parsed = tyro.cli(form, args=arguments, prog=prog, description=_description())
+    return Config(
+        **{name: x for title in GROUPS for name, x in vars(getattr(parsed, title)).items()}
+    )
+
+
 def _description() -> str:
+    width = max(map(len, PRESETS))
+    presets = "\n".join(f"  {name:{width}}  {line}" for name, (line, _) in PRESETS.items())
     return (
         "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. "
-        f"Leaves {', '.join(_FILES)} in the run directory. "
+        f"Leaves {', '.join(_FILES)} in the run directory.\n\n"
+        f"Presets, published programs whose settings replace the defaults:\n{presets}\n\n"
         f"Environments: {', '.join(envs.names())}."
     )
 
@@ -55,61 +99,6 @@ def _configure_jax() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if settings["jax_default_matmul_precision"] is None:
         jax.config.update("jax_default_matmul_precision", "highest")
-
-
-def build(env: Any, config: Config) -> tuple[Any, int]:
-    """Builds the learner that the settings describe.
-
-    Returns:
-      The learner, and the horizon in env steps.
-
-    Raises:
-      ValueError: the settings do not fit the environment.
-    """
-    import optax
-
-    from mjx_reinforce import estimators, learner
-    from mjx_reinforce.checkpoint import build_policy
-    from mjx_reinforce.registry import ESTIMATORS, load
-
-    horizon = learner.check_horizon(env, config.horizon)
-    estimator = load(ESTIMATORS[config.estimator])(config.discount)
-    if config.standardize:
-        estimator = estimators.standardize(estimator, floor=config.standardize_floor)
-    if config.discount_weights:
-        estimator = estimators.discount_weights(estimator, config.discount)
-    schedule = optax.linear_schedule(
-        config.learning_rate, config.final_learning_rate, config.decay_updates
-    )
-    built = learner.reinforce(
-        env,
-        policy=build_policy(policy_settings(env, config)),
-        estimator=estimator,
-        optimizer=learner.default_optimizer(schedule, config.max_grad_norm),
-        num_episodes=config.num_episodes,
-        horizon=horizon,
-        entropy_cost=config.entropy_cost,
-        loss_per=config.loss_per,
-        normalize_steps=config.normalize_steps,
-        engine=config.engine,
-    )
-    return built, horizon
-
-
-def policy_settings(env: Any, config: Config) -> dict[str, Any]:
-    """Returns what ``checkpoint.build_policy`` needs to rebuild the policy without the env."""
-    from mjx_reinforce.types import action_space, observation_size
-
-    space = action_space(env)
-    return {
-        "env": config.env,
-        "policy": config.policy,
-        "hidden_sizes": config.hidden_sizes,
-        "initial_std": config.initial_std,
-        "observation_size": observation_size(env),
-        "action_low": space.low.tolist(),
-        "action_high": space.high.tolist(),
-    }
 
 
 class Programs:
@@ -130,7 +119,11 @@ class Programs:
 
         def update(carry, _):
             states, used = carry
-            active = used < config.env_steps
+            active = jnp.ones(config.num_seeds, bool)
+            if config.env_steps is not None:
+                active &= used < config.env_steps
+            if config.max_updates is not None:
+                active &= states.update < config.max_updates
             states, metrics = jax.vmap(learner.step)(states, active)
             return (states, used + metrics["env_steps"]), metrics | {"active": active}
 
@@ -177,15 +170,18 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
 
     settings = dataclasses.asdict(config) | {"horizon": horizon, "output": str(directory)}
     records.write_json(directory / "config.json", settings | records.provenance())
-    with Display(config.env_steps) as display, Interrupt(display) as interrupt:
+    threshold = getattr(env, "reward_threshold", None)
+    with Display() as display, Interrupt(display) as interrupt:
         started = time.perf_counter()
         programs = Programs(env, learner, horizon, config)
         compile_seconds = time.perf_counter() - started
+        gc.freeze()
+        gc.enable()
         display.say(f"engine {learner.engine.name}: {learner.engine.why}")
         display.say(f"compiled in {compile_seconds:.1f} s")
         display.start()
         threading.Thread(target=report.load_libraries, daemon=True).start()
-        log = RunLog(config, directory, display, learner.engine.name)
+        log = RunLog(config, directory, display, learner.engine.name, threshold)
         while not interrupt.is_set():
             log.evaluation(programs.evaluate())
             if log.finished():
@@ -196,7 +192,7 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
             log.evaluation(programs.evaluate())
         actor = programs.carry[0].actor
     checkpoint.save_policy(directory / "policy", actor, policy_settings(env, config))
-    summary = log.finish(compile_seconds, getattr(env, "reward_threshold", None))
+    summary = log.finish(compile_seconds)
     print_summary(display.console, summary, directory)
     return interrupt.is_set()
 

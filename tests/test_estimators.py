@@ -64,6 +64,31 @@ def test_leave_one_out_by_hand(ended):
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
 
 
+def test_mean_log_prob_is_the_gradient_of_its_loss():
+    """The weight of log pi[t] in mean(log_probs) * sum(returns), episode by episode."""
+    returns, got = returns_by_hand(0.9), weights(est.mean_log_prob(0.9), make_trajectory())
+    for n, length in enumerate(LENGTHS):
+
+        def objective(log_probs, n=n, length=length):
+            return jnp.sum(jnp.mean(log_probs) * returns[:length, n])
+
+        np.testing.assert_allclose(
+            got[:length, n], jax.grad(objective)(jnp.ones(length)), rtol=1e-6
+        )
+        assert np.all(got[length:, n] == 0.0)
+
+
+def test_normalized_returns_by_hand():
+    returns = returns_by_hand(0.9)
+    got = weights(est.normalized_returns(0.9), make_trajectory())
+    for n, length in enumerate(LENGTHS):
+        own = returns[:length, n]
+        spread = np.std(own, ddof=1) if length > 1 else 0.0
+        expected = (own - own.mean()) / (spread + np.finfo(np.float32).eps)
+        np.testing.assert_allclose(got[:length, n], expected, rtol=1e-5, atol=1e-6)
+        assert np.all(got[length:, n] == 0.0)
+
+
 def test_standardize_and_discount_weights():
     raw = weights(est.reward_to_go(1.0), make_trajectory())
     mask = np.arange(4)[:, None] < LENGTHS
@@ -119,6 +144,24 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 def test_gradient_is_unbiased_on_a_bandit(case):
     estimator, discount = CASES[case]
+    assert_unbiased(estimator, functools.partial(expected_return, discount=discount))
+
+
+def test_mean_log_prob_is_unbiased_for_the_mean_return_to_go():
+    """E[sum_t G[t] / L]: at discount 1, reward t counts t + 1 times, over the length."""
+
+    def expected(logits):
+        log_probs, total = jax.nn.log_softmax(logits), 0.0
+        for arms in [(a, 0) for a in (0, 1)] + [(a, 1, b) for a in (0, 1) for b in (0, 1)]:
+            probability = jnp.exp(sum(log_probs[t, arm] for t, arm in enumerate(arms)))
+            earned = sum((t + 1) * Chain.rewards[t, arm] for t, arm in enumerate(arms))
+            total = total + probability * earned / len(arms)
+        return total
+
+    assert_unbiased(est.mean_log_prob(1.0), expected)
+
+
+def assert_unbiased(estimator, objective):
     policy = tabular_policy()
     learner = reinforce(
         Chain(),
@@ -135,7 +178,7 @@ def test_gradient_is_unbiased_on_a_bandit(case):
         return state.actor.params - start
 
     samples = jax.jit(jax.vmap(gradient))(jax.random.split(jax.random.key(1), 30_000))
-    exact = jax.grad(functools.partial(expected_return, discount=discount))(start)
+    exact = jax.grad(objective)(start)
     error = np.std(samples, axis=0) / np.sqrt(len(samples))
     assert np.all(np.abs(np.mean(samples, axis=0) - exact) < 4.5 * error + 1e-6)
 

@@ -18,6 +18,7 @@ from mjx_reinforce import (
     reinforce,
     rollout,
     train_step,
+    updates,
 )
 
 
@@ -148,9 +149,12 @@ def test_one_trace_and_nothing_donated():
     )
 
 
-def test_no_key_is_used_twice():
+@pytest.mark.parametrize(
+    "settings", [{}, {"update": updates.minibatches(2, 8), "one_start": True}], ids=str
+)
+def test_no_key_is_used_twice(settings):
     with jax.debug_key_reuse(True):
-        learner = reinforce(Survive(), num_episodes=4, estimator=critic())
+        learner = reinforce(Survive(), num_episodes=4, estimator=critic(), **settings)
         state = jax.jit(learner.init)(jax.random.key(0))
         state, _ = train_step(learner, state)
         train_step(learner, state)
@@ -202,6 +206,39 @@ def test_hyperparameters_vmap():
 
     moves = jax.vmap(step)(jnp.array([0.1, 0.2]))
     np.testing.assert_allclose(2 * moves[0], moves[1], rtol=1e-4)
+
+
+class Scattered(Survive):
+    """Starts anywhere."""
+
+    def observe(self, key):
+        return jax.random.uniform(key, (1,))
+
+
+@pytest.mark.parametrize("one_start", [True, False])
+def test_one_start_is_a_seeds_own_and_stays(one_start):
+    plain = estimators.reward_to_go()
+
+    def update(state, trajectory):
+        weight, state, _ = plain.update(state, trajectory)
+        return weight, state, {"start": trajectory.observation[0, :, 0]}
+
+    learner = reinforce(
+        Scattered(),
+        num_episodes=4,
+        estimator=plain._replace(update=update),
+        normalize_steps=0,
+        one_start=one_start,
+    )
+    states = jax.vmap(learner.init)(jax.random.split(jax.random.key(0), 3))
+    starts = []
+    for _ in range(2):
+        states, metrics = jax.vmap(functools.partial(train_step, learner))(states)
+        starts.append(np.asarray(metrics["start"]))
+    starts = np.stack(starts)  # [updates, seeds, episodes]
+    assert np.unique(starts).size == (3 if one_start else starts.size)
+    if one_start:
+        assert np.unique(starts[:, 0]).size == 1
 
 
 class Breaks(Survive):

@@ -65,3 +65,10 @@ def test_a_model_without_actuators_is_explained(tmp_path):
 def test_a_class_of_ones_own_by_module_and_name(monkeypatch):
     monkeypatch.syspath_prepend(SCRIPT.parent)
     assert envs.make("own_model:Crane").max_episode_steps == 100
+
+
+@pytest.mark.parametrize("id", ["own_modle:Crane", "own_model:Crain"])
+def test_a_class_that_is_not_there_is_explained(monkeypatch, id):
+    monkeypatch.syspath_prepend(SCRIPT.parent)
+    with pytest.raises(ValueError, match="cannot import the environment"):
+        envs.make(id)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from toys import Survive
 
-from mjx_reinforce import envs, load_policy, normalize
+from mjx_reinforce import envs, load_policy, normalize, report
 from mjx_reinforce import train as train_module
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
@@ -54,7 +54,7 @@ def test_a_run_leaves_its_files(run, tmp_path):
     assert all(int(row["env_steps"]) >= 1500 for row in last)
     assert summary["env"] == "Survive-v0"
     assert summary["num_seeds"] == 3
-    assert len(summary["env_steps_to_solve"]) == 3
+    assert len(summary["env_steps_to_solve"]) == len(summary["episodes_to_solve"]) == 3
     assert summary["iqm_ci"][0] <= summary["iqm"] <= summary["iqm_ci"][1]
     assert 0 < summary["useful_step_fraction"] <= 1
     for name in ("compile_seconds", "run_seconds", "env_steps_per_second", "engine", "solve_rate"):
@@ -65,6 +65,49 @@ def test_a_run_leaves_its_files(run, tmp_path):
     assert config["packages"]["jax"] == jax.__version__
     assert (out / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
     assert not list(out.glob(".*"))
+
+
+def test_training_returns_are_kept(run, tmp_path):
+    """Of every update until each seed's budget is used; after that it is NaN."""
+    assert run(*ARGUMENTS, "--output", "out", "--hidden-sizes", "4") == 0
+    rows, summary = read(tmp_path / "out")
+    with np.load(tmp_path / "out" / "returns.npz", allow_pickle=False) as archive:
+        training = dict(archive)
+    made = np.isfinite(training["episode_return"])
+    assert training["env_steps"][-1].tolist() == summary["env_steps"]
+    for seed, row in enumerate(rows[-3:]):
+        updates = int(row["update"])
+        assert made[:updates, seed].all()
+        assert not made[updates:, seed].any()
+        assert training["episodes"][-1, seed] == int(row["episodes"]) == 16 * updates
+        returns, steps = training["episode_return"][:, seed], training["env_steps"][:, seed]
+        assert returns[updates - 1] == pytest.approx(float(row["train_return"]))
+        # Survive pays 1 a step.
+        np.testing.assert_allclose(np.cumsum(16 * returns[:updates]), steps[:updates], rtol=1e-5)
+
+
+def test_the_number_of_updates_is_a_budget_by_itself(run, tmp_path):
+    arguments = ["--env", "Survive-v0", "--env-steps", "None", "--max-updates", "7"]
+    assert run(*arguments, "--output", "out") == 0
+    rows, _ = read(tmp_path / "out")
+    assert [int(row["update"]) for row in rows] == [0] * 4 + [5] * 4 + [7] * 4
+
+
+@pytest.mark.parametrize("horizon", [20, 8])
+def test_a_run_may_stop_when_solved(run, tmp_path, horizon):
+    """A fresh policy solves Survive, unless it has less time than the threshold of 15."""
+    arguments = ["--max-updates", "5", "--stop-when-solved", "--horizon", str(horizon)]
+    assert run(*ARGUMENTS, *arguments, "--output", "out") == 0
+    rows, summary = read(tmp_path / "out")
+    assert int(rows[-1]["update"]) == (0 if horizon == 20 else 5)
+    assert summary["episodes_to_solve"] == [0 if horizon == 20 else None] * 3
+
+
+def test_random_search_trains_and_loads(run, tmp_path):
+    assert run(*ARGUMENTS, "--algorithm", "ars", "--hidden-sizes", "--output", "out") == 0
+    policy, actor = load_policy(tmp_path / "out" / "policy", seed=1)
+    outputs = policy.apply(actor.params, normalize.apply(actor.normalizer, jnp.zeros(1)))
+    assert np.isfinite(policy.distribution.mode(outputs)[0])
 
 
 def test_a_seed_does_not_depend_on_how_many_there_are(run, tmp_path):
@@ -100,6 +143,18 @@ def test_the_saved_policy_plays_like_the_trained_one(run, tmp_path):
         (["--discount", "1.5"], r"--discount must be in [0, 1], got 1.5"),
         (["--hidden-sizes", "32", "0"], "positive in every layer"),
         (["--horizon", "0"], "--horizon must be at least 1"),
+        (["--env-steps", "None"], "nothing would end this run"),
+        (["--max-updates", "0"], "--max-updates must be at least 1, got 0"),
+        (["--max-grad-norm", "0"], "--max-grad-norm must be positive and finite, got 0.0"),
+        (["--weight-decay", "-1"], "--weight-decay must be finite and not negative"),
+        (["--minibatch-size", "0"], "--minibatch-size must be at least 1"),
+        (["--value-learning-rate", "0"], "--value-learning-rate must be positive"),
+        (["--policy", "deterministic"], "no log-probability"),
+        (["--update", "each-step"], "pass --decay-updates None"),
+        (["--algorithm", "ars", "--one-start"], "--shared-starts"),
+        (["--algorithm", "ars", "--top-directions", "9"], "at most --num-directions 8, got 9"),
+        (["--algorithm", "ars", "--ars-update", "document"], "pass --hidden-sizes alone"),
+        (["gymnasium"], "Did you mean 'gymnasium-tutorial'"),
         (["--output", "taken"], "is not empty"),
         (["--output", "taken/file"], "cannot write"),
         (["--output", "/proc/no"], "cannot write"),
@@ -114,6 +169,18 @@ def test_bad_input_is_explained_before_anything_starts(run, tmp_path, capsys, ar
     assert error.count("\n") <= 2
     assert not (tmp_path / "runs").exists()
     assert (tmp_path / "taken" / "file").read_text() == "mine"
+
+
+def test_solving_needs_a_threshold(run, monkeypatch, capsys):
+    monkeypatch.setattr(Survive, "reward_threshold", None)
+    assert run(*ARGUMENTS, "--stop-when-solved", "--output", "out") == 2
+    assert "leave --stop-when-solved out" in capsys.readouterr().err
+
+
+def test_smoothing_is_a_mean_of_the_latest():
+    values = np.arange(12.0).reshape(6, 2)
+    expected = [values[max(0, u - 2) : u + 1].mean(axis=0) for u in range(6)]
+    np.testing.assert_allclose(report.smooth(values, 3), expected)
 
 
 def test_overwrite_is_by_request_alone(run, tmp_path):

@@ -1,0 +1,135 @@
+"""From settings to a learner."""
+
+import math
+from typing import Any
+
+from mjx_reinforce.config import Config
+
+
+def build(env: Any, config: Config) -> tuple[Any, int]:
+    """Builds the learner that the settings describe.
+
+    Returns:
+      The learner, and the horizon in env steps.
+
+    Raises:
+      ValueError: the settings do not fit the environment.
+    """
+    from mjx_reinforce import learner
+    from mjx_reinforce.checkpoint import build_policy
+
+    if config.stop_when_solved and getattr(env, "reward_threshold", None) is None:
+        raise ValueError(
+            f"{config.env} names no return at which it is solved: leave --stop-when-solved out"
+        )
+    horizon = learner.check_horizon(env, config.horizon)
+    policy = build_policy(policy_settings(env, config))
+    forever = config.normalize_steps is None
+    shared = {
+        "policy": policy,
+        "horizon": horizon,
+        "normalize_steps": math.inf if forever else config.normalize_steps,
+        "engine": config.engine,
+    }
+    if config.algorithm == "ars":
+        return _build_ars(env, config, shared), horizon
+    built = learner.reinforce(
+        env,
+        estimator=_build_estimator(config),
+        optimizer=_build_optimizer(config),
+        update=_build_update(config),
+        num_episodes=config.num_episodes,
+        entropy_cost=config.entropy_cost,
+        loss_per=config.loss_per,
+        one_start=config.one_start,
+        **shared,
+    )
+    return built, horizon
+
+
+def policy_settings(env: Any, config: Config) -> dict[str, Any]:
+    """Returns what ``checkpoint.build_policy`` needs to rebuild the policy without the env."""
+    from mjx_reinforce.types import Discrete, action_space, observation_size
+
+    space = action_space(env)
+    if isinstance(space, Discrete):
+        family, described = "categorical", {"num_actions": space.num_actions}
+    else:
+        family = "normal" if config.algorithm == "reinforce" else "deterministic"
+        described = {"action_low": space.low.tolist(), "action_high": space.high.tolist()}
+    return {
+        "env": config.env,
+        "policy": family if config.policy == "auto" else config.policy,
+        "hidden_sizes": config.hidden_sizes,
+        "shared_trunk": config.shared_trunk,
+        "initializer": config.initializer,
+        "initial_std": config.initial_std,
+        "rescale": config.rescale,
+        "observation_size": observation_size(env),
+        **described,
+    }
+
+
+def _build_ars(env: Any, config: Config, shared: dict[str, Any]) -> Any:
+    from mjx_reinforce.ars import ars
+
+    return ars(
+        env,
+        num_directions=config.num_directions,
+        top_directions=config.top_directions,
+        step_size=config.step_size,
+        noise_std=config.noise_std,
+        shared_starts=config.shared_starts,
+        update=config.ars_update,
+        **shared,
+    )
+
+
+def _build_estimator(config: Config) -> Any:
+    import optax
+
+    from mjx_reinforce import estimators
+    from mjx_reinforce.networks import MLP
+    from mjx_reinforce.registry import ESTIMATORS, load
+
+    settings = {}
+    if config.estimator == "value-baseline":
+        settings = {
+            "network": MLP(config.value_hidden_sizes, 1, initializer=config.initializer),
+            "optimizer": optax.adam(config.value_learning_rate),
+            "num_fits": config.value_fits,
+        }
+    estimator = load(ESTIMATORS[config.estimator])(config.discount, **settings)
+    if config.standardize:
+        estimator = estimators.standardize(estimator, floor=config.standardize_floor)
+    if config.discount_weights:
+        estimator = estimators.discount_weights(estimator, config.discount)
+    return estimator
+
+
+def _build_optimizer(config: Config) -> Any:
+    import optax
+
+    from mjx_reinforce.updates import make_optimizer
+
+    rate: Any = config.learning_rate
+    if config.decay_updates is not None:
+        final = config.final_learning_rate
+        final = config.learning_rate / 10 if final is None else final
+        # The schedule counts optimiser steps.
+        each = config.minibatch_updates if config.update == "minibatches" else 1
+        rate = optax.linear_schedule(rate, final, config.decay_updates * each)
+    return make_optimizer(
+        config.optimizer,
+        rate,
+        weight_decay=config.weight_decay,
+        max_grad_norm=config.max_grad_norm,
+    )
+
+
+def _build_update(config: Config) -> Any:
+    from mjx_reinforce import updates
+
+    if config.update == "minibatches":
+        return updates.minibatches(config.minibatch_updates, config.minibatch_size)
+    return updates.full_batch() if config.update == "full-batch" else updates.each_step()

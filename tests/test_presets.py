@@ -1,0 +1,121 @@
+"""Every preset: its settings make sense, it trains through the command line, it is the program's.
+
+The physics is that of a toy where it would be MuJoCo's, which takes long to compile.
+"""
+
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import Survive
+
+from mjx_reinforce import envs
+from mjx_reinforce import train as train_module
+from mjx_reinforce.build import build, policy_settings
+from mjx_reinforce.checkpoint import build_policy
+from mjx_reinforce.config import Config, check
+from mjx_reinforce.presets import PRESETS
+
+TINY = ["--num-seeds", "2", "--max-updates", "2", "--horizon", "8"]
+TINY += ["--eval-every", "1", "--eval-episodes", "1", "--minibatch-updates", "3"]
+
+
+@pytest.fixture(autouse=True)
+def toys(monkeypatch, tmp_path):
+    for name in ("InvertedPendulum-v4", "InvertedDoublePendulum-v5"):
+        monkeypatch.setitem(envs._TABLE, name, (Survive, {}))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+
+
+def run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["train", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        train_module.main()
+    return stop.value.code
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_trains(name, monkeypatch, tmp_path):
+    arguments = [name, *TINY, "--output", "out", "--num-episodes", "2", "--num-directions", "2"]
+    assert run(monkeypatch, *arguments) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    config = json.loads((tmp_path / "out" / "config.json").read_text())
+    assert np.all(np.isfinite(summary["final_returns"]))
+    assert not summary["nonfinite"]
+    episodes = 4 if config["algorithm"] == "ars" else 2
+    with np.load(tmp_path / "out" / "returns.npz", allow_pickle=False) as training:
+        assert training["episode_return"].shape == training["env_steps"].shape == (2, 2)
+        np.testing.assert_array_equal(training["episodes"], [[episodes] * 2, [2 * episodes] * 2])
+    for setting in ("estimator", "optimizer", "learning_rate", "update", "policy", "one_start"):
+        assert config[setting] == getattr(PRESETS[name][1], setting)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_makes_sense(name):
+    line, config = PRESETS[name]
+    check(config)
+    assert 20 < len(line) < 100
+    assert train_module.parse([name]) == config
+    assert train_module.parse([name, "--discount", "0.5"]).discount == 0.5
+
+
+def test_no_preset_is_the_default():
+    assert train_module.parse([]) == Config()
+
+
+@pytest.mark.parametrize(
+    ("name", "std"),
+    [
+        ("gymnasium-tutorial", lambda x: np.log1p(np.exp(x))),
+        ("baseline-truncated-normal", None),
+        ("continuous-cartpole", lambda x: 1 / (1 + np.exp(-x))),
+    ],
+)
+def test_network_outputs_mean_what_they_do_in_the_program(name, std):
+    """The first is the mean itself; the second gives the std without a shift."""
+    config = PRESETS[name][1]
+    policy = build_policy(policy_settings(envs.make(config.env), config))
+    outputs = jnp.array([0.3, -0.7])
+    if std is None:  # a parameter that begins at log 1
+        assert policy.distribution.constants == (0.0,)
+        assert float(policy.distribution.mode(outputs)[0]) == pytest.approx(0.3)
+    else:
+        moved = policy.distribution.sample(outputs, jnp.array([2.0]))
+        assert float(moved[0]) == pytest.approx(0.3 + 2 * std(-0.7), rel=1e-5)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_first_weights_are_pytorchs(name):
+    """Uniform within 1 / sqrt(fan-in), biases too; the critic's as well."""
+    config = PRESETS[name][1]
+    learner, _ = build(envs.make(config.env), config)
+    state = jax.vmap(learner.init)(jax.random.split(jax.random.key(0), 50))
+    params = [state.actor.params["network"]["params"]]
+    if config.estimator == "value-baseline" and config.algorithm == "reinforce":
+        params.append(state.estimator_state.params["params"])
+    for layer in [layer for network in params for layer in network.values()]:
+        bound = layer["kernel"].shape[-2] ** -0.5
+        for x in layer.values():
+            assert 0.8 * bound < float(jnp.max(jnp.abs(x))) <= bound
+
+
+def test_an_unknown_preset_is_explained(monkeypatch, capsys):
+    assert run(monkeypatch, "gymnasium-tutorail") == 2
+    assert "Did you mean 'gymnasium-tutorial'" in capsys.readouterr().err
+
+
+def test_help_lists_presets_and_groups_without_jax():
+    code = (
+        "import sys\nfrom mjx_reinforce import train\n"
+        "try: train.parse(['--help'])\n"
+        "except SystemExit: print('jax' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.endswith("False\n")
+    for text in (*PRESETS, "policy options", "updates options", "--ars-update"):
+        assert text in done.stdout

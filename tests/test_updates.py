@@ -1,0 +1,209 @@
+"""Updates and optimisers against loops by hand."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from toys import Survive, Target
+
+from mjx_reinforce import estimators, reinforce, train_step, updates
+from mjx_reinforce.updates import Problem
+
+LENGTHS = np.array([4, 1, 3])
+MASK = np.arange(5)[:, None] < LENGTHS
+
+
+def surrogate(params, samples):
+    """Any function that is not linear in the parameters."""
+    observation, action, weight, mask = samples
+    entropy = jnp.cos(params["w"] * observation[..., 0])
+    terms = weight * jnp.tanh(params["w"] * observation[..., 0] - action[..., 0] * params["b"])
+    loss = -jnp.sum(jnp.where(mask, terms, 0.0))
+    return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
+
+
+def make_problem(optimizer, divisor=3, mask=MASK, seed=0):
+    rng = np.random.default_rng(seed)
+    observation, action = rng.normal(size=(2, *mask.shape, 1))
+    weight = np.where(mask, rng.normal(size=mask.shape), 0.0)
+    samples = tuple(map(jnp.asarray, (observation, action, weight, mask)))
+    return Problem(surrogate, optimizer, samples, divisor)
+
+
+PARAMS = {"w": jnp.array(0.7), "b": jnp.array(-0.4)}
+
+
+def run(update, problem, key=None):
+    key = jax.random.key(1) if key is None else key
+    return update(problem, key, PARAMS, problem.optimizer.init(PARAMS))
+
+
+def descend(problem, params, opt_state, samples, divisor):
+    grads, sums = jax.grad(surrogate, has_aux=True)(params, samples)
+    grads = jax.tree.map(lambda g: g / divisor, grads)
+    changes, opt_state = problem.optimizer.update(grads, opt_state, params)
+    norm = np.sqrt(sum(float(g) ** 2 for g in grads.values()))
+    return optax.apply_updates(params, changes), opt_state, norm, float(sums["entropy"])
+
+
+def assert_close(got, expected):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), got, expected)
+
+
+def test_full_batch_is_one_step():
+    problem = make_problem(optax.adam(0.1))
+    params, opt_state, metrics = run(updates.full_batch(), problem)
+    start = PARAMS, problem.optimizer.init(PARAMS)
+    expected = descend(problem, *start, problem.samples, 3)
+    assert_close((params, opt_state), expected[:2])
+    assert float(metrics["gradient_norm"]) == pytest.approx(expected[2], rel=1e-5)
+    assert float(metrics["entropy"]) == pytest.approx(expected[3] / MASK.sum(), rel=1e-5)
+
+
+def each_step_by_hand(problem):
+    params, opt_state = PARAMS, problem.optimizer.init(PARAMS)
+    norms, entropy, mask = [], 0.0, np.asarray(problem.samples[-1])
+    for t in range(len(mask)):
+        if mask[t].any():
+            now = tuple(x[t] for x in problem.samples)
+            params, opt_state, norm, sums = descend(problem, params, opt_state, now, 3)
+            norms, entropy = [*norms, norm], entropy + sums
+    return params, opt_state, {"entropy": entropy / mask.sum(), "gradient_norm": np.mean(norms)}
+
+
+def test_each_step_is_a_loop_over_time():
+    problem = make_problem(optax.adam(0.1))
+    assert_close(run(updates.each_step(), problem), each_step_by_hand(problem))
+
+
+def test_each_step_of_one_seed_ends_with_its_own_episodes():
+    """Beside a seed whose episodes are longer; Adam would move on without a gradient."""
+    short, optimizer = np.arange(5)[:, None] < np.array([2, 1, 1]), optax.adam(0.1)
+    problems = [make_problem(optimizer), make_problem(optimizer, mask=short, seed=1)]
+    samples = jax.tree.map(lambda *x: jnp.stack(x), *[p.samples for p in problems])
+
+    def update(samples):
+        return run(updates.each_step(), Problem(surrogate, optimizer, samples, 3))
+
+    together = jax.vmap(update)(samples)
+    for s, problem in enumerate(problems):
+        alone = jax.tree.map(lambda x, s=s: x[s], together)
+        assert_close(alone, each_step_by_hand(problem))
+
+
+def test_minibatches_are_steps_on_drawn_samples():
+    problem, key = make_problem(optax.adam(0.1)), jax.random.key(5)
+    got = run(updates.minibatches(3, 4), problem, key)
+    drawn = jax.random.randint(key, (3, 4), 1, MASK.sum() + 1)
+    flat = [x.reshape(-1, *x.shape[2:]) for x in problem.samples]
+    params, opt_state, norms, entropy = PARAMS, problem.optimizer.init(PARAMS), [], []
+    for index in np.flatnonzero(MASK)[np.asarray(drawn) - 1]:
+        batch = tuple(x[index] for x in flat)
+        params, opt_state, norm, sums = descend(problem, params, opt_state, batch, 4)
+        norms, entropy = [*norms, norm], [*entropy, sums / 4]
+    metrics = {"entropy": np.mean(entropy), "gradient_norm": np.mean(norms)}
+    assert_close(got, (params, opt_state, metrics))
+
+
+def test_minibatches_draw_every_played_step_alike_and_no_other():
+    """The weights outside the mask are NaN here."""
+
+    def which(key):
+        number = jnp.asarray(np.where(MASK, np.arange(MASK.size).reshape(MASK.shape), np.nan))
+        linear = Problem(
+            lambda w, s: (w * jnp.sum(s[0]), {"entropy": 0.0}), optax.sgd(1.0), (number, MASK), 1
+        )
+        linear = linear._replace(samples=jax.tree.map(jnp.asarray, linear.samples))
+        return -updates.minibatches(1, 1)(linear, key, jnp.zeros(()), linear.optimizer.init(0.0))[0]
+
+    drawn = np.asarray(jax.vmap(which)(jax.random.split(jax.random.key(0), 8000))).round()
+    counts = np.bincount(drawn.astype(int), minlength=MASK.size).reshape(MASK.shape)
+    assert np.all(counts[~MASK] == 0)
+    np.testing.assert_allclose(counts[MASK], 1000, atol=5 * np.sqrt(1000 * 7 / 8))
+
+
+@pytest.mark.parametrize("update", [updates.each_step(), updates.minibatches(2, 8)])
+def test_a_seed_that_stands_still_stays_as_it_is(update):
+    learner = reinforce(Survive(), num_episodes=4, update=update)
+    states = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 2))
+    after, metrics = jax.jit(jax.vmap(learner.step))(states, jnp.array([True, False]))
+    assert int(metrics["env_steps"][1]) == 0
+
+    def same(seed, x, y):
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            x, y = jax.random.key_data(x), jax.random.key_data(y)
+        return bool(np.all(np.asarray(x[seed]) == np.asarray(y[seed])))
+
+    assert all(jax.tree.leaves(jax.tree.map(functools.partial(same, 1), states, after)))
+    assert not all(jax.tree.leaves(jax.tree.map(functools.partial(same, 0), states, after)))
+
+
+def test_each_step_of_episodes_of_one_step_is_the_full_batch():
+    def after(update):
+        learner = reinforce(Target(), num_episodes=4, update=update)
+        return train_step(learner, learner.init(jax.random.key(0)))[0].actor
+
+    assert_close(after(updates.each_step()), after(None))
+
+
+def test_minibatches_find_the_best_action():
+    learner = reinforce(
+        Target(),
+        num_episodes=32,
+        estimator=estimators.leave_one_out(),
+        optimizer=optax.adam(1e-3),
+        update=updates.minibatches(4, 16),
+    )
+    state = learner.init(jax.random.key(0))
+    state = jax.jit(lambda s: jax.lax.scan(lambda s, _: learner.step(s), s, length=200)[0])(state)
+    mode = learner.policy.distribution.mode(learner.act(state.actor, jnp.zeros(1)))
+    assert float(mode[0]) == pytest.approx(0.5, abs=0.1)
+
+
+def adam_by_hand(grads, decay, *, decoupled):
+    """PyTorch's documented recursion, at a learning rate of 0.1."""
+    x, m, v = 2.0, 0.0, 0.0
+    for i, g in enumerate(grads, 1):
+        if decoupled:
+            x -= 0.1 * decay * x
+        else:
+            g = g + decay * x
+        m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
+        x -= 0.1 * (m / (1 - 0.9**i)) / (np.sqrt(v / (1 - 0.999**i)) + 1e-8)
+    return x
+
+
+@pytest.mark.parametrize("name", updates.OPTIMIZERS)
+def test_optimizers_by_hand(name):
+    grads, decay = [0.5, -3.0, 1.0], 0.3
+    optimizer = updates.make_optimizer(name, 0.1, weight_decay=decay, max_grad_norm=None)
+    x = jnp.array(2.0)
+    state = optimizer.init(x)
+    for g in grads:
+        change, state = optimizer.update(jnp.array(g), state, x)
+        x = x + change
+    expected = 2.0
+    for g in grads:
+        expected -= 0.1 * (g + decay * expected)
+    if name != "sgd":
+        expected = adam_by_hand(grads, decay, decoupled=name == "adamw")
+    assert float(x) == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_norm_is_clipped_before_the_weight_decay():
+    optimizer = updates.make_optimizer("sgd", 1.0, weight_decay=0.5, max_grad_norm=1.0)
+    x = jnp.array([6.0, 8.0])
+    change, _ = optimizer.update(jnp.array([3.0, 4.0]), optimizer.init(x), x)
+    np.testing.assert_allclose(change, [-0.6 - 3.0, -0.8 - 4.0], rtol=1e-6)
+
+
+def test_nonsense_is_refused():
+    with pytest.raises(ValueError, match="num_updates must be at least 1, got 0"):
+        updates.minibatches(0, 8)
+    with pytest.raises(ValueError, match="batch_size must be at least 1, got -1"):
+        updates.minibatches(1, -1)
+    with pytest.raises(ValueError, match="Did you mean 'adamw'"):
+        updates.make_optimizer("adamww")
