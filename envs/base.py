@@ -187,6 +187,11 @@ class MujocoEnv(Env):
         )
 
     @property
+    def num_contacts(self) -> int:
+        """The most contacts that the model can have at once."""
+        return int(mjx.make_data(self.mj_model, impl="jax")._impl.ncon)  # type: ignore
+
+    @property
     def dt(self) -> float:
         """The duration of one env step (s)."""
         return self.frame_skip * self.mj_model.opt.timestep

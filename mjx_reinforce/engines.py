@@ -72,6 +72,10 @@ def choose(name: str, env: Environment, player: Player | None = None) -> Engine:
     why = "chosen by name"
     if name == "mjx":
         return Engine(name, why, rollout)
+    contacts = getattr(env, "num_contacts", 0)
+    if name == "auto" and contacts:
+        why = f"plain MJX is the fastest for models with contacts, here up to {contacts}"
+        return Engine("mjx", why, rollout)
     reason = _against_kernel(name, env, player)
     if name != "fused" and not reason:
         if name == "auto":
