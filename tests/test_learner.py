@@ -150,7 +150,9 @@ def test_one_trace_and_nothing_donated():
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"update": updates.minibatches(2, 8), "one_start": True}], ids=str
+    "settings",
+    [{}, {"update": updates.minibatches(2, 8), "one_start": True}],
+    ids=["default", "minibatches from one start"],
 )
 def test_no_key_is_used_twice(settings):
     with jax.debug_key_reuse(True):
