@@ -5,6 +5,8 @@ An environment is a ``brax.envs.base.Env`` whose ``reset`` and ``step`` call MJX
 directly. Nothing heavy is imported before ``make``.
 """
 
+import contextlib
+import io
 from collections.abc import Callable
 from typing import Any
 
@@ -54,7 +56,9 @@ def make(id: str, /, **kwargs: Any) -> Any:
     check_id(id)
     entry, settings = (id, {}) if ":" in id else _TABLE[id]
     try:
-        build = load(entry)
+        # MJX prints two lines when its optional Warp backend is not installed.
+        with contextlib.redirect_stdout(io.StringIO()):
+            build = load(entry)
     except (ImportError, AttributeError) as error:
         raise ValueError(
             f"cannot import the environment {id!r}: {error}; write module:Class of a module "

@@ -33,8 +33,7 @@ def peers(env_id: str, quick: bool) -> list[Candidate]:
         return candidates
     if importlib.util.find_spec("gymnasium") and _in_gymnasium(env_id):
         candidates.append(gymnasium_vector(env_id))
-    # brax 0.14.2's trainers call what JAX 0.11 no longer has.
-    if env_id == "InvertedPendulum-v5" and hasattr(jax, "device_put_replicated"):
+    if env_id == "InvertedPendulum-v5":
         candidates.append(brax_ppo())
     return candidates
 
@@ -80,11 +79,13 @@ def gymnasium_vector(env_id: str, batch: int = 8, steps: int = 200) -> Candidate
     return Candidate(row, run, batch * steps)
 
 
-def brax_ppo(batch: int = 2048, env_steps: int = 1_000_000) -> Candidate:
+def brax_ppo(batch: int = 1024, env_steps: int = 200_000) -> Candidate:
     """PPO of brax with its own networks and inverted pendulum, in MJX; compiled in each run."""
     from brax import envs as brax_envs
     from brax.training.agents.ppo import train as ppo
 
+    if not hasattr(jax, "device_put_replicated"):  # brax 0.14.2 calls it, JAX no longer has it
+        jax.device_put_replicated = _replicate
     env = brax_envs.get_environment("inverted_pendulum", backend="mjx")
 
     def run():
@@ -106,6 +107,11 @@ def brax_ppo(batch: int = 2048, env_steps: int = 1_000_000) -> Candidate:
     row = {"what": "train", "engine": "brax PPO, compiling", "env": "InvertedPendulum-v5"}
     row |= {"batch": batch, "device": jax.devices()[0].device_kind, "frame_skip": 4}
     return Candidate(row, run, env_steps)
+
+
+def _replicate(tree: Any, devices: list[Any]) -> Any:
+    """Returns every leaf once for each device."""
+    return jax.tree.map(lambda x: jax.numpy.stack([x] * len(devices)), tree)
 
 
 def _in_gymnasium(env_id: str) -> bool:
