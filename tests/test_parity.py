@@ -50,7 +50,7 @@ def test_model_equals_gymnasium_field_by_field(id):
 
 
 #: They compile for minutes; CI steps them on the oldest JAX alone.
-SLOW = {"Ant-v5", "Humanoid-v5", "HumanoidStandup-v5", "Pusher-v5"}
+SLOW = {"Ant-v5", "Humanoid-v5", "HumanoidStandup-v5", "Pusher-v5", "Hopper-v5", "Walker2d-v5"}
 
 
 @pytest.mark.parametrize(
