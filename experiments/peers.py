@@ -5,7 +5,6 @@ import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from mjx_reinforce import envs
@@ -25,7 +24,7 @@ class Candidate(NamedTuple):
 
 
 def peers(env_id: str, quick: bool) -> list[Candidate]:
-    """C MuJoCo on all threads and, where installed, Gymnasium's vector env and brax's PPO."""
+    """C MuJoCo on all threads and, where installed, Gymnasium's vector env."""
     candidates = []
     if hasattr(envs.make(env_id), "mj_model"):
         candidates.append(c_mujoco(env_id))
@@ -33,8 +32,6 @@ def peers(env_id: str, quick: bool) -> list[Candidate]:
         return candidates
     if importlib.util.find_spec("gymnasium") and _in_gymnasium(env_id):
         candidates.append(gymnasium_vector(env_id))
-    if env_id == "InvertedPendulum-v5":
-        candidates.append(brax_ppo())
     return candidates
 
 
@@ -77,41 +74,6 @@ def gymnasium_vector(env_id: str, batch: int = 8, steps: int = 200) -> Candidate
     frame_skip = getattr(envs.make(env_id), "frame_skip", 1)
     row |= {"device": "cpu", "frame_skip": frame_skip}
     return Candidate(row, run, batch * steps)
-
-
-def brax_ppo(batch: int = 1024, env_steps: int = 200_000) -> Candidate:
-    """PPO of brax with its own networks and inverted pendulum, in MJX; compiled in each run."""
-    from brax import envs as brax_envs
-    from brax.training.agents.ppo import train as ppo
-
-    if not hasattr(jax, "device_put_replicated"):  # brax 0.14.2 calls it, JAX no longer has it
-        jax.device_put_replicated = _replicate
-    env = brax_envs.get_environment("inverted_pendulum", backend="mjx")
-
-    def run():
-        ppo.train(
-            environment=env,
-            num_timesteps=env_steps,
-            num_envs=batch,
-            episode_length=1000,
-            num_evals=1,
-            num_eval_envs=1,
-            run_evals=False,
-            unroll_length=5,
-            num_minibatches=32,
-            num_updates_per_batch=4,
-            batch_size=1024,
-            normalize_observations=True,
-        )
-
-    row = {"what": "train", "engine": "brax PPO, compiling", "env": "InvertedPendulum-v5"}
-    row |= {"batch": batch, "device": jax.devices()[0].device_kind, "frame_skip": 4}
-    return Candidate(row, run, env_steps)
-
-
-def _replicate(tree: Any, devices: list[Any]) -> Any:
-    """Returns every leaf once for each device."""
-    return jax.tree.map(lambda x: jax.numpy.stack([x] * len(devices)), tree)
 
 
 def _in_gymnasium(env_id: str) -> bool:
