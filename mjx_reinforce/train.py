@@ -169,15 +169,16 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
     from mjx_reinforce.runlog import RunLog
 
     settings = dataclasses.asdict(config) | {"horizon": horizon, "output": str(directory)}
-    records.write_json(directory / "config.json", settings | records.provenance())
     threshold = getattr(env, "reward_threshold", None)
     with Display() as display, Interrupt(display) as interrupt:
+        display.say(f"engine {learner.engine.name}: {learner.engine.why}; compiling")
         started = time.perf_counter()
         programs = Programs(env, learner, horizon, config)
         compile_seconds = time.perf_counter() - started
         gc.freeze()
         gc.enable()
-        display.say(f"engine {learner.engine.name}: {learner.engine.why}")
+        # Not before: a run killed while it compiles leaves nothing that would refuse the next.
+        records.write_json(directory / "config.json", settings | records.provenance())
         display.say(f"compiled in {compile_seconds:.1f} s")
         display.start()
         threading.Thread(target=report.load_libraries, daemon=True).start()

@@ -102,3 +102,13 @@ def test_single_precision_is_closer_than_plain_mjx(exact):
     assert error(fused, reference) < plain_error / 10
     assert error(kernel, reference) < plain_error / 10
     assert error(kernel, fused) < 5e-6
+
+
+def test_auto_says_what_it_takes_and_why():
+    pendulum = envs.make("InvertedPendulum-v5")
+    assert engines.choose("auto", pendulum).name == "fused"
+    contacts = engines.choose("auto", envs.make("Hopper-v5"))
+    assert contacts.name == "mjx"
+    assert "contacts" in contacts.why
+    with pytest.raises(ValueError, match=r"runs on NVIDIA GPUs.*choose auto"):
+        engines.choose("kernel", pendulum)

@@ -426,3 +426,16 @@ def test_short_loops_can_stay_loops():
         for unrolled in (4, 1)
     ]
     assert counts == [3, 1]
+
+
+def test_pruned_functions_keep_only_what_they_return():
+    def simulate(x):
+        unused = jnp.sort(jnp.outer(x, x), axis=0)
+        return {"kept": jnp.sin(x), "same": x, "dropped": unused.shape}
+
+    pruned = fused.prune(lambda x: {k: v for k, v in simulate(x).items() if k != "dropped"})
+    x = jnp.arange(3.0)
+    np.testing.assert_array_equal(jax.jit(pruned)(x)["kept"], jnp.sin(x))
+    np.testing.assert_array_equal(jax.jit(pruned)(x)["same"], x)
+    names = [eqn.primitive.name for eqn in jax.make_jaxpr(pruned)(x).eqns]
+    assert names == ["sin"]
