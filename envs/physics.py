@@ -6,7 +6,8 @@ also where no constraint is active. Two cases are cheaper and lead to the same a
 - Where the only constraint rows are limits of slide and hinge joints, at most two of them to a
   kinematic tree, the optimum has a closed form: `_solve_limits`.
 - Otherwise the solver is entered only if some row is active; without one, the acceleration is the
-  unconstrained one: `_solve`.
+  unconstrained one: `_solve`. For all of Gymnasium's tasks with contacts it is `newton`, whose line
+  search is exact; MJX's own remains for elliptic cones, friction loss and conjugate gradients.
 
 Everything else is MJX's own stages in MJX's order, but for two places in which MJX 3.17 departs
 from C MuJoCo 4.0, which Gymnasium runs, and in which the answer here is C's:
@@ -16,8 +17,8 @@ from C MuJoCo 4.0, which Gymnasium runs, and in which the answer here is C's:
 
 With neither, as in InvertedPendulum, a step is equal to `mjx.step`. Solver options are untouched;
 the closed form does not read `iterations` and `tolerance`, nor the warm start, because it is exact.
-C's Newton solver has one more reason to stop than MJX's (the decrement it predicts is below
-`tolerance`), so that MJX's now and then takes an iteration more, nearer to the optimum.
+C's Newton solver has one more reason to stop than `newton` (the decrement it predicts is below
+`tolerance`), so that ours now and then takes an iteration more, nearer to the optimum.
 """
 
 import functools
@@ -31,7 +32,7 @@ from mujoco import mjx
 from mujoco.mjx._src import constraint, sensor, smooth, solver, types
 from mujoco.mjx._src import forward as stages
 
-from mjx_reinforce.envs import contacts
+from mjx_reinforce.envs import contacts, newton
 
 _MAX_ROWS_TOGETHER = 2
 
@@ -101,7 +102,7 @@ def _solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if _impl(data).efc_J.shape[0] == joints.size and max(map(len, groups)) <= _MAX_ROWS_TOGETHER:
         reached, solve = _limit_reached(model, data, joints), _solve_limits
     elif _impl(data).ne or _impl(data).nf:  # rows that are always active
-        return solver.solve(model, data)
+        reached, solve = jnp.array(True), _solve_any
     else:  # inactive rows have a Jacobian of zero
         reached, solve = jnp.any(_impl(data).efc_J != 0), _solve_any
     qacc, qfrc_constraint, efc_force = jax.lax.cond(
@@ -120,7 +121,9 @@ def _solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
 
 
 def _solve_any(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """MJX's solver; returns acceleration, joint forces and row forces."""
+    """Newton's method, or MJX's solver; returns acceleration, joint forces and row forces."""
+    if newton.supports(model, data):
+        return newton.solve(model, data)
     data = solver.solve(model, data)
     return data.qacc, data.qfrc_constraint, _impl(data).efc_force
 

@@ -174,15 +174,16 @@ def test_without_constraints():
 
 def test_general_models_enter_the_solver_only_if_a_row_is_active():
     """Three limits in one chain have no closed form."""
-    qpos = jnp.array([[0.2, -0.2, 0.1], [0.7, -0.6, 0.8], [0.1, 0.9, 0.0]])
-    args = qpos, 2 * qpos, jnp.zeros((3, 0))
-    _, model, data = load("chain")
-    lanes = fused.vmap(runner(physics.forward, model, data))
-    actual = jax.tree.map(np.asarray, jax.jit(lanes)(*args))
-    expected = play_mjx(mjx.forward, "chain", args)
-    assert scaled_errors(actual, expected)["qacc"] < 1e-5
-    assert np.any(expected["row force"] != 0, axis=1).tolist() == [False, True, True]
-    jaxpr = jax.make_jaxpr(lanes)(*args)
+    with jax.enable_x64(True):
+        qpos = jnp.array([[0.2, -0.2, 0.1], [0.7, -0.6, 0.8], [0.1, 0.9, 0.0]])
+        args = qpos, 2 * qpos, jnp.zeros((3, 0))
+        _, model, data = load("chain")
+        lanes = fused.vmap(runner(physics.forward, model, data))
+        actual = jax.tree.map(np.asarray, jax.jit(lanes)(*args))
+        expected = play_mjx(mjx.forward, "chain", args)
+        assert scaled_errors(actual, expected)["qacc"] < 1e-12
+        assert np.any(expected["row force"] != 0, axis=1).tolist() == [False, True, True]
+        jaxpr = jax.make_jaxpr(lanes)(*args)
     gates = [eqn for eqn in jaxpr.jaxpr.eqns if eqn.primitive.name == "cond"]
     assert len(gates) == 1
     assert "while" not in [eqn.primitive.name for eqn in jaxpr.jaxpr.eqns]
