@@ -35,6 +35,8 @@ class _Cart(Env):
     """What both carts share: the start, the dynamics and where the cart or the pole is lost."""
 
     dt, frame_skip = _TIMESTEP, 1
+    #: An asset that ``qpos`` moves, to look at.
+    scene = "cart_pole.xml"
     action_space: Box | Discrete
 
     def __init__(self, *, max_angle: float, kinematics_integrator: str):

@@ -13,7 +13,7 @@ _HOME = {
     "reinforce": "learner",
     "train_step": "learner",
     "Distribution": "distributions",
-    "normal": "distributions",
+    "normal": "normals",
     "Estimator": "estimators",
     "total_return": "estimators",
     "reward_to_go": "estimators",

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import optax
 
 from mjx_reinforce import engines, normalize
-from mjx_reinforce.distributions import categorical, deterministic
+from mjx_reinforce.distributions import categorical
 from mjx_reinforce.learner import (
     Actor,
     Learner,
@@ -28,6 +28,7 @@ from mjx_reinforce.learner import (
     episode_metrics,
     keep_finite,
 )
+from mjx_reinforce.normals import deterministic
 from mjx_reinforce.policies import Policy, mlp_policy
 from mjx_reinforce.rollouts import episode_returns
 from mjx_reinforce.types import (

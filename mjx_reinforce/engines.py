@@ -74,7 +74,7 @@ def choose(name: str, env: Environment, player: Player | None = None) -> Engine:
         return Engine(name, why, rollout)
     contacts = getattr(env, "num_contacts", 0)
     if name == "auto" and contacts:
-        why = f"plain MJX is the fastest for models with contacts, here up to {contacts}"
+        why = f"the fastest for models with contacts, here up to {contacts}"
         return Engine("mjx", why, rollout)
     reason = _against_kernel(name, env, player)
     if name != "fused" and not reason:

@@ -11,8 +11,9 @@ import optax
 from flax import struct
 
 from mjx_reinforce import engines, normalize
-from mjx_reinforce.distributions import Distribution, categorical, normal
+from mjx_reinforce.distributions import Distribution, categorical
 from mjx_reinforce.estimators import Estimator, leave_one_out, standardize
+from mjx_reinforce.normals import normal
 from mjx_reinforce.policies import Policy, mlp_policy
 from mjx_reinforce.rollouts import episode_lengths, episode_returns, simulated_steps
 from mjx_reinforce.types import (

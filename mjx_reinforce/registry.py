@@ -7,13 +7,13 @@ from typing import Any
 
 #: Action distributions: name -> "module:function" of an action space.
 DISTRIBUTIONS = {
-    "normal": "mjx_reinforce.distributions:normal",
-    "normal-softplus": "mjx_reinforce.distributions:normal_softplus",
-    "normal-sigmoid": "mjx_reinforce.distributions:normal_sigmoid",
-    "truncated-normal": "mjx_reinforce.distributions:truncated_normal",
-    "clipped-normal": "mjx_reinforce.distributions:clipped_normal",
-    "tanh-normal": "mjx_reinforce.distributions:tanh_normal",
-    "deterministic": "mjx_reinforce.distributions:deterministic",
+    "normal": "mjx_reinforce.normals:normal",
+    "normal-softplus": "mjx_reinforce.normals:normal_softplus",
+    "normal-sigmoid": "mjx_reinforce.normals:normal_sigmoid",
+    "truncated-normal": "mjx_reinforce.bounded:truncated_normal",
+    "clipped-normal": "mjx_reinforce.bounded:clipped_normal",
+    "tanh-normal": "mjx_reinforce.bounded:tanh_normal",
+    "deterministic": "mjx_reinforce.normals:deterministic",
     "categorical": "mjx_reinforce.distributions:categorical",
 }
 

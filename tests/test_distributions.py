@@ -9,14 +9,15 @@ import pytest
 from scipy import integrate, special, stats
 
 from mjx_reinforce import Box, fused, truncated_normal
-from mjx_reinforce.distributions import normal
+from mjx_reinforce.normals import normal
 from mjx_reinforce.registry import DISTRIBUTIONS, load
 from mjx_reinforce.types import Discrete
 
 LOW, HIGH = -3.0, 1.0
 SPACE, ARMS = Box(np.array([LOW]), np.array([HIGH])), Discrete(4)
 NUM_SAMPLES = 200_000
-CONTINUOUS = sorted(set(DISTRIBUTIONS) - {"categorical", "deterministic"})
+DISCRETE = {"categorical"}
+CONTINUOUS = sorted(set(DISTRIBUTIONS) - DISCRETE - {"deterministic"})
 BOUNDED = sorted(name for name in CONTINUOUS if not name.startswith("normal"))
 #: Actions of positive probability, and the ends of the interval where there is a density.
 ATOMS = {"clipped-normal": [LOW, HIGH], "tanh-normal": -1.0 + 2.0 * np.tanh([-6.0, 6.0])}
@@ -127,7 +128,7 @@ def test_one_vector_and_many_entries(name):
 
 @pytest.mark.parametrize("name", sorted(DISTRIBUTIONS))
 def test_the_fused_engine_writes_out_sample_and_mode(name):
-    space = ARMS if name == "categorical" else SPACE
+    space = ARMS if name in DISCRETE else SPACE
     distribution = build(name, space)
     outputs = jax.random.normal(jax.random.key(2), (len(some_outputs(distribution)), 64))
     noise = distribution.noise(jax.random.key(3), (64,)).T

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from mjx_reinforce import Box, checkpoint, mlp_policy, normal
-from mjx_reinforce.distributions import categorical, normal_softplus
+from mjx_reinforce.distributions import categorical
 from mjx_reinforce.networks import MLP
+from mjx_reinforce.normals import normal_softplus
 from mjx_reinforce.types import Discrete
 
 SPACE = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))

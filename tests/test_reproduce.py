@@ -10,8 +10,8 @@ from toys import Toy, ToyState
 
 from experiments import reproduce
 from mjx_reinforce import Box, reinforce
+from mjx_reinforce.bounded import truncated_normal
 from mjx_reinforce.config import check
-from mjx_reinforce.distributions import truncated_normal
 from mjx_reinforce.estimators import reward_to_go
 from mjx_reinforce.presets import PRESETS
 

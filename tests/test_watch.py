@@ -1,0 +1,146 @@
+"""Films of trained policies."""
+
+import json
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+from mjx_reinforce import envs, load_policy, normalize, watch
+from mjx_reinforce.checkpoint import save_policy
+from mjx_reinforce.learner import reinforce
+from mjx_reinforce.rollouts import rollout
+
+SETTINGS = {
+    "InvertedPendulum-v5": {
+        "policy": "normal",
+        "observation_size": 4,
+        "action_low": [-3.0],
+        "action_high": [3.0],
+    },
+    "CartPole-v1": {"policy": "categorical", "observation_size": 4, "num_actions": 2},
+}
+
+
+def make_run(directory, env_id):
+    """What two seeds of training leave, as far as watching needs it."""
+    env = envs.make(env_id)
+    settings = SETTINGS[env_id] | {"hidden_sizes": [32, 32], "initial_std": 0.5}
+    learner = reinforce(env)
+    states = jax.vmap(learner.init)(jax.random.split(jax.random.key(3), 2))
+    save_policy(directory / "policy", states.actor, settings)
+    (directory / "config.json").write_text(json.dumps({"env": env_id, "horizon": 60}))
+    return env
+
+
+def watch_run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["watch", *map(str, arguments)])
+    watch.main()
+
+
+@pytest.mark.parametrize("env_id", SETTINGS)
+def test_the_film_is_the_episode(tmp_path, env_id):
+    """In a process of its own: the way MuJoCo draws is settled when it is imported."""
+    env = make_run(tmp_path, env_id)
+    options = ["--seed", "1", "--width", "96", "--height", "64"]
+    command = [sys.executable, "-m", "mjx_reinforce.watch", str(tmp_path), *options]
+    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    policy, actor = load_policy(tmp_path / "policy", 1)
+
+    def act(actor, observation):
+        return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))
+
+    played = rollout(
+        env,
+        act,
+        actor,
+        policy.distribution,
+        jax.random.key(0),
+        num_episodes=1,
+        horizon=60,
+        num_deterministic=1,
+    )
+    length = int(played.mask.sum())
+    assert f"return {float(played.reward.sum()):.1f} in {length} steps" in said
+    skip = max(1, round(1 / (env.dt * 30)))
+    with Image.open(tmp_path / "seed-1.gif") as film:
+        assert film.size == (96, 64)
+        pictures = []
+        for i in range(film.n_frames):
+            film.seek(i)
+            pictures.append(np.asarray(film.convert("RGB"), float))
+            assert film.info["duration"] == pytest.approx(1000 * env.dt * skip, abs=10)
+    assert len(pictures) == -(-(length + 1) // skip)
+    assert np.abs(pictures[0] - pictures[-1]).max() > 50  # something moves
+    assert np.ptp(pictures[0]) > 100  # and is to be seen
+
+
+def test_noise_and_other_starts_differ(tmp_path):
+    env = make_run(tmp_path, "CartPole-v1")
+    player = load_policy(tmp_path / "policy", 0)
+    plain, other = (watch.play(env, *player, episode, 60, False) for episode in (0, 1))
+    noisy = watch.play(env, *player, 0, 60, True)
+    assert np.any(plain[0][0] != other[0][0])
+    np.testing.assert_array_equal(plain[0][0], noisy[0][0])
+    assert plain[0].shape != noisy[0].shape or np.any(plain[0] != noisy[0])
+    assert len(plain[0]) == len(plain[1]) + 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--seed", 2], "seed 2 is not among the 2"),
+        (["--seconds", 0], "--seconds must be positive, got 0"),
+        (["--output", "nowhere/film.gif"], "there is no folder nowhere"),
+        (["--output", "config.json"], "exists; pass --overwrite"),
+        (["--output", "film.mp4"], "need mediapy and ffmpeg"),
+    ],
+)
+def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
+    make_run(tmp_path, "CartPole-v1")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "mediapy", None)
+    with pytest.raises(SystemExit, match="2"):
+        watch_run(monkeypatch, tmp_path, *arguments)
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", [None, "[", "[]", '{"env": "CartPole-v1"}'])
+def test_what_is_no_run_is_named(tmp_path, monkeypatch, capsys, content):
+    if content is not None:
+        (tmp_path / "config.json").write_text(content)
+    with pytest.raises(SystemExit, match="2"):
+        watch_run(monkeypatch, tmp_path)
+    error = capsys.readouterr().err
+    assert ("is no run directory" if content is None else "is damaged") in error
+
+
+def test_other_films_go_through_mediapy(tmp_path, monkeypatch):
+    """The bytes are ffmpeg's; what arrives there is checked."""
+    written = {}
+
+    class Mediapy:
+        @staticmethod
+        def video_is_available():
+            return True
+
+        @staticmethod
+        def write_video(path, frames, fps):
+            written.update(frames=len(frames), fps=fps)
+            path.write_bytes(b"film")
+
+    monkeypatch.setitem(sys.modules, "mediapy", Mediapy)
+    watch.write_film(tmp_path / "film.mp4", iter(np.zeros((3, 4, 4, 3), np.uint8)), 25.0)
+    assert written == {"frames": 3, "fps": 25.0}
+    assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_an_environment_without_a_model_is_refused():
+    class Bare:
+        pass
+
+    with pytest.raises(ValueError, match="Bare has no mj_model"):
+        watch.scene(Bare())
