@@ -7,7 +7,7 @@ The acceleration a minimises (MuJoCo's documentation, "Computation", "Constraint
 with the unconstrained acceleration a_s, the constraints' Jacobian J, reference r and stiffness D;
 rows of equality constraints count on both sides of zero. The cost is convex and quadratic for a
 given set of active rows, so that Newton's method, with an exact line search, ends after finitely
-many steps: once a step leaves the set as it is, it led to the minimum.
+many steps: once a full step leaves the set as it is, it led to the minimum.
 
 MJX's own solver does the same steps, but its line search looks at three points in each of
 `ls_iterations` (50) rounds, which `jax.vmap` carries out for every episode until the slowest is
@@ -40,6 +40,38 @@ class _Point(NamedTuple):
     residual: jax.Array
     active: jax.Array
     cost: jax.Array
+
+
+class _Search(NamedTuple):
+    """Where Newton's method is.
+
+    point: the acceleration it has
+    count: [] steps it made
+    settled: [] whether the last one led to the minimum
+    """
+
+    point: _Point
+    count: jax.Array
+    settled: jax.Array
+
+
+class _Look(NamedTuple):
+    """Where a line search is.
+
+    low: [] a place with a negative derivative
+    high: [] one with a positive derivative
+    root: [] of the line found at the last place
+    active: [rows] there
+    count: [] places looked at
+    settled: [] whether no row changed from the last place but one
+    """
+
+    low: jax.Array
+    high: jax.Array
+    root: jax.Array
+    active: jax.Array
+    count: jax.Array
+    settled: jax.Array
 
 
 class _Rows(NamedTuple):
@@ -90,22 +122,22 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
         cost = (jnp.dot(imbalance, qacc - data.qacc_smooth) + strain) / 2
         return _Point(qacc, imbalance, residual, active, cost)
 
-    def improve(loop: tuple[_Point, jax.Array, jax.Array]) -> tuple[_Point, jax.Array, jax.Array]:
-        before, count, _ = loop
-        after = at(_newton_step(mass, rows, before, model.opt.ls_iterations))
-        settled = jnp.all(after.active == before.active)
-        settled |= before.cost - after.cost < smallest
-        return after, count + 1, settled
+    def improve(search: _Search) -> _Search:
+        before = search.point
+        qacc, decrement = _newton_step(mass, rows, before, model.opt.ls_iterations)
+        after = at(qacc)
+        settled = jnp.all(after.active == before.active) | (decrement < smallest)
+        return _Search(after, search.count + 1, settled)
 
     start = at(data.qacc_smooth)
     if not model.opt.disableflags & types.DisableBit.WARMSTART:
         warm = at(data.qacc_warmstart)
         start = jax.tree.map(lambda w, s: jnp.where(warm.cost < start.cost, w, s), warm, start)
-    end, _, _ = jax.lax.while_loop(
-        lambda loop: ~loop[2] & (loop[1] < model.opt.iterations),
+    end = jax.lax.while_loop(
+        lambda search: ~search.settled & (search.count < model.opt.iterations),
         improve,
-        (start, jnp.int32(0), jnp.array(False)),
-    )
+        _Search(start, jnp.int32(0), jnp.array(False)),
+    ).point
     force = _force(rows, end)
     return end.qacc, rows.jacobian.T @ force, force
 
@@ -115,8 +147,14 @@ def _force(rows: _Rows, point: _Point) -> jax.Array:
     return jnp.where(point.active, -rows.stiffness * point.residual, 0)
 
 
-def _newton_step(mass: jax.Array, rows: _Rows, point: _Point, max_rounds: int) -> jax.Array:
-    """Returns the least costly acceleration [nv] in the direction of Newton's step."""
+def _newton_step(
+    mass: jax.Array, rows: _Rows, point: _Point, max_rounds: int
+) -> tuple[jax.Array, jax.Array]:
+    """Returns the least costly acceleration [nv] in the direction of Newton's step.
+
+    And by how much the cost would fall [] if no row changed: half the product of gradient and
+    step, which rounding spares; the difference of two costs it does not.
+    """
     gradient = point.imbalance - rows.jacobian.T @ _force(rows, point)
     stiffness = jnp.where(point.active, rows.stiffness, 0)
     hessian = mass + (rows.jacobian.T * stiffness) @ rows.jacobian
@@ -126,7 +164,7 @@ def _newton_step(mass: jax.Array, rows: _Rows, point: _Point, max_rounds: int) -
     slope = jnp.dot(direction, point.imbalance)
     curvature = jnp.dot(direction, mass @ direction)
     length = _line_search(rows, point, change, slope, curvature, max_rounds)
-    return point.qacc + length * direction
+    return point.qacc + length * direction, -jnp.dot(gradient, direction) / 2
 
 
 def _line_search(
@@ -140,8 +178,8 @@ def _line_search(
     """Returns the length of the step at which the cost's derivative along it is zero, [].
 
     The derivative increases and is linear as long as no row changes. Each round goes to the root
-    of the line found at the last place; where that is outside of what is known to hold the root,
-    to the middle of it.
+    of the line found at the last place; where rounding puts that outside of what is known to hold
+    the root, to the middle of it. At the minimum there is no direction, and the length is 1.
 
     Args:
         rows: the constraints.
@@ -153,19 +191,30 @@ def _line_search(
     """
     pull, stretch = rows.stiffness * change * point.residual, rows.stiffness * change**2
 
-    def look(loop: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        low, high, root, active, count, _ = loop
-        place = jnp.where((low < root) & (root < high), root, (low + high) / 2)
-        active_there = rows.equality | (point.residual + place * change < 0)
-        at_zero = slope + jnp.sum(jnp.where(active_there, pull, 0))
-        rate = curvature + jnp.sum(jnp.where(active_there, stretch, 0))
-        root = -at_zero / rate
-        low, high = jnp.where(root > place, place, low), jnp.where(root > place, high, place)
-        return low, high, root, active_there, count + 1, jnp.all(active_there == active)
+    def look(last: _Look) -> _Look:
+        inside = (last.low < last.root) & (last.root < last.high)
+        place = jnp.where(inside, last.root, (last.low + last.high) / 2)
+        active = rows.equality | (point.residual + place * change < 0)
+        at_zero = slope + jnp.sum(jnp.where(active, pull, 0))
+        rate = curvature + jnp.sum(jnp.where(active, stretch, 0))
+        root = jnp.where(rate > 0, -at_zero / rate, place)
+        return _Look(
+            low=jnp.where(root > place, place, last.low),
+            high=jnp.where(root > place, last.high, place),
+            root=root,
+            active=active,
+            count=last.count + 1,
+            settled=jnp.all(active == last.active),
+        )
 
-    zero, one = jnp.zeros_like(slope), jnp.ones_like(slope)  # one: the root of Newton's own line
-    start = (zero, jnp.full_like(slope, jnp.inf), one, point.active, jnp.int32(0), jnp.array(False))
-    *_, root, _, _, _ = jax.lax.while_loop(
-        lambda loop: ~loop[5] & (loop[4] < max_rounds), look, start
+    start = _Look(
+        low=jnp.zeros_like(slope),
+        high=jnp.full_like(slope, jnp.inf),
+        root=jnp.ones_like(slope),  # of Newton's own line
+        active=point.active,
+        count=jnp.int32(0),
+        settled=jnp.array(False),
     )
-    return root
+    return jax.lax.while_loop(
+        lambda last: ~last.settled & (last.count < max_rounds), look, start
+    ).root

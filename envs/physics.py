@@ -1,13 +1,14 @@
-"""C MuJoCo's step in MJX, with a constraint solver that costs next to nothing.
+"""C MuJoCo's step in MJX, with constraint solvers that do no needless work.
 
 MJX's Newton solver is a loop around a line search that is another loop, in every forward pass,
 also where no constraint is active. Two cases are cheaper and lead to the same answer:
 
 - Where the only constraint rows are limits of slide and hinge joints, at most two of them to a
   kinematic tree, the optimum has a closed form: `_solve_limits`.
-- Otherwise the solver is entered only if some row is active; without one, the acceleration is the
-  unconstrained one: `_solve`. For all of Gymnasium's tasks with contacts it is `newton`, whose line
-  search is exact; MJX's own remains for elliptic cones, friction loss and conjugate gradients.
+- Otherwise the solver is entered only if some row is active (under `jax.vmap` it always is);
+  without one, the acceleration is the unconstrained one: `_solve`. For all of Gymnasium's tasks
+  with contacts it is `newton`, whose line search is exact; MJX's own remains for elliptic cones,
+  friction loss and conjugate gradients.
 
 Everything else is MJX's own stages in MJX's order, but for two places in which MJX 3.17 departs
 from C MuJoCo 4.0, which Gymnasium runs, and in which the answer here is C's:
@@ -17,8 +18,8 @@ from C MuJoCo 4.0, which Gymnasium runs, and in which the answer here is C's:
 
 With neither, as in InvertedPendulum, a step is equal to `mjx.step`. Solver options are untouched;
 the closed form does not read `iterations` and `tolerance`, nor the warm start, because it is exact.
-C's Newton solver has one more reason to stop than `newton` (the decrement it predicts is below
-`tolerance`), so that ours now and then takes an iteration more, nearer to the optimum.
+C's Newton solver stops at a small gradient or a small improvement, `newton` only at the optimum or
+a step too small to count, so that ours now and then takes an iteration more, nearer to the optimum.
 """
 
 import functools

@@ -7,6 +7,7 @@ import numpy as np
 from mjx_reinforce import truncated_normal as tn
 from mjx_reinforce.distributions import Distribution
 from mjx_reinforce.normals import (
+    LOG_SQRT_2PI,
     gaussian,
     middle_and_half_range,
     normal_entropy,
@@ -14,7 +15,6 @@ from mjx_reinforce.normals import (
 )
 from mjx_reinforce.types import Box, Discrete
 
-_LOG_SQRT_2PI = 0.5 * float(np.log(2.0 * np.pi))
 #: ``tanh_normal`` records what it draws beyond the first, before the tanh, as the second.
 _SATURATED, _SATURATION = 5.0, 6.0
 
@@ -198,7 +198,7 @@ def _clipped_entropy(mean: jax.Array, std: jax.Array, low: jax.Array, high: jax.
     a, b = (low - mean) / std, (high - mean) / std
     log_below, log_above = tn.log_tail(-a), tn.log_tail(b)
     below, above = jnp.exp(log_below), jnp.exp(log_above)
-    edges = b * jnp.exp(-0.5 * b**2 - _LOG_SQRT_2PI) - a * jnp.exp(-0.5 * a**2 - _LOG_SQRT_2PI)
+    edges = b * jnp.exp(-0.5 * b**2 - LOG_SQRT_2PI) - a * jnp.exp(-0.5 * a**2 - LOG_SQRT_2PI)
     inside = (1.0 - below - above) * normal_entropy(std) - 0.5 * edges
     return inside - below * log_below - above * log_above
 

@@ -2,6 +2,7 @@
 
 import io
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -53,17 +54,21 @@ def load_policy(directory: str | Path, seed: int | None = None) -> tuple[Policy,
       ValueError: its files are damaged, or there is no such seed.
     """
     directory = Path(directory)
-    settings = json.loads((directory / "policy.json").read_text(encoding="utf-8"))
-    with np.load(directory / "actor.npz", allow_pickle=False) as archive:
-        flat = {name: jnp.asarray(archive[name]) for name in archive.files}
-    tree = traverse_util.unflatten_dict(flat, sep="/")
-    actor = Actor(params=tree["params"], normalizer=Normalizer(**tree["normalizer"]))
+    try:
+        settings = json.loads((directory / "policy.json").read_text(encoding="utf-8"))
+        with np.load(directory / "actor.npz", allow_pickle=False) as archive:
+            flat = {name: jnp.asarray(archive[name]) for name in archive.files}
+        tree = traverse_util.unflatten_dict(flat, sep="/")
+        actor = Actor(params=tree["params"], normalizer=Normalizer(**tree["normalizer"]))
+        policy = build_policy(settings)
+    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        raise ValueError(f"the policy in {directory} is damaged: {error!r}") from error
     if seed is not None:
         num_seeds = actor.normalizer.count.shape[0]
         if not 0 <= seed < num_seeds:
             raise ValueError(f"seed {seed} is not among the {num_seeds} of {directory}")
         actor = jax.tree.map(lambda x: x[seed], actor)
-    return build_policy(settings), actor
+    return policy, actor
 
 
 def build_policy(settings: dict[str, Any]) -> Policy:

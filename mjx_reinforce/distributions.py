@@ -7,9 +7,10 @@ state. Sampling is split in two, ``noise`` and ``sample``, so that every engine
 draws the same actions from the same key: noise may be drawn far from where it
 is used.
 
-Every family below takes the action space, ``initial_std``, the standard deviation
-before training in the action's unit, and ``rescale``, so that all can be built
-alike. A family that does not suit the space raises ValueError.
+Every family, here, in ``normals`` and in ``bounded``, takes the action space,
+``initial_std``, the standard deviation before training in the action's unit, and
+``rescale``, so that all can be built alike. A family that does not suit the space
+raises ValueError.
 """
 
 from collections.abc import Callable

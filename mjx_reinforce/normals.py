@@ -9,7 +9,7 @@ import numpy as np
 from mjx_reinforce.distributions import Distribution
 from mjx_reinforce.types import Box, Discrete
 
-_LOG_SQRT_2PI = 0.5 * float(np.log(2.0 * np.pi))
+LOG_SQRT_2PI = 0.5 * float(np.log(2.0 * np.pi))
 _MIN_STD = 1e-6
 
 
@@ -108,7 +108,7 @@ def deterministic(
     )
 
 
-class Gaussian(NamedTuple):
+class GaussianOutputs(NamedTuple):
     """How the outputs hold the means and standard deviations of a family's Normals.
 
     size: A
@@ -158,7 +158,7 @@ class Gaussian(NamedTuple):
 
 def gaussian(
     name: str, space: Box | Discrete, std: str, initial_std: float, rescale: bool
-) -> Gaussian:
+) -> GaussianOutputs:
     """Checks what all Gaussian families require, and lays out their outputs."""
     if not isinstance(space, Box):
         raise ValueError(
@@ -174,7 +174,7 @@ def gaussian(
     middle, half = np.zeros(size, np.float32), np.ones(size, np.float32)
     if rescale:
         middle, half = middle_and_half_range(space)
-    return Gaussian(size, std, initial_std, middle, half)
+    return GaussianOutputs(size, std, initial_std, middle, half)
 
 
 def middle_and_half_range(space: Box) -> tuple[np.ndarray, np.ndarray]:
@@ -187,9 +187,9 @@ def middle_and_half_range(space: Box) -> tuple[np.ndarray, np.ndarray]:
 
 def normal_log_density(x: jax.Array, mean: jax.Array, std: jax.Array) -> jax.Array:
     """Returns the log-density at ``x``, entry by entry."""
-    return -0.5 * ((x - mean) / std) ** 2 - jnp.log(std) - _LOG_SQRT_2PI
+    return -0.5 * ((x - mean) / std) ** 2 - jnp.log(std) - LOG_SQRT_2PI
 
 
 def normal_entropy(std: jax.Array) -> jax.Array:
     """Returns the entropy in nats, entry by entry."""
-    return jnp.log(std) + 0.5 + _LOG_SQRT_2PI
+    return jnp.log(std) + 0.5 + LOG_SQRT_2PI

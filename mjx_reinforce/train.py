@@ -34,6 +34,7 @@ _FILES = (
 def main() -> None:
     """Reads the command line, trains, and exits: 0 done, 2 bad input, 130 interrupted."""
     gc.disable()  # imports and tracing make many objects and no garbage: a second in eight
+    directory = None
     try:
         config = parse(sys.argv[1:])
         check(config)
@@ -44,6 +45,8 @@ def main() -> None:
         _configure_jax()
         learner, horizon = build(env, config)
     except ValueError as error:
+        if directory and not any(directory.iterdir()):
+            directory.rmdir()
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
     interrupted = train(env, learner, horizon, config, directory)

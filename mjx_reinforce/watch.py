@@ -2,11 +2,12 @@
 
 import ctypes.util
 import dataclasses
-import functools
 import io
 import json
+import math
 import os
 import sys
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -46,25 +47,41 @@ class Settings:
 
 
 def main() -> None:
-    """Reads the command line, plays, draws, and exits: 0 done, 2 bad input."""
+    """Reads the command line, films, and exits: 0 done, 2 bad input, 130 interrupted."""
     settings = tyro.cli(Settings, prog="python -m mjx_reinforce.watch")
-    # Before MuJoCo is imported: without a screen it draws through EGL, where that is installed.
-    if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
     try:
-        output = check(settings)
-        env_id, horizon = read_run(settings.run)
-        from mjx_reinforce.checkpoint import load_policy
-
-        player = load_policy(settings.run / "policy", settings.seed)
-        env = envs.make(env_id)
-        renderer = Renderer(scene(env), settings.width, settings.height)
+        film(settings)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
-    qpos, rewards = play(env, *player, settings.episode, horizon, settings.noise)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def film(settings: Settings) -> None:
+    """Plays the episode, says what it returned, and writes the film.
+
+    Raises:
+      ValueError: a setting is out of range, or the run is damaged, or nothing can be drawn here.
+      OSError: a file cannot be read or written.
+    """
+    env_id, horizon = read_run(settings.run)
+    output = check(settings)
+    _import_mujoco()
+    from mjx_reinforce.checkpoint import load_policy
+
+    policy, actor = load_policy(settings.run / "policy", settings.seed)
+    env = envs.make(env_id)
+    expected, size = env.observation_size, actor.normalizer.mean.shape[0]
+    if size != expected:
+        raise ValueError(
+            f"the policy in {settings.run} takes observations of {size} entries, "
+            f"{env_id} has {expected}: config.json and policy/ are of different runs"
+        )
+    renderer = Renderer(scene(env), settings.width, settings.height)
+    qpos, rewards = play(env, policy, actor, settings.episode, horizon, noise=settings.noise)
     print(f"{env_id}, seed {settings.seed}: return {rewards.sum():.1f} in {len(rewards)} steps")
-    skip = max(1, round(1 / (env.dt * _MAX_RATE)))
+    skip = max(1, math.ceil(1 / (env.dt * _MAX_RATE) - 1e-9))
     shown = qpos[: max(1, round(settings.seconds / env.dt)) : skip]
     write_film(output, map(renderer.draw, shown), 1 / (env.dt * skip))
     print(f"{len(shown)} frames in {output}")
@@ -74,19 +91,23 @@ def check(settings: Settings) -> Path:
     """Returns the film's path.
 
     Raises:
-      ValueError: a setting is out of range, or the film exists.
+      ValueError: a setting is out of range, or the film exists or cannot be written.
     """
-    for name in ("seconds", "width", "height"):
+    if not 0 < settings.seconds < float("inf"):
+        raise ValueError(f"--seconds must be positive and finite, got {settings.seconds}")
+    for name, least, most in (("width", 1, 4096), ("height", 1, 4096), ("episode", 0, 2**31 - 1)):
         value = getattr(settings, name)
-        if not 0 < value < float("inf"):
-            raise ValueError(f"--{name} must be positive, got {value}")
+        if not least <= value <= most:
+            raise ValueError(f"--{name} must be in [{least}, {most}], got {value}")
     output = settings.output or settings.run / f"seed-{settings.seed}.gif"
-    if not output.parent.is_dir():
-        raise ValueError(f"there is no folder {output.parent}")
-    if output.exists() and not settings.overwrite:
+    if not output.suffix:
+        raise ValueError(f"{output} has no ending; end --output in .gif, or .mp4")
+    if not os.access(output.parent, os.W_OK):
+        raise ValueError(f"cannot write to {output.parent}; choose another --output")
+    if output.is_dir() or (output.exists() and not settings.overwrite):
         raise ValueError(f"{output} exists; pass --overwrite or another --output")
-    if output.suffix != ".gif":
-        _ffmpeg(output)
+    if output.suffix.lower() != ".gif":
+        _mediapy(output)
     return output
 
 
@@ -99,13 +120,18 @@ def read_run(directory: Path) -> tuple[str, int]:
     path = directory / "config.json"
     try:
         settings = json.loads(path.read_text(encoding="utf-8"))
-        return str(settings["env"]), int(settings["horizon"])
+        env_id, horizon = str(settings["env"]), int(settings["horizon"])
     except OSError as error:
         raise ValueError(
             f"{directory} is no run directory: cannot read {path} ({error.strerror})"
         ) from error
     except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
+        raise ValueError(f"{path} is damaged: {error!r}") from error
+    if horizon < 1:
+        raise ValueError(f"{path} is damaged: the horizon is {horizon}")
+    if not (directory / "policy").is_dir():
+        raise ValueError(f"{directory} has no policy yet: its training goes on, or was killed")
+    return env_id, horizon
 
 
 def scene(env: Any) -> Any:
@@ -124,7 +150,7 @@ def scene(env: Any) -> Any:
 
 
 def play(
-    env: Any, policy: Any, actor: Any, episode: int, horizon: int, noise: bool
+    env: Any, policy: Any, actor: Any, episode: int, horizon: int, *, noise: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """Plays one episode.
 
@@ -137,7 +163,8 @@ def play(
       noise: whether actions are drawn, or the policy's mode.
 
     Returns:
-      Positions [T + 1, nq], the start's first, and rewards [T], to the end of the episode.
+      Positions [T + 1, nq], the start's first, and rewards [T], to the end of the episode: its
+      own, the time limit, or the step before numbers are not finite.
     """
     import jax
     import jax.numpy as jnp
@@ -153,8 +180,9 @@ def play(
         drawn = distribution.sample(outputs, noises)
         after = env.step(state, drawn if noise else distribution.mode(outputs))
         after = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, state)
-        record = after.pipeline_state.qpos, after.reward, alive
-        return (after, alive & (after.done == 0)), record
+        finite = jnp.all(jnp.isfinite(after.obs)) & jnp.isfinite(after.reward)
+        record = after.pipeline_state.qpos, after.reward, alive & finite
+        return (after, alive & finite & (after.done == 0)), record
 
     @jax.jit
     def whole(key):
@@ -176,30 +204,43 @@ class Renderer:
         Raises:
           ValueError: there is no OpenGL here.
         """
-        import mujoco
-
+        mujoco = _import_mujoco()
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
         model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.4, 0.6
         cameras = [model.camera(i).name for i in range(model.ncam)]
         self._camera = "track" if "track" in cameras else -1
-        self._model, self._data = model, mujoco.MjData(model)  # type: ignore - a C extension
+        self._model, self._data = model, mujoco.MjData(model)
+        self._forward = mujoco.mj_forward
         try:
             self._renderer = mujoco.Renderer(model, height, width)
         except Exception as error:  # each of MuJoCo's backends has its own
-            raise ValueError(
-                f"MuJoCo cannot draw here ({error}); install EGL (Debian: apt install libegl1) "
-                "or set MUJOCO_GL to egl, osmesa or glfw, whichever this machine has"
-            ) from error
+            raise _no_drawing(error) from error
 
     def draw(self, qpos: np.ndarray) -> np.ndarray:
         """Returns a picture [height, width, 3] uint8 at positions [nq]."""
-        import mujoco
-
         self._data.qpos[:] = qpos
-        mujoco.mj_forward(self._model, self._data)  # type: ignore - a C extension
+        self._forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
         return self._renderer.render()
+
+
+def _import_mujoco() -> Any:
+    """Returns MuJoCo; without a screen it is told to draw through EGL, where that is installed."""
+    if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+    try:
+        import mujoco
+    except Exception as error:  # what MUJOCO_GL names is not here
+        raise _no_drawing(error) from error
+    return mujoco
+
+
+def _no_drawing(error: Exception) -> ValueError:
+    return ValueError(
+        f"MuJoCo cannot draw here ({error}); install EGL (Debian: apt install libegl1) "
+        "or set MUJOCO_GL to egl, osmesa or glfw, whichever this machine has"
+    )
 
 
 def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
@@ -212,21 +253,22 @@ def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     """
     from mjx_reinforce.records import write_bytes
 
-    if path.suffix == ".gif":
+    if path.suffix.lower() == ".gif":
         from PIL import Image
 
-        first, *rest = (Image.fromarray(frame) for frame in frames)
+        pictures = (Image.fromarray(frame) for frame in frames)
+        options: dict[str, Any] = {"save_all": True, "loop": 0, "duration": 1000 / rate}
         film = io.BytesIO()
-        save = functools.partial(first.save, film, format="GIF", save_all=True, loop=0)
-        save(append_images=rest, duration=1000 / rate)
+        next(pictures).save(film, format="GIF", append_images=pictures, **options)
         write_bytes(path, film.getvalue())
     else:
-        partial = path.with_name(f".{path.stem}.partial{path.suffix}")
-        _ffmpeg(path).write_video(partial, list(frames), fps=rate)
-        os.replace(partial, path)
+        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+            partial = Path(folder) / path.name
+            _mediapy(path).write_video(partial, list(frames), fps=rate)
+            os.replace(partial, path)
 
 
-def _ffmpeg(path: Path) -> Any:
+def _mediapy(path: Path) -> Any:
     """Returns mediapy.
 
     Raises:

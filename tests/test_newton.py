@@ -9,7 +9,7 @@ from mujoco import mjx
 from mujoco.mjx._src import solver
 
 from mjx_reinforce import envs
-from mjx_reinforce.envs import newton
+from mjx_reinforce.envs import newton, physics
 
 SCENE = """
 <mujoco>
@@ -92,7 +92,9 @@ def test_the_line_search_finds_the_root_among_kinks():
     for _ in range(20):
         residual, change = random.standard_normal((2, 12))
         stiffness = 10 ** random.uniform(-1, 3, 12)
-        rows = newton._Rows(jnp.zeros((12, 1)), jnp.zeros(12), jnp.asarray(stiffness), False)
+        rows = newton._Rows(
+            jnp.zeros((12, 1)), jnp.zeros(12), jnp.asarray(stiffness), jnp.array(False)
+        )
         active = residual < 0
         curvature = random.uniform(0.1, 1)
         pull, stretch = stiffness * change * residual, stiffness * change**2
@@ -123,6 +125,45 @@ def test_a_nan_ends_the_search():
     dirty = solve(qpos, qvel.at[2].set(jnp.nan), warmstart)
     assert np.isnan(dirty[2]).all()
     np.testing.assert_array_equal(np.delete(dirty, 2, 0), np.delete(clean, 2, 0))
+
+
+def test_an_optimum_is_left_as_it_is():
+    """A sphere that leaves the floor: no row pushes, and the gradient is zero to the last bit."""
+    xml = """
+    <mujoco><worldbody><geom type="plane" size="5 5 1"/>
+      <body pos="0 0 0.099"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>
+        <geom type="sphere" size="0.1"/></body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)  # pyright: ignore
+    model, data = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
+    data = data.replace(qvel=data.qvel.at[2].set(5.0))
+    qacc = jax.jit(lambda data: physics.forward(model, data).qacc)(data)
+    np.testing.assert_allclose(qacc, [0, 0, -9.81, 0, 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("cap", [1, 2])
+def test_caps_leave_no_more_cost_than_the_start(cap):
+    with jax.enable_x64(True):
+        model, data = scene()
+        opt = model.opt.replace(iterations=cap, ls_iterations=cap)
+        capped = model.replace(opt=opt)
+
+        def costs(*state):
+            ready = rows_at(model, data, *state)
+            impl = ready._impl
+
+            def cost(qacc):
+                residual = impl.efc_J @ qacc - impl.efc_aref
+                equality = jnp.arange(residual.size) < impl.ne
+                pushed = jnp.where(equality | (residual < 0), residual, 0)
+                offset = qacc - ready.qacc_smooth
+                inertial = offset @ mjx._src.support.mul_m(model, ready, offset)
+                return (inertial + jnp.sum(impl.efc_D * pushed**2)) / 2
+
+            return cost(newton.solve(capped, ready)[0]), cost(ready.qacc_smooth)
+
+        after, before = jax.jit(jax.vmap(costs))(*random_states(model, 64))
+    assert np.all(np.asarray(after) <= np.asarray(before))
+    assert np.median(np.asarray(after) / np.asarray(before)) < 0.5
 
 
 @pytest.mark.parametrize(

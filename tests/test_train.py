@@ -171,10 +171,11 @@ def test_bad_input_is_explained_before_anything_starts(run, tmp_path, capsys, ar
     assert (tmp_path / "taken" / "file").read_text() == "mine"
 
 
-def test_solving_needs_a_threshold(run, monkeypatch, capsys):
+def test_solving_needs_a_threshold(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(Survive, "reward_threshold", None)
     assert run(*ARGUMENTS, "--stop-when-solved", "--output", "out") == 2
     assert "leave --stop-when-solved out" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_smoothing_is_a_mean_of_the_latest():
