@@ -27,8 +27,9 @@ from mujoco import mjx
 from mujoco.mjx._src import collision_driver, collision_primitive, forward, math
 from mujoco.mjx._src.collision_types import Collision, GeomInfo
 
-# mjMINVAL: what C takes for zero.
-_MIN_LENGTH = 1e-15
+# What C takes for zero (mjMINVAL); in single precision, what rounding may leave of a zero distance
+# between points a few metres from the origin. Axes that cross, as in a planar Hopper, have that.
+_MIN_LENGTH = {"float64": 1e-15, "float32": 2e-6}
 # Capsules are parallel in C (`mjc_segWeights`) below this square of their angle's sine.
 _PARALLEL = 1e-8
 
@@ -96,8 +97,7 @@ def _collide_spheres(
 def _direction(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Returns a unit vector and the length; the x axis and 0 for what counts as no length."""
     square = jnp.dot(vector, vector)
-    # In single precision, rounding leaves lengths that are none.
-    short = square < max(_MIN_LENGTH, float(jnp.finfo(square.dtype).eps)) ** 2
+    short = square < _MIN_LENGTH[square.dtype.name] ** 2
     length = jnp.sqrt(jnp.where(short, 1, square))
     unit = jnp.where(short, jnp.eye(3, dtype=vector.dtype)[0], vector / length)
     return unit, jnp.where(short, 0, length)

@@ -370,6 +370,27 @@ def test_contacts_are_those_of_mujoco():
     np.testing.assert_allclose(theirs[2][ends].mean(axis=0), pos[middle][0], atol=1e-12)
 
 
+def test_axes_that_cross_push_across_also_in_single_precision():
+    """As in a planar Hopper: the distance is zero, of which rounding leaves up to 1e-6."""
+    rng = np.random.default_rng(0)
+    pivot = np.stack([rng.uniform(-3, 3, 200), np.zeros(200), rng.uniform(0, 2, 200)], axis=1)
+    tilt = rng.uniform(0, np.pi, 200)[:, None] + [0.0, 1.0]
+    turn = Rotation.from_euler("y", tilt.reshape(-1, 1)).as_matrix().reshape(200, 2, 3, 3)
+    along = rng.uniform(-0.2, 0.2, (200, 2, 1))
+    pos = jnp.asarray(pivot[:, None] - along * turn[..., 2], jnp.float32)
+    size = jnp.array([[0.05, 0.3, 0], [0.04, 0.3, 0]])
+
+    @jax.vmap
+    def collide(pos, mat):
+        data = types.SimpleNamespace(geom_xpos=pos, geom_xmat=mat)
+        model = types.SimpleNamespace(geom_size=size)
+        return contacts.capsule_capsule(model, data, None, np.array([[0, 1]]))
+
+    dist, _, frame = collide(pos, jnp.asarray(turn, jnp.float32))
+    np.testing.assert_allclose(dist, -0.09, atol=1e-6)
+    np.testing.assert_allclose(np.abs(frame[:, 0, 0]), np.tile([0, 1, 0], (200, 1)), atol=1e-5)
+
+
 def test_mjx_is_left_as_it_is():
     _, _, mx, start = compiled(TOUCHING)
 
