@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import tyro
+from rich.progress import track
 
 from mjx_reinforce import envs
 
@@ -83,7 +84,8 @@ def film(settings: Settings) -> None:
     print(f"{env_id}, seed {settings.seed}: return {rewards.sum():.1f} in {len(rewards)} steps")
     skip = max(1, math.ceil(1 / (env.dt * _MAX_RATE) - 1e-9))
     shown = qpos[: max(1, round(settings.seconds / env.dt)) : skip]
-    write_film(output, map(renderer.draw, shown), 1 / (env.dt * skip))
+    frames = track(map(renderer.draw, shown), "drawing", len(shown), transient=True)
+    write_film(output, frames, 1 / (env.dt * skip))
     print(f"{len(shown)} frames in {output}")
 
 
