@@ -11,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import parity
+import parity
 from mjx_reinforce import envs
+from parity_sides import Ours, make_peer
+from parity_states import draw_states
 
 NUM_STATES = 64
 IDS = [id for id in envs.names() if not id.endswith("-v0")]  # CartPole-v0 is v1, cut short
@@ -60,7 +62,7 @@ def test_equals_gymnasium(id):
     """One step from many states, the starts, and the observation at a start."""
     theirs = parity.Theirs.play(id, states=NUM_STATES, resets=1000, seed=0, tolerance=0)
     with jax.enable_x64(True):
-        ours = parity.Ours(id, NUM_STATES)
+        ours = Ours(id, NUM_STATES)
         starts = ours.starts(0, 1000)
         row = parity.reset_errors(starts, theirs.peer, theirs.starts, "float64")
         row |= parity.step_errors(ours, theirs.peer, theirs.states, theirs.expected, 2e-16)
@@ -76,8 +78,8 @@ def test_equals_gymnasium(id):
 @pytest.mark.parametrize("id", ["InvertedPendulum-v5", "CartPole-v1", "ContinuousCartPole-v0"])
 def test_states_reach_what_matters(id):
     """The states that are compared end episodes and pass limits, and not all of them."""
-    peer = parity.make_peer(id)
-    states = parity.draw_states(peer, envs.make(id).action_space, 200, seed=0)
+    peer = make_peer(id)
+    states = draw_states(peer, envs.make(id).action_space, 200, seed=0)
     ended = np.mean(parity.peer_steps(peer, *states).terminated)
     assert 0.05 < ended < 0.95
     low, high = peer.limits.T

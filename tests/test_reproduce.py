@@ -8,57 +8,60 @@ import numpy as np
 import pytest
 from toys import Toy, ToyState
 
-from experiments import reproduce
+import reproduce
 from mjx_reinforce import Box, reinforce
 from mjx_reinforce.bounded import truncated_normal
 from mjx_reinforce.config import check
 from mjx_reinforce.estimators import reward_to_go
 from mjx_reinforce.presets import PRESETS
+from reproduce_cases import CASES, load_reference
+from reproduce_mistakes import clamped_log_prob, stale_starts
+from reproduce_statistics import compare, rank_test, reached, windowed
 
 RECORD = {"every_updates": 50, "window_updates": 50, "seeds": {"1": [1.0, 2.0, 3.0], "2": [5.0]}}
 
 
 def test_windows_end_at_the_count():
     scores = np.arange(6.0).reshape(6, 1) * [1.0, 10.0]
-    np.testing.assert_allclose(reproduce.windowed(scores, 4, 2), [2.5, 25.0])
-    np.testing.assert_allclose(reproduce.windowed(scores, 2, 50), [0.5, 5.0])
+    np.testing.assert_allclose(windowed(scores, 4, 2), [2.5, 25.0])
+    np.testing.assert_allclose(windowed(scores, 2, 50), [0.5, 5.0])
 
 
 def test_seeds_count_as_far_as_they_got():
-    np.testing.assert_allclose(reproduce.reached(RECORD, 50), [1.0, 5.0])
-    np.testing.assert_allclose(reproduce.reached(RECORD, 150), [3.0])
+    np.testing.assert_allclose(reached(RECORD, 50), [1.0, 5.0])
+    np.testing.assert_allclose(reached(RECORD, 150), [3.0])
 
 
 def test_rank_test():
     ours = np.arange(20.0)
-    assert reproduce.rank_test(ours, ours[8:12]) > 0.5
-    assert reproduce.rank_test(ours, np.array([9.5])) > 0.5
+    assert rank_test(ours, ours[8:12]) > 0.5
+    assert rank_test(ours, np.array([9.5])) > 0.5
     # All of five beyond all of twenty: 2 of the binom(25, 5) = 53130 ways, sampled 9999 times.
-    assert reproduce.rank_test(ours, ours[:5] + 100) <= 0.001
+    assert rank_test(ours, ours[:5] + 100) <= 0.001
     # One of 21 places, at either end.
-    assert reproduce.rank_test(ours, np.array([100.0])) == pytest.approx(2 / 21, rel=0.15)
-    assert reproduce.rank_test(np.full(20, 50.0), np.full(3, 50.0)) == 1.0
+    assert rank_test(ours, np.array([100.0])) == pytest.approx(2 / 21, rel=0.15)
+    assert rank_test(np.full(20, 50.0), np.full(3, 50.0)) == 1.0
 
 
 def test_rank_test_is_fair():
     rng = np.random.default_rng(1)
-    p = [reproduce.rank_test(rng.exponential(size=32), rng.exponential(size=4)) for _ in range(100)]
+    p = [rank_test(rng.exponential(size=32), rng.exponential(size=4)) for _ in range(100)]
     assert np.mean(np.array(p) < 0.05) < 0.13  # 0.05 expected, sd 0.022
 
 
 def test_a_comparison_by_hand():
-    case = dataclasses.replace(reproduce.CASES[0], counts=(50,), updates=50)
+    case = dataclasses.replace(CASES[0], counts=(50,), updates=50)
     scores = np.ones((50, 101)) * np.arange(101.0)
-    (row,) = reproduce.compare(case, "000", RECORD, scores)
+    (row,) = compare(case, "000", RECORD, scores)
     assert (row["episode"], row["ours_mean"], row["theirs_mean"], row["theirs_n"]) == (50, 50, 3, 2)
     assert (row["ours_low"], row["ours_high"]) == (2.5, 97.5)
     assert row["inside"] == 1  # 1 is not, 5 is
     assert row["agrees"] == (row["p_value"] >= 0.05)
 
 
-@pytest.mark.parametrize("case", reproduce.CASES, ids=lambda case: case.title)
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.title)
 def test_a_case_fits_its_record(case):
-    reference = reproduce.load_reference()
+    reference = load_reference()
     changes = case.repair[1] if case.repair else {}
     check(reproduce.settings_of(case, 3, {}))
     check(reproduce.settings_of(case, 3, changes))
@@ -67,13 +70,13 @@ def test_a_case_fits_its_record(case):
     for name in case.references:
         entry = reference[name]
         assert all(count % entry["every_updates"] == 0 for count in case.counts)
-        assert all(len(reproduce.reached(entry, count)) >= 1 for count in case.counts)
+        assert all(len(reached(entry, count)) >= 1 for count in case.counts)
     own = reference[case.references[0]]
-    assert len(reproduce.reached(own, case.counts[-1])) == len(own["seeds"])
+    assert len(reached(own, case.counts[-1])) == len(own["seeds"])
 
 
 def test_end_to_end(tmp_path, monkeypatch):
-    case = next(case for case in reproduce.CASES if case.references == ("002_ars_fixed2",))
+    case = next(case for case in CASES if case.references == ("002_ars_fixed2",))
     monkeypatch.setattr(reproduce, "CASES", (case,))
     settings = reproduce.Settings(
         preset=(case.preset,),
@@ -114,7 +117,7 @@ def test_a_stale_start_shows_the_episode_before():
     learner = reinforce(
         Count(), estimator=reward_to_go(), num_episodes=1, normalize_steps=0, engine="mjx"
     )
-    stale = reproduce.stale_starts(learner)
+    stale = stale_starts(learner)
     step = jax.jit(stale.step)
     state = stale.init(jax.random.key(0))
     returns = []
@@ -129,13 +132,13 @@ def test_a_stale_start_shows_the_episode_before():
 def test_the_clamped_density_is_torchrls():
     """Its numbers on record: the mean 6 and 10, the std 0.8, the action 0.95."""
     outputs = jnp.array([[6.0, np.log(0.8)], [10.0, np.log(0.8)]])
-    value = reproduce.clamped_log_prob(outputs, jnp.full((2, 1), 0.95), -1.0, 1.0)
+    value = clamped_log_prob(outputs, jnp.full((2, 1), 0.95), -1.0, 1.0)
     np.testing.assert_allclose(value, [-6.80, -50.9], rtol=2e-3)
     exact = truncated_normal(Box(np.array([-1.0]), np.array([1.0])))
     inside = jnp.array([[0.3, -0.1]])
     action = jnp.array([[0.5]])
     np.testing.assert_allclose(
-        reproduce.clamped_log_prob(inside, action, -1.0, 1.0),
+        clamped_log_prob(inside, action, -1.0, 1.0),
         exact.log_prob(inside, action),
         rtol=1e-5,
     )
