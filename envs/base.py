@@ -152,7 +152,7 @@ class MujocoEnv(Env):
         """Returns the state one env step later under ``action`` [A]."""
         before = self._data(cast(Any, state.pipeline_state)).replace(ctrl=action)
         data = jax.lax.fori_loop(
-            0, self.frame_skip, lambda _, data: _like(self._physics_step(data), data), before
+            0, self.frame_skip, lambda _, data: physics.like(self._physics_step(data), data), before
         )
         if self.contact_forces:
             data = mjx.rne_postconstraint(self.model, data)
@@ -210,8 +210,3 @@ class MujocoEnv(Env):
     def backend(self) -> str:
         """The physics engine, for brax's interface."""
         return "mjx"
-
-
-def _like(new: mjx.Data, old: mjx.Data) -> mjx.Data:
-    """Returns new data in the old one's types; MJX makes tendon indices int64 under x64."""
-    return jax.tree.map(lambda x, y: x.astype(y.dtype), new, old)

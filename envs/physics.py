@@ -37,9 +37,8 @@ from mjx_reinforce.envs import contacts, newton
 
 _MAX_ROWS_TOGETHER = 2
 
-# Runge-Kutta 4: where each later stage is evaluated, and what each stage counts.
-_STAGE_POSITIONS = (0.5, 0.5, 1.0)
-_STAGE_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+# Runge-Kutta 4: where each stage is in the timestep, what it counts, and where the next one is.
+_STAGES = ((0, 1 / 6, 0.5), (0.5, 1 / 3, 0.5), (0.5, 1 / 3, 1), (1, 1 / 6, 0))
 
 # Below this square of an angle a series in it replaces the closed form in `_rotation_rate`.
 _SMALL_SQUARE = 0.01
@@ -65,12 +64,12 @@ def step(model: mjx.Model, data: mjx.Data, evaluate: Forward | None = None) -> m
     """
     if model.impl != mjx.Impl.JAX:
         raise ValueError(f"physics.step needs mjx.put_model(model, impl='jax'), got {model.impl}")
-    # Traced once for all stages of Runge-Kutta; the model stays constant, so that it folds.
+    # The model stays constant, so that it folds.
     evaluate = evaluate or jax.jit(functools.partial(forward, model))
-    data = evaluate(data)
     integrator = model.opt.integrator
     if integrator == mjx.IntegratorType.RK4:
         return _runge_kutta_4(model, data, evaluate)
+    data = evaluate(data)
     if integrator == mjx.IntegratorType.EULER:
         return stages.euler(model, data)
     if integrator == mjx.IntegratorType.IMPLICITFAST:
@@ -219,31 +218,42 @@ def _runge_kutta_4(model: mjx.Model, data: mjx.Data, evaluate: Forward) -> mjx.D
     velocities, though each is in its own stage's frame; MuJoCo, from 4.0 on, averages the rates of
     one rotation vector (Runge-Kutta-Munthe-Kaas), without which the order is 2.
     """
-    start, stage, timestep = data, data, model.opt.timestep
-    rate = data.qvel
-    qvel, qacc, act_dot = (_STAGE_WEIGHTS[0] * x for x in (rate, data.qacc, data.act_dot))
-    for position, weight in zip(_STAGE_POSITIONS, _STAGE_WEIGHTS[1:], strict=True):
-        advanced = start.replace(qacc=position * stage.qacc)
-        advanced = stages._advance(
-            model, advanced, position * stage.act_dot, advanced.qacc, position * rate
-        )
+    start, timestep = data, model.opt.timestep
+
+    def follow(carry: tuple, row: jax.Array) -> tuple[tuple, None]:
+        """Evaluates a stage, adds what it counts, and moves from the start to the next stage."""
+        stage, rate, sums = carry
+        position, weight, next_position = row
+        stage = like(evaluate(stage), stage)
+        rate = _displacement_rate(model, stage.qvel, rate, position)
+        rates = rate, stage.qacc, stage.act_dot
+        sums = tuple(total + weight * x for total, x in zip(sums, rates, strict=True))
+        qvel, qacc, act_dot = (next_position * x for x in rates)
+        advanced = stages._advance(model, start.replace(qacc=qacc), act_dot, qacc, qvel)
         stage = stage.replace(
             qpos=advanced.qpos,
             qvel=advanced.qvel,
-            act=start.act + position * stage.act_dot * timestep,
-            time=start.time + position * timestep,
+            act=start.act + act_dot * timestep,
+            time=start.time + next_position * timestep,
         )
-        stage = evaluate(stage)
-        rate = _displacement_rate(model, stage.qvel, rate, position)
-        qvel = qvel + weight * rate
-        qacc = qacc + weight * stage.qacc
-        act_dot = act_dot + weight * stage.act_dot
+        return (stage, rate, sums), None
+
+    # A loop: one forward pass to compile, not four.
+    nothing = jax.tree.map(jnp.zeros_like, (data.qvel, data.qvel, data.act))
+    rows = jnp.asarray(_STAGES, data.qpos.dtype)
+    (stage, _, sums), _ = jax.lax.scan(follow, (data, data.qvel, nothing), rows)
     end = stage.replace(qpos=start.qpos, qvel=start.qvel, act=start.act, time=start.time)
+    qvel, qacc, act_dot = sums
     return stages._advance(model, end, act_dot, qacc, qvel)
 
 
+def like(new: mjx.Data, old: mjx.Data) -> mjx.Data:
+    """Returns new data in the old one's types; MJX makes tendon indices int64 under x64."""
+    return jax.tree.map(lambda x, y: x.astype(y.dtype), new, old)
+
+
 def _displacement_rate(
-    model: mjx.Model, qvel: jax.Array, last_rate: jax.Array, position: float
+    model: mjx.Model, qvel: jax.Array, last_rate: jax.Array, position: jax.Array
 ) -> jax.Array:
     """Returns how fast the displacement since the step's start grows at a stage, [nv].
 
@@ -251,7 +261,7 @@ def _displacement_rate(
         model: an MJX model; without free and ball joints, the answer is `qvel`.
         qvel: [nv] the stage's velocity.
         last_rate: [nv] the rate that led to the stage.
-        position: the stage's place in the timestep, from 0 to 1.
+        position: [] the stage's place in the timestep, from 0 to 1.
     """
     rate = qvel
     for kind, dof in zip(model.jnt_type, model.jnt_dofadr, strict=True):
