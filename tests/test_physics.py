@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from mjx_reinforce import fused
 from mjx_reinforce.envs import contacts, physics
+from mjx_reinforce.envs.fences import fenced
 
 ASSETS = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
 
@@ -404,3 +405,20 @@ def test_mjx_is_left_as_it_is():
     assert table == collision_driver._COLLISION_FUNC
     capsules = mjx.GeomType.CAPSULE, mjx.GeomType.CAPSULE
     assert table[capsules] is collision_primitive.capsule_capsule
+
+
+def test_descent_to_a_cylinder_is_written_out():
+    """A loop there stalls jaxlib 0.10.2; the contacts are the same without it."""
+    model = mujoco.MjModel.from_xml_path(os.path.join(ASSETS, "pusher_v5.xml"))
+    mjx_model, data = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
+    functions = [
+        lambda data: contacts.fwd_position(mjx_model, data),
+        fenced(lambda data: contacts.fwd_position(mjx_model, data)),
+    ]
+    plain, ours = (str(jax.make_jaxpr(function)(data)) for function in functions)
+    assert "scan[" in plain
+    assert "scan[" not in ours
+    assert "while[" not in ours
+    plain, ours = (cast(Any, jax.jit(function)(data))._impl.contact for function in functions)
+    np.testing.assert_allclose(ours.dist, plain.dist, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(ours.pos, plain.pos, rtol=1e-5, atol=1e-6)
