@@ -35,7 +35,7 @@ class Settings:
     noise: bool = False
     """Draw actions from the policy, as training does, instead of taking its mode."""
     output: Path | None = None
-    """The film; .gif, or .mp4 and others where mediapy and ffmpeg are installed.
+    """The film, .gif or, after pip install mediapy imageio-ffmpeg, .mp4.
     By default RUN/seed-SEED.gif."""
     seconds: float = 20.0
     """Length of the film at most, in simulated seconds; the episode is played to its end."""
@@ -102,13 +102,13 @@ def check(settings: Settings) -> Path:
         if not least <= value <= most:
             raise ValueError(f"--{name} must be in [{least}, {most}], got {value}")
     output = settings.output or settings.run / f"seed-{settings.seed}.gif"
-    if not output.suffix:
-        raise ValueError(f"{output} has no ending; end --output in .gif, or .mp4")
+    if output.suffix.lower() not in (".gif", ".mp4"):
+        raise ValueError(f"{output} is no film; end --output in .gif or .mp4")
     if not os.access(output.parent, os.W_OK):
         raise ValueError(f"cannot write to {output.parent}; choose another --output")
     if output.is_dir() or (output.exists() and not settings.overwrite):
         raise ValueError(f"{output} exists; pass --overwrite or another --output")
-    if output.suffix.lower() != ".gif":
+    if output.suffix.lower() == ".mp4":
         _mediapy(output)
     return output
 
@@ -249,7 +249,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
     """Writes a film at once.
 
     Args:
-      path: .gif, or what ffmpeg knows by its ending.
+      path: .gif or .mp4.
       frames: pictures [height, width, 3] uint8.
       rate: frames a second.
     """
@@ -271,20 +271,21 @@ def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
 
 
 def _mediapy(path: Path) -> Any:
-    """Returns mediapy.
+    """Returns mediapy with an ffmpeg.
 
     Raises:
-      ValueError: mediapy or ffmpeg is not installed.
+      ValueError: one of the two is not installed.
     """
     try:
+        import imageio_ffmpeg
         import mediapy
-    except ImportError:
-        mediapy = None
-    if mediapy is None or not mediapy.video_is_available():
+
+        mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
+    except (ImportError, RuntimeError) as error:
         raise ValueError(
-            f"films other than .gif, such as {path}, need mediapy and ffmpeg: "
-            "pip install mediapy, and ffmpeg from your system"
-        )
+            f"cannot write {path} ({error}); "
+            "pip install mediapy imageio-ffmpeg, or end --output in .gif"
+        ) from error
     return mediapy
 
 
