@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import tyro
@@ -45,12 +45,23 @@ def main() -> None:
         _configure_jax()
         learner, horizon = build(env, config)
     except ValueError as error:
-        if directory and not any(directory.iterdir()):
-            directory.rmdir()
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    interrupted = train(env, learner, horizon, config, directory)
+        _refuse(str(error), directory)
+    try:
+        interrupted = train(env, learner, horizon, config, directory)
+    except RuntimeError as error:  # XLA's
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        remedy = "lower --num-seeds, --num-episodes, --eval-episodes or --horizon"
+        _refuse(f"this run does not fit into memory ({error}); {remedy}", directory)
     sys.exit(130 if interrupted else 0)
+
+
+def _refuse(message: str, directory: Path | None) -> NoReturn:
+    """Says what is wrong, leaves no empty run directory behind, and exits."""
+    if directory and not any(directory.iterdir()):
+        directory.rmdir()
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(2)
 
 
 def parse(arguments: Sequence[str]) -> Config:

@@ -178,6 +178,14 @@ def test_solving_needs_a_threshold(run, tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_run_beyond_all_memory_is_refused(run, tmp_path, capsys):
+    assert run(*ARGUMENTS, "--num-seeds", str(10**13), "--output", "out") == 2
+    error = capsys.readouterr().err
+    assert "does not fit into memory" in error
+    assert "lower --num-seeds" in error
+    assert not (tmp_path / "out").exists()
+
+
 def test_smoothing_is_a_mean_of_the_latest():
     values = np.arange(12.0).reshape(6, 2)
     expected = [values[max(0, u - 2) : u + 1].mean(axis=0) for u in range(6)]
