@@ -22,8 +22,9 @@ with contextlib.redirect_stdout(io.StringIO()):
     from brax.envs.base import Env, State
     from mujoco import mjx
 
-    from mjx_reinforce.envs import models, physics
-    from mjx_reinforce.envs.fences import fenced
+    from mjx_reinforce.envs import models
+    from mjx_reinforce.physics import step as physics
+    from mjx_reinforce.physics.mjx_internals import fenced
 
 SOLVERS = ("exact", "mjx", "fast")
 

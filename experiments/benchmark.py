@@ -25,9 +25,9 @@ from rich.table import Table
 
 from benchmark_peers import Candidate, peers
 from mjx_reinforce import envs, load_policy, mlp_policy, reinforce
-from mjx_reinforce.engines import Player, choose
-from mjx_reinforce.learner import Actor, default_distribution
-from mjx_reinforce.normalize import apply, init
+from mjx_reinforce.engines.choice import Player, choose
+from mjx_reinforce.learners.learner import Actor, default_distribution
+from mjx_reinforce.policies.normalize import apply, init
 from mjx_reinforce.types import action_space, observation_size
 
 #: Name in the table -> engine, and the solver of the environment's physics.

@@ -24,9 +24,9 @@ from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
 from mjx_reinforce import envs
-from mjx_reinforce.build import build
-from mjx_reinforce.config import Config
-from mjx_reinforce.presets import PRESETS
+from mjx_reinforce.runs.build import build
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.train import Programs
 from reproduce_cases import CASES, Case, limit, load_reference
 from reproduce_figures import draw

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.stats import norm
 
-from mjx_reinforce import checkpoint
+from mjx_reinforce.export import policy_files as checkpoint
 
 STALE = "stale first observation"
 _CLAMP = 1e-6

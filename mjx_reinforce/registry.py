@@ -7,24 +7,24 @@ from typing import Any
 
 #: Action distributions: name -> "module:function" of an action space.
 DISTRIBUTIONS = {
-    "normal": "mjx_reinforce.normals:normal",
-    "normal-softplus": "mjx_reinforce.normals:normal_softplus",
-    "normal-sigmoid": "mjx_reinforce.normals:normal_sigmoid",
-    "truncated-normal": "mjx_reinforce.bounded:truncated_normal",
-    "clipped-normal": "mjx_reinforce.bounded:clipped_normal",
-    "tanh-normal": "mjx_reinforce.bounded:tanh_normal",
-    "deterministic": "mjx_reinforce.normals:deterministic",
-    "categorical": "mjx_reinforce.distributions:categorical",
+    "normal": "mjx_reinforce.policies.normal:normal",
+    "normal-softplus": "mjx_reinforce.policies.normal:normal_softplus",
+    "normal-sigmoid": "mjx_reinforce.policies.normal:normal_sigmoid",
+    "truncated-normal": "mjx_reinforce.policies.bounded:truncated_normal",
+    "clipped-normal": "mjx_reinforce.policies.bounded:clipped_normal",
+    "tanh-normal": "mjx_reinforce.policies.bounded:tanh_normal",
+    "deterministic": "mjx_reinforce.policies.normal:deterministic",
+    "categorical": "mjx_reinforce.policies.distribution:categorical",
 }
 
 #: Gradient estimators: name -> "module:function" of a discount.
 ESTIMATORS = {
-    "total-return": "mjx_reinforce.estimators:total_return",
-    "reward-to-go": "mjx_reinforce.estimators:reward_to_go",
-    "leave-one-out": "mjx_reinforce.estimators:leave_one_out",
-    "value-baseline": "mjx_reinforce.estimators:value_baseline",
-    "mean-log-prob": "mjx_reinforce.estimators:mean_log_prob",
-    "normalized-returns": "mjx_reinforce.estimators:normalized_returns",
+    "total-return": "mjx_reinforce.learners.estimators:total_return",
+    "reward-to-go": "mjx_reinforce.learners.estimators:reward_to_go",
+    "leave-one-out": "mjx_reinforce.learners.estimators:leave_one_out",
+    "value-baseline": "mjx_reinforce.learners.estimators:value_baseline",
+    "mean-log-prob": "mjx_reinforce.learners.estimators:mean_log_prob",
+    "normalized-returns": "mjx_reinforce.learners.estimators:normalized_returns",
 }
 
 

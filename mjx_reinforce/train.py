@@ -16,10 +16,10 @@ import numpy as np
 import tyro
 
 from mjx_reinforce import envs
-from mjx_reinforce.build import build, policy_settings
-from mjx_reinforce.config import GROUPS, Config, check
-from mjx_reinforce.presets import PRESETS
 from mjx_reinforce.registry import check_name
+from mjx_reinforce.runs.build import build, policy_settings
+from mjx_reinforce.runs.config import GROUPS, Config, check
+from mjx_reinforce.runs.presets import PRESETS
 
 _FILES = (
     "config.json",
@@ -38,7 +38,7 @@ def main() -> None:
     try:
         config = parse(sys.argv[1:])
         check(config)
-        from mjx_reinforce import records
+        from mjx_reinforce.runs import files as records
 
         directory = records.prepare(config.output, config.env, config.overwrite)
         env = envs.make(config.env)
@@ -129,7 +129,7 @@ class Programs:
         import jax.numpy as jnp
         from jax import lax
 
-        from mjx_reinforce.evaluation import evaluate
+        from mjx_reinforce.runs.evaluation import evaluate
 
         def update(carry, _):
             states, used = carry
@@ -178,9 +178,12 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
     Returns:
       Whether it was interrupted.
     """
-    from mjx_reinforce import checkpoint, records, report
-    from mjx_reinforce.display import Display, Interrupt, print_summary
-    from mjx_reinforce.runlog import RunLog
+    from mjx_reinforce.export import policy_files as checkpoint
+    from mjx_reinforce.export.files import write_json
+    from mjx_reinforce.reports import curves as report
+    from mjx_reinforce.runs import files as records
+    from mjx_reinforce.runs.display import Display, Interrupt, print_summary
+    from mjx_reinforce.runs.log import RunLog
 
     settings = dataclasses.asdict(config) | {"horizon": horizon, "output": str(directory)}
     threshold = getattr(env, "reward_threshold", None)
@@ -192,7 +195,7 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
         gc.freeze()
         gc.enable()
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
-        records.write_json(directory / "config.json", settings | records.provenance())
+        write_json(directory / "config.json", settings | records.provenance())
         display.say(f"compiled in {compile_seconds:.1f} s")
         display.start()
         threading.Thread(target=report.load_libraries, daemon=True).start()

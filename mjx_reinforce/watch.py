@@ -69,7 +69,7 @@ def film(settings: Settings) -> None:
     env_id, horizon = read_run(settings.run)
     output = check(settings)
     _import_mujoco()
-    from mjx_reinforce.checkpoint import load_policy
+    from mjx_reinforce.export.policy_files import load_policy
 
     policy, actor = load_policy(settings.run / "policy", settings.seed)
     env = envs.make(env_id)
@@ -171,8 +171,8 @@ def play(
     import jax
     import jax.numpy as jnp
 
-    from mjx_reinforce import normalize
-    from mjx_reinforce.rollouts import begin
+    from mjx_reinforce.engines.rollouts import begin
+    from mjx_reinforce.policies import normalize
 
     distribution = policy.distribution
 
@@ -253,7 +253,7 @@ def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
       frames: pictures [height, width, 3] uint8.
       rate: frames a second.
     """
-    from mjx_reinforce.records import write_bytes
+    from mjx_reinforce.export.files import write_bytes
 
     if path.suffix.lower() == ".gif":
         from PIL import Image

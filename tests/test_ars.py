@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from toys import Chain, SignedTarget, Survive, Target
 
-from mjx_reinforce import ars as ars_module
-from mjx_reinforce import evaluate, mlp_policy, normalize, rollout, train_step
-from mjx_reinforce.ars import ars
-from mjx_reinforce.normals import deterministic
+from mjx_reinforce import evaluate, mlp_policy, rollout, train_step
+from mjx_reinforce.learners import ars as ars_module
+from mjx_reinforce.learners.ars import ars
+from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.normal import deterministic
 from mjx_reinforce.types import Discrete
 
 

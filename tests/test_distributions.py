@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy import integrate, special, stats
 
-from mjx_reinforce import Box, fused, truncated_normal
-from mjx_reinforce.normals import normal
+from mjx_reinforce import Box, fused
+from mjx_reinforce.policies import normal_integrals as truncated_normal
+from mjx_reinforce.policies.normal import normal
 from mjx_reinforce.registry import DISTRIBUTIONS, load
 from mjx_reinforce.types import Discrete
 

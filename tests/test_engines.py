@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce import engines, envs, kernel, normal, rollouts
+from mjx_reinforce import envs, normal
+from mjx_reinforce.engines import choice as engines
+from mjx_reinforce.engines import kernel, rollouts
 from mjx_reinforce.types import action_space
 
 NUM_STATES = 10_000

@@ -10,7 +10,7 @@ import pytest
 from toys import Chain, categorical, expected_return
 
 from mjx_reinforce import Policy, Trajectory, reinforce, train_step
-from mjx_reinforce import estimators as est
+from mjx_reinforce.learners import estimators as est
 from mjx_reinforce.registry import ESTIMATORS, load
 
 LENGTHS = np.array([4, 1, 3])

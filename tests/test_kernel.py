@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 from toys import Chain, Survive, ToyState, categorical
 
-from mjx_reinforce import envs, fused, kernel, mlp_policy, normal, normalize, rollouts, types
-from mjx_reinforce.learner import Actor
+from mjx_reinforce import envs, fused, mlp_policy, normal, types
+from mjx_reinforce.engines import kernel, rollouts
+from mjx_reinforce.learners.learner import Actor
+from mjx_reinforce.policies import normalize
 
 HORIZON = 24  # one chunk; a fresh pendulum falls after 6 to 30 steps
 

@@ -10,16 +10,8 @@ import optax
 import pytest
 from toys import Late, Signed, SignedTarget, Survive, Target, Toy
 
-from mjx_reinforce import (
-    estimators,
-    gradients,
-    mlp_policy,
-    normal,
-    reinforce,
-    rollout,
-    train_step,
-    updates,
-)
+from mjx_reinforce import mlp_policy, normal, reinforce, rollout, train_step
+from mjx_reinforce.learners import estimators, gradients, updates
 
 
 def train(env, num_updates, **settings):
@@ -37,8 +29,8 @@ def critic():
 
 
 def value(learner, state, obs):
-    from mjx_reinforce import normalize
-    from mjx_reinforce.networks import MLP
+    from mjx_reinforce.policies import normalize
+    from mjx_reinforce.policies.networks import MLP
 
     scaled = normalize.apply(state.actor.normalizer, jnp.asarray(obs))
     return MLP((64, 64), 1).apply(state.estimator_state.params, scaled)[..., 0]

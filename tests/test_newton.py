@@ -9,7 +9,8 @@ from mujoco import mjx
 from mujoco.mjx._src import solver
 
 from mjx_reinforce import envs
-from mjx_reinforce.envs import newton, physics
+from mjx_reinforce.physics import newton
+from mjx_reinforce.physics import step as physics
 
 SCENE = """
 <mujoco>

@@ -1,61 +1,74 @@
 """The package's shape: imports point one way, the heavy ones wait, the README runs."""
 
 import ast
+import graphlib
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-#: Modules from the ground up; each may import only from earlier levels.
-LEVELS = [
-    {"__init__", "registry", "types", "networks", "statistics", "fused", "truncated_normal"},
-    {
-        "distributions",
-        "normals",
-        "bounded",
-        "estimators",
-        "gradients",
-        "rollouts",
-        "normalize",
-        "control",
-        "envs",
-    },
-    {"policies", "kernel", "engines", "updates", "learner", "ars", "evaluation"},
-    {"checkpoint", "config", "presets", "build", "records", "report", "display", "runlog"},
-    {"train", "watch"},
-]
+PACKAGE = ROOT / "mjx_reinforce"
+#: Folders and root modules from the ground up; a file imports from its own folder and those before.
+ORDER = (
+    *("types", "registry", "fused", "physics", "envs", "policies", "engines", "learners"),
+    *("reports", "export", "runs", "train", "watch"),
+)
+#: Who may know that our environments exist; all others take any environment as an argument.
+MAY_IMPORT_ENVS = {"envs", "runs", "train", "watch"}
+
+
+def modules(root, parent):
+    """Dotted names below the package, and their files; a package is named as its folder."""
+    for path in sorted(root.rglob("*.py")):
+        if "envs" not in path.relative_to(root).parts:  # a link to the folder at the top
+            parts = (*parent, *path.relative_to(root).with_suffix("").parts)
+            yield ".".join(parts[:-1] if parts[-1] == "__init__" else parts), path
+
+
+FILES = dict([*modules(PACKAGE, ()), *modules(ROOT / "envs", ("envs",))])
+
+
+def folder(module):
+    return module.partition(".")[0]
 
 
 def imported(path):
     """The package's own modules that a file imports, at its top or in its functions."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names = []
         if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mjx_reinforce"):
-            parts = node.module.split(".")
-            yield from [parts[1]] if len(parts) > 1 else [alias.name for alias in node.names]
+            inside = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = [
+                n if n.removeprefix("mjx_reinforce.") in FILES else node.module for n in inside
+            ]
         elif isinstance(node, ast.Import):
-            yield from (a.name.split(".")[1] for a in node.names if "mjx_reinforce." in a.name)
+            names = [alias.name for alias in node.names if "mjx_reinforce." in alias.name]
+        yield from (name.removeprefix("mjx_reinforce.") for name in names if "." in name)
 
 
-def level(module):
-    return next(i for i, names in enumerate(LEVELS) if module in names)
+@pytest.mark.parametrize("module", filter(None, FILES))
+def test_imports_point_one_way(module):
+    for other in imported(FILES[module]):
+        where, here = ORDER.index(folder(other)), ORDER.index(folder(module))
+        assert where <= here, f"{module} imports {other}"
+        if folder(other) == "envs":
+            assert folder(module) in MAY_IMPORT_ENVS, f"{module} imports {other}"
 
 
-@pytest.mark.parametrize(
-    "path", sorted((ROOT / "mjx_reinforce").glob("*.py")), ids=lambda p: p.stem
-)
-def test_imports_point_one_way(path):
-    for module in imported(path):
-        assert level(module) <= level(path.stem), f"{path.stem} imports {module}"
-        if module == "envs":
-            assert path.stem in ("train", "watch", "config", "__init__")
+def test_no_imports_in_a_circle():
+    """Within a folder too: every file can be read after those it imports."""
+    graph = {name: set(imported(path)) - {name} for name, path in FILES.items() if name}
+    graphlib.TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "envs").glob("*.py")), ids=lambda p: p.stem)
-def test_envs_import_no_trainer_module(path):
-    assert set(imported(path)) <= {"types", "registry", "fused", "envs"}
+def test_the_wheel_has_every_package():
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]
+    packages = (name for name, path in FILES.items() if path.name == "__init__.py")
+    assert set(listed["packages"]) == {f"mjx_reinforce.{name}".strip(".") for name in packages}
 
 
 def run(code):
@@ -66,7 +79,7 @@ def run(code):
 
 def test_import_is_light():
     loaded = run(
-        "import sys, mjx_reinforce, mjx_reinforce.envs, mjx_reinforce.config\n"
+        "import sys, mjx_reinforce, mjx_reinforce.envs, mjx_reinforce.runs.config\n"
         "print([m for m in ('jax', 'brax', 'mujoco', 'flax', 'scipy') if m in sys.modules])"
     )
     assert loaded.strip() == "[]"

@@ -15,7 +15,9 @@ from mujoco.mjx._src import collision_driver, collision_primitive, collision_sdf
 from scipy.spatial.transform import Rotation
 
 from mjx_reinforce import fused
-from mjx_reinforce.envs import contacts, fences, physics
+from mjx_reinforce.physics import contacts
+from mjx_reinforce.physics import mjx_internals as fences
+from mjx_reinforce.physics import step as physics
 
 ASSETS = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
 

@@ -6,10 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce import Box, checkpoint, mlp_policy, normal
-from mjx_reinforce.distributions import categorical
-from mjx_reinforce.networks import MLP
-from mjx_reinforce.normals import normal_softplus
+from mjx_reinforce import Box, mlp_policy, normal
+from mjx_reinforce.export import policy_files as checkpoint
+from mjx_reinforce.policies.distribution import categorical
+from mjx_reinforce.policies.networks import MLP
+from mjx_reinforce.policies.normal import normal_softplus
 from mjx_reinforce.types import Discrete
 
 SPACE = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))

@@ -15,10 +15,10 @@ from toys import Survive
 
 from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
-from mjx_reinforce.build import build, policy_settings
-from mjx_reinforce.checkpoint import build_policy
-from mjx_reinforce.config import Config, check
-from mjx_reinforce.presets import PRESETS
+from mjx_reinforce.export.policy_files import build_policy
+from mjx_reinforce.runs.build import build, policy_settings
+from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.runs.presets import PRESETS
 
 TINY = ["--num-seeds", "2", "--max-updates", "2", "--horizon", "8"]
 TINY += ["--eval-every", "1", "--eval-episodes", "1", "--minibatch-updates", "3"]

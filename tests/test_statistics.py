@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mjx_reinforce.statistics import iqm, iqm_interval, steps_to_solve
+from mjx_reinforce.reports.statistics import iqm, iqm_interval, steps_to_solve
 
 
 def test_iqm_is_the_mean_of_the_middle_half():

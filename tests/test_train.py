@@ -14,8 +14,10 @@ import numpy as np
 import pytest
 from toys import Survive
 
-from mjx_reinforce import envs, load_policy, normalize, report
+from mjx_reinforce import envs, load_policy
 from mjx_reinforce import train as train_module
+from mjx_reinforce.policies import normalize
+from mjx_reinforce.reports import curves as report
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
 

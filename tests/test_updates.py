@@ -9,8 +9,9 @@ import optax
 import pytest
 from toys import Survive, Target
 
-from mjx_reinforce import estimators, reinforce, train_step, updates
-from mjx_reinforce.updates import Problem
+from mjx_reinforce import reinforce, train_step
+from mjx_reinforce.learners import estimators, updates
+from mjx_reinforce.learners.updates import Problem
 
 LENGTHS = np.array([4, 1, 3])
 MASK = np.arange(5)[:, None] < LENGTHS

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mjx_reinforce import envs, load_policy, normalize, watch
-from mjx_reinforce.checkpoint import save_policy
-from mjx_reinforce.learner import reinforce
-from mjx_reinforce.rollouts import rollout
+from mjx_reinforce import envs, load_policy, watch
+from mjx_reinforce.engines.rollouts import rollout
+from mjx_reinforce.export.policy_files import save_policy
+from mjx_reinforce.learners.learner import reinforce
+from mjx_reinforce.policies import normalize
 
 SETTINGS = {
     "InvertedPendulum-v5": {

@@ -4,19 +4,10 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused import (
-    arrays,
-    branches,
-    elementwise,
-    indexing,
-    jaxprs,
-    linear,
-    loops,
-    reductions,
-    structural,
-)
+from mjx_reinforce.fused import arrays, branches, jaxprs, loops
 from mjx_reinforce.fused.errors import UnsupportedPrimitive
 from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.rules import elementwise, indexing, linear, reductions, structural
 
 _RULES = {
     **structural.RULES,

@@ -9,7 +9,8 @@ import jax
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.fused import arrays, emit, evaluate, jaxprs, lanes, liveness, loops, ops
+from mjx_reinforce.fused import arrays, evaluate, jaxprs, lanes, liveness, loops, ops
+from mjx_reinforce.fused.backends import xla as emit
 from mjx_reinforce.fused.graph import Graph, Scalar, Scope
 
 

@@ -58,3 +58,25 @@ def _swapped(module: Any, name: str, value: Any) -> Iterator[None]:
         yield
     finally:
         setattr(module, name, before)
+
+
+class Simulation:
+    """A read-only view of an ``mjx.Data``: every field of mjData under MuJoCo's own name.
+
+    MJX keeps some fields (``cinert``, ``cfrc_ext``, ``efc_force``, ...) in a part of its own;
+    here all stand side by side, as in C.
+    """
+
+    def __init__(self, data: Any):
+        self._data = data
+
+    def __getattr__(self, name: str) -> Any:
+        for part in (self._data, self._data._impl):
+            if hasattr(part, name):
+                return getattr(part, name)
+        raise AttributeError(f"mjx.Data has no field {name!r}; see mjData in MuJoCo's reference")
+
+
+def num_contacts(data: Any) -> int:
+    """Returns the most contacts that a model can have at once, from its ``mjx.Data``."""
+    return int(data._impl.ncon)

@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.learner import Actor, Learner
-from mjx_reinforce.rollouts import episode_lengths, episode_returns
+from mjx_reinforce.learners.learner import Actor, Learner
+from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.types import Environment
 
 

@@ -8,7 +8,7 @@ is, beside the training returns that the programs report. Five seeds of ours are
 import dataclasses
 import math
 
-from mjx_reinforce.config import Config
+from mjx_reinforce.runs.config import Config
 
 # What they have in common: PyTorch's weights, one episode an update, and none of our inventions.
 _PLAIN = Config(

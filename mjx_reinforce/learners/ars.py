@@ -18,9 +18,9 @@ import jax.core
 import jax.numpy as jnp
 import optax
 
-from mjx_reinforce import engines, normalize
-from mjx_reinforce.distributions import categorical
-from mjx_reinforce.learner import (
+from mjx_reinforce.engines import choice as engines
+from mjx_reinforce.engines.rollouts import episode_returns
+from mjx_reinforce.learners.learner import (
     Actor,
     Learner,
     TrainState,
@@ -28,9 +28,10 @@ from mjx_reinforce.learner import (
     episode_metrics,
     keep_finite,
 )
-from mjx_reinforce.normals import deterministic
-from mjx_reinforce.policies import Policy, mlp_policy
-from mjx_reinforce.rollouts import episode_returns
+from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.distribution import categorical
+from mjx_reinforce.policies.normal import deterministic
+from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.types import (
     Discrete,
     Environment,

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from mjx_reinforce.config import Config
+from mjx_reinforce.runs.config import Config
 
 
 def build(env: Any, config: Config) -> tuple[Any, int]:
@@ -15,8 +15,8 @@ def build(env: Any, config: Config) -> tuple[Any, int]:
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    from mjx_reinforce import learner
-    from mjx_reinforce.checkpoint import build_policy
+    from mjx_reinforce.learners import learner
+    from mjx_reinforce.export.policy_files import build_policy
 
     if config.stop_when_solved and getattr(env, "reward_threshold", None) is None:
         raise ValueError(
@@ -71,7 +71,7 @@ def policy_settings(env: Any, config: Config) -> dict[str, Any]:
 
 
 def _build_ars(env: Any, config: Config, shared: dict[str, Any]) -> Any:
-    from mjx_reinforce.ars import ars
+    from mjx_reinforce.learners.ars import ars
 
     return ars(
         env,
@@ -88,8 +88,8 @@ def _build_ars(env: Any, config: Config, shared: dict[str, Any]) -> Any:
 def _build_estimator(config: Config) -> Any:
     import optax
 
-    from mjx_reinforce import estimators
-    from mjx_reinforce.networks import MLP
+    from mjx_reinforce.learners import estimators
+    from mjx_reinforce.policies.networks import MLP
     from mjx_reinforce.registry import ESTIMATORS, load
 
     settings = {}
@@ -110,7 +110,7 @@ def _build_estimator(config: Config) -> Any:
 def _build_optimizer(config: Config) -> Any:
     import optax
 
-    from mjx_reinforce.updates import make_optimizer
+    from mjx_reinforce.learners.updates import make_optimizer
 
     rate: Any = config.learning_rate
     if config.decay_updates is not None:
@@ -128,7 +128,7 @@ def _build_optimizer(config: Config) -> Any:
 
 
 def _build_update(config: Config) -> Any:
-    from mjx_reinforce import updates
+    from mjx_reinforce.learners import updates
 
     if config.update == "minibatches":
         return updates.minibatches(config.minibatch_updates, config.minibatch_size)

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from mjx_reinforce.control import largest_divisor, while_any
-from mjx_reinforce.distributions import Distribution
+from mjx_reinforce.engines.loops import largest_divisor, while_any
+from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Environment, Trajectory
 
 #: Steps between two looks whether every episode is over; noise is drawn by the chunk.

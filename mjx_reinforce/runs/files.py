@@ -1,10 +1,9 @@
-"""The files of a run, each written whole or not at all."""
+"""The directory of a run, what its results depend on, and its tables."""
 
 import contextlib
 import csv
 import datetime
 import io
-import json
 import os
 import platform
 import subprocess
@@ -13,6 +12,8 @@ from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+from mjx_reinforce.export.files import write_bytes
 
 _PACKAGES = ("mjx-reinforce", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "optax", "flax")
 
@@ -45,28 +46,6 @@ def prepare(output: Path | None, env: str, overwrite: bool) -> Path:
             "choose another --output"
         ) from error
     return directory
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Replaces a file at once: a reader, or a crash, sees the old one or the new one."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
-    except BaseException:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(temporary)
-        raise
-
-
-def write_json(path: Path, value: Mapping[str, Any]) -> None:
-    """Writes JSON; numbers that are not finite become null, which JSON has."""
-    text = json.dumps(_finite(value), indent=2, default=str, allow_nan=False)
-    write_bytes(path, (text + "\n").encode())
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -113,13 +92,3 @@ def _git_commit() -> str | None:
             done = subprocess.run(command, capture_output=True, check=True, text=True)
             return done.stdout.strip()
     return None
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float) and not (-float("inf") < value < float("inf")):
-        return None
-    return value

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce import truncated_normal as tn
-from mjx_reinforce.distributions import Distribution
-from mjx_reinforce.normals import (
+from mjx_reinforce.policies import normal_integrals as tn
+from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.normal import (
     LOG_SQRT_2PI,
     gaussian,
     middle_and_half_range,
@@ -30,7 +30,7 @@ def truncated_normal(
 
     Density, entropy, their gradients and the sampling by inverse distribution
     function stay exact when the mean runs far out of the range; see
-    ``mjx_reinforce.truncated_normal``. The noise is uniform in (0, 1).
+    ``mjx_reinforce.policies.normal_integrals``. The noise is uniform in (0, 1).
 
     Args:
       space: the action bounds, [A] each, finite.

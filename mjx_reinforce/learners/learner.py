@@ -10,12 +10,14 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from mjx_reinforce import engines, normalize
-from mjx_reinforce.distributions import Distribution, categorical
-from mjx_reinforce.estimators import Estimator, leave_one_out, standardize
-from mjx_reinforce.normals import normal
-from mjx_reinforce.policies import Policy, mlp_policy
-from mjx_reinforce.rollouts import episode_lengths, episode_returns, simulated_steps
+from mjx_reinforce.engines import choice as engines
+from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns, simulated_steps
+from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
+from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_optimizer
+from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.distribution import Distribution, categorical
+from mjx_reinforce.policies.normal import normal
+from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.types import (
     Box,
     Discrete,
@@ -24,7 +26,6 @@ from mjx_reinforce.types import (
     action_space,
     observation_size,
 )
-from mjx_reinforce.updates import Problem, Update, full_batch, make_optimizer
 
 Metrics = dict[str, jax.Array]
 

@@ -6,10 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce import records, report
-from mjx_reinforce.config import Config
-from mjx_reinforce.display import Display
-from mjx_reinforce.statistics import iqm
+from mjx_reinforce.runs import files as records
+from mjx_reinforce.export.files import write_bytes, write_json
+from mjx_reinforce.reports import curves as report
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.display import Display
+from mjx_reinforce.reports.statistics import iqm
 
 
 class RunLog:
@@ -143,7 +145,7 @@ class RunLog:
             for name in ("eval_return", "env_steps", "episodes")
         }
         training = self._training_returns()
-        records.write_bytes(self._directory / "returns.npz", report.to_npz(training))
+        write_bytes(self._directory / "returns.npz", report.to_npz(training))
         summary = {
             "env": self._config.env,
             "engine": self._engine,
@@ -156,15 +158,15 @@ class RunLog:
             "useful_step_fraction": float(self.used.sum() / max(self._simulated, 1.0)),
             "nonfinite": self._broken,
         }
-        report.draw_learning_curve(
-            self._directory / "learning_curve.png",
+        picture = report.draw_learning_curve(
             history,
             training,
             self._config.env,
             self._threshold,
             "episodes" if self._config.env_steps is None else "env_steps",
         )
-        records.write_json(self._directory / "summary.json", summary)
+        write_bytes(self._directory / "learning_curve.png", picture)
+        write_json(self._directory / "summary.json", summary)
         return summary
 
     def _training_returns(self) -> dict[str, np.ndarray]:

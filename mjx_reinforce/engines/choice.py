@@ -3,7 +3,7 @@
 ``mjx`` maps the environment's step with ``jax.vmap``. ``fused`` writes it out in
 scalars and lets XLA fuse what is left (``mjx_reinforce.fused``). ``kernel`` writes
 out the whole step, policy included, and repeats it in one kernel on an NVIDIA GPU
-(``mjx_reinforce.kernel``). Trajectories agree up to rounding.
+(``mjx_reinforce.engines.kernel``). Trajectories agree up to rounding.
 """
 
 import functools
@@ -12,10 +12,11 @@ from typing import Any, NamedTuple
 
 import jax
 
-from mjx_reinforce import fused, kernel
-from mjx_reinforce.distributions import Distribution
+from mjx_reinforce import fused
+from mjx_reinforce.engines import kernel
+from mjx_reinforce.engines.rollouts import rollout
+from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.registry import check_name
-from mjx_reinforce.rollouts import rollout
 from mjx_reinforce.types import Environment, Trajectory, null_action
 
 #: An env step of more operations takes minutes to compile and runs slower than plain MJX.
@@ -45,7 +46,7 @@ class Engine(NamedTuple):
 
     name: "mjx", "fused" or "kernel"
     why: the reason it was chosen, for people
-    rollout: as ``mjx_reinforce.rollouts.rollout``
+    rollout: as ``mjx_reinforce.engines.rollouts.rollout``
     """
 
     name: str

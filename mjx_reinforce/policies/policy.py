@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.distributions import Distribution
-from mjx_reinforce.networks import INITIALIZERS, MLP
+from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.networks import INITIALIZERS, MLP
 from mjx_reinforce.registry import check_name
 
 

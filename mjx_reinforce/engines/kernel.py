@@ -19,11 +19,11 @@ from jax import lax
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton as pltriton
 
-from mjx_reinforce.control import largest_divisor, while_any
-from mjx_reinforce.distributions import Distribution
+from mjx_reinforce.engines.loops import largest_divisor, while_any
+from mjx_reinforce.engines.rollouts import CHUNK_STEPS, begin, draw_noise
 from mjx_reinforce.fused import UnsupportedPrimitive, scalarized
-from mjx_reinforce.networks import MLP
-from mjx_reinforce.rollouts import CHUNK_STEPS, begin, draw_noise
+from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.networks import MLP
 from mjx_reinforce.types import Environment, Trajectory
 
 #: Episodes a block, one a thread.

@@ -1,13 +1,11 @@
 """What a run says at its end: a summary, a picture, a table."""
 
 import io
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 
-from mjx_reinforce.records import write_bytes
-from mjx_reinforce.statistics import iqm, iqm_interval, steps_to_solve
+from mjx_reinforce.reports.statistics import iqm, iqm_interval, steps_to_solve
 
 #: Training returns are drawn as means over so many episodes.
 _SMOOTHED_EPISODES = 50
@@ -63,20 +61,18 @@ def smooth(values: np.ndarray, window: int) -> np.ndarray:
 
 
 def draw_learning_curve(
-    path: Path,
     history: dict[str, np.ndarray],
     training: dict[str, np.ndarray],
     env: str,
     threshold: float | None,
     axis: str = "env_steps",
-) -> None:
+) -> bytes:
     """Draws every seed thin, their interquartile mean with a 95 % band, and the threshold.
 
     Seeds may reach different numbers of env steps at an evaluation, so all curves are
     read off, by linear interpolation, in the range of the slowest seed.
 
     Args:
-      path: of the picture.
       history: evaluations, as for ``summarize``.
       training: ``episode_return`` of each update, NaN where a seed stands still, and the
         ``env_steps`` and ``episodes`` after it, [U, S]; drawn smoothed over some fifty
@@ -84,6 +80,9 @@ def draw_learning_curve(
       env: its id, for the title.
       threshold: the return that counts as solved, if any.
       axis: what the curves are drawn over, "env_steps" or "episodes".
+
+    Returns:
+      A PNG file.
     """
     from matplotlib.figure import Figure
 
@@ -111,7 +110,7 @@ def draw_learning_curve(
     axes.legend(loc="best", frameon=False)
     picture = io.BytesIO()
     figure.savefig(picture, format="png")
-    write_bytes(path, picture.getvalue())
+    return picture.getvalue()
 
 
 def _draw_mean(

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import optax
 from jax import lax
 
-from mjx_reinforce.gradients import accumulate_gradient
-from mjx_reinforce.networks import MLP
+from mjx_reinforce.learners.gradients import accumulate_gradient
+from mjx_reinforce.policies.networks import MLP
 from mjx_reinforce.types import Trajectory
 
 

@@ -33,7 +33,7 @@ from mujoco import mjx
 from mujoco.mjx._src import constraint, sensor, smooth, solver, types
 from mujoco.mjx._src import forward as stages
 
-from mjx_reinforce.envs import contacts, newton
+from mjx_reinforce.physics import contacts, newton
 
 _MAX_ROWS_TOGETHER = 2
 

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from flax import serialization, traverse_util
 
-from mjx_reinforce.learner import Actor
-from mjx_reinforce.normalize import Normalizer
-from mjx_reinforce.policies import Policy, mlp_policy
-from mjx_reinforce.records import write_bytes, write_json
+from mjx_reinforce.export.files import write_bytes, write_json
+from mjx_reinforce.learners.learner import Actor
+from mjx_reinforce.policies.normalize import Normalizer
+from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.registry import DISTRIBUTIONS, check_name, load
 from mjx_reinforce.types import Box, Discrete
 

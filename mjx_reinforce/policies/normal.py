@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.distributions import Distribution
+from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Box, Discrete
 
 LOG_SQRT_2PI = 0.5 * float(np.log(2.0 * np.pi))

@@ -1,0 +1,1 @@
+"""Backends: what the scalar graph becomes."""

@@ -1,0 +1,1 @@
+"""Rules: what each JAX primitive becomes in the scalar graph."""

@@ -1,0 +1,1 @@
+"""Policies: action distributions, networks, and the statistics that scale observations."""
