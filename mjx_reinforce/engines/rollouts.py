@@ -2,23 +2,34 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from mjx_reinforce.engines.loops import largest_divisor, while_any
+from mjx_reinforce.engines import episode
+from mjx_reinforce.engines.chunks import chunk_length, play_chunks
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Environment, Trajectory
 
-#: Steps between two looks whether every episode is over; noise is drawn by the chunk.
-CHUNK_STEPS = 50
+
+class _Progress(NamedTuple):
+    """Where N episodes are.
+
+    state: the environment's state, episodes on the last axis of every leaf
+    alive: [N] whether the episode is still running
+    nonfinite: [N] whether it left the finite numbers
+    """
+
+    state: Any
+    alive: jax.Array
+    nonfinite: jax.Array
 
 
 def rollout(
     env: Environment,
-    act: Callable[[Any, jax.Array], jax.Array],
+    act: episode.Act,
     actor: Any,
     distribution: Distribution,
     key: jax.Array,
@@ -31,9 +42,8 @@ def rollout(
 ) -> Trajectory:
     """Plays N episodes from fresh resets, each to its end or to the horizon.
 
-    An episode's reset and noise come from the key folded with its own index, so
-    they do not depend on how many are played beside it. When all are over the
-    simulation stops.
+    An episode's reset and noise come from the key folded with its own index, so they do not depend
+    on how many are played beside it. When all are over the simulation stops.
 
     Args:
       env: what is played.
@@ -45,90 +55,64 @@ def rollout(
       horizon: T, the time limit in steps; reaching it ends an episode.
       num_deterministic: how many episodes, the first ones, take the mode.
       active: [] False plays nothing, for a seed that stands still among others.
-      env_step: the environment's step over a batch on the last axis of every leaf;
-        by default ``jax.vmap`` of it.
+      env_step: the environment's step over a batch on the last axis of every leaf; by default
+        ``jax.vmap`` of it.
 
     Returns:
-      The episodes. A non-finite observation or reward ends its episode, with
-      reward 0 for that step, and is told apart in ``nonfinite``.
+      The episodes. A non-finite observation or reward ends its episode, with reward 0 for that
+      step, and shows in ``nonfinite``.
     """
-    # Inside, episodes are the last axis: each scalar of the state is a contiguous row.
-    start = jax.vmap(functools.partial(begin, env, key), out_axes=(-1, 0))
-    state, noise_keys = start(jnp.arange(num_episodes))
     if env_step is None:
         env_step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
-    deterministic = jnp.arange(num_episodes) < num_deterministic
-    length = largest_divisor(horizon, CHUNK_STEPS)
-
-    def step(carry, noise):
-        state, alive, bad = carry
-        observation = jnp.where(alive, state.obs, 0.0)
-        outputs = act(actor, observation.T)
-        action = distribution.sample(outputs, noise)
-        if num_deterministic:
-            action = _where(deterministic, distribution.mode(outputs), action)
-        # A finished episode repeats its last step: its state must not run off to
-        # infinity, where the solver of plain MJX needs all its iterations.
-        after = env_step(state, jnp.moveaxis(action, 0, -1))
-        after = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, state)
-        broken = alive & ~(jnp.all(jnp.isfinite(after.obs), axis=0) & jnp.isfinite(after.reward))
-        reward = jnp.where(alive & ~broken, after.reward, 0.0)
-        record = (observation, _where(alive, action, jnp.zeros_like(action)), reward, alive)
-        alive = alive & ~broken & (after.done == 0)
-        return (after, alive, bad | broken), record
-
-    def advance(carry):
-        chunk, keys, simulation, records = carry
-        draw = functools.partial(draw_noise, distribution, length)
-        keys, noise = jax.vmap(draw, out_axes=(0, 1))(keys)
-        simulation, new = lax.scan(step, simulation, noise)
-        records = jax.tree.map(
-            lambda old, x: lax.dynamic_update_slice_in_dim(old, x, chunk * length, 0), records, new
-        )
-        return chunk + 1, keys, simulation, records
-
-    def unfinished(carry):
-        chunk, _, (_, alive, _), _ = carry
-        return (chunk < horizon // length) & jnp.any(alive)
-
+    # Inside, episodes are the last axis: each scalar of the state is a contiguous row.
+    start = jax.vmap(functools.partial(episode.begin, env, key), out_axes=(-1, 0))
+    state, noise_keys = start(jnp.arange(num_episodes))
+    deterministic = jnp.arange(num_episodes) < num_deterministic if num_deterministic else None
+    step = functools.partial(_step, env_step, act, distribution, actor, deterministic)
     none = jnp.zeros(num_episodes, bool)
-
-    def first(noise_keys):
-        noise = jax.vmap(lambda key: draw_noise(distribution, 1, key)[1], out_axes=1)(noise_keys)
-        action = distribution.sample(act(actor, state.obs.T), noise[0])
-        return state.obs, action, state.reward, none
-
+    progress = _Progress(state, none | active, none)
+    noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), (num_episodes,)))
     records = jax.tree.map(
-        lambda x: jnp.zeros((horizon, *x.shape), x.dtype), jax.eval_shape(first, noise_keys)
+        lambda x: jnp.zeros((horizon, *x.shape), x.dtype), jax.eval_shape(step, progress, noise)[1]
     )
-    init = (jnp.zeros((), jnp.int32), noise_keys, (state, none | active, none), records)
-    _, _, (_, _, bad), (observation, action, reward, mask) = while_any(unfinished, advance, init)
+    progress, (observation, action, reward, mask) = play_chunks(
+        lambda noise, progress: lax.scan(step, progress, noise),
+        distribution,
+        noise_keys,
+        progress,
+        records,
+        episode_axis=1,
+    )
+    observation = jnp.swapaxes(observation, 1, 2)
     return Trajectory(
-        observation=jnp.swapaxes(observation, 1, 2),
+        observation=observation,
         action=action,
         reward=reward,
         mask=mask,
-        nonfinite=bad,
+        nonfinite=progress.nonfinite,
     )
 
 
-def begin(env: Environment, key: jax.Array, episode: jax.Array) -> tuple[Any, jax.Array]:
-    """Returns an episode's start state and the key of its noise."""
-    reset_key, noise_key = jax.random.split(jax.random.fold_in(key, episode))
-    return env.reset(reset_key), noise_key
+def _step(
+    env_step: Callable[[Any, jax.Array], Any],
+    act: episode.Act,
+    distribution: Distribution,
+    actor: Any,
+    deterministic: jax.Array | None,
+    progress: _Progress,
+    noise: jax.Array,
+) -> tuple[_Progress, tuple[jax.Array, ...]]:
+    """Plays one step of N episodes; for ``lax.scan`` over the noise [length, N, E].
 
-
-def draw_noise(
-    distribution: Distribution, length: int, key: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Returns the next key of an episode's noise, and its noise [length, E] for a chunk."""
-    key, noise_key = jax.random.split(key)
-    return key, distribution.noise(noise_key, (length,))
-
-
-def _where(mask: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-    """Chooses between [N, ...] arrays episode by episode."""
-    return jnp.where(mask.reshape(mask.shape + (1,) * (x.ndim - 1)), x, y)
+    Returns:
+      The progress, and the records of the step: observation [O, N], action [N, A], reward [N] and
+      whether the episode was running before it [N].
+    """
+    state, alive, nonfinite = progress
+    played = episode.step(env_step, act, distribution, actor, state, noise, alive, deterministic)
+    state = episode.hold(alive, played.state, state)
+    record = (played.observation, played.action, played.reward, alive)
+    return _Progress(state, played.alive, nonfinite | played.broken), record
 
 
 def episode_returns(trajectory: Trajectory) -> jax.Array:
@@ -147,6 +131,6 @@ def simulated_steps(trajectory: Trajectory) -> jax.Array:
     Beside other seeds, it is the seed with the longest episode that decides.
     """
     horizon, num_episodes = trajectory.mask.shape
-    length = largest_divisor(horizon, CHUNK_STEPS)
+    length = chunk_length(horizon)
     longest = jnp.max(episode_lengths(trajectory))
     return num_episodes * length * ((longest + length - 1) // length)

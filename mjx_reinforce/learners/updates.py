@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 from jax import lax
 
-from mjx_reinforce.engines.loops import while_any
+from mjx_reinforce.engines.chunks import while_any
 from mjx_reinforce.learners.gradients import accumulate_gradient
 from mjx_reinforce.registry import check_name
 

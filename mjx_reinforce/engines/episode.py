@@ -1,0 +1,104 @@
+"""What an episode is: how it begins, what one step of it does, and when it is over.
+
+Every engine plays these functions, so that an episode means the same everywhere. Arrays are those
+of one episode. Or they are those of N episodes, which are the last axis of the environment's state
+and the first axis of what the policy reads and returns.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.types import Environment
+
+Act = Callable[[Any, jax.Array], jax.Array]
+
+
+class Step(NamedTuple):
+    """What one step of an episode did.
+
+    observation: [O] or [O, N] what the policy saw; zero where the episode was over
+    action: [A] or [N, A] what it drew; zero where the episode was over
+    reward: [] or [N] what that earned; zero where the episode was over or broke
+    alive: [] or [N] whether the episode goes on
+    broken: [] or [N] whether this step left the finite numbers, which ends the episode
+    state: the environment's next state, also where the episode was over: see ``hold``
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    alive: jax.Array
+    broken: jax.Array
+    state: Any
+
+
+def begin(env: Environment, key: jax.Array, episode: jax.Array) -> tuple[Any, jax.Array]:
+    """Returns the start state of an episode, by its number, and the key of its noise."""
+    reset_key, noise_key = jax.random.split(jax.random.fold_in(key, episode))
+    return env.reset(reset_key), noise_key
+
+
+def draw_noise(
+    distribution: Distribution, length: int, key: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Returns the next key of an episode's noise, and its noise [length, E] for a chunk."""
+    key, noise_key = jax.random.split(key)
+    return key, distribution.noise(noise_key, (length,))
+
+
+def step(
+    env_step: Callable[[Any, jax.Array], Any],
+    act: Act,
+    distribution: Distribution,
+    actor: Any,
+    state: Any,
+    noise: jax.Array,
+    alive: jax.Array,
+    deterministic: jax.Array | None = None,
+) -> Step:
+    """Plays one step.
+
+    Args:
+      env_step: (state, action) -> state of the environment.
+      act: (actor, observation [O] or [N, O]) -> outputs of the distribution.
+      distribution: what the outputs index.
+      actor: what ``act`` reads.
+      state: the environment's state before the step.
+      noise: [E] or [N, E] what the action is drawn from.
+      alive: [] or [N] whether the episode is still running.
+      deterministic: [] or [N] whether the action is the mode instead; by default it never is.
+    """
+    observation = jnp.where(alive, state.obs, 0.0)
+    outputs = act(actor, observation.T)
+    action = distribution.sample(outputs, noise)
+    if deterministic is not None:
+        action = _choose(deterministic, distribution.mode(outputs), action)
+    after = env_step(state, action.T)
+    finite = jnp.all(jnp.isfinite(after.obs), axis=0) & jnp.isfinite(after.reward)
+    broken = alive & ~finite
+    return Step(
+        observation=observation,
+        action=_choose(alive, action, jnp.zeros_like(action)),
+        reward=jnp.where(alive & ~broken, after.reward, 0.0),
+        alive=alive & ~broken & (after.done == 0),
+        broken=broken,
+        state=after,
+    )
+
+
+def hold(alive: jax.Array, after: Any, before: Any) -> Any:
+    """Returns the next state of an episode that runs, and of one that is over its last.
+
+    A finished episode repeats its last step, because a state that runs off to infinity costs MJX's
+    own constraint solver all its iterations.
+    """
+    return jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)
+
+
+def _choose(mask: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+    """Chooses episode by episode between arrays whose first axis, if any, is that of ``mask``."""
+    return jnp.where(mask.reshape(mask.shape + (1,) * (x.ndim - mask.ndim)), x, y)
