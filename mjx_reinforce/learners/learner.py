@@ -15,6 +15,7 @@ from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns, sim
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_optimizer
 from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.policies.distribution import Distribution, categorical
 from mjx_reinforce.policies.normal import normal
 from mjx_reinforce.policies.policy import Policy, mlp_policy
@@ -28,18 +29,6 @@ from mjx_reinforce.types import (
 )
 
 Metrics = dict[str, jax.Array]
-
-
-@struct.dataclass(kw_only=True)
-class Actor:
-    """All that playing needs.
-
-    params: the policy's parameters
-    normalizer: the statistics that scale its observations
-    """
-
-    params: Any
-    normalizer: normalize.Normalizer
 
 
 @struct.dataclass(kw_only=True)

@@ -1,0 +1,36 @@
+"""What a policy needs to act: its parameters and the statistics that scale its observations."""
+
+from typing import Any
+
+import jax
+from flax import struct
+
+from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.policy import Policy
+
+
+@struct.dataclass(kw_only=True)
+class Actor:
+    """All that playing needs.
+
+    params: the policy's parameters
+    normalizer: the statistics that scale its observations
+    """
+
+    params: Any
+    normalizer: normalize.Normalizer
+
+
+def act(policy: Policy, actor: Actor, observation: jax.Array) -> jax.Array:
+    """Returns the parameters of the action distribution for each observation.
+
+    Args:
+      policy: the network and its distribution.
+      actor: the policy's parameters and the observation statistics.
+      observation: [..., O] as the environment returned it, not yet scaled.
+
+    Returns:
+      The outputs [..., K]: ``policy.distribution.mode(outputs)`` is the deterministic
+      action, ``policy.distribution.sample(outputs, noise)`` a random one.
+    """
+    return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))
