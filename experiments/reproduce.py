@@ -156,7 +156,8 @@ def train(
     started = time.perf_counter()
     with clamped() if clamp else contextlib.nullcontext():
         learner, horizon = build(env, config)
-    learner = stale_starts(learner) if stale else learner
+    if stale:
+        learner = stale_starts(lambda env: build(env, config)[0], env)
     programs = Programs(env, learner, horizon, config)
     compiled = time.perf_counter()
     scores, env_steps, columns = [], 0, Progress.get_default_columns()

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 from unittest import mock
 
@@ -12,6 +13,7 @@ import numpy as np
 from jax.scipy.stats import norm
 
 from mjx_reinforce.export import policy_files as checkpoint
+from mjx_reinforce.learners.learner import Learner
 
 STALE = "stale first observation"
 _CLAMP = 1e-6
@@ -66,39 +68,36 @@ class _StaleStart:
         return getattr(self._env, name)
 
 
-def stale_starts(learner: Any) -> Any:
+def stale_starts(build: Callable[[Any], Learner], env: Any) -> Learner:
     """Returns a learner of one episode an update with a mistake of document 001's program.
 
     Its loop over an episode's steps re-uses the variable that holds the next episode's first
     observation. So the first action of every episode but the first answers, and is trained on,
     the observation before the last action of the episode before. That travels in the state.
+
+    Args:
+      build: returns the learner of the program without the mistake, for an environment.
+      env: what is played.
     """
+    learner = build(env)
 
     def init(key):
         state = learner.init(key)
-        trajectory = jax.eval_shape(lambda: _play(learner, state, None)[1])
+        trajectory = jax.eval_shape(lambda: learner.play(state, key, True))
         nothing = jnp.full(trajectory.observation.shape[-1], jnp.nan)
         return dataclasses.replace(state, estimator_state=(state.estimator_state, nothing))
 
-    def step(state, active=True):
+    def play(state, key, active):
         inner, shown = state.estimator_state
-        played = dataclasses.replace(state, estimator_state=inner)
-        (after, metrics), trajectory = _play(learner, played, shown, active)
+        stale = build(_StaleStart(env, shown))
+        return stale.play(dataclasses.replace(state, estimator_state=inner), key, active)
+
+    def learn(state, trajectory, key):
+        inner, _ = state.estimator_state
+        known = dataclasses.replace(state, estimator_state=inner)
+        state, metrics = learner.learn(known, trajectory, key)
         last = jnp.maximum(jnp.sum(trajectory.mask[:, 0]) - 1, 0)
-        shown = jnp.where(active, trajectory.observation[last, 0], shown)
-        return dataclasses.replace(after, estimator_state=(after.estimator_state, shown)), metrics
+        shown = trajectory.observation[last, 0]
+        return dataclasses.replace(state, estimator_state=(state.estimator_state, shown)), metrics
 
-    return learner._replace(init=init, step=step)
-
-
-def _play(learner: Any, state: Any, shown: jax.Array | None, active: Any = True) -> Any:
-    """Returns what a step of the learner does, and the episodes that it played."""
-    episodes = []
-
-    def rollout(env, *args, **kwargs):
-        env = env if shown is None else _StaleStart(env, shown)
-        episodes.append(learner.engine.rollout(env, *args, **kwargs))
-        return episodes[0]
-
-    # The step is a partial of a function whose first argument plays the episodes.
-    return learner.step.func(rollout, state, active), episodes[0]
+    return learner._replace(init=init, play=play, learn=learn)

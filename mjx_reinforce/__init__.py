@@ -10,7 +10,7 @@ import importlib
 _HOME = {
     "Learner": "learners.learner",
     "TrainState": "learners.learner",
-    "reinforce": "learners.learner",
+    "reinforce": "learners.reinforce",
     "train_step": "learners.learner",
     "ars": "learners.ars",
     "Distribution": "policies.distribution",

@@ -137,7 +137,7 @@ class Programs:
             if config.env_steps is not None:
                 active &= used < config.env_steps
             if config.max_updates is not None:
-                active &= states.update < config.max_updates
+                active &= states.num_updates < config.max_updates
             states, metrics = jax.vmap(learner.step)(states, active)
             return (states, used + metrics["env_steps"]), metrics | {"active": active}
 

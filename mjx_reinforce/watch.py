@@ -1,14 +1,11 @@
 """``python -m mjx_reinforce.watch RUN`` plays a trained policy and makes a film of it."""
 
-import ctypes.util
 import dataclasses
-import io
+import functools
 import json
 import math
 import os
 import sys
-import tempfile
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +14,7 @@ import tyro
 from rich.progress import track
 
 from mjx_reinforce import envs
+from mjx_reinforce.export.films import Renderer, import_mujoco, mediapy_with_ffmpeg, write_film
 
 #: Frames a second at most: what a film shows, and what GIF viewers play.
 _MAX_RATE = 30
@@ -68,7 +66,7 @@ def film(settings: Settings) -> None:
     """
     env_id, horizon = read_run(settings.run)
     output = check(settings)
-    _import_mujoco()
+    import_mujoco()
     from mjx_reinforce.export.policy_files import load_policy
 
     policy, actor = load_policy(settings.run / "policy", settings.seed)
@@ -109,7 +107,7 @@ def check(settings: Settings) -> Path:
     if output.is_dir() or (output.exists() and not settings.overwrite):
         raise ValueError(f"{output} exists; pass --overwrite or another --output")
     if output.suffix.lower() == ".mp4":
-        _mediapy(output)
+        mediapy_with_ffmpeg(output)
     return output
 
 
@@ -171,122 +169,28 @@ def play(
     import jax
     import jax.numpy as jnp
 
-    from mjx_reinforce.engines.rollouts import begin
-    from mjx_reinforce.policies import normalize
+    from mjx_reinforce.engines.episode import begin, hold, step
+    from mjx_reinforce.policies.actor import act
 
     distribution = policy.distribution
+    play_step = functools.partial(step, env.step, functools.partial(act, policy), distribution)
 
-    def step(carry, noises):
+    def advance(carry, noises):
         state, alive = carry
-        outputs = policy.apply(actor.params, normalize.apply(actor.normalizer, state.obs))
-        drawn = distribution.sample(outputs, noises)
-        after = env.step(state, drawn if noise else distribution.mode(outputs))
-        after = jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, state)
-        finite = jnp.all(jnp.isfinite(after.obs)) & jnp.isfinite(after.reward)
-        record = after.pipeline_state.qpos, after.reward, alive & finite
-        return (after, alive & finite & (after.done == 0)), record
+        played = play_step(actor, state, noises, alive, jnp.array(not noise))
+        after = hold(alive, played.state, state)
+        record = after.pipeline_state.qpos, played.reward, alive & ~played.broken
+        return (after, played.alive), record
 
     @jax.jit
     def whole(key):
         start, noise_key = begin(env, key, jnp.asarray(episode))
         noises = distribution.noise(noise_key, (horizon,))
         first = start.pipeline_state.qpos
-        return first, jax.lax.scan(step, (start, jnp.array(True)), noises)[1]
+        return first, jax.lax.scan(advance, (start, jnp.array(True)), noises)[1]
 
     first, (qpos, rewards, mask) = jax.device_get(whole(jax.random.key(0)))
     return np.concatenate([first[None], qpos[mask]]), rewards[mask]
-
-
-class Renderer:
-    """Draws a model at given positions, through its camera "track" if it has one."""
-
-    def __init__(self, model: Any, width: int, height: int):
-        """Opens MuJoCo's renderer for pictures of so many pixels.
-
-        Raises:
-          ValueError: there is no OpenGL here.
-        """
-        mujoco = _import_mujoco()
-        model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
-        model.vis.global_.offheight = max(model.vis.global_.offheight, height)
-        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.4, 0.6
-        cameras = [model.camera(i).name for i in range(model.ncam)]
-        self._camera = "track" if "track" in cameras else -1
-        self._model, self._data = model, mujoco.MjData(model)
-        self._forward = mujoco.mj_forward
-        try:
-            self._renderer = mujoco.Renderer(model, height, width)
-        except Exception as error:  # each of MuJoCo's backends has its own
-            raise _no_drawing(error) from error
-
-    def draw(self, qpos: np.ndarray) -> np.ndarray:
-        """Returns a picture [height, width, 3] uint8 at positions [nq]."""
-        self._data.qpos[:] = qpos
-        self._forward(self._model, self._data)
-        self._renderer.update_scene(self._data, self._camera)
-        return self._renderer.render()
-
-
-def _import_mujoco() -> Any:
-    """Returns MuJoCo; without a screen it is told to draw through EGL, where that is installed."""
-    if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):
-        os.environ.setdefault("MUJOCO_GL", "egl")
-    try:
-        import mujoco
-    except Exception as error:  # what MUJOCO_GL names is not here
-        raise _no_drawing(error) from error
-    return mujoco
-
-
-def _no_drawing(error: Exception) -> ValueError:
-    return ValueError(
-        f"MuJoCo cannot draw here ({error}); install EGL (Debian: apt install libegl1) "
-        "or set MUJOCO_GL to egl, osmesa or glfw, whichever this machine has"
-    )
-
-
-def write_film(path: Path, frames: Iterable[np.ndarray], rate: float) -> None:
-    """Writes a film at once.
-
-    Args:
-      path: .gif or .mp4.
-      frames: pictures [height, width, 3] uint8.
-      rate: frames a second.
-    """
-    from mjx_reinforce.export.files import write_bytes
-
-    if path.suffix.lower() == ".gif":
-        from PIL import Image
-
-        pictures = (Image.fromarray(frame) for frame in frames)
-        options: dict[str, Any] = {"save_all": True, "loop": 0, "duration": 1000 / rate}
-        film = io.BytesIO()
-        next(pictures).save(film, format="GIF", append_images=pictures, **options)
-        write_bytes(path, film.getvalue())
-    else:
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            partial = Path(folder) / path.name
-            _mediapy(path).write_video(partial, list(frames), fps=rate)
-            os.replace(partial, path)
-
-
-def _mediapy(path: Path) -> Any:
-    """Returns mediapy with an ffmpeg.
-
-    Raises:
-      ValueError: one of the two is not installed.
-    """
-    try:
-        import imageio_ffmpeg
-        import mediapy
-
-        mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
-    except (ImportError, RuntimeError) as error:
-        raise ValueError(
-            f"cannot write {path} ({error}); "
-            "pip install mediapy imageio-ffmpeg, or end --output in .gif"
-        ) from error
-    return mediapy
 
 
 if __name__ == "__main__":

@@ -33,7 +33,8 @@ def test_one_update_by_hand(top):
     state = learner.init(jax.random.key(0))
     state, _ = train_step(learner, state)  # Observations are normalised from here on.
     flat, unflatten = jax.flatten_util.ravel_pytree(state.actor.params)
-    _, directions_key, episodes_key = jax.random.split(state.key, 3)
+    _, play_key, _ = jax.random.split(state.key, 3)
+    directions_key, episodes_key = jax.random.split(play_key)
     drawn = ars_module._draw(directions_key, state.actor.params, 5)
     directions = jax.vmap(lambda d: jax.flatten_util.ravel_pytree(d)[0])(drawn)
 
@@ -85,7 +86,7 @@ def test_equal_returns_change_nothing(update):
     after, metrics = train_step(learner, state)
     jax.tree.map(np.testing.assert_array_equal, after.actor.params, state.actor.params)
     assert int(metrics["skipped_update"]) == 0
-    assert int(after.update) == 1
+    assert int(after.num_updates) == 1
 
 
 def train(env, num_updates, **settings):
@@ -114,7 +115,7 @@ def test_discrete_actions():
         action_space = Discrete(2)
         action_size = 2
 
-    _, _, metrics = train(DiscreteChain(), 100, step_size=0.1, noise_std=0.3, engine="mjx")
+    _, _, metrics = train(DiscreteChain(), 100, step_size=0.1, noise_std=0.3, engine="vmap")
     assert float(metrics["episode_return_max"][-1]) == pytest.approx(1.0 + 0.7 + 3.0)
 
 

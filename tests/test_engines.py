@@ -55,7 +55,7 @@ def one_step(id, engine, solver="exact", **options):
     """Returns [N, nq + nv + 1]: positions, velocities and reward after one env step."""
     env = Wide(envs.make(id, solver=solver))
     distribution = normal(action_space(env))
-    play = {"kernel": kernel.rollout, "mjx": rollouts.rollout}.get(engine)
+    play = {"kernel": kernel.rollout, "vmap": rollouts.rollout}.get(engine)
     if play is None:
         play = engines.choose(engine, env).rollout
     episodes = jax.jit(
@@ -84,11 +84,11 @@ def exact():
     """Plain MJX in double precision, and how far plain MJX in single precision is from it."""
     jax.clear_caches()  # MJX's traces in one precision, kept, do not lower in the other
     with jax.enable_x64(True):
-        reference = one_step("InvertedPendulum-v5", "mjx", solver="mjx")
+        reference = one_step("InvertedPendulum-v5", "vmap", solver="mjx")
     jax.clear_caches()
     assert np.any(np.abs(reference[:, 0]) > 1)
     assert np.any(np.abs(reference[:, 1]) > 0.2)
-    return reference, error(one_step("InvertedPendulum-v5", "mjx", solver="mjx"), reference)
+    return reference, error(one_step("InvertedPendulum-v5", "vmap", solver="mjx"), reference)
 
 
 def test_fused_is_plain_mjx_in_double_precision(exact):
@@ -110,7 +110,7 @@ def test_auto_says_what_it_takes_and_why():
     pendulum = envs.make("InvertedPendulum-v5")
     assert engines.choose("auto", pendulum).name == "fused"
     contacts = engines.choose("auto", envs.make("Hopper-v5"))
-    assert contacts.name == "mjx"
+    assert contacts.name == "vmap"
     assert "contacts" in contacts.why
     with pytest.raises(ValueError, match=r"runs on NVIDIA GPUs.*choose auto"):
         engines.choose("kernel", pendulum)

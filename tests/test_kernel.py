@@ -12,8 +12,8 @@ from toys import Chain, Survive, ToyState, categorical
 
 from mjx_reinforce import envs, fused, mlp_policy, normal, types
 from mjx_reinforce.engines import kernel, rollouts
-from mjx_reinforce.learners.learner import Actor
 from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.actor import Actor
 
 HORIZON = 24  # one chunk; a fresh pendulum falls after 6 to 30 steps
 

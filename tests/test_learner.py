@@ -267,7 +267,7 @@ def test_a_gradient_that_is_not_finite_is_skipped():
     state = learner.init(jax.random.key(0))
     after, metrics = train_step(learner, state)
     assert int(metrics["skipped_update"]) == 1
-    assert int(after.update) == 1
+    assert int(after.num_updates) == 1
     jax.tree.map(np.testing.assert_array_equal, state.actor, after.actor)
 
 

@@ -114,10 +114,8 @@ class Count(Toy):
 
 def test_a_stale_start_shows_the_episode_before():
     """The reward is what was shown before the step: 0 + 1 + 2, then 2 + 1 + 2."""
-    learner = reinforce(
-        Count(), estimator=reward_to_go(), num_episodes=1, normalize_steps=0, engine="mjx"
-    )
-    stale = stale_starts(learner)
+    settings = {"num_episodes": 1, "normalize_steps": 0, "engine": "vmap"}
+    stale = stale_starts(lambda env: reinforce(env, estimator=reward_to_go(), **settings), Count())
     step = jax.jit(stale.step)
     state = stale.init(jax.random.key(0))
     returns = []

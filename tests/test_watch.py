@@ -13,7 +13,7 @@ from PIL import Image
 from mjx_reinforce import envs, load_policy, watch
 from mjx_reinforce.engines.rollouts import rollout
 from mjx_reinforce.export.policy_files import save_policy
-from mjx_reinforce.learners.learner import reinforce
+from mjx_reinforce.learners.reinforce import reinforce
 from mjx_reinforce.policies import normalize
 
 SETTINGS = {

@@ -1,6 +1,6 @@
-"""Engines: ways to play the same episodes, from the same noise, at different speeds.
+"""The choice of an engine: the same episodes, from the same noise, at different speeds.
 
-``mjx`` maps the environment's step with ``jax.vmap``. ``fused`` writes it out in
+``vmap`` maps the environment's step with ``jax.vmap``. ``fused`` writes it out in
 scalars and lets XLA fuse what is left (``mjx_reinforce.fused``). ``kernel`` writes
 out the whole step, policy included, and repeats it in one kernel on an NVIDIA GPU
 (``mjx_reinforce.engines.kernel``). Trajectories agree up to rounding.
@@ -44,7 +44,7 @@ class Player(NamedTuple):
 class Engine(NamedTuple):
     """A way to play episodes.
 
-    name: "mjx", "fused" or "kernel"
+    name: "vmap", "fused" or "kernel"
     why: the reason it was chosen, for people
     rollout: as ``mjx_reinforce.engines.rollouts.rollout``
     """
@@ -54,7 +54,7 @@ class Engine(NamedTuple):
     rollout: Callable[..., Trajectory]
 
 
-NAMES = ("auto", "mjx", "fused", "kernel")
+NAMES = ("auto", "vmap", "fused", "kernel")
 
 
 def choose(name: str, env: Environment, player: Player | None = None) -> Engine:
@@ -71,12 +71,12 @@ def choose(name: str, env: Environment, player: Player | None = None) -> Engine:
     """
     check_name("engine", name, dict.fromkeys(NAMES))
     why = "chosen by name"
-    if name == "mjx":
+    if name == "vmap":
         return Engine(name, why, rollout)
     contacts = getattr(env, "num_contacts", 0)
     if name == "auto" and contacts:
         why = f"the fastest for models with contacts, here up to {contacts}"
-        return Engine("mjx", why, rollout)
+        return Engine("vmap", why, rollout)
     reason = _against_kernel(name, env, player)
     if name != "fused" and not reason:
         if name == "auto":
@@ -93,7 +93,7 @@ def choose(name: str, env: Environment, player: Player | None = None) -> Engine:
         return Engine("fused", why, functools.partial(rollout, env_step=step))
     if name == "fused":
         raise ValueError(f"the fused engine does not support this environment: {reason}")
-    return Engine("mjx", f"fused does not support this environment: {reason}", rollout)
+    return Engine("vmap", f"fused does not support this environment: {reason}", rollout)
 
 
 def _against_kernel(name: str, env: Environment, player: Player | None) -> str | None:

@@ -42,8 +42,8 @@ def rollout(
 ) -> Trajectory:
     """Plays N episodes from fresh resets, each to its end or to the horizon.
 
-    An episode's reset and noise come from the key folded with its own index, so they do not depend
-    on how many are played beside it. When all are over the simulation stops.
+    An episode's reset and noise come from the key folded with its own index, whatever N is. When
+    all are over the simulation stops.
 
     Args:
       env: what is played.
@@ -55,8 +55,7 @@ def rollout(
       horizon: T, the time limit in steps; reaching it ends an episode.
       num_deterministic: how many episodes, the first ones, take the mode.
       active: [] False plays nothing, for a seed that stands still among others.
-      env_step: the environment's step over a batch on the last axis of every leaf; by default
-        ``jax.vmap`` of it.
+      env_step: ``env.step`` over the last axis of every leaf; by default ``jax.vmap`` of it.
 
     Returns:
       The episodes. A non-finite observation or reward ends its episode, with reward 0 for that
@@ -71,10 +70,7 @@ def rollout(
     step = functools.partial(_step, env_step, act, distribution, actor, deterministic)
     none = jnp.zeros(num_episodes, bool)
     progress = _Progress(state, none | active, none)
-    noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), (num_episodes,)))
-    records = jax.tree.map(
-        lambda x: jnp.zeros((horizon, *x.shape), x.dtype), jax.eval_shape(step, progress, noise)[1]
-    )
+    records = _empty_records(step, progress, distribution, horizon)
     progress, (observation, action, reward, mask) = play_chunks(
         lambda noise, progress: lax.scan(step, progress, noise),
         distribution,
@@ -83,9 +79,8 @@ def rollout(
         records,
         episode_axis=1,
     )
-    observation = jnp.swapaxes(observation, 1, 2)
     return Trajectory(
-        observation=observation,
+        observation=jnp.swapaxes(observation, 1, 2),
         action=action,
         reward=reward,
         mask=mask,
@@ -113,6 +108,16 @@ def _step(
     state = episode.hold(alive, played.state, state)
     record = (played.observation, played.action, played.reward, alive)
     return _Progress(state, played.alive, nonfinite | played.broken), record
+
+
+def _empty_records(
+    step: Callable[..., Any], progress: _Progress, distribution: Distribution, horizon: int
+) -> Any:
+    """Returns zeros [horizon, ...] of the shapes that ``step`` records."""
+    shape = progress.alive.shape
+    noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), shape))
+    record = jax.eval_shape(step, progress, noise)[1]
+    return jax.tree.map(lambda x: jnp.zeros((horizon, *x.shape), x.dtype), record)
 
 
 def episode_returns(trajectory: Trajectory) -> jax.Array:

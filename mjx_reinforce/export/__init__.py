@@ -1,1 +1,1 @@
-"""Export: trained policies as files."""
+"""Export: files that leave the program, trained policies and films."""

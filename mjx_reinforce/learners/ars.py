@@ -9,26 +9,28 @@ with sigma the standard deviation of those 2 b returns. No gradient of the polic
 learner has the same two functions as ``reinforce``, so whatever drives one drives the other.
 """
 
+import dataclasses
 import math
-from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.core
 import jax.numpy as jnp
 import optax
 
-from mjx_reinforce.engines import choice as engines
+from mjx_reinforce.engines import choice
+from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.rollouts import episode_returns
 from mjx_reinforce.learners.learner import (
-    Actor,
     Learner,
+    Metrics,
     TrainState,
     check_horizon,
     episode_metrics,
     keep_finite,
 )
 from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.distribution import categorical
 from mjx_reinforce.policies.normal import deterministic
 from mjx_reinforce.policies.policy import Policy, mlp_policy
@@ -59,22 +61,20 @@ def ars(
 
     Args:
       env: what is played; any brax-style environment.
-      policy: whose mode plays; by default linear and zero. All its params are
-        searched, so it should have none that the mode does not read.
-      num_directions: directions tried in an update, by two episodes each.
-      top_directions: b, how many of them count, those with the greatest of their
-        two returns (V1-t, V2-t); by default all (V1, V2).
+      policy: whose mode plays; by default linear and zero. All its params are searched, so it
+        should have none that the mode does not read.
+      num_directions: D, directions tried in an update, by two episodes each.
+      top_directions: b, how many of them count, those with the greatest of their two returns
+        (V1-t, V2-t); by default all (V1, V2).
       step_size: alpha.
       noise_std: nu, how far along a direction the policies are.
-      horizon: T, steps after which an episode ends; by default the environment's
-        ``max_episode_steps``.
-      normalize_steps: observations are scaled by the mean and standard deviation
-        of about the first so many steps; inf is V2, 0 is V1.
-      shared_starts: the two episodes of a direction start alike; each starts for
-        itself in the paper.
-      update: "paper", or "document" for that of a published notebook, see
-        ``_document_increment``.
-      engine: "auto", "mjx" or "fused", see ``engines``.
+      horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
+      normalize_steps: scale observations by the mean and std of about the first so many steps;
+        inf is V2, 0 is V1.
+      shared_starts: the two episodes of a direction start alike; each has its own start in the
+        paper.
+      update: "paper", or "document" for that of a published notebook: ``_document_increment``.
+      engine: "auto", "vmap" or "fused", see ``engines.choice``.
 
     Returns:
       The learner. Where sigma is zero the parameters stay.
@@ -83,92 +83,130 @@ def ars(
       ValueError: an argument makes no sense.
     """
     horizon = check_horizon(env, horizon)
-    size = observation_size(env)
     top = num_directions if top_directions is None else top_directions
     _check(num_directions, top, step_size, noise_std, update)
-    policy = _zero_policy(env, size) if policy is None else policy
-    tie = _bias_overwriter(policy) if update == "document" else lambda params: params
-    chosen = engines.choose(engine, env)
-    play = _both_ways(env, policy, chosen, num_directions, horizon)
+    size = observation_size(env)
+    search = _Search(
+        env=env,
+        policy=policy or _zero_policy(env, size),
+        engine=choice.choose(engine, env),
+        num_directions=num_directions,
+        top_directions=top,
+        step_size=step_size,
+        noise_std=noise_std,
+        horizon=horizon,
+        normalize_steps=normalize_steps,
+        shared_starts=shared_starts,
+        update=update,
+        observation_size=size,
+    )
+    return Learner(search.init, search.play, search.learn, search.policy, search.engine)
 
-    def act(actor, observation):
-        return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))
 
-    def init(key):
+class Trial(NamedTuple):
+    """What is tried for one update.
+
+    directions: like the params, with a leading axis [D]
+    trajectory: 2 D episodes, an episode a policy; the forward ones first
+    """
+
+    directions: Any
+    trajectory: Trajectory
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class _Search:
+    """The arguments of ``ars``, and what it does with them; ``observation_size`` is O."""
+
+    env: Environment
+    policy: Policy
+    engine: Engine
+    num_directions: int
+    top_directions: int
+    step_size: float | jax.Array
+    noise_std: float | jax.Array
+    horizon: int
+    normalize_steps: float
+    shared_starts: bool
+    update: str
+    observation_size: int
+
+    def __post_init__(self):
+        if self.update == "document":
+            _check_linear(self.policy)
+
+    def init(self, key: jax.Array) -> TrainState:
         policy_key, key = jax.random.split(key)
+        normalizer = normalize.init(self.observation_size)
         return TrainState(
             key=key,
-            update=jnp.zeros((), jnp.int32),
-            actor=Actor(params=policy.init(policy_key), normalizer=normalize.init(size)),
+            num_updates=jnp.zeros((), jnp.int32),
+            actor=Actor(params=self.policy.init(policy_key), normalizer=normalizer),
             opt_state=(),
             estimator_state=(),
         )
 
-    def perturb(params, directions):
-        """Returns the params of all policies, [2, D, ...], the forward ones first."""
-        moves = jax.tree.map(lambda d: jnp.stack([noise_std * d, -noise_std * d]), directions)
-        return jax.vmap(jax.vmap(tie))(jax.tree.map(jnp.add, params, moves))
-
-    def step(state, active=True):
-        actor = state.actor
-        key, directions_key, episodes_key = jax.random.split(state.key, 3)
+    def play(self, state: TrainState, key: jax.Array, active: Any = True) -> Trial:
+        directions_key, episodes_key = jax.random.split(key)
         keys = jax.random.split(episodes_key)
-        keys = keys[jnp.array([0, 0])] if shared_starts else keys
-        directions = _draw(directions_key, actor.params, num_directions)
-        trajectory = play(perturb(actor.params, directions), actor.normalizer, keys, active)
-        returns = episode_returns(trajectory).reshape(2, num_directions)
-        if update == "paper":
-            increment = _paper_increment(directions, returns, top)
+        keys = keys[jnp.array([0, 0])] if self.shared_starts else keys
+        directions = _draw(directions_key, state.actor.params, self.num_directions)
+        params = self._perturb(state.actor.params, directions)
+
+        def one_way(params, key):
+            return self.engine.rollout(
+                self.env,
+                self._act_each,
+                Actor(params=params, normalizer=state.actor.normalizer),
+                self.policy.distribution,
+                key,
+                num_episodes=self.num_directions,
+                num_deterministic=self.num_directions,
+                horizon=self.horizon,
+                active=active,
+            )
+
+        return Trial(directions, _side_by_side(jax.vmap(one_way)(params, keys)))
+
+    def learn(self, state: TrainState, trial: Trial, key: jax.Array) -> tuple[TrainState, Metrics]:
+        del key
+        actor, trajectory = state.actor, trial.trajectory
+        returns = episode_returns(trajectory).reshape(2, self.num_directions)
+        if self.update == "paper":
+            increment = _paper_increment(trial.directions, returns, self.top_directions)
         else:
-            increment = _document_increment(directions, returns, noise_std)
-        params = tie(jax.tree.map(lambda p, d: p + step_size * d, actor.params, increment))
+            increment = _document_increment(trial.directions, returns, self.noise_std)
+        moved = jax.tree.map(lambda p, d: p + self.step_size * d, actor.params, increment)
         normalizer = normalize.update(
-            actor.normalizer, trajectory.observation, trajectory.mask, normalize_steps
+            actor.normalizer, trajectory.observation, trajectory.mask, self.normalize_steps
         )
-        learned, skipped = keep_finite(Actor(params=params, normalizer=normalizer), actor)
-        proposed = state.replace(key=key, update=state.update + 1, actor=learned)
-        if active is not True:
-            proposed = jax.tree.map(lambda new, old: jnp.where(active, new, old), proposed, state)
-        return proposed, episode_metrics(trajectory) | {
+        learned = Actor(params=self._tie(moved), normalizer=normalizer)
+        actor, skipped = keep_finite(learned, actor)
+        return dataclasses.replace(state, actor=actor), episode_metrics(trajectory) | {
             "entropy": jnp.zeros(()),
             "gradient_norm": optax.tree.norm(increment),
             "return_std": jnp.std(returns),
             "skipped_update": skipped,
         }
 
-    return Learner(init, step, act, policy, chosen)
+    def _act_each(self, actor: Actor, observation: jax.Array) -> jax.Array:
+        """Returns the outputs [D, K] of D policies for an observation [D, O] of each."""
 
+        def act_one(params, observation):
+            return act(self.policy, dataclasses.replace(actor, params=params), observation)
 
-def _both_ways(
-    env: Environment, policy: Policy, chosen: engines.Engine, num_directions: int, horizon: int
-) -> Callable[..., Trajectory]:
-    """Returns what plays 2 D policies, an episode each: (params, normalizer, keys, active) -> ...
+        return jax.vmap(act_one)(actor.params, observation)
 
-    The params are [2, D, ...], the keys [2], and of the N = 2 D episodes the first D are those of
-    the first D policies.
-    """
+    def _tie(self, params: Any) -> Any:
+        """Returns the params as the update ties them; the paper's does not."""
+        return params if self.update == "paper" else _overwrite_bias(params)
 
-    def act_each(actor, observation):
-        scaled = normalize.apply(actor.normalizer, observation)
-        return jax.vmap(policy.apply)(actor.params, scaled)
-
-    def play(params, normalizer, keys, active):
-        def one_way(params, key):
-            return chosen.rollout(
-                env,
-                act_each,
-                Actor(params=params, normalizer=normalizer),
-                policy.distribution,
-                key,
-                num_episodes=num_directions,
-                num_deterministic=num_directions,
-                horizon=horizon,
-                active=active,
-            )
-
-        return _side_by_side(jax.vmap(one_way)(params, keys))
-
-    return play
+    def _perturb(self, params: Any, directions: Any) -> Any:
+        """Returns the params of all policies, [2, D, ...], the forward ones first."""
+        moves = jax.tree.map(
+            lambda d: jnp.stack([self.noise_std * d, -self.noise_std * d]), directions
+        )
+        return jax.vmap(jax.vmap(self._tie))(jax.tree.map(jnp.add, params, moves))
 
 
 def _paper_increment(directions: Any, returns: jax.Array, top: int) -> Any:
@@ -189,7 +227,7 @@ def _document_increment(directions: Any, returns: jax.Array, noise_std: Any) -> 
 
     Its ``np.sum`` without an axis adds up the entries of the direction too, so all parameters move
     by the same number; it does not divide by how many directions there are, and multiplies by
-    ``noise_std``. The bias is overwritten besides, see ``_bias_overwriter``. Not reproduced: where
+    ``noise_std``. The bias is overwritten besides, see ``_overwrite_bias``. Not reproduced: where
     all returns are equal it divides 0 by 0, and its parameters are NaN for good.
     """
     totals = sum(jnp.sum(d.reshape(len(d), -1), axis=1) for d in jax.tree.leaves(directions))
@@ -197,25 +235,22 @@ def _document_increment(directions: Any, returns: jax.Array, noise_std: Any) -> 
     return jax.tree.map(lambda d: jnp.full(d.shape[1:], increment, d.dtype), directions)
 
 
-def _bias_overwriter(policy: Policy) -> Callable[[Any], Any]:
-    """Returns what overwrites a linear policy's bias [A] with its first A weights.
+def _overwrite_bias(params: Any) -> Any:
+    """Returns a linear policy's params with the first A weights in place of the bias [A].
 
     The notebook writes the same first entries of its flat vector into every parameter.
-
-    Raises:
-      ValueError: the policy is not linear.
     """
+    layer = params["network"]["params"]["Dense_0"]
+    # PyTorch stores weights as [A, O], flax as [O, A].
+    bias = layer["kernel"].T.reshape(-1)[: layer["bias"].size]
+    return params | {"network": {"params": {"Dense_0": layer | {"bias": bias}}}}
+
+
+def _check_linear(policy: Policy) -> None:
+    """Raises ValueError for a policy whose bias ``_overwrite_bias`` does not find."""
     params = jax.eval_shape(policy.init, jax.random.key(0))
     if set(params) != {"network", "constants"} or set(params["network"]["params"]) != {"Dense_0"}:
         raise ValueError("update='document' is for linear policies: pass one with hidden_sizes=()")
-
-    def overwrite(params):
-        layer = params["network"]["params"]["Dense_0"]
-        # PyTorch stores weights as [A, O], flax as [O, A].
-        bias = layer["kernel"].T.reshape(-1)[: layer["bias"].size]
-        return params | {"network": {"params": {"Dense_0": layer | {"bias": bias}}}}
-
-    return overwrite
 
 
 def _over_std(x: jax.Array, returns: jax.Array) -> jax.Array:

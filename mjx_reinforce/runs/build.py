@@ -15,14 +15,15 @@ def build(env: Any, config: Config) -> tuple[Any, int]:
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    from mjx_reinforce.learners import learner
+    from mjx_reinforce.learners.learner import check_horizon
+    from mjx_reinforce.learners.reinforce import reinforce
     from mjx_reinforce.export.policy_files import build_policy
 
     if config.stop_when_solved and getattr(env, "reward_threshold", None) is None:
         raise ValueError(
             f"{config.env} names no return at which it is solved: leave --stop-when-solved out"
         )
-    horizon = learner.check_horizon(env, config.horizon)
+    horizon = check_horizon(env, config.horizon)
     policy = build_policy(policy_settings(env, config))
     forever = config.normalize_steps is None
     shared = {
@@ -33,7 +34,7 @@ def build(env: Any, config: Config) -> tuple[Any, int]:
     }
     if config.algorithm == "ars":
         return _build_ars(env, config, shared), horizon
-    built = learner.reinforce(
+    built = reinforce(
         env,
         estimator=_build_estimator(config),
         optimizer=_build_optimizer(config),

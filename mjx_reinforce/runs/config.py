@@ -40,8 +40,8 @@ class Run:
     one_start: bool = False
     """Begin all training episodes of a seed in one state, each seed in its own. Evaluations keep
     their own starts, and show what such training knows of the others."""
-    engine: Literal["auto", "mjx", "fused", "kernel"] = "auto"
-    """How episodes are played: mjx (plain jax.vmap), fused (the step written out), kernel (all in
+    engine: Literal["auto", "vmap", "fused", "kernel"] = "auto"
+    """How episodes are played: vmap (jax.vmap of the step), fused (the step written out), kernel (all in
     one GPU kernel), or the fastest of them here."""
     output: Path | None = None
     """Run directory; runs/<env>-<time> if not given."""

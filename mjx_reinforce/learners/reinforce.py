@@ -1,0 +1,232 @@
+"""REINFORCE (Williams 1992).
+
+One update plays N complete episodes and follows the gradient of
+
+    (1/N) sum_n sum_t weight[t, n] log pi(a[t, n] | o[t, n]) + entropy_cost H[t, n]
+
+with the weights that an estimator gives.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from mjx_reinforce.engines import choice
+from mjx_reinforce.engines.choice import Engine
+from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
+from mjx_reinforce.learners.learner import (
+    Learner,
+    Metrics,
+    TrainState,
+    check_horizon,
+    episode_metrics,
+    keep_finite,
+)
+from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_optimizer
+from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.actor import Actor, act
+from mjx_reinforce.policies.distribution import Distribution, categorical
+from mjx_reinforce.policies.normal import normal
+from mjx_reinforce.policies.policy import Policy, mlp_policy
+from mjx_reinforce.types import (
+    Box,
+    Discrete,
+    Environment,
+    Trajectory,
+    action_space,
+    observation_size,
+)
+
+
+def default_distribution(space: Box | Discrete) -> Distribution:
+    """Returns a Normal with a trained std, or a categorical distribution if discrete."""
+    return categorical(space) if isinstance(space, Discrete) else normal(space)
+
+
+def reinforce(
+    env: Environment,
+    *,
+    policy: Policy | None = None,
+    estimator: Estimator | None = None,
+    optimizer: optax.GradientTransformation | None = None,
+    update: Update | None = None,
+    num_episodes: int = 16,
+    horizon: int | None = None,
+    entropy_cost: float | jax.Array = 0.0,
+    loss_per: str = "episode",
+    normalize_steps: float = 1000,
+    one_start: bool = False,
+    engine: str = "auto",
+) -> Learner:
+    """Builds REINFORCE for an environment; the formula is at the top of this file.
+
+    Numbers such as ``entropy_cost``, the estimator's discount and the optimiser's learning rate
+    may be traced: build the learner inside a function to vmap over them.
+
+    Args:
+      env: what is played; any brax-style environment.
+      policy: by default an MLP of 32 and 32 tanh units with ``default_distribution``.
+      estimator: by default leave-one-out on the return to go (discount 0.99), divided by its
+        standard deviation plus 10.
+      optimizer: by default Adam at 1e-2 with the gradient's norm clipped at 1.
+      update: how the gradient is spent, from ``updates``; by default in one optimiser step.
+      num_episodes: N, episodes an update.
+      horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
+      entropy_cost: weight of the policy's entropy H, in return per nat.
+      loss_per: "episode" divides the sum by N; "step" by the number of steps played, which makes
+        the optimiser's step shrink as episodes grow.
+      normalize_steps: scale observations by the mean and std of about the first so many steps,
+        then keep that scale (one that follows a policy as it learns to stay near the middle
+        raises its gain until it fails); 0 does not scale, inf never stops. An update uses the
+        statistics that its episodes were played with.
+      one_start: reset every episode of a seed with one key of its own, drawn at ``init``.
+      engine: how episodes are played: "auto", "vmap", "fused" or "kernel", see ``engines.choice``.
+
+    Raises:
+      ValueError: an argument makes no sense for this environment.
+    """
+    size = observation_size(env)
+    default = policy or mlp_policy(size, default_distribution(action_space(env)))
+    return _Reinforce(
+        env=env,
+        policy=default,
+        estimator=estimator or standardize(leave_one_out(), floor=10.0),
+        optimizer=optimizer or make_optimizer(),
+        update=update or full_batch(),
+        num_episodes=num_episodes,
+        horizon=check_horizon(env, horizon),
+        entropy_cost=entropy_cost,
+        loss_per=loss_per,
+        normalize_steps=normalize_steps,
+        one_start=one_start,
+        observation_size=size,
+    ).learner(engine)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class _Reinforce:
+    """The arguments of ``reinforce``, and what it does with them; ``observation_size`` is O."""
+
+    env: Environment
+    policy: Policy
+    estimator: Estimator
+    optimizer: optax.GradientTransformation
+    update: Update
+    num_episodes: int
+    horizon: int
+    entropy_cost: float | jax.Array
+    loss_per: str
+    normalize_steps: float
+    one_start: bool
+    observation_size: int
+
+    def __post_init__(self):
+        if self.num_episodes < self.estimator.min_episodes:
+            raise ValueError(
+                f"this estimator needs at least {self.estimator.min_episodes} episodes an update, "
+                f"got num_episodes={self.num_episodes}"
+            )
+        if self.loss_per not in ("episode", "step"):
+            raise ValueError(f"loss_per must be 'episode' or 'step', got {self.loss_per!r}")
+
+    def learner(self, engine: str) -> Learner:
+        """Returns the learner, whose episodes are played by the engine of that name."""
+        actor = jax.eval_shape(self._first_actor, jax.random.key(0))
+        player = choice.Player(self._act, actor, self.policy.distribution)
+        chosen = choice.choose(engine, self.env, player)
+        play = functools.partial(self._play, chosen)
+        return Learner(self._init, play, self._learn, self.policy, chosen)
+
+    def _act(self, actor: Actor, observation: jax.Array) -> jax.Array:
+        return act(self.policy, actor, observation)
+
+    def _first_actor(self, key: jax.Array) -> Actor:
+        normalizer = normalize.init(self.observation_size)
+        return Actor(params=self.policy.init(key), normalizer=normalizer)
+
+    def _init(self, key: jax.Array) -> TrainState:
+        policy_key, estimator_key, key = jax.random.split(key, 3)
+        start_key = None
+        if self.one_start:
+            key, start_key = jax.random.split(key)
+        actor = self._first_actor(policy_key)
+        return TrainState(
+            key=key,
+            num_updates=jnp.zeros((), jnp.int32),
+            actor=actor,
+            opt_state=self.optimizer.init(actor.params),
+            estimator_state=self.estimator.init(estimator_key, self.observation_size),
+            start_key=start_key,
+        )
+
+    def _play(
+        self, engine: Engine, state: TrainState, key: jax.Array, active: Any = True
+    ) -> Trajectory:
+        return engine.rollout(
+            self.env if state.start_key is None else _OneStart(self.env, state.start_key),
+            self._act,
+            state.actor,
+            self.policy.distribution,
+            key,
+            num_episodes=self.num_episodes,
+            horizon=self.horizon,
+            active=active,
+        )
+
+    def _learn(
+        self, state: TrainState, trajectory: Trajectory, key: jax.Array
+    ) -> tuple[TrainState, Metrics]:
+        actor, mask = state.actor, trajectory.mask
+        scaled = normalize.apply(actor.normalizer, trajectory.observation)
+        seen = dataclasses.replace(trajectory, observation=scaled)
+        weight, estimator_state, metrics = self.estimator.update(state.estimator_state, seen)
+        problem = Problem(
+            surrogate=_surrogate(self.policy, self.entropy_cost),
+            optimizer=self.optimizer,
+            samples=(scaled, trajectory.action, weight, mask),
+            divisor=jnp.maximum(jnp.sum(mask), 1) if self.loss_per == "step" else self.num_episodes,
+        )
+        params, opt_state, spent = self.update(problem, key, actor.params, state.opt_state)
+        normalizer = normalize.update(
+            actor.normalizer, trajectory.observation, mask, self.normalize_steps
+        )
+        learned = Actor(params=params, normalizer=normalizer), opt_state, estimator_state
+        known = actor, state.opt_state, state.estimator_state
+        (actor, opt_state, estimator_state), skipped = keep_finite(learned, known)
+        state = dataclasses.replace(
+            state, actor=actor, opt_state=opt_state, estimator_state=estimator_state
+        )
+        return state, episode_metrics(trajectory) | metrics | spent | {"skipped_update": skipped}
+
+
+class _OneStart:
+    """An environment whose every episode starts with the same key."""
+
+    def __init__(self, env: Environment, key: jax.Array):
+        self._env, self._key = env, key
+
+    def reset(self, rng: jax.Array) -> Any:
+        del rng
+        return self._env.reset(self._key)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
+
+
+def _surrogate(policy: Policy, entropy_cost: float | jax.Array) -> Callable[..., Any]:
+    """Returns the sum over samples whose gradient is followed, and the entropy's sum."""
+
+    def surrogate(params, chunk):
+        observation, action, weight, mask = chunk
+        outputs = policy.apply(params, observation)
+        entropy = policy.distribution.entropy(outputs)
+        terms = policy.distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
+        loss = -jnp.sum(jnp.where(mask, terms, 0.0))
+        return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
+
+    return surrogate
