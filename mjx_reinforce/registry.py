@@ -10,11 +10,11 @@ DISTRIBUTIONS = {
     "normal": "mjx_reinforce.policies.normal:normal",
     "normal-softplus": "mjx_reinforce.policies.normal:normal_softplus",
     "normal-sigmoid": "mjx_reinforce.policies.normal:normal_sigmoid",
-    "truncated-normal": "mjx_reinforce.policies.bounded:truncated_normal",
-    "clipped-normal": "mjx_reinforce.policies.bounded:clipped_normal",
-    "tanh-normal": "mjx_reinforce.policies.bounded:tanh_normal",
-    "deterministic": "mjx_reinforce.policies.normal:deterministic",
-    "categorical": "mjx_reinforce.policies.distribution:categorical",
+    "truncated-normal": "mjx_reinforce.policies.truncated_normal:truncated_normal",
+    "clipped-normal": "mjx_reinforce.policies.clipped_normal:clipped_normal",
+    "tanh-normal": "mjx_reinforce.policies.tanh_normal:tanh_normal",
+    "deterministic": "mjx_reinforce.policies.deterministic:deterministic",
+    "categorical": "mjx_reinforce.policies.categorical:categorical",
 }
 
 #: Gradient estimators: name -> "module:function" of a discount.

@@ -11,7 +11,7 @@ from mjx_reinforce import evaluate, mlp_policy, rollout, train_step
 from mjx_reinforce.learners import ars as ars_module
 from mjx_reinforce.learners.ars import ars
 from mjx_reinforce.policies import normalize
-from mjx_reinforce.policies.normal import deterministic
+from mjx_reinforce.policies.deterministic import deterministic
 from mjx_reinforce.types import Discrete
 
 

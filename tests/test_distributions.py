@@ -1,5 +1,6 @@
 """Every distribution: density, entropy, score and sampling agree with each other."""
 
+import contextlib
 import itertools
 
 import jax
@@ -9,33 +10,49 @@ import pytest
 from scipy import integrate, special, stats
 
 from mjx_reinforce import Box, fused
-from mjx_reinforce.policies import normal_integrals as truncated_normal
+from mjx_reinforce.policies import normal_integrals
 from mjx_reinforce.policies.normal import normal
 from mjx_reinforce.registry import DISTRIBUTIONS, load
 from mjx_reinforce.types import Discrete
 
 LOW, HIGH = -3.0, 1.0
 SPACE, ARMS = Box(np.array([LOW]), np.array([HIGH])), Discrete(4)
+UNBOUNDED = Box(np.array([-np.inf]), np.array([1.0]))
 NUM_SAMPLES = 200_000
-DISCRETE = {"categorical"}
-CONTINUOUS = sorted(set(DISTRIBUTIONS) - DISCRETE - {"deterministic"})
-BOUNDED = sorted(name for name in CONTINUOUS if not name.startswith("normal"))
-#: Actions of positive probability, and the ends of the interval where there is a density.
-ATOMS = {"clipped-normal": [LOW, HIGH], "tanh-normal": -1.0 + 2.0 * np.tanh([-6.0, 6.0])}
-TRANSFORM = jax.jit(truncated_normal.transform)
-LOG_DENSITY = jax.jit(truncated_normal.log_density)
-HALF_LINE = jax.jit(truncated_normal.half_line, static_argnums=0)
-SEGMENT = jax.jit(truncated_normal.segment, static_argnums=0)
-ENTROPY = jax.jit(truncated_normal.entropy)
-SUPPORT = {
-    "truncated-normal": (LOW, HIGH),
-    "clipped-normal": (LOW + 1e-6, HIGH - 1e-6),
-    "tanh-normal": tuple(-1.0 + 2.0 * np.tanh([-5.0, 5.0])),
-}
+TRANSFORM = jax.jit(normal_integrals.transform)
+LOG_DENSITY = jax.jit(normal_integrals.log_density)
+HALF_LINE = jax.jit(normal_integrals.half_line, static_argnums=0)
+SEGMENT = jax.jit(normal_integrals.segment, static_argnums=0)
+ENTROPY = jax.jit(normal_integrals.entropy)
 
 
 def build(name, space=SPACE, **settings):
     return load(DISTRIBUTIONS[name])(space, **settings)
+
+
+def supporting(space):
+    """The families in the registry that can be built for an action space."""
+    for name in sorted(DISTRIBUTIONS):
+        with contextlib.suppress(ValueError):
+            build(name, space)
+            yield name
+
+
+DISCRETE = list(supporting(ARMS))
+CONTINUOUS = [name for name in supporting(SPACE) if name != "deterministic"]
+BOUNDED = sorted(set(CONTINUOUS) - set(supporting(UNBOUNDED)))
+#: The bounded families whose outputs are the mean and the log of the standard deviation.
+BOUNDED_NORMALS = ["clipped-normal", "tanh-normal", "truncated-normal"]
+#: Actions of positive probability, and the ends of the interval where there is a density, if it
+#: is not all of the action's range.
+ATOMS = {"clipped-normal": [LOW, HIGH], "tanh-normal": -1.0 + 2.0 * np.tanh([-6.0, 6.0])}
+SUPPORT = {"tanh-normal": tuple(-1.0 + 2.0 * np.tanh([-5.0, 5.0]))}
+
+
+def grid_of_actions(name):
+    """Actions [20001, 1] over the interval where there is a density."""
+    range_ = (LOW + 1e-6, HIGH - 1e-6) if name in BOUNDED else (-12.0, 12.0)
+    return jnp.linspace(*SUPPORT.get(name, range_), 20_001)[:, None]
 
 
 def some_outputs(distribution):
@@ -65,7 +82,7 @@ def outputs(distribution):
 
 
 def test_probability_adds_up_to_one(name, distribution, outputs):
-    grid = jnp.linspace(*SUPPORT.get(name, (-12.0, 12.0)), 20_001)[:, None]
+    grid = grid_of_actions(name)
     density = jnp.exp(distribution.log_prob(outputs, grid))
     atoms = jnp.asarray(ATOMS.get(name, []))[:, None]
     masses = jnp.exp(distribution.log_prob(outputs, atoms))
@@ -82,9 +99,10 @@ def test_expected_score_is_zero(distribution, outputs):
 
 @pytest.mark.parametrize("saturated", [-4.0, 3.0])
 @pytest.mark.parametrize("name", BOUNDED)
-def test_expected_score_is_zero_when_the_mean_is_out_of_bounds(name, saturated):
+def test_expected_score_is_zero_at_large_outputs(name, saturated):
+    """A Normal's mean is then out of bounds."""
     distribution = build(name, initial_std=3.0)
-    outputs = jnp.array([saturated, *distribution.constants])
+    outputs = jnp.array([saturated] * distribution.num_outputs + list(distribution.constants))
     actions = draw(distribution, outputs)
     score = jax.jit(jax.vmap(jax.grad(distribution.log_prob), (None, 0)))(outputs, actions)
     error = np.std(score, axis=0) / np.sqrt(NUM_SAMPLES)
@@ -102,7 +120,7 @@ def test_mode(name, distribution, outputs):
     if name == "tanh-normal":
         best = np.median(draw(distribution, outputs), axis=0)
     else:
-        grid = jnp.linspace(*SUPPORT.get(name, (-12.0, 12.0)), 20_001)[:, None]
+        grid = grid_of_actions(name)
         best = grid[jnp.argmax(distribution.log_prob(outputs, grid))]
     np.testing.assert_allclose(distribution.mode(outputs), best, atol=6e-3)
 
@@ -141,7 +159,7 @@ def test_the_fused_engine_writes_out_sample_and_mode(name):
     np.testing.assert_allclose(written, jax.vmap(distribution.mode, -1, -1)(outputs), rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", BOUNDED)
+@pytest.mark.parametrize("name", BOUNDED_NORMALS)
 def test_far_out_samples_stay_inside_and_gradients_finite(name):
     """At means up to 10,000 standard deviations beyond either bound."""
     distribution = build(name)
@@ -215,7 +233,7 @@ def test_truncated_normal_far_out_is_exponential(distance, dtype):
         tolerance = 4 / distance**2 + (1e-10 if dtype == np.float64 else 5e-6)
 
         def log_density(mean, log_std, action):
-            return truncated_normal.log_density(action, mean, jnp.exp(log_std), *settings[2:])
+            return normal_integrals.log_density(action, mean, jnp.exp(log_std), *settings[2:])
 
         scored = jax.jit(jax.value_and_grad(log_density, (0, 1)))
         for uniform in (0.02, 0.5, 0.9):
@@ -231,7 +249,7 @@ def test_truncated_normal_far_out_is_exponential(distance, dtype):
                 sign * (t / scale - 1.0), abs=tolerance
             )
             assert float(score[1]) == pytest.approx(2.0 * (t / scale - 1.0), abs=10 * tolerance)
-        entropy, slope = jax.jit(jax.value_and_grad(truncated_normal.entropy))(*settings)
+        entropy, slope = jax.jit(jax.value_and_grad(normal_integrals.entropy))(*settings)
         assert float(entropy) == pytest.approx(1.0 + np.log(0.5 * scale), abs=tolerance)
         assert abs(float(slope)) * 0.5 == pytest.approx(scale, rel=tolerance)
 
@@ -262,9 +280,9 @@ def test_integrals_by_quadrature(order, dtype):
 def test_log_tail_against_scipy():
     with jax.enable_x64(True):
         x = np.array([-40.0, -3.0, -1e-3, 0.0, 0.5, 8.0, 200.0])
-        got = truncated_normal.log_tail(jnp.asarray(x))
+        got = normal_integrals.log_tail(jnp.asarray(x))
         np.testing.assert_allclose(got, special.log_ndtr(-x), rtol=1e-12, atol=1e-300)
-        slope = jax.vmap(jax.grad(truncated_normal.log_tail))(jnp.asarray(x))
+        slope = jax.vmap(jax.grad(normal_integrals.log_tail))(jnp.asarray(x))
         hazard = np.exp(stats.norm.logpdf(x) - special.log_ndtr(-x))
         np.testing.assert_allclose(-slope, hazard, rtol=1e-9)
 
@@ -292,21 +310,31 @@ def test_tanh_normal_density():
     np.testing.assert_allclose(distribution.log_prob(outputs, actions), expected, atol=5e-3)
 
 
-def test_categorical_is_exact():
-    distribution = build("categorical", ARMS)
-    logits = jnp.array([0.3, -1.0, 2.0, 0.0])
-    probabilities = special.softmax(np.asarray(logits, float))
-    got = jnp.exp(distribution.log_prob(logits, jnp.arange(4)))
-    np.testing.assert_allclose(got, probabilities, rtol=1e-6)
-    assert float(distribution.entropy(logits)) == pytest.approx(stats.entropy(probabilities))
-    assert int(distribution.mode(logits)) == 2
-    actions = draw(distribution, logits)
+@pytest.mark.parametrize("name", DISCRETE)
+def test_discrete_probabilities(name):
+    """Entropy, mode, score and the frequencies of samples follow from the probabilities."""
+    distribution = build(name, ARMS)
+    outputs = some_outputs(distribution)
+    log_probs = distribution.log_prob(outputs, jnp.arange(4))
+    probabilities = np.exp(np.asarray(log_probs, float))
+    assert np.sum(probabilities) == pytest.approx(1.0, rel=1e-6)
+    assert float(distribution.entropy(outputs)) == pytest.approx(stats.entropy(probabilities))
+    assert int(distribution.mode(outputs)) == np.argmax(probabilities)
+    actions = draw(distribution, outputs)
     assert actions.dtype == jnp.int32
     assert actions.shape == (NUM_SAMPLES,)
     counts = np.bincount(actions, minlength=4)
     assert stats.chisquare(counts, NUM_SAMPLES * probabilities / probabilities.sum()).pvalue > 1e-4
-    scores = jax.vmap(jax.grad(distribution.log_prob), (None, 0))(logits, jnp.arange(4))
+    scores = jax.vmap(jax.grad(distribution.log_prob), (None, 0))(outputs, jnp.arange(4))
     np.testing.assert_allclose(probabilities @ np.asarray(scores), 0.0, atol=1e-6)
+
+
+def test_categorical_is_a_softmax():
+    distribution = build("categorical", ARMS)
+    logits = jnp.array([0.3, -1.0, 2.0, 0.0])
+    got = jnp.exp(distribution.log_prob(logits, jnp.arange(4)))
+    np.testing.assert_allclose(got, special.softmax(np.asarray(logits, float)), rtol=1e-6)
+    assert int(distribution.mode(logits)) == 2
 
 
 def test_deterministic_has_no_density():
@@ -339,4 +367,10 @@ def test_a_discrete_space_is_refused(name):
 @pytest.mark.parametrize("name", BOUNDED)
 def test_unbounded_actions_are_refused(name):
     with pytest.raises(ValueError, match=r"finite action bounds.*choose normal"):
-        build(name, Box(np.array([-np.inf]), np.array([1.0])))
+        build(name, UNBOUNDED)
+
+
+def test_every_family_is_tested():
+    """The lists above leave out a family that cannot be built."""
+    assert {*CONTINUOUS, *DISCRETE, "deterministic"} == set(DISTRIBUTIONS)
+    assert set(BOUNDED) >= set(BOUNDED_NORMALS)

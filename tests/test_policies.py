@@ -8,7 +8,7 @@ import pytest
 
 from mjx_reinforce import Box, mlp_policy, normal
 from mjx_reinforce.export import policy_files as checkpoint
-from mjx_reinforce.policies.distribution import categorical
+from mjx_reinforce.policies.categorical import categorical
 from mjx_reinforce.policies.networks import MLP
 from mjx_reinforce.policies.normal import normal_softplus
 from mjx_reinforce.types import Discrete
@@ -18,7 +18,8 @@ SPACE = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))
 
 @pytest.mark.parametrize("hidden_sizes", [(), (7,), (5, 3, 4)])
 @pytest.mark.parametrize("initializer", ["orthogonal", "torch"])
-def test_torch_weights_are_uniform_and_orthogonal_ones_are_not(hidden_sizes, initializer):
+def test_initial_weights_and_biases(hidden_sizes, initializer):
+    """With "torch" all uniform within 1 / sqrt(fan-in); with "orthogonal" the biases are zero."""
     policy = mlp_policy(400, normal(SPACE), hidden_sizes, initializer=initializer)
     params = policy.init(jax.random.key(0))
     assert policy.apply(params, jnp.zeros((6, 5, 400))).shape == (6, 5, 4)
@@ -35,6 +36,23 @@ def test_torch_weights_are_uniform_and_orthogonal_ones_are_not(hidden_sizes, ini
     if initializer == "torch":
         first = np.ravel(layers["Dense_0"]["kernel"])
         assert np.std(first) == pytest.approx(400**-0.5 / np.sqrt(3), rel=0.05)
+
+
+@pytest.mark.parametrize("hidden_sizes", [(), (7,), (5, 3, 4)])
+@pytest.mark.parametrize("shared_trunk", [True, False])
+def test_a_fresh_policy_does_nearly_the_same_in_all_states(hidden_sizes, shared_trunk):
+    """Its last layer is 0.01 times an orthogonal matrix, so it shrinks its input 100-fold."""
+    policy = mlp_policy(6, normal_softplus(SPACE), hidden_sizes, shared_trunk=shared_trunk)
+    params = policy.init(jax.random.key(0))
+    for name in ("network",) if shared_trunk else ("network", "scale_network"):
+        last = params[name]["params"][f"Dense_{len(hidden_sizes)}"]["kernel"]
+        gains = np.linalg.svd(np.asarray(last), compute_uv=False)
+        np.testing.assert_allclose(gains, 0.01, rtol=1e-5)
+    # The input's entries are between -1 and 1: a tanh unit's value, or here the observation's.
+    outputs = policy.apply(params, jax.random.uniform(jax.random.key(1), (100, 6), float, -1, 1))
+    length = np.sqrt((hidden_sizes or (6,))[-1])
+    assert np.all(np.abs(outputs) <= 0.01 * length)
+    assert np.all(np.std(outputs, axis=0) > 0)
 
 
 def test_separate_trunks_do_not_touch_each_other():

@@ -31,8 +31,8 @@ from mjx_reinforce.learners.learner import (
 )
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
-from mjx_reinforce.policies.distribution import categorical
-from mjx_reinforce.policies.normal import deterministic
+from mjx_reinforce.policies.categorical import categorical
+from mjx_reinforce.policies.deterministic import deterministic
 from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.types import (
     Discrete,

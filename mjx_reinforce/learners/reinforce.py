@@ -30,7 +30,8 @@ from mjx_reinforce.learners.learner import (
 from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_optimizer
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
-from mjx_reinforce.policies.distribution import Distribution, categorical
+from mjx_reinforce.policies.categorical import categorical
+from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.policies.normal import normal
 from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.types import (

@@ -1,4 +1,4 @@
-"""Networks, shared by policies and critics."""
+"""The multilayer perceptron of policies and critics."""
 
 from collections.abc import Sequence
 
@@ -7,10 +7,10 @@ from flax import linen as nn
 
 from mjx_reinforce.registry import check_name
 
-#: Ways to draw initial weights.
+#: The ways to draw initial weights.
 INITIALIZERS = ("orthogonal", "torch")
 
-# TF32, the default of NVIDIA's matrix units, breaks small policies quietly.
+# With TF32, the default on NVIDIA's GPUs, small policies fail to learn and nothing reports it.
 _PRECISION = jax.lax.Precision.HIGHEST
 
 
@@ -19,12 +19,13 @@ class MLP(nn.Module):
 
     hidden_sizes: units of each hidden layer; none for a linear function
     num_outputs: entries of the output
-    output_scale: gain of the last layer's orthogonal initial weights; 0.01 makes
-      every fresh policy nearly the same in all states (Andrychowicz et al. 2020,
+    output_scale: gain of the last layer's orthogonal initial weights; with 0.01 an
+      untrained policy does nearly the same in all states (Andrychowicz et al. 2020,
       arXiv:2006.05990, section 3.2)
-    initializer: "orthogonal", with LeCun's normal weights in the hidden layers and
-      zero biases; or "torch" for that of ``torch.nn.Linear``, all weights and biases
-      uniform within 1 / sqrt(fan-in), whatever ``output_scale``
+    initializer: "orthogonal": orthogonal weights in the last layer, LeCun's normal
+      weights in the hidden layers, zero biases; "torch": all weights and biases
+      uniform within 1 / sqrt(fan-in), as in ``torch.nn.Linear``, and ``output_scale``
+      is not used
     """
 
     hidden_sizes: Sequence[int]
@@ -34,7 +35,7 @@ class MLP(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """Returns [..., num_outputs] from ``x`` [..., O]; ValueError for another initialiser."""
+        """Returns [..., num_outputs] of ``x`` [..., O]; ValueError: unknown initialiser."""
         check_name("initializer", self.initializer, dict.fromkeys(INITIALIZERS))
         for size in self.hidden_sizes:
             x = nn.tanh(self._dense(x, size, nn.initializers.lecun_normal()))
@@ -48,7 +49,7 @@ class MLP(nn.Module):
 
 
 def _symmetric_uniform(bound: float) -> nn.initializers.Initializer:
-    """Draws from U(-bound, bound)."""
+    """Returns an initialiser that draws from the uniform distribution on (-bound, bound)."""
 
     def draw(key, shape, dtype=float, out_sharding=None):
         del out_sharding

@@ -1,19 +1,21 @@
-"""Integrals of a Normal density over part of the line, exact however far out in a tail.
+"""Integrals of the Normal density over an interval, accurate even far out in its tails.
 
-Everything is measured from an anchor: with c the anchor's distance from the mean and t the
-distance from the anchor, both in standard deviations,
+A truncated Normal needs ratios of such integrals. Far from the mean both terms of a ratio are 0 in
+floating point, and so is the usual difference of two distribution functions (Burkardt 2014, "The
+truncated normal distribution"). Here every integral is taken relative to the density at an anchor:
+the mean, or the bound next to it if the mean is outside the interval. With c the distance from the
+mean to the anchor and t that from the anchor to x, both in standard deviations,
 
     exp(-x^2 / 2) = exp(-c^2 / 2) exp(-t^2 / 2 - c t),    x = c + t.
 
-Anchored at the bound next to the mean, the first factor leaves every ratio, and what remains is of
-order one where the usual difference of two distribution functions is 0 - 0 (Burkardt 2014, "The
-truncated normal distribution"). The integrals over a half-line,
+The first factor, which underflows, cancels in every ratio. What remains are integrals of the second
+factor. Those over a half-line,
 
     F_n(c) = integral from 0 to infinity of t^n exp(-t^2 / 2 - c t) dt,
 
-of which F_0 is the Mills ratio, come from Chebyshev series in (4 - c) / (4 + c), after Shepherd and
-Laframboise (1981), "Chebyshev approximation of (1 + 2x) exp(x^2) erfc x in 0 <= x < infinity".
-They use no more than sums, products and quotients.
+of which F_0 is the Mills ratio, are computed by Chebyshev series in (4 - c) / (4 + c), after
+Shepherd and Laframboise (1981), "Chebyshev approximation of (1 + 2x) exp(x^2) erfc x in
+0 <= x < infinity". A series needs only sums, products and quotients.
 """
 
 import functools
@@ -26,7 +28,8 @@ from numpy.polynomial import legendre
 
 _LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 _PIVOT = 4.0
-#: Beyond so many standard deviations a bound cuts off nothing; squares stay finite in float32.
+# A bound farther away, in standard deviations, is treated as this far: it cuts off nothing either
+# way, and the square stays finite in float32.
 _FAR = 1e9
 
 
@@ -58,8 +61,9 @@ def _half_line_jvp(order, primals, tangents):
 def segment(order: int, c: jax.Array, width: jax.Array) -> jax.Array:
     """Returns the integral of t^n exp(-t^2 / 2 - c t) over t from 0 to ``width``.
 
-    Long segments are the difference of two half-lines; where the density falls by less than a
-    factor e, that would cancel, and Gauss-Legendre quadrature is as good as exact.
+    A long segment is the difference of two half-lines. If the density falls by less than a factor e
+    over the segment, that difference would cancel; there Gauss-Legendre quadrature is used, whose
+    error is below the rounding error.
 
     Args:
       order: n.
@@ -92,7 +96,7 @@ def _segment_jvp(order, primals, tangents):
 
 
 def log_tail(x: jax.Array) -> jax.Array:
-    """Returns the log-probability [...] that a standard Normal exceeds ``x``; -x gives log Phi."""
+    """Returns the log-probability [...] that a standard Normal exceeds ``x`` [...]."""
     upper = x >= 0
     distance = jnp.where(upper, x, -x)
     log_small = -0.5 * distance**2 + jnp.log(half_line(0, distance)) - _LOG_SQRT_2PI
@@ -102,10 +106,11 @@ def log_tail(x: jax.Array) -> jax.Array:
 def anchor(
     mean: jax.Array, std: jax.Array, low: jax.Array, high: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Returns the mode, its distance c from the mean, and how far the bounds are to each side.
+    """Returns the anchor, its distance c from the mean, and those to the lower and upper bound.
 
-    The last three are in standard deviations. Either c is 0, or the mode lies on a bound and the
-    mean beyond it. No result below depends on where the anchor is, so none is differentiated by it.
+    The anchor is the truncated Normal's mode: the mean, and then c is 0, or the bound next to it.
+    The distances are in standard deviations. The results of the functions below do not depend on
+    which point is the anchor, so no gradient is taken through it.
     """
     mode = jax.lax.stop_gradient(jnp.clip(mean, low, high))
     return mode, (mode - mean) / std, (mode - low) / std, (high - mode) / std
@@ -125,8 +130,9 @@ def log_density(
 def entropy(mean: jax.Array, std: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
     """Returns the differential entropy [...] in nats of a Normal restricted to [low, high].
 
-    It is log(std W) + E[t^2 / 2 + c t] with W the mass; partial integration turns the expectation
-    into (1 + c E[t] - boundary terms) / 2, whose terms are of order one.
+    It is log(std W) + E[t^2 / 2 + c t], where W is the integral of exp(-t^2 / 2 - c t) between the
+    bounds. By partial integration the expectation is (1 + c E[t] - boundary terms) / 2, and these
+    terms stay of order one far out.
     """
     _, c, left, right = anchor(mean, std, low, high)
     mass = segment(0, -c, left) + segment(0, c, right)
@@ -140,8 +146,8 @@ def transform(
 ) -> jax.Array:
     """Returns the inverse distribution function [...] of a Normal restricted to [low, high].
 
-    The mass between the mode and the sample is inverted, on whichever side the sample lies, so a
-    sample is as exact in a far tail as near the mean.
+    The function that is inverted is the integral from the anchor to the sample, to the left or to
+    the right, so a sample in a far tail is as exact as one near the mean.
     """
     mode, c, left, right = anchor(mean, std, low, high)
     left_mass = segment(0, -c, left)
@@ -154,7 +160,8 @@ def _invert(c: jax.Array, mass: jax.Array) -> jax.Array:
     """Returns the t with ``segment(0, c, t) == mass``, by Halley's method on the log of the tail.
 
     With the hazard h = 1 / F_0, minus that log has slope h(c + t) and curvature h (h - c - t),
-    between 2 / pi and 1. The first guess takes both at the anchor; it is never too small.
+    between 2 / pi and 1. The first guess takes slope and curvature from the anchor; it is never
+    too small.
     """
     eps = float(jnp.finfo(c.dtype).eps)
     hazard = 1.0 / half_line(0, c)
@@ -167,16 +174,18 @@ def _invert(c: jax.Array, mass: jax.Array) -> jax.Array:
         excess = (t * (0.5 * t + c) - jnp.log(mills * hazard) - log_drop) * mills
         bend = jnp.clip(1.0 / mills - c - t, 0.0, 0.8)
         t = t - excess / (1.0 - 0.5 * bend * excess)
-    # A small drop is lost in the logarithm's rounding, and the guess is exact to its third power.
+    # A small drop loses its digits in the rounding of the logarithm; the guess does not, and its
+    # error is only of the third order in the drop.
     return jnp.where(log_drop < eps ** (1 / 3), guess, t)
 
 
 @functools.cache
 def _series(order: int, eps: float) -> tuple[float, ...]:
-    """Returns the Chebyshev coefficients of (1 + c)^(n + 1) F_n(c), as many as a dtype resolves.
+    """Returns the Chebyshev coefficients of (1 + c)^(n + 1) F_n(c), those above a dtype's rounding.
 
-    With t = s / (1 + c) that is the integral of s^n exp(-(s z)^2 / 2 - s (1 - z)), z = 1 / (1 + c),
-    a smooth function of z in [0, 1], and nothing in it cancels.
+    With t = s / (1 + c) and z = 1 / (1 + c) it is the integral over s of
+    s^n exp(-(s z)^2 / 2 - s (1 - z)), a smooth function of z in [0, 1]. No term is negative, so
+    nothing cancels.
     """
     nodes, weights = _legendre(12)
     panels = np.arange(100)[:, None]

@@ -1,4 +1,4 @@
-"""Mean and standard deviation of the first observations, exact over any batch order."""
+"""Observations scaled by the mean and standard deviation of the first ones."""
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,9 @@ _MIN_STD = 1e-4
 
 @struct.dataclass(kw_only=True)
 class Normalizer:
-    """Sufficient statistics of the observations counted so far.
+    """The mean and variance of the observations counted so far, in a form that can be merged.
 
-    count: [] how many observations
+    count: [] number of observations
     mean: [O] their mean
     m2: [O] the sum of their squared deviations from the mean
     """
@@ -23,7 +23,7 @@ class Normalizer:
 
 
 def init(observation_size: int) -> Normalizer:
-    """Returns the statistics of no observation; ``apply`` is then the identity."""
+    """Returns the statistics before any observation; with them ``apply`` changes nothing."""
     zeros = jnp.zeros(observation_size)
     return Normalizer(count=jnp.zeros(()), mean=zeros, m2=zeros)
 
@@ -31,16 +31,16 @@ def init(observation_size: int) -> Normalizer:
 def update(
     normalizer: Normalizer, observation: jax.Array, mask: jax.Array, at_most: float
 ) -> Normalizer:
-    """Merges a batch into the statistics, unless enough is counted already.
+    """Merges a batch into the statistics, unless enough observations are counted already.
 
-    The parallel rule of Chan, Golub and LeVeque (1979), which stays accurate in
-    float32 where sums of squares cancel.
+    By the parallel rule of Chan, Golub and LeVeque (1979). It stays accurate in float32;
+    the difference of the mean square and the squared mean would not.
 
     Args:
       normalizer: the statistics so far.
       observation: [T, N, O]; entries outside the mask have no effect.
       mask: [T, N] True where the observation counts.
-      at_most: a batch is merged while fewer observations than this are counted.
+      at_most: a batch is merged only if fewer observations than this are counted so far.
 
     Returns:
       The statistics of both together, or those so far.
@@ -61,9 +61,9 @@ def update(
 
 
 def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
-    """Returns ``observation`` [..., O] in standard deviations from the mean, clipped at 10.
+    """Returns ``observation`` [..., O] in standard deviations from the mean, clipped to +-10.
 
-    With no observation counted yet it comes back unchanged.
+    While no observation is counted, it is returned unchanged.
     """
     variance = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
     std = jnp.maximum(jnp.sqrt(variance), _MIN_STD)

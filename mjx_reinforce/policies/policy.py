@@ -16,7 +16,7 @@ class Policy(NamedTuple):
 
     init: (key) -> params; consumes the key
     apply: (params, observation [..., O]) -> outputs [..., K] of ``distribution``
-    distribution: what the outputs index
+    distribution: the family of distributions that the outputs are the parameters of
     """
 
     init: Callable[[jax.Array], Any]
@@ -32,14 +32,14 @@ def mlp_policy(
     shared_trunk: bool = True,
     initializer: str = "orthogonal",
 ) -> Policy:
-    """A policy whose distribution is indexed by an MLP with tanh units.
+    """Builds a policy whose distribution has its parameters from an MLP with tanh units.
 
     Args:
       observation_size: O.
-      distribution: what the network's outputs index.
+      distribution: the family whose parameters the network computes.
       hidden_sizes: units of each hidden layer; empty for a linear policy.
-      shared_trunk: whether one network computes means and standard deviations;
-        else the standard deviations have one of their own, of the same sizes.
+      shared_trunk: True for one network that computes means and standard deviations;
+        False for a second network, of the same sizes, for the standard deviations.
       initializer: of the weights, see ``networks.MLP``.
 
     Returns:
@@ -47,25 +47,10 @@ def mlp_policy(
       and ``"scale_network"`` without a shared trunk.
 
     Raises:
-      ValueError: a layer has no units, the initialiser is unknown, or there is
-        nothing for a second network to compute.
+      ValueError: a layer has no units, the initialiser is unknown, or a second network
+        is asked for and no standard deviation depends on the observation.
     """
-    if any(size < 1 for size in hidden_sizes):
-        raise ValueError(f"every hidden layer needs at least one unit, got {tuple(hidden_sizes)}")
-    check_name("initializer", initializer, dict.fromkeys(INITIALIZERS))
-    num_outputs, num_scales = distribution.num_outputs, distribution.num_scales
-    if not (shared_trunk or num_scales):
-        raise ValueError(
-            "without a shared trunk the standard deviation must come from the state, "
-            "as in normal-softplus; this distribution's is a constant, or it has none"
-        )
-    sizes = {"network": num_outputs}
-    if not shared_trunk:
-        sizes = {"network": num_outputs - num_scales, "scale_network": num_scales}
-    networks = {
-        name: MLP(tuple(hidden_sizes), size, output_scale=0.01, initializer=initializer)
-        for name, size in sizes.items()
-    }
+    networks = _networks(distribution, tuple(hidden_sizes), shared_trunk, initializer)
     constants = distribution.constants
 
     def init(key):
@@ -86,3 +71,25 @@ def mlp_policy(
         return jnp.concatenate([*outputs, fixed], axis=-1)
 
     return Policy(init, apply, distribution)
+
+
+def _networks(
+    distribution: Distribution, hidden_sizes: tuple[int, ...], shared_trunk: bool, initializer: str
+) -> dict[str, MLP]:
+    """Returns the networks by their name in the params; raises ValueError as ``mlp_policy``."""
+    if any(size < 1 for size in hidden_sizes):
+        raise ValueError(f"every hidden layer needs at least one unit, got {hidden_sizes}")
+    check_name("initializer", initializer, dict.fromkeys(INITIALIZERS))
+    num_outputs, num_scales = distribution.num_outputs, distribution.num_scales
+    if not (shared_trunk or num_scales):
+        raise ValueError(
+            "without a shared trunk the standard deviation must come from the state, "
+            "as in normal-softplus; this distribution's is a constant, or it has none"
+        )
+    sizes = {"network": num_outputs}
+    if not shared_trunk:
+        sizes = {"network": num_outputs - num_scales, "scale_network": num_scales}
+    return {
+        name: MLP(hidden_sizes, size, output_scale=0.01, initializer=initializer)
+        for name, size in sizes.items()
+    }

@@ -1,0 +1,102 @@
+"""What the Gaussian families share: the means and standard deviations in a network's outputs."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_reinforce.policies.action_range import continuous_box, middle_and_half_range
+from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.types import Box, Discrete
+
+LOG_SQRT_2PI = 0.5 * float(np.log(2.0 * np.pi))
+_MIN_STD = 1e-6
+
+
+class GaussianOutputs(NamedTuple):
+    """Where the outputs hold the means and standard deviations of a family's Normals.
+
+    size: A
+    std: "parameter", "softplus" or "sigmoid"
+    initial_std: the standard deviation before training
+    middle: [A] the mean where the network's output is 0
+    half: [A] what a network output of 1 adds to it
+    """
+
+    size: int
+    std: str
+    initial_std: float
+    middle: np.ndarray
+    half: np.ndarray
+
+    def mean(self, outputs: jax.Array) -> jax.Array:
+        """Returns the means [..., A]."""
+        return outputs[..., : self.size] * self.half + self.middle
+
+    def split(self, outputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns the means and standard deviations, [..., A] each."""
+        raw, initial = outputs[..., self.size :], self.initial_std
+        # A fresh network's outputs are near 0; the added constants make the std initial_std there.
+        if self.std == "parameter":
+            std = jnp.exp(raw)
+        elif self.std == "softplus":
+            std = jax.nn.softplus(raw + float(np.log(np.expm1(initial)))) + _MIN_STD
+        else:
+            std = jax.nn.sigmoid(raw + float(np.log(initial / (1.0 - initial)))) + _MIN_STD
+        return self.mean(outputs), std
+
+    def distribution(self, sample, mode, log_prob, entropy, noise=None) -> Distribution:
+        """Returns the distribution of these functions; its noise is standard Normal by default."""
+        constant = self.std == "parameter"
+        draw = jax.random.normal if noise is None else noise
+        return Distribution(
+            num_outputs=self.size if constant else 2 * self.size,
+            constants=(float(np.log(self.initial_std)),) * self.size if constant else (),
+            noise=lambda key, shape: draw(key, (*shape, self.size)),
+            sample=sample,
+            mode=mode,
+            log_prob=log_prob,
+            entropy=entropy,
+            num_scales=0 if constant else self.size,
+        )
+
+
+def gaussian_outputs(
+    name: str, space: Box | Discrete, std: str, initial_std: float, rescale: bool
+) -> GaussianOutputs:
+    """Checks the arguments of a Gaussian family and returns the layout of its outputs.
+
+    Args:
+      name: the family's name, for the messages.
+      space: the action bounds, [A] each.
+      std: "parameter", "softplus" or "sigmoid", as in ``normal``.
+      initial_std: the standard deviation before training, in the action's unit.
+      rescale: False takes the network's output as the mean itself.
+
+    Raises:
+      ValueError: the space is discrete, ``std`` is unknown, or ``initial_std`` is
+        not positive or, for "sigmoid", not below 1.
+    """
+    box = continuous_box(name, space)
+    if std not in ("parameter", "softplus", "sigmoid"):
+        raise ValueError(f"std must be 'parameter', 'softplus' or 'sigmoid', got {std!r}")
+    if not (np.isfinite(initial_std) and initial_std > 0):
+        raise ValueError(f"initial_std must be positive and finite, got {initial_std}")
+    if std == "sigmoid" and initial_std >= 1:
+        raise ValueError(f"a sigmoid std stays below 1, got initial_std={initial_std}")
+    size = len(box.low)
+    middle, half = np.zeros(size, np.float32), np.ones(size, np.float32)
+    if rescale:
+        middle, half = middle_and_half_range(box)
+    return GaussianOutputs(size, std, initial_std, middle, half)
+
+
+def normal_log_density(x: jax.Array, mean: jax.Array, std: jax.Array) -> jax.Array:
+    """Returns the log-density [...] of a Normal at ``x``, entry by entry."""
+    return -0.5 * ((x - mean) / std) ** 2 - jnp.log(std) - LOG_SQRT_2PI
+
+
+def normal_entropy(std: jax.Array) -> jax.Array:
+    """Returns the entropy [...] of a Normal in nats, entry by entry."""
+    return jnp.log(std) + 0.5 + LOG_SQRT_2PI
