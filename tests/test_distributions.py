@@ -43,8 +43,8 @@ CONTINUOUS = [name for name in supporting(SPACE) if name != "deterministic"]
 BOUNDED = sorted(set(CONTINUOUS) - set(supporting(UNBOUNDED)))
 #: The bounded families whose outputs are the mean and the log of the standard deviation.
 BOUNDED_NORMALS = ["clipped-normal", "tanh-normal", "truncated-normal"]
-#: Actions of positive probability, and the ends of the interval where there is a density, if it
-#: is not all of the action's range.
+#: Actions of positive probability; and the interval where there is a density, if it is not all of
+#: the action's range.
 ATOMS = {"clipped-normal": [LOW, HIGH], "tanh-normal": -1.0 + 2.0 * np.tanh([-6.0, 6.0])}
 SUPPORT = {"tanh-normal": tuple(-1.0 + 2.0 * np.tanh([-5.0, 5.0]))}
 
