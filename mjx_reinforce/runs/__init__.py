@@ -1,0 +1,1 @@
+"""Runs: settings, the programs that train many seeds, and what they leave on disk."""
