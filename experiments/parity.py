@@ -127,7 +127,7 @@ def _max_error(actual: Outcome, expected: Outcome, name: str, where: Any = ...) 
 def _undecided(
     peer: Peer, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray, size: float
 ) -> bool:
-    """Tells whether the peer ends the episode for some small changes of a state, not for all."""
+    """Returns whether the peer ends the episode for some small changes of a state, not for all."""
     random, ends = np.random.default_rng(0), set()
     for _ in range(50):
         qpos_scale, qvel_scale = (size * random.uniform(-1, 1, x.shape) for x in (qpos, qvel))

@@ -84,7 +84,7 @@ def choose(name: str, env: Environment, player: Player | None = None) -> Engine:
         return Engine("kernel", why, kernel.rollout)
     if name == "kernel":
         raise ValueError(f"the kernel engine cannot play this: {reason}; choose auto")
-    # On a GPU a branch costs a look at the predicate by the host, and computing it nothing.
+    # On a GPU a real branch makes the host wait for its predicate; computing both sides is cheap.
     cost = _CPU_BRANCH_COST if jax.default_backend() == "cpu" else MAX_OPERATIONS
     step = fused.vmap(env.step, in_axes=-1, out_axes=-1, branch_cost=cost)
     reason = unsupported_by_fused(env, step)

@@ -6,10 +6,9 @@ and never sees the policy. With the discounted return to go written
 
     G[t] = r[t] + discount * G[t + 1],
 
-every estimator here but two is unbiased for the same gradient (the critic's up to
-its own step, ``standardize`` up to a positive factor); they differ in variance.
-``mean_log_prob`` and ``normalized_returns`` are of published programs, and say
-what they follow instead.
+every estimator here but two is unbiased for the same gradient; they differ in variance.
+``standardize`` multiplies that gradient by a positive factor. ``mean_log_prob`` and
+``normalized_returns`` come from published programs, and say what they follow instead.
 """
 
 from collections.abc import Callable
@@ -111,8 +110,8 @@ def mean_log_prob(discount: float | jax.Array = 0.99) -> Estimator:
     REINFORCE tutorial comes to, though its comment promises the sum of the
     products log pi[t] G[t]: the mean over log-probabilities is taken before the
     product. Its gradient is unbiased, but for E[sum_t G[t] / L], which counts a
-    reward the more often the later it comes; and no action is told what came after
-    it from what came before, which makes it noisy besides.
+    reward the more often the later it comes. It is also noisy, because the weight of an action
+    contains the rewards from before that action.
     """
     _check_discount(discount)
 
@@ -128,10 +127,10 @@ def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
 
     The weight is ``(G[t] - mean) / (std + 1.19e-7)``, with the mean and the
     unbiased standard deviation over the steps of the episode, and 0 in an episode
-    of one step. It is biased: the mean depends on the action, and as every episode
-    is scaled to the same spread, a long one teaches nothing by being long. Where
-    each step earns the same, the weight is a function of the time that is left:
-    early actions are always encouraged, late ones always discouraged.
+    of one step. It is biased. The mean depends on the action. Every episode is scaled to the same
+    spread, so that a long episode counts no more than a short one. Where each step earns the
+    same, the weight depends on the remaining time alone: it is positive for early actions and
+    negative for late ones.
     """
     _check_discount(discount)
 
@@ -216,8 +215,8 @@ def standardize(
 ) -> Estimator:
     """Divides an estimator's weights by their standard deviation plus ``floor``.
 
-    A floor of the order of the return's own noise lets a solved policy, whose
-    weights are all noise, stand still instead of being torn apart by it.
+    The weights of a solved policy are noise. A floor as large as the noise of the return keeps
+    them small; without it they would be scaled up and would spoil the policy.
 
     Args:
       estimator: whose weights are divided.

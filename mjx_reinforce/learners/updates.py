@@ -1,8 +1,9 @@
 """Updates: how the weights of one rollout become changes of the parameters.
 
-All of them follow the gradient that ``reinforce`` states. They differ in how many optimiser
-steps they spend a rollout on, and so in how far the parameters have moved from those that played
-it: nothing here corrects for that, as the programs that these follow do not.
+All of them follow the gradient that ``reinforce`` states. They differ in the number of optimiser
+steps for one rollout. From the second step on, the parameters are no longer those that played the
+episodes. No update corrects for that (there are no importance weights), and neither do the
+published programs that these updates follow.
 """
 
 from collections.abc import Callable
@@ -78,7 +79,8 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), problem.samples)
         ranks = jnp.cumsum(mask)
         drawn = jax.random.randint(key, (num_updates, batch_size), 1, 1 + jnp.maximum(ranks[-1], 1))
-        indices = jnp.searchsorted(ranks, drawn)  # of the drawn-th True, counted from 1
+        # Where the first, second, ... step inside the mask is; ``drawn`` counts from 1.
+        indices = jnp.searchsorted(ranks, drawn)
 
         def one(carry, index):
             params, opt_state = carry
@@ -94,7 +96,7 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
 
 
 def each_step() -> Update:
-    """One optimiser step for every time step of the episodes, in order, once they are over.
+    """One optimiser step for every time step, in order, after all episodes are over.
 
     Step t follows its own share of the full gradient, the terms of all episodes at t, at the
     parameters that steps 0 to t - 1 have moved (Sutton and Barto 2018, section 13.3, has
@@ -119,7 +121,7 @@ def each_step() -> Update:
             grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, now)
             moved, moved_state, norm = _descend(problem, grads, problem.divisor, params, opt_state)
             after = t + 1, moved, moved_state, entropy + sums["entropy"], norms + norm
-            # Beside other seeds, the loop goes on for one whose episodes are over.
+            # Vmapped over seeds, the loop goes on until the seed with the longest episode is done.
             return jax.tree.map(lambda new, old: jnp.where(more(carry), new, old), after, carry)
 
         zero = jnp.zeros(())
