@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from mjx_reinforce.envs.settings import EpisodeSettings, build_settings, check_positive
 from mjx_reinforce.fused import prune
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Box
@@ -23,20 +24,21 @@ with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
     from mjx_reinforce.envs import models
+    from mjx_reinforce.physics import mjx_internals
     from mjx_reinforce.physics import step as physics
-    from mjx_reinforce.physics.mjx_internals import fenced
+    from mjx_reinforce.physics.mjx_internals import Simulation
 
 SOLVERS = ("exact", "mjx", "fast")
 
 
 @struct.dataclass(kw_only=True)
 class Physics:
-    """What the next physics step needs to know; all else of mjx.Data follows from it.
+    """What the next physics step needs; all other fields of mjx.Data are computed from it.
 
     qpos: [nq] generalised positions (m, rad)
     qvel: [nv] generalised velocities (m/s, rad/s)
     qacc_warmstart: [nv] where the constraint solver starts (m/s^2, rad/s^2)
-    carried: fields of the last step's mjx.Data that the next outcome reads, by name
+    carried: fields of the last step's mjx.Data that the next outcome reads, by their names
     """
 
     qpos: jax.Array
@@ -53,52 +55,65 @@ class MujocoEnv(Env):
     (gymnasium/envs/mujoco/mujoco_env.py, ``do_simulation``). Truncation is the
     trainer's: ``max_episode_steps`` says when.
 
-    Subclasses define ``initial`` and ``outcome``.
+    Subclasses define ``initial`` and ``outcome``, and read their arguments from ``settings``.
     """
 
-    #: Fields of mjx.Data that ``outcome`` reads of ``before`` besides qpos and qvel. They are as
-    #: the last step left them: those of its last forward pass, older than qpos, as in Gymnasium.
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(EpisodeSettings):
+        """Arguments of every task on a MuJoCo model."""
+
+        xml_file: str
+        """The model: a file of this package's assets, or a path with a folder in it."""
+        frame_skip: int
+        """Physics steps an env step; the model says how many seconds a physics step lasts."""
+        solver: str = "exact"
+        """What simulates the model, at the start of an episode and in each step.
+
+        "exact": ``physics.forward`` and ``physics.step``, which give the answer of C MuJoCo 4.0.
+        "mjx": ``mjx.forward`` and ``mjx.step`` as they are.
+        "fast": the same two with one solver iteration of at most four line-search steps. This is
+        not exact.
+        """
+
+        def __post_init__(self):
+            """Raises ValueError for a value that is out of its range."""
+            super().__post_init__()
+            check_name("solver", self.solver, dict.fromkeys(SOLVERS))
+            check_positive("frame_skip", self.frame_skip)
+
+    settings: Settings
+    #: Fields of mjData that ``outcome`` reads of ``before`` besides qpos and qvel. Their values are
+    #: of the last forward pass, which is up to one physics step older than qpos, as in Gymnasium.
     carried: tuple[str, ...] = ()
-    #: Whether ``outcome`` or ``observe`` reads ``cfrc_ext``: zero at a start, as in Gymnasium.
+    #: Whether ``outcome`` or ``observe`` reads ``cfrc_ext``, which is zero at the start of an
+    #: episode, as in Gymnasium.
     contact_forces = False
 
-    def __init__(
-        self,
-        *,
-        xml_file: str,
-        frame_skip: int,
-        max_episode_steps: int,
-        reward_threshold: float | None,
-        solver: str = "exact",
-    ):
+    def __init__(self, **arguments: Any):
         """Compiles the model.
 
         Args:
-          xml_file: a file of this package's assets, or a path with a folder in it.
-          frame_skip: physics steps an env step.
-          max_episode_steps: the time limit, in env steps.
-          reward_threshold: the return at which the task counts as solved, if any.
-          solver: "exact" is ``physics.step``, which is C MuJoCo 4.0's answer, with no loops
-            where it has a closed form; "mjx" is ``mjx.step`` as it is; "fast" is ``mjx.step``
-            with one solver iteration of four line-search steps, which is not exact.
+          **arguments: the fields of the class's ``Settings``.
 
         Raises:
-          ValueError: ``solver`` is unknown, or MJX cannot run the model.
+          ValueError: an argument is unknown or out of its range, or MJX cannot run the model.
         """
-        check_name("solver", solver, dict.fromkeys(SOLVERS))
-        self.mj_model = models.load(xml_file)
-        if solver == "fast":
+        self.settings = build_settings(self, arguments)
+        self.frame_skip = self.settings.frame_skip
+        self.max_episode_steps = self.settings.max_episode_steps
+        self.reward_threshold = self.settings.reward_threshold
+        self.mj_model = models.load(self.settings.xml_file)
+        if self.settings.solver == "fast":
             self.mj_model.opt.iterations, self.mj_model.opt.ls_iterations = 1, 4
-        self.model = models.to_mjx(self.mj_model, xml_file)
+        self.model = models.to_mjx(self.mj_model, self.settings.xml_file)
         # Tracing the physics takes a second of Python; jit does it once.
-        self._forward = jax.jit(functools.partial(fenced(physics.forward), self.model))
+        forward = physics.forward if self.settings.solver == "exact" else mjx.forward
+        forward = mjx_internals.fenced(forward)
+        self._forward = jax.jit(functools.partial(forward, self.model))
         exact = functools.partial(physics.step, evaluate=self._forward)
-        step = exact if solver == "exact" else mjx.step
+        step = exact if self.settings.solver == "exact" else mjx.step
         self._physics_step = jax.jit(functools.partial(step, self.model))
         self._start = jax.jit(prune(self._forward_state))
-        self.frame_skip = frame_skip
-        self.max_episode_steps = max_episode_steps
-        self.reward_threshold = reward_threshold
         low, high = np.array(self.mj_model.actuator_ctrlrange).T
         limited = np.array(self.mj_model.actuator_ctrllimited, bool)
         self.action_space = Box(np.where(limited, low, -np.inf), np.where(limited, high, np.inf))
@@ -109,17 +124,18 @@ class MujocoEnv(Env):
 
     @abc.abstractmethod
     def outcome(
-        self, before: mjx.Data, data: mjx.Data, action: jax.Array
+        self, before: Simulation, data: Simulation, action: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
         """Returns the reward [], whether the episode terminated [], and the reward's terms.
 
         Args:
-          before: the simulation at the start of the env step: qpos, qvel and what is ``carried``.
-          data: the simulation after it.
+          before: the simulation at the start of the env step; of its fields only qpos, qvel and
+            those in ``carried`` are set.
+          data: the simulation after the env step; it has every field of mjData.
           action: [A] as the policy gave it.
         """
 
-    def observe(self, data: mjx.Data) -> jax.Array:
+    def observe(self, data: Simulation) -> jax.Array:
         """Returns the observation [O]; by default qpos, then qvel."""
         return jnp.concatenate([data.qpos, data.qvel])
 
@@ -143,11 +159,11 @@ class MujocoEnv(Env):
         )
         # MJX normalises quaternions in qpos itself; MuJoCo does so when it steps.
         data = self._forward(self._data(start)).replace(qpos=qpos)
-        start = self._physics(data)
+        start, view = self._physics(data), Simulation(data)
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
-        terms = jax.tree.map(jnp.zeros_like, self.outcome(data, data, action)[2])
-        return State(cast(Any, start), self.observe(data), zero, zero, terms)
+        terms = jax.tree.map(jnp.zeros_like, self.outcome(view, view, action)[2])
+        return State(cast(Any, start), self.observe(view), zero, zero, terms)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Returns the state one env step later under ``action`` [A]."""
@@ -157,12 +173,13 @@ class MujocoEnv(Env):
         )
         if self.contact_forces:
             data = mjx.rne_postconstraint(self.model, data)
-        reward, terminated, terms = self.outcome(before, data, action)
+        view = Simulation(data)
+        reward, terminated, terms = self.outcome(Simulation(before), view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
             pipeline_state=self._physics(data),
-            obs=self.observe(data),
+            obs=self.observe(view),
             reward=jnp.asarray(reward, dtype),
             done=jnp.asarray(terminated, dtype),
             metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
@@ -190,7 +207,7 @@ class MujocoEnv(Env):
     @property
     def num_contacts(self) -> int:
         """The most contacts that the model can have at once."""
-        return int(mjx.make_data(self.mj_model, impl="jax")._impl.ncon)  # type: ignore
+        return mjx_internals.num_contacts(mjx.make_data(self.mj_model, impl="jax"))
 
     @property
     def dt(self) -> float:

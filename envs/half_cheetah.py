@@ -1,5 +1,7 @@
 """HalfCheetah: a planar animal on two legs that runs as fast as it can."""
 
+import dataclasses
+
 from mjx_reinforce.envs.locomotion import Runner
 
 
@@ -21,39 +23,14 @@ class HalfCheetah(Runner):
     num_places = 1
     normal_velocity = True
 
-    def __init__(
-        self,
-        *,
-        xml_file: str = "half_cheetah.xml",
-        frame_skip: int = 5,
-        forward_reward_weight: float = 1.0,
-        ctrl_cost_weight: float = 0.1,
-        reset_noise_scale: float = 0.1,
-        exclude_current_positions_from_observation: bool = True,
-        solver: str = "exact",
-    ):
-        """Builds the task.
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(Runner.Settings):
+        """Arguments of HalfCheetah."""
 
-        Args:
-          xml_file: the model.
-          frame_skip: physics steps of 0.01 s an env step.
-          forward_reward_weight: what 1 m/s along x earns.
-          ctrl_cost_weight: what one unit of squared action costs.
-          reset_noise_scale: half the width for positions (m, rad), the deviation for velocities
-            (m/s, rad/s).
-          exclude_current_positions_from_observation: whether to leave out x.
-          solver: "exact", "mjx" or "fast", see ``MujocoEnv``.
+        xml_file: str = "half_cheetah.xml"
+        frame_skip: int = 5
+        reward_threshold: float | None = 4800.0
+        ctrl_cost_weight: float = 0.1
+        reset_noise_scale: float = 0.1
 
-        Raises:
-          ValueError: an argument is out of its range.
-        """
-        super().__init__(
-            xml_file=xml_file,
-            frame_skip=frame_skip,
-            reward_threshold=4800.0,
-            forward_reward_weight=forward_reward_weight,
-            ctrl_cost_weight=ctrl_cost_weight,
-            reset_noise_scale=reset_noise_scale,
-            exclude_current_positions_from_observation=exclude_current_positions_from_observation,
-            solver=solver,
-        )
+    settings: Settings

@@ -1,9 +1,11 @@
 """HumanoidStandup: a person who lies on the floor and should get up."""
 
+import dataclasses
+
 import jax.numpy as jnp
 
-from mjx_reinforce.envs.humanoid import Person
-from mjx_reinforce.envs.locomotion import Range
+from mjx_reinforce.envs.person import Person
+from mjx_reinforce.envs.settings import Range, check_range
 
 
 class HumanoidStandup(Person):
@@ -20,67 +22,34 @@ class HumanoidStandup(Person):
     lying at rest. Never terminates. No threshold; at most 1000 steps of 0.015 s.
     """
 
-    def __init__(
-        self,
-        *,
-        xml_file: str = "humanoid_standup.xml",
-        frame_skip: int = 5,
-        uph_cost_weight: float = 1.0,
-        ctrl_cost_weight: float = 0.1,
-        impact_cost_weight: float = 0.5e-6,
-        impact_cost_range: Range = (-float("inf"), 10.0),
-        reset_noise_scale: float = 1e-2,
-        exclude_current_positions_from_observation: bool = True,
-        include_cinert_in_observation: bool = True,
-        include_cvel_in_observation: bool = True,
-        include_qfrc_actuator_in_observation: bool = True,
-        include_cfrc_ext_in_observation: bool = True,
-        solver: str = "exact",
-    ):
-        """Builds the task.
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(Person.Settings):
+        """Arguments of HumanoidStandup."""
 
-        Args:
-          xml_file: the model, with a solver that MJX has.
-          frame_skip: physics steps of 0.003 s an env step.
-          uph_cost_weight: times the reward for height; Gymnasium takes it and ignores it.
-          ctrl_cost_weight: what one unit of squared action costs.
-          impact_cost_weight: what one unit of squared contact force costs.
-          impact_cost_range: the cost of contacts is clipped to this.
-          reset_noise_scale: half the width of the start distribution (m, rad, m/s, rad/s).
-          exclude_current_positions_from_observation: whether to leave out x and y.
-          include_cinert_in_observation: whether to observe inertias and masses.
-          include_cvel_in_observation: whether to observe the bodies' velocities.
-          include_qfrc_actuator_in_observation: whether to observe the motors' torques.
-          include_cfrc_ext_in_observation: whether to observe the contact forces.
-          solver: "exact", "mjx" or "fast", see ``MujocoEnv``.
+        xml_file: str = "humanoid_standup.xml"
+        uph_cost_weight: float = 1.0
+        """Times the reward for height; Gymnasium takes this argument and ignores it."""
+        impact_cost_weight: float = 0.5e-6
+        """What one unit of squared contact force costs."""
+        impact_cost_range: Range = (-float("inf"), 10.0)
+        """The cost of contacts is clipped to this."""
 
-        Raises:
-          ValueError: an argument is out of its range.
-        """
-        super().__init__(
-            xml_file=xml_file,
-            frame_skip=frame_skip,
-            reward_threshold=None,
-            ctrl_cost_weight=ctrl_cost_weight,
-            contact_cost_weight=impact_cost_weight,
-            contact_cost_range=impact_cost_range,
-            reset_noise_scale=reset_noise_scale,
-            exclude_current_positions_from_observation=exclude_current_positions_from_observation,
-            include_cinert_in_observation=include_cinert_in_observation,
-            include_cvel_in_observation=include_cvel_in_observation,
-            include_qfrc_actuator_in_observation=include_qfrc_actuator_in_observation,
-            include_cfrc_ext_in_observation=include_cfrc_ext_in_observation,
-            solver=solver,
-        )
-        self._uph_cost_weight = uph_cost_weight
+        def __post_init__(self):
+            """Raises ValueError for a value that is out of its range."""
+            super().__post_init__()
+            check_range("impact_cost_range", self.impact_cost_range)
+
+    settings: Settings
 
     def outcome(self, before, data, action):
         """Returns the reward for height less the costs, and its terms; never terminates."""
-        height = data.qpos[2]
+        height, weights = data.qpos[2], self.settings
         terms = {
-            "reward_linup": self._uph_cost_weight * height / self.mj_model.opt.timestep,
+            "reward_linup": weights.uph_cost_weight * height / self.mj_model.opt.timestep,
             "reward_quadctrl": -self.control_cost(action),
-            "reward_impact": -self.contact_cost(data),
+            "reward_impact": -self.contact_cost(
+                data, weights.impact_cost_weight, weights.impact_cost_range
+            ),
         }
         where = {
             "x_position": data.qpos[0],

@@ -1,5 +1,7 @@
 """InvertedDoublePendulum: keep two poles, one on the other, upright on a cart."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 
@@ -21,40 +23,29 @@ class InvertedDoublePendulum(MujocoEnv):
     tip is at 1 m or lower, of 1.2 m. Solved at a return of 9100; at most 1000 steps of 0.05 s.
     """
 
-    def __init__(
-        self,
-        *,
-        xml_file: str = "inverted_double_pendulum.xml",
-        frame_skip: int = 5,
-        healthy_reward: float = 10.0,
-        reset_noise_scale: float = 0.1,
-        solver: str = "exact",
-    ):
-        """Builds the task.
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(MujocoEnv.Settings):
+        """Arguments of InvertedDoublePendulum."""
 
-        Args:
-          xml_file: the model; its first site is the tip.
-          frame_skip: physics steps of 0.01 s an env step.
-          healthy_reward: the reward of a step that does not end the episode.
-          reset_noise_scale: half the width of the start positions (m, rad) and the standard
-            deviation of the start velocities (m/s, rad/s).
-          solver: "exact", "mjx" or "fast", see ``MujocoEnv``.
-        """
-        super().__init__(
-            xml_file=xml_file,
-            frame_skip=frame_skip,
-            max_episode_steps=1000,
-            reward_threshold=9100.0,
-            solver=solver,
-        )
-        self._healthy_reward = healthy_reward
-        self._noise = reset_noise_scale
+        xml_file: str = "inverted_double_pendulum.xml"
+        """The model; its first site is the tip."""
+        frame_skip: int = 5
+        max_episode_steps: int = 1000
+        reward_threshold: float | None = 9100.0
+        healthy_reward: float = 10.0
+        """The reward of a step that does not end the episode."""
+        reset_noise_scale: float = 0.1
+        """Half the width of the start positions (m, rad) and the standard deviation of the start
+        velocities (m/s, rad/s)."""
+
+    settings: Settings
 
     def initial(self, rng):
         """Draws qpos [3] uniformly and qvel [3] normally around upright rest."""
         qpos_key, qvel_key = jax.random.split(rng)
-        qpos = jax.random.uniform(qpos_key, (3,), minval=-self._noise, maxval=self._noise)
-        qvel = self._noise * jax.random.normal(qvel_key, (3,))
+        noise = self.settings.reset_noise_scale
+        qpos = jax.random.uniform(qpos_key, (3,), minval=-noise, maxval=noise)
+        qvel = noise * jax.random.normal(qvel_key, (3,))
         return jnp.asarray(self.mj_model.qpos0, qpos.dtype) + qpos, qvel
 
     def observe(self, data):
@@ -67,12 +58,13 @@ class InvertedDoublePendulum(MujocoEnv):
     def outcome(self, before, data, action):
         """Returns the bonus less the penalties, and whether the tip is down.
 
-        The tip is where the last stage of Runge-Kutta had it, not where qpos has it now.
+        The tip's position is that of the last Runge-Kutta stage, as in Gymnasium, not that of the
+        new qpos.
         """
         x, _, y = data.site_xpos[0]
         terminated = y <= 1
         terms = {
-            "reward_survive": self._healthy_reward * ~terminated,
+            "reward_survive": self.settings.healthy_reward * ~terminated,
             "distance_penalty": -(0.01 * x**2 + (y - 2) ** 2),
             "velocity_penalty": -(1e-3 * data.qvel[1] ** 2 + 5e-3 * data.qvel[2] ** 2),
         }

@@ -1,5 +1,7 @@
 """InvertedPendulum: keep a pole upright on a cart that runs on a rail."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 
@@ -22,45 +24,32 @@ class InvertedPendulum(MujocoEnv):
     0.04 s.
     """
 
-    def __init__(
-        self,
-        *,
-        xml_file: str = "inverted_pendulum.xml",
-        frame_skip: int = 2,
-        reset_noise_scale: float = 0.01,
-        reward_at_fall: float = 0.0,
-        solver: str = "exact",
-    ):
-        """Builds the task.
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(MujocoEnv.Settings):
+        """Arguments of InvertedPendulum."""
 
-        Args:
-          xml_file: the model.
-          frame_skip: physics steps of 0.02 s an env step.
-          reset_noise_scale: half the width of the start distribution (m, rad, m/s, rad/s).
-          reward_at_fall: the reward of the step that ends the episode: 0 is v5, 1 is v4.
-          solver: "exact", "mjx" or "fast", see ``MujocoEnv``.
-        """
-        super().__init__(
-            xml_file=xml_file,
-            frame_skip=frame_skip,
-            max_episode_steps=1000,
-            reward_threshold=950.0,
-            solver=solver,
-        )
-        self._noise = reset_noise_scale
-        self._reward_at_fall = reward_at_fall
+        xml_file: str = "inverted_pendulum.xml"
+        frame_skip: int = 2
+        max_episode_steps: int = 1000
+        reward_threshold: float | None = 950.0
+        reset_noise_scale: float = 0.01
+        """Half the width of the start distribution (m, rad, m/s, rad/s)."""
+        reward_at_fall: float = 0.0
+        """The reward of the step that ends the episode: 0 is v5, 1 is v4."""
+
+    settings: Settings
 
     def initial(self, rng):
         """Draws qpos [2] and qvel [2] uniformly within the noise scale of upright rest."""
         qpos_key, qvel_key = jax.random.split(rng)
-        size = (2,)
-        qpos = jax.random.uniform(qpos_key, size, minval=-self._noise, maxval=self._noise)
-        qvel = jax.random.uniform(qvel_key, size, minval=-self._noise, maxval=self._noise)
+        noise = self.settings.reset_noise_scale
+        qpos = jax.random.uniform(qpos_key, (2,), minval=-noise, maxval=noise)
+        qvel = jax.random.uniform(qvel_key, (2,), minval=-noise, maxval=noise)
         return jnp.asarray(self.mj_model.qpos0, qpos.dtype) + qpos, qvel
 
     def outcome(self, before, data, action):
         """Returns 1 while the pole is up, and whether it fell."""
         finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
         terminated = ~finite | (jnp.abs(data.qpos[1]) > _MAX_ANGLE)
-        reward = jnp.where(terminated, self._reward_at_fall, 1.0)
+        reward = jnp.where(terminated, self.settings.reward_at_fall, 1.0)
         return reward, terminated, {"reward_survive": reward}

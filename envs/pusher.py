@@ -1,5 +1,8 @@
 """Pusher: a seven-joint arm pushes a cylinder over a table to a goal."""
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -25,39 +28,30 @@ class Pusher(MujocoEnv):
     of 0 is out of reach; at most 100 steps of 0.05 s.
     """
 
-    def __init__(
-        self,
-        *,
-        xml_file: str = "pusher_v5.xml",
-        frame_skip: int = 5,
-        reward_near_weight: float = 0.5,
-        reward_dist_weight: float = 1.0,
-        reward_control_weight: float = 0.1,
-        solver: str = "exact",
-    ):
-        """Builds the task.
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(MujocoEnv.Settings):
+        """Arguments of Pusher."""
 
-        Args:
-          xml_file: the model, with bodies "tips_arm", "object" and "goal".
-          frame_skip: physics steps of 0.01 s an env step.
-          reward_near_weight: what 1 m between tip and cylinder costs.
-          reward_dist_weight: what 1 m between cylinder and goal costs.
-          reward_control_weight: what one unit of squared action costs.
-          solver: "exact", "mjx" or "fast", see ``MujocoEnv``.
-        """
-        super().__init__(
-            xml_file=xml_file,
-            frame_skip=frame_skip,
-            max_episode_steps=100,
-            reward_threshold=0.0,
-            solver=solver,
-        )
+        xml_file: str = "pusher_v5.xml"
+        """The model, with bodies "tips_arm", "object" and "goal"."""
+        frame_skip: int = 5
+        max_episode_steps: int = 100
+        reward_threshold: float | None = 0.0
+        reward_near_weight: float = 0.5
+        """What 1 m between tip and cylinder costs."""
+        reward_dist_weight: float = 1.0
+        """What 1 m between cylinder and goal costs."""
+        reward_control_weight: float = 0.1
+        """What one unit of squared action costs."""
+
+    settings: Settings
+
+    def __init__(self, **arguments: Any):
+        """Builds the task; see ``MujocoEnv``."""
+        super().__init__(**arguments)
         self._tip = self.mj_model.body("tips_arm").id
         self._object = self.mj_model.body("object").id
         self._goal = self.mj_model.body("goal").id
-        self._near_weight = reward_near_weight
-        self._dist_weight = reward_dist_weight
-        self._control_weight = reward_control_weight
 
     def initial(self, rng):
         """Draws qpos [11] and qvel [11]."""
@@ -71,7 +65,10 @@ class Pusher(MujocoEnv):
         )
 
     def observe(self, data):
-        """Returns the observation [23]; bodies are where the last physics step began."""
+        """Returns the observation [23].
+
+        The bodies' positions are those at which the last physics step began, as in Gymnasium.
+        """
         bodies = (data.xpos[i] for i in (self._tip, self._object, self._goal))
         return jnp.concatenate([data.qpos[:7], data.qvel[:7], *bodies])
 
@@ -79,10 +76,11 @@ class Pusher(MujocoEnv):
         """Returns the penalties for distances and control; never terminates."""
         near = data.xpos[self._object] - data.xpos[self._tip]
         dist = data.xpos[self._object] - data.xpos[self._goal]
+        weights = self.settings
         terms = {
-            "reward_dist": -self._dist_weight * jnp.linalg.norm(dist),
-            "reward_ctrl": -self._control_weight * jnp.sum(action**2),
-            "reward_near": -self._near_weight * jnp.linalg.norm(near),
+            "reward_dist": -weights.reward_dist_weight * jnp.linalg.norm(dist),
+            "reward_ctrl": -weights.reward_control_weight * jnp.sum(action**2),
+            "reward_near": -weights.reward_near_weight * jnp.linalg.norm(near),
         }
         return sum(terms.values()), jnp.zeros((), bool), terms
 
@@ -90,9 +88,10 @@ class Pusher(MujocoEnv):
 def _cylinder(key):
     """Draws the cylinder's start [2], uniform in the rectangle outside the disc.
 
-    Gymnasium rejects; here the distribution function of the depth is inverted instead. The area
-    nearer than depth d is convex in d, so that Newton's steps from the far end come down to the
-    root from one side, and twelve of them reach it to the last bit.
+    Gymnasium draws again until the point is outside; here the distribution function of the depth is
+    inverted, which takes the same time for every draw. The area nearer than depth d is convex in d,
+    so that Newton's method from the greatest depth approaches the root from one side; after twelve
+    steps it has converged to rounding error.
     """
     depth_share, side = jax.random.uniform(key, (2,))
     side = 2 * side - 1

@@ -1,5 +1,8 @@
 """Reacher: bring the fingertip of a two-joint arm to a target in the plane."""
 
+import dataclasses
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -23,36 +26,27 @@ class Reacher(MujocoEnv):
     50 steps of 0.02 s.
     """
 
-    def __init__(
-        self,
-        *,
-        xml_file: str = "reacher.xml",
-        frame_skip: int = 2,
-        reward_dist_weight: float = 1.0,
-        reward_control_weight: float = 1.0,
-        solver: str = "exact",
-    ):
-        """Builds the task.
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(MujocoEnv.Settings):
+        """Arguments of Reacher."""
 
-        Args:
-          xml_file: the model, with bodies "fingertip" and "target".
-          frame_skip: physics steps of 0.01 s an env step.
-          reward_dist_weight: what 1 m of distance costs.
-          reward_control_weight: what one unit of squared action costs; Gymnasium's page says 0.1
-            where its code has 1.
-          solver: "exact", "mjx" or "fast", see ``MujocoEnv``.
-        """
-        super().__init__(
-            xml_file=xml_file,
-            frame_skip=frame_skip,
-            max_episode_steps=50,
-            reward_threshold=-3.75,
-            solver=solver,
-        )
+        xml_file: str = "reacher.xml"
+        """The model, with bodies "fingertip" and "target"."""
+        frame_skip: int = 2
+        max_episode_steps: int = 50
+        reward_threshold: float | None = -3.75
+        reward_dist_weight: float = 1.0
+        """What 1 m of distance costs."""
+        reward_control_weight: float = 1.0
+        """What one unit of squared action costs; Gymnasium's page says 0.1, its code has 1."""
+
+    settings: Settings
+
+    def __init__(self, **arguments: Any):
+        """Builds the task; see ``MujocoEnv``."""
+        super().__init__(**arguments)
         self._fingertip = self.mj_model.body("fingertip").id
         self._target = self.mj_model.body("target").id
-        self._dist_weight = reward_dist_weight
-        self._control_weight = reward_control_weight
 
     def initial(self, rng):
         """Draws qpos [4] and qvel [4]; the target in polar coordinates, without rejection."""
@@ -76,11 +70,15 @@ class Reacher(MujocoEnv):
     def outcome(self, before, data, action):
         """Returns the penalties for distance and control; never terminates."""
         terms = {
-            "reward_dist": -self._dist_weight * jnp.linalg.norm(self._away(data)),
-            "reward_ctrl": -self._control_weight * jnp.sum(action**2),
+            "reward_dist": -self.settings.reward_dist_weight * jnp.linalg.norm(self._away(data)),
+            "reward_ctrl": -self.settings.reward_control_weight * jnp.sum(action**2),
         }
         return sum(terms.values()), jnp.zeros((), bool), terms
 
     def _away(self, data):
-        """Returns fingertip less target [3], in the last stage of Runge-Kutta, not at qpos."""
+        """Returns fingertip less target [3] (m).
+
+        Both positions are those of the last Runge-Kutta stage, as in Gymnasium, not those of the
+        new qpos.
+        """
         return data.xpos[self._fingertip] - data.xpos[self._target]

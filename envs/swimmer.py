@@ -1,5 +1,7 @@
 """Swimmer: three rods in a viscous fluid, driven forward by the two joints between them."""
 
+import dataclasses
+
 from mjx_reinforce.envs.locomotion import Runner
 
 
@@ -17,38 +19,14 @@ class Swimmer(Runner):
     0.04 s.
     """
 
-    def __init__(
-        self,
-        *,
-        xml_file: str = "swimmer.xml",
-        frame_skip: int = 4,
-        forward_reward_weight: float = 1.0,
-        ctrl_cost_weight: float = 1e-4,
-        reset_noise_scale: float = 0.1,
-        exclude_current_positions_from_observation: bool = True,
-        solver: str = "exact",
-    ):
-        """Builds the task.
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(Runner.Settings):
+        """Arguments of Swimmer."""
 
-        Args:
-          xml_file: the model.
-          frame_skip: physics steps of 0.01 s an env step.
-          forward_reward_weight: what 1 m/s along x earns.
-          ctrl_cost_weight: what one unit of squared action costs.
-          reset_noise_scale: half the width of the start distribution (m, rad, m/s, rad/s).
-          exclude_current_positions_from_observation: whether to leave out x and y.
-          solver: "exact", "mjx" or "fast", see ``MujocoEnv``.
+        xml_file: str = "swimmer.xml"
+        frame_skip: int = 4
+        reward_threshold: float | None = 360.0
+        ctrl_cost_weight: float = 1e-4
+        reset_noise_scale: float = 0.1
 
-        Raises:
-          ValueError: an argument is out of its range.
-        """
-        super().__init__(
-            xml_file=xml_file,
-            frame_skip=frame_skip,
-            reward_threshold=360.0,
-            forward_reward_weight=forward_reward_weight,
-            ctrl_cost_weight=ctrl_cost_weight,
-            reset_noise_scale=reset_noise_scale,
-            exclude_current_positions_from_observation=exclude_current_positions_from_observation,
-            solver=solver,
-        )
+    settings: Settings

@@ -1,16 +1,27 @@
 """The contract of every registered environment, and its life under brax's own tools."""
 
+import dataclasses
+import inspect
+
+import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from brax.envs import wrappers
+from gymnasium.envs.registration import load_env_creator
+from mujoco import mjx
 
 from mjx_reinforce import Environment, envs
+from mjx_reinforce.envs.settings import EpisodeSettings
 from mjx_reinforce.types import Discrete, action_space, null_action, observation_size
 
 IDS = envs.names()
+#: Gymnasium has no such task.
+OURS_ALONE = {"ContinuousCartPole-v0"}
+#: Arguments of Gymnasium's tasks that are about pictures.
+PICTURES = {"render_mode", "default_camera_config"}
 #: What compiles in seconds is also run; the others are traced here and run in test_parity.py.
 LIGHT = {id for id in IDS if "Pole" in id or "Pendulum" in id or id == "Reacher-v5"}
 
@@ -48,6 +59,96 @@ def test_bounds_and_limits(env):
         assert np.all(space.low < space.high)
     assert env.max_episode_steps > 0
     assert env.dt > 0
+
+
+def test_settings_are_frozen_and_explained(env):
+    assert isinstance(env.settings, EpisodeSettings)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        env.settings.max_episode_steps = 1
+    limits = env.settings.max_episode_steps, env.settings.reward_threshold
+    assert limits == (env.max_episode_steps, env.reward_threshold)
+
+
+def test_defaults_are_gymnasiums(env, request):
+    """Every argument of Gymnasium's class is here under its name, with its default."""
+    id = request.node.callspec.params["env"]
+    if id in OURS_ALONE:
+        with pytest.raises(gymnasium.error.Error):
+            gymnasium.spec(id)
+        return
+    theirs = gymnasium.spec(id)
+    parameters = inspect.signature(load_env_creator(theirs.entry_point)).parameters.values()
+    expected = {
+        parameter.name: parameter.default
+        for parameter in parameters
+        if parameter.kind != parameter.VAR_KEYWORD and parameter.name not in PICTURES
+    }
+    expected |= {
+        "max_episode_steps": theirs.max_episode_steps,
+        "reward_threshold": theirs.reward_threshold,
+    }
+    ours = dataclasses.asdict(env.settings)
+    assert expected.pop("xml_file", "").endswith(".xml") == ("xml_file" in ours and "v4" not in id)
+    assert {name: ours[name] for name in expected} == expected
+
+
+@pytest.mark.parametrize(
+    ("id", "wrong", "message"),
+    [
+        ("Hopper-v5", {"helthy_reward": 1}, "of Hopper 'helthy_reward'.*'healthy_reward'.*Known"),
+        ("CartPole-v1", {"sutton": True}, "of CartPole 'sutton'.*'sutton_barto_reward'"),
+        ("InvertedPendulum-v5", {"solver": "mjxx"}, "unknown solver 'mjxx'"),
+        ("InvertedPendulum-v5", {"frame_skip": 0}, "frame_skip must be 1 or more, got 0"),
+        ("CartPole-v1", {"max_episode_steps": 0}, "max_episode_steps must be 1 or more, got 0"),
+        ("CartPole-v1", {"kinematics_integrator": "rk4"}, "unknown integrator 'rk4'"),
+        ("Swimmer-v5", {"reset_noise_scale": -0.1}, "reset_noise_scale must be 0 or more"),
+        ("Hopper-v5", {"healthy_state_range": (1, 1)}, "healthy_state_range must be"),
+        ("Walker2d-v5", {"healthy_angle_range": (1, -1)}, "healthy_angle_range must be"),
+        ("Humanoid-v5", {"healthy_z_range": (2, 1)}, "healthy_z_range must be"),
+        ("Humanoid-v5", {"contact_cost_range": (2, 1)}, "contact_cost_range must be"),
+        ("HumanoidStandup-v5", {"impact_cost_range": (2, 1)}, "impact_cost_range must be"),
+        ("Ant-v5", {"contact_force_range": (2, 1)}, "contact_force_range must be"),
+        ("Ant-v5", {"main_body": "tail"}, "main_body 'tail' is not in ant.xml"),
+    ],
+)
+def test_wrong_arguments_are_explained(id, wrong, message):
+    with pytest.raises(ValueError, match=message):
+        envs.make(id, **wrong)
+
+
+#: A capsule that stands on its end, tilted, in the floor; C MuJoCo and MJX see other contacts.
+CAPSULE = """
+<mujoco>
+  <worldbody>
+    <geom type="plane" size="1 1 1"/>
+    <body pos="0 0 .3">
+      <joint name="lift" type="slide" axis="0 0 1"/>
+      <joint axis="1 2 0" type="hinge"/>
+      <geom type="capsule" size=".1 .2"/>
+    </body>
+  </worldbody>
+  <actuator><motor joint="lift"/></actuator>
+</mujoco>
+"""
+
+
+def test_solver_mjx_is_mjx_from_the_start(tmp_path):
+    """Acceleration at a start, bit for bit that of ``mjx.forward``; "exact" has another contact."""
+    path = tmp_path / "capsule.xml"
+    path.write_text(CAPSULE, encoding="utf-8")
+    qpos, qvel = jnp.array([-0.05, 0.2]), jnp.array([-0.1, 0.3])
+
+    def start(solver):
+        env = envs.make("InvertedPendulum-v5", xml_file=str(path), solver=solver)
+        data = mjx.make_data(env.mj_model, impl="jax").replace(qpos=qpos, qvel=qvel)
+        theirs = jax.jit(mjx.forward)(env.model, data).qacc
+        return env.set_state(qpos, qvel).pipeline_state.qacc_warmstart, theirs
+
+    for solver in ("mjx", "fast"):
+        ours, theirs = start(solver)
+        np.testing.assert_array_equal(ours, theirs)
+    ours, theirs = start("exact")
+    assert np.any(ours != theirs)
 
 
 def test_step_does_not_modify_its_argument(env):

@@ -1,0 +1,137 @@
+"""What the carts with a pole share: the start, the dynamics in closed form, the end."""
+
+import dataclasses
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from mjx_reinforce.envs.base import Env, State
+from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
+from mjx_reinforce.registry import check_name
+from mjx_reinforce.types import Box, Discrete
+
+_GRAVITY, _CART_MASS, _POLE_MASS, _HALF_LENGTH = 9.8, 1.0, 0.1, 0.5
+_TIMESTEP = 0.02
+_MAX_POSITION, _START_NOISE = 2.4, 0.05
+_INTEGRATORS = ("euler", "semi-implicit euler")
+
+
+@struct.dataclass(kw_only=True)
+class Motion:
+    """Where the cart is and how it moves.
+
+    qpos: [2] cart position (m), pole angle from upright (rad)
+    qvel: [2] cart velocity (m/s), pole angular velocity (rad/s)
+    """
+
+    qpos: jax.Array
+    qvel: jax.Array
+
+
+class Cart(Env):
+    """A cart on a rail with a pole on it; tasks define ``action_space`` and ``step``."""
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(EpisodeSettings):
+        """Arguments of every cart."""
+
+        kinematics_integrator: str = "euler"
+        """"euler" moves with the old velocity, "semi-implicit euler" with the new one."""
+
+        def __post_init__(self):
+            """Raises ValueError for a value that is out of its range."""
+            super().__post_init__()
+            check_name("integrator", self.kinematics_integrator, dict.fromkeys(_INTEGRATORS))
+
+    settings: Settings
+
+    dt, frame_skip = _TIMESTEP, 1
+    #: The model that shows ``qpos`` in pictures and videos; the dynamics do not use it.
+    scene = "cart_pole.xml"
+    action_space: Box | Discrete
+    #: The pole is lost beyond this angle from upright (rad).
+    max_angle: float
+
+    def __init__(self, **arguments: Any):
+        """Builds the task.
+
+        Args:
+          **arguments: the fields of the class's ``Settings``.
+
+        Raises:
+          ValueError: an argument is unknown or out of its range.
+        """
+        self.settings = build_settings(self, arguments)
+        self.max_episode_steps = self.settings.max_episode_steps
+        self.reward_threshold = self.settings.reward_threshold
+
+    @property
+    def observation_size(self) -> int:
+        """The number O of entries of an observation."""
+        return 4
+
+    @property
+    def action_size(self) -> int:
+        """The number of entries of a continuous action, or of discrete ones to choose from."""
+        space = self.action_space
+        return space.num_actions if isinstance(space, Discrete) else len(space.low)
+
+    @property
+    def backend(self) -> str:
+        """The physics engine, for brax's interface."""
+        return "closed form"
+
+    def reset(self, rng: jax.Array) -> State:
+        """Returns a start uniform within 0.05 (m, rad, m/s, rad/s); consumes the key."""
+        qpos, qvel = jax.random.uniform(rng, (2, 2), minval=-_START_NOISE, maxval=_START_NOISE)
+        return self.set_state(qpos, qvel)
+
+    def set_state(self, qpos: jax.Array, qvel: jax.Array) -> State:
+        """Returns the state at a given position and angle [2] and their rates [2]."""
+        zero = jnp.zeros((), qpos.dtype)
+        return _state(qpos, qvel, zero, zero)
+
+    def push(self, state: State, force: Any, reward_up: float, reward_lost: float) -> State:
+        """Returns the state a timestep later.
+
+        Args:
+          state: where the cart and the pole are.
+          force: on the cart (N), [].
+          reward_up: the reward of a step that does not end the episode.
+          reward_lost: the reward of the step that does.
+        """
+        motion = cast(Motion, state.pipeline_state)
+        qacc = _acceleration(motion, force)
+        qvel = motion.qvel + _TIMESTEP * qacc
+        explicit = self.settings.kinematics_integrator == "euler"
+        qpos = motion.qpos + _TIMESTEP * (motion.qvel if explicit else qvel)
+        lost = jnp.any(jnp.abs(qpos) > jnp.array([_MAX_POSITION, self.max_angle], qpos.dtype))
+        reward = jnp.where(lost, reward_lost, reward_up).astype(qpos.dtype)
+        return _state(qpos, qvel, reward, lost.astype(qpos.dtype), state)
+
+
+def _acceleration(motion: Motion, force: Any) -> jax.Array:
+    """Returns the accelerations [2] (m/s^2, rad/s^2).
+
+    Florian (2007), Correct equations for the dynamics of the cart-pole system, equations 23 and
+    24 without friction.
+    """
+    angle, rate = motion.qpos[1], motion.qvel[1]
+    sine, cosine = jnp.sin(angle), jnp.cos(angle)
+    mass, moment = _CART_MASS + _POLE_MASS, _POLE_MASS * _HALF_LENGTH
+    push = (force + moment * rate**2 * sine) / mass
+    turn = (_GRAVITY * sine - cosine * push) / (
+        _HALF_LENGTH * (4.0 / 3.0 - _POLE_MASS * cosine**2 / mass)
+    )
+    return jnp.stack([push - moment * turn * cosine / mass, turn])
+
+
+def _state(qpos, qvel, reward, done, previous: State | None = None) -> State:
+    """Returns a state; all else is as in the previous one, such as what wrappers keep there."""
+    motion = cast(Any, Motion(qpos=qpos, qvel=qvel))
+    obs = jnp.stack([qpos[0], qvel[0], qpos[1], qvel[1]])
+    if previous is None:
+        return State(motion, obs, reward, done)
+    return dataclasses.replace(previous, pipeline_state=motion, obs=obs, reward=reward, done=done)
