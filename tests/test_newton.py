@@ -6,11 +6,11 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco import mjx
-from mujoco.mjx._src import solver
 
 from mjx_reinforce import envs
 from mjx_reinforce.physics import newton
 from mjx_reinforce.physics import step as physics
+from mjx_reinforce.physics.mjx_internals import jax_fields
 
 SCENE = """
 <mujoco>
@@ -40,7 +40,7 @@ def rows_at(model, data, qpos, qvel, warmstart):
     """Everything that the solver reads."""
     data = mjx.fwd_position(model, data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart))
     data = mjx.fwd_actuation(model, mjx.fwd_velocity(model, data))
-    return mjx._src.forward.fwd_acceleration(model, data)
+    return mjx.fwd_acceleration(model, data)
 
 
 def random_states(model, count):
@@ -58,8 +58,8 @@ def test_finds_the_optimum_that_mjx_finds():
 
         def both(*state):
             ready = rows_at(model, data, *state)
-            theirs = solver.solve(model, ready)
-            expected = theirs.qacc, theirs.qfrc_constraint, theirs._impl.efc_force
+            theirs = mjx.solve(model, ready)
+            expected = theirs.qacc, theirs.qfrc_constraint, jax_fields(theirs).efc_force
             return newton.solve(model, ready), expected
 
         actual, expected = jax.jit(jax.vmap(both))(*states)
@@ -79,7 +79,7 @@ def test_ends_where_the_gradient_vanishes(dtype):
             ready = rows_at(model, data, *state)
             qacc, joint_force, _ = newton.solve(model, ready)
             forces = ready.qfrc_smooth + joint_force
-            return mjx._src.support.mul_m(model, ready, qacc) - forces, forces
+            return mjx.mul_m(model, ready, qacc) - forces, forces
 
         left, forces = jax.jit(jax.vmap(imbalance))(*random_states(model, 64))
     scale = 1 + np.abs(forces).max(axis=1, keepdims=True)
@@ -92,26 +92,24 @@ def test_the_line_search_finds_the_root_among_kinks():
     random = np.random.default_rng(1)
     for _ in range(20):
         residual, change = random.standard_normal((2, 12))
-        stiffness = 10 ** random.uniform(-1, 3, 12)
-        rows = newton._Rows(
-            jnp.zeros((12, 1)), jnp.zeros(12), jnp.asarray(stiffness), jnp.array(False)
-        )
+        mass = 10 ** random.uniform(-1, 3, 12)
+        rows = newton._Rows(jnp.zeros((12, 1)), jnp.zeros(12), jnp.asarray(mass), jnp.array(False))
         active = residual < 0
         curvature = random.uniform(0.1, 1)
-        pull, stretch = stiffness * change * residual, stiffness * change**2
+        row_slope, row_curvature = mass * change * residual, mass * change**2
         # Newton's own line has its root at a step of 1.
-        slope = -(curvature + (pull + stretch)[active].sum())
+        slope = -(curvature + (row_slope + row_curvature)[active].sum())
         zero = jnp.zeros(())
         start = newton._Point(zero, zero, jnp.asarray(residual), jnp.asarray(active), zero)
         found = newton._line_search(
             rows, start, jnp.asarray(change), jnp.asarray(slope), jnp.asarray(curvature), 50
         )
 
-        def cost(length, args=(residual, change, stiffness, slope, curvature)):
-            residual, change, stiffness, slope, curvature = args
+        def cost(length, args=(residual, change, mass, slope, curvature)):
+            residual, change, mass, slope, curvature = args
             pushed = np.minimum(residual + np.multiply.outer(length, change), 0)
-            strain = (stiffness * pushed**2).sum(-1) / 2
-            return slope * length + curvature * length**2 / 2 + strain
+            penalty = (mass * pushed**2).sum(-1) / 2
+            return slope * length + curvature * length**2 / 2 + penalty
 
         grid = np.linspace(0, 3 * abs(float(found)) + 1, 20_001)
         assert cost(np.float64(found)) <= cost(grid).min() + 1e-4 * abs(cost(grid).min())
@@ -150,15 +148,15 @@ def test_caps_leave_no_more_cost_than_the_start(cap):
 
         def costs(*state):
             ready = rows_at(model, data, *state)
-            impl = ready._impl
+            fields = jax_fields(ready)
 
             def cost(qacc):
-                residual = impl.efc_J @ qacc - impl.efc_aref
-                equality = jnp.arange(residual.size) < impl.ne
+                residual = fields.efc_J @ qacc - fields.efc_aref
+                equality = jnp.arange(residual.size) < fields.ne
                 pushed = jnp.where(equality | (residual < 0), residual, 0)
                 offset = qacc - ready.qacc_smooth
-                inertial = offset @ mjx._src.support.mul_m(model, ready, offset)
-                return (inertial + jnp.sum(impl.efc_D * pushed**2)) / 2
+                inertial = offset @ mjx.mul_m(model, ready, offset)
+                return (inertial + jnp.sum(fields.efc_D * pushed**2)) / 2
 
             return cost(newton.solve(capped, ready)[0]), cost(ready.qacc_smooth)
 

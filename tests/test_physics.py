@@ -11,13 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco import mjx
-from mujoco.mjx._src import collision_driver, collision_primitive, collision_sdf
 from scipy.spatial.transform import Rotation
 
 from mjx_reinforce import fused
-from mjx_reinforce.physics import contacts
-from mjx_reinforce.physics import mjx_internals as fences
+from mjx_reinforce.physics import contacts, runge_kutta
 from mjx_reinforce.physics import step as physics
+from mjx_reinforce.physics.mjx_internals import jax_fields
 
 ASSETS = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "assets")
 
@@ -75,7 +74,7 @@ def runner(advance, model, data):
             "qacc": end.qacc,
             "warmstart": end.qacc_warmstart,
             "joint force": end.qfrc_constraint,
-            "row force": end._impl.efc_force,
+            "row force": jax_fields(end).efc_force,
             "time": end.time,
         }
 
@@ -318,7 +317,9 @@ def test_rotation_rate_at_every_angle(double, tolerance):
     across = np.cross(axis, velocity)
     expected = along + cotangent[:, None] * (velocity - along) + principal[:, None] / 2 * across
     with jax.enable_x64(double):
-        rate = jax.vmap(lambda x: physics._rotation_rate(x * jnp.array(axis), jnp.array(velocity)))
+        rate = jax.vmap(
+            lambda x: runge_kutta._rotation_rate(x * jnp.array(axis), jnp.array(velocity))
+        )
         np.testing.assert_allclose(rate(jnp.array(angles)), expected, rtol=0, atol=tolerance)
 
 
@@ -356,7 +357,7 @@ def test_contacts_are_those_of_mujoco():
         model, data, mx, start = compiled(TOUCHING)
 
         def collide(qpos):
-            return cast(Any, contacts.fwd_position(mx, start.replace(qpos=qpos)))._impl.contact
+            return jax_fields(contacts.fwd_position(mx, start.replace(qpos=qpos))).contact
 
         found = jax.jit(jax.vmap(collide), compiler_options=UNOPTIMIZED)(qpos)
         ours = [contacts_in_order(jax.tree.map(lambda x, i=i: x[i], found)) for i in range(65)]
@@ -391,44 +392,3 @@ def test_axes_that_cross_push_across_also_in_single_precision():
     dist, _, frame = collide(pos, jnp.asarray(turn, jnp.float32))
     np.testing.assert_allclose(dist, -0.09, atol=1e-6)
     np.testing.assert_allclose(np.abs(frame[:, 0, 0]), np.tile([0, 1, 0], (200, 1)), atol=1e-5)
-
-
-def test_mjx_is_left_as_it_is():
-    _, _, mx, start = compiled(TOUCHING)
-
-    def program(position):
-        return str(jax.make_jaxpr(lambda data: position(mx, data)._impl.contact.frame)(start))
-
-    table = dict(collision_driver._COLLISION_FUNC)
-    before = program(mjx.fwd_position)
-    assert program(contacts.fwd_position) != before
-    assert program(mjx.fwd_position) == before
-    assert table == collision_driver._COLLISION_FUNC
-    capsules = mjx.GeomType.CAPSULE, mjx.GeomType.CAPSULE
-    assert table[capsules] is collision_primitive.capsule_capsule
-
-
-def test_descent_to_a_cylinder_is_written_out():
-    """A loop there stalls jaxlib 0.10.2."""
-    model = mujoco.MjModel.from_xml_path(os.path.join(ASSETS, "pusher_v5.xml"))
-    mjx_model, data = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
-    functions = [
-        lambda data: contacts.fwd_position(mjx_model, data),
-        fences.fenced(lambda data: contacts.fwd_position(mjx_model, data)),
-    ]
-    plain, ours = (str(jax.make_jaxpr(function)(data)) for function in functions)
-    assert "scan[" in plain
-    assert "scan[" not in ours
-    assert "while[" not in ours
-
-
-def test_the_written_out_descent_is_mjxs():
-    def objective(x):
-        return jnp.sum(jnp.array([1.0, 0.3, 0.1]) * (x - jnp.array([0.3, -0.2, 0.1])) ** 2)
-
-    start = jnp.array([1.0, 2.0, -3.0])
-    dist, place = fences._descend(objective, start, 10)
-    expected, there = collision_sdf._gradient_descent(objective, start, 10)
-    np.testing.assert_allclose(dist, expected, rtol=1e-4)
-    np.testing.assert_allclose(place, there, rtol=1e-4, atol=1e-5)
-    assert dist < objective(start)

@@ -12,20 +12,22 @@ ends of their overlap, and here in one, at its middle: the number of rows is sta
 every pair of capsules would pay for a second row (a fifth of Humanoid's time on a CPU). None of
 60,000 states of Humanoid, HumanoidStandup and Hopper under random actions had such a pair.
 
-MJX finds its collision functions in one table of a module. `fwd_position` is MJX's own code with
-another table; MJX itself is left as it is.
+`fwd_position` is MJX's with these three in the table of collision functions.
 """
 
-import inspect
-import types
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from mujoco import mjx
-from mujoco.mjx._src import collision_driver, collision_primitive, forward, math
-from mujoco.mjx._src.collision_types import Collision, GeomInfo
+
+from mjx_reinforce.physics.mjx_internals import (
+    Collision,
+    GeomInfo,
+    collider,
+    collision_with,
+    make_frame,
+)
 
 # What C takes for zero (mjMINVAL); in single precision, what rounding may leave of a zero distance
 # between points a few metres from the origin. Axes that cross, as in a planar Hopper, have that.
@@ -34,7 +36,7 @@ _MIN_LENGTH = {"float64": 1e-15, "float32": 2e-6}
 _PARALLEL = 1e-8
 
 
-@collision_primitive.collider(ncon=2)
+@collider(ncon=2)
 def plane_capsule(plane: GeomInfo, capsule: GeomInfo) -> Collision:
     """Collides both ends of a capsule with a plane; the first tangents follow its axis."""
     normal, axis = plane.mat[:, 2], capsule.mat[:, 2]
@@ -47,7 +49,7 @@ def plane_capsule(plane: GeomInfo, capsule: GeomInfo) -> Collision:
     return dist, pos, jnp.stack([frame, frame])
 
 
-@collision_primitive.collider(ncon=1)
+@collider(ncon=1)
 def sphere_capsule(sphere: GeomInfo, capsule: GeomInfo) -> Collision:
     """Collides a sphere with the point of a capsule's axis that is closest to it."""
     axis, half = capsule.mat[:, 2], capsule.size[1]
@@ -55,7 +57,7 @@ def sphere_capsule(sphere: GeomInfo, capsule: GeomInfo) -> Collision:
     return _collide_spheres(sphere, sphere.pos, capsule, capsule.pos + along * axis)
 
 
-@collision_primitive.collider(ncon=1)
+@collider(ncon=1)
 def capsule_capsule(first: GeomInfo, second: GeomInfo) -> Collision:
     """Collides two capsules where their axes are closest."""
     point1, point2 = _closest_points(first, second)
@@ -91,7 +93,7 @@ def _collide_spheres(
     across, _ = _direction(jnp.cross(first.mat[:, 2], second.mat[:, 2]))
     normal = jnp.where(length == 0, across, normal)
     dist = length - (first.size[0] + second.size[0])
-    return dist, point1 + normal * (first.size[0] + dist / 2), math.make_frame(normal)
+    return dist, point1 + normal * (first.size[0] + dist / 2), make_frame(normal)
 
 
 def _direction(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -103,23 +105,24 @@ def _direction(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
     return unit, jnp.where(short, 0, length)
 
 
-def _rebound(function: Callable[..., Any], **names: Any) -> Callable[..., Any]:
-    """Returns a copy of a function in whose code these global names mean something else."""
-    plain = inspect.unwrap(function)
-    return types.FunctionType(plain.__code__, {**plain.__globals__, **names})
-
-
-_FUNCTIONS = {
-    **collision_driver._COLLISION_FUNC,
-    (mjx.GeomType.PLANE, mjx.GeomType.CAPSULE): plane_capsule,
-    (mjx.GeomType.SPHERE, mjx.GeomType.CAPSULE): sphere_capsule,
-    (mjx.GeomType.CAPSULE, mjx.GeomType.CAPSULE): capsule_capsule,
-}
-_collision = _rebound(collision_driver.collision, _COLLISION_FUNC=_FUNCTIONS)
-_driver = types.SimpleNamespace(collision=_collision)
-_fwd_position = _rebound(forward.fwd_position, collision_driver=_driver)
+_collision = collision_with(
+    {
+        (mjx.GeomType.PLANE, mjx.GeomType.CAPSULE): plane_capsule,
+        (mjx.GeomType.SPHERE, mjx.GeomType.CAPSULE): sphere_capsule,
+        (mjx.GeomType.CAPSULE, mjx.GeomType.CAPSULE): capsule_capsule,
+    }
+)
 
 
 def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Computes what depends on position: MJX's `fwd_position` with this module's contacts."""
-    return _fwd_position(model, data)
+    """Computes what depends on position: `mjx.fwd_position` with this module's contacts."""
+    data = mjx.kinematics(model, data)
+    data = mjx.com_pos(model, data)
+    data = mjx.camlight(model, data)
+    data = mjx.tendon(model, data)
+    data = mjx.crb(model, data)
+    data = mjx.tendon_armature(model, data)
+    data = mjx.factor_m(model, data)
+    data = _collision(model, data)
+    data = mjx.make_constraint(model, data)
+    return mjx.transmission(model, data)

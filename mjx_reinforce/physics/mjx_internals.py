@@ -1,4 +1,17 @@
-"""Two changes to how MJX is traced, for XLA's CPU backend; neither changes an answer.
+"""Everything that this package uses of MJX and that MJX does not publish.
+
+No other file imports MJX's private modules or reads the private part of its data. Three kinds:
+
+- Names that MJX keeps private, here without underscore: the imports, and `advance`.
+- Fields of `mjx.Data` that only MJX's JAX implementation has: `jax_fields`, `with_solution`,
+  `Simulation`, `num_contacts`.
+- Functions of MJX in which a name is given another meaning: `collision_with` and `fenced`. They
+  would do nothing, silently, if MJX stopped looking that name up; `check_lookup` raises then.
+
+`tests/test_mjx_internals.py` holds a hash of each MJX function that this package replaces or
+whose source it depends on: a new MJX fails there first.
+
+`fenced` makes two changes for XLA's CPU backend; neither changes an answer.
 
 - A body's pose needs every entry of its parent's. XLA fuses the whole chain and then computes the
   parent's entries again for each entry of the child: time grows exponentially with depth. Pusher's
@@ -9,20 +22,114 @@
 """
 
 import contextlib
+import dis
 import functools
+import inspect
 import threading
+import types
 from collections.abc import Callable, Iterator
-from typing import Any
+from importlib import metadata
+from typing import Any, cast
 
 import jax
-from mujoco.mjx._src import collision_sdf, scan
+from mujoco import mjx
+from mujoco.mjx._src import collision_driver, collision_sdf, scan
+from mujoco.mjx._src.collision_primitive import collider
+from mujoco.mjx._src.collision_types import Collision, GeomInfo
+from mujoco.mjx._src.forward import _advance as advance
+from mujoco.mjx._src.math import make_frame
+from mujoco.mjx._src.smooth import solve_m
+
+__all__ = [
+    "Collision",
+    "GeomInfo",
+    "Simulation",
+    "advance",
+    "check_lookup",
+    "collider",
+    "collision_with",
+    "fenced",
+    "jax_fields",
+    "make_frame",
+    "num_contacts",
+    "solve_m",
+    "with_solution",
+]
+
+#: What this package was tested with; `pyproject.toml` bounds the versions at the same.
+TESTED_VERSIONS = {"mujoco": "4.0", "mujoco-mjx": "3.17"}
+
+
+# ---------------------------------------------------------------------------- names in MJX's code
+
+
+def check_lookup(module: types.ModuleType, function: str, name: str) -> None:
+    """Checks that a function of MJX looks up a global name, so that it sees another meaning.
+
+    Args:
+        module: the module of MJX that has the function and the name.
+        function: the function's name.
+        name: the global name that this package gives another meaning.
+
+    Raises:
+        RuntimeError: if the function is gone, or does not look the name up in this module.
+    """
+    found = inspect.unwrap(getattr(module, function, None))  # type: ignore
+    if (
+        isinstance(found, types.FunctionType)
+        and found.__globals__ is vars(module)
+        and name in _looked_up(found.__code__)
+    ):
+        return
+    versions = ", ".join(
+        f"{package} {metadata.version(package)} (tested: {tested}.*)"
+        for package, tested in TESTED_VERSIONS.items()
+    )
+    raise RuntimeError(
+        f"{module.__name__}.{function} does not look up {name}, which mjx_reinforce replaces. "
+        f"Installed: {versions}. Install the tested versions, or adapt {__name__}"
+    )
+
+
+def _looked_up(code: types.CodeType) -> set[str]:
+    """Returns the global names that a function's code looks up, also in functions inside it."""
+    names = {step.argval for step in dis.get_instructions(code) if step.opname == "LOAD_GLOBAL"}
+    inner = (_looked_up(const) for const in code.co_consts if isinstance(const, types.CodeType))
+    return names.union(*inner)
+
+
+for _function, _module, _name in (
+    ("collision", collision_driver, "_COLLISION_FUNC"),
+    ("flat", scan, "_nvmap"),
+    ("body_tree", scan, "_nvmap"),
+    ("_optim", collision_sdf, "_gradient_descent"),
+    ("_gradient_descent", collision_sdf, "_gradient_step"),
+):
+    check_lookup(_module, _function, _name)
+
+
+def collision_with(
+    functions: dict[tuple[mjx.GeomType, mjx.GeomType], Callable[..., Any]],
+) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
+    """Returns a copy of `mjx.collision` with some collision functions replaced.
+
+    MJX finds its collision functions in one table, a global of a module; the copy has a table of
+    its own, and MJX stays as it is.
+
+    Args:
+        functions: a `collider` for each pair of types of geoms, in MJX's order.
+    """
+    plain = inspect.unwrap(mjx.collision)
+    table = {**collision_driver._COLLISION_FUNC, **functions}
+    return types.FunctionType(plain.__code__, {**plain.__globals__, "_COLLISION_FUNC": table})
+
 
 _lock = threading.RLock()
 _level = scan._nvmap
 
 
 def fenced(fn: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a function that traces MJX with both changes."""
+    """Returns a function that traces MJX with a fence between levels and without that loop."""
 
     @functools.wraps(fn)
     def traced(*args: Any) -> Any:
@@ -50,7 +157,7 @@ def _descend(objective: Callable[..., Any], x: jax.Array, niter: int) -> tuple[A
 
 
 @contextlib.contextmanager
-def _swapped(module: Any, name: str, value: Any) -> Iterator[None]:
+def _swapped(module: types.ModuleType, name: str, value: Any) -> Iterator[None]:
     """Gives a module's name another meaning for a while."""
     before = getattr(module, name)
     setattr(module, name, value)
@@ -58,6 +165,29 @@ def _swapped(module: Any, name: str, value: Any) -> Iterator[None]:
         yield
     finally:
         setattr(module, name, before)
+
+
+# --------------------------------------------------------------------------- fields of MJX's data
+
+
+def jax_fields(data: mjx.Data) -> mjx.DataJAX:
+    """Returns the fields that only MJX's JAX implementation has, by MuJoCo's names."""
+    return cast(mjx.DataJAX, data._impl)
+
+
+def with_solution(
+    data: mjx.Data, qacc: jax.Array, qfrc_constraint: jax.Array, efc_force: jax.Array
+) -> mjx.Data:
+    """Returns the data with what a constraint solver found.
+
+    Args:
+        data: an MJX simulation.
+        qacc: [nv] the acceleration.
+        qfrc_constraint: [nv] the constraints' joint forces.
+        efc_force: [rows] the constraint rows' forces.
+    """
+    solution = {"qacc": qacc, "qfrc_constraint": qfrc_constraint, "_impl.efc_force": efc_force}
+    return cast(mjx.Data, data.tree_replace(solution))  # flax types it as any PyTreeNode
 
 
 class Simulation:
@@ -79,4 +209,4 @@ class Simulation:
 
 def num_contacts(data: Any) -> int:
     """Returns the most contacts that a model can have at once, from its ``mjx.Data``."""
-    return int(data._impl.ncon)
+    return int(jax_fields(data).ncon)
