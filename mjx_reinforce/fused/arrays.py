@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused import ops
+from mjx_reinforce.fused.nodes import is_constant
 
 
 def is_numeric(array: np.ndarray) -> bool:
-    """Tells whether every element is a constant."""
+    """Returns whether every element is a constant."""
     return array.dtype != object
 
 
@@ -21,7 +21,7 @@ def elements(array: np.ndarray) -> list[Any]:
 def pack(scalars: Iterable[Any], shape: Sequence[int], dtype: Any) -> np.ndarray:
     """Returns the array of these scalars."""
     scalars = list(scalars)
-    if dtype is not object and all(map(ops.is_constant, scalars)):
+    if dtype is not object and all(map(is_constant, scalars)):
         return np.array(scalars, dtype).reshape(shape)
     return np.fromiter(scalars, object, len(scalars)).reshape(shape)
 
@@ -60,3 +60,22 @@ def map_elements(function: Callable, shape: Sequence[int], dtype: Any, *arrays: 
     """Applies a scalar function element by element; axes of size 1 are shared."""
     columns = [elements(np.broadcast_to(array, shape)) for array in arrays]
     return pack(map(function, *columns), shape, dtype)
+
+
+class Layout:
+    """How arrays divide into scalars and back."""
+
+    def __init__(self, avals: Sequence[Any]):
+        self._avals = list(avals)
+
+    def pack(self, scalars: Sequence[Any]) -> list[np.ndarray]:
+        """Makes the arrays of these scalars."""
+        values, packed = iter(scalars), []
+        for aval in self._avals:
+            size = int(np.prod(aval.shape, dtype=int))
+            packed.append(pack([next(values) for _ in range(size)], aval.shape, aval.dtype))
+        return packed
+
+    def unpack(self, packed: Sequence[np.ndarray]) -> list[Any]:
+        """Lists the scalars of these arrays."""
+        return [scalar for array in packed for scalar in elements(array)]

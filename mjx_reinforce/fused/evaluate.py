@@ -1,5 +1,6 @@
 """Evaluates a program on arrays of scalars, equation by equation."""
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -45,14 +46,14 @@ def _apply(graph: Graph, eqn: Any, used: list[bool], operands: list[np.ndarray])
     """Finds and applies the rule for one equation."""
     name = eqn.primitive.name
     if name in _CONTROL:
-        return _CONTROL[name](run, graph, eqn, used, *operands)
+        return _CONTROL[name](graph, functools.partial(run, graph), eqn, used, *operands)
     if name in _RULES:
         return _settled(eqn, _RULES[name](graph, eqn, *operands))
     program = jaxprs.callee(eqn)
     if program is not None:
         return run(graph, program, operands, used)
     if all(map(arrays.is_numeric, operands)):
-        return jaxprs.evaluate(eqn.primitive, eqn.params, operands)
+        return jaxprs.evaluate(eqn.primitive.bind, eqn.params, operands)
     raise UnsupportedPrimitive(name, jaxprs.source(eqn))
 
 

@@ -1,83 +1,20 @@
 """The scalar graph: what a program becomes before it is JAX again.
 
-A *scalar* is a NumPy scalar (a constant) or a `Node` (a value that each lane of the batch has its
-own of, or that all lanes share). Equal nodes are one object, so common subexpressions are shared.
-
-Values have scopes. The body of a loop and an expensive branch are scopes of their own: a node made
-there is not visible outside. A node that needs nothing of a loop's body is placed before the loop;
-out of a branch nothing moves, because a branch exists to be skipped.
+`nodes` has the parts; here they are made. Equal nodes are one object, so common subexpressions are
+shared. A node that needs nothing of a loop's body is placed before the loop. Nothing is moved out
+of a branch, because then it would run also where the branch is skipped.
 """
 
 import contextlib
-import dataclasses
-from collections.abc import Callable, Hashable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
-from jax import lax
 
-from mjx_reinforce.fused import arrays, jaxprs, ops, simplify
+from mjx_reinforce.fused import arrays, folding, jaxprs, ops, simplify
+from mjx_reinforce.fused.nodes import Captured, Gate, Loop, Node, Scalar, Scope, identity
 
-Scalar = Any  # np.generic or Node
-
-
-@dataclasses.dataclass(eq=False, slots=True)
-class Scope:
-    """Where nodes live.
-
-    Attributes:
-        depth: 0 for the program itself.
-        floor: nodes made here are placed in a scope at least this deep.
-        known: the nodes of this scope by what they compute.
-        cost: the number of nodes placed here.
-        has_loop: whether a loop was made here.
-    """
-
-    depth: int
-    floor: int
-    known: dict[Hashable, "Node"] = dataclasses.field(default_factory=dict)
-    cost: int = 0
-    has_loop: bool = False
-
-
-@dataclasses.dataclass(eq=False, slots=True)
-class Node:
-    """One value.
-
-    Attributes:
-        dtype: its dtype.
-        varying: True if each lane has its own, False if all lanes share it.
-        scope: where it can be used.
-        index: nodes are numbered as they are made, so operands come before results.
-        op: what computes it; None for a leaf.
-        args: the operands.
-        owner: the loop or gate that a leaf belongs to; None for an input.
-        position: which of the owner's values a leaf is.
-    """
-
-    dtype: np.dtype
-    varying: bool
-    scope: Scope
-    index: int
-    op: ops.Op | None = None
-    args: tuple[Scalar, ...] = ()
-    owner: Any = None
-    position: Any = None
-
-
-class Captured(NamedTuple):
-    """An array that the program closes over and whose value is not known yet.
-
-    Attributes:
-        array: a tracer of an outer transformation.
-    """
-
-    array: Any
-
-    def element(self, position: int) -> Any:
-        """Returns one element, in row-major order."""
-        flat = lax.reshape(self.array, (self.array.size,))
-        return lax.index_in_dim(flat, position, keepdims=False)
+_BOOL = np.dtype(bool)
 
 
 class Graph:
@@ -86,7 +23,8 @@ class Graph:
     Attributes:
         branch_cost: a branch of more scalar operations than this is skipped where no lane needs it.
         unrolled: a scan that reads and makes no arrays is written out up to this length.
-        certain: predicates known to hold in some lane, because we are where nothing runs otherwise.
+        certain: predicates that hold in some lane wherever the present scope runs: those of the
+            branches and loops around it, which run only if some lane has them.
     """
 
     def __init__(self, branch_cost: int, unrolled: int):
@@ -130,7 +68,20 @@ class Graph:
             self.scope.cost += scope.cost
             self.scope.has_loop |= scope.has_loop
 
-    def leaf(self, dtype: Any, varying: bool, owner: Any = None, position: Any = None) -> Node:
+    @contextlib.contextmanager
+    def assuming(self, predicate: Scalar) -> Iterator[None]:
+        """Takes a predicate for one that holds in some lane."""
+        before = set(self.certain)
+        if isinstance(predicate, Node):
+            self.certain.add(predicate)
+        try:
+            yield
+        finally:
+            self.certain = before
+
+    def leaf(
+        self, dtype: Any, varying: bool, owner: Loop | Gate | None = None, position: Any = None
+    ) -> Node:
         """Makes a node that nothing computes: an input, a loop's carry, a gate's result."""
         index = self.number()
         return Node(np.dtype(dtype), varying, self.scope, index, owner=owner, position=position)
@@ -156,8 +107,8 @@ class Graph:
 
     def call(self, name: str, *args: Scalar) -> Scalar:
         """Applies one of the named operations to scalars."""
-        op = ops.CORE[name]
-        return self.apply(op, args, np.dtype(bool) if op.is_predicate else args[-1].dtype)
+        predicate = ops.FACTS[name].is_predicate
+        return self.apply(ops.Op(name), args, _BOOL if predicate else args[-1].dtype)
 
     def convert(self, value: Scalar, dtype: Any) -> Scalar:
         """Converts a scalar to another dtype."""
@@ -177,13 +128,13 @@ class Graph:
     def apply(self, op: ops.Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar:
         """Applies an operation: a constant, an existing node, a simpler one or a new one."""
         if not any(isinstance(arg, Node) for arg in args):
-            return ops.fold(op, args, dtype)
+            return folding.fold(op, args, dtype)
         simpler = simplify.simplify(self, op, args, dtype)
         return self._share(op, args, dtype) if simpler is None else simpler
 
     def _share(self, op: ops.Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Node:
         keys = tuple(map(identity, args))
-        key = (op.key, tuple(sorted(keys)) if op.commutes else keys)
+        key = (op, tuple(sorted(keys)) if ops.FACTS[op.name].commutes else keys)
         nodes = [arg for arg in args if isinstance(arg, Node)]
         depth = max(self.scope.floor, *(node.scope.depth for node in nodes))
         for scope in self._scopes[depth::-1]:
@@ -195,15 +146,3 @@ class Graph:
         scope.known[key] = node
         scope.cost += 1
         return node
-
-
-def identity(value: Scalar) -> tuple:
-    """Returns what tells a scalar from others: bits for a constant, so that NaN equals itself."""
-    if isinstance(value, Node):
-        return (0, value.index, "")
-    return (1, value.tobytes(), value.dtype.str)
-
-
-def same(left: Scalar, right: Scalar) -> bool:
-    """Tells whether two scalars are the same node or bitwise the same constant."""
-    return left is right or identity(left) == identity(right)

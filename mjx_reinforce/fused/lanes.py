@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 @jax.custom_batching.custom_vmap
 def any_lane(predicate: jax.Array) -> jax.Array:
-    """Tells whether a predicate holds in any lane, of this batch or of one mapped over it.
+    """Returns whether a predicate holds in any lane, of this batch or of one mapped over it.
 
     A loop's or a branch's predicate that `jax.vmap` batches turns the loop into one that computes
     every lane, and the branch into a selection. This one is never batched: under an outer

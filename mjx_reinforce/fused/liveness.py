@@ -1,79 +1,200 @@
-"""Which nodes the results need, scope by scope."""
+"""What the results need, in the order in which it is computed.
+
+A *schedule* is a list of steps. A step is a node, a loop or a gate; the latter two have a schedule
+of their own, and keep only the values that something reads.
+"""
 
 import dataclasses
 from collections import defaultdict
 from collections.abc import Iterable
-from typing import Any
+from typing import NamedTuple
 
-from mjx_reinforce.fused.branches import Gate
-from mjx_reinforce.fused.graph import Node, Scalar, Scope
-from mjx_reinforce.fused.loops import Loop
+from mjx_reinforce.fused.nodes import Gate, Loop, Node, Scalar, Scope
+
+
+class Out(NamedTuple):
+    """One result of a gate.
+
+    Attributes:
+        leaf: the node that stands for it after the gate.
+        hot: its value at the end of the body.
+        cold: its value if the body is skipped; computed before the gate.
+    """
+
+    leaf: Node
+    hot: Scalar
+    cold: Scalar
+
+
+class Carry(NamedTuple):
+    """One value that a loop changes.
+
+    Attributes:
+        leaf: the node that stands for it in the body.
+        init: its value before the loop.
+        next: its value at the end of the body.
+        out: the node that stands for it after the loop.
+    """
+
+    leaf: Node
+    init: Scalar
+    next: Scalar
+    out: Node
+
+
+class Element(NamedTuple):
+    """One value that a loop reads from a list, another one in each iteration.
+
+    Attributes:
+        leaf: the node that stands for it in the body.
+        values: its value in each iteration; computed before the loop.
+    """
+
+    leaf: Node
+    values: list[Scalar]
+
+
+class Record(NamedTuple):
+    """One value that a loop keeps of each iteration.
+
+    Attributes:
+        value: its value at the end of the body.
+        outs: the nodes that stand for it after the loop, one for each iteration.
+    """
+
+    value: Scalar
+    outs: list[Node]
 
 
 @dataclasses.dataclass(frozen=True)
-class Schedule:
-    """What is to be computed.
+class LiveGate:
+    """A branch that runs only if some lane needs it.
 
     Attributes:
-        steps: for each scope, its nodes, loops and gates in order.
-        carries: for each loop, the positions of its carry that are needed.
-        elements: for each loop, the positions of its xs that are needed.
-        ys: for each loop, the positions of its ys that are needed.
-        wanted: every node that is needed.
+        predicate: which lanes need the branch.
+        body: what it computes.
+        outs: its results.
     """
 
-    steps: dict[Scope, list[Any]]
-    carries: dict[Loop, list[int]]
-    elements: dict[Loop, list[int]]
-    ys: dict[Loop, list[int]]
-    wanted: set[Node]
+    predicate: Node
+    body: "Schedule"
+    outs: list[Out]
 
 
-def schedule(results: Iterable[Scalar]) -> Schedule:
-    """Returns what these scalars need, directly or through loops and gates."""
-    steps: dict[Scope, set] = defaultdict(set)
-    roles: dict[str, dict[Any, set]] = {
-        name: defaultdict(set) for name in ("carry", "element", "y")
-    }
+@dataclasses.dataclass(frozen=True)
+class LiveLoop:
+    """A loop.
+
+    Attributes:
+        length: the number of iterations, or None for no limit.
+        active: the position in `carries` of the bool that ends the loop when no lane has it; None
+            if the loop always runs to its length.
+        body: what one iteration computes.
+        carries: what it changes.
+        elements: what it reads.
+        records: what it keeps.
+    """
+
+    length: int | None
+    active: int | None
+    body: "Schedule"
+    carries: list[Carry]
+    elements: list[Element]
+    records: list[Record]
+
+
+Schedule = list[Node | LiveGate | LiveLoop]
+
+
+def schedule(root: Scope, results: Iterable[Scalar]) -> Schedule:
+    """Returns what these scalars need, directly or through loops and gates.
+
+    Args:
+        root: the scope of the whole program.
+        results: scalars of that scope.
+    """
+    needs = _Needs()
     waiting, seen = list(results), set()
     while waiting:
         node = waiting.pop()
-        if not isinstance(node, Node) or node in seen:
-            continue
-        seen.add(node)
+        if isinstance(node, Node) and node not in seen:
+            seen.add(node)
+            waiting.extend(needs.note(node))
+    return needs.steps_of(root)
+
+
+class _Needs:
+    """What was found to be needed so far."""
+
+    def __init__(self) -> None:
+        self._steps: dict[Scope, set[Node | Gate | Loop]] = defaultdict(set)
+        self._outs: dict[Gate, set[int]] = defaultdict(set)
+        # For each loop the positions of what is needed, by its role.
+        self._places: dict[Loop, dict[str, set[int]]] = defaultdict(lambda: defaultdict(set))
+
+    def note(self, node: Node) -> list[Scalar]:
+        """Notes that a node is needed; returns what it needs in turn."""
+        owner = node.owner
         if node.op is not None:
-            steps[node.scope].add(node)
-            waiting.extend(node.args)
-        elif isinstance(node.owner, Gate):
-            gate = node.owner
-            steps[gate.scope].add(gate)
-            waiting.extend([gate.predicate, gate.hot[node.position], gate.cold[node.position]])
-        elif isinstance(node.owner, Loop):
-            steps[node.owner.scope].add(node.owner)
-            waiting.extend(_loop_needs(node.owner, node.position, roles))
-    return Schedule(
-        wanted=seen,
-        steps={scope: sorted(nodes, key=lambda n: n.index) for scope, nodes in steps.items()},
-        **{
-            field: {loop: sorted(places) for loop, places in roles[role].items()}
-            for field, role in (("carries", "carry"), ("elements", "element"), ("ys", "y"))
-        },
-    )
+            self._steps[node.scope].add(node)
+            return list(node.args)
+        if isinstance(owner, Gate):
+            self._steps[owner.scope].add(owner)
+            self._outs[owner].add(node.position)
+            return [owner.predicate, owner.hot[node.position], owner.cold[node.position]]
+        if isinstance(owner, Loop):
+            self._steps[owner.scope].add(owner)
+            return self._note_loop(owner, node.position)
+        return []
 
+    def _note_loop(self, loop: Loop, position: tuple) -> list[Scalar]:
+        role, i = position[:2]
+        if role == "element":
+            self._places[loop]["element"].add(i)
+            needs = list(loop.xs[i])
+        elif role == "y":
+            self._places[loop]["y"].add(i)
+            needs = [loop.ys[i]]
+        else:  # in the body or after the loop
+            self._places[loop]["carry"].add(i)
+            needs = [loop.inits[i], loop.nexts[i]]
+        if loop.active is not None:
+            needs.append(loop.carries[loop.active])
+        return needs
 
-def _loop_needs(loop: Loop, position: tuple, roles: dict) -> list[Scalar]:
-    """Notes that a leaf of a loop is needed; returns what it needs in turn."""
-    role, i = position[:2]
-    needs: list[Scalar] = []
-    if role == "element":
-        roles["element"][loop].add(i)
-        needs += loop.xs[i]
-    elif role == "y":
-        roles["y"][loop].add(i)
-        needs.append(loop.ys[i])
-    else:
-        roles["carry"][loop].add(i)
-        needs += [loop.inits[i], loop.nexts[i]]
-    if loop.active is not None and loop.carries[loop.active] is not None:
-        needs.append(loop.carries[loop.active])
-    return needs
+    def steps_of(self, scope: Scope) -> Schedule:
+        """Returns the steps of a scope in order."""
+        steps: Schedule = []
+        for step in sorted(self._steps[scope], key=lambda step: step.index):
+            if isinstance(step, Gate):
+                steps.append(self._gate(step))
+            elif isinstance(step, Loop):
+                steps.append(self._loop(step))
+            else:
+                steps.append(step)
+        return steps
+
+    def _gate(self, gate: Gate) -> LiveGate:
+        outs = [
+            Out(leaf, gate.hot[i], gate.cold[i])
+            for i in sorted(self._outs[gate])
+            if (leaf := gate.outs[i]) is not None
+        ]
+        return LiveGate(gate.predicate, self.steps_of(gate.body), outs)
+
+    def _loop(self, loop: Loop) -> LiveLoop:
+        places = {role: sorted(found) for role, found in self._places[loop].items()}
+        carried = places.get("carry", [])
+        carries = [
+            Carry(leaf, loop.inits[i], loop.nexts[i], out)
+            for i in carried
+            if (leaf := loop.carries[i]) is not None and (out := loop.outs[i]) is not None
+        ]
+        elements = [
+            Element(leaf, loop.xs[j])
+            for j in places.get("element", [])
+            if (leaf := loop.elements[j]) is not None
+        ]
+        records = [Record(loop.ys[j], loop.stacked[j]) for j in places.get("y", [])]
+        active = None if loop.active is None else carried.index(loop.active)
+        return LiveLoop(loop.length, active, self.steps_of(loop.body), carries, elements, records)

@@ -9,9 +9,11 @@ import jax
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.fused import arrays, evaluate, jaxprs, lanes, liveness, loops, ops
-from mjx_reinforce.fused.backends import xla as emit
-from mjx_reinforce.fused.graph import Graph, Scalar, Scope
+from mjx_reinforce.fused import arrays, evaluate, jaxprs, lanes, liveness, loops
+from mjx_reinforce.fused.backends import BACKENDS
+from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.nodes import Scalar, is_constant
+from mjx_reinforce.registry import check_name, load
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,9 +25,8 @@ class Scalarized:
         in_shapes: the shape of each leaf of the arguments.
         out_tree: the structure of its result.
         out_avals: shape and dtype of each leaf of the result.
-        root: the scope of the whole program.
         outputs: the scalars of each leaf of the result.
-        schedule: what they need.
+        schedule: the steps that compute them.
         captures: whether it closes over an array that an outer transformation traces.
     """
 
@@ -33,16 +34,24 @@ class Scalarized:
     in_shapes: list[tuple[int, ...]]
     out_tree: Any
     out_avals: list[Any]
-    root: Scope
     outputs: list[list[Scalar]]
     schedule: liveness.Schedule
     captures: bool
 
+    def compile(self, backend: str, **settings: Any) -> Any:
+        """Returns what a backend makes of the function.
+
+        Args:
+            backend: a name of `backends.BACKENDS`.
+            **settings: what the backend takes.
+        """
+        check_name("backend", backend, BACKENDS)
+        return load(BACKENDS[backend])(**settings).compile(self.schedule, self.outputs)
+
     @property
     def operations(self) -> Counter:
-        """How many scalar operations it takes, by primitive; a loop's body counts once."""
-        steps = [step for scope in self.schedule.steps.values() for step in scope]
-        return Counter(step.op.name for step in steps if getattr(step, "op", None) is not None)
+        """How many scalar operations it takes, by name; a loop's body counts once."""
+        return self.compile("count")
 
     def emit(
         self,
@@ -63,9 +72,13 @@ class Scalarized:
         Returns:
             For each leaf of the result, its elements: lanes, shared values and constants.
         """
-        emitter = emit.Emitter(self.schedule, read, batch_shape, any_lane, read_anywhere)
-        values = iter(emitter.results(self.root, [x for leaf in self.outputs for x in leaf]))
-        return [[next(values) for _ in leaf] for leaf in self.outputs]
+        return self.compile(
+            "xla",
+            read=read,
+            batch_shape=batch_shape,
+            any_lane=any_lane,
+            read_anywhere=read_anywhere,
+        )
 
     def __call__(self, *args: Any, any_lane: Callable = lanes.any_lane) -> Any:
         """Evaluates the function on lanes.
@@ -142,16 +155,15 @@ def build(
         in_shapes=[np.shape(leaf) for leaf in leaves],
         out_tree=out_tree,
         out_avals=out_avals,
-        root=graph.scope,
         outputs=outputs,
-        schedule=liveness.schedule(x for leaf in outputs for x in leaf),
+        schedule=liveness.schedule(graph.scope, (x for leaf in outputs for x in leaf)),
         captures=graph.captures,
     )
 
 
 def full(value: Any, batch_shape: tuple[int, ...]) -> jax.Array:
     """Gives a shared value or a constant the shape of a lane."""
-    if np.shape(value) == batch_shape and not ops.is_constant(value):
+    if np.shape(value) == batch_shape and not is_constant(value):
         return value
     return lax.broadcast(value, batch_shape)
 

@@ -8,25 +8,40 @@ A division by a constant becomes a product only where the reciprocal is exact.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 
-from mjx_reinforce.fused import ops
+from mjx_reinforce.fused import folding
+from mjx_reinforce.fused.nodes import Node, Scalar, is_constant
+from mjx_reinforce.fused.ops import Op
 
-_LARGEST_POWER = 8  # of repeated multiplication; beyond it `pow` is no dearer
+# Greater powers are not faster as products than as `pow`.
+_LARGEST_POWER = 8
 
 
-def simplify(graph: Any, op: ops.Op, args: tuple, dtype: np.dtype) -> Any:
+class Builder(Protocol):
+    """What is asked of the graph here: to make a simpler scalar."""
+
+    def call(self, name: str, *args: Scalar) -> Scalar:
+        """Applies one of the named operations to scalars."""
+        ...
+
+    def select(self, predicate: Scalar, on_true: Scalar, on_false: Scalar) -> Scalar:
+        """Returns on_true where the predicate holds, else on_false."""
+        ...
+
+
+def simplify(graph: Builder, op: Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar | None:
     """Returns a simpler scalar equal to op(*args), or None; at least one operand is a node."""
     rule = _RULES.get(op.name)
     simpler = rule(graph, *args) if rule else None
-    if simpler is None and op is not ops.SELECT:
+    if simpler is None and op.name != "select_n":
         simpler = _through_select(graph, op, args, dtype)
     return simpler
 
 
-def power(graph: Any, base: Any, exponent: int) -> Any:
+def power(graph: Builder, base: Scalar, exponent: int) -> Scalar:
     """Returns an integer power by repeated multiplication."""
     one = base.dtype.type(1)
     if exponent < 0:
@@ -41,23 +56,24 @@ def power(graph: Any, base: Any, exponent: int) -> Any:
     return result
 
 
-def _is(value: Any, number: float) -> bool:
-    return ops.is_constant(value) and bool(value == number)
+def _is(value: Scalar, number: float) -> bool:
+    return is_constant(value) and bool(value == number)
 
 
-def _args(value: Any, name: str) -> tuple | None:
+def _args(value: Scalar, name: str) -> tuple[Scalar, ...] | None:
     """Returns the operands of a node that the named operation computes."""
-    op = getattr(value, "op", None)
-    return value.args if op is not None and op.name == name else None
+    if isinstance(value, Node) and value.op is not None and value.op.name == name:
+        return value.args
+    return None
 
 
-def _negated(value: Any) -> Any:
+def _negated(value: Scalar) -> Scalar | None:
     """Returns x where value is -x, else None."""
     operands = _args(value, "neg")
     return operands[0] if operands else None
 
 
-def _add(graph: Any, x: Any, y: Any) -> Any:
+def _add(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     for left, right in ((x, y), (y, x)):
         if _is(right, 0):
             return left
@@ -66,7 +82,7 @@ def _add(graph: Any, x: Any, y: Any) -> Any:
     return None
 
 
-def _sub(graph: Any, x: Any, y: Any) -> Any:
+def _sub(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     if _is(y, 0):
         return x
     if _is(x, 0):
@@ -76,7 +92,7 @@ def _sub(graph: Any, x: Any, y: Any) -> Any:
     return None
 
 
-def _mul(graph: Any, x: Any, y: Any) -> Any:
+def _mul(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     for left, right in ((x, y), (y, x)):
         if _is(right, 0):
             return right.dtype.type(0)
@@ -85,7 +101,7 @@ def _mul(graph: Any, x: Any, y: Any) -> Any:
         if _is(right, -1) and not np.issubdtype(right.dtype, np.unsignedinteger):
             return graph.call("neg", left)
         if _negated(left) is not None:
-            if ops.is_constant(right):
+            if is_constant(right):
                 return graph.call("mul", _negated(left), -right)
             return graph.call("neg", graph.call("mul", _negated(left), right))
         masked = _mask(graph, left, right)
@@ -94,10 +110,10 @@ def _mul(graph: Any, x: Any, y: Any) -> Any:
     return None
 
 
-def _mask(graph: Any, mask: Any, value: Any) -> Any:
+def _mask(graph: Builder, mask: Scalar, value: Scalar) -> Scalar | None:
     """Turns a product with a bool's 1 or 0 into a selection."""
     operands = _args(mask, "select_n")
-    if operands and not ops.is_constant(value):
+    if operands and not is_constant(value):
         predicate, on_false, on_true = operands
         zero = value.dtype.type(0)
         if _is(on_false, 0) and _is(on_true, 1):
@@ -107,75 +123,75 @@ def _mask(graph: Any, mask: Any, value: Any) -> Any:
     return None
 
 
-def _div(graph: Any, x: Any, y: Any) -> Any:
+def _div(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     if _is(x, 0):
         return x
-    if ops.is_constant(y) and np.issubdtype(y.dtype, np.floating):
+    if is_constant(y) and np.issubdtype(y.dtype, np.floating):
         mantissa, exponent = np.frexp(y)
         if abs(mantissa) == 0.5 and abs(exponent) < 100:
             return graph.call("mul", x, y.dtype.type(1) / y)
     return x if _is(y, 1) else None
 
 
-def _pow(graph: Any, x: Any, y: Any) -> Any:
-    if ops.is_constant(y) and y == int(y if np.isfinite(y) else 0.5) and abs(y) <= _LARGEST_POWER:
+def _pow(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
+    if is_constant(y) and y == int(y if np.isfinite(y) else 0.5) and abs(y) <= _LARGEST_POWER:
         return power(graph, x, int(y))
     return None
 
 
-def _neg(graph: Any, x: Any) -> Any:
+def _neg(graph: Builder, x: Scalar) -> Scalar | None:
     if _negated(x) is not None:
         return _negated(x)
     operands = _args(x, "sub")
     return graph.call("sub", operands[1], operands[0]) if operands else None
 
 
-def _abs(graph: Any, x: Any) -> Any:
+def _abs(graph: Builder, x: Scalar) -> Scalar | None:
     return graph.call("abs", _negated(x)) if _negated(x) is not None else None
 
 
-def _max(graph: Any, x: Any, y: Any) -> Any:
+def _max(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     return _extreme(x, y, -np.inf)
 
 
-def _min(graph: Any, x: Any, y: Any) -> Any:
+def _min(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     return _extreme(x, y, np.inf)
 
 
-def _extreme(x: Any, y: Any, neutral: float) -> Any:
+def _extreme(x: Scalar, y: Scalar, neutral: float) -> Scalar | None:
     if x is y or _is(y, neutral):
         return x
     return y if _is(x, neutral) else None
 
 
-def _and(graph: Any, x: Any, y: Any) -> Any:
+def _and(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     return _bitwise(x, y, absorbing=False)
 
 
-def _or(graph: Any, x: Any, y: Any) -> Any:
+def _or(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     return _bitwise(x, y, absorbing=True)
 
 
-def _bitwise(x: Any, y: Any, absorbing: bool) -> Any:
+def _bitwise(x: Scalar, y: Scalar, absorbing: bool) -> Scalar | None:
     """Simplifies `and` (absorbing False) and `or` (absorbing True) of bools."""
     if x.dtype != np.bool_:
         return None
     for left, right in ((x, y), (y, x)):
-        if ops.is_constant(right):
+        if is_constant(right):
             return right if bool(right) is absorbing else left
     return x if x is y else None
 
 
-def _not(graph: Any, x: Any) -> Any:
+def _not(graph: Builder, x: Scalar) -> Scalar | None:
     operands = _args(x, "not")
     return operands[0] if operands else None
 
 
-def _select(graph: Any, predicate: Any, *cases: Any) -> Any:
+def _select(graph: Builder, predicate: Scalar, *cases: Scalar) -> Scalar | None:
     if len(cases) != 2:
-        return cases[int(predicate)] if ops.is_constant(predicate) else None
+        return cases[int(predicate)] if is_constant(predicate) else None
     on_false, on_true = cases
-    if ops.is_constant(predicate):
+    if is_constant(predicate):
         return on_true if predicate else on_false
     if on_true is on_false or _equal_constants(on_true, on_false):
         return on_true
@@ -189,12 +205,14 @@ def _select(graph: Any, predicate: Any, *cases: Any) -> Any:
     return _select_again(graph, predicate, on_true, on_false)
 
 
-def _equal_constants(x: Any, y: Any) -> bool:
-    both = ops.is_constant(x) and ops.is_constant(y)
+def _equal_constants(x: Scalar, y: Scalar) -> bool:
+    both = is_constant(x) and is_constant(y)
     return both and x.tobytes() == y.tobytes()
 
 
-def _select_bool(graph: Any, predicate: Any, on_true: Any, on_false: Any) -> Any:
+def _select_bool(
+    graph: Builder, predicate: Scalar, on_true: Scalar, on_false: Scalar
+) -> Scalar | None:
     if _is(on_true, True):
         return predicate if _is(on_false, False) else graph.call("or", predicate, on_false)
     if _is(on_false, False):
@@ -207,7 +225,9 @@ def _select_bool(graph: Any, predicate: Any, on_true: Any, on_false: Any) -> Any
     return None
 
 
-def _select_again(graph: Any, predicate: Any, on_true: Any, on_false: Any) -> Any:
+def _select_again(
+    graph: Builder, predicate: Scalar, on_true: Scalar, on_false: Scalar
+) -> Scalar | None:
     """Drops the case of an inner selection that the same predicate rules out."""
     inner = _args(on_true, "select_n")
     if inner and len(inner) == 3 and inner[0] is predicate:
@@ -218,25 +238,27 @@ def _select_again(graph: Any, predicate: Any, on_true: Any, on_false: Any) -> An
     return None
 
 
-def _through_select(graph: Any, op: ops.Op, args: tuple, dtype: np.dtype) -> Any:
+def _through_select(
+    graph: Builder, op: Op, args: tuple[Scalar, ...], dtype: np.dtype
+) -> Scalar | None:
     """Folds an operation whose operands are constants and selections among constants."""
-    nodes = [arg for arg in args if not ops.is_constant(arg)]
+    nodes = [arg for arg in args if not is_constant(arg)]
     if op.name == "convert_element_type" and nodes[0].dtype == np.bool_ != dtype:
         return graph.select(nodes[0], dtype.type(1), dtype.type(0))
     choices: list[tuple] = [_args(node, "select_n") or () for node in nodes]
     for choice in choices:
         if len(choice) != 3 or choice[0] is not choices[0][0]:
             return None
-        if not (ops.is_constant(choice[1]) and ops.is_constant(choice[2])):
+        if not (is_constant(choice[1]) and is_constant(choice[2])):
             return None
     cases = []
     for case in (1, 2):
-        chosen = [arg if ops.is_constant(arg) else arg.args[case] for arg in args]
-        cases.append(ops.fold(op, chosen, dtype))
+        chosen = [arg if is_constant(arg) else arg.args[case] for arg in args]
+        cases.append(folding.fold(op, chosen, dtype))
     return graph.select(choices[0][0], cases[1], cases[0])
 
 
-_RULES: dict[str, Callable] = {
+_RULES: dict[str, Callable[..., Scalar | None]] = {
     "add": _add,
     "sub": _sub,
     "mul": _mul,

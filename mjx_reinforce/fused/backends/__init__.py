@@ -1,1 +1,7 @@
 """Backends: what the scalar graph becomes."""
+
+#: Backends: name -> "module:class" of a `backend.Backend`.
+BACKENDS = {
+    "xla": "mjx_reinforce.fused.backends.xla:XLA",
+    "count": "mjx_reinforce.fused.backends.count:Count",
+}

@@ -11,7 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays, ops
+from mjx_reinforce.fused import arrays
+from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.nodes import is_constant
 
 
 class Unknown(NamedTuple):
@@ -60,7 +62,7 @@ def _window(shape: Sequence[int], sizes: Sequence[int], starts: Sequence[Any]) -
     return Window(positions, unknowns, inside)
 
 
-def _read(graph: Any, flat: np.ndarray, positions: np.ndarray, unknowns: list) -> np.ndarray:
+def _read(graph: Graph, flat: np.ndarray, positions: np.ndarray, unknowns: list) -> np.ndarray:
     """Reads a window; an unknown start outside counts as the nearest inside."""
     if not unknowns:
         return arrays.lift(arrays.take(flat, positions))
@@ -75,7 +77,7 @@ def _read(graph: Any, flat: np.ndarray, positions: np.ndarray, unknowns: list) -
 
 
 def _write(
-    graph: Any, flat: np.ndarray, window: Window, updates: np.ndarray, combine: Callable
+    graph: Graph, flat: np.ndarray, window: Window, updates: np.ndarray, combine: Callable
 ) -> None:
     """Combines updates into a window, in place; a start outside changes nothing."""
     for ks in itertools.product(*(range(unknown.count) for unknown in window.unknowns)):
@@ -106,7 +108,7 @@ def _mode(eqn: Any) -> str:
     return "drop" if "FILL" in str(eqn.params["mode"]) else "clip"
 
 
-def _gather(graph: Any, eqn: Any, operand: np.ndarray, indices: np.ndarray) -> list[np.ndarray]:
+def _gather(graph: Graph, eqn: Any, operand: np.ndarray, indices: np.ndarray) -> list[np.ndarray]:
     dims, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
     aval, flat = eqn.outvars[0].aval, operand.reshape(-1)
     hidden = {*dims.collapsed_slice_dims, *dims.operand_batching_dims}
@@ -128,7 +130,7 @@ def _gather(graph: Any, eqn: Any, operand: np.ndarray, indices: np.ndarray) -> l
     return [arrays.settle(gathered, aval.dtype)]
 
 
-def _fill(graph: Any, eqn: Any, values: np.ndarray, window: Window) -> np.ndarray:
+def _fill(graph: Graph, eqn: Any, values: np.ndarray, window: Window) -> np.ndarray:
     """Replaces the values of a window that is outside by the fill value."""
     dtype = np.dtype(eqn.outvars[0].aval.dtype)
     inside = np.bool_(window.inside)
@@ -152,7 +154,7 @@ def _default_fill(dtype: np.dtype) -> Any:
 
 
 def _scatter(
-    graph: Any, eqn: Any, operand: Any, indices: Any, updates: Any, *, combine: Callable
+    graph: Graph, eqn: Any, operand: Any, indices: Any, updates: Any, *, combine: Callable
 ) -> list[np.ndarray]:
     dims = eqn.params["dimension_numbers"]
     hidden = {*dims.inserted_window_dims, *dims.operand_batching_dims}
@@ -174,11 +176,11 @@ def _scatter(
     return [arrays.settle(flat.reshape(operand.shape), eqn.outvars[0].aval.dtype)]
 
 
-def _clip(graph: Any, starts: Sequence[Any], shape: Sequence[int], sizes: Sequence[int]) -> list:
+def _clip(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequence[int]) -> list:
     """Moves starts to the nearest place that keeps the window inside."""
     clipped = []
     for start, limit, size in zip(starts, shape, sizes, strict=True):
-        if ops.is_constant(start) or isinstance(start, int):
+        if is_constant(start) or isinstance(start, int):
             clipped.append(min(max(int(start), 0), limit - size))
         else:
             low, high = start.dtype.type(0), start.dtype.type(limit - size)
@@ -186,7 +188,7 @@ def _clip(graph: Any, starts: Sequence[Any], shape: Sequence[int], sizes: Sequen
     return clipped
 
 
-def _dynamic_slice(graph: Any, eqn: Any, operand: np.ndarray, *starts: Any) -> list[np.ndarray]:
+def _dynamic_slice(graph: Graph, eqn: Any, operand: np.ndarray, *starts: Any) -> list[np.ndarray]:
     aval = eqn.outvars[0].aval
     window = _window(operand.shape, eqn.params["slice_sizes"], [s[()] for s in starts])
     values = _read(graph, operand.reshape(-1), window.positions, window.unknowns)
@@ -194,7 +196,7 @@ def _dynamic_slice(graph: Any, eqn: Any, operand: np.ndarray, *starts: Any) -> l
 
 
 def _dynamic_update_slice(
-    graph: Any, eqn: Any, operand: np.ndarray, update: np.ndarray, *starts: Any
+    graph: Graph, eqn: Any, operand: np.ndarray, update: np.ndarray, *starts: Any
 ) -> list[np.ndarray]:
     clipped = _clip(graph, [s[()] for s in starts], operand.shape, update.shape)
     flat = arrays.lift(operand).reshape(-1).copy()
@@ -202,7 +204,7 @@ def _dynamic_update_slice(
     return [arrays.settle(flat.reshape(operand.shape), eqn.outvars[0].aval.dtype)]
 
 
-def _replace(graph: Any, old: Any, new: Any) -> Any:
+def _replace(graph: Graph, old: Any, new: Any) -> Any:
     return new
 
 

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.fused import arrays
+from mjx_reinforce.fused.graph import Graph
 
 
-def _reduce(graph: Any, eqn: Any, x: np.ndarray, *, combine: str, empty: float) -> list:
+def _reduce(graph: Graph, eqn: Any, x: np.ndarray, *, combine: str, empty: float) -> list:
     """Combines the elements along some axes, from the first to the last."""
     axes, aval = tuple(eqn.params["axes"]), eqn.outvars[0].aval
     if x.size == 0:
@@ -21,7 +22,7 @@ def _reduce(graph: Any, eqn: Any, x: np.ndarray, *, combine: str, empty: float) 
     return [arrays.pack(reduced, aval.shape, aval.dtype)]
 
 
-def _cumulate(graph: Any, eqn: Any, x: np.ndarray, *, combine: Callable) -> list[np.ndarray]:
+def _cumulate(graph: Graph, eqn: Any, x: np.ndarray, *, combine: Callable) -> list[np.ndarray]:
     """Combines each element with all before it (after it, if reversed)."""
     step = -1 if eqn.params["reverse"] else 1
     lines = np.moveaxis(arrays.lift(x), eqn.params["axis"], -1)[..., ::step].copy()
@@ -36,13 +37,13 @@ def _named(name: str) -> Callable:
     return lambda graph, x, y: graph.call(name, x, y)
 
 
-def _logaddexp(graph: Any, x: Any, y: Any) -> Any:
+def _logaddexp(graph: Graph, x: Any, y: Any) -> Any:
     largest = graph.call("max", x, y)
     terms = [graph.call("exp", graph.call("sub", term, largest)) for term in (x, y)]
     return graph.call("add", largest, graph.call("log", graph.call("add", *terms)))
 
 
-def _arg_extreme(graph: Any, eqn: Any, x: np.ndarray, *, better: str) -> list[np.ndarray]:
+def _arg_extreme(graph: Graph, eqn: Any, x: np.ndarray, *, better: str) -> list[np.ndarray]:
     """The position of the first extreme element; the first NaN counts as extreme."""
     (axis,), aval = eqn.params["axes"], eqn.outvars[0].aval
     rows = np.moveaxis(x, axis, -1).reshape(-1, x.shape[axis])
@@ -50,7 +51,7 @@ def _arg_extreme(graph: Any, eqn: Any, x: np.ndarray, *, better: str) -> list[np
     return [arrays.pack(positions, aval.shape, aval.dtype)]
 
 
-def _first_extreme(graph: Any, row: list, better: str, dtype: np.dtype) -> Any:
+def _first_extreme(graph: Graph, row: list, better: str, dtype: np.dtype) -> Any:
     best, where = row[0], dtype.type(0)
     for i, value in enumerate(row[1:], 1):
         wins = graph.call("or", graph.call(better, value, best), graph.call("ne", value, value))
@@ -60,7 +61,7 @@ def _first_extreme(graph: Any, row: list, better: str, dtype: np.dtype) -> Any:
     return where
 
 
-def _sort(graph: Any, eqn: Any, *operands: np.ndarray) -> list[np.ndarray]:
+def _sort(graph: Graph, eqn: Any, *operands: np.ndarray) -> list[np.ndarray]:
     """Sorts short arrays by exchanging neighbours, which is stable; NaN comes last."""
     axis, num_keys = eqn.params["dimension"], eqn.params["num_keys"]
     columns = [np.moveaxis(arrays.lift(x), axis, -1).copy() for x in operands]
@@ -75,7 +76,7 @@ def _sort(graph: Any, eqn: Any, *operands: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def _exchange(graph: Any, lines: Any, i: int, num_keys: int) -> None:
+def _exchange(graph: Graph, lines: Any, i: int, num_keys: int) -> None:
     """Puts elements i and i + 1 in order, in place."""
     swap = np.False_
     for line in reversed(lines[:num_keys]):
@@ -87,8 +88,8 @@ def _exchange(graph: Any, lines: Any, i: int, num_keys: int) -> None:
         line[i], line[i + 1] = graph.select(swap, high, low), graph.select(swap, low, high)
 
 
-def _precedes(graph: Any, x: Any, y: Any) -> Any:
-    """Tells whether x < y, where NaN is above everything."""
+def _precedes(graph: Graph, x: Any, y: Any) -> Any:
+    """Returns whether x < y, where NaN is above everything."""
     number, nan = graph.call("eq", x, x), graph.call("ne", y, y)
     return graph.call("or", graph.call("lt", x, y), graph.call("and", number, nan))
 
