@@ -36,35 +36,12 @@ def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 3
         ValueError: if no argument is mapped, the mapped sizes differ, or an axis does not fit.
         UnsupportedPrimitive: if fn uses a primitive that has no rule.
     """
-    programs: dict[Any, scalarized.Scalarized] = {}  # writing one out takes about a second
-
-    def write(*args: Any, **kwargs: Any) -> tuple[scalarized.Scalarized, list[int | None]]:
-        axes = [*_axes(in_axes, args), *_axes(0, kwargs)]
-        leaves, in_tree = jax.tree.flatten((args, kwargs))
-        axes = [
-            None if axis is None else _axis(axis, leaf.ndim)
-            for axis, leaf in zip(axes, leaves, strict=True)
-        ]
-        examples = [_example(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
-
-        def flat_fn(*flat: Any) -> Any:
-            inner_args, inner_kwargs = jax.tree.unflatten(in_tree, flat)
-            return fn(*inner_args, **inner_kwargs)
-
-        varying = tuple(axis is not None for axis in axes)
-        precision = jnp.result_type(float)  # constants inside depend on it
-        seen = (in_tree, tuple((x.shape, x.dtype) for x in examples), varying, precision)
-        written = programs.get(seen)
-        if written is None:
-            written = scalarized.build(flat_fn, examples, varying, branch_cost)
-            if not written.captures:
-                programs[seen] = written
-        return written, axes
+    write = _Writer(fn, in_axes, branch_cost)
 
     @functools.wraps(fn)
     def mapped(*args: Any, **kwargs: Any) -> Any:
         args, kwargs = jax.tree.map(jnp.asarray, (args, kwargs))
-        written, axes = write(*args, **kwargs)
+        written, axes = write(args, kwargs)
         leaves = jax.tree.leaves((args, kwargs))
         batch = _batch_size(leaves, axes)
         rows = [_rows(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
@@ -79,8 +56,46 @@ def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 3
         return jax.tree.unflatten(out_tree, outputs)
 
     # The type that `wraps` gives a function has no room for attributes.
-    mapped.write = lambda *args, **kwargs: write(*args, **kwargs)[0]  # pyright: ignore[reportAttributeAccessIssue]
+    mapped.write = lambda *args, **kwargs: write(args, kwargs)[0]  # pyright: ignore[reportAttributeAccessIssue]
     return mapped
+
+
+class _Writer:
+    """Writes a function out once for each kind of arguments."""
+
+    def __init__(self, fn: Callable, in_axes: Any, branch_cost: int):
+        self._fn = fn
+        self._in_axes = in_axes
+        self._branch_cost = branch_cost
+        self._written: dict[Any, scalarized.Scalarized] = {}
+
+    def __call__(
+        self, args: tuple, kwargs: dict[str, Any]
+    ) -> tuple[scalarized.Scalarized, list[int | None]]:
+        """Returns the function written out for these arguments, and the axis of each leaf."""
+        axes = [*_axes(self._in_axes, args), *_axes(0, kwargs)]
+        leaves, in_tree = jax.tree.flatten((args, kwargs))
+        axes = [
+            None if axis is None else _axis(axis, leaf.ndim)
+            for axis, leaf in zip(axes, leaves, strict=True)
+        ]
+        examples = [_example(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
+        varying = tuple(axis is not None for axis in axes)
+        precision = jnp.result_type(float)  # constants inside depend on it
+        key = (in_tree, tuple((x.shape, x.dtype) for x in examples), varying, precision)
+        written = self._written.get(key)
+        if written is None:  # writing it out takes about a second
+            written = self._write(in_tree, examples, varying)
+            if not written.captures:
+                self._written[key] = written
+        return written, axes
+
+    def _write(self, in_tree: Any, examples: list, varying: tuple) -> scalarized.Scalarized:
+        def flat_fn(*flat: Any) -> Any:
+            args, kwargs = jax.tree.unflatten(in_tree, flat)
+            return self._fn(*args, **kwargs)
+
+        return scalarized.build(flat_fn, examples, varying, self._branch_cost)
 
 
 def _is_none(x: Any) -> bool:

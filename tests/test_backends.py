@@ -1,0 +1,219 @@
+"""Every backend knows every operation, and a new one is a class and a line."""
+
+import ast
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from mjx_reinforce import fused
+from mjx_reinforce.fused import folding, ops
+from mjx_reinforce.fused.backends import BACKENDS
+from mjx_reinforce.fused.backends.backend import Backend
+from mjx_reinforce.fused.backends.xla import XLA
+from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.registry import load
+
+#: Operands of which every float operation is finite.
+FLOATS = np.float32([0.25, 0.5, 0.75])
+BITS = np.int32([6, 3, 0])
+#: What an operation takes, if it is not one or two floats.
+ARITY = {"select_n": 3, "regularized_incomplete_beta": 3}
+TWO = {
+    *("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne", "lt", "le", "gt", "ge", "sub"),
+    *("div", "rem", "pow", "atan2", "nextafter", "shift_left", "shift_right_arithmetic"),
+    *("shift_right_logical", "igamma", "igamma_grad_a", "igammac", "polygamma", "zeta"),
+    "random_gamma_grad",
+}
+ON_BITS = {
+    *("and", "or", "xor", "not", "shift_left", "shift_right_arithmetic", "shift_right_logical"),
+    *("clz", "population_count"),
+}
+PARAMS = {
+    "convert_element_type": {"new_dtype": np.dtype(np.int32)},
+    "reduce_precision": {"exponent_bits": 8, "mantissa_bits": 7},
+    "round": {"rounding_method": lax.RoundingMethod.TO_NEAREST_EVEN},
+}
+
+
+def operands_of(name):
+    values = BITS if name in ON_BITS else FLOATS
+    operands = list(values[: 2 if name in TWO else ARITY.get(name, 1)])
+    if name == "select_n":
+        operands[0] = np.True_
+    if name == "acosh":
+        operands = [np.float32(1.5)]
+    if name == "zeta":
+        operands = [np.float32(1.5), np.float32(0.5)]
+    if name == "polygamma":
+        operands = [np.float32(1), np.float32(0.5)]
+    return operands
+
+
+def dtype_of(op, operands):
+    if op.name == "convert_element_type":
+        return dict(op.params)["new_dtype"]
+    return np.dtype(bool) if ops.FACTS[op.name].is_predicate else operands[-1].dtype
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_backend_with_a_table_knows_every_operation(backend):
+    table = load(BACKENDS[backend]).OPERATIONS
+    if table is not None:
+        assert set(table) == set(ops.FACTS)
+
+
+@pytest.mark.parametrize("name", ops.FACTS)
+def test_constants_fold_to_what_jax_computes(name):
+    """The same operation on constants, on lanes, and on a lane and constants."""
+    op = ops.Op(name, tuple(sorted(PARAMS.get(name, {}).items())))
+    operands = operands_of(name)
+    dtype = dtype_of(op, operands)
+    folded = folding.fold(op, operands, dtype)
+    assert (folded.dtype, np.ndim(folded)) == (dtype, 0)
+    assert np.isfinite(folded)
+    for num_lanes in {1, len(operands)}:
+        graph = Graph(branch_cost=0, unrolled=0)
+        leaves = [graph.leaf(x.dtype, True, position=(0, i)) for i, x in enumerate(operands)]
+        mixed = (*leaves[:num_lanes], *operands[num_lanes:])
+        backend = XLA(lambda place: jnp.full(2, operands[place[1]]), (2,), fused.any_lane)
+        node = graph.apply(op, mixed, dtype)
+        (results,) = backend.compile([node] if node.op else [], [[node]])
+        np.testing.assert_allclose(results[0], [folded] * 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", [n for n, facts in ops.FACTS.items() if facts.commutes])
+def test_operations_that_commute_are_shared(name):
+    graph = Graph(branch_cost=0, unrolled=0)
+    x, y = (graph.leaf(operands_of(name)[0].dtype, True) for _ in range(2))
+    assert graph.call(name, x, y) is graph.call(name, y, x)
+
+
+def test_equal_operations_are_equal():
+    float32, int32 = np.dtype(np.float32), np.dtype(np.int32)
+    assert len({ops.conversion(float32), ops.conversion(float32), ops.conversion(int32)}) == 2
+
+
+class Listing(Backend[str]):
+    """Writes a program out as text, one statement a line."""
+
+    def __init__(self):
+        self.lines = []
+
+    def constant(self, number):
+        return f"{number:g}"
+
+    def leaf(self, node):
+        return f"x{node.position[1]}"
+
+    def node(self, node, operands):
+        return self.assign(f"{node.op.name}({', '.join(operands)})")
+
+    def gate(self, gate, env):
+        cold = [self.value(out.cold, env) for out in gate.outs]
+        self.lines.append(f"if any {self.value(gate.predicate, env)}")
+        inner = self.inside(gate.body, env)
+        hot = [self.value(out.hot, inner) for out in gate.outs]
+        return [self.assign(f"{on} else {off}") for on, off in zip(hot, cold, strict=True)]
+
+    def loop(self, loop, env):
+        starts = [self.assign(self.value(carry.init, env)) for carry in loop.carries]
+        rows = [[self.value(x, env) for x in element.values] for element in loop.elements]
+        self.lines.append(f"repeat {loop.length}")
+        known = {c.leaf: start for c, start in zip(loop.carries, starts, strict=True)}
+        known.update(
+            {e.leaf: f"[{' '.join(row)}]" for e, row in zip(loop.elements, rows, strict=True)}
+        )
+        inner = self.inside(loop.body, env, known)
+        ends = [self.value(carry.next, inner) for carry in loop.carries]
+        kept = [self.value(record.value, inner) for record in loop.records]
+        self.lines.append(f"next {' '.join(ends)}")
+        return ends, [
+            [f"{y}[{t}]" for t in range(len(record.outs))]
+            for y, record in zip(kept, loop.records, strict=True)
+        ]
+
+    def result(self, outputs):
+        return [*self.lines, *(f"return {' '.join(leaf)}" for leaf in outputs)]
+
+    def assign(self, text):
+        name = f"v{sum(' = ' in line for line in self.lines)}"
+        self.lines.append(f"{name} = {text}")
+        return name
+
+
+@pytest.fixture
+def listing(monkeypatch):
+    monkeypatch.setitem(BACKENDS, "listing", Listing)
+    return lambda fn, *args, **kwargs: fused.scalarize(fn, *args, **kwargs).compile("listing")
+
+
+def test_a_backend_of_arithmetic(listing):
+    assert listing(lambda x: (x[0] * 2 + x[1], x[1]), jnp.ones(2)) == [
+        "v0 = mul(x0, 2)",
+        "v1 = add(v0, x1)",
+        "return v1",
+        "return x1",
+    ]
+
+
+def test_a_backend_gets_only_what_is_needed_of_a_loop(listing):
+    def fn(x):
+        def body(carry, row):
+            y, unused = carry
+            return (y * row, jnp.exp(unused)), (y, unused)
+
+        (y, _), (kept, _) = lax.scan(body, (x, x), jnp.arange(2.0, 8.0))
+        return y, kept[1]
+
+    assert listing(fn, 1.0) == [
+        "v0 = x0",
+        "repeat 6",
+        "v1 = mul(v0, [2 3 4 5 6 7])",
+        "next v1",
+        "return v1",
+        "return v0[1]",
+    ]
+
+
+def test_a_backend_gets_a_gate_for_an_expensive_branch(listing):
+    fn = lambda x: lax.cond(x > 0, lambda: jnp.sin(jnp.cos(x)), lambda: x)  # noqa: E731
+    assert listing(fn, 1.0, branch_cost=1) == [
+        "v0 = gt(x0, 0)",
+        "if any v0",
+        "v1 = cos(x0)",
+        "v2 = sin(v1)",
+        "v3 = select_n(v0, x0, v2)",
+        "v4 = v3 else x0",
+        "return v4",
+    ]
+
+
+def test_operations_are_counted_inside_loops_and_branches():
+    def fn(x):
+        y = lax.fori_loop(0, 30, lambda _, y: jnp.sin(y) * x, x)
+        return lax.cond(x > 0, lambda: jnp.cos(jnp.cos(x)), lambda: y)
+
+    counted = fused.scalarize(fn, 1.0, branch_cost=1).operations
+    assert counted == {"gt": 1, "sin": 1, "mul": 1, "cos": 2, "select_n": 1}
+
+
+def test_an_unknown_backend_is_refused():
+    with pytest.raises(ValueError, match=r"unknown backend 'xal'. Did you mean 'xla'"):
+        fused.scalarize(jnp.sin, 1.0).compile("xal")
+
+
+@pytest.mark.parametrize("module", ["ops", "nodes", "graph", "simplify", "liveness", "rules"])
+def test_the_graph_itself_knows_no_jax(module):
+    """What is computed is the backend's; the graph, its algebra and its rules move scalars."""
+    root = Path(fused.__file__).parent / module
+    for path in root.glob("*.py") if root.is_dir() else [root.with_suffix(".py")]:
+        names = [
+            name
+            for node in ast.walk(ast.parse(path.read_text("utf-8")))
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            for name in [getattr(node, "module", None), *(alias.name for alias in node.names)]
+        ]
+        assert not [name for name in names if (name or "").partition(".")[0] == "jax"], path
