@@ -186,8 +186,10 @@ def with_solution(
         qfrc_constraint: [nv] the constraints' joint forces.
         efc_force: [rows] the constraint rows' forces.
     """
-    solution = {"qacc": qacc, "qfrc_constraint": qfrc_constraint, "_impl.efc_force": efc_force}
-    return cast(mjx.Data, data.tree_replace(solution))  # flax types it as any PyTreeNode
+    solved = data.tree_replace(
+        {"qacc": qacc, "qfrc_constraint": qfrc_constraint, "_impl.efc_force": efc_force}
+    )
+    return cast(mjx.Data, solved)  # flax types it as any PyTreeNode
 
 
 class Simulation:
