@@ -1,4 +1,4 @@
-"""A drop-in for `jax.vmap` that turns wiring into nothing and leaves only arithmetic.
+"""A drop-in for `jax.vmap` that leaves only elementwise arithmetic, loops and branches.
 
 A function such as `mjx.step` on a small model is thousands of operations on vectors of three and
 matrices of two by two, most of them slices and reshapes. Under `jax.vmap` each becomes a pass over

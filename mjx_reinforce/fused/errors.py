@@ -9,5 +9,5 @@ class UnsupportedPrimitive(NotImplementedError):  # noqa: N818 (reads as what it
         reason = f" ({detail})" if detail else ""
         super().__init__(
             f"fused.vmap has no rule for the primitive '{name}'{reason}, used at {source}. "
-            "Use jax.vmap for this function, or add a rule in mjx_reinforce/fused."
+            "Use jax.vmap for this function, or add a rule in mjx_reinforce/fused/rules."
         )

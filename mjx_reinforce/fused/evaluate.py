@@ -43,7 +43,7 @@ def run(
 
 
 def _apply(graph: Graph, eqn: Any, used: list[bool], operands: list[np.ndarray]) -> list:
-    """Finds and applies the rule for one equation."""
+    """Applies the rule of one equation; what has no rule may call a program that can be run."""
     name = eqn.primitive.name
     if name in _CONTROL:
         return _CONTROL[name](graph, functools.partial(run, graph), eqn, used, *operands)

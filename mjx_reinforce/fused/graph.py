@@ -1,4 +1,4 @@
-"""The scalar graph: what a program becomes before it is JAX again.
+"""The scalar graph: a program as elementwise operations on scalars.
 
 `nodes` has the parts; here they are made. Equal nodes are one object, so common subexpressions are
 shared. A node that needs nothing of a loop's body is placed before the loop. Nothing is moved out
@@ -47,13 +47,13 @@ class Graph:
 
     @contextlib.contextmanager
     def loop_body(self) -> Iterator[Scope]:
-        """Opens a scope that invariant nodes leave."""
+        """Opens the scope of a loop's body; what is the same in each iteration is placed outside."""
         with self._open(self.scope.floor) as scope:
             yield scope
 
     @contextlib.contextmanager
     def branch(self) -> Iterator[Scope]:
-        """Opens a scope that nothing leaves."""
+        """Opens the scope of a branch; everything made in it stays in it."""
         with self._open(self.scope.depth + 1) as scope:
             yield scope
 

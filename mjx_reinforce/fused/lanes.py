@@ -1,4 +1,4 @@
-"""Reductions over lanes that an outer `jax.vmap` cannot undo."""
+"""Reductions over lanes that stay reductions under an outer `jax.vmap`."""
 
 from typing import Any
 

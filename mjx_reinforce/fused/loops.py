@@ -1,4 +1,4 @@
-"""Rules for `while` and `scan`: real loops, that end when no lane needs another iteration."""
+"""Rules for `while` and `scan`: loops that end when no lane needs another iteration."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,7 +15,7 @@ UNROLLED_LENGTH = 4
 
 
 def while_rule(graph: Graph, run: Callable, eqn: Any, used: Any, *operands: np.ndarray) -> list:
-    """A lane that is done keeps its values while others go on."""
+    """Makes a loop; a lane that is done keeps its values while others go on."""
     num_cond, num_body = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
     cond_consts, body_consts = operands[:num_cond], operands[num_cond : num_cond + num_body]
     carry = arrays.Layout([out.aval for out in eqn.outvars])
@@ -41,7 +41,7 @@ def while_rule(graph: Graph, run: Callable, eqn: Any, used: Any, *operands: np.n
 
 
 def scan_rule(graph: Graph, run: Callable, eqn: Any, used: Any, *operands: np.ndarray) -> list:
-    """A short scan is written out; another becomes a loop, ended early where that is the same."""
+    """Writes a short scan out; makes a loop of a longer one, which may end early."""
     length, parts = eqn.params["length"], jaxprs.scan_parts(eqn)
     body = jaxprs.program(eqn.params["jaxpr"])
     split = parts.num_consts + parts.num_carry

@@ -109,7 +109,7 @@ class Scalarized:
 
 
 def scalarize(fn: Callable, *examples: Any, branch_cost: int = 400) -> Scalarized:
-    """Writes a function out in scalars, to be evaluated on lanes that live anywhere.
+    """Writes a function out in scalars, to be evaluated on lanes in any memory.
 
     What comes back emits only elementwise operations, loops and branches, and constants only as
     NumPy scalars, so a Pallas kernel can call it on values in registers.
