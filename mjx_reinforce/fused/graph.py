@@ -47,7 +47,7 @@ class Graph:
 
     @contextlib.contextmanager
     def loop_body(self) -> Iterator[Scope]:
-        """Opens the scope of a loop's body; what is the same in each iteration is placed outside."""
+        """Opens the scope of a loop's body; what each iteration has the same is placed outside."""
         with self._open(self.scope.floor) as scope:
             yield scope
 
