@@ -47,7 +47,7 @@ class Graph:
 
     @contextlib.contextmanager
     def loop_body(self) -> Iterator[Scope]:
-        """Opens the scope of a loop's body; what each iteration has the same is placed outside."""
+        """Opens the scope of a loop's body; nodes that do not depend on it are placed outside."""
         with self._open(self.scope.floor) as scope:
             yield scope
 
