@@ -27,7 +27,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.runs.build import build
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.presets import PRESETS
-from mjx_reinforce.train import Programs
+from mjx_reinforce.runs.state import compile_programs, first_state
 from reproduce_cases import CASES, Case, limit, load_reference
 from reproduce_figures import draw
 from reproduce_mistakes import STALE, clamped, stale_starts
@@ -158,17 +158,18 @@ def train(
         learner, horizon = build(env, config)
     if stale:
         learner = stale_starts(lambda env: build(env, config)[0], env)
-    programs = Programs(env, learner, horizon, config)
+    state = first_state(learner, config)
+    programs = compile_programs(env, learner, horizon, config, state)
     compiled = time.perf_counter()
     scores, env_steps, columns = [], 0, Progress.get_default_columns()
     with Progress(*columns, MofNCompleteColumn(), TimeElapsedColumn()) as progress:
         bar = progress.add_task(label, total=config.max_updates)
         for _ in range(-(-config.max_updates // config.eval_every)):
-            programs.carry, metrics = programs.advance(programs.carry)
+            state, metrics = programs.advance(state)
             active = np.asarray(metrics["active"])
             env_steps += int(np.sum(np.asarray(metrics["env_steps"]), where=active))
             evaluated = score == "eval_return"
-            new = programs.evaluate()[score][None] if evaluated else np.asarray(metrics[score])
+            new = programs.evaluate(state)[score][None] if evaluated else np.asarray(metrics[score])
             scores.append(new)
             progress.update(bar, completed=min(len(scores) * config.eval_every, config.max_updates))
     seconds = time.perf_counter() - compiled

@@ -1,25 +1,26 @@
 """``python -m mjx_reinforce.train`` trains many seeds at once and reports over them."""
 
+import contextlib
 import dataclasses
 import gc
 import os
 import sys
 import threading
 import time
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn
 
-import numpy as np
 import tyro
 
 from mjx_reinforce import envs
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs.build import build, policy_settings
-from mjx_reinforce.runs.config import GROUPS, Config, check
+from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.runs.files import prepare
 from mjx_reinforce.runs.presets import PRESETS
+from mjx_reinforce.runs.settings import GROUPS
 
 _FILES = (
     "config.json",
@@ -33,17 +34,15 @@ _FILES = (
 
 def main() -> None:
     """Reads the command line, trains, and exits: 0 done, 2 bad input, 130 interrupted."""
-    gc.disable()  # imports and tracing make many objects and no garbage: a second in eight
     directory = None
     try:
-        config = parse(sys.argv[1:])
-        check(config)
-        from mjx_reinforce.runs import files as records
-
-        directory = records.prepare(config.output, config.env, config.overwrite)
-        env = envs.make(config.env)
-        _configure_jax()
-        learner, horizon = build(env, config)
+        with _collection_paused():
+            config = parse(sys.argv[1:])
+            check(config)
+            directory = prepare(config.output, config.env, config.overwrite)
+            env = envs.make(config.env)
+            _configure_jax()
+            learner, horizon = build(env, config)
     except ValueError as error:
         _refuse(str(error), directory)
     try:
@@ -115,110 +114,77 @@ def _configure_jax() -> None:
         jax.config.update("jax_default_matmul_precision", "highest")
 
 
-class Programs:
-    """The two compiled programs of a run, over all seeds at once.
-
-    A carry is ``(TrainState [S, ...], env steps used [S])``. ``advance`` moves it on
-    by ``eval_every`` updates, except seeds whose budget is used, which stand still;
-    it donates its argument. ``evaluate`` only looks.
-    """
-
-    def __init__(self, env: Any, learner: Any, horizon: int, config: Config):
-        """Traces both, then compiles them side by side."""
-        import jax
-        import jax.numpy as jnp
-        from jax import lax
-
-        from mjx_reinforce.runs.evaluation import evaluate
-
-        def update(carry, _):
-            states, used = carry
-            active = jnp.ones(config.num_seeds, bool)
-            if config.env_steps is not None:
-                active &= used < config.env_steps
-            if config.max_updates is not None:
-                active &= states.num_updates < config.max_updates
-            states, metrics = jax.vmap(learner.step)(states, active)
-            return (states, used + metrics["env_steps"]), metrics | {"active": active}
-
-        def advance(carry):
-            return lax.scan(update, carry, length=config.eval_every)
-
-        def look(actor, key):
-            return jax.vmap(
-                lambda actor: evaluate(
-                    env,
-                    learner,
-                    actor,
-                    key,
-                    num_episodes=config.eval_episodes,
-                    horizon=horizon,
-                )
-            )(actor)
-
-        # Two domains under one seed: whatever the user types, no key is in both.
-        train_key = jax.random.fold_in(jax.random.key(config.seed), 0)
-        self.eval_key = jax.random.fold_in(jax.random.key(config.eval_seed), 1)
-        states = jax.jit(jax.vmap(learner.init))(jax.random.split(train_key, config.num_seeds))
-        self.carry = (states, jnp.zeros(config.num_seeds, jnp.int32))
-        with ThreadPoolExecutor() as pool:  # the first compiles while the second is traced
-            look_program = pool.submit(jax.jit(look).lower(states.actor, self.eval_key).compile)
-            lowered = jax.jit(advance, donate_argnums=0).lower(self.carry)
-            self.advance = lowered.compile()
-            self._look = look_program.result()
-
-    def evaluate(self) -> dict[str, np.ndarray]:
-        """Returns the evaluation of the present policies, [S] each."""
-        return _to_numpy(self._look(self.carry[0].actor, self.eval_key))
-
-
 def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path) -> bool:
     """Trains to the budget, or to Ctrl-C, and writes the run's files.
+
+    Args:
+      env: what is trained on.
+      learner: how.
+      horizon: the time limit of an episode in steps.
+      config: the settings of the run.
+      directory: where the files go.
 
     Returns:
       Whether it was interrupted.
     """
-    from mjx_reinforce.export import policy_files as checkpoint
-    from mjx_reinforce.export.files import write_json
-    from mjx_reinforce.reports import curves as report
-    from mjx_reinforce.runs import files as records
-    from mjx_reinforce.runs.display import Display, Interrupt, print_summary
-    from mjx_reinforce.runs.log import RunLog
+    with _collection_paused():
+        from mjx_reinforce.reports.curves import draw_learning_curve, load_libraries
+        from mjx_reinforce.runs.display import Display, print_summary
+        from mjx_reinforce.runs.interrupt import Interrupt
+        from mjx_reinforce.runs.log import RunLog
+        from mjx_reinforce.runs.record import Record
+        from mjx_reinforce.runs.state import compile_programs, first_state
 
-    settings = dataclasses.asdict(config) | {"horizon": horizon, "output": str(directory)}
     threshold = getattr(env, "reward_threshold", None)
-    with Display() as display, Interrupt(display) as interrupt:
+    with Display() as display, Interrupt(display.say) as interrupt:
         display.say(f"engine {learner.engine.name}: {learner.engine.why}; compiling")
         started = time.perf_counter()
-        programs = Programs(env, learner, horizon, config)
+        with _collection_paused():
+            state = first_state(learner, config)
+            programs = compile_programs(env, learner, horizon, config, state)
         compile_seconds = time.perf_counter() - started
-        gc.freeze()
-        gc.enable()
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
-        write_json(directory / "config.json", settings | records.provenance())
-        display.say(f"compiled in {compile_seconds:.1f} s")
-        display.start()
-        threading.Thread(target=report.load_libraries, daemon=True).start()
-        log = RunLog(config, directory, display, learner.engine.name, threshold)
-        while not interrupt.is_set():
-            log.evaluation(programs.evaluate())
-            if log.finished():
+        record, log = Record(config, threshold), RunLog(directory)
+        log.begin(dataclasses.asdict(config) | {"horizon": horizon, "output": str(directory)})
+        display.start(compile_seconds)
+        threading.Thread(target=load_libraries, daemon=True).start()
+        began = time.perf_counter()
+        while True:
+            result = programs.evaluate(state)
+            seconds = time.perf_counter() - began
+            log.add_rows(record.add_evaluation(result, seconds))
+            display.show_progress(record.progress(seconds))
+            if record.finished() or interrupt.is_set():
                 break
-            programs.carry, metrics = programs.advance(programs.carry)
-            log.updates(_to_numpy(metrics))
-        else:
-            log.evaluation(programs.evaluate())
-        actor = programs.carry[0].actor
-    checkpoint.save_policy(directory / "policy", actor, policy_settings(env, config))
-    summary = log.finish(compile_seconds)
+            state, metrics = programs.advance(state)
+            for event in record.add_updates(metrics):
+                display.show_nonfinite(event)
+    log.save_policy(state.train_states.actor, policy_settings(env, config))
+    run_seconds = time.perf_counter() - began
+    summary = record.summary(learner.engine.name, compile_seconds, run_seconds)
+    history, training = record.history(), record.training()
+    axis = "episodes" if config.env_steps is None else "env_steps"
+    picture = draw_learning_curve(history, training, config.env, threshold, axis)
+    log.finish(training, picture, summary)
     print_summary(display.console, summary, directory)
     return interrupt.is_set()
 
 
-def _to_numpy(tree: dict[str, Any]) -> dict[str, np.ndarray]:
-    import jax
+@contextlib.contextmanager
+def _collection_paused() -> Iterator[None]:
+    """Stops the garbage collector in a block that makes many objects and no garbage.
 
-    return {name: np.asarray(value) for name, value in jax.device_get(tree).items()}
+    Imports and tracing are such: it saves a second in eight. The objects of a block that
+    succeeds are never looked at again.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+        gc.freeze()
+    finally:
+        if enabled:
+            gc.enable()
 
 
 if __name__ == "__main__":

@@ -104,6 +104,14 @@ def test_first_weights_are_pytorchs(name):
             assert 0.8 * bound < float(jnp.max(jnp.abs(x))) <= bound
 
 
+@pytest.mark.parametrize("name", ["auto", "vmap", "fused", "kernel"])
+def test_engines_have_names(name, capsys):
+    assert train_module.parse(["--engine", name]).engine == name
+    with pytest.raises(SystemExit):
+        train_module.parse(["--engine", "mjx"])
+    assert "'vmap'" in capsys.readouterr().err
+
+
 def test_an_unknown_preset_is_explained(monkeypatch, capsys):
     assert run(monkeypatch, "gymnasium-tutorail") == 2
     assert "Did you mean 'gymnasium-tutorial'" in capsys.readouterr().err

@@ -1,7 +1,9 @@
 """The command line, end to end on toy environments: files, statistics, errors, Ctrl-C."""
 
 import csv
+import gc
 import json
+import resource
 import signal
 import subprocess
 import sys
@@ -17,7 +19,11 @@ from toys import Survive
 from mjx_reinforce import envs, load_policy
 from mjx_reinforce import train as train_module
 from mjx_reinforce.policies import normalize
-from mjx_reinforce.reports import curves as report
+from mjx_reinforce.reports.statistics import smooth
+from mjx_reinforce.runs.build import build
+from mjx_reinforce.runs.config import MAX_COUNT, Config, check_step_count
+from mjx_reinforce.runs.files import append_csv, create_csv
+from mjx_reinforce.runs.record import Record
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
 
@@ -147,6 +153,11 @@ def test_the_saved_policy_plays_like_the_trained_one(run, tmp_path):
         (["--horizon", "0"], "--horizon must be at least 1"),
         (["--env-steps", "None"], "nothing would end this run"),
         (["--max-updates", "0"], "--max-updates must be at least 1, got 0"),
+        (["--max-updates", str(2**31)], "--max-updates must be less than 2^31, got 2147483648"),
+        (
+            ["--env-steps", "None", "--max-updates", "134218", "--output", "out"],
+            "give --env-steps, or lower",
+        ),
         (["--max-grad-norm", "0"], "--max-grad-norm must be positive and finite, got 0.0"),
         (["--weight-decay", "-1"], "--weight-decay must be finite and not negative"),
         (["--minibatch-size", "0"], "--minibatch-size must be at least 1"),
@@ -188,10 +199,125 @@ def test_a_run_beyond_all_memory_is_refused(run, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("arguments", [["--num-seeds", "0"], ["--help"]])
+def test_the_garbage_collector_runs_after_every_way_out(run, arguments):
+    assert gc.isenabled()
+    run(*arguments)
+    assert gc.isenabled()
+
+
+@pytest.mark.parametrize(
+    ("settings", "most"),
+    [
+        # 320 env steps an update, all of which the last one before the budget may add.
+        ({"env_steps": None, "max_updates": 100}, 32_000),
+        ({"env_steps": 1000, "max_updates": None}, 1319),
+        ({"env_steps": 1000, "max_updates": 3}, 960),
+        ({"env_steps": 1000, "max_updates": 100}, 1319),
+    ],
+)
+def test_env_steps_that_cannot_be_counted_are_refused(monkeypatch, settings, most):
+    config = Config(num_episodes=16, **settings)
+    monkeypatch.setattr("mjx_reinforce.runs.config.MAX_COUNT", most)
+    check_step_count(config, horizon=20)
+    monkeypatch.setattr("mjx_reinforce.runs.config.MAX_COUNT", most - 1)
+    with pytest.raises(ValueError, match=f"a seed may play {most:,} env steps"):
+        check_step_count(config, horizon=20)
+
+
+def test_counts_fit_into_int32():
+    assert jnp.iinfo(jnp.int32).max == MAX_COUNT
+
+
+def test_a_ready_policy_may_be_trained():
+    config = Config(env="Survive-v0")
+    policy = build(Survive(), config)[0].policy._replace(distribution="another")
+    assert build(Survive(), config)[0].policy != policy
+    # Only ars does not look into the distribution while it builds.
+    config = Config(env="Survive-v0", algorithm="ars", engine="fused")
+    assert build(Survive(), config, policy)[0].policy is policy
+
+
+METRICS = {  # two updates of two seeds; the second seed stands still in the second update
+    "active": np.array([[True, True], [True, False]]),
+    "updates_total": np.array([[1, 1], [2, 1]], np.int32),
+    "env_steps_total": np.array([[30, 40], [70, 40]], np.int32),
+    "env_steps": np.array([[30, 40], [40, 0]], np.int32),
+    "simulated_steps": np.array([[50, 60], [40, 0]], np.int32),
+    "episode_return": np.array([[3.0, 4.0], [5.0, 0.0]], np.float32),
+    "episode_length": np.array([[15.0, 20.0], [20.0, 0.0]], np.float32),
+    "entropy": np.array([[0.5, 0.25], [0.125, 0.0]], np.float32),
+    "gradient_norm": np.array([[1.0, 2.0], [3.0, 0.0]], np.float32),
+    "nonfinite_episodes": np.array([[0, 0], [2, 7]], np.int32),
+    "skipped_update": np.array([[0, 0], [1, 1]], np.int32),
+}
+
+
+def evaluation(*returns):
+    values = np.array(returns, np.float32)
+    return {"eval_return": values, "eval_return_stochastic": values / 2, "eval_length": values}
+
+
+def test_a_record_of_two_seeds_by_hand():
+    config = Config(num_seeds=2, num_episodes=2, env_steps=60, stop_when_solved=True)
+    record = Record(config, threshold=8.0)
+    first = record.add_evaluation(evaluation(1, 9), 0.5)
+    assert [row["train_return"] for row in first] == ["", ""]
+    assert not record.finished()
+    assert record.progress(2.0).fraction == 0
+    assert record.add_updates(METRICS) == [
+        {"seed": 0, "update": 1, "episodes": 2, "skipped": True},
+    ]
+    second = record.add_evaluation(evaluation(7, 10), 1.23456)
+    keys = ("seed", "update", "episodes", "env_steps", "wall_seconds", "train_return")
+    assert [[row[key] for key in keys] for row in second] == [
+        [0, 2, 4, 70, 1.235, 5.0],
+        [1, 1, 2, 40, 1.235, 4.0],
+    ]
+    assert [row["skipped_update"] for row in second] == [1, 0]
+    assert record.progress(2.0) == (40 / 60, 2, 55.0, 8.5, 7.0, 55.0)
+    assert not record.finished()
+    np.testing.assert_array_equal(record.training()["episode_return"], [[3, 4], [5, np.nan]])
+    np.testing.assert_array_equal(record.training()["env_steps"], [[30, 40], [70, 40]])
+    np.testing.assert_array_equal(record.training()["episodes"], [[2, 2], [4, 2]])
+    summary = record.summary("fused", 3.0, 2.0)
+    assert summary["env_steps_to_solve"] == [None, 0]
+    assert summary["useful_step_fraction"] == 110 / 200  # 2 (60 + 40): each waits for the other
+    assert summary["env_steps_per_second"] == 55
+    assert len(summary["nonfinite"]) == 1
+    record.add_evaluation(evaluation(8, 8), 2.0)
+    assert record.finished()
+
+
+def test_a_csv_file_grows_by_whole_rows(tmp_path):
+    path = tmp_path / "table.csv"
+    create_csv(path, ["a", "b"])
+    append_csv(path, ["a", "b"], [{"a": 1, "b": 0.1}, {"b": "", "a": "x,y"}])
+    append_csv(path, ["a", "b"], [{"a": 2, "b": 1e-30}])
+    assert path.read_bytes() == b'a,b\n1,0.1\n"x,y",\n2,1e-30\n'
+
+
+def test_a_full_disk_leaves_no_half_row(tmp_path):
+    """A limit on the size of files fails as a full disk does: after a part was written."""
+    path = tmp_path / "table.csv"
+    create_csv(path, ["a"])
+    append_csv(path, ["a"], [{"a": 1}])
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (7, hard))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            append_csv(path, ["a"], [{"a": 23456}])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.read_bytes() == b"a\n1\n"
+    append_csv(path, ["a"], [{"a": 23456}])
+    assert path.read_bytes() == b"a\n1\n23456\n"
+
+
 def test_smoothing_is_a_mean_of_the_latest():
     values = np.arange(12.0).reshape(6, 2)
     expected = [values[max(0, u - 2) : u + 1].mean(axis=0) for u in range(6)]
-    np.testing.assert_allclose(report.smooth(values, 3), expected)
+    np.testing.assert_allclose(smooth(values, 3), expected)
 
 
 def test_overwrite_is_by_request_alone(run, tmp_path):

@@ -1,12 +1,15 @@
 """Files that are written whole or not at all."""
 
 import contextlib
+import io
 import json
 import os
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -29,6 +32,14 @@ def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Writes JSON; numbers that are not finite become null, which JSON has."""
     text = json.dumps(_finite(value), indent=2, default=str, allow_nan=False)
     write_bytes(path, (text + "\n").encode())
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
+    """Writes a NumPy archive (.npz) of named arrays; no pickle."""
+    archive = io.BytesIO()
+    save = np.savez_compressed if compressed else np.savez
+    save(archive, allow_pickle=False, **arrays)
+    write_bytes(path, archive.getvalue())
 
 
 def _finite(value: Any) -> Any:

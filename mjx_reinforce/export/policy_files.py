@@ -1,6 +1,5 @@
 """Trained policies on disk: a NumPy archive and a JSON file, never pickle."""
 
-import io
 import json
 import zipfile
 from pathlib import Path
@@ -11,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import serialization, traverse_util
 
-from mjx_reinforce.export.files import write_bytes, write_json
-from mjx_reinforce.learners.learner import Actor
+from mjx_reinforce.export.files import write_arrays, write_json
+from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.policies.normalize import Normalizer
 from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.registry import DISTRIBUTIONS, check_name, load
@@ -30,11 +29,9 @@ def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None
         ``shared_trunk``, ``initializer``, ``rescale``: what ``build_policy`` reads.
     """
     flat = traverse_util.flatten_dict(serialization.to_state_dict(actor), sep="/")
-    archive = io.BytesIO()
-    arrays: dict[str, Any] = {name: np.asarray(value) for name, value in flat.items()}
-    np.savez(archive, allow_pickle=False, **arrays)
     directory.mkdir(parents=True, exist_ok=True)
-    write_bytes(directory / "actor.npz", archive.getvalue())
+    arrays = {name: np.asarray(value) for name, value in flat.items()}
+    write_arrays(directory / "actor.npz", arrays)
     write_json(directory / "policy.json", settings)
 
 

@@ -1,63 +1,19 @@
-"""What a run says at its end: a summary, a picture, a table."""
+"""Pictures of how seeds learned."""
 
 import io
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.reports.statistics import iqm, iqm_interval, steps_to_solve
+from mjx_reinforce.reports.statistics import iqm, iqm_interval, smooth
 
 #: Training returns are drawn as means over so many episodes.
 _SMOOTHED_EPISODES = 50
 
 
 def load_libraries() -> None:
-    """Imports what the report needs, half a second of work, while something else runs."""
+    """Imports what drawing needs, half a second of work, so that it can run beside other work."""
     import matplotlib.figure  # noqa: F401
-    import scipy.stats  # noqa: F401
-
-
-def summarize(history: dict[str, np.ndarray], threshold: float | None) -> dict[str, Any]:
-    """Returns the statistics over seeds of a run.
-
-    Args:
-      history: ``eval_return``, and the ``env_steps`` and ``episodes`` until then, each
-        [E, S]: evaluations by seeds.
-      threshold: the return that counts as solved, if any.
-
-    Returns:
-      ``final_returns`` [S], their interquartile mean ``iqm`` with its 95 %
-      interval ``iqm_ci``, ``solve_rate`` (the fraction of seeds whose last
-      evaluation reached the threshold, None without one), and
-      ``env_steps_to_solve`` and ``episodes_to_solve`` [S], until the first that did.
-    """
-    final = history["eval_return"][-1]
-    low, high = iqm_interval(final)
-    return {
-        "final_returns": final.tolist(),
-        "iqm": float(iqm(final)),
-        "iqm_ci": [float(low), float(high)],
-        "solve_rate": None if threshold is None else float(np.mean(final >= threshold)),
-        "env_steps_to_solve": steps_to_solve(
-            history["eval_return"], history["env_steps"], threshold
-        ),
-        "episodes_to_solve": steps_to_solve(history["eval_return"], history["episodes"], threshold),
-    }
-
-
-def to_npz(arrays: dict[str, np.ndarray]) -> bytes:
-    """Returns the contents of a compressed NumPy archive; no pickle."""
-    archive = io.BytesIO()
-    np.savez_compressed(archive, allow_pickle=False, **cast(Any, arrays))
-    return archive.getvalue()
-
-
-def smooth(values: np.ndarray, window: int) -> np.ndarray:
-    """Returns the mean of each value [U, ...] and up to ``window`` - 1 before it."""
-    sums = np.cumsum(np.concatenate([np.zeros_like(values[:1]), values]), axis=0)
-    first = np.maximum(np.arange(len(values)) + 1 - window, 0)
-    count = np.arange(len(values)) + 1 - first
-    return (sums[1:] - sums[first]) / count.reshape(-1, *(1,) * (values.ndim - 1))
 
 
 def draw_learning_curve(
@@ -92,12 +48,7 @@ def draw_learning_curve(
     figure = Figure(figsize=(8, 4.5), dpi=150, layout="constrained")
     axes = figure.subplots()
     if len(training[axis]):
-        episodes = training["episodes"][0, 0]  # an update
-        window = min(-(-_SMOOTHED_EPISODES // episodes), len(training[axis]))
-        label = f"while training, mean of {window * episodes} episodes"
-        smoothed = smooth(training["episode_return"], window)
-        inside = grid[grid >= training[axis][0].max()]
-        _draw_mean(axes, inside, training[axis], smoothed, "tab:orange", label)
+        _draw_training(axes, grid, training, axis)
     alpha = max(0.03, min(0.5, 4 / num_seeds))
     axes.plot(steps, returns, color="tab:blue", linewidth=0.7, alpha=alpha)
     _draw_mean(axes, grid, steps, returns, "tab:blue", "deterministic policy")
@@ -111,6 +62,16 @@ def draw_learning_curve(
     picture = io.BytesIO()
     figure.savefig(picture, format="png")
     return picture.getvalue()
+
+
+def _draw_training(axes: Any, grid: np.ndarray, training: dict[str, np.ndarray], axis: str) -> None:
+    """Draws the smoothed training returns, as ``draw_learning_curve`` says."""
+    episodes = training["episodes"][0, 0]  # an update
+    window = min(-(-_SMOOTHED_EPISODES // episodes), len(training[axis]))
+    label = f"while training, mean of {window * episodes} episodes"
+    smoothed = smooth(training["episode_return"], window)
+    inside = grid[grid >= training[axis][0].max()]
+    _draw_mean(axes, inside, training[axis], smoothed, "tab:orange", label)
 
 
 def _draw_mean(

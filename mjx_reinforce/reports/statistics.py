@@ -1,6 +1,7 @@
 """Statistics over seeds: what a few numbers can and cannot say of a distribution."""
 
 import warnings
+from typing import Any
 
 import numpy as np
 from scipy import stats
@@ -68,3 +69,39 @@ def steps_to_solve(
     solved = returns >= threshold
     first = np.argmax(solved, axis=0)
     return [int(env_steps[e, s]) if solved[e, s] else None for s, e in enumerate(first)]
+
+
+def summarize(history: dict[str, np.ndarray], threshold: float | None) -> dict[str, Any]:
+    """Returns the statistics over seeds of a run.
+
+    Args:
+      history: ``eval_return``, and the ``env_steps`` and ``episodes`` until then, each
+        [E, S]: evaluations by seeds.
+      threshold: the return that counts as solved, if any.
+
+    Returns:
+      ``final_returns`` [S], their interquartile mean ``iqm`` with its 95 %
+      interval ``iqm_ci``, ``solve_rate`` (the fraction of seeds whose last
+      evaluation reached the threshold, None without one), and
+      ``env_steps_to_solve`` and ``episodes_to_solve`` [S], until the first that did.
+    """
+    final = history["eval_return"][-1]
+    low, high = iqm_interval(final)
+    return {
+        "final_returns": final.tolist(),
+        "iqm": float(iqm(final)),
+        "iqm_ci": [float(low), float(high)],
+        "solve_rate": None if threshold is None else float(np.mean(final >= threshold)),
+        "env_steps_to_solve": steps_to_solve(
+            history["eval_return"], history["env_steps"], threshold
+        ),
+        "episodes_to_solve": steps_to_solve(history["eval_return"], history["episodes"], threshold),
+    }
+
+
+def smooth(values: np.ndarray, window: int) -> np.ndarray:
+    """Returns the mean of each value [U, ...] and up to ``window`` - 1 before it."""
+    sums = np.cumsum(np.concatenate([np.zeros_like(values[:1]), values]), axis=0)
+    first = np.maximum(np.arange(len(values)) + 1 - window, 0)
+    count = np.arange(len(values)) + 1 - first
+    return (sums[1:] - sums[first]) / count.reshape(-1, *(1,) * (values.ndim - 1))

@@ -3,11 +3,16 @@
 import math
 from typing import Any
 
-from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.config import Config, check_step_count
 
 
-def build(env: Any, config: Config) -> tuple[Any, int]:
+def build(env: Any, config: Config, policy: Any = None) -> tuple[Any, int]:
     """Builds the learner that the settings describe.
+
+    Args:
+      env: what it learns on.
+      config: the settings.
+      policy: a ready policy, in place of the one that the settings describe.
 
     Returns:
       The learner, and the horizon in env steps.
@@ -15,41 +20,28 @@ def build(env: Any, config: Config) -> tuple[Any, int]:
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    from mjx_reinforce.learners.learner import check_horizon
-    from mjx_reinforce.learners.reinforce import reinforce
     from mjx_reinforce.export.policy_files import build_policy
+    from mjx_reinforce.learners.learner import check_horizon
 
     if config.stop_when_solved and getattr(env, "reward_threshold", None) is None:
         raise ValueError(
             f"{config.env} names no return at which it is solved: leave --stop-when-solved out"
         )
     horizon = check_horizon(env, config.horizon)
-    policy = build_policy(policy_settings(env, config))
+    check_step_count(config, horizon)
     forever = config.normalize_steps is None
     shared = {
-        "policy": policy,
+        "policy": build_policy(policy_settings(env, config)) if policy is None else policy,
         "horizon": horizon,
         "normalize_steps": math.inf if forever else config.normalize_steps,
         "engine": config.engine,
     }
-    if config.algorithm == "ars":
-        return _build_ars(env, config, shared), horizon
-    built = reinforce(
-        env,
-        estimator=_build_estimator(config),
-        optimizer=_build_optimizer(config),
-        update=_build_update(config),
-        num_episodes=config.num_episodes,
-        entropy_cost=config.entropy_cost,
-        loss_per=config.loss_per,
-        one_start=config.one_start,
-        **shared,
-    )
-    return built, horizon
+    build_learner = _build_ars if config.algorithm == "ars" else _build_reinforce
+    return build_learner(env, config, shared), horizon
 
 
 def policy_settings(env: Any, config: Config) -> dict[str, Any]:
-    """Returns what ``checkpoint.build_policy`` needs to rebuild the policy without the env."""
+    """Returns what ``policy_files.build_policy`` needs to build the policy without the env."""
     from mjx_reinforce.types import Discrete, action_space, observation_size
 
     space = action_space(env)
@@ -69,6 +61,22 @@ def policy_settings(env: Any, config: Config) -> dict[str, Any]:
         "observation_size": observation_size(env),
         **described,
     }
+
+
+def _build_reinforce(env: Any, config: Config, shared: dict[str, Any]) -> Any:
+    from mjx_reinforce.learners.reinforce import reinforce
+
+    return reinforce(
+        env,
+        estimator=_build_estimator(config),
+        optimizer=_build_optimizer(config),
+        update=_build_update(config),
+        num_episodes=config.num_episodes,
+        entropy_cost=config.entropy_cost,
+        loss_per=config.loss_per,
+        one_start=config.one_start,
+        **shared,
+    )
 
 
 def _build_ars(env: Any, config: Config, shared: dict[str, Any]) -> Any:

@@ -1,176 +1,34 @@
-"""The settings of a training run, as the command line and config.json show them.
-
-One class a group of ``--help``; ``Config`` has all their fields side by side.
-"""
+"""All settings of a run side by side, as config.json shows them, and the rules they obey."""
 
 import dataclasses
 import math
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from mjx_reinforce import envs
 from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS, check_name
+from mjx_reinforce.runs.settings import (
+    EstimatorSettings,
+    EvaluationSettings,
+    PolicySettings,
+    RunSettings,
+    SearchSettings,
+    UpdateSettings,
+)
+
+#: The greatest number of updates, and of env steps of a seed: they are counted as int32.
+MAX_COUNT = 2**31 - 1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Run:
-    """What is trained, for how long, and where it is written."""
-
-    env: str = "InvertedPendulum-v5"
-    """Environment id; `python -m mjx_reinforce.envs` lists them. Or module:Class for your own."""
-    algorithm: Literal["reinforce", "ars"] = "reinforce"
-    """reinforce follows the policy gradient; ars (augmented random search, Mania et al. 2018)
-    tries out changes of the parameters, and reads its own group below besides this one."""
-    num_seeds: int = 4
-    """How many independent seeds are trained together, in one compiled program."""
-    seed: int = 0
-    """Root of all randomness; the seeds' keys are split from it."""
-    env_steps: int | None = 280_000
-    """Training budget of each seed in env steps; it stops after the update that reaches it.
-    None leaves it to --max-updates."""
-    max_updates: int | None = None
-    """Stop every seed after this many updates; with --num-episodes 1, as many episodes."""
-    stop_when_solved: bool = False
-    """Stop once every seed's last evaluation reached the environment's reward threshold."""
-    num_episodes: int = 16
-    """Complete episodes played for one update, for each seed. (ars: see --num-directions.)"""
-    horizon: int | None = None
-    """Steps after which an episode ends; the environment's own limit if not given."""
-    one_start: bool = False
-    """Begin all training episodes of a seed in one state, each seed in its own. Evaluations keep
-    their own starts, and show what such training knows of the others."""
-    engine: Literal["auto", "vmap", "fused", "kernel"] = "auto"
-    """How episodes are played: vmap (jax.vmap of the step), fused (the step written out), kernel (all in
-    one GPU kernel), or the fastest of them here."""
-    output: Path | None = None
-    """Run directory; runs/<env>-<time> if not given."""
-    overwrite: bool = False
-    """Write into an output directory that is not empty, replacing a run's files there."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Policy:
-    """The network and the distribution of its actions."""
-
-    policy: str = "auto"
-    """Action distribution: normal (one trained std), normal-softplus and normal-sigmoid (std from
-    the state), truncated-normal, clipped-normal, tanh-normal (on the action bounds), categorical
-    (discrete actions), deterministic (ars only); auto is categorical where the actions are
-    discrete, else normal, or deterministic for ars."""
-    hidden_sizes: tuple[int, ...] = (32, 32)
-    """Units of the policy network's tanh layers; the flag alone makes it linear."""
-    shared_trunk: bool = True
-    """Compute means and stds in one network; else stds from the state have their own."""
-    initializer: Literal["orthogonal", "torch"] = "orthogonal"
-    """Initial weights: orthogonal, the last layer's scaled by 0.01, so that a fresh policy acts
-    alike everywhere; or torch.nn.Linear's uniform ones."""
-    initial_std: float = 0.5
-    """Standard deviation of the actions before training, in the action's unit."""
-    rescale: bool = True
-    """Scale the network's output 1 to the end of the action's range; else it is the mean itself."""
-    normalize_steps: int | None = 1000
-    """Scale observations by the statistics of about the first so many steps; 0 does not, None
-    goes on for ever."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Weights:
-    """What multiplies the gradient of an action's log-probability (reinforce)."""
-
-    estimator: str = "leave-one-out"
-    """total-return; reward-to-go; leave-one-out (less that of the other episodes);
-    value-baseline (less a learned value); and two that are published but odd: mean-log-prob,
-    normalized-returns (their docstrings say how)."""
-    discount: float = 0.99
-    """Discount of rewards, in [0, 1]."""
-    discount_weights: bool = False
-    """Multiply the weight at step t by discount^t, which most programs leave out."""
-    standardize: bool = True
-    """Divide the weights by their standard deviation plus the floor below."""
-    standardize_floor: float = 10.0
-    """Added to that standard deviation, in units of return."""
-    value_learning_rate: float = 3e-3
-    """Adam's learning rate for the value network of value-baseline."""
-    value_fits: int = 10
-    """Its gradient steps an update, on the squared error over the rollout."""
-    value_hidden_sizes: tuple[int, ...] = (64, 64)
-    """Units of its tanh layers."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Updates:
-    """How the gradient becomes changes of the parameters (reinforce)."""
-
-    update: Literal["full-batch", "minibatches", "each-step"] = "full-batch"
-    """full-batch: one optimiser step a rollout; minibatches: several, on steps drawn from it;
-    each-step: one for every time step, in order."""
-    minibatch_updates: int = 50
-    """Optimiser steps a rollout, of minibatches."""
-    minibatch_size: int = 128
-    """Steps of the episodes a minibatch, drawn with replacement; their loss is averaged."""
-    loss_per: Literal["episode", "step"] = "episode"
-    """Average the gradient over episodes (the definition) or over steps."""
-    entropy_cost: float = 0.0
-    """Weight of the policy's entropy in the objective."""
-    optimizer: Literal["adam", "adamw", "sgd"] = "adam"
-    """What makes a step of a gradient."""
-    learning_rate: float = 1e-2
-    """Its learning rate at the start."""
-    final_learning_rate: float | None = None
-    """Learning rate after the decay, which is linear; a tenth of the first if not given."""
-    decay_updates: int | None = 100
-    """Updates over which the learning rate decays; None keeps it constant."""
-    weight_decay: float = 0.0
-    """adamw: the parameters shrink by learning rate times this; adam, sgd: this times the
-    parameters is added to the gradient (L2, as in PyTorch)."""
-    max_grad_norm: float | None = 1.0
-    """The gradient is scaled down to at most this Euclidean norm; None leaves it."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Search:
-    """Augmented random search (ars)."""
-
-    num_directions: int = 8
-    """Directions tried in an update, by an episode forwards and one backwards."""
-    top_directions: int | None = None
-    """How many of them count, those with the greatest returns; all if not given."""
-    step_size: float = 0.02
-    """Learning rate."""
-    noise_std: float = 0.03
-    """How far along a direction the policies are that are tried."""
-    shared_starts: bool = False
-    """Start the two episodes of a direction alike."""
-    ars_update: Literal["paper", "document"] = "paper"
-    """paper, or that of a published notebook with its mistakes."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Evaluation:
-    """Playing the policies without training them."""
-
-    eval_every: int = 5
-    """Updates between evaluations."""
-    eval_episodes: int = 16
-    """Episodes of an evaluation, with the mode and as many with samples; the starts are fixed."""
-    eval_seed: int = 0
-    """Root of the evaluation's keys, apart from all training keys whatever its value."""
-
-
-#: The groups of --help, in order, under their titles.
-GROUPS = {
-    "run": Run,
-    "policy": Policy,
-    "weights": Weights,
-    "updates": Updates,
-    "search": Search,
-    "evaluation": Evaluation,
-}
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Config(Evaluation, Search, Updates, Weights, Policy, Run):
+class Config(
+    EvaluationSettings,
+    SearchSettings,
+    UpdateSettings,
+    EstimatorSettings,
+    PolicySettings,
+    RunSettings,
+):
     """Train policies, many seeds at once, and report over the seeds."""
 
     @property
@@ -194,6 +52,30 @@ def check(config: Config) -> None:
     (_check_reinforce if config.algorithm == "reinforce" else _check_ars)(config)
 
 
+def check_step_count(config: Config, horizon: int) -> None:
+    """Raises ValueError if a seed may play more env steps than are counted.
+
+    A seed stops after the update that reaches its budget, so it may pass ``env_steps`` by
+    one update of full episodes.
+
+    Args:
+      config: the settings; at least one of the two budgets is given.
+      horizon: the time limit of an episode in steps.
+    """
+    an_update = config.episodes_per_update * horizon
+    bounds = []
+    if config.env_steps is not None:
+        bounds.append(config.env_steps - 1 + an_update)
+    if config.max_updates is not None:
+        bounds.append(config.max_updates * an_update)
+    if min(bounds) > MAX_COUNT:
+        raise ValueError(
+            f"a seed may play {min(bounds):,} env steps ({config.episodes_per_update:,} episodes "
+            f"an update, up to {horizon:,} steps each), more than the 2^31 - 1 that can be "
+            "counted; give --env-steps, or lower --max-updates or --horizon"
+        )
+
+
 _OPTIONAL = {field.name for field in dataclasses.fields(Config) if "None" in str(field.type)}
 
 #: Names of settings, what must hold of a value that is given, and how to say it.
@@ -206,6 +88,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ),
     ("normalize_steps", lambda x: x >= 0, "at least 0"),
     ("env_steps", lambda x: x < 2**30, "less than 2^30, for each seed"),
+    ("max_updates", lambda x: x <= MAX_COUNT, "less than 2^31"),
     ("seed eval_seed", lambda x: 0 <= x < 2**32, "in [0, 2^32)"),
     ("discount", lambda x: 0 <= x <= 1, "in [0, 1]"),
     (

@@ -1,7 +1,6 @@
-"""What a person sees while a run goes on and when it ends."""
+"""What a user sees while a run goes on and when it ends."""
 
-import signal
-import threading
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +16,15 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from mjx_reinforce.runs import record
+
 
 class Display:
     """A progress bar on a terminal, one line an evaluation elsewhere."""
 
     def __init__(self):
         self.console = Console()
-        self._progress = Progress(
+        self._bar = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}"),
             BarColumn(),
@@ -34,63 +35,42 @@ class Display:
             console=self.console,
             disable=not self.console.is_terminal,
         )
-        self._task = self._progress.add_task("compiling", total=None)
+        self._task = self._bar.add_task("compiling", total=None)
 
     def __enter__(self) -> "Display":
         """Starts drawing."""
-        self._progress.start()
+        self._bar.start()
         return self
 
     def __exit__(self, *_: Any) -> None:
         """Leaves the last state on the screen."""
-        self._progress.stop()
+        self._bar.stop()
 
     def say(self, text: str) -> None:
         """Prints a line above the bar."""
         self.console.print(text, highlight=False, soft_wrap=True)
 
-    def start(self) -> None:
+    def start(self, compile_seconds: float) -> None:
         """Marks the end of compilation, from where the time left is counted."""
-        self._progress.reset(self._task, total=1.0, description="training")
+        self.say(f"compiled in {compile_seconds:.1f} s")
+        self._bar.reset(self._task, total=1.0, description="training")
 
-    def evaluated(
-        self, done: float, update: int, steps: float, value: float, low: float, rate: float
-    ) -> None:
-        """Shows an evaluation.
-
-        Args:
-          done: the fraction of the budget that is used.
-          update: how many updates were made.
-          steps: env steps of the mean seed.
-          value: interquartile mean of the return over seeds.
-          low: the return of the worst seed.
-          rate: env steps a second, all seeds together.
-        """
-        text = f"return {value:7.1f}  worst {low:7.1f}  {rate:,.0f} steps/s"
-        self._progress.update(self._task, completed=done, description=text)
+    def show_progress(self, progress: record.Progress) -> None:
+        """Shows how far the run is and how well it does."""
+        text = (
+            f"return {progress.iqm:7.1f}  worst {progress.worst:7.1f}  "
+            f"{progress.env_steps_per_second:,.0f} steps/s"
+        )
+        self._bar.update(self._task, completed=progress.fraction, description=text)
         if not self.console.is_terminal:
-            self.say(f"update {update:5d}  {steps:12,.0f} env steps a seed  {text}")
+            steps = f"{progress.env_steps:12,.0f} env steps a seed"
+            self.say(f"update {progress.updates:5d}  {steps}  {text}")
 
-
-class Interrupt(threading.Event):
-    """Ctrl-C asks the run to stop after the present block; a second one stops at once."""
-
-    def __init__(self, display: Display):
-        super().__init__()
-        self._display = display
-
-    def __enter__(self) -> "Interrupt":
-        self._previous = signal.signal(signal.SIGINT, self._handle)
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        signal.signal(signal.SIGINT, self._previous)
-
-    def _handle(self, number: int, frame: Any) -> None:
-        del number, frame
-        self.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        self._display.say("stopping after this block of updates; Ctrl-C again stops at once")
+    def show_nonfinite(self, event: Mapping[str, Any]) -> None:
+        """Names an update with numbers that are not finite, from ``Record.add_updates``."""
+        what = f"{event['episodes']} non-finite episodes"
+        what += ", update skipped" if event["skipped"] else ""
+        self.say(f"[yellow]seed {event['seed']}, update {event['update']}: {what}[/yellow]")
 
 
 def print_summary(console: Console, summary: dict[str, Any], directory: Path) -> None:

@@ -3,8 +3,9 @@
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.learners.learner import Actor, Learner
 from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
+from mjx_reinforce.learners.learner import Learner
+from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.types import Environment
 
 

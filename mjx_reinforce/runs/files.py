@@ -1,4 +1,4 @@
-"""The directory of a run, what its results depend on, and its tables."""
+"""The directory of a run, what its results depend on, and CSV files."""
 
 import contextlib
 import csv
@@ -48,13 +48,33 @@ def prepare(output: Path | None, env: str, overwrite: bool) -> Path:
     return directory
 
 
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Writes rows under the names of the first one; the others have the same names."""
+def create_csv(path: Path, columns: Sequence[str]) -> None:
+    """Writes a CSV file that has the names of its columns and no rows yet."""
+    write_bytes(path, _lines([dict(zip(columns, columns, strict=True))], columns))
+
+
+def append_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
+    """Adds rows to a file of ``create_csv``, in time that does not depend on what it holds.
+
+    A row is whole once its line has ended; where the disk is full, or Ctrl-C comes in
+    between, the file is left as it was.
+    """
+    content = memoryview(_lines(rows, columns))
+    with path.open("ab", buffering=0) as file:
+        size = file.tell()
+        try:
+            while content:
+                content = content[file.write(content) :]
+        except BaseException:
+            file.truncate(size)
+            raise
+
+
+def _lines(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> bytes:
+    """Returns rows as the lines of a CSV file."""
     text = io.StringIO(newline="")
-    writer = csv.DictWriter(text, fieldnames=list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_bytes(path, text.getvalue().encode())
+    csv.DictWriter(text, columns, lineterminator="\n").writerows(rows)
+    return text.getvalue().encode()
 
 
 def provenance() -> dict[str, Any]:
