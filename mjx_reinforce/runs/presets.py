@@ -1,8 +1,8 @@
 """Published programs, setting by setting, under names for the command line.
 
-Their network weights, optimisers and constants are those of the programs. What is not theirs:
-five seeds train together, so that there is an interval; and all are evaluated as everything here
-is, beside the training returns that the programs report. Five seeds of ours are not their seeds.
+Their network weights, optimisers and constants are those of the programs. Two things are ours:
+five seeds train together, so that there is an interval, and each is evaluated as in every other
+run, beside the training returns that the programs report. Our random numbers are not theirs.
 """
 
 import dataclasses
@@ -10,7 +10,7 @@ import math
 
 from mjx_reinforce.runs.config import Config
 
-# What they have in common: PyTorch's weights, one episode an update, and none of our inventions.
+# What they share: PyTorch's weights, one episode an update, and none of our own additions.
 _PLAIN = Config(
     num_seeds=5,
     env_steps=None,
