@@ -7,7 +7,6 @@ The programs' own curves, a few seeds each, are in reference.json. Ours come fro
 train together. Where a program has a mistake that can be taken out, so do as many without it.
 """
 
-import contextlib
 import dataclasses
 import hashlib
 import json
@@ -24,7 +23,8 @@ from rich.progress import MofNCompleteColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
 from mjx_reinforce import envs
-from mjx_reinforce.runs.build import build
+from mjx_reinforce.export.policy_files import build_policy
+from mjx_reinforce.runs.build import build, policy_settings
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.state import compile_programs, first_state
@@ -154,10 +154,12 @@ def train(
     assert config.max_updates is not None
     env = envs.make(config.env)
     started = time.perf_counter()
-    with clamped() if clamp else contextlib.nullcontext():
-        learner, horizon = build(env, config)
+    policy = build_policy(policy_settings(env, config))
+    if clamp and config.policy == "truncated-normal":
+        policy = clamped(policy, env.action_space)
+    learner, horizon = build(env, config, policy)
     if stale:
-        learner = stale_starts(lambda env: build(env, config)[0], env)
+        learner = stale_starts(lambda env: build(env, config, policy)[0], env)
     state = first_state(learner, config)
     programs = compile_programs(env, learner, horizon, config, state)
     compiled = time.perf_counter()

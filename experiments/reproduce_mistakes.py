@@ -1,18 +1,15 @@
 """Mistakes of document 001's program that no setting of ours has."""
 
-import contextlib
 import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any
-from unittest import mock
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.stats import norm
 
-from mjx_reinforce.export import policy_files as checkpoint
+from mjx_reinforce import Box, Policy
 from mjx_reinforce.learners.learner import Learner
 
 STALE = "stale first observation"
@@ -40,17 +37,9 @@ def clamped_log_prob(outputs: Any, action: Any, low: Any, high: Any) -> jax.Arra
     return jnp.sum(norm.logpdf(action, mean, jnp.exp(log_std)) - jnp.log(mass), axis=-1)
 
 
-def clamped() -> contextlib.AbstractContextManager[Any]:
-    """Returns a context in which truncated Normals are built with ``clamped_log_prob``."""
-    return mock.patch.object(checkpoint, "build_policy", _clamped_policy)
-
-
-def _clamped_policy(settings: dict[str, Any], build_policy: Any = checkpoint.build_policy) -> Any:
-    policy = build_policy(settings)
-    if settings["policy"] != "truncated-normal":
-        return policy
-    low, high = np.array(settings["action_low"]), np.array(settings["action_high"])
-    log_prob = functools.partial(clamped_log_prob, low=low, high=high)
+def clamped(policy: Policy, space: Box) -> Policy:
+    """Returns a policy of truncated Normals whose density is ``clamped_log_prob``."""
+    log_prob = functools.partial(clamped_log_prob, low=space.low, high=space.high)
     return policy._replace(distribution=policy.distribution._replace(log_prob=log_prob))
 
 

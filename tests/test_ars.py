@@ -10,6 +10,7 @@ from toys import Chain, SignedTarget, Survive, Target
 from mjx_reinforce import evaluate, mlp_policy, rollout, train_step
 from mjx_reinforce.learners import ars as ars_module
 from mjx_reinforce.learners.ars import ars
+from mjx_reinforce.learners.ars_increments import document_increment
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.deterministic import deterministic
 from mjx_reinforce.types import Discrete
@@ -65,7 +66,7 @@ def test_the_documents_update_by_hand():
     """One increment for all parameters; the bias is a copy of the first weight."""
     directions = {"kernel": jnp.array([[[1.0], [2.0]], [[0.5], [-1.0]]]), "bias": jnp.ones((2, 1))}
     returns = jnp.array([[5.0, 2.0], [3.0, 6.0]])
-    increment = ars_module._document_increment(directions, returns, 0.1)
+    increment = document_increment(directions, returns, 0.1)
     expected = 0.1 * (2.0 * 4.0 - 4.0 * 0.5) / np.std([5.0, 2.0, 3.0, 6.0])
     for leaf in jax.tree.leaves(increment):
         np.testing.assert_allclose(leaf, expected, rtol=1e-6)

@@ -21,6 +21,12 @@ import optax
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.rollouts import episode_returns
+from mjx_reinforce.learners.ars_increments import (
+    check_linear,
+    document_increment,
+    overwrite_bias,
+    paper_increment,
+)
 from mjx_reinforce.learners.learner import (
     Learner,
     Metrics,
@@ -73,7 +79,7 @@ def ars(
         inf is V2, 0 is V1.
       shared_starts: the two episodes of a direction start alike; each has its own start in the
         paper.
-      update: "paper", or "document" for that of a published notebook: ``_document_increment``.
+      update: "paper", or "document" for that of a published notebook: ``document_increment``.
       engine: "auto", "vmap" or "fused", see ``engines.choice``.
 
     Returns:
@@ -133,7 +139,7 @@ class _Search:
 
     def __post_init__(self):
         if self.update == "document":
-            _check_linear(self.policy)
+            check_linear(self.policy)
 
     def init(self, key: jax.Array) -> TrainState:
         policy_key, key = jax.random.split(key)
@@ -173,9 +179,9 @@ class _Search:
         actor, trajectory = state.actor, trial.trajectory
         returns = episode_returns(trajectory).reshape(2, self.num_directions)
         if self.update == "paper":
-            increment = _paper_increment(trial.directions, returns, self.top_directions)
+            increment = paper_increment(trial.directions, returns, self.top_directions)
         else:
-            increment = _document_increment(trial.directions, returns, self.noise_std)
+            increment = document_increment(trial.directions, returns, self.noise_std)
         moved = jax.tree.map(lambda p, d: p + self.step_size * d, actor.params, increment)
         normalizer = normalize.update(
             actor.normalizer, trajectory.observation, trajectory.mask, self.normalize_steps
@@ -199,7 +205,7 @@ class _Search:
 
     def _tie(self, params: Any) -> Any:
         """Returns the params as the update ties them; the paper's does not."""
-        return params if self.update == "paper" else _overwrite_bias(params)
+        return params if self.update == "paper" else overwrite_bias(params)
 
     def _perturb(self, params: Any, directions: Any) -> Any:
         """Returns the params of all policies, [2, D, ...], the forward ones first."""
@@ -207,61 +213,6 @@ class _Search:
             lambda d: jnp.stack([self.noise_std * d, -self.noise_std * d]), directions
         )
         return jax.vmap(jax.vmap(self._tie))(jax.tree.map(jnp.add, params, moves))
-
-
-def _paper_increment(directions: Any, returns: jax.Array, top: int) -> Any:
-    """Returns the sum in the module's formula over b sigma; zero where sigma is.
-
-    Args:
-      directions: like the params, with a leading axis [D].
-      returns: [2, D] forwards and backwards.
-      top: b.
-    """
-    best = jnp.argsort(-jnp.max(returns, axis=0))[:top]
-    gain = _over_std(returns[0, best] - returns[1, best], returns[:, best]) / top
-    return jax.tree.map(lambda d: _weighted_sum(gain, d[best]), directions)
-
-
-def _document_increment(directions: Any, returns: jax.Array, noise_std: Any) -> Any:
-    """Returns the increment of a published notebook, mistakes included, for reproducing it.
-
-    Its ``np.sum`` without an axis adds up the entries of the direction too, so all parameters move
-    by the same number; it does not divide by how many directions there are, and multiplies by
-    ``noise_std``. The bias is overwritten besides, see ``_overwrite_bias``. Not reproduced: where
-    all returns are equal it divides 0 by 0, and its parameters are NaN for good.
-    """
-    totals = sum(jnp.sum(d.reshape(len(d), -1), axis=1) for d in jax.tree.leaves(directions))
-    increment = noise_std * jnp.sum(_over_std(returns[0] - returns[1], returns) * totals)
-    return jax.tree.map(lambda d: jnp.full(d.shape[1:], increment, d.dtype), directions)
-
-
-def _overwrite_bias(params: Any) -> Any:
-    """Returns a linear policy's params with the first A weights in place of the bias [A].
-
-    The notebook writes the same first entries of its flat vector into every parameter.
-    """
-    layer = params["network"]["params"]["Dense_0"]
-    # PyTorch stores weights as [A, O], flax as [O, A].
-    bias = layer["kernel"].T.reshape(-1)[: layer["bias"].size]
-    return params | {"network": {"params": {"Dense_0": layer | {"bias": bias}}}}
-
-
-def _check_linear(policy: Policy) -> None:
-    """Raises ValueError for a policy whose bias ``_overwrite_bias`` does not find."""
-    params = jax.eval_shape(policy.init, jax.random.key(0))
-    if set(params) != {"network", "constants"} or set(params["network"]["params"]) != {"Dense_0"}:
-        raise ValueError("update='document' is for linear policies: pass one with hidden_sizes=()")
-
-
-def _over_std(x: jax.Array, returns: jax.Array) -> jax.Array:
-    """Returns ``x`` over the standard deviation of all returns, 0 if they are all equal."""
-    std = jnp.std(returns)
-    return jnp.where(std > 0, x / jnp.where(std > 0, std, 1.0), 0.0)
-
-
-def _weighted_sum(weight: jax.Array, x: jax.Array) -> jax.Array:
-    """Returns the sum over the first axis of ``x`` [D, ...] times ``weight`` [D]."""
-    return jnp.sum(weight.reshape(-1, *(1,) * (x.ndim - 1)) * x, axis=0)
 
 
 def _draw(key: jax.Array, params: Any, num_directions: int) -> Any:
