@@ -136,6 +136,30 @@ def test_lowers_for_nvidia_gpus(pendulum):
     assert "triton" in lowered.as_text()
 
 
+class Pays(Survive):
+    """Pays what it was built with."""
+
+    def __init__(self, price):
+        self.price = price
+
+    def step(self, state, action):
+        return super().step(state, action).replace(reward=self.price)
+
+
+def test_a_traced_value_in_the_environment_is_not_supported():
+    def reason(price):
+        env = Pays(price)
+        actor, act, distribution = actor_and_act(env, ())
+        reasons.append(kernel.unsupported(env, act, actor, distribution))
+        return price
+
+    reasons = []
+    jax.vmap(reason)(jnp.ones(2))
+    reason(jnp.ones(()))
+    assert "JAX is tracing" in reasons[0]
+    assert reasons[1] is None
+
+
 class Flagged(Survive):
     """Its state has a bool."""
 

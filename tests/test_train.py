@@ -192,7 +192,8 @@ def test_solving_needs_a_threshold(run, tmp_path, monkeypatch, capsys):
 
 
 def test_a_run_beyond_all_memory_is_refused(run, tmp_path, capsys):
-    assert run(*ARGUMENTS, "--num-seeds", str(10**13), "--output", "out") == 2
+    size = ["--engine", "fused", "--num-seeds", str(10**13)]
+    assert run(*ARGUMENTS, *size, "--output", "out") == 2
     error = capsys.readouterr().err
     assert "does not fit into memory" in error
     assert "lower --num-seeds" in error

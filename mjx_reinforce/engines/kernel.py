@@ -100,9 +100,12 @@ def unsupported(
     if reason:
         return reason
     try:
-        operations = sum(_write_out(env, act, actor, distribution).operations.values())
+        written = _write_out(env, act, actor, distribution)
     except UnsupportedPrimitive as error:
         return str(error)
+    if written.captures:
+        return "the environment or the policy holds a value that JAX is tracing, as under jax.vmap"
+    operations = sum(written.operations.values())
     if operations > MAX_OPERATIONS:
         return f"one step takes {operations} scalar operations, more than {MAX_OPERATIONS}"
     return None
