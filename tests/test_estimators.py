@@ -2,6 +2,7 @@
 
 import functools
 
+import flax.linen
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,27 +12,38 @@ from toys import Chain, categorical, expected_return
 
 from mjx_reinforce import Policy, Trajectory, reinforce, train_step
 from mjx_reinforce.learners import estimators as est
+from mjx_reinforce.policies.networks import MLP
 from mjx_reinforce.registry import ESTIMATORS, load
 
 LENGTHS = np.array([4, 1, 3])
 REWARD = np.array([[1.0, 2.0, 0.5], [0.5, 9.0, 1.5], [2.0, 9.0, 1.0], [3.0, 9.0, 9.0]])
 
 
-def make_trajectory(padding=0.0):
-    mask = np.arange(4)[:, None] < LENGTHS
-    filler = np.where(mask, 0.0, padding)[..., None]
+MASK = np.arange(4)[:, None] < LENGTHS
+
+
+def make_trajectory(mask=MASK, observation=0.0, action=0.0, reward=0.0):
+    """Three episodes; the arguments are what stands behind their ends."""
+    seen = np.arange(12.0).reshape(4, 3, 1) / 12
     return Trajectory(
-        observation=jnp.asarray(np.arange(12.0).reshape(4, 3, 1) * mask[..., None] + filler),
-        action=jnp.asarray(filler),
-        reward=jnp.asarray(np.where(mask, REWARD, 0.0)),
+        observation=jnp.asarray(np.where(mask[..., None], seen, observation)),
+        action=jnp.asarray(np.where(mask[..., None], 0.5, action)),
+        reward=jnp.asarray(np.where(mask, REWARD, reward)),
         mask=jnp.asarray(mask),
-        nonfinite=jnp.zeros(3, bool),
+        nonfinite=jnp.zeros(mask.shape[1], bool),
     )
 
 
+def update(estimator, trajectory):
+    return estimator.update(estimator.init(jax.random.key(0), 1), trajectory)
+
+
 def weights(estimator, trajectory):
-    state = estimator.init(jax.random.key(0), 1)
-    return np.asarray(estimator.update(state, trajectory)[0])
+    return np.asarray(update(estimator, trajectory)[0])
+
+
+def assert_equal(got, expected):
+    jax.tree.map(np.testing.assert_array_equal, got, expected)
 
 
 def returns_by_hand(discount):
@@ -44,11 +56,10 @@ def returns_by_hand(discount):
 
 def test_reward_to_go_and_total_return_by_hand():
     expected = returns_by_hand(0.9)
-    mask = np.arange(4)[:, None] < LENGTHS
     got = weights(est.reward_to_go(0.9), make_trajectory())
     np.testing.assert_allclose(got, expected, rtol=1e-6)
     got = weights(est.total_return(0.9), make_trajectory())
-    np.testing.assert_allclose(got, np.where(mask, expected[0], 0.0), rtol=1e-6)
+    np.testing.assert_allclose(got, np.where(MASK, expected[0], 0.0), rtol=1e-6)
 
 
 @pytest.mark.parametrize("ended", ["zero", "skip"])
@@ -89,25 +100,173 @@ def test_normalized_returns_by_hand():
         assert np.all(got[length:, n] == 0.0)
 
 
-def test_standardize_and_discount_weights():
+def test_value_baseline_by_hand():
+    """Two gradient steps of a linear critic on the mean squared error, after its use."""
+    returns, seen = returns_by_hand(0.9)[MASK], np.asarray(make_trajectory().observation)[MASK][:, 0]
+    estimator = est.value_baseline(
+        0.9, network=flax.linen.Dense(1), optimizer=optax.sgd(0.1), num_fits=2
+    )
+    critic = estimator.init(jax.random.key(0), 1)
+    slope, bias = float(critic.params["params"]["kernel"][0, 0]), 0.0
+    weight, after, metrics = estimator.update(critic, make_trajectory())
+    residual = returns - slope * seen
+    np.testing.assert_allclose(np.asarray(weight)[MASK], residual, rtol=1e-5)
+    assert np.all(np.asarray(weight)[~MASK] == 0.0)
+    assert float(metrics["value_loss"]) == pytest.approx(np.mean(residual**2), rel=1e-5)
+    explained = 1 - np.var(residual) / np.var(returns)
+    assert float(metrics["explained_variance"]) == pytest.approx(explained, rel=1e-5)
+    for _ in range(2):
+        error = slope * seen + bias - returns
+        slope, bias = slope - 0.1 * np.mean(2 * error * seen), bias - 0.1 * np.mean(2 * error)
+    params = after.params["params"]
+    assert float(params["kernel"][0, 0]) == pytest.approx(slope, rel=1e-5)
+    assert float(params["bias"][0]) == pytest.approx(bias, rel=1e-5)
+
+
+def test_the_critics_defaults_are_as_documented():
+    explicit = est.value_baseline(
+        0.99, network=MLP((64, 64), 1), optimizer=optax.adam(3e-3), num_fits=10
+    )
+    assert_equal(
+        update(est.value_baseline(), make_trajectory()), update(explicit, make_trajectory())
+    )
+
+
+def test_the_critics_optimizer_keeps_its_state_and_sees_the_parameters():
+    """Momentum goes on from one update to the next; a weight decay needs the parameters."""
+    optimizer = optax.chain(optax.add_decayed_weights(0.5), optax.sgd(0.1, momentum=0.9))
+    trajectory, network = make_trajectory(), flax.linen.Dense(1)
+    one, two = (
+        est.value_baseline(0.9, network=network, optimizer=optimizer, num_fits=fits)
+        for fits in (1, 2)
+    )
+    critic = one.init(jax.random.key(0), 1)
+    twice = one.update(one.update(critic, trajectory)[1], trajectory)[1]
+    at_once = two.update(critic, trajectory)[1]
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), twice, at_once)
+
+
+def test_equal_returns_leave_nothing_to_explain():
+    """A variance of 0 counts as 1e-8."""
+    explained = est._explained(jnp.array([[1e-4], [-1e-4]]), jnp.ones((2, 1)), jnp.ones((2, 1), bool))
+    assert float(explained) == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("center", [False, True])
+def test_standardize_divides_by_the_deviation_and_its_floor(center):
     raw = weights(est.reward_to_go(1.0), make_trajectory())
-    mask = np.arange(4)[:, None] < LENGTHS
-    scaled = weights(est.standardize(est.reward_to_go(1.0), floor=0.0), make_trajectory())
-    np.testing.assert_allclose(scaled, raw / np.sqrt(np.mean(raw[mask] ** 2)), rtol=1e-5)
-    centred = weights(est.standardize(est.reward_to_go(1.0), center=True), make_trajectory())
-    assert np.mean(centred[mask]) == pytest.approx(0.0, abs=1e-6)
-    assert np.std(centred[mask]) == pytest.approx(1.0, rel=1e-5)
-    powers = weights(est.discount_weights(est.reward_to_go(1.0), 0.5), make_trajectory())
-    np.testing.assert_allclose(powers, raw * 0.5 ** np.arange(4)[:, None], rtol=1e-6)
+    mean = raw[MASK].mean() if center else 0.0
+    std = np.sqrt(np.mean((raw[MASK] - mean) ** 2))
+    estimator = est.standardize(est.reward_to_go(1.0), floor=0.5, center=center)
+    got, _, metrics = update(estimator, make_trajectory())
+    expected = np.where(MASK, (raw - mean) / (std + 0.5), 0.0)
+    np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+    assert float(metrics["weight_std"]) == pytest.approx(std, rel=1e-5)
+
+
+def test_standardize_by_default_does_not_centre_and_adds_almost_nothing():
+    tiny = 1e-8 * make_trajectory().reward
+    trajectory = make_trajectory().replace(reward=tiny)
+    got = weights(est.standardize(est.reward_to_go(0.0)), trajectory)
+    expected = np.asarray(tiny) / (np.sqrt(np.mean(np.asarray(tiny)[MASK] ** 2)) + 1e-8)
+    np.testing.assert_allclose(got, expected, rtol=1e-5)
+
+
+def test_discount_weights_multiplies_by_the_power_of_the_time():
+    raw = weights(est.reward_to_go(1.0), make_trajectory())
+    got = weights(est.discount_weights(est.reward_to_go(1.0), 0.5), make_trajectory())
+    np.testing.assert_allclose(got, raw * 0.5 ** np.arange(4)[:, None], rtol=1e-6)
+
+
+@pytest.mark.parametrize("wrap", [est.standardize, est.discount_weights])
+def test_wrapping_keeps_what_an_estimator_requires_learns_and_measures(wrap):
+    inner = est.value_baseline(0.9)
+    assert wrap(est.leave_one_out()).min_episodes == 2
+    _, critic, metrics = update(inner, make_trajectory())
+    _, wrapped_critic, wrapped_metrics = update(wrap(inner), make_trajectory())
+    assert_equal(critic, wrapped_critic)
+    assert_equal(metrics, {name: wrapped_metrics[name] for name in metrics})
+
+
+@pytest.mark.parametrize(
+    "make",
+    [est.total_return, est.reward_to_go, est.leave_one_out, est.mean_log_prob]
+    + [est.normalized_returns, est.value_baseline],
+)
+def test_the_default_discount_is_099(make):
+    assert_equal(weights(make(), make_trajectory()), weights(make(0.99), make_trajectory()))
+
+
+def test_the_default_of_discount_weights_is_099():
+    one, other = (est.discount_weights(est.reward_to_go(), *args) for args in ((), (0.99,)))
+    assert_equal(weights(one, make_trajectory()), weights(other, make_trajectory()))
+
+
+def test_only_leave_one_out_needs_two_episodes():
+    required = {name: load(ESTIMATORS[name])(0.9).min_episodes for name in ESTIMATORS}
+    assert required == dict.fromkeys(ESTIMATORS, 1) | {"leave-one-out": 2}
+
+
+@pytest.mark.parametrize("wrap", [lambda e: e, est.standardize, est.discount_weights])
+@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+def test_nothing_after_the_end_has_any_effect_on_the_weights(name, wrap):
+    """A normalised observation behind the end may be anything: no weight reads it."""
+    estimator = wrap(load(ESTIMATORS[name])(0.9))
+    clean = weights(estimator, make_trajectory())
+    poisoned = weights(estimator, make_trajectory(observation=np.nan, action=np.nan))
+    np.testing.assert_array_equal(clean, poisoned)
+    assert np.all(clean[~MASK] == 0.0)
+    assert np.all(clean[MASK] != 0.0) or name == "normalized-returns"  # 0 in a single step
 
 
 @pytest.mark.parametrize("name", sorted(ESTIMATORS))
-def test_nothing_after_the_end_has_any_effect(name):
-    estimator = est.standardize(load(ESTIMATORS[name])(0.9))
-    clean = weights(estimator, make_trajectory())
-    poisoned = make_trajectory().replace(action=make_trajectory(np.nan).action)
-    np.testing.assert_array_equal(clean, weights(estimator, poisoned))
-    assert np.all(clean[np.arange(4)[:, None] >= LENGTHS] == 0.0)
+def test_nothing_after_the_end_has_any_effect_on_what_is_learned(name):
+    """The observation stays finite, as it does clipped: a critic is differentiated.
+
+    A reward behind the end is zero by Trajectory's contract, for it would count in the return of
+    every step before it. Not so at discount 0, where G[t] = r[t]: there it may be poisoned too.
+    Only a mean that counts ended episodes as the 0 they earn relies on that 0.
+    """
+    options = {"ended": "skip"} if name == "leave-one-out" else {}
+    estimator = load(ESTIMATORS[name])(0.0, **options)
+    clean = update(estimator, make_trajectory())
+    huge = make_trajectory(observation=1e30, action=np.nan, reward=1e30)
+    assert_equal(update(estimator, huge), clean)
+
+
+@pytest.mark.parametrize("center", [False, True])
+def test_standardize_reads_no_weight_outside_the_mask(center):
+    plain = est.reward_to_go(0.9)
+    poison = plain._replace(
+        update=lambda state, trajectory: (
+            jnp.where(trajectory.mask, plain.update(state, trajectory)[0], jnp.nan),
+            state,
+            {},
+        )
+    )
+    expected = update(est.standardize(plain, center=center), make_trajectory())
+    assert_equal(update(est.standardize(poison, center=center), make_trajectory()), expected)
+
+
+@pytest.mark.parametrize("wrap", [lambda e: e, functools.partial(est.standardize, center=True)])
+@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+def test_a_seed_that_plays_nothing_stays_finite(name, wrap):
+    estimator = wrap(load(ESTIMATORS[name])(0.9))
+    weight, state, metrics = update(estimator, make_trajectory(mask=np.zeros((4, 3), bool)))
+    assert np.all(np.asarray(weight) == 0.0)
+    assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((state, metrics)))
+
+
+def test_one_step_is_a_sample_of_one():
+    """A mean over one step divides by one."""
+    mask = np.array([[True], [False]])
+    trajectory = make_trajectory(mask=np.pad(mask, ((0, 2), (0, 2))))
+    scaled, _, metrics = update(est.standardize(est.reward_to_go(), floor=0.0), trajectory)
+    assert float(metrics["weight_std"]) == float(scaled[0, 0]) == 1.0
+    estimator = est.value_baseline(network=flax.linen.Dense(1), num_fits=1)
+    critic = estimator.init(jax.random.key(0), 1)
+    _, _, metrics = estimator.update(critic, trajectory)
+    assert float(metrics["value_loss"]) == pytest.approx(1.0, rel=1e-5)  # seen 0, valued 0, earned 1
 
 
 @pytest.mark.parametrize("name", sorted(ESTIMATORS))
@@ -136,7 +295,7 @@ CASES = {
     "reward to go": (est.reward_to_go(1.0), 1.0),
     "leave one out": (est.leave_one_out(1.0), 1.0),
     "leave one out of the living": (est.leave_one_out(1.0, ended="skip"), 1.0),
-    "value baseline": (est.value_baseline(1.0), 1.0),
+    "value baseline": (est.value_baseline(1.0, network=MLP((4,), 1), num_fits=1), 1.0),
     "discounted with gamma^t": (est.discount_weights(est.leave_one_out(0.5), 0.5), 0.5),
 }
 
@@ -183,10 +342,24 @@ def assert_unbiased(estimator, objective):
     assert np.all(np.abs(np.mean(samples, axis=0) - exact) < 4.5 * error + 1e-6)
 
 
+@pytest.mark.parametrize(
+    "make",
+    [est.total_return, est.reward_to_go, est.leave_one_out, est.mean_log_prob]
+    + [est.normalized_returns, est.value_baseline]
+    + [functools.partial(est.discount_weights, est.reward_to_go())],
+)
+def test_a_discount_lies_between_0_and_1(make):
+    make(0.0), make(1.0)
+    jax.vmap(lambda discount: make(discount) and discount)(jnp.array([0.5, 2.0]))  # on trust
+    for wrong in (-0.01, 1.01):
+        with pytest.raises(ValueError, match=rf"must lie in \[0, 1\], got {wrong}"):
+            make(wrong)
+
+
 def test_nonsense_is_refused():
-    with pytest.raises(ValueError, match=r"discount must lie in \[0, 1\], got 1.5"):
-        est.reward_to_go(1.5)
-    with pytest.raises(ValueError, match="'zero' or 'skip'"):
+    with pytest.raises(ValueError, match="'zero' or 'skip', got 'alive'"):
         est.leave_one_out(ended="alive")
+    with pytest.raises(ValueError, match="num_fits must be at least 1, got 0"):
+        est.value_baseline(num_fits=0)
     with pytest.raises(ValueError, match="at least 2 episodes"):
         reinforce(Chain(), policy=tabular_policy(), estimator=est.leave_one_out(), num_episodes=1)

@@ -56,7 +56,14 @@ def test_a_comparison_by_hand():
     assert (row["episode"], row["ours_mean"], row["theirs_mean"], row["theirs_n"]) == (50, 50, 3, 2)
     assert (row["ours_low"], row["ours_high"]) == (2.5, 97.5)
     assert row["inside"] == 1  # 1 is not, 5 is
-    assert row["agrees"] == (row["p_value"] >= 0.05)
+    # Of the 103 * 102 / 2 pairs of ranks, 41 have a mean as far out as that of 1 and 5.
+    assert row["p_value"] == pytest.approx(41 / 5253, abs=0.004)
+    assert row["agrees"] is False
+    middle = RECORD | {"seeds": {"1": [40.0], "2": [60.0]}}
+    (row,) = compare(case, "000", middle, scores)
+    assert (row["theirs_mean"], row["inside"]) == (50, 2)
+    assert row["p_value"] > 0.9
+    assert row["agrees"] is True
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.title)

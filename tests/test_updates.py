@@ -64,6 +64,21 @@ def test_full_batch_is_one_step():
     assert float(metrics["entropy"]) == pytest.approx(expected[3] / MASK.sum(), rel=1e-5)
 
 
+@pytest.mark.parametrize("update", [updates.full_batch(), updates.each_step()])
+def test_metrics_of_a_single_step_and_of_none(update):
+    """A mean over one step divides by one; nothing played measures nothing, and is finite."""
+    one = np.zeros((5, 3), bool)
+    one[0, 1] = True
+    problem = make_problem(optax.sgd(0.1), divisor=2, mask=one)
+    _, _, metrics = run(update, problem)
+    expected = descend(problem, PARAMS, problem.optimizer.init(PARAMS), problem.samples, 2)
+    assert float(metrics["gradient_norm"]) == pytest.approx(expected[2], rel=1e-5)
+    assert float(metrics["entropy"]) == pytest.approx(expected[3], rel=1e-5)
+    params, _, metrics = run(update, make_problem(optax.sgd(0.1), mask=np.zeros((5, 3), bool)))
+    assert_close(params, PARAMS)
+    assert {name: float(x) for name, x in metrics.items()} == {"entropy": 0, "gradient_norm": 0}
+
+
 def each_step_by_hand(problem):
     params, opt_state = PARAMS, problem.optimizer.init(PARAMS)
     norms, entropy, mask = [], 0.0, np.asarray(problem.samples[-1])
@@ -75,8 +90,11 @@ def each_step_by_hand(problem):
     return params, opt_state, {"entropy": entropy / mask.sum(), "gradient_norm": np.mean(norms)}
 
 
-def test_each_step_is_a_loop_over_time():
-    problem = make_problem(optax.adam(0.1))
+@pytest.mark.parametrize("longest", [1, 4, 5])
+def test_each_step_is_a_loop_over_time(longest):
+    """Up to the end of the longest episode, which may be the horizon of 5."""
+    mask = np.arange(5)[:, None] < np.minimum([longest, 1, 3], longest)
+    problem = make_problem(optax.adam(0.1), mask=mask)
     assert_close(run(updates.each_step(), problem), each_step_by_hand(problem))
 
 
@@ -107,6 +125,26 @@ def test_minibatches_are_steps_on_drawn_samples():
         norms, entropy = [*norms, norm], [*entropy, sums / 4]
     metrics = {"entropy": np.mean(entropy), "gradient_norm": np.mean(norms)}
     assert_close(got, (params, opt_state, metrics))
+
+
+def test_minibatches_divide_by_their_own_size():
+    """One minibatch of one sample is a step on that sample's own gradient."""
+    one = np.zeros((5, 3), bool)
+    one[2, 0] = True
+    problem = make_problem(optax.sgd(0.1), divisor=7, mask=one)
+    expected = descend(problem, PARAMS, problem.optimizer.init(PARAMS), problem.samples, 1)
+    params, _, metrics = run(updates.minibatches(1, 1), problem)
+    assert_close(params, expected[0])
+    assert float(metrics["gradient_norm"]) == pytest.approx(expected[2], rel=1e-5)
+    assert float(metrics["entropy"]) == pytest.approx(expected[3], rel=1e-5)
+
+
+def test_minibatches_of_nothing_stay_in_bounds():
+    """A seed that stands still draws too; what it draws is thrown away, and must be finite."""
+    params, _, metrics = run(
+        updates.minibatches(2, 3), make_problem(optax.adam(0.1), mask=np.zeros((5, 3), bool))
+    )
+    assert all(np.isfinite(x) for x in jax.tree.leaves((params, metrics)))
 
 
 def test_minibatches_draw_every_played_step_alike_and_no_other():
@@ -199,6 +237,39 @@ def test_the_norm_is_clipped_before_the_weight_decay():
     x = jnp.array([6.0, 8.0])
     change, _ = optimizer.update(jnp.array([3.0, 4.0]), optimizer.init(x), x)
     np.testing.assert_allclose(change, [-0.6 - 3.0, -0.8 - 4.0], rtol=1e-6)
+
+
+def changes(optimizer, params, *grads):
+    """Returns what an optimiser makes of a sequence of gradients."""
+    state, made = optimizer.init(params), []
+    for g in grads:
+        change, state = optimizer.update(g, state, params)
+        made.append(change)
+    return np.stack(made)
+
+
+def test_the_default_optimizer_is_adam_of_a_gradient_of_norm_one():
+    x, grads = jnp.array([6.0, 8.0]), [jnp.array([3.0, 4.0]), jnp.array([0.3, -0.4])]
+    explicit = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-2))
+    got = changes(updates.make_optimizer(), x, *grads)
+    np.testing.assert_allclose(got, changes(explicit, x, *grads), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", updates.OPTIMIZERS)
+def test_no_weight_decay_by_default_and_a_clipped_norm_in_all(name):
+    """The parameters do not matter; 5 times the gradient is 1 times it at a norm of at most 1."""
+    optimizer, g = updates.make_optimizer(name, 0.1), jnp.array([0.6, 0.8])
+    got = changes(optimizer, jnp.array([6.0, 8.0]), g, 5 * g, 0.1 * g)
+    np.testing.assert_allclose(got, changes(optimizer, jnp.zeros(2), g, g, 0.1 * g), rtol=1e-5)
+    assert np.all(got != 0)
+
+
+@pytest.mark.parametrize("name", updates.OPTIMIZERS)
+def test_the_learning_rate_may_be_a_schedule(name):
+    schedule = optax.piecewise_constant_schedule(0.1, {1: 10.0})
+    optimizer, g = updates.make_optimizer(name, schedule, max_grad_norm=None), jnp.array(0.5)
+    first, second = changes(optimizer, jnp.array(0.0), g, g)
+    assert float(second / first) == pytest.approx(10, rel=1e-4)
 
 
 def test_nonsense_is_refused():

@@ -1,0 +1,243 @@
+"""Rollouts against a loop by hand, on a task that counts its steps."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import Chain, Toy, ToyState, categorical
+
+from mjx_reinforce import Distribution, Trajectory
+from mjx_reinforce.engines import rollouts
+
+#: Two entries of an action, noise added; the mode is what the network says.
+PLAIN = Distribution(
+    num_outputs=2,
+    constants=(),
+    noise=lambda key, shape: jax.random.normal(key, (*shape, 2)),
+    sample=lambda outputs, noise: outputs + noise,
+    mode=lambda outputs: outputs,
+    log_prob=lambda outputs, action: jnp.zeros(action.shape[:-1]),
+    entropy=lambda outputs: jnp.zeros(outputs.shape[:-1]),
+)
+
+
+class Counter(Toy):
+    """Shows (steps made, drawn start); earns its action's sum; ends after ``length`` steps.
+
+    ``spoil(state)`` may change what a step returns.
+    """
+
+    action_size = 2
+
+    def __init__(self, length=10**9, spoil=lambda state: state):
+        self.length, self.spoil = length, spoil
+
+    def reset(self, rng):
+        start = jax.random.uniform(rng)
+        return ToyState(jnp.stack([0.0, start]), jnp.zeros(()), jnp.zeros(()), start)
+
+    def step(self, state, action):
+        obs = state.obs + jnp.array([1.0, 0.0])
+        limit = jnp.floor(1 + self.length * state.info)
+        done = (obs[0] >= limit).astype(jnp.float32)
+        return self.spoil(state.replace(obs=obs, reward=jnp.sum(action), done=done))
+
+
+def act(actor, observation):
+    """Outputs [N, 2] that tell the episodes and the steps apart."""
+    return actor * observation
+
+
+def play(env, key=None, *, num_episodes=4, horizon=6, distribution=PLAIN, act=act, **options):
+    options = {"num_episodes": num_episodes, "horizon": horizon} | options
+    key = jax.random.key(0) if key is None else key
+    roll = jax.jit(functools.partial(rollouts.rollout, env, act, **options), static_argnums=1)
+    return jax.tree.map(np.asarray, roll(jnp.array([0.1, 2.0]), distribution, key))
+
+
+def by_hand(env, key, num_episodes, horizon, chunk, num_deterministic=0):
+    """The episodes one by one; an episode's keys come from its own index and the chunk."""
+    shape = horizon, num_episodes
+    observation, action = np.zeros((2, *shape, 2), np.float32)
+    reward, mask = np.zeros(shape, np.float32), np.zeros(shape, bool)
+    for n in range(num_episodes):
+        reset_key, noise_key = jax.random.split(jax.random.fold_in(key, n))
+        state = env.reset(reset_key)
+        for t in range(horizon):
+            if t % chunk == 0:
+                noise_key, draw_key = jax.random.split(noise_key)
+                noise = PLAIN.noise(draw_key, (chunk,))
+            outputs = act(jnp.array([0.1, 2.0]), state.obs)
+            chosen = outputs if n < num_deterministic else outputs + noise[t % chunk]
+            observation[t, n], action[t, n], mask[t, n] = state.obs, chosen, True
+            state = env.step(state, chosen)
+            reward[t, n] = state.reward
+            if state.done:
+                break
+    return observation, action, reward, mask
+
+
+def assert_is(trajectory, expected):
+    names = ("observation", "action", "reward", "mask")
+    for name, values in zip(names, expected, strict=True):
+        np.testing.assert_allclose(getattr(trajectory, name), values, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("num_deterministic", [0, 1, 4])
+def test_episodes_are_those_of_a_loop(num_deterministic):
+    """The last step is in the mask, everything behind it is zero, the first ones take the mode."""
+    env, key = Counter(length=8), jax.random.key(3)
+    trajectory = play(env, key, num_deterministic=num_deterministic)
+    expected = by_hand(env, key, 4, 6, 6, num_deterministic)
+    lengths = expected[-1].sum(axis=0)
+    assert lengths.min() < 6  # some end by themselves,
+    assert lengths.max() == 6  # some at the horizon
+    assert_is(trajectory, expected)
+    assert not trajectory.nonfinite.any()
+
+
+@pytest.mark.parametrize(("horizon", "chunk"), [(1, 1), (50, 50), (51, 17), (100, 50)])
+def test_noise_is_drawn_by_the_chunk(horizon, chunk):
+    """A chunk is as long as the largest divisor of the horizon up to 50."""
+    env, key = Counter(), jax.random.key(5)
+    trajectory = play(env, key, num_episodes=2, horizon=horizon)
+    assert trajectory.mask.all()
+    assert_is(trajectory, by_hand(env, key, 2, horizon, chunk))
+
+
+@pytest.mark.parametrize(
+    ("length", "steps"), [(1, 50), (49, 50), (50, 50), (51, 100), (100, 100), (101, 150)]
+)
+def test_the_simulation_stops_when_all_episodes_are_over(length, steps):
+    """And ``simulated_steps`` says how many were made: whole chunks of 50 here."""
+    made = []
+
+    class Fixed(Counter):
+        def reset(self, rng):
+            return super().reset(rng).replace(info=(length - 0.5) / 200)
+
+    env = Fixed(length=200)
+    batch = jax.vmap(env.step, in_axes=-1, out_axes=-1)
+
+    def counted(state, action):
+        jax.debug.callback(lambda: made.append(1))
+        return batch(state, action)
+
+    trajectory = play(env, horizon=200, env_step=counted)
+    jax.effects_barrier()
+    assert rollouts.episode_lengths(trajectory).tolist() == [length] * 4
+    assert len(made) == steps
+    assert int(rollouts.simulated_steps(trajectory)) == 4 * steps
+
+
+@pytest.mark.parametrize("entry", ["observation", "reward"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_what_is_not_finite_ends_its_episode(entry, value):
+    """The third step breaks in those episodes that start high; its reward is 0."""
+
+    def spoil(state):
+        broken = (state.obs[0] == 3) & (state.info > 0.5)
+        if entry == "reward":
+            return state.replace(reward=jnp.where(broken, value, state.reward))
+        return state.replace(obs=state.obs.at[1].set(jnp.where(broken, value, state.obs[1])))
+
+    key = jax.random.key(1)
+    trajectory = play(Counter(spoil=spoil), key)
+    healthy = play(Counter(), key)
+    broken = healthy.observation[0, :, 1] > 0.5
+    assert 0 < broken.sum() < 4
+    np.testing.assert_array_equal(trajectory.nonfinite, broken)
+    np.testing.assert_array_equal(trajectory.mask.sum(axis=0), np.where(broken, 3, 6))
+    kept = trajectory.mask & ~(broken & (np.arange(6)[:, None] == 2))
+    np.testing.assert_array_equal(trajectory.reward, np.where(kept, healthy.reward, 0.0))
+    assert all(np.all(np.isfinite(x)) for x in (trajectory.observation, trajectory.action))
+
+
+def test_a_finished_episode_stands_still():
+    """What the simulation would do behind the end is not counted as broken, nor as played."""
+
+    def spoil(state):
+        return state.replace(obs=jnp.where(state.obs[0] > 2, jnp.nan, state.obs))
+
+    class Two(Counter):
+        def step(self, state, action):
+            after = super().step(state, action)
+            return after.replace(done=jnp.where(after.obs[0] == 2, 1.0, 0.0))
+
+    trajectory = play(Two(spoil=spoil))
+    assert not trajectory.nonfinite.any()
+    assert trajectory.mask.sum(axis=0).tolist() == [2] * 4
+
+
+def test_an_end_that_breaks_is_both():
+    def spoil(state):
+        return state.replace(reward=jnp.where(state.obs[0] == 1, jnp.nan, 1.0), done=jnp.ones(()))
+
+    trajectory = play(Counter(spoil=spoil))
+    assert trajectory.nonfinite.all()
+    assert trajectory.mask.sum(axis=0).tolist() == [1] * 4
+    assert np.all(trajectory.reward == 0)
+
+
+@pytest.mark.parametrize("active", [True, False])
+def test_a_seed_that_stands_still_plays_nothing(active):
+    trajectory = play(Counter(), active=active)
+    assert trajectory.mask.all() == active
+    if not active:
+        assert all(not np.any(x) for x in jax.tree.leaves(trajectory))
+        assert int(rollouts.simulated_steps(trajectory)) == 0
+
+
+def test_seeds_side_by_side_are_each_its_own():
+    """One of them stands still, and the others' episodes end at different times."""
+    env, keys = Counter(length=8), jax.random.split(jax.random.key(0), 3)
+    actor = jnp.array([0.1, 2.0])
+
+    def roll(key, active):
+        return rollouts.rollout(
+            env, act, actor, PLAIN, key, num_episodes=2, horizon=100, active=active
+        )
+
+    together = jax.vmap(roll)(keys, jnp.array([True, False, True]))
+    for s in (0, 2):
+        alone = jax.tree.map(lambda x, s=s: x[s], together)
+        assert_is(alone, by_hand(env, keys[s], 2, 100, 50))
+    assert not together.mask[1].any()
+
+
+def test_discrete_actions_have_no_last_axis():
+    trajectory = play(
+        Chain(),
+        num_episodes=5,
+        horizon=3,
+        distribution=categorical(2),
+        act=lambda actor, observation: jnp.stack([observation[:, 0], 2 * observation[:, 1]], -1),
+        num_deterministic=5,
+    )
+    # Arm 0 first, then arm 1, and where both are equal arm 0.
+    assert trajectory.action.shape == (3, 5)
+    np.testing.assert_array_equal(trajectory.action, np.array([[0], [1], [0]]).repeat(5, axis=1))
+    earned = Chain.rewards[[0, 1, 2], [0, 1, 0]]
+    np.testing.assert_allclose(trajectory.reward, earned[:, None].repeat(5, axis=1), rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("lengths", "horizon", "expected"),
+    [([3, 1], 20, 40), ([20, 1], 20, 40), ([50, 50], 100, 100), ([51, 2], 100, 200)]
+    + [([0, 0], 100, 0), ([1, 1], 53, 2), ([2, 1], 34, 68), ([18, 1], 51, 68)],
+)
+def test_simulated_steps_by_hand(lengths, horizon, expected):
+    mask = jnp.arange(horizon)[:, None] < jnp.array(lengths)
+    empty = jnp.zeros((horizon, 2))
+    trajectory = Trajectory(
+        observation=empty[..., None],
+        action=empty[..., None],
+        reward=jnp.where(mask, 0.5, 0.0),
+        mask=mask,
+        nonfinite=jnp.zeros(2, bool),
+    )
+    assert int(rollouts.simulated_steps(trajectory)) == expected
+    assert rollouts.episode_lengths(trajectory).tolist() == lengths
+    np.testing.assert_allclose(rollouts.episode_returns(trajectory), 0.5 * np.array(lengths))
