@@ -19,6 +19,7 @@ LENGTHS = np.array([4, 1, 3])
 REWARD = np.array([[1.0, 2.0, 0.5], [0.5, 9.0, 1.5], [2.0, 9.0, 1.0], [3.0, 9.0, 9.0]])
 
 
+FACTORIES = [load(path) for path in ESTIMATORS.values()]
 MASK = np.arange(4)[:, None] < LENGTHS
 
 
@@ -102,7 +103,10 @@ def test_normalized_returns_by_hand():
 
 def test_value_baseline_by_hand():
     """Two gradient steps of a linear critic on the mean squared error, after its use."""
-    returns, seen = returns_by_hand(0.9)[MASK], np.asarray(make_trajectory().observation)[MASK][:, 0]
+    returns, seen = (
+        returns_by_hand(0.9)[MASK],
+        np.asarray(make_trajectory().observation)[MASK][:, 0],
+    )
     estimator = est.value_baseline(
         0.9, network=flax.linen.Dense(1), optimizer=optax.sgd(0.1), num_fits=2
     )
@@ -148,7 +152,9 @@ def test_the_critics_optimizer_keeps_its_state_and_sees_the_parameters():
 
 def test_equal_returns_leave_nothing_to_explain():
     """A variance of 0 counts as 1e-8."""
-    explained = est._explained(jnp.array([[1e-4], [-1e-4]]), jnp.ones((2, 1)), jnp.ones((2, 1), bool))
+    explained = est._explained(
+        jnp.array([[1e-4], [-1e-4]]), jnp.ones((2, 1)), jnp.ones((2, 1), bool)
+    )
     assert float(explained) == pytest.approx(0.0, abs=1e-3)
 
 
@@ -188,11 +194,7 @@ def test_wrapping_keeps_what_an_estimator_requires_learns_and_measures(wrap):
     assert_equal(metrics, {name: wrapped_metrics[name] for name in metrics})
 
 
-@pytest.mark.parametrize(
-    "make",
-    [est.total_return, est.reward_to_go, est.leave_one_out, est.mean_log_prob]
-    + [est.normalized_returns, est.value_baseline],
-)
+@pytest.mark.parametrize("make", FACTORIES)
 def test_the_default_discount_is_099(make):
     assert_equal(weights(make(), make_trajectory()), weights(make(0.99), make_trajectory()))
 
@@ -266,7 +268,9 @@ def test_one_step_is_a_sample_of_one():
     estimator = est.value_baseline(network=flax.linen.Dense(1), num_fits=1)
     critic = estimator.init(jax.random.key(0), 1)
     _, _, metrics = estimator.update(critic, trajectory)
-    assert float(metrics["value_loss"]) == pytest.approx(1.0, rel=1e-5)  # seen 0, valued 0, earned 1
+    assert float(metrics["value_loss"]) == pytest.approx(
+        1.0, rel=1e-5
+    )  # seen 0, valued 0, earned 1
 
 
 @pytest.mark.parametrize("name", sorted(ESTIMATORS))
@@ -343,10 +347,7 @@ def assert_unbiased(estimator, objective):
 
 
 @pytest.mark.parametrize(
-    "make",
-    [est.total_return, est.reward_to_go, est.leave_one_out, est.mean_log_prob]
-    + [est.normalized_returns, est.value_baseline]
-    + [functools.partial(est.discount_weights, est.reward_to_go())],
+    "make", [*FACTORIES, functools.partial(est.discount_weights, est.reward_to_go())]
 )
 def test_a_discount_lies_between_0_and_1(make):
     make(0.0), make(1.0)

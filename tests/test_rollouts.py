@@ -225,8 +225,16 @@ def test_discrete_actions_have_no_last_axis():
 
 @pytest.mark.parametrize(
     ("lengths", "horizon", "expected"),
-    [([3, 1], 20, 40), ([20, 1], 20, 40), ([50, 50], 100, 100), ([51, 2], 100, 200)]
-    + [([0, 0], 100, 0), ([1, 1], 53, 2), ([2, 1], 34, 68), ([18, 1], 51, 68)],
+    [
+        ([3, 1], 20, 40),
+        ([20, 1], 20, 40),
+        ([50, 50], 100, 100),
+        ([51, 2], 100, 200),
+        ([0, 0], 100, 0),
+        ([1, 1], 53, 2),  # a prime: step by step
+        ([2, 1], 34, 68),
+        ([18, 1], 51, 68),
+    ],
 )
 def test_simulated_steps_by_hand(lengths, horizon, expected):
     mask = jnp.arange(horizon)[:, None] < jnp.array(lengths)
