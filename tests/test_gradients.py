@@ -9,8 +9,8 @@ from mjx_reinforce.learners.gradients import accumulate_gradient
 
 
 def loss(params, chunk):
-    x, mask = chunk
-    total = jnp.sum(jnp.where(mask, jnp.tanh(params["w"] * x), 0.0))
+    x, factor, mask = chunk
+    total = jnp.sum(jnp.where(mask, jnp.tanh(params["w"] * factor * x), 0.0))
     return total, {"steps": jnp.sum(mask), "x": jnp.sum(jnp.where(mask, x, 0.0))}
 
 
@@ -24,7 +24,8 @@ def test_the_sum_is_over_every_step_and_chunks_after_the_end_are_skipped(longest
     mask = np.arange(256)[:, None] < lengths
     x = np.random.default_rng(0).normal(size=(256, 2))
     unvisited = np.arange(256) >= (0 if longest == 0 else 128 if longest <= 128 else 256)
-    data = jnp.asarray(np.where(unvisited[:, None], np.nan, x)), jnp.asarray(mask)
+    poisoned = np.where(unvisited[:, None], np.nan, x)
+    data = tuple(map(jnp.asarray, (poisoned, np.ones((256, 2)), mask)))
     total, grads, sums = accumulate_gradient(loss, PARAMS, data)
     slope = np.sum((x / np.cosh(0.7 * x) ** 2)[mask])
     assert float(total) == pytest.approx(np.sum(np.tanh(0.7 * x)[mask]), rel=1e-5, abs=1e-6)
@@ -34,7 +35,7 @@ def test_the_sum_is_over_every_step_and_chunks_after_the_end_are_skipped(longest
 
 
 def test_integers_are_summed_as_integers():
-    data = jnp.ones((4, 2)), jnp.ones((4, 2), bool)
+    data = jnp.ones((4, 2)), jnp.ones((4, 2)), jnp.ones((4, 2), bool)
     _, _, sums = accumulate_gradient(loss, PARAMS, data)
     assert jnp.issubdtype(sums["steps"].dtype, jnp.integer)
 
@@ -47,10 +48,10 @@ def chunk_length(horizon, num_episodes):
         seen.append(chunk[-1].shape)
         return loss(params, chunk)
 
-    data = (
-        jax.ShapeDtypeStruct((horizon, num_episodes), jnp.float32),
-        jax.ShapeDtypeStruct((horizon, num_episodes), jnp.bool),
+    numbers, mask = (
+        jax.ShapeDtypeStruct((horizon, num_episodes), dtype) for dtype in (jnp.float32, jnp.bool)
     )
+    data = numbers, numbers, mask
     jax.eval_shape(lambda *data: accumulate_gradient(watched, PARAMS, data), *data)
     lengths = {shape[0] for shape in seen}
     assert {shape[1:] for shape in seen} == {(num_episodes,)}
@@ -63,6 +64,7 @@ def chunk_length(horizon, num_episodes):
     [
         (100, 4, 100),
         (256, 4, 128),  # at most 128 steps
+        (258, 4, 86),  # and not 129
         (1000, 4, 125),  # the largest divisor below
         (12, 2**18 // 6, 6),  # at most 2**18 samples
         (12, 2**18 // 6 + 1, 4),
@@ -83,11 +85,10 @@ def test_seeds_side_by_side_stop_each_at_its_own_end():
     """Beside a seed of longer episodes the loop goes on: what it adds then is nothing."""
     masks = np.arange(256)[:, None] < np.array([[3], [200]])[:, None, :]
     x = np.random.default_rng(0).normal(size=(2, 256, 1))
-    together = jax.vmap(lambda *data: accumulate_gradient(loss, PARAMS, data))(
-        jnp.asarray(x), jnp.asarray(masks)
-    )
+    data = tuple(map(jnp.asarray, (x, np.ones_like(x), masks)))
+    together = jax.vmap(lambda *data: accumulate_gradient(loss, PARAMS, data))(*data)
     for s in range(2):
-        alone = accumulate_gradient(loss, PARAMS, (jnp.asarray(x[s]), jnp.asarray(masks[s])))
+        alone = accumulate_gradient(loss, PARAMS, jax.tree.map(lambda x, s=s: x[s], data))
         jax.tree.map(
             lambda a, b, s=s: np.testing.assert_allclose(a[s], b, rtol=1e-5), together, alone
         )
