@@ -54,8 +54,12 @@ def assert_close(got, expected):
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), got, expected)
 
 
+#: It reads its state, and the parameters for their decay.
+ADAMW = optax.adamw(0.1, weight_decay=0.3)
+
+
 def test_full_batch_is_one_step():
-    problem = make_problem(optax.adam(0.1))
+    problem = make_problem(ADAMW)
     params, opt_state, metrics = run(updates.full_batch(), problem)
     start = PARAMS, problem.optimizer.init(PARAMS)
     expected = descend(problem, *start, problem.samples, 3)
@@ -94,7 +98,7 @@ def each_step_by_hand(problem):
 def test_each_step_is_a_loop_over_time(longest):
     """Up to the end of the longest episode, which may be the horizon of 5."""
     mask = np.arange(5)[:, None] < np.minimum([longest, 1, 3], longest)
-    problem = make_problem(optax.adam(0.1), mask=mask)
+    problem = make_problem(ADAMW, mask=mask)
     assert_close(run(updates.each_step(), problem), each_step_by_hand(problem))
 
 
@@ -114,7 +118,7 @@ def test_each_step_of_one_seed_ends_with_its_own_episodes():
 
 
 def test_minibatches_are_steps_on_drawn_samples():
-    problem, key = make_problem(optax.adam(0.1)), jax.random.key(5)
+    problem, key = make_problem(ADAMW), jax.random.key(5)
     got = run(updates.minibatches(3, 4), problem, key)
     drawn = jax.random.randint(key, (3, 4), 1, MASK.sum() + 1)
     flat = [x.reshape(-1, *x.shape[2:]) for x in problem.samples]
@@ -277,5 +281,5 @@ def test_nonsense_is_refused():
         updates.minibatches(0, 8)
     with pytest.raises(ValueError, match="batch_size must be at least 1, got -1"):
         updates.minibatches(1, -1)
-    with pytest.raises(ValueError, match="Did you mean 'adamw'"):
+    with pytest.raises(ValueError, match="unknown optimizer 'adamww'. Did you mean 'adamw'"):
         updates.make_optimizer("adamww")
