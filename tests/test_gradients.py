@@ -10,7 +10,7 @@ from mjx_reinforce.learners.gradients import accumulate_gradient
 
 def loss(params, chunk):
     x, factor, mask = chunk
-    total = jnp.sum(jnp.where(mask, jnp.tanh(params["w"] * factor * x), 0.0))
+    total = jnp.sum(jnp.where(mask, jnp.tanh(params["w"] * factor[..., 0] * x), 0.0))
     return total, {"steps": jnp.sum(mask), "x": jnp.sum(jnp.where(mask, x, 0.0))}
 
 
@@ -25,7 +25,7 @@ def test_the_sum_is_over_every_step_and_chunks_after_the_end_are_skipped(longest
     x = np.random.default_rng(0).normal(size=(256, 2))
     unvisited = np.arange(256) >= (0 if longest == 0 else 128 if longest <= 128 else 256)
     poisoned = np.where(unvisited[:, None], np.nan, x)
-    data = tuple(map(jnp.asarray, (poisoned, np.ones((256, 2)), mask)))
+    data = tuple(map(jnp.asarray, (poisoned, np.ones((256, 2, 1)), mask)))
     total, grads, sums = accumulate_gradient(loss, PARAMS, data)
     slope = np.sum((x / np.cosh(0.7 * x) ** 2)[mask])
     assert float(total) == pytest.approx(np.sum(np.tanh(0.7 * x)[mask]), rel=1e-5, abs=1e-6)
@@ -35,7 +35,7 @@ def test_the_sum_is_over_every_step_and_chunks_after_the_end_are_skipped(longest
 
 
 def test_integers_are_summed_as_integers():
-    data = jnp.ones((4, 2)), jnp.ones((4, 2)), jnp.ones((4, 2), bool)
+    data = jnp.ones((4, 2)), jnp.ones((4, 2, 1)), jnp.ones((4, 2), bool)
     _, _, sums = accumulate_gradient(loss, PARAMS, data)
     assert jnp.issubdtype(sums["steps"].dtype, jnp.integer)
 
@@ -48,10 +48,11 @@ def chunk_length(horizon, num_episodes):
         seen.append(chunk[-1].shape)
         return loss(params, chunk)
 
-    numbers, mask = (
-        jax.ShapeDtypeStruct((horizon, num_episodes), dtype) for dtype in (jnp.float32, jnp.bool)
+    data = (
+        jax.ShapeDtypeStruct((horizon, num_episodes), jnp.float32),
+        jax.ShapeDtypeStruct((horizon, num_episodes, 1), jnp.float32),
+        jax.ShapeDtypeStruct((horizon, num_episodes), jnp.bool),
     )
-    data = numbers, numbers, mask
     jax.eval_shape(lambda *data: accumulate_gradient(watched, PARAMS, data), *data)
     lengths = {shape[0] for shape in seen}
     assert {shape[1:] for shape in seen} == {(num_episodes,)}
@@ -85,7 +86,7 @@ def test_seeds_side_by_side_stop_each_at_its_own_end():
     """Beside a seed of longer episodes the loop goes on: what it adds then is nothing."""
     masks = np.arange(256)[:, None] < np.array([[3], [200]])[:, None, :]
     x = np.random.default_rng(0).normal(size=(2, 256, 1))
-    data = tuple(map(jnp.asarray, (x, np.ones_like(x), masks)))
+    data = tuple(map(jnp.asarray, (x, np.ones((2, 256, 1, 1)), masks)))
     together = jax.vmap(lambda *data: accumulate_gradient(loss, PARAMS, data))(*data)
     for s in range(2):
         alone = accumulate_gradient(loss, PARAMS, jax.tree.map(lambda x, s=s: x[s], data))

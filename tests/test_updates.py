@@ -281,5 +281,5 @@ def test_nonsense_is_refused():
         updates.minibatches(0, 8)
     with pytest.raises(ValueError, match="batch_size must be at least 1, got -1"):
         updates.minibatches(1, -1)
-    with pytest.raises(ValueError, match="unknown optimizer 'adamww'. Did you mean 'adamw'"):
+    with pytest.raises(ValueError, match=r"unknown optimizer 'adamww'\. Did you mean 'adamw'"):
         updates.make_optimizer("adamww")
