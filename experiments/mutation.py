@@ -69,7 +69,7 @@ def draw(mutants: list[str], sample: int | None, seed: int) -> list[str]:
 
 def main() -> None:
     """Tests the mutants and prints the table and the survivors."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="Tests mutants of the arithmetic.")
     parser.add_argument("modules", nargs="*", help="by file name; all by default")
     parser.add_argument("--sample", type=int, help="mutants a module; all by default")
     parser.add_argument("--seed", type=int, default=0, help="of the sample")

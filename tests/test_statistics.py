@@ -33,8 +33,8 @@ def test_iqm_is_taken_along_its_axis():
 
 def test_interval_is_the_percentile_bootstrap():
     """5000 resamples of as many seeds, drawn from the generator of seed 0; at 95 %."""
-    values = np.random.default_rng(3).exponential(size=9)
-    drawn = np.random.default_rng(0).integers(0, 9, (5000, 9))
+    values = np.random.default_rng(3).exponential(size=40)
+    drawn = np.random.default_rng(0).integers(0, 40, (5000, 40))
     expected = np.quantile(iqm(values[drawn]), [0.025, 0.975])
     np.testing.assert_allclose(iqm_interval(values), expected, rtol=1e-12)
     expected = np.quantile(iqm(values[drawn]), [0.25, 0.75])
