@@ -83,7 +83,7 @@ class MujocoEnv(Env):
 
     settings: Settings
     #: Fields of mjData that ``outcome`` reads of ``before`` besides qpos and qvel. Their values are
-    #: of the last forward pass, which is up to one physics step older than qpos, as in Gymnasium.
+    #: up to one physics step older than qpos, as in Gymnasium.
     carried: tuple[str, ...] = ()
     #: Whether ``outcome`` or ``observe`` reads ``cfrc_ext``, which is zero at the start of an
     #: episode, as in Gymnasium.

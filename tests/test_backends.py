@@ -31,6 +31,14 @@ ON_BITS = {
     *("and", "or", "xor", "not", "shift_left", "shift_right_arithmetic", "shift_right_logical"),
     *("clz", "population_count"),
 }
+#: What a backend must be given, by its name.
+SETTINGS = {
+    "xla": {
+        "read": lambda place: jnp.linspace(1.0, 2.0, 4),
+        "batch_shape": (4,),
+        "any_lane": fused.any_lane,
+    }
+}
 PARAMS = {
     "convert_element_type": {"new_dtype": np.dtype(np.int32)},
     "reduce_precision": {"exponent_bits": 8, "mantissa_bits": 7},
@@ -63,6 +71,19 @@ def test_a_backend_with_a_table_knows_every_operation(backend):
     table = load(BACKENDS[backend]).OPERATIONS
     if table is not None:
         assert set(table) == set(ops.FACTS)
+
+
+def branches_and_repeats(x):
+    """Has a loop that ends by what the lanes hold, and a branch that some lanes do not need."""
+    x = lax.while_loop(lambda y: y < 3.0, lambda y: jnp.sin(y) + 2.0 * y, x)
+    return lax.cond(x > 5.0, lambda y: jnp.exp(jnp.cos(y) / y), lambda y: y, x)
+
+
+@pytest.mark.parametrize("name", BACKENDS)
+def test_a_backend_walks_loops_and_gates(name):
+    """With settings as in `SETTINGS`, if the backend takes any."""
+    written = fused.scalarize(branches_and_repeats, jnp.ones(()), branch_cost=1)
+    assert written.compile(name, **SETTINGS.get(name, {}))
 
 
 @pytest.mark.parametrize("name", ops.FACTS)
@@ -111,22 +132,22 @@ class Listing(Backend[str]):
     def node(self, node, operands):
         return self.assign(f"{node.op.name}({', '.join(operands)})")
 
-    def gate(self, gate, env):
-        cold = [self.value(out.cold, env) for out in gate.outs]
-        self.lines.append(f"if any {self.value(gate.predicate, env)}")
-        inner = self.inside(gate.body, env)
+    def gate(self, gate, values):
+        cold = [self.value(out.cold, values) for out in gate.outs]
+        self.lines.append(f"if any {self.value(gate.predicate, values)}")
+        inner = self.inside(gate.body, values)
         hot = [self.value(out.hot, inner) for out in gate.outs]
         return [self.assign(f"{on} else {off}") for on, off in zip(hot, cold, strict=True)]
 
-    def loop(self, loop, env):
-        starts = [self.assign(self.value(carry.init, env)) for carry in loop.carries]
-        rows = [[self.value(x, env) for x in element.values] for element in loop.elements]
+    def loop(self, loop, values):
+        starts = [self.assign(self.value(carry.init, values)) for carry in loop.carries]
+        rows = [[self.value(x, values) for x in element.values] for element in loop.elements]
         self.lines.append(f"repeat {loop.length}")
         known = {c.leaf: start for c, start in zip(loop.carries, starts, strict=True)}
         known.update(
             {e.leaf: f"[{' '.join(row)}]" for e, row in zip(loop.elements, rows, strict=True)}
         )
-        inner = self.inside(loop.body, env, known)
+        inner = self.inside(loop.body, values, known)
         ends = [self.value(carry.next, inner) for carry in loop.carries]
         kept = [self.value(record.value, inner) for record in loop.records]
         self.lines.append(f"next {' '.join(ends)}")

@@ -33,7 +33,7 @@ class Player(NamedTuple):
 
     act: (actor, observation [..., O]) -> outputs [..., K] of the distribution
     actor: what ``act`` reads, or its shapes
-    distribution: what the outputs index
+    distribution: the family whose parameters the outputs are
     """
 
     act: Callable[[Any, jax.Array], jax.Array]

@@ -1,8 +1,8 @@
 """What an episode is: how it begins, what one step of it does, and when it is over.
 
-Every engine plays these functions, so that an episode means the same everywhere. Arrays are those
-of one episode. Or they are those of N episodes, which are the last axis of the environment's state
-and the first axis of what the policy reads and returns.
+Every engine plays these functions, so that an episode means the same everywhere. Arrays hold one
+episode or N. N is the last axis of the environment's state, and the first axis of what the policy
+reads and returns.
 """
 
 from collections.abc import Callable
@@ -65,7 +65,7 @@ def step(
     Args:
       env_step: (state, action) -> state of the environment.
       act: (actor, observation [O] or [N, O]) -> outputs of the distribution.
-      distribution: what the outputs index.
+      distribution: the family whose parameters the outputs are.
       actor: what ``act`` reads.
       state: the environment's state before the step.
       noise: [E] or [N, E] what the action is drawn from.
@@ -91,10 +91,10 @@ def step(
 
 
 def hold(alive: jax.Array, after: Any, before: Any) -> Any:
-    """Returns the next state of an episode that runs, and of one that is over its last.
+    """Returns ``after`` where an episode is running, and ``before`` where it is over.
 
-    A finished episode repeats its last step, because a state that runs off to infinity costs MJX's
-    own constraint solver all its iterations.
+    So a finished episode keeps its last state. Otherwise its state could run off to infinity,
+    where MJX's own constraint solver needs all its iterations.
     """
     return jax.tree.map(lambda new, old: jnp.where(alive, new, old), after, before)
 

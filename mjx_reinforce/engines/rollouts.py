@@ -49,13 +49,13 @@ def rollout(
       env: what is played.
       act: (actor, observation [N, O]) -> outputs [N, K] of the distribution.
       actor: what ``act`` reads.
-      distribution: what the outputs index.
+      distribution: the family whose parameters the outputs are.
       key: consumed.
       num_episodes: N.
       horizon: T, the time limit in steps; reaching it ends an episode.
       num_deterministic: how many episodes, the first ones, take the mode.
-      active: [] False plays nothing, for a seed that stands still among others.
-      env_step: ``env.step`` over the last axis of every leaf; by default ``jax.vmap`` of it.
+      active: [] where False, nothing is played: a finished seed beside others that train.
+      env_step: ``env.step`` of N episodes, the last axis of every leaf; by default ``jax.vmap``.
 
     Returns:
       The episodes. A non-finite observation or reward ends its episode, with reward 0 for that
@@ -133,7 +133,8 @@ def episode_lengths(trajectory: Trajectory) -> jax.Array:
 def simulated_steps(trajectory: Trajectory) -> jax.Array:
     """Returns how many env steps [] were simulated: N times the longest episode, in whole chunks.
 
-    Beside other seeds, it is the seed with the longest episode that decides.
+    This counts one seed alone. Seeds that are vmapped together all run as long as the slowest,
+    which ``runs.record.Record`` counts.
     """
     horizon, num_episodes = trajectory.mask.shape
     length = chunk_length(horizon)

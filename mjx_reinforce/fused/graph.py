@@ -6,7 +6,7 @@ of a branch, because then it would run also where the branch is skipped.
 """
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -21,10 +21,11 @@ class Graph:
     """Makes nodes, folding constants and sharing equal ones.
 
     Attributes:
-        branch_cost: a branch of more scalar operations than this is skipped where no lane needs it.
+        branch_cost: a branch of more scalar operations than this is skipped where no element of
+            the batch needs it.
         unrolled: a scan that reads and makes no arrays is written out up to this length.
-        certain: predicates that hold in some lane wherever the present scope runs: those of the
-            branches and loops around it, which run only if some lane has them.
+        certain: predicates of the branches and loops around the present scope. Its code runs only
+            if each of them is true for at least one element of the batch.
     """
 
     def __init__(self, branch_cost: int, unrolled: int):
@@ -70,7 +71,7 @@ class Graph:
 
     @contextlib.contextmanager
     def assuming(self, predicate: Scalar) -> Iterator[None]:
-        """Takes a predicate for one that holds in some lane."""
+        """Assumes in a block that a predicate is true for at least one element of the batch."""
         before = set(self.certain)
         if isinstance(predicate, Node):
             self.certain.add(predicate)
@@ -87,7 +88,7 @@ class Graph:
         return Node(np.dtype(dtype), varying, self.scope, index, owner=owner, position=position)
 
     def constant(self, value: Any) -> np.ndarray:
-        """Returns a captured array: its value, or shared leaves if it is a tracer."""
+        """Returns a captured array: its value, or for a tracer one leaf for each element."""
         known = jaxprs.as_numpy(value)
         if known is not None:
             return known
@@ -118,12 +119,6 @@ class Graph:
     def select(self, predicate: Scalar, on_true: Scalar, on_false: Scalar) -> Scalar:
         """Returns on_true where the predicate holds, else on_false."""
         return self.apply(ops.SELECT, (predicate, on_false, on_true), on_true.dtype)
-
-    def fold(self, function: Callable, values: Sequence[Scalar], first: Scalar) -> Scalar:
-        """Combines values from the left."""
-        for value in values:
-            first = function(first, value)
-        return first
 
     def apply(self, op: ops.Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar:
         """Applies an operation: a constant, an existing node, a simpler one or a new one."""

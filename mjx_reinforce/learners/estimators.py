@@ -7,7 +7,8 @@ and never sees the policy. With the discounted return to go written
     G[t] = r[t] + discount * G[t + 1],
 
 every estimator here but two is unbiased for the same gradient; they differ in variance.
-``standardize`` multiplies that gradient by a positive factor. ``mean_log_prob`` and
+``standardize`` divides the weights of an update by a number that it computes from them, so that
+its gradient has another length, and is no longer exactly unbiased. ``mean_log_prob`` and
 ``normalized_returns`` come from published programs, and say what they follow instead.
 """
 

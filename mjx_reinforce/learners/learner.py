@@ -19,7 +19,7 @@ Metrics = dict[str, jax.Array]
 
 @struct.dataclass(kw_only=True)
 class TrainState:
-    """All that the next update needs; no environment state is among it.
+    """All that the next update needs; it holds no environment state.
 
     key: [] the seed's own random key, split by every update
     num_updates: [] how many updates were made
@@ -111,14 +111,14 @@ def check_horizon(env: Environment, horizon: int | None) -> int:
     return horizon
 
 
-def keep_finite(learned: Any, known: Any) -> tuple[Any, jax.Array]:
-    """Returns what was learned if all of it is finite, else what was known, and 1 in that case.
+def keep_finite(learned: Any, before: Any) -> tuple[Any, jax.Array]:
+    """Returns ``learned`` and 0 if all of it is finite, else ``before`` and 1.
 
-    A broken update must cost one seed one update, not the seed, and nothing else.
+    So an update that breaks costs its seed that one update.
     """
     leaves = [x for x in jax.tree.leaves(learned) if jnp.issubdtype(x.dtype, jnp.floating)]
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))
-    kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), learned, known)
+    kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), learned, before)
     return kept, jnp.where(finite, 0, 1)
 
 

@@ -2,7 +2,7 @@
 
 One update plays N complete episodes and follows the gradient of
 
-    (1/N) sum_n sum_t weight[t, n] log pi(a[t, n] | o[t, n]) + entropy_cost H[t, n]
+    (1/N) sum_n sum_t (weight[t, n] log pi(a[t, n] | o[t, n]) + entropy_cost H[t, n])
 
 with the weights that an estimator gives.
 """
@@ -79,23 +79,23 @@ def reinforce(
       num_episodes: N, episodes an update.
       horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
       entropy_cost: weight of the policy's entropy H, in return per nat.
-      loss_per: "episode" divides the sum by N; "step" by the number of steps played, which makes
-        the optimiser's step shrink as episodes grow.
+      loss_per: "episode" divides the sum by N; "step" by the number of steps played, so that the
+        gradient does not grow with the episodes.
       normalize_steps: scale observations by the mean and std of about the first so many steps,
-        then keep that scale (one that follows a policy as it learns to stay near the middle
-        raises its gain until it fails); 0 does not scale, inf never stops. An update uses the
-        statistics that its episodes were played with.
-      one_start: reset every episode of a seed with one key of its own, drawn at ``init``.
+        then keep that scale; 0 does not scale, inf never stops. (Where a policy learns to keep
+        the state near the middle, statistics that never stop shrink, and magnify the
+        observations until the policy fails.)
+      one_start: reset every episode of a seed with the same key, drawn once at ``init``.
       engine: how episodes are played: "auto", "vmap", "fused" or "kernel", see ``engines.choice``.
 
     Raises:
       ValueError: an argument makes no sense for this environment.
     """
     size = observation_size(env)
-    default = policy or mlp_policy(size, default_distribution(action_space(env)))
+    chosen = policy or mlp_policy(size, default_distribution(action_space(env)))
     return _Reinforce(
         env=env,
-        policy=default,
+        policy=chosen,
         estimator=estimator or standardize(leave_one_out(), floor=10.0),
         optimizer=optimizer or make_optimizer(),
         update=update or full_batch(),
@@ -192,17 +192,19 @@ class _Reinforce:
             samples=(scaled, trajectory.action, weight, mask),
             divisor=jnp.maximum(jnp.sum(mask), 1) if self.loss_per == "step" else self.num_episodes,
         )
-        params, opt_state, spent = self.update(problem, key, actor.params, state.opt_state)
+        params, opt_state, update_metrics = self.update(problem, key, actor.params, state.opt_state)
         normalizer = normalize.update(
             actor.normalizer, trajectory.observation, mask, self.normalize_steps
         )
         learned = Actor(params=params, normalizer=normalizer), opt_state, estimator_state
-        known = actor, state.opt_state, state.estimator_state
-        (actor, opt_state, estimator_state), skipped = keep_finite(learned, known)
+        before = actor, state.opt_state, state.estimator_state
+        (actor, opt_state, estimator_state), skipped = keep_finite(learned, before)
         state = dataclasses.replace(
             state, actor=actor, opt_state=opt_state, estimator_state=estimator_state
         )
-        return state, episode_metrics(trajectory) | metrics | spent | {"skipped_update": skipped}
+        return state, episode_metrics(trajectory) | metrics | update_metrics | {
+            "skipped_update": skipped
+        }
 
 
 class _OneStart:
@@ -220,7 +222,7 @@ class _OneStart:
 
 
 def _surrogate(policy: Policy, entropy_cost: float | jax.Array) -> Callable[..., Any]:
-    """Returns the sum over samples whose gradient is followed, and the entropy's sum."""
+    """Returns (params, samples) -> (minus the sum in the formula, the sum of the entropy)."""
 
     def surrogate(params, chunk):
         observation, action, weight, mask = chunk

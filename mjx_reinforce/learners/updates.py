@@ -29,7 +29,7 @@ class Problem(NamedTuple):
       of metrics, ``entropy`` among them)
     optimizer: what turns gradients into changes
     samples: observation [T, N, O], action [T, N, ...], weight [T, N] and mask [T, N]
-    divisor: [] over which the sum over all samples is divided
+    divisor: [] by which the sum over all samples is divided
     """
 
     surrogate: Callable[[Any, tuple[jax.Array, ...]], tuple[jax.Array, dict[str, jax.Array]]]

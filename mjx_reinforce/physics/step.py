@@ -7,8 +7,8 @@ The stages are MJX's own, in MJX's order, but for three:
 - `contacts` finds the contacts of capsules as C MuJoCo 4.0 does; MJX 3.17 departs from it.
 - `runge_kutta` turns free and ball joints as C MuJoCo 4.0 does; MJX 3.17 departs from it.
 
-Gymnasium runs C MuJoCo, so that its answer is the one wanted. Where a model has neither such
-contacts nor such joints, as InvertedPendulum, a step equals `mjx.step`.
+Gymnasium runs C MuJoCo, so its answer is the one we want. For a model without such contacts and
+joints, such as InvertedPendulum's, a step equals `mjx.step`.
 """
 
 import functools

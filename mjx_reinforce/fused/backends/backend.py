@@ -30,19 +30,22 @@ class Backend(abc.ABC, Generic[Value]):
 
     @abc.abstractmethod
     def leaf(self, node: Node) -> Value:
-        """Returns what an input becomes, or an element of a captured array; read when needed."""
+        """Returns what an input becomes, or an element of a captured array.
+
+        It is called when the value is first needed.
+        """
 
     @abc.abstractmethod
     def node(self, node: Node, operands: list[Value]) -> Value:
         """Returns what the operation of a node becomes."""
 
     @abc.abstractmethod
-    def gate(self, gate: LiveGate, env: dict[Node, Value]) -> Sequence[Value]:
+    def gate(self, gate: LiveGate, values: dict[Node, Value]) -> Sequence[Value]:
         """Returns a value for each of the gate's outs."""
 
     @abc.abstractmethod
     def loop(
-        self, loop: LiveLoop, env: dict[Node, Value]
+        self, loop: LiveLoop, values: dict[Node, Value]
     ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
         """Returns the final value of each carry, and each record's value in each iteration."""
 
@@ -52,41 +55,43 @@ class Backend(abc.ABC, Generic[Value]):
 
     def compile(self, schedule: Schedule, outputs: list[list[Scalar]]) -> Any:
         """Runs a whole program; returns its `result`."""
-        env: dict[Node, Value] = {}
-        self.run(schedule, env)
-        return self.result([[self.value(x, env) for x in leaf] for leaf in outputs])
+        values: dict[Node, Value] = {}
+        self.run(schedule, values)
+        return self.result([[self.value(x, values) for x in leaf] for leaf in outputs])
 
-    def run(self, schedule: Schedule, env: dict[Node, Value]) -> None:
-        """Adds to the environment what the steps of a schedule compute."""
+    def run(self, schedule: Schedule, values: dict[Node, Value]) -> None:
+        """Adds to the values what the steps of a schedule compute."""
         for step in schedule:
             if isinstance(step, LiveLoop):
-                carries, records = self.loop(step, env)
-                env.update(zip((carry.out for carry in step.carries), carries, strict=True))
-                for record, values in zip(step.records, records, strict=True):
-                    env.update(zip(record.outs, values, strict=True))
+                carries, records = self.loop(step, values)
+                values.update(zip((carry.out for carry in step.carries), carries, strict=True))
+                for record, kept in zip(step.records, records, strict=True):
+                    values.update(zip(record.outs, kept, strict=True))
             elif isinstance(step, LiveGate):
-                env.update(zip((out.leaf for out in step.outs), self.gate(step, env), strict=True))
+                values.update(
+                    zip((out.leaf for out in step.outs), self.gate(step, values), strict=True)
+                )
             else:
-                env[step] = self.node(step, [self.value(arg, env) for arg in step.args])
+                values[step] = self.node(step, [self.value(arg, values) for arg in step.args])
 
     def inside(
-        self, body: Schedule, env: dict[Node, Value], known: Mapping[Node, Value] | None = None
+        self, body: Schedule, values: dict[Node, Value], known: Mapping[Node, Value] | None = None
     ) -> dict[Node, Value]:
-        """Runs the body of a loop or a gate; returns the environment at its end.
+        """Runs the body of a loop or a gate; returns the values at its end.
 
         Args:
             body: its steps.
-            env: the environment around it, left as it is.
+            values: the values known around it, left as they are.
             known: the values of the leaves that the body starts from.
         """
-        inner = {**env, **(known or {})}
+        inner = {**values, **(known or {})}
         self.run(body, inner)
         return inner
 
-    def value(self, scalar: Scalar, env: dict[Node, Value]) -> Value:
+    def value(self, scalar: Scalar, values: dict[Node, Value]) -> Value:
         """Returns a scalar's value, reading leaves when they are first needed."""
         if is_constant(scalar):
             return self.constant(scalar)
-        if scalar not in env:
-            env[scalar] = self.leaf(scalar)
-        return env[scalar]
+        if scalar not in values:
+            values[scalar] = self.leaf(scalar)
+        return values[scalar]

@@ -26,16 +26,16 @@ class Count(Backend[None]):
         if node.op is not None:
             self._counter[node.op.name] += 1
 
-    def gate(self, gate: LiveGate, env: dict[Node, None]) -> Sequence[None]:
+    def gate(self, gate: LiveGate, values: dict[Node, None]) -> Sequence[None]:
         """Counts a branch."""
-        self.inside(gate.body, env)
+        self.inside(gate.body, values)
         return [None] * len(gate.outs)
 
     def loop(
-        self, loop: LiveLoop, env: dict[Node, None]
+        self, loop: LiveLoop, values: dict[Node, None]
     ) -> tuple[Sequence[None], Sequence[Sequence[None]]]:
         """Counts one iteration."""
-        self.inside(loop.body, env)
+        self.inside(loop.body, values)
         return [None] * len(loop.carries), [[None] * len(record.outs) for record in loop.records]
 
     def result(self, outputs: list[list[None]]) -> Counter[str]:

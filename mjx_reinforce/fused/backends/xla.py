@@ -15,7 +15,7 @@ from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
 from mjx_reinforce.fused.ops import Op
 
-Environment = dict[Node, Any]
+Values = dict[Node, Any]
 
 
 class XLA(Backend[Any]):
@@ -66,22 +66,22 @@ class XLA(Backend[Any]):
         ]
         return OPERATIONS[op.name](*values, **dict(op.params))
 
-    def gate(self, gate: LiveGate, env: Environment) -> Sequence[Any]:
+    def gate(self, gate: LiveGate, values: Values) -> Sequence[Any]:
         """Emits a `cond`."""
-        predicate = self._any_of(self.value(gate.predicate, env))
-        before = dict(env)
+        predicate = self._any_of(self.value(gate.predicate, values))
+        before = dict(values)
         cold = [self._materialize(out.cold, out.leaf.varying, before) for out in gate.outs]
 
         def hot() -> list[Any]:
-            inner = self.inside(gate.body, env)
+            inner = self.inside(gate.body, values)
             return [self._materialize(out.hot, out.leaf.varying, inner) for out in gate.outs]
 
         return lax.cond(predicate, hot, lambda: cold)
 
-    def loop(self, loop: LiveLoop, env: Environment) -> tuple[list[Any], list[Any]]:
+    def loop(self, loop: LiveLoop, values: Values) -> tuple[list[Any], list[Any]]:
         """Emits a `fori_loop`, a `scan` or a `while_loop`."""
-        init = [self._materialize(c.init, c.out.varying, env) for c in loop.carries]
-        body = functools.partial(self._iteration, loop, env)
+        init = [self._materialize(c.init, c.out.varying, values) for c in loop.carries]
+        body = functools.partial(self._iteration, loop, values)
         places = self._places(loop)
         if places and not loop.records:
             final = lax.fori_loop(
@@ -91,23 +91,23 @@ class XLA(Backend[Any]):
                 init,
             )
         elif loop.records or loop.elements:
-            rows = [self._stack(e.values, e.leaf.varying, env) for e in loop.elements]
+            rows = [self._stack(e.values, e.leaf.varying, values) for e in loop.elements]
             final, stacked = lax.scan(body, init, rows, length=loop.length)
             return final, [
-                [values[t] for t in range(len(record.outs))]
-                for record, values in zip(loop.records, stacked, strict=True)
+                [kept[t] for t in range(len(record.outs))]
+                for record, kept in zip(loop.records, stacked, strict=True)
             ]
         else:
             final = self._repeat(loop, body, init)
         return final, []
 
     def _iteration(
-        self, loop: LiveLoop, env: Environment, carry: list[Any], row: Sequence[Any] = ()
+        self, loop: LiveLoop, values: Values, carry: list[Any], row: Sequence[Any] = ()
     ) -> tuple[list[Any], list[Any]]:
         """Emits a loop's body; returns the next carry and what is kept."""
         known = dict(zip((c.leaf for c in loop.carries), carry, strict=True))
         known.update(zip((e.leaf for e in loop.elements), row, strict=True))
-        inner = self.inside(loop.body, env, known)
+        inner = self.inside(loop.body, values, known)
         nexts = [
             _computed(self._materialize(c.next, c.out.varying, inner), before)
             for c, before in zip(loop.carries, carry, strict=True)
@@ -142,11 +142,11 @@ class XLA(Backend[Any]):
             return lax.broadcast(value, self._batch_shape)
         return value
 
-    def _materialize(self, scalar: Scalar, varying: bool, env: Environment) -> Any:
-        return self._spread(self.value(scalar, env), varying)
+    def _materialize(self, scalar: Scalar, varying: bool, values: Values) -> Any:
+        return self._spread(self.value(scalar, values), varying)
 
-    def _stack(self, row: list[Scalar], varying: bool, env: Environment) -> jax.Array:
-        return jax.numpy.stack([self._materialize(x, varying, env) for x in row])
+    def _stack(self, row: list[Scalar], varying: bool, values: Values) -> jax.Array:
+        return jax.numpy.stack([self._materialize(x, varying, values) for x in row])
 
     def _places(self, loop: LiveLoop) -> list["_Places"]:
         """Returns where each element's values are; nothing if not all can be read in a loop."""
