@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import datetime
+import glob
 import io
 import os
 import platform
@@ -68,6 +69,26 @@ def append_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, A
         except BaseException:
             file.truncate(size)
             raise
+
+
+def cut(path: Path, length: int) -> None:
+    """Cuts a file back to a length in bytes."""
+    with path.open("r+b") as file:
+        file.truncate(length)
+
+
+def remove(directory: Path, names: Sequence[str]) -> None:
+    """Removes files of these names, if they are there, and what a crash left of writing them."""
+    for name in names:
+        path = directory / name
+        path.unlink(missing_ok=True)
+        remove_parts(path)
+
+
+def remove_parts(path: Path) -> None:
+    """Removes what a crash left of writing a file."""
+    for part in path.parent.glob(f".{glob.escape(path.name)}.*"):
+        part.unlink()
 
 
 def _lines(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> bytes:
