@@ -42,12 +42,14 @@ def main() -> None:
     The status is 0 when done, 1 if files cannot be written, 2 for bad input, 130 after Ctrl-C and
     143 after SIGTERM.
     """
-    with Interrupt() as interrupt:
-        sys.exit(_main(sys.argv[1:], interrupt))
+    with Interrupt() as interrupt, contextlib.ExitStack() as held:
+        sys.exit(_main(sys.argv[1:], interrupt, held))
 
 
-def _main(arguments: Sequence[str], interrupt: Interrupt) -> int:
-    """Returns the exit status of a command line."""
+def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitStack) -> int:
+    """Returns the exit status of a command line; ``held`` keeps what is released at its end."""
+    from mjx_reinforce.runs.files import locked
+
     directory = None
     try:
         with _collection_paused():
@@ -55,6 +57,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt) -> int:
             check(config)
             directory = _directory(config)
             interrupt.on_exit(lambda: _remove_if_empty(directory))
+            held.enter_context(locked(directory))
             env = envs.make(config.env)
             _configure_jax()
             start = _start(env, config)

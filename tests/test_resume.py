@@ -20,6 +20,7 @@ from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.runs import checkpoint
 from mjx_reinforce.runs.best import first_best, keep_best
 from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.files import locked
 from mjx_reinforce.runs.record import Record
 
 
@@ -250,6 +251,12 @@ def test_what_is_no_run_is_named(run, tmp_path, capsys, content):
         (tmp_path / "out" / "config.json").write_text(content)
     assert run("--resume", "out") == 2
     assert "config.json" in capsys.readouterr().err
+
+
+def test_two_processes_do_not_train_in_one_directory(run, parts, capsys):
+    with locked(parts):
+        assert run("--resume", "parts") == 2
+    assert "another process trains in parts" in capsys.readouterr().err
 
 
 def test_a_finished_run_has_nothing_to_do(run, tmp_path, capsys):

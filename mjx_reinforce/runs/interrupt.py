@@ -1,6 +1,7 @@
 """Ctrl-C and SIGTERM."""
 
 import contextlib
+import functools
 import os
 import signal
 import socket
@@ -32,7 +33,7 @@ class Interrupt:
         self._told.setblocking(False)
         self._descriptor = signal.set_wakeup_fd(self._told.fileno(), warn_on_full_buffer=False)
         self._handlers = {number: signal.signal(number, _nothing) for number in _SIGNALS}
-        threading.Thread(target=self._listen, daemon=True).start()
+        _start(self._listen)
         return self
 
     def __exit__(self, *_: Any) -> None:
@@ -61,12 +62,23 @@ class Interrupt:
 
     def _act(self, number: int) -> None:
         if self._say is None or self.number is not None:
-            for action in (*self._actions, sys.stdout.flush, sys.stderr.flush):
-                with contextlib.suppress(Exception):
-                    action()
+            # Not for long: the screen may be a pipe that nobody reads.
+            _start(self._clean_up).join(timeout=1)
             os._exit(128 + number)
         self.number = number
-        self._say("stopping after this block of updates; Ctrl-C again stops at once")
+        said = "stopping after this block of updates; Ctrl-C again stops at once"
+        _start(functools.partial(self._say, said))
+
+    def _clean_up(self) -> None:
+        for action in (*self._actions, sys.stdout.flush, sys.stderr.flush):
+            with contextlib.suppress(Exception):
+                action()
+
+
+def _start(action: Callable[[], Any]) -> threading.Thread:
+    thread = threading.Thread(target=action, daemon=True)
+    thread.start()
+    return thread
 
 
 def _nothing(number: int, frame: Any) -> None:

@@ -35,7 +35,9 @@ class RunLog:
         Args:
           settings: of the run; what else its results depend on is added.
         """
-        files.remove(self.directory, _RESULTS)
+        self._remove_parts()
+        for name in _RESULTS:
+            (self.directory / name).unlink(missing_ok=True)
         checkpoint.remove(self.directory / "checkpoint")
         write_json(self.directory / "config.json", {**settings, **files.provenance()})
         files.create_csv(self._metrics, rows.COLUMNS)
@@ -53,8 +55,7 @@ class RunLog:
           budget: settings that may have changed.
           found: the checkpoint, or None to start again.
         """
-        for name in _FILES:
-            files.remove_parts(self.directory / name)
+        self._remove_parts()
         moment = {
             "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             "updates": 0 if found is None else int(found.record["updates"].max()),
@@ -68,6 +69,13 @@ class RunLog:
             files.create_csv(self._metrics, rows.COLUMNS)
         else:
             files.cut(self._metrics, found.metrics_bytes)
+
+    def _remove_parts(self) -> None:
+        """Removes what a crash left of writing files."""
+        for name in _FILES:
+            path = self.directory / name
+            for part in path.parent.glob(f".{path.name}.*"):
+                part.unlink()
 
     def say_running(self, reached: Mapping[str, Any]) -> None:
         """Writes a summary.json that says how far the run is, for whoever finds it killed."""

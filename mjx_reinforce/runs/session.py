@@ -1,5 +1,6 @@
 """A run as it goes on: its programs, its measurements, its screen and its files."""
 
+import contextlib
 import time
 from collections.abc import Callable
 from typing import Any
@@ -76,7 +77,8 @@ class Session:
         seconds = self.seconds()
         rows = self.record.add_evaluation(result, seconds)
         self._attempt("metrics.csv", lambda: self.log.add_rows(rows))
-        self.display.show_progress(self.record.progress(seconds))
+        progress = self.record.progress(seconds)
+        self._attempt("to the screen", lambda: self.display.show_progress(progress))
 
     def save_if_due(self) -> None:
         """Saves a checkpoint once there were enough updates, or about a minute, since the last."""
@@ -137,9 +139,9 @@ class Session:
             write()
             self._failing.discard(what)
         except OSError as error:
-            if what not in self._failing:
-                reason = error.strerror or error
-                self.display.say(
-                    f"warning: cannot write {what} ({reason}); training goes on and tries again"
-                )
+            if what in self._failing:
+                return
             self._failing.add(what)
+            warning = f"cannot write {what} ({error.strerror or error})"
+            with contextlib.suppress(OSError):  # the screen may be a file on the same disk
+                self.display.say(f"warning: {warning}; training goes on and tries again")
