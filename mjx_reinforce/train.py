@@ -1,5 +1,10 @@
 """``python -m mjx_reinforce.train`` trains many seeds at once and reports over them."""
 
+import signal
+
+if __name__ == "__main__":  # Ctrl-C ends the imports below without a traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
 import contextlib
 import dataclasses
 import gc
@@ -12,13 +17,11 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn
 
-import tyro
-
 from mjx_reinforce import envs
 from mjx_reinforce.registry import check_name
-from mjx_reinforce.runs.build import build, policy_settings
+from mjx_reinforce.runs import resume
 from mjx_reinforce.runs.config import Config, check
-from mjx_reinforce.runs.files import prepare
+from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.settings import GROUPS
 
@@ -29,38 +32,85 @@ _FILES = (
     "summary.json",
     "learning_curve.png",
     "policy/",
+    "checkpoint/",
 )
 
 
 def main() -> None:
-    """Reads the command line, trains, and exits: 0 done, 2 bad input, 130 interrupted."""
+    """Reads the command line, trains, and exits.
+
+    The status is 0 when done, 1 if files cannot be written, 2 for bad input, 130 after Ctrl-C and
+    143 after SIGTERM.
+    """
+    with Interrupt() as interrupt, contextlib.ExitStack() as held:
+        sys.exit(_main(sys.argv[1:], interrupt, held))
+
+
+def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitStack) -> int:
+    """Returns the exit status of a command line; ``held`` keeps what is released at its end."""
+    from mjx_reinforce.runs.files import locked
+
     directory = None
     try:
         with _collection_paused():
-            config = parse(sys.argv[1:])
+            config = parse(arguments)
             check(config)
-            directory = prepare(config.output, config.env, config.overwrite)
+            directory = _directory(config)
+            interrupt.on_exit(lambda: _remove_if_empty(directory))
+            held.enter_context(locked(directory))
             env = envs.make(config.env)
             _configure_jax()
-            learner, horizon = build(env, config)
+            start = _start(env, config)
     except ValueError as error:
         _refuse(str(error), directory)
     try:
-        interrupted = train(env, learner, horizon, config, directory)
+        interrupted = train(env, *start, config, directory, interrupt)
     except RuntimeError as error:  # XLA's
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         remedy = "lower --num-seeds, --num-episodes, --eval-episodes or --horizon"
         _refuse(f"this run does not fit into memory ({error}); {remedy}", directory)
-    sys.exit(130 if interrupted else 0)
+    except OSError as error:
+        remedy = f"make room, then go on with --resume {directory}"
+        _refuse(f"cannot write the files of this run ({error}); {remedy}", directory, status=1)
+    return 128 + interrupted if interrupted else 0
 
 
-def _refuse(message: str, directory: Path | None) -> NoReturn:
+def _directory(config: Config) -> Path:
+    """Returns the run directory; makes it, unless the run goes on in its own."""
+    from mjx_reinforce.runs.files import prepare
+
+    if config.resume is not None:
+        return config.resume
+    return prepare(config.output, config.env, config.overwrite)
+
+
+def _start(env: Any, config: Config) -> tuple[Any, int, Any]:
+    """Returns the learner, the horizon, and the checkpoint from which the run goes on, if any.
+
+    Raises:
+      ValueError: the settings do not fit the environment, or the run cannot go on here.
+    """
+    from mjx_reinforce.runs.build import build
+    from mjx_reinforce.runs.files import provenance
+
+    learner, horizon = build(env, config)
+    if config.resume is None:
+        return learner, horizon, None
+    resume.check_program(config.resume, provenance())
+    return learner, horizon, resume.find(learner, config, print)
+
+
+def _refuse(message: str, directory: Path | None, status: int = 2) -> NoReturn:
     """Says what is wrong, leaves no empty run directory behind, and exits."""
+    _remove_if_empty(directory)
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(status)
+
+
+def _remove_if_empty(directory: Path | None) -> None:
     if directory and not any(directory.iterdir()):
         directory.rmdir()
-    print(f"error: {message}", file=sys.stderr)
-    sys.exit(2)
 
 
 def parse(arguments: Sequence[str]) -> Config:
@@ -70,15 +120,33 @@ def parse(arguments: Sequence[str]) -> Config:
       arguments: a preset's name, if any, then flags.
 
     Raises:
-      ValueError: there is no such preset.
+      ValueError: there is no such preset, or the run to resume is not there or has other settings.
     """
-    default, prog = Config(), "python -m mjx_reinforce.train"
+    default, prog, preset = Config(), "python -m mjx_reinforce.train", None
     if arguments and not arguments[0].startswith("-"):
-        name, *arguments = arguments
-        check_name("preset", name, PRESETS)
-        default, prog = PRESETS[name][1], f"{prog} {name}"
+        preset, *arguments = arguments
+        check_name("preset", preset, PRESETS)
+        default, prog = PRESETS[preset][1], f"{prog} {preset}"
     else:
         prog = f"{prog} [PRESET]"
+    config = _read(arguments, default, prog)
+    if config.resume is None:
+        return config
+    if preset is not None:
+        raise ValueError(f"--resume has the run's own settings: leave the preset {preset} out")
+    known = resume.read_settings(config.resume)
+    asked = _read(arguments, known, prog)
+    resume.check_settings(known, asked)
+    if resume.is_done(known, asked):
+        print(f"{known.resume} is finished; to go on, give a larger --env-steps or --max-updates")
+        sys.exit(0)
+    return asked
+
+
+def _read(arguments: Sequence[str], default: Config, prog: str) -> Config:
+    """Returns the settings that flags ask for, with others as given; --help and bad flags exit."""
+    import tyro
+
     groups = [
         (title, group, group(**{f.name: getattr(default, f.name) for f in fields(group)}))
         for title, group in GROUPS.items()
@@ -114,60 +182,128 @@ def _configure_jax() -> None:
         jax.config.update("jax_default_matmul_precision", "highest")
 
 
-def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path) -> bool:
-    """Trains to the budget, or to Ctrl-C, and writes the run's files.
+def train(
+    env: Any,
+    learner: Any,
+    horizon: int,
+    found: Any,
+    config: Config,
+    directory: Path,
+    interrupt: Interrupt,
+) -> int | None:
+    """Trains to the budget, or until a signal, and writes the run's files.
 
     Args:
       env: what is trained on.
       learner: how.
       horizon: the time limit of an episode in steps.
+      found: the checkpoint from which the run goes on, if any.
       config: the settings of the run.
       directory: where the files go.
+      interrupt: what listens to signals.
 
     Returns:
-      Whether it was interrupted.
+      The number of the signal that interrupted it, or None.
     """
     with _collection_paused():
-        from mjx_reinforce.reports.curves import draw_learning_curve, load_libraries
+        from mjx_reinforce.reports.curves import load_libraries
         from mjx_reinforce.runs.display import Display, print_summary
-        from mjx_reinforce.runs.interrupt import Interrupt
-        from mjx_reinforce.runs.log import RunLog
-        from mjx_reinforce.runs.record import Record
-        from mjx_reinforce.runs.state import compile_programs, first_state
 
-    threshold = getattr(env, "reward_threshold", None)
-    with Display() as display, Interrupt(display.say) as interrupt:
+    with Display() as display:
+        interrupt.on_exit(display.console.show_cursor)
         display.say(f"engine {learner.engine.name}: {learner.engine.why}; compiling")
-        started = time.perf_counter()
-        with _collection_paused():
-            state = first_state(learner, config)
-            programs = compile_programs(env, learner, horizon, config, state)
-        compile_seconds = time.perf_counter() - started
+        session, compile_seconds = _compile(env, learner, horizon, config, directory, display)
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
-        record, log = Record(config, threshold), RunLog(directory)
-        log.begin(dataclasses.asdict(config) | {"horizon": horizon, "output": str(directory)})
+        interrupt.defer(display.say)
+        _begin(session, horizon, found)
         display.start(compile_seconds)
         threading.Thread(target=load_libraries, daemon=True).start()
-        began = time.perf_counter()
-        while True:
-            result = programs.evaluate(state)
-            seconds = time.perf_counter() - began
-            log.add_rows(record.add_evaluation(result, seconds))
-            display.show_progress(record.progress(seconds))
-            if record.finished() or interrupt.is_set():
-                break
-            state, metrics = programs.advance(state)
-            for event in record.add_updates(metrics):
-                display.show_nonfinite(event)
-    log.save_policy(state.train_states.actor, policy_settings(env, config))
-    run_seconds = time.perf_counter() - began
-    summary = record.summary(learner.engine.name, compile_seconds, run_seconds)
+        interrupted = _loop(session, interrupt, evaluated=found is not None)
+    session.save()
+    summary = _finish(session, learner.engine.name, compile_seconds, interrupted)
+    print_summary(display.console, summary, directory)
+    return interrupted
+
+
+def _compile(
+    env: Any, learner: Any, horizon: int, config: Config, directory: Path, display: Any
+) -> tuple[Any, float]:
+    """Returns a run before its first update, and how long it took to compile, in seconds."""
+    with _collection_paused():
+        from mjx_reinforce.runs.best import first_best
+        from mjx_reinforce.runs.build import policy_settings
+        from mjx_reinforce.runs.log import RunLog
+        from mjx_reinforce.runs.record import Record
+        from mjx_reinforce.runs.session import Session
+        from mjx_reinforce.runs.state import compile_programs, first_state
+
+    started = time.perf_counter()
+    with _collection_paused():
+        state = first_state(learner, config)
+        programs = compile_programs(env, learner, horizon, config, state)
+    seconds = time.perf_counter() - started
+    record = Record(config, getattr(env, "reward_threshold", None))
+    best, policy = first_best(state.train_states), policy_settings(env, config)
+    session = Session(config, policy, programs, record, RunLog(directory), display, state, best)
+    return session, seconds
+
+
+def _begin(session: Any, horizon: int, found: Any) -> None:
+    """Writes the first files, or takes the run and its files back to where it goes on."""
+    config, log = session.config, session.log
+    if config.resume is None:
+        settings = dataclasses.asdict(config) | {"horizon": horizon, "output": str(log.directory)}
+        del settings["resume"]
+        log.begin(settings)
+        return
+    budget = {name: getattr(config, name) for name in resume.BUDGETS}
+    log.resume(resume.read_record(config.resume), budget, found)
+    if found is not None:
+        session.restore(found)
+    session.display.say(f"going on after {session.record.updates.max()} updates")
+
+
+def _loop(session: Any, interrupt: Interrupt, *, evaluated: bool) -> int | None:
+    """Trains until the budget is used, or a signal came, whose number is returned.
+
+    Args:
+      session: the run.
+      interrupt: what listens to signals.
+      evaluated: whether the present policies have been.
+    """
+    if not evaluated:
+        session.evaluate()
+    while not session.record.finished():
+        if interrupt.number is not None:
+            return interrupt.number
+        session.advance()
+        session.evaluate()
+        session.save_if_due()
+    return None
+
+
+def _finish(
+    session: Any, engine: str, compile_seconds: float, interrupted: int | None
+) -> dict[str, Any]:
+    """Writes the last files; returns the contents of summary.json."""
+    from mjx_reinforce.reports.curves import draw_learning_curve
+
+    config, record = session.config, session.record
+    # A run that was interrupted is to end soon, and is tested when it has been resumed.
+    test = {} if interrupted else session.test()
+    run_seconds = session.seconds()
+    summary = {
+        "status": "interrupted" if interrupted else "finished",
+        **record.summary(engine, compile_seconds, run_seconds),
+        "best_updates": session.best.num_updates.tolist(),
+        **test,
+    }
     history, training = record.history(), record.training()
     axis = "episodes" if config.env_steps is None else "env_steps"
-    picture = draw_learning_curve(history, training, config.env, threshold, axis)
-    log.finish(training, picture, summary)
-    print_summary(display.console, summary, directory)
-    return interrupt.is_set()
+    picture = draw_learning_curve(history, training, config.env, record.threshold, axis)
+    session.save_policies()
+    session.log.finish(training, picture, summary)
+    return summary
 
 
 @contextlib.contextmanager

@@ -31,8 +31,8 @@ def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None
     flat = traverse_util.flatten_dict(serialization.to_state_dict(actor), sep="/")
     directory.mkdir(parents=True, exist_ok=True)
     arrays = {name: np.asarray(value) for name, value in flat.items()}
-    write_arrays(directory / "actor.npz", arrays)
     write_json(directory / "policy.json", settings)
+    write_arrays(directory / "actor.npz", arrays)  # last: where it is, the folder is whole
 
 
 def load_policy(directory: str | Path, seed: int | None = None) -> tuple[Policy, Actor]:

@@ -8,6 +8,7 @@ from typing import Any
 from mjx_reinforce import envs
 from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS, check_name
 from mjx_reinforce.runs.settings import (
+    CheckpointSettings,
     EstimatorSettings,
     EvaluationSettings,
     PolicySettings,
@@ -22,6 +23,7 @@ MAX_COUNT = 2**31 - 1
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config(
+    CheckpointSettings,
     EvaluationSettings,
     SearchSettings,
     UpdateSettings,
@@ -82,6 +84,7 @@ _OPTIONAL = {field.name for field in dataclasses.fields(Config) if "None" in str
 _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     (
         "num_seeds num_episodes env_steps max_updates horizon decay_updates eval_every "
+        "checkpoint_every "
         "eval_episodes value_fits minibatch_updates minibatch_size num_directions top_directions",
         lambda x: x >= 1,
         "at least 1",

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -16,6 +17,7 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.runs import record
 
 
@@ -88,6 +90,9 @@ def print_summary(console: Console, summary: dict[str, Any], directory: Path) ->
             episodes = [number for number in summary["episodes_to_solve"] if number is not None]
             table.add_row("env steps to solve", f"{min(solved):,} to {max(solved):,}")
             table.add_row("episodes to solve", f"{min(episodes):,} to {max(episodes):,}")
+    if "final_test_returns" in summary:
+        last, best = (iqm(np.array(summary[f"{kind}_test_returns"])) for kind in ("final", "best"))
+        table.add_row("last policies, best policies, on fresh starts", f"{last:.1f}, {best:.1f}")
     table.add_row("env steps a second", f"{summary['env_steps_per_second']:,.0f}")
     table.add_row("useful steps of those simulated", f"{summary['useful_step_fraction']:.0%}")
     table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")

@@ -3,12 +3,13 @@
 import contextlib
 import csv
 import datetime
+import fcntl
 import io
 import os
 import platform
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -33,7 +34,9 @@ def prepare(output: Path | None, env: str, overwrite: bool) -> Path:
     directory = Path("runs") / f"{env.replace(':', '.')}-{stamp}" if output is None else output
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        if any(directory.iterdir()) and not overwrite:
+        # Where a run was killed as it wrote its first file, nothing was begun.
+        names = [path.name for path in directory.iterdir()]
+        if any(not name.startswith(".config.json.") for name in names) and not overwrite:
             raise ValueError(
                 f"the run directory {directory} is not empty; choose another --output, "
                 "or pass --overwrite to replace the run in it"
@@ -46,6 +49,27 @@ def prepare(output: Path | None, env: str, overwrite: bool) -> Path:
             "choose another --output"
         ) from error
     return directory
+
+
+@contextlib.contextmanager
+def locked(directory: Path) -> Iterator[None]:
+    """Keeps other processes from training in a directory; also ends with the process.
+
+    Raises:
+      ValueError: another one does.
+    """
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(
+                f"another process trains in {directory}; wait for its end, or choose another "
+                "--output"
+            ) from error
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def create_csv(path: Path, columns: Sequence[str]) -> None:
@@ -68,6 +92,12 @@ def append_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, A
         except BaseException:
             file.truncate(size)
             raise
+
+
+def cut(path: Path, length: int) -> None:
+    """Cuts a file back to a length in bytes."""
+    with path.open("r+b") as file:
+        file.truncate(length)
 
 
 def _lines(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> bytes:

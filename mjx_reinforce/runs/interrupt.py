@@ -1,31 +1,85 @@
-"""Ctrl-C while a run trains."""
+"""Ctrl-C and SIGTERM."""
 
+import contextlib
+import functools
+import os
 import signal
+import socket
+import sys
 import threading
 from collections.abc import Callable
 from typing import Any
 
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
-class Interrupt(threading.Event):
-    """Is set by Ctrl-C, so that the run stops after the present block; a second one stops at once.
 
-    It listens inside a ``with`` block.
+class Interrupt:
+    """Ends the process at Ctrl-C or SIGTERM, without a traceback; after ``defer`` it first asks.
+
+    It listens inside a ``with`` block, in a thread of its own: Python runs signal handlers in the
+    main thread only, which may be inside a compiler for minutes. The process ends with
+    ``os._exit``, which waits for no other thread, with the status that shells give: 128 plus the
+    signal's number.
     """
 
-    def __init__(self, say: Callable[[str], None]):
-        """Takes what shows a line to the user."""
-        super().__init__()
-        self._say = say
+    def __init__(self):
+        #: Number of the signal that asks the run to stop, or None so far.
+        self.number: int | None = None
+        self._say: Callable[[str], None] | None = None
+        self._actions: list[Callable[[], Any]] = []
 
     def __enter__(self) -> "Interrupt":
-        self._previous = signal.signal(signal.SIGINT, self._handle)
+        self._heard, self._told = socket.socketpair()
+        self._told.setblocking(False)
+        self._descriptor = signal.set_wakeup_fd(self._told.fileno(), warn_on_full_buffer=False)
+        self._handlers = {number: signal.signal(number, _nothing) for number in _SIGNALS}
+        _start(self._listen)
         return self
 
     def __exit__(self, *_: Any) -> None:
-        signal.signal(signal.SIGINT, self._previous)
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+        signal.set_wakeup_fd(self._descriptor)
+        self._told.close()  # which ends the thread
 
-    def _handle(self, number: int, frame: Any) -> None:
-        del number, frame
-        self.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-        self._say("stopping after this block of updates; Ctrl-C again stops at once")
+    def on_exit(self, action: Callable[[], Any]) -> None:
+        """Adds what is done before a signal ends the process; its errors are not shown."""
+        self._actions.append(action)
+
+    def defer(self, say: Callable[[str], None]) -> None:
+        """From now on the first signal only sets ``number``; the second ends the process.
+
+        Args:
+          say: shows a line to the user.
+        """
+        self._say = say
+
+    def _listen(self) -> None:
+        with self._heard:
+            while heard := self._heard.recv(1):
+                if heard[0] in _SIGNALS:
+                    self._act(heard[0])
+
+    def _act(self, number: int) -> None:
+        if self._say is None or self.number is not None:
+            # Not for long: the screen may be a pipe that nobody reads.
+            _start(self._clean_up).join(timeout=1)
+            os._exit(128 + number)
+        self.number = number
+        said = "stopping after this block of updates; Ctrl-C again stops at once"
+        _start(functools.partial(self._say, said))
+
+    def _clean_up(self) -> None:
+        for action in (*self._actions, sys.stdout.flush, sys.stderr.flush):
+            with contextlib.suppress(Exception):
+                action()
+
+
+def _start(action: Callable[[], Any]) -> threading.Thread:
+    thread = threading.Thread(target=action, daemon=True)
+    thread.start()
+    return thread
+
+
+def _nothing(number: int, frame: Any) -> None:
+    """Handles a signal, so that Python tells the thread of it."""

@@ -39,6 +39,7 @@ class Record:
 
     updates: [S] int64, how many each seed has made
     env_steps: [S] int64, how many each seed has played in training
+    threshold: the return that counts as solved, if any
     """
 
     def __init__(self, config: Config, threshold: float | None):
@@ -50,7 +51,8 @@ class Record:
         """
         self.updates = np.zeros(config.num_seeds, np.int64)
         self.env_steps = np.zeros(config.num_seeds, np.int64)
-        self._config, self._threshold = config, threshold
+        self.threshold = threshold
+        self._config = config
         self._evaluations: list[Arrays] = []
         self._training: list[Arrays] = []
         self._nonfinite: list[dict[str, Any]] = []
@@ -115,7 +117,7 @@ class Record:
     def finished(self) -> bool:
         """Returns whether the budget is used, or all seeds are solved and that was to end it."""
         last = self._evaluations[-1]["eval_return"]
-        solved = self._threshold is not None and np.all(last >= self._threshold)
+        solved = self.threshold is not None and np.all(last >= self.threshold)
         return bool(self._fraction() >= 1.0 or (self._config.stop_when_solved and solved))
 
     def _fraction(self) -> float:
@@ -157,6 +159,33 @@ class Record:
             for name, kind in types.items()
         }
 
+    def content(self) -> Arrays:
+        """Returns all that was measured, at least one evaluation, as arrays for ``restore``."""
+        events = [[e[name] for name in _EVENT] for e in self._nonfinite]
+        content = {
+            "updates": self.updates,
+            "env_steps": self.env_steps,
+            "simulated": np.asarray(self._simulated),
+            "nonfinite": np.array(events, np.int64).reshape(-1, len(_EVENT)),
+        }
+        for name in self._evaluations[0]:
+            content[f"evaluations/{name}"] = np.stack([e[name] for e in self._evaluations])
+        content |= {f"training/{name}": values for name, values in self.training().items()}
+        return content | {f"last/{name}": values for name, values in self._last.items()}
+
+    def restore(self, content: Arrays) -> None:
+        """Takes in what ``content`` of the same run returned, in place of all that is here."""
+        self.updates, self.env_steps = content["updates"], content["env_steps"]
+        self._simulated = float(content["simulated"])
+        self._nonfinite = [
+            dict(zip(_EVENT, event, strict=True)) | {"skipped": bool(event[-1])}
+            for event in content["nonfinite"].tolist()
+        ]
+        evaluations = _under("evaluations/", content)
+        count = len(evaluations["eval_return"])
+        self._evaluations = [{n: x[i] for n, x in evaluations.items()} for i in range(count)]
+        self._training, self._last = [_under("training/", content)], _under("last/", content)
+
     def summary(self, engine: str, compile_seconds: float, run_seconds: float) -> dict[str, Any]:
         """Returns what summary.json says.
 
@@ -170,7 +199,7 @@ class Record:
             "env": self._config.env,
             "engine": engine,
             "num_seeds": self._config.num_seeds,
-            **summarize(self.history(), self._threshold),
+            **summarize(self.history(), self.threshold),
             "env_steps": self.env_steps.tolist(),
             "compile_seconds": compile_seconds,
             "run_seconds": run_seconds,
@@ -178,6 +207,15 @@ class Record:
             "useful_step_fraction": float(env_steps / max(self._simulated, 1.0)),
             "nonfinite": self._nonfinite,
         }
+
+
+#: The entries of an update that met numbers which are not finite, see ``add_updates``.
+_EVENT = ("seed", "update", "episodes", "skipped")
+
+
+def _under(prefix: str, arrays: Arrays) -> Arrays:
+    """Returns the arrays whose names begin so, without that beginning."""
+    return {name.removeprefix(prefix): x for name, x in arrays.items() if name.startswith(prefix)}
 
 
 def _nonfinite_updates(metrics: Arrays) -> list[dict[str, Any]]:

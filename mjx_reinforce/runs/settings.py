@@ -151,6 +151,18 @@ class EvaluationSettings:
     """Root of the evaluation's keys, apart from all training keys whatever its value."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CheckpointSettings:
+    """Going on with a run that was interrupted, or whose budget is used."""
+
+    checkpoint_every: int | None = None
+    """Updates between checkpoints, to which a killed run falls back; about every minute if not
+    given. They are written after evaluations."""
+    resume: Path | None = None
+    """Go on with the run in this directory, with its own settings. Only its budget may change:
+    --env-steps, --max-updates, --stop-when-solved, --checkpoint-every."""
+
+
 #: The groups of --help, in order, under their titles.
 GROUPS = {
     "run": RunSettings,
@@ -159,4 +171,5 @@ GROUPS = {
     "updates": UpdateSettings,
     "search": SearchSettings,
     "evaluation": EvaluationSettings,
+    "checkpoints": CheckpointSettings,
 }

@@ -39,10 +39,12 @@ class Programs(NamedTuple):
       To the metrics of ``Learner.step`` it adds ``active`` (False for a seed that stood still),
       and ``updates_total`` and ``env_steps_total``, the seed's counts after the update
     evaluate: (RunState) -> [S] each, what ``evaluation.evaluate`` returns for every seed
+    test: (Actor [S, ...]) -> the same on start states that nothing else is played on
     """
 
     advance: Callable[[RunState], tuple[RunState, Arrays]]
     evaluate: Callable[[RunState], Arrays]
+    test: Callable[[Actor], Arrays]
 
 
 def first_state(learner: Learner, config: Config) -> RunState:
@@ -82,11 +84,14 @@ def compile_programs(
     def evaluated(state: RunState) -> Arrays:
         return _to_numpy(compiled(state.train_states.actor, key))
 
-    return Programs(advanced, evaluated)
+    def tested(actor: Actor) -> Arrays:
+        return _to_numpy(compiled(actor, _key(config.eval_seed, domain=2)))
+
+    return Programs(advanced, evaluated, tested)
 
 
 def _key(seed: int, domain: int) -> jax.Array:
-    """Returns the root of training's keys (domain 0) or of evaluation's (1).
+    """Returns the root of the keys of training (domain 0), evaluation (1), or the last test (2).
 
     The domains share no key, whatever seeds the user chooses.
     """

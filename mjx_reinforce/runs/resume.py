@@ -1,0 +1,185 @@
+"""Going on with a run: its own settings, the same program, and the checkpoint that serves."""
+
+import dataclasses
+import json
+import types
+import typing
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from mjx_reinforce.runs.config import Config
+
+#: What may change when a run goes on: when it ends, and how often it is saved.
+BUDGETS = ("env_steps", "max_updates", "stop_when_solved", "checkpoint_every")
+#: Settings that say where a run is, not what it does.
+PLACES = ("output", "overwrite", "resume")
+#: Entries of config.json on which every number of a run depends, besides its settings.
+_PROGRAM = ("packages", "git_commit", "device", "x64", "xla_flags")
+
+
+def read_record(directory: Path) -> dict[str, Any]:
+    """Returns what config.json of a run says.
+
+    Raises:
+      ValueError: there is no such run, or the file is damaged.
+    """
+    path = directory / "config.json"
+    try:
+        recorded = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(
+            f"cannot resume {directory}: there is no {path} ({error.strerror}), so nothing was "
+            "begun there; start it anew with --output"
+        ) from error
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if not isinstance(recorded, dict):
+        raise ValueError(f"{path} is damaged: it is no object of names and values")
+    return recorded
+
+
+def read_settings(directory: Path) -> Config:
+    """Returns the settings of a run, for going on with it in its directory.
+
+    Raises:
+      ValueError: there is no such run, or its config.json is damaged or of another version.
+    """
+    recorded, hints = read_record(directory), typing.get_type_hints(Config)
+    settings = {}
+    for field in dataclasses.fields(Config):
+        if field.name in PLACES:
+            continue
+        if field.name not in recorded:
+            raise ValueError(
+                f"{directory / 'config.json'} does not say {field.name}: it is damaged, or of "
+                "another version of the program; resume with the version that wrote it"
+            )
+        value = recorded[field.name]
+        value = tuple(value) if isinstance(value, list) else value
+        if not _fits(value, hints[field.name]):
+            raise ValueError(f"{directory / 'config.json'} is damaged: {field.name} is {value!r}")
+        settings[field.name] = value
+    return Config(**settings, resume=directory)
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Returns whether a value is of a type that a setting has."""
+    kind, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if kind is Literal:
+        return value in arguments
+    if kind in (typing.Union, types.UnionType):
+        return any(_fits(value, argument) for argument in arguments)
+    if kind is tuple:
+        return isinstance(value, tuple) and all(_fits(item, arguments[0]) for item in value)
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is hint
+
+
+def check_settings(known: Config, asked: Config) -> None:
+    """Raises ValueError if more than the budget of a run is to change.
+
+    Args:
+      known: the run's settings.
+      asked: those that the command line asks for.
+    """
+    if asked.output is not None or asked.overwrite:
+        raise ValueError("--resume goes on in the run's own directory: leave --output out")
+    for field in dataclasses.fields(Config):
+        old, new = getattr(known, field.name), getattr(asked, field.name)
+        if old != new and field.name not in (*BUDGETS, *PLACES):
+            flag = "--" + field.name.replace("_", "-")
+            raise ValueError(
+                f"{flag} is {old} in {known.resume} and cannot become {new}: only "
+                "its budget may change; leave it out, or start another run"
+            )
+
+
+def is_done(known: Config, asked: Config) -> bool:
+    """Returns whether a run has finished and is asked for no more than it did."""
+    assert known.resume is not None
+    if any(getattr(known, name) != getattr(asked, name) for name in BUDGETS[:-1]):
+        return False
+    try:
+        summary = json.loads((known.resume / "summary.json").read_text(encoding="utf-8"))
+        return summary["status"] == "finished"
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+
+
+def check_program(directory: Path, present: Mapping[str, Any]) -> None:
+    """Raises ValueError if a run was begun by a program whose numbers may differ.
+
+    Args:
+      directory: the run's.
+      present: what ``files.provenance`` returns.
+    """
+    recorded = read_record(directory)
+    for name in _PROGRAM:
+        old, new = recorded.get(name), present[name]
+        if isinstance(old, dict) and isinstance(new, dict):
+            changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+            if changed:
+                name, old, new = changed[0], old.get(changed[0]), new.get(changed[0])
+        if old != new:
+            raise ValueError(
+                f"{directory} was begun with {name} {old}, and here it is {new}, so its numbers "
+                "would change; resume where it was begun, or start another run"
+            )
+
+
+def find(learner: Any, config: Config, say: Callable[[str], None]) -> Any:
+    """Returns the newest checkpoint that serves, or None: then the run starts again.
+
+    Args:
+      learner: how it learns.
+      config: its settings, with the budget that it is to have.
+      say: shows a line about each file that does not serve.
+
+    Raises:
+      ValueError: the budget is smaller than what the run did, or a checkpoint is of another
+        version.
+    """
+    import jax
+
+    from mjx_reinforce.runs import checkpoint
+    from mjx_reinforce.runs.best import first_best
+    from mjx_reinforce.runs.state import first_state
+
+    def fresh() -> Any:
+        state = first_state(learner, config)
+        return state, first_best(state.train_states)
+
+    assert config.resume is not None
+    like = jax.eval_shape(fresh)
+    length = _size(config.resume / "metrics.csv")
+    for found in checkpoint.load(config.resume / "checkpoint", like, say):
+        if found.metrics_bytes > length:
+            say(f"metrics.csv is shorter than at checkpoint {found.number}; trying the one before")
+        elif _serves(found, config):
+            return found
+    return None
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
+
+
+def _serves(found: Any, config: Config) -> bool:
+    """Returns whether a run with this budget passes through a checkpoint.
+
+    Raises:
+      ValueError: the budget is smaller than what it has used.
+    """
+    if (found.env_steps, found.max_updates) == (config.env_steps, config.max_updates):
+        return True
+    for flag, budget, used in (
+        ("--env-steps", config.env_steps, found.record["env_steps"].max()),
+        ("--max-updates", config.max_updates, found.record["updates"].max()),
+    ):
+        if budget is not None and budget < used:
+            raise ValueError(
+                f"{flag} {budget} is less than the {used} of the run so far; give at least that"
+            )
+    return found.is_even(config.eval_every)

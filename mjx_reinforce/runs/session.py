@@ -1,0 +1,147 @@
+"""A run as it goes on: its programs, its measurements, its screen and its files."""
+
+import contextlib
+import time
+from collections.abc import Callable
+from typing import Any
+
+from mjx_reinforce.runs.best import Best, keep_best
+from mjx_reinforce.runs.checkpoint import Checkpoint
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.display import Display
+from mjx_reinforce.runs.log import RunLog
+from mjx_reinforce.runs.record import Record
+from mjx_reinforce.runs.state import Programs, RunState
+
+#: Between checkpoints, where the user has not said how many updates.
+_CHECKPOINT_SECONDS = 60.0
+
+
+class Session:
+    """Moves a run on, block by block.
+
+    A file that cannot be written while the run goes on is a warning, and is tried again.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        policy: dict[str, Any],
+        programs: Programs,
+        record: Record,
+        log: RunLog,
+        display: Display,
+        state: RunState,
+        best: Best,
+    ):
+        """Takes what a run is made of, before its first update.
+
+        Args:
+          config: its settings.
+          policy: how to rebuild its policy, see ``policy_files.save_policy``.
+          programs: what moves it on.
+          record: what it measures.
+          log: its files.
+          display: its screen.
+          state: of training.
+          best: the best policies so far.
+        """
+        self.config, self.policy, self.programs = config, policy, programs
+        self.record, self.log, self.display = record, log, display
+        self.state, self.best = state, best
+        self._began = self._saved_at = time.perf_counter()
+        self._saved_updates = 0
+        self._failing: set[str] = set()
+
+    def restore(self, found: Checkpoint) -> None:
+        """Goes back to a checkpoint."""
+        self.state, self.best = found.state
+        self.record.restore(found.record)
+        self._began = time.perf_counter() - found.seconds
+        self._saved_updates = self._updates()
+
+    def seconds(self) -> float:
+        """Returns the wall time since the run began, without that of compiling."""
+        return time.perf_counter() - self._began
+
+    def advance(self) -> None:
+        """Makes a block of updates."""
+        self.state, metrics = self.programs.advance(self.state)
+        for event in self.record.add_updates(metrics):
+            self.display.show_nonfinite(event)
+
+    def evaluate(self) -> None:
+        """Evaluates the present policies, writes the rows, and keeps the best."""
+        result = self.programs.evaluate(self.state)
+        self.best = keep_best(self.best, self.state.train_states, result["eval_return"])
+        seconds = self.seconds()
+        rows = self.record.add_evaluation(result, seconds)
+        self._attempt("metrics.csv", lambda: self.log.add_rows(rows))
+        progress = self.record.progress(seconds)
+        self._attempt("to the screen", lambda: self.display.show_progress(progress))
+
+    def save_if_due(self) -> None:
+        """Saves a checkpoint once there were enough updates, or about a minute, since the last."""
+        every, now = self.config.checkpoint_every, time.perf_counter()
+        if every is None:
+            due = now - self._saved_at >= _CHECKPOINT_SECONDS
+        else:
+            due = self._updates() - self._saved_updates >= every
+        if due:
+            self.save()
+
+    def save(self) -> None:
+        """Writes a checkpoint, the policies, and how far the run is."""
+        self._saved_at, self._saved_updates = time.perf_counter(), self._updates()
+        self._attempt("a checkpoint", self._save_checkpoint)
+        self._attempt("the policies", self.save_policies)
+        reached = {
+            "env": self.config.env,
+            "num_seeds": self.config.num_seeds,
+            "updates": self._updates(),
+            "env_steps": int(self.record.env_steps.sum()),
+        }
+        self._attempt("summary.json", lambda: self.log.say_running(reached))
+
+    def save_policies(self) -> None:
+        """Writes the last and the best policies, or raises OSError."""
+        self.log.save_policies(self.state.train_states.actor, self.best.actor, self.policy)
+
+    def _save_checkpoint(self) -> None:
+        content = Checkpoint(
+            state=(self.state, self.best),
+            record=self.record.content(),
+            seconds=self.seconds(),
+            metrics_bytes=self.log.metrics_bytes(),
+            env_steps=self.config.env_steps,
+            max_updates=self.config.max_updates,
+        )
+        self.log.save_checkpoint(content, even=content.is_even(self.config.eval_every))
+
+    def test(self) -> dict[str, Any]:
+        """Plays the last and the best policies on starts used nowhere else, for summary.json.
+
+        Choosing the best by its evaluations flatters these evaluations, but not the test.
+        """
+        final = self.programs.test(self.state.train_states.actor)["eval_return"]
+        best = self.programs.test(self.best.actor)["eval_return"]
+        return {
+            "final_test_returns": final.tolist(),
+            "best_test_returns": best.tolist(),
+        }
+
+    def _updates(self) -> int:
+        return int(self.record.updates.max())
+
+    def _attempt(self, what: str, write: Callable[[], None]) -> None:
+        """Writes something; the first of several failures in a row is shown."""
+        try:
+            write()
+            self._failing.discard(what)
+        except OSError as error:
+            if what in self._failing:
+                return
+            self._failing.add(what)
+            warning = f"cannot write {what} ({error.strerror or error})"
+            with contextlib.suppress(OSError):  # the screen may be a file on the same disk
+                self.display.say(f"warning: {warning}; training goes on and tries again")

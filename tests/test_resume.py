@@ -1,0 +1,341 @@
+"""Checkpoints: a run that goes on ends as one that never stopped, whatever happens to its files."""
+
+import errno
+import json
+import shutil
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import Survive
+
+from mjx_reinforce import envs
+from mjx_reinforce import train as train_module
+from mjx_reinforce.export import files as export_files
+from mjx_reinforce.learners.learner import TrainState
+from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.runs import checkpoint
+from mjx_reinforce.runs.best import first_best, keep_best
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.files import locked
+from mjx_reinforce.runs.record import Record
+
+
+class Drift(Survive):
+    """Up to 20 steps; starts, returns and lengths vary, and one action in a hundred breaks it."""
+
+    def observe(self, key):
+        return jax.random.uniform(key, (1,), minval=-1.0)
+
+    def step(self, state, action):
+        obs = state.obs + 0.3 * action
+        reward = 1.0 - obs[0] ** 2
+        broken = (action[0] > 1.1) & (action[0] < 1.15)
+        done = (jnp.abs(obs[0]) > 1.2).astype(jnp.float32)
+        return state.replace(obs=jnp.where(broken, jnp.nan, obs), reward=reward, done=done)
+
+
+SIZE = ["--num-seeds", "3", "--num-episodes", "4", "--eval-episodes", "2", "--hidden-sizes", "4"]
+COMMON = ["--env", "Drift-v0", "--env-steps", "None", *SIZE]
+#: Parts of summary.json that a clock decides.
+CLOCKS = ("compile_seconds", "run_seconds", "env_steps_per_second")
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path):
+    monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["train", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            train_module.main()
+        return stop.value.code
+
+    return run
+
+
+def results(directory):
+    """All that a run leaves, but for clocks and the story in config.json."""
+    rows = [line.split(",") for line in (directory / "metrics.csv").read_text().splitlines()]
+    clock = rows[0].index("wall_seconds")
+    summary = json.loads((directory / "summary.json").read_text())
+    with np.load(directory / "returns.npz", allow_pickle=False) as archive:
+        training = {name: archive[name].tobytes() for name in archive.files}
+    return {
+        "metrics": [row[:clock] + row[clock + 1 :] for row in rows],
+        "actor": (directory / "policy" / "actor.npz").read_bytes(),
+        "best": (directory / "policy" / "best" / "actor.npz").read_bytes(),
+        "training": training,
+        "summary": {name: value for name, value in summary.items() if name not in CLOCKS},
+    }
+
+
+def assert_same(one, other):
+    one, other = results(one), results(other)
+    for name in one:
+        assert one[name] == other[name], name
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--estimator", "value-baseline", "--value-hidden-sizes", "4", "--value-fits", "2"],
+        ["--algorithm", "ars", "--num-directions", "3"],
+        ["--one-start", "--update", "minibatches", "--minibatch-updates", "3"],
+    ],
+)
+def test_a_run_in_two_parts_is_the_run_in_one(run, tmp_path, arguments):
+    """Also where the first part ends in the middle of a block, or between two checkpoints."""
+    assert run(*COMMON, *arguments, "--max-updates", 24, "--output", "whole") == 0
+    more = ["--checkpoint-every", 5, "--output", "parts"]
+    assert run(*COMMON, *arguments, "--max-updates", 10, *more) == 0
+    assert run("--resume", "parts", "--max-updates", 13) == 0
+    assert run("--resume", "parts", "--max-updates", 24) == 0
+    assert_same(tmp_path / "whole", tmp_path / "parts")
+    config = json.loads((tmp_path / "parts" / "config.json").read_text())
+    assert config["max_updates"] == 24
+    assert [entry["updates"] for entry in config["resumed"]] == [10, 10]
+    assert not list((tmp_path / "parts").rglob(".*"))
+
+
+def test_seeds_that_stood_still_are_played_again(run, tmp_path):
+    """Under --env-steps they stop one by one; a run of a larger budget knows no such state."""
+    steps = [*COMMON, "--env-steps"]
+    assert run(*steps, 900, "--output", "whole") == 0
+    assert run(*steps, 300, "--checkpoint-every", 5, "--output", "parts") == 0
+    updates = json.loads((tmp_path / "parts" / "summary.json").read_text())["best_updates"]
+    assert run("--resume", "parts", "--env-steps", 900) == 0
+    assert_same(tmp_path / "whole", tmp_path / "parts")
+    assert len(updates) == 3
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of 20 updates; its checkpoints at 15 and 20 are left."""
+    directory = tmp_path_factory.mktemp("trained")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
+        patch.chdir(directory)
+        budget = ["--max-updates", "20", "--checkpoint-every", "5", "--output", "whole"]
+        patch.setattr(sys, "argv", ["train", *COMMON, *budget])
+        with pytest.raises(SystemExit, match=r"^0$"):
+            train_module.main()
+    return directory / "whole"
+
+
+@pytest.fixture
+def parts(trained, tmp_path):
+    """A copy of that run, as if it had been killed at its end."""
+    shutil.copytree(trained, tmp_path / "parts")
+    (tmp_path / "parts" / "summary.json").write_text('{"status": "running"}')
+    return tmp_path / "parts"
+
+
+def checkpoints(directory):
+    return sorted((directory / "checkpoint").iterdir())
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "changed", "all"])
+def test_a_damaged_checkpoint_costs_an_interval(run, trained, parts, capsys, damage):
+    old, new = checkpoints(parts)
+    content = new.read_bytes()
+    new.write_bytes({"cut": content[:-7], "empty": b""}.get(damage, content[:-1] + b"!"))
+    if damage == "all":
+        old.unlink()
+    assert run("--resume", "parts") == 0
+    assert_same(trained, parts)
+    output = capsys.readouterr().out
+    assert f"checkpoint {new.name} is damaged; trying the one before" in output
+    assert f"going on after {0 if damage == 'all' else 15} updates" in output
+
+
+def test_a_shortened_table_is_played_again(run, trained, parts, capsys):
+    metrics = parts / "metrics.csv"
+    metrics.write_bytes(metrics.read_bytes()[:-7])
+    assert run("--resume", "parts") == 0
+    assert_same(trained, parts)
+    assert "metrics.csv is shorter than at checkpoint 4" in capsys.readouterr().out
+
+
+def test_rows_after_the_checkpoint_are_played_again(run, trained, parts):
+    checkpoints(parts)[-1].unlink()
+    with (parts / "metrics.csv").open("a") as file:
+        file.write("0,25,half a ro")
+    assert run("--resume", "parts") == 0
+    assert_same(trained, parts)
+
+
+def test_a_full_disk_costs_no_training(run, trained, tmp_path, monkeypatch, capsys):
+    """Neither checkpoints nor policies nor rows can be written, then all of them again."""
+    written, real = [], export_files.write_bytes
+
+    def full(path, content):
+        written.append(path.name)
+        if path.suffix == ".npz" and len(written) < 20:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(path, content)
+
+    for module in (checkpoint, export_files):
+        monkeypatch.setattr(module, "write_bytes", full)
+    arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "full"]
+    assert run(*COMMON, *arguments) == 0
+    assert_same(trained, tmp_path / "full")
+    output = capsys.readouterr().out
+    assert "warning: cannot write a checkpoint (No space left on device)" in output
+
+
+def test_a_run_that_cannot_end_is_resumed(run, trained, tmp_path, monkeypatch, capsys):
+    def full(path, content):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("mjx_reinforce.runs.log.write_bytes", full)
+    arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "full"]
+    assert run(*COMMON, *arguments) == 1
+    assert "then go on with --resume full" in capsys.readouterr().err
+    assert json.loads((tmp_path / "full" / "summary.json").read_text())["status"] == "running"
+    monkeypatch.undo()
+    monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
+    monkeypatch.chdir(tmp_path)
+    assert run("--resume", "full") == 0
+    assert_same(trained, tmp_path / "full")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--learning-rate", "0.5"], "--learning-rate is 0.01 in parts and cannot become 0.5"),
+        (["--eval-every", "1"], "--eval-every is 5"),
+        (["--num-seeds", "4"], "--num-seeds is 3"),
+        (["--output", "other"], "leave --output out"),
+        (["--overwrite"], "leave --output out"),
+        (["--max-updates", "13"], "--max-updates 13 is less than the 20"),
+        (["--checkpoint-every", "0"], "--checkpoint-every must be at least 1"),
+    ],
+)
+def test_only_the_budget_may_change(run, parts, capsys, arguments, message):
+    before = {path: path.read_bytes() for path in parts.rglob("*") if path.is_file()}
+    assert run("--resume", "parts", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") <= 2
+    assert before == {path: path.read_bytes() for path in parts.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda old: {"packages": old["packages"] | {"jax": "0.1"}}, "was begun with jax 0.1"),
+        (lambda old: {"device": "TPU"}, "was begun with device TPU"),
+        (lambda old: {"num_seeds": "four"}, "num_seeds is 'four'"),
+        (lambda old: {"hidden_sizes": [1.5]}, "hidden_sizes is (1.5,)"),
+        (lambda old: {"eval_every": None}, "eval_every is None"),
+    ],
+)
+def test_what_cannot_be_resumed_is_named(run, parts, capsys, change, message):
+    path = parts / "config.json"
+    config = json.loads(path.read_text())
+    path.write_text(json.dumps(config | change(config)))
+    assert run("--resume", "parts") == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("content", [None, "{", "[]", "{}"])
+def test_what_is_no_run_is_named(run, tmp_path, capsys, content):
+    (tmp_path / "out").mkdir()
+    if content is not None:
+        (tmp_path / "out" / "config.json").write_text(content)
+    assert run("--resume", "out") == 2
+    assert "config.json" in capsys.readouterr().err
+
+
+def test_two_processes_do_not_train_in_one_directory(run, parts, capsys):
+    with locked(parts):
+        assert run("--resume", "parts") == 2
+    assert "another process trains in parts" in capsys.readouterr().err
+
+
+def test_a_finished_run_has_nothing_to_do(run, tmp_path, capsys):
+    assert run(*COMMON, "--max-updates", 5, "--output", "out") == 0
+    before = (tmp_path / "out" / "summary.json").read_bytes()
+    assert run("--resume", "out") == 0
+    assert "is finished" in capsys.readouterr().out
+    assert (tmp_path / "out" / "summary.json").read_bytes() == before
+
+
+def test_the_best_policies_are_kept_and_tested(run, tmp_path):
+    assert run(*COMMON, "--max-updates", 20, "--output", "out") == 0
+    out = tmp_path / "out"
+    rows = [line.split(",") for line in (out / "metrics.csv").read_text().splitlines()]
+    names = rows[0]
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["status"] == "finished"
+    for seed, update in enumerate(summary["best_updates"]):
+        mine = [dict(zip(names, row, strict=True)) for row in rows[1:] if row[0] == str(seed)]
+        best = max(float(row["eval_return"]) for row in mine)
+        latest = [row for row in mine if float(row["eval_return"]) == best][-1]
+        assert int(latest["update"]) == update
+        last = update == 20
+        ours = [summary[f"{kind}_test_returns"][seed] for kind in ("final", "best")]
+        assert (ours[0] == ours[1]) == last
+
+
+def test_ties_go_to_the_later_and_nan_is_never_best():
+    def state(updates):
+        normalizer = jax.vmap(lambda _: normalize.init(2))(jnp.zeros(3))
+        return TrainState(
+            key=jax.random.split(jax.random.key(0), 3),
+            num_updates=jnp.full(3, updates, jnp.int32),
+            actor=Actor(params={"w": jnp.full((3, 2), float(updates))}, normalizer=normalizer),
+            opt_state=(),
+            estimator_state=(),
+        )
+
+    nan = np.nan
+    best = first_best(state(0))
+    for updates, returns in ((0, [1, 2, nan]), (5, [1, 1, 3]), (10, [0, 2, nan])):
+        best = keep_best(best, state(updates), np.array(returns, np.float32))
+    assert best.num_updates.tolist() == [5, 10, 5]
+    np.testing.assert_array_equal(best.actor.params["w"][:, 0], [5, 10, 5])
+    np.testing.assert_array_equal(best.eval_return, [1, 2, 3])
+
+
+def test_a_record_comes_back_whole():
+    rng = np.random.default_rng(0)
+    config = Config(num_seeds=2, max_updates=9)
+    record = Record(config, threshold=1.0)
+
+    def evaluation():
+        names = ("eval_return", "eval_return_stochastic", "eval_length")
+        return {name: rng.random(2, np.float32) for name in names}
+
+    def block():
+        floats = ("episode_return", "episode_length", "entropy", "gradient_norm")
+        metrics = {name: rng.random((3, 2), np.float32) for name in floats}
+        counts = ("env_steps_total", "updates_total", "simulated_steps", "nonfinite_episodes")
+        metrics |= {name: rng.integers(0, 3, (3, 2)) for name in (*counts, "skipped_update")}
+        return metrics | {"active": rng.random((3, 2)) < 0.7}
+
+    record.add_evaluation(evaluation(), 0.5)
+    for _ in range(2):
+        record.add_updates(block())
+        record.add_evaluation(evaluation(), 1.0)
+    other = Record(config, threshold=1.0)
+    other.restore(record.content())
+    metrics, result = block(), evaluation()
+    for one in (record, other):
+        one.add_updates(metrics)
+    assert record.add_evaluation(result, 2.0) == other.add_evaluation(result, 2.0)
+    assert json.dumps(record.summary("e", 1, 2)) == json.dumps(other.summary("e", 1, 2))
+    assert vars(record).keys() == vars(other).keys()
+    for name, value in record.content().items():
+        np.testing.assert_array_equal(value, other.content()[name])
+    for method in ("history", "training"):
+        ours, theirs = getattr(record, method)(), getattr(other, method)()
+        for name, value in ours.items():
+            np.testing.assert_array_equal(value, theirs[name])
+            assert value.dtype == theirs[name].dtype

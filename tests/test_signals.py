@@ -1,0 +1,150 @@
+"""Ctrl-C, SIGTERM and SIGKILL, sent to real processes while they import, compile, train, write."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_resume import assert_same
+
+from mjx_reinforce import load_policy
+
+HERE = Path(__file__).parent
+#: The command line, with a toy among the environments; $SLOW makes each of its blocks take a while.
+TRAIN = """
+import sys
+sys.path.insert(0, {here!r})
+from toys import Survive
+from mjx_reinforce import envs, train
+envs.register("Survive-v0", Survive)
+train.main()
+"""
+FOREVER = ["--env", "Survive-v0", "--env-steps", "1000000000", "--output", "out"]
+#: It takes minutes to compile.
+HEAVY = ["--env", "Hopper-v5", "--output", "out"]
+
+
+def start(directory, *arguments, real=False, cache=None):
+    command = ["-m", "mjx_reinforce.train"] if real else ["-c", TRAIN.format(here=str(HERE))]
+    environment = dict(os.environ) | ({"JAX_COMPILATION_CACHE_DIR": str(cache)} if cache else {})
+    return subprocess.Popen(
+        [sys.executable, *command, *map(str, arguments)],
+        cwd=directory,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for(condition, process, seconds=200):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def rows(directory):
+    path = directory / "out" / "metrics.csv"
+    return path.read_text().count("\n") if path.exists() else 0
+
+
+def finish(process, seconds=60):
+    """The status; the process must have said nothing of a traceback."""
+    output, errors = process.communicate(timeout=seconds)
+    assert "Traceback" not in output + errors
+    assert "Segmentation" not in errors
+    return process.returncode
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_ends_the_run_after_the_block(tmp_path, number, status):
+    process = start(tmp_path, *FOREVER)
+    wait_for(lambda: rows(tmp_path) > 20, process)
+    process.send_signal(number)
+    assert finish(process) == status
+    with (tmp_path / "out" / "metrics.csv").open(newline="") as file:
+        last = list(csv.DictReader(file))[-4:]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["status"] == "interrupted"
+    assert summary["final_returns"] == [float(row["eval_return"]) for row in last]
+    assert len(list((tmp_path / "out" / "checkpoint").iterdir())) == 1
+    for folder in ("policy", "policy/best"):
+        _, actor = load_policy(tmp_path / "out" / folder)
+        assert np.all(np.isfinite(actor.normalizer.mean))
+
+
+def test_an_interrupted_run_goes_on(tmp_path):
+    budget = ["--env", "Survive-v0", "--env-steps", "None", "--max-updates", 3000]
+    process = start(tmp_path, *budget, "--output", "out")
+    wait_for(lambda: rows(tmp_path) > 20, process)
+    process.send_signal(signal.SIGTERM)
+    assert finish(process) == 143
+    assert finish(start(tmp_path, "--resume", "out")) == 0
+    assert finish(start(tmp_path, *budget, "--output", "whole")) == 0
+    assert_same(tmp_path / "whole", tmp_path / "out")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_while_compiling_leaves_nothing(tmp_path, number, status):
+    process = start(tmp_path, *HEAVY, real=True, cache=tmp_path / "cache")
+    line = process.stdout.readline()
+    assert line.endswith("compiling\n"), line
+    time.sleep(1)
+    process.send_signal(number)
+    begun = time.monotonic()
+    assert finish(process) == status
+    assert time.monotonic() - begun < 5
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("delay", [0.15, 0.5, 1.5])
+def test_a_signal_while_importing_shows_no_traceback(tmp_path, delay):
+    process = start(tmp_path, *HEAVY, real=True, cache=tmp_path / "cache")
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    assert finish(process) in (130, -signal.SIGINT)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_second_signal_ends_at_once(tmp_path):
+    """Although a block of updates takes minutes."""
+    process = start(tmp_path, *FOREVER, "--eval-every", 100_000_000)
+    wait_for(lambda: rows(tmp_path) > 4, process)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    assert process.poll() is None
+    while "stopping after this block" not in process.stdout.readline():
+        pass
+    process.send_signal(signal.SIGINT)
+    begun = time.monotonic()
+    assert finish(process) == 130
+    assert time.monotonic() - begun < 5
+
+
+@pytest.mark.slow
+def test_kills_at_any_moment_cost_no_byte(tmp_path):
+    """SIGKILL five times at random, while it imports, compiles, trains and writes."""
+    rng = np.random.default_rng(0)
+    budget = ["--env", "InvertedPendulum-v5", "--horizon", 50, "--env-steps", 60_000]
+    budget += ["--hidden-sizes", 4, "--eval-episodes", 2]
+    assert finish(start(tmp_path, *budget, "--output", "whole", real=True), 300) == 0
+    run = [*budget, "--checkpoint-every", 5, "--output", "out"]
+    process, begun = start(tmp_path, *run, real=True), time.monotonic()
+    wait_for(lambda: rows(tmp_path) > 4, process)
+    compiled = time.monotonic() - begun
+    for _ in range(5):
+        time.sleep(rng.uniform(0, 3))
+        process.kill()
+        process.communicate()
+        process = start(tmp_path, "--resume", "out", real=True)
+        time.sleep(rng.uniform(0, compiled))
+    assert finish(process, 300) == 0
+    assert_same(tmp_path / "whole", tmp_path / "out")
