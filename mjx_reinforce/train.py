@@ -153,12 +153,11 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
             result = programs.evaluate(state)
             seconds = time.perf_counter() - began
             log.add_rows(record.add_evaluation(result, seconds))
-            display.show_progress(record.progress(seconds))
-            if record.finished() or interrupt.is_set():
+            display.show_progress(record.progress())
+            if record.finished() or record.hopeless() or interrupt.is_set():
                 break
             state, metrics = programs.advance(state)
-            for event in record.add_updates(metrics):
-                display.show_nonfinite(event)
+            display.show_nonfinite(record.add_updates(metrics), config.num_seeds)
     log.save_policy(state.train_states.actor, policy_settings(env, config))
     run_seconds = time.perf_counter() - began
     summary = record.summary(learner.engine.name, compile_seconds, run_seconds)
