@@ -33,7 +33,10 @@ _FILES = (
 
 
 def main() -> None:
-    """Reads the command line, trains, and exits: 0 done, 2 bad input, 130 interrupted."""
+    """Reads the command line, trains, and exits.
+
+    The status is 0 done, 1 given up on numbers that are not finite, 2 bad input, 130 interrupted.
+    """
     directory = None
     try:
         with _collection_paused():
@@ -46,13 +49,13 @@ def main() -> None:
     except ValueError as error:
         _refuse(str(error), directory)
     try:
-        interrupted = train(env, learner, horizon, config, directory)
+        status = train(env, learner, horizon, config, directory)
     except RuntimeError as error:  # XLA's
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         remedy = "lower --num-seeds, --num-episodes, --eval-episodes or --horizon"
         _refuse(f"this run does not fit into memory ({error}); {remedy}", directory)
-    sys.exit(130 if interrupted else 0)
+    sys.exit(status)
 
 
 def _refuse(message: str, directory: Path | None) -> NoReturn:
@@ -114,8 +117,8 @@ def _configure_jax() -> None:
         jax.config.update("jax_default_matmul_precision", "highest")
 
 
-def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path) -> bool:
-    """Trains to the budget, or to Ctrl-C, and writes the run's files.
+def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path) -> int:
+    """Trains to the budget, to Ctrl-C, or until nothing is finite, and writes the run's files.
 
     Args:
       env: what is trained on.
@@ -125,13 +128,14 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
       directory: where the files go.
 
     Returns:
-      Whether it was interrupted.
+      The exit status, see ``main``.
     """
     with _collection_paused():
         from mjx_reinforce.reports.curves import draw_learning_curve, load_libraries
         from mjx_reinforce.runs.display import Display, print_summary
         from mjx_reinforce.runs.interrupt import Interrupt
         from mjx_reinforce.runs.log import RunLog
+        from mjx_reinforce.runs.nonfinite import HOPELESS
         from mjx_reinforce.runs.record import Record
         from mjx_reinforce.runs.state import compile_programs, first_state
 
@@ -166,7 +170,10 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
     picture = draw_learning_curve(history, training, config.env, threshold, axis)
     log.finish(training, picture, summary)
     print_summary(display.console, summary, directory)
-    return interrupt.is_set()
+    if record.hopeless():
+        display.say(HOPELESS, "red")
+        return 1
+    return 130 if interrupt.is_set() else 0
 
 
 @contextlib.contextmanager

@@ -6,6 +6,11 @@ import numpy as np
 
 Arrays = dict[str, np.ndarray]
 
+#: What is said of a run that is ``hopeless``.
+HOPELESS = (
+    "stopped: every seed that still trained was broken in all updates of the last block, its "
+    "episodes or its new policy not finite; lower --learning-rate, or mend the environment"
+)
 #: The fields of such an update, in the order of summary.json.
 FIELDS = {"seed": np.int64, "update": np.int64, "episodes": np.int64, "skipped": np.bool_}
 #: A run is not given up before each of its seeds was broken so many updates in a row: blocks may
