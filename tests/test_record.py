@@ -82,7 +82,7 @@ def test_a_record_of_nothing_is_restored():
 
 
 def test_a_seed_is_broken_while_nothing_of_it_is_finite():
-    """All episodes of an update, or its policy; one good update ends it, standing still does not."""
+    """All its episodes, or its policy. One good update ends it, standing still does not."""
     metrics = {
         "active": np.array([[1, 1, 1, 1], [1, 1, 1, 0], [1, 1, 1, 0]], bool),
         "nonfinite_episodes": np.array([[4, 4, 3, 4], [0, 4, 4, 0], [4, 4, 4, 0]]),
@@ -143,10 +143,9 @@ def test_a_progress_line_fits_in_80_columns(monkeypatch):
             Progress(0.4567, 12, 3e4, 12345.6, np.nan, 3, 1000, 123456.0, 234567.0, 45296.0)
         )
     written = console.file.getvalue()
-    for text in ("45%", "0:00:00", "left 12:34:56", "return 12345.6", "worst     nan"):
+    for text in ("45.6 %", "0:00:00", "left 12:34:56", "return 12345.6"):
         assert text in written
-    assert "not finite 3 of 1,000" in written
-    assert "234,567 steps/s, mean" in written
+    assert "worst nan (3 of 1,000 seeds)  234,567 steps/s, mean 123,456\n" in written
     assert "…" not in written
 
 

@@ -401,7 +401,7 @@ def test_a_run_without_a_finite_number_stops(run, tmp_path, monkeypatch, capsys)
     assert run(*arguments, "--eval-every", "2", "--output", "out") == 1
     said = capsys.readouterr().out
     assert "stopped: every seed that still trained was broken" in said
-    assert "not finite 3 of 3" in said
+    assert "worst nan (3 of 3 seeds)" in said
     rows, summary = read(tmp_path / "out")
     assert {row["eval_return"] for row in rows} == {"nan"}
     assert {row["eval_return_stochastic"] for row in rows} == {"nan"}

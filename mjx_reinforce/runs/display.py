@@ -10,14 +10,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console, RenderableType
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-)
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
@@ -45,13 +38,13 @@ class Display:
             SpinnerColumn(),
             TextColumn("{task.description}"),
             BarColumn(bar_width=30),
-            TaskProgressColumn(),
+            TextColumn("{task.fields[done]}"),
             TimeElapsedColumn(),
             TextColumn("{task.fields[left]}"),
             console=self.console,
             disable=not self.console.is_terminal,
         )
-        self._task = self._bar.add_task("compiling", total=None, left="")
+        self._task = self._bar.add_task("compiling", total=None, done="", left="")
 
     def __enter__(self) -> "Display":
         """Starts drawing."""
@@ -69,16 +62,17 @@ class Display:
     def start(self, compile_seconds: float) -> None:
         """Marks the end of compilation, from where the time left is counted."""
         self.say(f"compiled in {compile_seconds:.1f} s")
-        self._bar.reset(self._task, total=1.0, description="training", left="")
+        self._bar.reset(self._task, total=1.0, description="training", done="", left="")
 
     def show_progress(self, now: progress.Progress) -> None:
         """Shows how far the run is and how well it does."""
         self._bar.line, left = _numbers(now), _time_left(now)
-        self._bar.update(self._task, completed=now.fraction, left=left)
+        done = percent(min(now.fraction, 1.0))
+        self._bar.update(self._task, completed=now.fraction, done=done, left=left)
         if not self.console.is_terminal:
             self.say(
                 f"update {now.updates:5d}  {now.env_steps:12,.0f} env steps a seed  "
-                f"{_numbers(now)}  {percent(min(now.fraction, 1.0))}  {left}".rstrip()
+                f"{_numbers(now)}  {done}  {left}".rstrip()
             )
 
     def show_nonfinite(self, updates: dict[str, np.ndarray], num_seeds: int) -> None:
@@ -91,7 +85,7 @@ def _numbers(now: progress.Progress) -> str:
     """Returns the returns and, after a block of updates, the speed."""
     text = f"return {now.iqm:7.1f}  worst {now.worst:7.1f}"
     if now.failed:
-        text += f"  not finite {now.failed:,} of {now.num_seeds:,}"
+        text = f"return {now.iqm:7.1f}  worst nan ({now.failed:,} of {now.num_seeds:,} seeds)"
     if not math.isnan(now.latest_per_second):
         text += f"  {now.latest_per_second:,.0f} steps/s, mean {now.env_steps_per_second:,.0f}"
     return text
