@@ -2,7 +2,10 @@
 
 import io
 from pathlib import Path
+from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
@@ -10,8 +13,10 @@ from rich.console import Console
 from mjx_reinforce.reports.statistics import summarize
 from mjx_reinforce.runs import display, nonfinite
 from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.evaluation import evaluate
 from mjx_reinforce.runs.progress import Progress
 from mjx_reinforce.runs.record import Record
+from mjx_reinforce.types import Trajectory
 
 
 def block(random, num_updates, num_seeds, first):
@@ -175,3 +180,34 @@ def test_the_end_table_has_counts():
     assert "not finite │ 1 of 1,000" in written
     assert "Files in t/[bold]x" in written
     assert "100" not in written.replace("1000.0", "").replace("1,000", "")
+
+
+def evaluated(reward, mask, nonfinite_episodes):
+    """What an evaluation of N episodes returns that were played so, half of them by the mode."""
+    trajectory = Trajectory(
+        observation=jnp.zeros((*mask.shape, 1)),
+        action=jnp.zeros((*mask.shape, 1)),
+        reward=jnp.asarray(reward),
+        mask=jnp.asarray(mask),
+        nonfinite=jnp.asarray(nonfinite_episodes),
+    )
+    engine = SimpleNamespace(rollout=lambda *_, **__: trajectory)
+    learner = SimpleNamespace(engine=engine, act=None, policy=SimpleNamespace(distribution=None))
+    key, half = jax.random.key(0), mask.shape[1] // 2
+    return evaluate(None, learner, None, key, num_episodes=half, horizon=len(mask))
+
+
+@pytest.mark.parametrize(("broken", "is_nan"), [(None, [0, 0]), (1, [1, 0]), (2, [0, 1])])
+def test_an_evaluation_with_a_broken_episode_is_nan(broken, is_nan):
+    """Two episodes of the mode, then two of samples."""
+    mask = np.arange(5)[:, None] < np.array([2, 3, 4, 5])
+    result = evaluated(np.where(mask, -1.0, 0.0), mask, np.arange(4) == broken)
+    got = [result["eval_return"], result["eval_return_stochastic"]]
+    np.testing.assert_allclose(got, np.where(is_nan, np.nan, [-2.5, -4.5]), rtol=1e-6)
+    assert result["eval_length"] == 2.5
+    assert result["simulated_steps"] >= 4 * 5
+
+
+def test_a_return_that_overflows_is_nan():
+    result = evaluated(np.full((2, 2), -3e38, np.float32), np.ones((2, 2), bool), np.zeros(2, bool))
+    assert np.isnan(result["eval_return"])
