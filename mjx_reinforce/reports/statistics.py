@@ -30,9 +30,9 @@ def iqm_interval(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Returns a percentile-bootstrap confidence interval of the interquartile mean over seeds.
 
-    It is that of ``scipy.stats.bootstrap`` to rounding: the same 5000 resamples, drawn from the
-    generator of seed 0. What is resampled is the seed, once for all other axes, as there: so an
-    interval of a curve's point is that of the point alone.
+    It is that of ``scipy.stats.bootstrap`` but for rounding, in the 13th digit or later: the same
+    5000 resamples, drawn from the generator of seed 0. What is resampled is the seed, once for
+    all other axes, as there: so the interval of a curve's point is that of the point alone.
 
     Args:
       values: one entry a seed along ``axis``; not finite where the seed failed, see ``iqm``.
