@@ -39,8 +39,8 @@ _FILES = (
 def main() -> None:
     """Reads the command line, trains, and exits.
 
-    The status is 0 when done, 1 if files cannot be written, 2 for bad input, 130 after Ctrl-C and
-    143 after SIGTERM.
+    The status is 0 when done, 1 if files cannot be written or nothing is finite any more, 2 for bad
+    input, 130 after Ctrl-C and 143 after SIGTERM.
     """
     with Interrupt() as interrupt, contextlib.ExitStack() as held:
         sys.exit(_main(sys.argv[1:], interrupt, held))
@@ -64,7 +64,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
     except ValueError as error:
         _refuse(str(error), directory)
     try:
-        interrupted = train(env, *start, config, directory, interrupt)
+        return train(env, *start, config, directory, interrupt)
     except RuntimeError as error:  # XLA's
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
@@ -73,7 +73,6 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
     except OSError as error:
         remedy = f"make room, then go on with --resume {directory}"
         _refuse(f"cannot write the files of this run ({error}); {remedy}", directory, status=1)
-    return 128 + interrupted if interrupted else 0
 
 
 def _directory(config: Config) -> Path:
@@ -190,8 +189,8 @@ def train(
     config: Config,
     directory: Path,
     interrupt: Interrupt,
-) -> int | None:
-    """Trains to the budget, or until a signal, and writes the run's files.
+) -> int:
+    """Trains to the budget, a signal, or until nothing is finite, and writes the run's files.
 
     Args:
       env: what is trained on.
@@ -203,11 +202,12 @@ def train(
       interrupt: what listens to signals.
 
     Returns:
-      The number of the signal that interrupted it, or None.
+      The exit status, see ``main``.
     """
     with _collection_paused():
         from mjx_reinforce.reports.curves import load_libraries
         from mjx_reinforce.runs.display import Display, print_summary
+        from mjx_reinforce.runs.nonfinite import HOPELESS
 
     with Display() as display:
         interrupt.on_exit(display.console.show_cursor)
@@ -222,7 +222,10 @@ def train(
     session.save()
     summary = _finish(session, learner.engine.name, compile_seconds, interrupted)
     print_summary(display.console, summary, directory)
-    return interrupted
+    if session.record.hopeless():
+        display.say(HOPELESS, "red")
+        return 1
+    return 128 + interrupted if interrupted else 0
 
 
 def _compile(
@@ -264,7 +267,7 @@ def _begin(session: Any, horizon: int, found: Any) -> None:
 
 
 def _loop(session: Any, interrupt: Interrupt, *, evaluated: bool) -> int | None:
-    """Trains until the budget is used, or a signal came, whose number is returned.
+    """Trains until the budget is used or nothing is finite, or a signal came; returns its number.
 
     Args:
       session: the run.
@@ -273,7 +276,7 @@ def _loop(session: Any, interrupt: Interrupt, *, evaluated: bool) -> int | None:
     """
     if not evaluated:
         session.evaluate()
-    while not session.record.finished():
+    while not (session.record.finished() or session.record.hopeless()):
         if interrupt.number is not None:
             return interrupt.number
         session.advance()

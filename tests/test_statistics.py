@@ -1,11 +1,16 @@
 """Statistics over seeds against hand counts and known coverage."""
 
+import subprocess
+import sys
 import warnings
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from scipy import stats
 
-from mjx_reinforce.reports.statistics import iqm, iqm_interval, steps_to_solve
+from mjx_reinforce.reports import bootstrap, curves
+from mjx_reinforce.reports.statistics import iqm, iqm_interval, steps_to_solve, summarize
 
 
 def test_iqm_is_the_mean_of_the_middle_half():
@@ -89,3 +94,113 @@ def test_steps_to_solve_is_the_first_time():
 def test_a_return_that_is_not_finite_solves_nothing():
     returns = np.array([[np.nan, np.nan], [5.0, np.nan]])
     assert steps_to_solve(returns, np.array([[0, 0], [9, 9]]), 5.0) == [9, None]
+
+
+def by_scipy(values):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return stats.bootstrap(
+            (values,),
+            iqm,
+            axis=-1,
+            n_resamples=5000,
+            method="percentile",
+            vectorized=True,
+            rng=np.random.default_rng(0),
+        ).confidence_interval
+
+
+CURVES = {
+    "smooth": lambda random, n: random.normal(size=(3, n)),
+    "ties": lambda random, n: random.integers(0, 3, size=(3, n)),
+    "solved": lambda random, n: np.minimum(random.normal(1001, 1, size=(2, n)), 1000.0),
+    "outliers": lambda random, n: random.normal(size=(2, n)) * 10.0 ** random.integers(0, 9, n),
+    "one for all": lambda random, n: np.repeat(random.normal(size=(2, 1)), n, axis=1),
+}
+
+
+@pytest.mark.parametrize("num_seeds", [2, 3, 4, 5, 7, 16, 101, 222])
+@pytest.mark.parametrize("kind", CURVES)
+def test_interval_is_that_of_scipy(kind, num_seeds):
+    values = CURVES[kind](np.random.default_rng(num_seeds), num_seeds)
+    np.testing.assert_allclose(iqm_interval(values), by_scipy(values), rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize(("setting", "value"), [("_DEVIATIONS", 1), ("_DRAWS", 3000)])
+def test_interval_does_not_depend_on_how_it_is_computed(monkeypatch, setting, value):
+    """Too few seeds looked at one by one are noticed, and resamples may come in parts."""
+    values = np.random.default_rng(2).exponential(size=(4, 150))
+    expected = by_scipy(values)
+    monkeypatch.setattr(bootstrap, setting, value)
+    np.testing.assert_allclose(iqm_interval(values), expected, rtol=1e-12)
+
+
+def test_interval_has_the_shape_of_the_other_axes():
+    values = np.random.default_rng(2).normal(size=(2, 9, 3))
+    low, high = iqm_interval(values, axis=1)
+    assert low.shape == high.shape == (2, 3)
+    np.testing.assert_array_equal([low[1, 2], high[1, 2]], iqm_interval(values[1, :, 2]))
+
+
+@pytest.mark.parametrize("failed", [np.nan, np.inf, -np.inf])
+def test_a_failed_seed_is_worse_than_every_other(failed):
+    """Of eight, two are left out at each end."""
+    values = np.array([-1000.0, -3.0, -1.0, -2.0, -50.0, -4.0, -5.0, -6.0])
+    values[2] = failed
+    assert iqm(values) == pytest.approx((-50 - 6 - 5 - 4) / 4)
+    assert iqm(values.astype(np.float32)).dtype == np.float32
+    values[3] = failed
+    assert iqm(values) == pytest.approx((-1000 - 50 - 6 - 5) / 4)
+    values[1] = failed
+    assert np.isnan(iqm(values))
+    assert np.isnan(iqm(np.array([1.0, 2.0, failed])))
+
+
+@pytest.mark.parametrize("num_failed", [1, 10, 24, 26, 30, 60, 100])
+def test_interval_of_failed_seeds(num_failed):
+    """An end is NaN where resamples around it have no mean; the upper one goes last."""
+    values = np.random.default_rng(5).normal(size=100)
+    drawn = np.random.default_rng(0).integers(0, 100, (5000, 100))
+    values[:num_failed] = np.nan
+    means = np.sort(np.nan_to_num(iqm(values[drawn]), nan=-np.inf))
+    with np.errstate(invalid="ignore"):
+        expected = np.quantile(means, [0.025, 0.975])
+    expected[~np.isfinite(expected)] = np.nan
+    np.testing.assert_allclose(iqm_interval(values), expected, rtol=1e-12)
+    assert np.isnan(expected).tolist() == [num_failed > 10, num_failed > 30]
+
+
+def test_a_thousand_seeds_take_little_memory():
+    """Two hundred points of them, in a process of its own, all libraries included."""
+    code = (
+        "import resource, numpy\n"
+        "from mjx_reinforce.reports.statistics import iqm_interval\n"
+        "iqm_interval(numpy.random.default_rng(0).normal(size=(200, 1000)))\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert float(done.stdout) < 500  # MB
+
+
+def test_seeds_are_counted():
+    returns = np.array([[5.0, 9.0, 1.0, np.nan], [9.0, 2.0, 3.0, 9.0], [9.0, 2.0, 4.0, np.nan]])
+    counts = np.zeros((3, 4), int)
+    summary = summarize({"eval_return": returns, "env_steps": counts, "episodes": counts}, 8.0)
+    assert summary["seeds_solved_at_end"] == 1
+    assert summary["seeds_ever_solved"] == 3
+    assert summary["solve_rate"] == 0.25
+    assert summary["seeds_nonfinite_at_end"] == 1
+    assert summary["iqm"] == pytest.approx(3.0)  # of 2 and 4
+    summary = summarize({"eval_return": returns, "env_steps": counts, "episodes": counts}, None)
+    for name in ("seeds_solved_at_end", "seeds_ever_solved", "solve_rate"):
+        assert summary[name] is None
+
+
+def test_a_curve_counts_failed_seeds_and_holds_those_that_stand_still():
+    """The mean of three seeds: one fails in its second evaluation, one stops after it."""
+    steps = np.array([[0, 0, 0], [10, 10, 10], [20, 20, 10], [30, 20, 10]])
+    returns = np.array([[0.0, 3, 6], [6, np.nan, 6], [12, 9, np.nan], [18, np.nan, np.nan]])
+    axes = Figure().subplots()
+    grid = np.array([0.0, 5, 10, 15, 20, 30])
+    curves._draw_mean(axes, grid, steps, returns, "blue", "")
+    np.testing.assert_allclose(axes.lines[0].get_ydata(), [3, np.nan, np.nan, np.nan, 9, 11])

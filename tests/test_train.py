@@ -23,6 +23,7 @@ from mjx_reinforce.reports.statistics import smooth
 from mjx_reinforce.runs.build import build
 from mjx_reinforce.runs.config import MAX_COUNT, Config, check_step_count
 from mjx_reinforce.runs.files import append_csv, create_csv
+from mjx_reinforce.runs.nonfinite import as_events
 from mjx_reinforce.runs.record import Record
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
@@ -256,7 +257,8 @@ METRICS = {  # two updates of two seeds; the second seed stands still in the sec
 
 def evaluation(*returns):
     values = np.array(returns, np.float32)
-    return {"eval_return": values, "eval_return_stochastic": values / 2, "eval_length": values}
+    measured = {"eval_return": values, "eval_return_stochastic": values / 2, "eval_length": values}
+    return measured | {"simulated_steps": np.arange(1, len(values) + 1)}
 
 
 def test_a_record_of_two_seeds_by_hand():
@@ -265,25 +267,27 @@ def test_a_record_of_two_seeds_by_hand():
     first = record.add_evaluation(evaluation(1, 9), 0.5)
     assert [row["train_return"] for row in first] == ["", ""]
     assert not record.finished()
-    assert record.progress(2.0).fraction == 0
-    assert record.add_updates(METRICS) == [
-        {"seed": 0, "update": 1, "episodes": 2, "skipped": True},
-    ]
-    second = record.add_evaluation(evaluation(7, 10), 1.23456)
+    assert record.progress().fraction == 0
+    met = record.add_updates(METRICS)
+    assert as_events(met) == [{"seed": 0, "update": 1, "episodes": 2, "skipped": True}]
+    second = record.add_evaluation(evaluation(7, 10), 2.00009)
     keys = ("seed", "update", "episodes", "env_steps", "wall_seconds", "train_return")
     assert [[row[key] for key in keys] for row in second] == [
-        [0, 2, 4, 70, 1.235, 5.0],
-        [1, 1, 2, 40, 1.235, 4.0],
+        [0, 2, 4, 70, 2.0, pytest.approx(np.nan, nan_ok=True)],
+        [1, 1, 2, 40, 2.0, 4.0],
     ]
     assert [row["skipped_update"] for row in second] == [1, 0]
-    assert record.progress(2.0) == (40 / 60, 2, 55.0, 8.5, 7.0, 55.0)
+    progress = record.progress()
+    assert progress[:-3] == (40 / 60, 2, 55.0, 8.5, 7.0, 0, 2)
+    np.testing.assert_allclose(progress[-3:], [55, 110 / 1.5, 1.5 / 2], rtol=1e-3)
     assert not record.finished()
-    np.testing.assert_array_equal(record.training()["episode_return"], [[3, 4], [5, np.nan]])
+    np.testing.assert_array_equal(record.training()["episode_return"], [[3, 4], [np.nan] * 2])
     np.testing.assert_array_equal(record.training()["env_steps"], [[30, 40], [70, 40]])
     np.testing.assert_array_equal(record.training()["episodes"], [[2, 2], [4, 2]])
     summary = record.summary("fused", 3.0, 2.0)
     assert summary["env_steps_to_solve"] == [None, 0]
-    assert summary["useful_step_fraction"] == 110 / 200  # 2 (60 + 40): each waits for the other
+    # 2 (60 + 40) in training and 2 (2 + 2) in evaluations: each waits for the other.
+    assert summary["useful_step_fraction"] == 110 / 208
     assert summary["env_steps_per_second"] == 55
     assert len(summary["nonfinite"]) == 1
     record.add_evaluation(evaluation(8, 8), 2.0)
@@ -317,8 +321,10 @@ def test_a_full_disk_leaves_no_half_row(tmp_path):
 
 def test_smoothing_is_a_mean_of_the_latest():
     values = np.arange(12.0).reshape(6, 2)
+    values[1, 0] = np.nan
     expected = [values[max(0, u - 2) : u + 1].mean(axis=0) for u in range(6)]
     np.testing.assert_allclose(smooth(values, 3), expected)
+    assert np.isnan(expected).sum() == 3
 
 
 def test_overwrite_is_by_request_alone(run, tmp_path):
@@ -367,10 +373,41 @@ class Fragile(Survive):
 
 
 def test_a_broken_simulation_is_named(run, tmp_path, monkeypatch, capsys):
+    """In one line a block of updates; the training return of such an update is no number."""
     monkeypatch.setitem(envs._TABLE, "Fragile-v0", (Fragile, {}))
     assert run("--env", "Fragile-v0", "--env-steps", "1500", "--output", "out") == 0
-    _, summary = read(tmp_path / "out")
-    assert summary["nonfinite"]
-    event = summary["nonfinite"][0]
-    assert f"seed {event['seed']}, update {event['update']}" in capsys.readouterr().out
+    rows, summary = read(tmp_path / "out")
+    blocks = {event["update"] // 5 for event in summary["nonfinite"]}
+    said = capsys.readouterr().out
+    assert said.count("met numbers that are not finite") == len(blocks) > 0
+    assert any(row["train_return"] == "nan" for row in rows)
+    for row in rows[4:]:
+        assert (row["train_return"] == "nan") == (int(row["nonfinite_episodes"]) > 0)
     assert np.all(np.isfinite(summary["final_returns"]))
+
+
+class Broken(Survive):
+    """Leaves the finite numbers in every first step, and would reward it."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        return after.replace(obs=after.obs * jnp.nan, done=jnp.zeros(()))
+
+
+def test_a_run_without_a_finite_number_stops(run, tmp_path, monkeypatch, capsys):
+    """Not with returns of 0, and long before its budget is used."""
+    monkeypatch.setitem(envs._TABLE, "Broken-v0", (Broken, {}))
+    arguments = ["--env", "Broken-v0", "--num-seeds", "3", "--env-steps", "100000"]
+    assert run(*arguments, "--eval-every", "2", "--output", "out") == 1
+    said = capsys.readouterr().out
+    assert "stopped: every seed that still trained was broken" in said
+    assert "worst nan (3 of 3 seeds)" in said
+    rows, summary = read(tmp_path / "out")
+    assert {row["eval_return"] for row in rows} == {"nan"}
+    assert {row["eval_return_stochastic"] for row in rows} == {"nan"}
+    assert int(rows[-1]["update"]) == 6  # three blocks of two: the first with at least five
+    assert summary["final_returns"] == [None] * 3
+    assert summary["iqm"] is None
+    assert summary["iqm_ci"] == [None, None]
+    assert summary["seeds_nonfinite_at_end"] == 3
+    assert summary["seeds_solved_at_end"] == summary["seeds_ever_solved"] == 0

@@ -30,9 +30,9 @@ def draw_learning_curve(
 
     Args:
       history: evaluations, as for ``summarize``.
-      training: ``episode_return`` of each update, NaN where a seed stands still, and the
-        ``env_steps`` and ``episodes`` after it, [U, S]; drawn smoothed over some fifty
-        episodes, the window is in the legend.
+      training: ``episode_return`` of each update, NaN where a seed stands still or an episode
+        left the finite numbers, and the ``env_steps`` and ``episodes`` after it, [U, S]; drawn
+        smoothed over some fifty episodes, the window is in the legend.
       env: its id, for the title.
       threshold: the return that counts as solved, if any.
       axis: what the curves are drawn over, "env_steps" or "episodes".
@@ -55,10 +55,13 @@ def draw_learning_curve(
     if threshold is not None:
         axes.axhline(threshold, color="0.3", linestyle="--", linewidth=1, label="solved")
     seeds = f"interquartile mean of {num_seeds} seeds, 95 % interval" if num_seeds > 1 else "1 seed"
+    failed = int(np.sum(~np.isfinite(returns[-1])))
+    seeds += f"; {failed:,} of {num_seeds:,} not finite at the end" if failed else ""
     axes.set(xlabel=f"{axis.replace('_', ' ')} of a seed", ylabel="return", title=f"{env}, {seeds}")
     axes.xaxis.set_major_formatter("{x:,.0f}")
     axes.grid(alpha=0.3)
-    axes.legend(loc="best", frameon=False)
+    # With a thousand seeds, to look for the best place takes as long as all the rest.
+    axes.legend(loc="best" if num_seeds <= 100 else "lower right", frameon=False)
     picture = io.BytesIO()
     figure.savefig(picture, format="png")
     return picture.getvalue()
@@ -77,11 +80,14 @@ def _draw_training(axes: Any, grid: np.ndarray, training: dict[str, np.ndarray],
 def _draw_mean(
     axes: Any, grid: np.ndarray, steps: np.ndarray, returns: np.ndarray, color: str, label: str
 ) -> None:
-    """Draws the interquartile mean over seeds of curves [E, S] on a grid of steps, and its band."""
+    """Draws the interquartile mean over seeds of curves [E, S] on a grid of steps, and its band.
+
+    A seed counts as failed, see ``iqm``, around a return that is not finite.
+    """
     curves = []
     for s in range(returns.shape[1]):
-        known = np.isfinite(returns[:, s])  # a seed that stands still keeps its last value
-        curves.append(np.interp(grid, steps[known, s], returns[known, s]))
+        moved = np.diff(steps[:, s], prepend=-1) > 0  # a seed that stands still keeps its value
+        curves.append(np.interp(grid, steps[moved, s], returns[moved, s]))
     curves = np.stack(curves, axis=1)
     axes.plot(grid, iqm(curves), color=color, linewidth=2, label=label)
     if len(grid) and curves.shape[1] > 1:

@@ -1,24 +1,33 @@
 """What a user sees while a run goes on and when it ends."""
 
-from collections.abc import Mapping
+import datetime
+import math
+from collections.abc import Iterable
+from decimal import ROUND_DOWN, Decimal
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    Progress,
-    SpinnerColumn,
-    TaskProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.console import Console, RenderableType
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 from mjx_reinforce.reports.statistics import iqm
-from mjx_reinforce.runs import record
+from mjx_reinforce.runs import nonfinite, progress
+
+
+class _Bar(Progress):
+    """A bar with its times, and a line below it: side by side they do not fit in 80 columns."""
+
+    line = ""
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """Returns what is drawn, from top to bottom."""
+        yield from super().get_renderables()
+        if self.line:
+            yield Text(self.line)
 
 
 class Display:
@@ -26,18 +35,17 @@ class Display:
 
     def __init__(self):
         self.console = Console()
-        self._bar = Progress(
+        self._bar = _Bar(
             SpinnerColumn(),
             TextColumn("{task.description}"),
-            BarColumn(),
-            TaskProgressColumn(),
+            BarColumn(bar_width=30),
+            TextColumn("{task.fields[done]}"),
             TimeElapsedColumn(),
-            TextColumn("left"),
-            TimeRemainingColumn(),
+            TextColumn("{task.fields[left]}"),
             console=self.console,
             disable=not self.console.is_terminal,
         )
-        self._task = self._bar.add_task("compiling", total=None)
+        self._task = self._bar.add_task("compiling", total=None, done="", left="")
 
     def __enter__(self) -> "Display":
         """Starts drawing."""
@@ -48,54 +56,85 @@ class Display:
         """Leaves the last state on the screen."""
         self._bar.stop()
 
-    def say(self, text: str) -> None:
+    def say(self, text: str, style: str | None = None) -> None:
         """Prints a line above the bar."""
-        self.console.print(text, highlight=False, soft_wrap=True)
+        self.console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
     def start(self, compile_seconds: float) -> None:
         """Marks the end of compilation, from where the time left is counted."""
         self.say(f"compiled in {compile_seconds:.1f} s")
-        self._bar.reset(self._task, total=1.0, description="training")
+        self._bar.reset(self._task, total=1.0, description="training", done="", left="")
 
-    def show_progress(self, progress: record.Progress) -> None:
+    def show_progress(self, now: progress.Progress) -> None:
         """Shows how far the run is and how well it does."""
-        text = (
-            f"return {progress.iqm:7.1f}  worst {progress.worst:7.1f}  "
-            f"{progress.env_steps_per_second:,.0f} steps/s"
-        )
-        self._bar.update(self._task, completed=progress.fraction, description=text)
+        self._bar.line, left = _numbers(now), _time_left(now)
+        done = percent(min(now.fraction, 1.0))
+        self._bar.update(self._task, completed=now.fraction, done=done, left=left)
         if not self.console.is_terminal:
-            steps = f"{progress.env_steps:12,.0f} env steps a seed"
-            self.say(f"update {progress.updates:5d}  {steps}  {text}")
+            self.say(
+                f"update {now.updates:5d}  {now.env_steps:12,.0f} env steps a seed  "
+                f"{_numbers(now)}  {done}  {left}".rstrip()
+            )
 
-    def show_nonfinite(self, event: Mapping[str, Any]) -> None:
-        """Names an update with numbers that are not finite, from ``Record.add_updates``."""
-        what = f"{event['episodes']} non-finite episodes"
-        what += ", update skipped" if event["skipped"] else ""
-        self.say(f"[yellow]seed {event['seed']}, update {event['update']}: {what}[/yellow]")
+    def show_nonfinite(self, updates: dict[str, np.ndarray], num_seeds: int) -> None:
+        """Says in a line which updates of a block met numbers that are not finite, if any did."""
+        if len(updates["seed"]):
+            self.say(nonfinite.describe(updates, num_seeds), "yellow")
+
+
+def _numbers(now: progress.Progress) -> str:
+    """Returns the returns and, after a block of updates, the speed."""
+    text = f"return {now.iqm:7.1f}  worst {now.worst:7.1f}"
+    if now.failed:
+        text = f"return {now.iqm:7.1f}  worst nan ({now.failed:,} of {now.num_seeds:,} seeds)"
+    if not math.isnan(now.latest_per_second):
+        text += f"  {now.latest_per_second:,.0f} steps/s, mean {now.env_steps_per_second:,.0f}"
+    return text
+
+
+def _time_left(now: progress.Progress) -> str:
+    """Returns how long the run still takes, empty where nobody knows."""
+    if math.isnan(now.seconds_left):
+        return ""
+    return f"left {datetime.timedelta(seconds=math.ceil(now.seconds_left))}"
+
+
+def percent(fraction: float) -> str:
+    """Returns a fraction as a percentage with one decimal, rounded down: 100 % is all."""
+    shown = Decimal(repr(fraction)).quantize(Decimal("0.001"), ROUND_DOWN)
+    return f"{100 * shown:.1f} %"
 
 
 def print_summary(console: Console, summary: dict[str, Any], directory: Path) -> None:
     """Prints the table that ends a run, and where its files are."""
+    num_seeds = f"{summary['num_seeds']:,}"
+    table = Table(title=escape(f"{summary['env']}, {num_seeds} seeds"), show_header=False)
     low, high = summary["iqm_ci"]
-    table = Table(title=f"{summary['env']}, {summary['num_seeds']} seeds", show_header=False)
-    interval = "" if low != low else f"  (95 % interval {low:.1f} to {high:.1f})"
+    known = not (math.isnan(low) and math.isnan(high))
+    interval = f"  (95 % interval {low:.1f} to {high:.1f})" if known else ""
     table.add_row("return, interquartile mean over seeds", f"{summary['iqm']:.1f}{interval}")
-    returns = summary["final_returns"]
-    table.add_row("worst and best seed", f"{min(returns):.1f}, {max(returns):.1f}")
-    if summary["solve_rate"] is not None:
-        solved = [steps for steps in summary["env_steps_to_solve"] if steps is not None]
-        table.add_row("seeds solved at the end", f"{summary['solve_rate']:.0%}")
-        if solved:
-            episodes = [number for number in summary["episodes_to_solve"] if number is not None]
-            table.add_row("env steps to solve", f"{min(solved):,} to {max(solved):,}")
-            table.add_row("episodes to solve", f"{min(episodes):,} to {max(episodes):,}")
+    returns = np.array(summary["final_returns"])
+    table.add_row("worst and best seed", f"{returns.min():.1f}, {np.fmax.reduce(returns):.1f}")
+    if failed := summary["seeds_nonfinite_at_end"]:
+        row = f"{failed:,} of {num_seeds}, worse than every other"
+        table.add_row("seeds whose return is not finite", row)
+    if summary["seeds_solved_at_end"] is not None:
+        table.add_row(
+            "seeds solved at the end", f"{summary['seeds_solved_at_end']:,} of {num_seeds}"
+        )
+        table.add_row("seeds ever solved", f"{summary['seeds_ever_solved']:,} of {num_seeds}")
+        for unit in ("env_steps", "episodes"):
+            solved = [count for count in summary[f"{unit}_to_solve"] if count is not None]
+            if solved:
+                name = f"{unit.replace('_', ' ')} to solve"
+                table.add_row(name, f"{min(solved):,} to {max(solved):,}")
     if "final_test_returns" in summary:
         last, best = (iqm(np.array(summary[f"{kind}_test_returns"])) for kind in ("final", "best"))
         table.add_row("last policies, best policies, on fresh starts", f"{last:.1f}, {best:.1f}")
     table.add_row("env steps a second", f"{summary['env_steps_per_second']:,.0f}")
-    table.add_row("useful steps of those simulated", f"{summary['useful_step_fraction']:.0%}")
+    useful = percent(summary["useful_step_fraction"])
+    table.add_row("steps trained on, of all simulated", useful)
     table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")
     table.add_row("training and evaluating", f"{summary['run_seconds']:.1f} s")
     console.print(table)
-    console.print(f"Files in {directory}", highlight=False, soft_wrap=True)
+    console.print(f"Files in {directory}", markup=False, highlight=False, soft_wrap=True)

@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
+from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns, simulated_steps
 from mjx_reinforce.learners.learner import Learner
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.types import Environment
@@ -30,7 +30,9 @@ def evaluate(
 
     Returns:
       ``eval_return`` and ``eval_length`` [], means over the deterministic
-      episodes, and ``eval_return_stochastic`` [], over the sampled ones.
+      episodes, ``eval_return_stochastic`` [], over the sampled ones, and
+      ``simulated_steps`` []. A return is NaN if one of its episodes left the finite
+      numbers: what that earned until then says nothing.
     """
     trajectory = learner.engine.rollout(
         env,
@@ -43,8 +45,10 @@ def evaluate(
         num_deterministic=num_episodes,
     )
     returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
+    returns = jnp.where(trajectory.nonfinite | ~jnp.isfinite(returns), jnp.nan, returns)
     return {
         "eval_return": jnp.mean(returns[:num_episodes]),
         "eval_return_stochastic": jnp.mean(returns[num_episodes:]),
         "eval_length": jnp.mean(lengths[:num_episodes]),
+        "simulated_steps": simulated_steps(trajectory),
     }

@@ -4,34 +4,18 @@ Blocks of training metrics and evaluations come in; rows of metrics.csv, curves,
 summary come out. Nothing here prints, writes a file, or reads a clock.
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.reports.statistics import iqm, summarize
-from mjx_reinforce.runs import rows
+from mjx_reinforce.reports.statistics import summarize
+from mjx_reinforce.runs import nonfinite, rows
 from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.progress import BLOCKS, Progress, measure
+from mjx_reinforce.runs.table import Table
 
 Arrays = dict[str, np.ndarray]
-
-
-class Progress(NamedTuple):
-    """How far a run is, as of its last evaluation.
-
-    fraction: how much of its budget the seed furthest from its end has used, 1 or more at the end
-    updates: made by the seed that made the most
-    env_steps: of the mean seed
-    iqm: interquartile mean of the return over seeds
-    worst: the return of the worst seed
-    env_steps_per_second: of all seeds together
-    """
-
-    fraction: float
-    updates: int
-    env_steps: float
-    iqm: float
-    worst: float
-    env_steps_per_second: float
 
 
 class Record:
@@ -39,6 +23,7 @@ class Record:
 
     updates: [S] int64, how many each seed has made
     env_steps: [S] int64, how many each seed has played in training
+    seconds: wall time from the end of compilation to the last evaluation
     threshold: the return that counts as solved, if any
     """
 
@@ -49,46 +34,91 @@ class Record:
           config: the settings of the run.
           threshold: the return that counts as solved, if any.
         """
+        self._config, self.threshold = config, threshold
         self.updates = np.zeros(config.num_seeds, np.int64)
         self.env_steps = np.zeros(config.num_seeds, np.int64)
-        self.threshold = threshold
-        self._config = config
-        self._evaluations: list[Arrays] = []
-        self._training: list[Arrays] = []
-        self._nonfinite: list[dict[str, Any]] = []
+        self.seconds = 0.0
+        kinds = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
+        self._tables = {
+            "evaluations": Table({}),
+            "training": Table({k: np.zeros((0, config.num_seeds), x) for k, x in kinds.items()}),
+            "nonfinite": Table({k: np.zeros(0, x) for k, x in nonfinite.FIELDS.items()}),
+        }
         self._last: Arrays = {}
-        self._simulated = 0.0
+        self._broken_in_a_row = np.zeros(config.num_seeds, np.int64)
+        self._simulated = 0
 
-    def add_updates(self, metrics: Arrays) -> list[dict[str, Any]]:
+    def arrays(self) -> Arrays:
+        """Returns all that was measured, by name, for ``restore``."""
+        kept = {
+            "updates": self.updates,
+            "env_steps": self.env_steps,
+            "seconds": np.asarray(self.seconds, np.float64),
+            "broken_in_a_row": self._broken_in_a_row,
+            "simulated": np.asarray(self._simulated, np.int64),
+        }
+        tables = {name: table.columns() for name, table in self._tables.items()}
+        for group, columns in (tables | {"last": self._last}).items():
+            kept |= {f"{group}.{name}": values for name, values in columns.items()}
+        return kept
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Goes back to what a record of the same settings had measured.
+
+        Args:
+          arrays: from its ``arrays``.
+        """
+        groups: dict[str, Arrays] = {"last": {}} | {name: {} for name in self._tables}
+        for key, values in arrays.items():
+            group, _, name = key.rpartition(".")
+            if group:
+                groups[group][name] = values
+        self.updates, self.env_steps = arrays["updates"], arrays["env_steps"]
+        self.seconds, self._simulated = float(arrays["seconds"]), int(arrays["simulated"])
+        self._broken_in_a_row = arrays["broken_in_a_row"]
+        self._last = groups.pop("last")
+        self._tables = {name: Table(columns) for name, columns in groups.items()}
+
+    def add_updates(self, metrics: Arrays) -> Arrays:
         """Takes in a block of updates.
+
+        A training return is NaN if one of its episodes left the finite numbers.
 
         Args:
           metrics: [K, S] each, of K updates: those of ``Learner.step`` and of
             ``state.Programs.advance``.
 
         Returns:
-          The seeds' updates in it that met numbers which are not finite: ``seed``, ``update``
-          (how many were made before it), ``episodes`` (how many) and ``skipped``.
+          The updates in it that met numbers which are not finite, see
+          ``nonfinite.nonfinite_updates``.
         """
-        active = metrics["active"]
+        active, episodes = metrics["active"], self._config.episodes_per_update
+        finite = metrics["nonfinite_episodes"] == 0
+        metrics = metrics | {"episode_return": np.where(finite, metrics["episode_return"], np.nan)}
         env_steps = metrics["env_steps_total"].astype(np.int64)
         updates = metrics["updates_total"].astype(np.int64)
         made = active.any(axis=1)
         returns = np.where(active, metrics["episode_return"], np.nan)
-        self._training.append(
-            {
-                "episode_return": returns[made],
-                "env_steps": env_steps[made],
-                "episodes": updates[made] * self._config.episodes_per_update,
-            }
-        )
+        training = {
+            "episode_return": returns,
+            "env_steps": env_steps,
+            "episodes": updates * episodes,
+        }
+        self._tables["training"].append({name: x[made] for name, x in training.items()})
         self.env_steps, self.updates = env_steps[-1], updates[-1]
-        # All seeds step on until the slowest is done, also those whose budget is used.
-        self._simulated += metrics["simulated_steps"].max(axis=1).sum() * active.shape[1]
+        self._count_simulated(metrics["simulated_steps"])
         self._remember(metrics)
-        nonfinite = _nonfinite_updates(metrics)
-        self._nonfinite += nonfinite
-        return nonfinite
+        self._broken_in_a_row = nonfinite.broken_in_a_row(self._broken_in_a_row, metrics, episodes)
+        met = nonfinite.nonfinite_updates(metrics)
+        self._tables["nonfinite"].append(met)
+        return met
+
+    def _count_simulated(self, steps: np.ndarray) -> None:
+        """Counts env steps [..., S] that were simulated side by side.
+
+        All seeds step on until the slowest is done, also those whose budget is used.
+        """
+        self._simulated += int(steps.max(axis=-1).sum()) * steps.shape[-1]
 
     def _remember(self, metrics: Arrays) -> None:
         """Keeps each seed's metrics of its last update; a seed that stands still makes none."""
@@ -109,82 +139,53 @@ class Record:
           The rows of metrics.csv, see ``rows``.
         """
         episodes = self.updates * self._config.episodes_per_update
-        self._evaluations.append(result | {"env_steps": self.env_steps, "episodes": episodes})
+        counts = {"env_steps": self.env_steps, "episodes": episodes, "updates": self.updates}
+        row = result | counts | {"seconds": np.asarray(seconds, np.float64)}
+        self._tables["evaluations"].append({name: x[None] for name, x in row.items()})
+        self._count_simulated(result["simulated_steps"])
+        self.seconds = seconds
         return rows.of_evaluation(
             result, self._last, self.updates, episodes, self.env_steps, seconds
         )
 
     def finished(self) -> bool:
         """Returns whether the budget is used, or all seeds are solved and that was to end it."""
-        last = self._evaluations[-1]["eval_return"]
+        last = self._tables["evaluations"].latest(1)["eval_return"]
         solved = self.threshold is not None and np.all(last >= self.threshold)
-        return bool(self._fraction() >= 1.0 or (self._config.stop_when_solved and solved))
+        used = self._used(self.env_steps, self.updates)
+        return bool(used.min() >= 1.0 or (self._config.stop_when_solved and solved))
 
-    def _fraction(self) -> float:
-        """Returns how much of its budget the seed furthest from its end has used."""
-        used = np.zeros(self._config.num_seeds)
+    def hopeless(self) -> bool:
+        """Returns whether all seeds that still train were broken throughout a block of updates."""
+        used = self._used(self.env_steps, self.updates)
+        return nonfinite.hopeless(self._broken_in_a_row, used, self._config.eval_every)
+
+    def _used(self, env_steps: np.ndarray, updates: np.ndarray) -> np.ndarray:
+        """Returns the fraction of its budget that each seed has used, of counts [..., S]."""
+        used = np.zeros(env_steps.shape)
         if self._config.env_steps is not None:
-            used = self.env_steps / self._config.env_steps
+            used = env_steps / self._config.env_steps
         if self._config.max_updates is not None:
-            used = np.maximum(used, self.updates / self._config.max_updates)
-        return float(used.min())
+            used = np.maximum(used, updates / self._config.max_updates)
+        return used
 
-    def progress(self, seconds: float) -> Progress:
-        """Returns how far the run is, ``seconds`` after compilation ended."""
-        returns = self._evaluations[-1]["eval_return"]
-        return Progress(
-            fraction=self._fraction(),
-            updates=int(self.updates.max()),
-            env_steps=float(self.env_steps.mean()),
-            iqm=float(iqm(returns)),
-            worst=float(returns.min()),
-            env_steps_per_second=float(self.env_steps.sum() / seconds),
-        )
+    def progress(self) -> Progress:
+        """Returns how far the run is, as of its last evaluation."""
+        past = self._tables["evaluations"].latest(BLOCKS + 1)
+        fractions = self._used(past["env_steps"], past["updates"]).min(axis=-1)
+        return measure(past, fractions)
 
     def history(self) -> Arrays:
         """Returns ``eval_return``, and ``env_steps`` and ``episodes`` until then, [E, S] each."""
-        return {
-            name: np.stack([evaluation[name] for evaluation in self._evaluations])
-            for name in ("eval_return", "env_steps", "episodes")
-        }
+        past = self._tables["evaluations"].columns()
+        return {name: past[name] for name in ("eval_return", "env_steps", "episodes")}
 
     def training(self) -> Arrays:
-        """Returns ``episode_return`` and the ``env_steps`` and ``episodes`` after it, [U, S]."""
-        types = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
-        return {
-            name: np.concatenate(
-                [np.zeros((0, self._config.num_seeds), kind)]
-                + [block[name] for block in self._training]
-            )
-            for name, kind in types.items()
-        }
+        """Returns ``episode_return`` and the ``env_steps`` and ``episodes`` after it, [U, S].
 
-    def content(self) -> Arrays:
-        """Returns all that was measured, at least one evaluation, as arrays for ``restore``."""
-        events = [[e[name] for name in _EVENT] for e in self._nonfinite]
-        content = {
-            "updates": self.updates,
-            "env_steps": self.env_steps,
-            "simulated": np.asarray(self._simulated),
-            "nonfinite": np.array(events, np.int64).reshape(-1, len(_EVENT)),
-        }
-        for name in self._evaluations[0]:
-            content[f"evaluations/{name}"] = np.stack([e[name] for e in self._evaluations])
-        content |= {f"training/{name}": values for name, values in self.training().items()}
-        return content | {f"last/{name}": values for name, values in self._last.items()}
-
-    def restore(self, content: Arrays) -> None:
-        """Takes in what ``content`` of the same run returned, in place of all that is here."""
-        self.updates, self.env_steps = content["updates"], content["env_steps"]
-        self._simulated = float(content["simulated"])
-        self._nonfinite = [
-            dict(zip(_EVENT, event, strict=True)) | {"skipped": bool(event[-1])}
-            for event in content["nonfinite"].tolist()
-        ]
-        evaluations = _under("evaluations/", content)
-        count = len(evaluations["eval_return"])
-        self._evaluations = [{n: x[i] for n, x in evaluations.items()} for i in range(count)]
-        self._training, self._last = [_under("training/", content)], _under("last/", content)
+        A return is NaN where the seed stood still or an episode left the finite numbers.
+        """
+        return self._tables["training"].columns()
 
     def summary(self, engine: str, compile_seconds: float, run_seconds: float) -> dict[str, Any]:
         """Returns what summary.json says.
@@ -204,30 +205,6 @@ class Record:
             "compile_seconds": compile_seconds,
             "run_seconds": run_seconds,
             "env_steps_per_second": float(env_steps / run_seconds),
-            "useful_step_fraction": float(env_steps / max(self._simulated, 1.0)),
-            "nonfinite": self._nonfinite,
+            "useful_step_fraction": float(env_steps / max(self._simulated, 1)),
+            "nonfinite": nonfinite.as_events(self._tables["nonfinite"].columns()),
         }
-
-
-#: The entries of an update that met numbers which are not finite, see ``add_updates``.
-_EVENT = ("seed", "update", "episodes", "skipped")
-
-
-def _under(prefix: str, arrays: Arrays) -> Arrays:
-    """Returns the arrays whose names begin so, without that beginning."""
-    return {name.removeprefix(prefix): x for name, x in arrays.items() if name.startswith(prefix)}
-
-
-def _nonfinite_updates(metrics: Arrays) -> list[dict[str, Any]]:
-    """Returns the updates [K, S] that met numbers which are not finite, as ``add_updates``."""
-    episodes, skipped = metrics["nonfinite_episodes"], metrics["skipped_update"]
-    met = (episodes + skipped) * metrics["active"]
-    return [
-        {
-            "seed": int(s),
-            "update": int(metrics["updates_total"][k, s]) - 1,
-            "episodes": int(episodes[k, s]),
-            "skipped": bool(skipped[k, s]),
-        }
-        for k, s in zip(*np.nonzero(met), strict=True)
-    ]

@@ -31,7 +31,7 @@ def of_evaluation(
     env_steps: np.ndarray,
     seconds: float,
 ) -> list[dict[str, Any]]:
-    """Returns a row for each seed.
+    """Returns a row for each seed; a return is NaN if one of its episodes was not finite.
 
     Args:
       evaluation: [S] each, what ``evaluation.evaluate`` returns.

@@ -67,8 +67,8 @@ class Session:
     def advance(self) -> None:
         """Makes a block of updates."""
         self.state, metrics = self.programs.advance(self.state)
-        for event in self.record.add_updates(metrics):
-            self.display.show_nonfinite(event)
+        met = self.record.add_updates(metrics)
+        self.display.show_nonfinite(met, self.config.num_seeds)
 
     def evaluate(self) -> None:
         """Evaluates the present policies, writes the rows, and keeps the best."""
@@ -77,7 +77,7 @@ class Session:
         seconds = self.seconds()
         rows = self.record.add_evaluation(result, seconds)
         self._attempt("metrics.csv", lambda: self.log.add_rows(rows))
-        progress = self.record.progress(seconds)
+        progress = self.record.progress()
         self._attempt("to the screen", lambda: self.display.show_progress(progress))
 
     def save_if_due(self) -> None:
@@ -110,7 +110,7 @@ class Session:
     def _save_checkpoint(self) -> None:
         content = Checkpoint(
             state=(self.state, self.best),
-            record=self.record.content(),
+            record=self.record.arrays(),
             seconds=self.seconds(),
             metrics_bytes=self.log.metrics_bytes(),
             env_steps=self.config.env_steps,

@@ -1,0 +1,84 @@
+"""Updates that met numbers which are not finite: which ones, and when a seed is past hope."""
+
+from typing import Any
+
+import numpy as np
+
+Arrays = dict[str, np.ndarray]
+
+#: What is said of a run that is ``hopeless``.
+HOPELESS = (
+    "stopped: every seed that still trained was broken in all updates of the last block, its "
+    "episodes or its new policy not finite; lower --learning-rate, or mend the environment"
+)
+#: The fields of such an update, in the order of summary.json.
+FIELDS = {"seed": np.int64, "update": np.int64, "episodes": np.int64, "skipped": np.bool_}
+#: A run is not given up before each of its seeds was broken so many updates in a row: blocks may
+#: be shorter, and a seed may recover from one such update, since the next draws other numbers.
+_FEWEST = 5
+#: A message names so many seeds.
+_NAMED = 5
+
+
+def nonfinite_updates(metrics: Arrays) -> Arrays:
+    """Returns the M updates of a block that met numbers which are not finite.
+
+    Args:
+      metrics: [K, S] each, as for ``Record.add_updates``.
+
+    Returns:
+      [M] each: ``seed``, ``update`` (how many the seed had made before it), ``episodes`` (how many
+      of it left the finite numbers) and ``skipped`` (whether the policy stayed as it was).
+    """
+    episodes, skipped = metrics["nonfinite_episodes"], metrics["skipped_update"]
+    k, s = np.nonzero((episodes + skipped) * metrics["active"])
+    found = (s, metrics["updates_total"][k, s] - 1, episodes[k, s], skipped[k, s])
+    return {name: x.astype(kind) for (name, kind), x in zip(FIELDS.items(), found, strict=True)}
+
+
+def as_events(updates: Arrays) -> list[dict[str, Any]]:
+    """Returns the updates of ``nonfinite_updates`` one by one, as summary.json has them."""
+    columns = (updates[name].tolist() for name in FIELDS)
+    return [dict(zip(FIELDS, event, strict=True)) for event in zip(*columns, strict=True)]
+
+
+def broken_in_a_row(before: np.ndarray, metrics: Arrays, num_episodes: int) -> np.ndarray:
+    """Returns how many of its latest updates each seed was broken in, without one between.
+
+    An update is broken if all its episodes left the finite numbers, or if it was skipped.
+
+    Args:
+      before: [S] the same before this block.
+      metrics: [K, S] each, as for ``Record.add_updates``.
+      num_episodes: how many an update plays.
+    """
+    broken = (metrics["nonfinite_episodes"] >= num_episodes) | (metrics["skipped_update"] > 0)
+    count = before
+    for active_now, broken_now in zip(metrics["active"], broken, strict=True):
+        count = np.where(active_now, np.where(broken_now, count + 1, 0), count)
+    return count
+
+
+def hopeless(in_a_row: np.ndarray, used: np.ndarray, block: int) -> bool:
+    """Returns whether every seed that still trains was broken throughout a block of updates.
+
+    Args:
+      in_a_row: [S] from ``broken_in_a_row``.
+      used: [S] the fraction of its budget that each seed has used.
+      block: updates in a block; fewer than five count as five.
+    """
+    training = used < 1.0
+    return bool(training.any() and np.all(in_a_row[training] >= max(block, _FEWEST)))
+
+
+def describe(updates: Arrays, num_seeds: int) -> str:
+    """Returns one line about at least one update of ``nonfinite_updates``."""
+    first, last = updates["update"].min(), updates["update"].max()
+    seeds = np.unique(updates["seed"]).tolist()
+    named = ", ".join(map(str, seeds[:_NAMED])) + (", ..." if len(seeds) > _NAMED else "")
+    when = f"update {first}" if first == last else f"updates {first} to {last}"
+    return (
+        f"{when}: {len(seeds):,} of {num_seeds:,} seeds met numbers that are not finite "
+        f"({named}): {updates['episodes'].sum():,} episodes, "
+        f"{updates['skipped'].sum():,} updates skipped"
+    )

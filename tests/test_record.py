@@ -1,0 +1,213 @@
+"""What a run measures: counts, numbers that are not finite, and going on where it was."""
+
+import io
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from rich.console import Console
+
+from mjx_reinforce.reports.statistics import summarize
+from mjx_reinforce.runs import display, nonfinite
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.evaluation import evaluate
+from mjx_reinforce.runs.progress import Progress
+from mjx_reinforce.runs.record import Record
+from mjx_reinforce.types import Trajectory
+
+
+def block(random, num_updates, num_seeds, first):
+    """Metrics of a block in which the last seed stands still after its first update."""
+    active = np.ones((num_updates, num_seeds), bool)
+    active[1:, -1] = False
+    made = first + np.cumsum(active, axis=0)
+    names = ("episode_return", "episode_length", "entropy", "gradient_norm")
+    floats = {name: random.normal(size=active.shape).astype(np.float32) for name in names}
+    return floats | {
+        "active": active,
+        "updates_total": made.astype(np.int32),
+        "env_steps_total": (10 * made).astype(np.int32),
+        "simulated_steps": random.integers(1, 99, active.shape, np.int32),
+        "nonfinite_episodes": random.integers(0, 2, active.shape, np.int32),
+        "skipped_update": random.integers(0, 2, active.shape, np.int32),
+    }
+
+
+def evaluation(*returns):
+    values = np.array(returns, np.float32)
+    whole = {"eval_return": values, "eval_return_stochastic": values / 2, "eval_length": values}
+    return whole | {"simulated_steps": np.full(len(values), 7, np.int32)}
+
+
+def filled():
+    """A record of three seeds, two blocks and three evaluations."""
+    record, random = Record(Config(num_seeds=3, max_updates=100), 2.0), np.random.default_rng(0)
+    record.add_evaluation(evaluation(1, 2, 3), 0.1)
+    for i in range(2):
+        record.add_updates(block(random, 4, 3, record.updates))
+        record.add_evaluation(evaluation(i, np.nan, -3.5), 1.0 + i / 3)
+    return record
+
+
+def same(one, other):
+    assert list(one) == list(other)
+    for name in one:
+        assert one[name].dtype == other[name].dtype
+        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
+
+
+def test_a_record_is_restored_exactly(tmp_path):
+    """It goes through an archive; what the copy measures after that is the same too."""
+    record = filled()
+    np.savez(tmp_path / "record.npz", allow_pickle=False, **record.arrays())
+    copy = Record(Config(num_seeds=3, max_updates=100), 2.0)
+    with np.load(tmp_path / "record.npz", allow_pickle=False) as archive:
+        copy.restore(dict(archive))
+    for i in range(2):
+        same(record.arrays(), copy.arrays())
+        same(record.history(), copy.history())
+        same(record.training(), copy.training())
+        assert repr(record.summary("fused", 1.0, 2.0)) == repr(copy.summary("fused", 1.0, 2.0))
+        assert repr(record.progress()) == repr(copy.progress())
+        both = []
+        for x in (record, copy):
+            x.add_updates(block(np.random.default_rng(i), 5, 3, x.updates))
+            both.append(x.add_evaluation(evaluation(5, 6, i), 3.0))
+        assert repr(both[0]) == repr(both[1])
+
+
+def test_a_record_of_nothing_is_restored():
+    record, copy = (Record(Config(num_seeds=2), None) for _ in range(2))
+    copy.restore(record.arrays())
+    same(record.arrays(), copy.arrays())
+    assert copy.add_evaluation(evaluation(1, 2), 0.5)[0]["train_return"] == ""
+
+
+def test_a_seed_is_broken_while_nothing_of_it_is_finite():
+    """All its episodes, or its policy. One good update ends it, standing still does not."""
+    metrics = {
+        "active": np.array([[1, 1, 1, 1], [1, 1, 1, 0], [1, 1, 1, 0]], bool),
+        "nonfinite_episodes": np.array([[4, 4, 3, 4], [0, 4, 4, 0], [4, 4, 4, 0]]),
+        "skipped_update": np.array([[0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]]),
+    }
+    count = nonfinite.broken_in_a_row(np.array([2, 0, 5, 1]), metrics, num_episodes=4)
+    assert count.tolist() == [5, 3, 2, 2]
+
+
+def test_a_run_is_hopeless_if_all_that_train_are():
+    count = np.array([5, 9, 0])
+    assert nonfinite.hopeless(count, np.array([0.1, 0.5, 1.0]), block=5)
+    assert nonfinite.hopeless(count, np.array([0.1, 0.5, 1.0]), block=1)
+    assert not nonfinite.hopeless(count, np.array([0.1, 0.5, 0.9]), block=5)
+    assert not nonfinite.hopeless(count, np.array([0.1, 0.5, 1.0]), block=6)
+    assert not nonfinite.hopeless(count - 1, np.array([0.1, 0.5, 1.0]), block=1)
+    assert not nonfinite.hopeless(count, np.ones(3), block=5)
+
+
+def test_a_block_of_broken_updates_is_one_line():
+    metrics = block(np.random.default_rng(1), 4, 9, 6)
+    metrics["nonfinite_episodes"] = np.full((4, 9), 2)
+    metrics["skipped_update"] = np.zeros((4, 9), int)
+    assert nonfinite.describe(nonfinite.nonfinite_updates(metrics), 1000) == (
+        "updates 6 to 9: 9 of 1,000 seeds met numbers that are not finite (0, 1, 2, 3, 4, ...): "
+        "66 episodes, 0 updates skipped"  # the last seed made one update of four
+    )
+
+
+@pytest.mark.parametrize(
+    ("fraction", "shown"),
+    [
+        (1.0, "100.0 %"),
+        (1 - 1e-12, "99.9 %"),
+        (0.9999, "99.9 %"),
+        (0.57, "57.0 %"),
+        (0.29, "29.0 %"),
+        (0.5, "50.0 %"),
+        (1e-5, "0.0 %"),
+        (0.0, "0.0 %"),
+    ],
+)
+def test_percentages_are_rounded_down(fraction, shown):
+    assert display.percent(fraction) == shown
+
+
+def screen(width):
+    return Console(file=io.StringIO(), width=width, force_terminal=True, color_system=None)
+
+
+def test_a_progress_line_fits_in_80_columns(monkeypatch):
+    """With the returns, both speeds, failed seeds, the time that passed and the time left."""
+    console = screen(80)
+    monkeypatch.setattr(display, "Console", lambda: console)
+    with display.Display() as shown:
+        shown.start(1.0)
+        shown.show_progress(
+            Progress(0.4567, 12, 3e4, 12345.6, np.nan, 3, 1000, 123456.0, 234567.0, 45296.0)
+        )
+    written = console.file.getvalue()
+    for text in ("45.6 %", "0:00:00", "left 12:34:56", "return 12345.6"):
+        assert text in written
+    assert "worst nan (3 of 1,000 seeds)  234,567 steps/s, mean 123,456\n" in written
+    assert "…" not in written
+
+
+def test_without_a_terminal_an_evaluation_is_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(display, "Console", lambda: Console(width=80))
+    with display.Display() as shown:
+        shown.show_progress(Progress(0.0, 0, 0, 8.0, 7.0, 0, 2, np.nan, np.nan, np.nan))
+        shown.show_progress(Progress(0.25, 5, 4e4, 9.5, 7.0, 0, 2, 1000.0, 2000.0, 59.2))
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.endswith("return     8.0  worst     7.0  0.0 %")
+    assert second.endswith("worst     7.0  2,000 steps/s, mean 1,000  25.0 %  left 0:01:00")
+
+
+def test_the_end_table_has_counts():
+    returns = np.full((1, 1000), 1000.0)
+    returns[0, :3] = 573.6, 600.0, np.nan
+    counts = np.full((1, 1000), 50_000)
+    history = {"eval_return": returns, "env_steps": counts, "episodes": counts}
+    more = {"env": "Task-v0", "num_seeds": 1000, "env_steps_per_second": 1e6}
+    more |= {"useful_step_fraction": 0.9999, "compile_seconds": 1.0, "run_seconds": 2.0}
+    console = screen(80)
+    display.print_summary(console, summarize(history, 950.0) | more, Path("t/[bold]x"))
+    written = " ".join(console.file.getvalue().split())
+    for text in ("solved at the end │ 997 of 1,000", "ever solved │ 997 of 1,000", "99.9 %"):
+        assert text in written
+    assert "nan, 1000.0" in written
+    assert "not finite │ 1 of 1,000" in written
+    assert "Files in t/[bold]x" in written
+    assert "100" not in written.replace("1000.0", "").replace("1,000", "")
+
+
+def evaluated(reward, mask, nonfinite_episodes):
+    """What an evaluation of N episodes returns that were played so, half of them by the mode."""
+    trajectory = Trajectory(
+        observation=jnp.zeros((*mask.shape, 1)),
+        action=jnp.zeros((*mask.shape, 1)),
+        reward=jnp.asarray(reward),
+        mask=jnp.asarray(mask),
+        nonfinite=jnp.asarray(nonfinite_episodes),
+    )
+    engine = SimpleNamespace(rollout=lambda *_, **__: trajectory)
+    learner = SimpleNamespace(engine=engine, act=None, policy=SimpleNamespace(distribution=None))
+    key, half = jax.random.key(0), mask.shape[1] // 2
+    return evaluate(None, learner, None, key, num_episodes=half, horizon=len(mask))
+
+
+@pytest.mark.parametrize(("broken", "is_nan"), [(None, [0, 0]), (1, [1, 0]), (2, [0, 1])])
+def test_an_evaluation_with_a_broken_episode_is_nan(broken, is_nan):
+    """Two episodes of the mode, then two of samples."""
+    mask = np.arange(5)[:, None] < np.array([2, 3, 4, 5])
+    result = evaluated(np.where(mask, -1.0, 0.0), mask, np.arange(4) == broken)
+    got = [result["eval_return"], result["eval_return_stochastic"]]
+    np.testing.assert_allclose(got, np.where(is_nan, np.nan, [-2.5, -4.5]), rtol=1e-6)
+    assert result["eval_length"] == 2.5
+    assert result["simulated_steps"] >= 4 * 5
+
+
+def test_a_return_that_overflows_is_nan():
+    result = evaluated(np.full((2, 2), -3e38, np.float32), np.ones((2, 2), bool), np.zeros(2, bool))
+    assert np.isnan(result["eval_return"])
