@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import gc
-import os
 import sys
 import threading
 import time
@@ -19,6 +18,7 @@ from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs.build import build, policy_settings
 from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.files import prepare
+from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.settings import GROUPS
 
@@ -41,7 +41,7 @@ def main() -> None:
             check(config)
             directory = prepare(config.output, config.env, config.overwrite)
             env = envs.make(config.env)
-            _configure_jax()
+            configure_jax()
             learner, horizon = build(env, config)
     except ValueError as error:
         _refuse(str(error), directory)
@@ -99,19 +99,6 @@ def _description() -> str:
         f"Presets, published programs whose settings replace the defaults:\n{presets}\n\n"
         f"Environments: {', '.join(envs.names())}."
     )
-
-
-def _configure_jax() -> None:
-    """Turns on exact float32 products and the compilation cache, unless the user chose."""
-    import jax
-
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    settings = jax.config.values
-    if settings["jax_compilation_cache_dir"] is None:
-        jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "mjx_reinforce"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    if settings["jax_default_matmul_precision"] is None:
-        jax.config.update("jax_default_matmul_precision", "highest")
 
 
 def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path) -> bool:
