@@ -82,15 +82,13 @@ def _is_size(value: Any) -> bool:
     return type(value) is int and 1 <= value <= _MAX_SIZE
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
     """Returns whether it is a finite number that float can hold."""
     return type(value) in (int, float) and abs(value) < 1e300 and math.isfinite(value)
 
 
 def _are_bounds(value: Any) -> bool:
-    return (
-        isinstance(value, list) and bool(value) and all(x is None or _is_number(x) for x in value)
-    )
+    return isinstance(value, list) and bool(value) and all(x is None or is_number(x) for x in value)
 
 
 _SIZE_RULE = f"a whole number from 1 to {_MAX_SIZE}"
@@ -101,7 +99,7 @@ _RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
         lambda x: isinstance(x, list) and all(map(_is_size, x)),
         f"a list, each entry {_SIZE_RULE}",
     ),
-    "initial_std": (_is_number, "a number"),
+    "initial_std": (is_number, "a number"),
     "observation_size": (_is_size, _SIZE_RULE),
     "num_actions": (_is_size, _SIZE_RULE),
     "action_low": (_are_bounds, "a list of numbers, null where unbounded"),

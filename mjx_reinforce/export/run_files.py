@@ -6,6 +6,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from mjx_reinforce.export.files import read_json
+from mjx_reinforce.export.policy_checks import is_number
 
 #: A seed by its rank in the run's final evaluation, or by its number.
 Seed = Literal["best", "worst", "median"] | int
@@ -101,7 +102,7 @@ def final_returns(run: Run, which: Which) -> np.ndarray:
     if summary.get("status") == "running":
         raise ValueError(f"{run.directory} has no final evaluation: {_NOT_YET}; {remedy}")
     values = summary.get(name)
-    if not isinstance(values, list) or not all(x is None or type(x) is float for x in values):
+    if not isinstance(values, list) or not all(x is None or is_number(x) for x in values):
         raise ValueError(f"{path} is damaged: {name} is not a list of numbers; {remedy}")
     values = np.array(values, float)  # None becomes nan
     if not np.any(np.isfinite(values)):
