@@ -78,7 +78,7 @@ def test_the_best_policies_on_the_way_are_another_folder(tmp_path):
     with pytest.raises(ValueError, match="has no policy/best"):
         load(tmp_path, which="best")
     make_run(tmp_path, folder="policy/best", hidden_sizes=[3])
-    change(tmp_path / "summary.json", best_returns=[9.0, 7.0, 5.0])
+    change(tmp_path / "summary.json", best_test_returns=[9.0, 7.0, 5.0])
     assert load(tmp_path, which="last").seed == 1
     player = load(tmp_path, which="best")
     assert player.seed == 0
@@ -147,7 +147,7 @@ DAMAGE = {
     "no policy": (remove("policy"), "", "goes on, or was killed"),
     "no summary": (remove("summary.json"), "", "no final evaluation: its training goes on"),
     "running": (entries("summary.json", status="running"), "", "no final evaluation"),
-    "no returns": (entries("summary.json", final_returns=...), "summary.json", "is not a list"),
+    "no returns": (entries("summary.json", final_returns=...), "summary.json", "has no final_"),
     "text for returns": (entries("summary.json", final_returns="7"), "summary.json", "not a list"),
     "nothing finite": (entries("summary.json", final_returns=[None] * 3), "summary.json", "none"),
     "more returns": (entries("summary.json", final_returns=[1.0] * 4), "summary.json", "ranks 4"),

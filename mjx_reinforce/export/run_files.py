@@ -14,8 +14,8 @@ Seed = Literal["best", "worst", "median"] | int
 Which = Literal["last", "best"]
 
 #: Where the policies are in the run directory, and their returns in summary.json.
-_PLACES = {"last": ("policy", "final_returns"), "best": ("policy/best", "best_returns")}
-_NOT_YET = "its training goes on, or was killed"
+_PLACES = {"last": ("policy", "final_returns"), "best": ("policy/best", "best_test_returns")}
+_NOT_YET = "its training goes on, or was killed, and then train --resume goes on with it"
 
 
 class Run(NamedTuple):
@@ -101,7 +101,9 @@ def final_returns(run: Run, which: Which) -> np.ndarray:
     summary: dict[str, Any] = read_json(path) if path.exists() else {"status": "running"}
     if summary.get("status") == "running":
         raise ValueError(f"{run.directory} has no final evaluation: {_NOT_YET}; {remedy}")
-    values = summary.get(name)
+    if name not in summary:
+        raise ValueError(f"{path} has no {name}; {remedy}")
+    values = summary[name]
     if not isinstance(values, list) or not all(x is None or is_number(x) for x in values):
         raise ValueError(f"{path} is damaged: {name} is not a list of numbers; {remedy}")
     values = np.array(values, float)  # None becomes nan
