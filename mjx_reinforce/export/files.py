@@ -51,13 +51,17 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
-def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> bytes:
-    """Writes a NumPy archive (.npz) of named arrays, no pickle, and returns its content."""
-    archive = io.BytesIO()
+def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
+    """Writes a NumPy archive (.npz) of named arrays; no pickle."""
+    write_bytes(path, archive(arrays, compressed=compressed))
+
+
+def archive(arrays: Mapping[str, Any], *, compressed: bool = False) -> bytes:
+    """Returns the content of a NumPy archive of named arrays; no pickle."""
+    content = io.BytesIO()
     save = np.savez_compressed if compressed else np.savez
-    save(archive, allow_pickle=False, **arrays)
-    write_bytes(path, archive.getvalue())
-    return archive.getvalue()
+    save(content, allow_pickle=False, **arrays)
+    return content.getvalue()
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], bytes]:
@@ -71,8 +75,8 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], bytes]:
     except OSError as error:
         raise ValueError(f"cannot read {path} ({error.strerror})") from error
     try:
-        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            return {name: np.asarray(archive[name]) for name in archive.files}, content
+        with np.load(io.BytesIO(content), allow_pickle=False) as opened:
+            return {name: np.asarray(opened[name]) for name in opened.files}, content
     except Exception as error:  # what zip and NumPy raise for damaged bytes has no common class
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise ValueError(f"{path} is damaged: it is no whole NumPy archive ({reason})") from error

@@ -12,7 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from flax import serialization, traverse_util
 
-from mjx_reinforce.export.files import finite, read_arrays, read_json, write_arrays, write_json
+from mjx_reinforce.export.files import (
+    archive,
+    finite,
+    read_arrays,
+    read_json,
+    write_bytes,
+    write_json,
+)
 from mjx_reinforce.export.policy_checks import check_arrays, check_finite, check_settings
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor
@@ -48,9 +55,10 @@ def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None
     """
     directory.mkdir(parents=True, exist_ok=True)
     arrays = {name: np.asarray(value) for name, value in _flat(actor).items()}
-    content = write_arrays(directory / "actor.npz", arrays)
+    content = archive(arrays)
     checksum = {"checksum": _checksum(settings, content)}
     write_json(directory / "policy.json", settings | checksum)
+    write_bytes(directory / "actor.npz", content)  # last: where it is, the folder is whole
 
 
 def load_policy(directory: str | Path, seed: int | None = None) -> tuple[Policy, Actor]:
@@ -126,10 +134,10 @@ def _shapes(policy: Policy, observation_size: int) -> dict[str, tuple[int, ...]]
     return {name: array.shape for name, array in _flat(jax.eval_shape(first)).items()}
 
 
-def _checksum(settings: dict[str, Any], archive: bytes) -> str:
-    """Returns what says that settings and an archive were saved together."""
+def _checksum(settings: dict[str, Any], content: bytes) -> str:
+    """Returns what says that settings and the content of an archive were saved together."""
     text = json.dumps(finite(settings), default=str, sort_keys=True)
-    return hashlib.sha256(text.encode() + archive).hexdigest()
+    return hashlib.sha256(text.encode() + content).hexdigest()
 
 
 def build_policy(settings: dict[str, Any]) -> Policy:
