@@ -162,13 +162,13 @@ DAMAGE = {
     "family of another space": (entries(JSON, policy="normal"), "policy.json", "is discrete"),
     "family is a list": (entries(JSON, policy=[]), "policy.json", "policy must be the name"),
     "bad initialiser": (entries(JSON, initializer="x"), "policy.json", "unknown initializer"),
-    "other hidden sizes": (entries(JSON, hidden_sizes=[8, 9]), NPZ, "it should be (3, 8, 9)"),
+    "other hidden sizes": (entries(JSON, hidden_sizes=[8, 9]), NPZ, "it should be (3, 9)"),
     "more layers": (entries(JSON, hidden_sizes=[8, 8, 8]), NPZ, "Dense_3/bias is missing"),
     "fewer layers": (entries(JSON, hidden_sizes=[8]), NPZ, "Dense_2/bias' is not an array of"),
     "hidden sizes of 0": (entries(JSON, hidden_sizes=[0]), "policy.json", "from 1 to 1048576"),
     "hidden sizes of 1e9": (entries(JSON, hidden_sizes=[10**9]), "policy.json", "got [1000000000]"),
     "hidden sizes of text": (entries(JSON, hidden_sizes="88"), "policy.json", "got '88'"),
-    "another observation": (entries(JSON, observation_size=5), NPZ, "should be (3, 5, 8)"),
+    "another observation": (entries(JSON, observation_size=5), NPZ, "should be (3, 5)"),
     "half an observation": (entries(JSON, observation_size=4.0), "policy.json", "whole number"),
     "more actions": (entries(JSON, num_actions=3), NPZ, "it should be (3, 3)"),
     "std is text": (entries(JSON, initial_std="1"), "policy.json", "initial_std must be a number"),
@@ -190,7 +190,7 @@ DAMAGE = {
     "nan": (arrays(**{KERNEL: lambda x: x * np.nan}), NPZ, "of seed 1 has numbers that are not"),
     "other numbers": (arrays(normalizer__mean=lambda x: x + 1), "policy.json", "checksum"),
     "a bit": (flip_a_bit, NPZ, "damaged"),
-    "arrays of another run": (of_another_run, NPZ, "do not belong together"),
+    "arrays of another run": (of_another_run, "actor.npz", "do not belong together"),
 }
 
 

@@ -78,8 +78,10 @@ def choose_seed(run: Run, seed: Seed, which: Which = "last") -> int:
       which: whose returns.
 
     Raises:
-      ValueError: the run has no final evaluation, or ``seed`` is none of these.
+      ValueError: the run has no such policies or no final evaluation, or ``seed`` is none of
+        these.
     """
+    policy_folder(run, which)
     if isinstance(seed, int | np.integer):
         return int(seed)
     if seed not in ("best", "worst", "median"):
