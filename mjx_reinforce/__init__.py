@@ -43,6 +43,8 @@ _HOME = {
     "Discrete": "types",
     "Environment": "types",
     "Trajectory": "types",
+    "Player": "export.player",
+    "load": "export.player",
     "load_policy": "export.policy_files",
     "save_policy": "export.policy_files",
 }

@@ -8,7 +8,6 @@ if __name__ == "__main__":  # Ctrl-C ends the imports below without a traceback
 import contextlib
 import dataclasses
 import gc
-import os
 import sys
 import threading
 import time
@@ -22,6 +21,7 @@ from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs import resume
 from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.interrupt import Interrupt
+from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.settings import GROUPS
 
@@ -59,7 +59,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             interrupt.on_exit(lambda: _remove_if_empty(directory))
             held.enter_context(locked(directory))
             env = envs.make(config.env)
-            _configure_jax()
+            configure_jax()
             start = _start(env, config)
     except ValueError as error:
         _refuse(str(error), directory)
@@ -166,19 +166,6 @@ def _description() -> str:
         f"Presets, published programs whose settings replace the defaults:\n{presets}\n\n"
         f"Environments: {', '.join(envs.names())}."
     )
-
-
-def _configure_jax() -> None:
-    """Turns on exact float32 products and the compilation cache, unless the user chose."""
-    import jax
-
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    settings = jax.config.values
-    if settings["jax_compilation_cache_dir"] is None:
-        jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "mjx_reinforce"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    if settings["jax_default_matmul_precision"] is None:
-        jax.config.update("jax_default_matmul_precision", "highest")
 
 
 def train(

@@ -1,23 +1,32 @@
 """``python -m mjx_reinforce.watch RUN`` plays a trained policy and makes a film of it."""
 
 import dataclasses
-import functools
-import json
 import math
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import tyro
+from rich.console import Console
 from rich.progress import track
 
 from mjx_reinforce import envs
 from mjx_reinforce.export.films import Renderer, import_mujoco, mediapy_with_ffmpeg, write_film
+from mjx_reinforce.export.run_files import Run, Seed, Which, choose_seed, read_run
+from mjx_reinforce.runs.jax_setup import configure_jax
 
 #: Frames a second at most: what a film shows, and what GIF viewers play.
 _MAX_RATE = 30
+#: Settings that are whole numbers, with the least and the greatest that is accepted.
+_RANGES = (
+    *(("width", 1, 4096), ("height", 1, 4096)),
+    *(("episode", 0, 2**31 - 1), ("episodes", 1, 10_000)),
+)
+
+Play = Callable[[int, bool], Any]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,15 +35,23 @@ class Settings:
 
     run: tyro.conf.Positional[Path]
     """The run directory that training left."""
-    seed: int = 0
-    """Which of the run's seeds plays."""
+    seed: Seed = "best"
+    """Which of the run's seeds plays: best, worst or median by its final evaluation, or a number.
+    """
+    which: Which = "last"
+    """The policy at the end of training, or the one that did best on the way, if it was kept."""
+    backend: Literal["mjx", "gymnasium"] = "mjx"
+    """Which simulation is filmed; "gymnasium" plays the same policy in the installed Gymnasium,
+    and prints the returns of --episodes in both."""
+    episodes: int = 16
+    """With --backend gymnasium: how many episodes are compared."""
     episode: int = 0
     """Number of the start state; the same number, the same start."""
     noise: bool = False
     """Draw actions from the policy, as training does, instead of taking its mode."""
     output: Path | None = None
     """The film, .gif or, after pip install mediapy imageio-ffmpeg, .mp4.
-    By default RUN/seed-SEED.gif."""
+    By default RUN/seed-NUMBER.gif."""
     seconds: float = 20.0
     """Length of the film at most, in simulated seconds; the episode is played to its end."""
     width: int = 480
@@ -64,42 +81,79 @@ def film(settings: Settings) -> None:
       ValueError: a setting is out of range, or the run is damaged, or nothing can be drawn here.
       OSError: a file cannot be read or written.
     """
-    env_id, horizon = read_run(settings.run)
-    output = check(settings)
+    run = read_run(settings.run)
+    output = check(settings, choose_seed(run, settings.seed, settings.which))
     import_mujoco()
-    from mjx_reinforce.export.policy_files import load_policy
+    configure_jax()
+    from mjx_reinforce.export.player import load_seed
 
-    policy, actor = load_policy(settings.run / "policy", settings.seed)
-    env = envs.make(env_id)
-    expected, size = env.observation_size, actor.normalizer.mean.shape[0]
-    if size != expected:
-        raise ValueError(
-            f"the policy in {settings.run} takes observations of {size} entries, "
-            f"{env_id} has {expected}: config.json and policy/ are of different runs"
-        )
+    player, _ = load_seed(run, settings.seed, settings.which)
+    env = _make(run, player.observation_size)
     renderer = Renderer(scene(env), settings.width, settings.height)
-    qpos, rewards = play(env, policy, actor, settings.episode, horizon, noise=settings.noise)
-    print(f"{env_id}, seed {settings.seed}: return {rewards.sum():.1f} in {len(rewards)} steps")
+    simulators = _simulators(settings, env, player, run.horizon)
+    name, play = list(simulators.items())[-1]
+    with Console(stderr=True).status("compiling and playing"):
+        episode = play(settings.episode, settings.noise)
+        steps = f"{len(episode.rewards)} steps in {name}"
+        print(f"{run.env}, seed {player.seed}: return {episode.total:.1f} in {steps}")
+        if len(simulators) > 1:
+            print(compare(settings, simulators))
     skip = max(1, math.ceil(1 / (env.dt * _MAX_RATE) - 1e-9))
-    shown = qpos[: max(1, round(settings.seconds / env.dt)) : skip]
+    shown = episode.qpos[: max(1, round(settings.seconds / env.dt)) : skip]
     frames = track(map(renderer.draw, shown), "drawing", len(shown), transient=True)
     write_film(output, frames, 1 / (env.dt * skip))
     print(f"{len(shown)} frames in {output}")
 
 
-def check(settings: Settings) -> Path:
+def _make(run: Run, size: int) -> Any:
+    """Returns the run's environment; raises ValueError if its observations are not of a size."""
+    env = envs.make(run.env)
+    if env.observation_size != size:
+        raise ValueError(
+            f"the policy in {run.directory} takes observations of {size} entries, {run.env} has "
+            f"{env.observation_size}: config.json and policy/ are of different runs"
+        )
+    return env
+
+
+def _simulators(settings: Settings, env: Any, player: Any, horizon: int) -> dict[str, Play]:
+    """Returns what plays, by name; the last is filmed."""
+    from mjx_reinforce.runs.playing import gymnasium_simulator, simulator
+
+    simulators: dict[str, Play] = {"mjx": simulator(env, player, horizon)}
+    if settings.backend == "gymnasium":
+        version, play = gymnasium_simulator(player, horizon)
+        simulators[f"gymnasium {version}"] = play
+    return simulators
+
+
+def compare(settings: Settings, simulators: dict[str, Play]) -> str:
+    """Returns the mean and range of the returns in each simulation, side by side."""
+    said = []
+    for name, play in simulators.items():
+        totals = [play(i, settings.noise).total for i in range(settings.episodes)]
+        worst, best = np.min(totals), np.max(totals)
+        said.append(f"{name} {np.mean(totals):.1f} ({worst:.1f} to {best:.1f})")
+    return f"mean return of {settings.episodes} episodes: {', '.join(said)}"
+
+
+def check(settings: Settings, seed: int) -> Path:
     """Returns the film's path.
+
+    Args:
+      settings: the command line.
+      seed: the number of the seed that plays.
 
     Raises:
       ValueError: a setting is out of range, or the film exists or cannot be written.
     """
     if not 0 < settings.seconds < float("inf"):
         raise ValueError(f"--seconds must be positive and finite, got {settings.seconds}")
-    for name, least, most in (("width", 1, 4096), ("height", 1, 4096), ("episode", 0, 2**31 - 1)):
+    for name, least, most in _RANGES:
         value = getattr(settings, name)
         if not least <= value <= most:
             raise ValueError(f"--{name} must be in [{least}, {most}], got {value}")
-    output = settings.output or settings.run / f"seed-{settings.seed}.gif"
+    output = settings.output or settings.run / f"seed-{seed}.gif"
     if output.suffix.lower() not in (".gif", ".mp4"):
         raise ValueError(f"{output} is no film; end --output in .gif or .mp4")
     if not os.access(output.parent, os.W_OK):
@@ -109,29 +163,6 @@ def check(settings: Settings) -> Path:
     if output.suffix.lower() == ".mp4":
         mediapy_with_ffmpeg(output)
     return output
-
-
-def read_run(directory: Path) -> tuple[str, int]:
-    """Returns the id of a run's environment and its time limit in steps.
-
-    Raises:
-      ValueError: it is no run directory.
-    """
-    path = directory / "config.json"
-    try:
-        settings = json.loads(path.read_text(encoding="utf-8"))
-        env_id, horizon = str(settings["env"]), int(settings["horizon"])
-    except OSError as error:
-        raise ValueError(
-            f"{directory} is no run directory: cannot read {path} ({error.strerror})"
-        ) from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is damaged: {error!r}") from error
-    if horizon < 1:
-        raise ValueError(f"{path} is damaged: the horizon is {horizon}")
-    if not (directory / "policy").is_dir():
-        raise ValueError(f"{directory} has no policy yet: its training goes on, or was killed")
-    return env_id, horizon
 
 
 def scene(env: Any) -> Any:
@@ -147,50 +178,6 @@ def scene(env: Any) -> Any:
 
         return models.load(env.scene)
     raise ValueError(f"{type(env).__name__} has no mj_model, so there is nothing to draw")
-
-
-def play(
-    env: Any, policy: Any, actor: Any, episode: int, horizon: int, *, noise: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Plays one episode.
-
-    Args:
-      env: what is played; its ``pipeline_state`` has ``qpos``.
-      policy: the policy.
-      actor: one seed's parameters and observation statistics.
-      episode: number of the start state.
-      horizon: the time limit in steps.
-      noise: whether actions are drawn, or the policy's mode.
-
-    Returns:
-      Positions [T + 1, nq], the start's first, and rewards [T], to the end of the episode: its
-      own, the time limit, or the step before numbers are not finite.
-    """
-    import jax
-    import jax.numpy as jnp
-
-    from mjx_reinforce.engines.episode import begin, hold, step
-    from mjx_reinforce.policies.actor import act
-
-    distribution = policy.distribution
-    play_step = functools.partial(step, env.step, functools.partial(act, policy), distribution)
-
-    def advance(carry, noises):
-        state, alive = carry
-        played = play_step(actor, state, noises, alive, jnp.array(not noise))
-        after = hold(alive, played.state, state)
-        record = after.pipeline_state.qpos, played.reward, alive & ~played.broken
-        return (after, played.alive), record
-
-    @jax.jit
-    def whole(key):
-        start, noise_key = begin(env, key, jnp.asarray(episode))
-        noises = distribution.noise(noise_key, (horizon,))
-        first = start.pipeline_state.qpos
-        return first, jax.lax.scan(advance, (start, jnp.array(True)), noises)[1]
-
-    first, (qpos, rewards, mask) = jax.device_get(whole(jax.random.key(0)))
-    return np.concatenate([first[None], qpos[mask]]), rewards[mask]
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from saved_runs import make_run
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "mjx_reinforce"
@@ -90,7 +91,8 @@ def test_every_public_name_exists():
 
 
 def test_readme_python_runs(tmp_path):
-    """Every Python block of the README, in order, in one program."""
+    """Every Python block of the README, in order, in one program, beside a trained run."""
+    make_run(tmp_path / "pendulum", "InvertedPendulum-v5")
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text("utf-8"), re.S)
     assert blocks
     code = "\n".join(blocks)

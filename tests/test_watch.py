@@ -1,41 +1,24 @@
 """Films of trained policies."""
 
-import json
+import functools
+import math
 import subprocess
 import sys
 
+import gymnasium
 import imageio_ffmpeg
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import struct
 from PIL import Image
+from saved_runs import change, change_arrays, make_run
+from toys import Survive, ToyState
 
-from mjx_reinforce import envs, load_policy, watch
+from mjx_reinforce import act, envs, load, load_policy, watch
 from mjx_reinforce.engines.rollouts import rollout
-from mjx_reinforce.export.policy_files import save_policy
-from mjx_reinforce.learners.reinforce import reinforce
-from mjx_reinforce.policies import normalize
-
-SETTINGS = {
-    "InvertedPendulum-v5": {
-        "policy": "normal",
-        "observation_size": 4,
-        "action_low": [-3.0],
-        "action_high": [3.0],
-    },
-    "CartPole-v1": {"policy": "categorical", "observation_size": 4, "num_actions": 2},
-}
-
-
-def make_run(directory, env_id):
-    """What two seeds of training leave, as far as watching needs it."""
-    env = envs.make(env_id)
-    settings = SETTINGS[env_id] | {"hidden_sizes": [32, 32], "initial_std": 0.5}
-    learner = reinforce(env)
-    states = jax.vmap(learner.init)(jax.random.split(jax.random.key(3), 2))
-    save_policy(directory / "policy", states.actor, settings)
-    (directory / "config.json").write_text(json.dumps({"env": env_id, "horizon": 60}))
-    return env
+from mjx_reinforce.runs import playing
 
 
 def watch_run(monkeypatch, *arguments):
@@ -43,21 +26,19 @@ def watch_run(monkeypatch, *arguments):
     watch.main()
 
 
-@pytest.mark.parametrize("env_id", SETTINGS)
+@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "CartPole-v1"])
 def test_the_film_is_the_episode(tmp_path, env_id):
     """In a process of its own: the way MuJoCo draws is settled when it is imported."""
-    env = make_run(tmp_path, env_id)
-    options = ["--seed", "1", "--width", "96", "--height", "64"]
+    env = envs.make(env_id)
+    make_run(tmp_path, env_id)
+    options = ["--width", "96", "--height", "64"]
     command = [sys.executable, "-m", "mjx_reinforce.watch", str(tmp_path), *options]
     said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-    policy, actor = load_policy(tmp_path / "policy", 1)
-
-    def act(actor, observation):
-        return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))
+    policy, actor = load_policy(tmp_path / "policy", 1)  # the best by summary.json
 
     played = rollout(
         env,
-        act,
+        functools.partial(act, policy),
         actor,
         policy.distribution,
         jax.random.key(0),
@@ -81,20 +62,140 @@ def test_the_film_is_the_episode(tmp_path, env_id):
 
 
 def test_noise_and_other_starts_differ(tmp_path):
-    env = make_run(tmp_path, "CartPole-v1")
-    player = load_policy(tmp_path / "policy", 0)
-    plain, other = (watch.play(env, *player, episode, 60, noise=False) for episode in (0, 1))
-    noisy = watch.play(env, *player, 0, 60, noise=True)
-    assert np.any(plain[0][0] != other[0][0])
-    np.testing.assert_array_equal(plain[0][0], noisy[0][0])
-    assert plain[0].shape != noisy[0].shape or np.any(plain[0] != noisy[0])
-    assert len(plain[0]) == len(plain[1]) + 1
+    player = load(make_run(tmp_path))
+    play = playing.simulator(envs.make("CartPole-v1"), player, 60)
+    plain, other, noisy = play(0, False), play(1, False), play(0, True)
+    assert np.any(plain.qpos[0] != other.qpos[0])
+    np.testing.assert_array_equal(plain.qpos[0], noisy.qpos[0])
+    assert plain.qpos.shape != noisy.qpos.shape or np.any(plain.qpos != noisy.qpos)
+    assert len(plain.qpos) == len(plain.rewards) + 1
+
+
+def test_seeds_and_starts_share_a_program(tmp_path):
+    """So that the compilation cache serves every later start."""
+    env, events = envs.make("CartPole-v1"), []
+    make_run(tmp_path)
+    playing.simulator(env, load(tmp_path, 0), 30)(0, False)
+    jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
+    player = load(tmp_path, 2)
+    del events[:]
+    playing.simulator(env, player, 30)(5, True)
+    assert "/jax/compilation_cache/cache_hits" in events
+    assert "/jax/compilation_cache/cache_misses" not in events
+
+
+def test_the_compilation_cache_is_that_of_training(tmp_path):
+    code = (
+        "import os\n"
+        "for name in list(os.environ):\n"
+        "    if name.startswith('JAX_'): del os.environ[name]\n"
+        "os.environ['XDG_CACHE_HOME'] = 'here'\n"
+        "from mjx_reinforce import train, watch\n"
+        "assert train.configure_jax is watch.configure_jax\n"
+        "watch.configure_jax()\n"
+        "import jax\n"
+        "print(jax.config.jax_compilation_cache_dir, jax.config.jax_default_matmul_precision)"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert ran.stdout.split() == ["here/mjx_reinforce", "highest"]
+
+
+@struct.dataclass
+class Moving(ToyState):
+    qpos: jax.Array | None = None
+
+    @property
+    def pipeline_state(self):
+        return self
+
+
+class Breaking(Survive):
+    """Leaves the finite numbers in its third step."""
+
+    def reset(self, rng):
+        del rng
+        return Moving(jnp.zeros(1), jnp.zeros(()), jnp.zeros(()), qpos=jnp.zeros(1))
+
+    def step(self, state, action):
+        del action
+        obs = state.obs + 1.0
+        obs = jnp.where(obs > 2.5, jnp.nan, obs)
+        return state.replace(obs=obs, reward=jnp.ones(()), qpos=obs)
+
+
+def test_a_return_that_is_not_finite_is_nan(tmp_path):
+    run = make_run(tmp_path, "InvertedPendulum-v5", observation_size=1)
+    episode = playing.simulator(Breaking(), load(run), 20)(0, False)
+    np.testing.assert_array_equal(episode.rewards, [1.0, 1.0, np.nan])
+    np.testing.assert_array_equal(episode.qpos, [[0.0], [1.0], [2.0]])
+    assert math.isnan(episode.total)
+    said = watch.compare(watch.Settings(run, episodes=2), {"mjx": lambda *_: episode})
+    assert said == "mean return of 2 episodes: mjx nan (nan to nan)"
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", "InvertedPendulum-v5"])
+def test_gymnasium_plays_the_same_policy(tmp_path, env_id):
+    player = load(make_run(tmp_path, env_id))
+    version, play = playing.gymnasium_simulator(player, 15)
+    assert version == gymnasium.__version__
+    episode = play(3, False)
+    env = gymnasium.make(env_id)
+    observation, _ = env.reset(seed=3)
+    for i, reward in enumerate(episode.rewards):
+        np.testing.assert_array_equal(
+            episode.qpos[i], observation[::2] if env_id == "CartPole-v1" else observation[:2]
+        )
+        observation, expected, terminated, _, _ = env.step(player.act(observation))
+        assert reward == expected
+    assert terminated or len(episode.rewards) == 15
+    assert len(episode.qpos) == len(episode.rewards) + 1
+    noisy = play(3, True)
+    np.testing.assert_array_equal(noisy.qpos, play(3, True).qpos)
+    assert noisy.qpos.shape != episode.qpos.shape or np.any(noisy.qpos != episode.qpos)
+
+
+def test_both_simulations_are_said_side_by_side(tmp_path, monkeypatch, capsys):
+    """The film is of the last one; nothing is drawn here."""
+
+    class Blank:
+        def __init__(self, *_):
+            self.draw = lambda qpos: np.full((8, 8, 3), len(qpos), np.uint8)
+
+    monkeypatch.setattr(watch, "Renderer", Blank)
+    run = make_run(tmp_path)
+    watch_run(monkeypatch, run, "--backend", "gymnasium", "--episodes", 2)
+    said = capsys.readouterr().out.splitlines()
+    player = load(run)
+    name, theirs = playing.gymnasium_simulator(player, 60)
+    ours = playing.simulator(envs.make("CartPole-v1"), player, 60)
+    episode = theirs(0, False)
+    returned = f"return {episode.total:.1f} in {len(episode.rewards)} steps"
+    assert said[0] == f"CartPole-v1, seed 1: {returned} in gymnasium {name}"
+    for label, play in (("mjx", ours), (f"gymnasium {name}", theirs)):
+        totals = [play(i, False).total for i in range(2)]
+        words = f"{label} {sum(totals) / 2:.1f} ({min(totals):.1f} to {max(totals):.1f})"
+        assert words in said[1]
+    assert (run / "seed-1.gif").exists()
+
+
+def test_a_simulator_that_is_not_there_is_named(tmp_path, monkeypatch):
+    player = load(make_run(tmp_path))
+    for env_id in ("ContinuousCartPole-v0", "os:path"):
+        with pytest.raises(ValueError, match="leave --backend gymnasium out"):
+            playing.gymnasium_simulator(player._replace(env=env_id), 9)
+    with pytest.raises(ValueError, match=r"of 4 entries, the installed Gymnasium's .* \(10,\)"):
+        playing.gymnasium_simulator(player._replace(env="Reacher-v5"), 9)
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(ValueError, match=r"pip install 'gymnasium\[mujoco\]'"):
+        playing.gymnasium_simulator(player, 9)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--seed", 2], "seed 2 is not among the 2"),
+        (["--seed", 3], "seed 3 is not among the 3"),
+        (["--which", "best"], "has no policy/best"),
+        (["--episodes", 0], "--episodes must be in [1, 10000], got 0"),
         (["--seconds", 0], "--seconds must be positive and finite, got 0"),
         (["--width", 5000], "--width must be in [1, 4096], got 5000"),
         (["--episode", -1], "--episode must be in [0, 2147483647], got -1"),
@@ -106,7 +207,7 @@ def test_noise_and_other_starts_differ(tmp_path):
     ],
 )
 def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
-    make_run(tmp_path, "CartPole-v1")
+    make_run(tmp_path)
     (tmp_path / "policy.gif").mkdir()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "mediapy", None)
@@ -115,39 +216,15 @@ def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("content", [None, "[", "[]", '{"env": "CartPole-v1"}'])
-def test_what_is_no_run_is_named(tmp_path, monkeypatch, capsys, content):
-    if content is not None:
-        (tmp_path / "config.json").write_text(content)
+def test_a_policy_of_another_environment_is_named(tmp_path, monkeypatch, capsys):
+    make_run(tmp_path)
+    for file in ("config.json", "policy/policy.json"):
+        change(tmp_path / file, env="Reacher-v5")
+    change_arrays(tmp_path / "policy" / "actor.npz", checksum=None)
     with pytest.raises(SystemExit, match="2"):
         watch_run(monkeypatch, tmp_path)
     error = capsys.readouterr().err
-    assert ("is no run directory" if content is None else "is damaged") in error
-
-
-@pytest.mark.parametrize(
-    ("file", "content", "message"),
-    [
-        ("policy/actor.npz", b"PK", "policy is damaged"),
-        ("policy/policy.json", b"{}", "policy is damaged: KeyError"),
-        ("policy/policy.json", b"{", "policy is damaged: JSONDecodeError"),
-        ("config.json", b'{"env": "Reacher-v5", "horizon": 9}', "observations of 4 entries"),
-        ("config.json", b'{"env": "CartPole-v1", "horizon": 0}', "the horizon is 0"),
-    ],
-)
-def test_damage_is_named(tmp_path, monkeypatch, capsys, file, content, message):
-    make_run(tmp_path, "CartPole-v1")
-    (tmp_path / file).write_bytes(content)
-    with pytest.raises(SystemExit, match="2"):
-        watch_run(monkeypatch, tmp_path)
-    assert message in capsys.readouterr().err
-
-
-def test_a_run_that_is_not_over_is_named(tmp_path, monkeypatch, capsys):
-    (tmp_path / "config.json").write_text('{"env": "CartPole-v1", "horizon": 9}')
-    with pytest.raises(SystemExit, match="2"):
-        watch_run(monkeypatch, tmp_path)
-    assert "has no policy yet" in capsys.readouterr().err
+    assert "takes observations of 4 entries, Reacher-v5 has 10" in error
 
 
 @pytest.mark.parametrize("width", [48, 33])

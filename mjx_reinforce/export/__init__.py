@@ -1,1 +1,1 @@
-"""Export: files that leave the program, trained policies and films."""
+"""Export: files that leave the program, trained policies and films, and reading them again."""

@@ -30,23 +30,59 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
     """Writes JSON; numbers that are not finite become null, which JSON has."""
-    text = json.dumps(_finite(value), indent=2, default=str, allow_nan=False)
+    text = json.dumps(finite(value), indent=2, default=str, allow_nan=False)
     write_bytes(path, (text + "\n").encode())
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Returns the JSON object in a file.
+
+    Raises:
+      ValueError: it cannot be read, or holds something else.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"cannot read {path} ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if not isinstance(value, dict):
+        raise ValueError(f"{path} is damaged: it holds no JSON object")
+    return value
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:
     """Writes a NumPy archive (.npz) of named arrays; no pickle."""
-    archive = io.BytesIO()
+    content = io.BytesIO()
     save = np.savez_compressed if compressed else np.savez
-    save(archive, allow_pickle=False, **arrays)
-    write_bytes(path, archive.getvalue())
+    save(content, allow_pickle=False, **arrays)
+    write_bytes(path, content.getvalue())
 
 
-def _finite(value: Any) -> Any:
+def read_arrays(path: Path) -> dict[str, np.ndarray]:
+    """Returns the arrays of a NumPy archive by their names.
+
+    Raises:
+      ValueError: it cannot be read, or is damaged.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ValueError(f"cannot read {path} ({error.strerror})") from error
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as opened:
+            return {name: np.asarray(opened[name]) for name in opened.files}
+    except Exception as error:  # what zip and NumPy raise for damaged bytes has no common class
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        raise ValueError(f"{path} is damaged: it is no whole NumPy archive ({reason})") from error
+
+
+def finite(value: Any) -> Any:
+    """Returns a value for JSON: numbers that are not finite are None."""
     if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     if isinstance(value, float) and not (-float("inf") < value < float("inf")):
         return None
     return value

@@ -1,21 +1,49 @@
 """Trained policies on disk: a NumPy archive and a JSON file, never pickle."""
 
+import contextlib
+import hashlib
 import json
-import zipfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import serialization, traverse_util
 
-from mjx_reinforce.export.files import write_arrays, write_json
+from mjx_reinforce.export.files import (
+    finite,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_json,
+)
+from mjx_reinforce.export.policy_checks import check_arrays, check_finite, check_settings
+from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.policies.normalize import Normalizer
 from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.registry import DISTRIBUTIONS, check_name, load
 from mjx_reinforce.types import Box, Discrete
+
+
+#: The name in the archive of what says that it belongs to the settings beside it.
+_CHECKSUM = "checksum"
+
+
+class SavedPolicy(NamedTuple):
+    """What a ``policy`` folder holds.
+
+    policy: the policy
+    actor: of one seed, or of all, stacked [S, ...]
+    settings: what ``policy`` was built from, see ``save_policy``
+    num_seeds: S, how many seeds the folder holds
+    """
+
+    policy: Policy
+    actor: Actor
+    settings: dict[str, Any]
+    num_seeds: int
 
 
 def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None:
@@ -28,9 +56,9 @@ def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None
         ``action_low`` and ``action_high`` or, if discrete, ``num_actions``; optionally
         ``shared_trunk``, ``initializer``, ``rescale``: what ``build_policy`` reads.
     """
-    flat = traverse_util.flatten_dict(serialization.to_state_dict(actor), sep="/")
     directory.mkdir(parents=True, exist_ok=True)
-    arrays = {name: np.asarray(value) for name, value in flat.items()}
+    arrays = {name: np.asarray(value) for name, value in _flat(actor).items()}
+    arrays[_CHECKSUM] = np.array(_checksum(settings, arrays))
     write_json(directory / "policy.json", settings)
     write_arrays(directory / "actor.npz", arrays)  # last: where it is, the folder is whole
 
@@ -43,29 +71,81 @@ def load_policy(directory: str | Path, seed: int | None = None) -> tuple[Policy,
       seed: which seed's actor; all of them, stacked [S, ...], if not given.
 
     Returns:
-      The policy and its actor; ``policy.apply(actor.params, normalize.apply(
-      actor.normalizer, observation))`` gives the distribution's outputs.
+      The policy and its actor; ``act(policy, actor, observation)`` gives the distribution's
+      outputs.
 
     Raises:
-      FileNotFoundError: it is no such folder.
-      ValueError: its files are damaged, or there is no such seed.
+      ValueError: the files cannot be read or are damaged, or there is no such seed.
     """
-    directory = Path(directory)
-    try:
-        settings = json.loads((directory / "policy.json").read_text(encoding="utf-8"))
-        with np.load(directory / "actor.npz", allow_pickle=False) as archive:
-            flat = {name: jnp.asarray(archive[name]) for name in archive.files}
-        tree = traverse_util.unflatten_dict(flat, sep="/")
-        actor = Actor(params=tree["params"], normalizer=Normalizer(**tree["normalizer"]))
+    saved = read_policy(directory, seed)
+    return saved.policy, saved.actor
+
+
+def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
+    """Reads what ``save_policy`` wrote, as ``load_policy``, with all that it says."""
+    settings_path, actor_path = Path(directory) / "policy.json", Path(directory) / "actor.npz"
+    settings = read_json(settings_path)
+    with _damage_in(settings_path):
+        check_settings(settings)
         policy = build_policy(settings)
-    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"the policy in {directory} is damaged: {error!r}") from error
-    if seed is not None:
-        num_seeds = actor.normalizer.count.shape[0]
-        if not 0 <= seed < num_seeds:
-            raise ValueError(f"seed {seed} is not among the {num_seeds} of {directory}")
-        actor = jax.tree.map(lambda x: x[seed], actor)
-    return policy, actor
+    arrays = read_arrays(actor_path)
+    checksum = arrays.pop(_CHECKSUM, None)
+    with _damage_in(actor_path):
+        num_seeds = check_arrays(arrays, _shapes(policy, settings["observation_size"]))
+    if seed is not None and not 0 <= seed < num_seeds:
+        raise ValueError(f"seed {seed} is not among the {num_seeds} of {directory}")
+    with _damage_in(actor_path):
+        check_finite(arrays, seed)
+    # Files from before there was a checksum have none.
+    if checksum is not None and checksum != _checksum(settings, arrays):
+        raise ValueError(
+            f"{settings_path} is damaged, or actor.npz beside it: they do not belong together "
+            "(their checksum differs), so one of them was changed or is another run's"
+        )
+    actor = jax.tree.map(lambda x: jnp.asarray(x if seed is None else x[seed]), _actor(arrays))
+    return SavedPolicy(policy, actor, settings, num_seeds)
+
+
+@contextlib.contextmanager
+def _damage_in(path: Path) -> Iterator[None]:
+    """Names the file in the ValueErrors of a block."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+
+
+def _flat(actor: Actor) -> dict[str, Any]:
+    """Returns an actor's arrays under the names they have in the archive."""
+    return traverse_util.flatten_dict(serialization.to_state_dict(actor), sep="/")
+
+
+def _actor(arrays: dict[str, Any]) -> Actor:
+    """Returns the actor of ``_flat``."""
+    tree = traverse_util.unflatten_dict(arrays, sep="/")
+    return Actor(params=tree["params"], normalizer=normalize.Normalizer(**tree["normalizer"]))
+
+
+def _shapes(policy: Policy, observation_size: int) -> dict[str, tuple[int, ...]]:
+    """Returns the shapes of one seed's arrays, under their names in the archive."""
+
+    def first():
+        params = policy.init(jax.random.key(0))
+        return Actor(params=params, normalizer=normalize.init(observation_size))
+
+    return {name: array.shape for name, array in _flat(jax.eval_shape(first)).items()}
+
+
+def _checksum(settings: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:
+    """Returns what says that settings and the arrays of an archive were saved together.
+
+    It is kept in the archive: a run that goes on replaces that file at once, and a kill between
+    the two files leaves a pair that fits.
+    """
+    checksum = hashlib.sha256(json.dumps(finite(settings), default=str, sort_keys=True).encode())
+    for name in sorted(arrays):
+        checksum.update(name.encode() + np.ascontiguousarray(arrays[name]).tobytes())
+    return checksum.hexdigest()
 
 
 def build_policy(settings: dict[str, Any]) -> Policy:
@@ -76,7 +156,7 @@ def build_policy(settings: dict[str, Any]) -> Policy:
     """
     check_name("policy", settings["policy"], DISTRIBUTIONS)
     distribution = load(DISTRIBUTIONS[settings["policy"]])(
-        _space(settings),
+        action_space(settings),
         initial_std=settings["initial_std"],
         rescale=settings.get("rescale", True),
     )
@@ -89,8 +169,14 @@ def build_policy(settings: dict[str, Any]) -> Policy:
     )
 
 
-def _space(settings: dict[str, Any]) -> Box | Discrete:
-    """Returns the action space: ``num_actions``, or ``action_low`` and ``action_high``."""
+def action_space(settings: dict[str, Any]) -> Box | Discrete:
+    """Returns the action space that ``settings`` of ``save_policy`` describe.
+
+    It is ``num_actions``, or ``action_low`` and ``action_high``; None, as JSON has no infinity,
+    stands for unbounded.
+    """
     if "num_actions" in settings:
         return Discrete(settings["num_actions"])
-    return Box(np.asarray(settings["action_low"]), np.asarray(settings["action_high"]))
+    low = [-np.inf if x is None else x for x in settings["action_low"]]
+    high = [np.inf if x is None else x for x in settings["action_high"]]
+    return Box(np.asarray(low), np.asarray(high))

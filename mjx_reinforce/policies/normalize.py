@@ -4,7 +4,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-_CLIP = 10.0
+#: Scaled observations are clipped to plus or minus this many standard deviations.
+CLIP = 10.0
 _MIN_STD = 1e-4
 
 
@@ -65,7 +66,12 @@ def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
 
     While no observation is counted, it is returned unchanged.
     """
-    variance = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
-    std = jnp.maximum(jnp.sqrt(variance), _MIN_STD)
-    scaled = jnp.clip((observation - normalizer.mean) / std, -_CLIP, _CLIP)
+    std = standard_deviation(normalizer)
+    scaled = jnp.clip((observation - normalizer.mean) / std, -CLIP, CLIP)
     return jnp.where(normalizer.count > 0, scaled, observation)
+
+
+def standard_deviation(normalizer: Normalizer) -> jax.Array:
+    """Returns what ``apply`` divides by, [O]: the standard deviation, and 1e-4 at least."""
+    variance = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
+    return jnp.maximum(jnp.sqrt(variance), _MIN_STD)

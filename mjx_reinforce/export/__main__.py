@@ -1,0 +1,98 @@
+"""``python -m mjx_reinforce.export RUN --to numpy`` takes a trained policy out of the program."""
+
+import dataclasses
+import os
+import sys
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from mjx_reinforce.export.run_files import Seed, Which, choose_seed, read_run
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Write the deterministic action of a trained policy as a file that needs no JAX."""
+
+    run: tyro.conf.Positional[Path]
+    """The run directory that training left."""
+    to: Literal["numpy", "onnx"]
+    """"numpy": an archive .npz and a short .py beside it that needs NumPy alone. "onnx": a model
+    from observation, float32 [N, O], to action [N, A]; needs pip install onnx."""
+    seed: Seed = "best"
+    """Which of the run's seeds: best, worst or median by its final evaluation, or a number."""
+    which: Which = "last"
+    """The policy at the end of training, or the one that did best on the way, if it was kept."""
+    output: Path | None = None
+    """The file, .npz or .onnx. By default seed_NUMBER in the run directory."""
+    overwrite: bool = False
+    """Replace files that exist."""
+
+
+def main() -> None:
+    """Reads the command line, exports, and exits: 0 done, 2 bad input, 130 interrupted."""
+    settings = tyro.cli(Settings, prog="python -m mjx_reinforce.export")
+    try:
+        print("\n".join(map(str, export(settings))))
+    except (ValueError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def export(settings: Settings) -> list[Path]:
+    """Writes the files and returns their names.
+
+    Raises:
+      ValueError: a setting is out of range, the run is damaged, or a package is missing.
+      OSError: a file cannot be written.
+    """
+    run = read_run(settings.run)
+    outputs = check(settings, choose_seed(run, settings.seed, settings.which))
+    from mjx_reinforce.export.arithmetic import arithmetic
+    from mjx_reinforce.export.files import write_arrays, write_bytes
+    from mjx_reinforce.export.numpy_source import numpy_source
+    from mjx_reinforce.export.onnx_model import import_onnx, onnx_model
+    from mjx_reinforce.export.player import load_seed
+
+    if settings.to == "onnx":
+        import_onnx()
+    player, saved = load_seed(run, settings.seed, settings.which)
+    plain = arithmetic(saved)
+    if settings.to == "onnx":
+        write_bytes(outputs[0], onnx_model(plain, player.env, player.seed))
+    else:
+        write_arrays(outputs[0], plain.arrays)
+        source = numpy_source(plain, outputs[0].stem, player.env, player.seed)
+        write_bytes(outputs[1], source.encode())
+    return outputs
+
+
+def check(settings: Settings, seed: int) -> list[Path]:
+    """Returns the files that are to be written.
+
+    Raises:
+      ValueError: their name does not fit, they exist, or they cannot be written.
+    """
+    suffix = {"numpy": ".npz", "onnx": ".onnx"}[settings.to]
+    output = settings.output or settings.run / f"seed_{seed}{suffix}"
+    if output.suffix != suffix:
+        raise ValueError(f"--to {settings.to} writes {suffix}, got --output {output}")
+    if not os.access(output.parent, os.W_OK):
+        raise ValueError(f"cannot write to {output.parent}; choose another --output")
+    if settings.to == "numpy" and not output.stem.isidentifier():
+        raise ValueError(
+            f"Python cannot import a module called {output.stem!r}; "
+            "choose an --output of letters, digits and underscores, such as policy.npz"
+        )
+    outputs = [output, output.with_suffix(".py")] if settings.to == "numpy" else [output]
+    for path in outputs:
+        if path.is_dir() or (path.exists() and not settings.overwrite):
+            raise ValueError(f"{path} exists; pass --overwrite or another --output")
+    return outputs
+
+
+if __name__ == "__main__":
+    main()

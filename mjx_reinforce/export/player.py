@@ -1,0 +1,117 @@
+"""A trained policy for programs without JAX: NumPy observations in, NumPy actions out."""
+
+import functools
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_reinforce.export.policy_files import SavedPolicy, read_policy
+from mjx_reinforce.export.run_files import (
+    Run,
+    Seed,
+    Which,
+    choose_seed,
+    final_returns,
+    policy_folder,
+    read_run,
+)
+from mjx_reinforce.policies.actor import Actor, act
+from mjx_reinforce.policies.policy import Policy
+
+
+class Player(NamedTuple):
+    """The trained policy of one seed of a run.
+
+    env: the id of the environment that it was trained on
+    seed: the number of the seed
+    policy: the network and its distribution
+    actor: the seed's parameters and observation statistics
+    """
+
+    env: str
+    seed: int
+    policy: Policy
+    actor: Actor
+
+    @property
+    def observation_size(self) -> int:
+        """The number O of entries of an observation."""
+        return self.actor.normalizer.mean.shape[0]
+
+    def act(
+        self, observation: np.ndarray, rng: np.random.Generator | None = None
+    ) -> np.ndarray | int:
+        """Returns what ``env.step`` of Gymnasium takes.
+
+        Args:
+          observation: [O], or [N, O] for N environments, as the environment gave it.
+          rng: draws the action, as in training; without it the action is the policy's mode.
+
+        Returns:
+          The action [A], or [N, A]; discrete: an int, or [N].
+
+        Raises:
+          ValueError: the observation is not of this environment.
+        """
+        mean = self.actor.normalizer.mean
+        observation = np.asarray(observation, mean.dtype)
+        if observation.ndim not in (1, 2) or observation.shape[-1:] != mean.shape:
+            raise ValueError(
+                f"the policy for {self.env} takes observations [{mean.size}] or "
+                f"[N, {mean.size}], got one of shape {list(observation.shape)}"
+            )
+        if rng is None:
+            action = _mode(self.policy, self.actor, jnp.asarray(observation))
+        else:
+            key = jax.random.key(int(rng.integers(2**32)))
+            action = _sample(self.policy, self.actor, jnp.asarray(observation), key)
+        return np.array(action) if action.ndim else int(action)
+
+
+def load(run: str | Path, seed: Seed = "best", *, which: Which = "last") -> Player:
+    """Loads a trained policy to play, in Gymnasium or elsewhere.
+
+    Args:
+      run: the run directory that training left.
+      seed: "best", "worst" or "median" in the run's final evaluation, or a number.
+      which: "last" for the policy at the end of training, "best" for the one that did best on
+        the way, where the run kept it.
+
+    Raises:
+      ValueError: there is no such run or seed, the run has not ended, or a file is damaged.
+    """
+    return load_seed(read_run(run), seed, which)[0]
+
+
+def load_seed(run: Run, seed: Seed, which: Which = "last") -> tuple[Player, SavedPolicy]:
+    """Loads one seed, as ``load``, with what its files say."""
+    folder, number = policy_folder(run, which), choose_seed(run, seed, which)
+    saved = read_policy(folder, number)
+    if isinstance(seed, str):
+        ranked = len(final_returns(run, which))
+        if ranked != saved.num_seeds:
+            raise ValueError(
+                f"{run.directory / 'summary.json'} ranks {ranked} seeds, {folder} holds "
+                f"{saved.num_seeds}: they are of different runs"
+            )
+    if saved.settings.get("env", run.env) != run.env:
+        raise ValueError(
+            f"{folder / 'policy.json'} is for {saved.settings['env']}, "
+            f"{run.directory / 'config.json'} for {run.env}: they are of different runs"
+        )
+    return Player(run.env, number, saved.policy, saved.actor), saved
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _mode(policy: Policy, actor: Actor, observation: jax.Array) -> jax.Array:
+    return policy.distribution.mode(act(policy, actor, observation))
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _sample(policy: Policy, actor: Actor, observation: jax.Array, key: jax.Array) -> jax.Array:
+    outputs = act(policy, actor, observation)
+    noise = policy.distribution.noise(key, outputs.shape[:-1])
+    return policy.distribution.sample(outputs, noise)

@@ -1,0 +1,114 @@
+"""What a finished run says of itself: its environment, and how its seeds ended."""
+
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from mjx_reinforce.export.files import read_json
+from mjx_reinforce.export.policy_checks import is_number
+
+#: A seed by its rank in the run's final evaluation, or by its number.
+Seed = Literal["best", "worst", "median"] | int
+#: Each seed's policy at the end of training, or the one that did best on the way.
+Which = Literal["last", "best"]
+
+#: Where the policies are in the run directory, and their returns in summary.json.
+_PLACES = {"last": ("policy", "final_returns"), "best": ("policy/best", "best_test_returns")}
+_NOT_YET = "its training goes on, or was killed, and then train --resume goes on with it"
+
+
+class Run(NamedTuple):
+    """A run directory.
+
+    directory: where it is
+    env: the id of its environment
+    horizon: the time limit in env steps
+    """
+
+    directory: Path
+    env: str
+    horizon: int
+
+
+def read_run(directory: str | Path) -> Run:
+    """Reads the config.json of a run directory.
+
+    Raises:
+      ValueError: it is no run directory, or it has no policy yet.
+    """
+    directory = Path(directory)
+    path = directory / "config.json"
+    if not path.is_file():
+        raise ValueError(f"{directory} is no run directory: there is no {path}")
+    settings = read_json(path)
+    try:
+        env_id, horizon = str(settings["env"]), int(settings["horizon"])
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
+        raise ValueError(f"{path} is damaged: {error!r}") from error
+    if horizon < 1:
+        raise ValueError(f"{path} is damaged: the horizon is {horizon}")
+    if not (directory / "policy").is_dir():
+        raise ValueError(f"{directory} has no policy yet: {_NOT_YET}")
+    return Run(directory, env_id, horizon)
+
+
+def policy_folder(run: Run, which: Which) -> Path:
+    """Returns the folder of a run's policies.
+
+    Raises:
+      ValueError: ``which`` is unknown, or the run kept no such policies.
+    """
+    if which not in _PLACES:
+        raise ValueError(f"which must be one of {', '.join(_PLACES)}, got {which!r}")
+    folder = run.directory / _PLACES[which][0]
+    if not folder.is_dir():
+        raise ValueError(f"{run.directory} has no {_PLACES[which][0]}: it kept the last policies")
+    return folder
+
+
+def choose_seed(run: Run, seed: Seed, which: Which = "last") -> int:
+    """Returns the number of a seed.
+
+    Args:
+      run: the run.
+      seed: a number, which is returned as it is; or "best", "worst" or "median" (the lower one
+        of two) by return in the run's final evaluation, where a return that is not finite is
+        below all others.
+      which: whose returns.
+
+    Raises:
+      ValueError: the run has no such policies or no final evaluation, or ``seed`` is none of
+        these.
+    """
+    policy_folder(run, which)
+    if isinstance(seed, int | np.integer):
+        return int(seed)
+    if seed not in ("best", "worst", "median"):
+        raise ValueError(f"seed must be best, worst, median or a number, got {seed!r}")
+    returns = final_returns(run, which)
+    order = np.argsort(returns, kind="stable")
+    ranked = {"worst": order[0], "median": order[(len(order) - 1) // 2], "best": returns.argmax()}
+    return int(ranked[seed])
+
+
+def final_returns(run: Run, which: Which) -> np.ndarray:
+    """Returns each seed's return [S] in the final evaluation, -inf where it was not finite.
+
+    Raises:
+      ValueError: the run has no final evaluation, or none of its returns is finite.
+    """
+    path, name = run.directory / "summary.json", _PLACES[which][1]
+    remedy = "choose a seed by its number"
+    summary: dict[str, Any] = read_json(path) if path.exists() else {"status": "running"}
+    if summary.get("status") == "running":
+        raise ValueError(f"{run.directory} has no final evaluation: {_NOT_YET}; {remedy}")
+    if name not in summary:
+        raise ValueError(f"{path} has no {name}; {remedy}")
+    values = summary[name]
+    if not isinstance(values, list) or not all(x is None or is_number(x) for x in values):
+        raise ValueError(f"{path} is damaged: {name} is not a list of numbers; {remedy}")
+    values = np.array(values, float)  # None becomes nan
+    if not np.any(np.isfinite(values)):
+        raise ValueError(f"{path}: none of {name} is finite, so no seed is the best; {remedy}")
+    return np.where(np.isfinite(values), values, -np.inf)

@@ -1,0 +1,160 @@
+"""Policies outside this program: as NumPy and as ONNX, they act as here."""
+
+import importlib.util
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from saved_runs import change, change_arrays, make_run
+
+from mjx_reinforce import load
+from mjx_reinforce.export import __main__ as export
+from mjx_reinforce.export.arithmetic import HEADS
+from mjx_reinforce.registry import DISTRIBUTIONS
+
+#: Far from the mean too: scaled observations are clipped, tanh units saturate.
+OBSERVATIONS = np.random.default_rng(0).normal(size=(200, 4)) * np.geomspace(0.1, 50, 200)[:, None]
+BOX = {"action_low": [-3.0, -1.0, 0.5], "action_high": [3.0, -0.5, 2.0]}
+
+#: Settings of the policy besides its family and actions, and how many observations are counted.
+CASES = {
+    "mlp": ({}, 50.0),
+    "linear": ({"hidden_sizes": []}, 50.0),
+    "one layer, not normalised": ({"hidden_sizes": [8]}, 0.0),
+    "not rescaled": ({"rescale": False}, 50.0),
+}
+
+
+def make(tmp_path, family, settings, count):
+    if family == "categorical":
+        return make_run(tmp_path, "CartPole-v1", count=count, **settings)
+    return make_run(tmp_path, "InvertedPendulum-v5", policy=family, count=count, **BOX, **settings)
+
+
+def run_export(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["export", *map(str, arguments)])
+    export.main()
+
+
+def import_file(path):
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def onnx_actions(path, observations):
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    [entry], [out] = session.get_inputs(), session.get_outputs()
+    assert (entry.name, out.name) == ("observation", "action")
+    assert entry.shape == ["N", 4]
+    return session.run(None, {"observation": observations.astype(np.float32)})[0]
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("family", DISTRIBUTIONS)
+def test_the_exported_policy_acts_as_ours(tmp_path, monkeypatch, capsys, family, case):
+    run = make(tmp_path, family, *CASES[case])
+    run_export(monkeypatch, run, "--to", "numpy")
+    run_export(monkeypatch, run, "--to", "onnx", "--seed", 1)
+    written = [run / name for name in ("seed_1.npz", "seed_1.py", "seed_1.onnx")]
+    assert capsys.readouterr().out.split() == list(map(str, written))
+    module, player = import_file(run / "seed_1.py"), load(run)
+    assert player.env == module.ENVIRONMENT
+    assert module.SEED == 1
+    expected = player.act(OBSERVATIONS)
+    for actions in (module.act(OBSERVATIONS), onnx_actions(run / "seed_1.onnx", OBSERVATIONS)):
+        assert actions.shape == expected.shape
+        if family == "categorical":
+            np.testing.assert_array_equal(actions, expected)
+        else:
+            assert actions.dtype == np.float32
+            np.testing.assert_allclose(actions, expected, rtol=1e-6, atol=1e-6)
+    one = module.act(OBSERVATIONS[0])
+    np.testing.assert_allclose(one, expected[0], rtol=1e-6, atol=1e-6)
+    if HEADS[family] == "clip":
+        at_a_bound = (expected == BOX["action_low"]) | (expected == BOX["action_high"])
+        assert at_a_bound.any()
+        assert not at_a_bound.all()
+
+
+def test_every_family_can_be_exported():
+    assert set(HEADS) == set(DISTRIBUTIONS)
+
+
+def test_two_networks_and_unbounded_actions(tmp_path, monkeypatch):
+    settings = {"shared_trunk": False, "policy": "normal-softplus"}
+    space = {"action_low": [-np.inf, -1.0], "action_high": [np.inf, 3.0]}
+    run = make_run(tmp_path, "InvertedPendulum-v5", **settings, **space)
+    run_export(monkeypatch, run, "--to", "numpy")
+    actions = import_file(run / "seed_1.py").act(OBSERVATIONS)
+    np.testing.assert_allclose(actions, load(run).act(OBSERVATIONS), rtol=1e-6, atol=1e-6)
+
+
+def test_the_numpy_file_is_short_and_needs_nothing_else(tmp_path, monkeypatch):
+    """It is imported where nothing but NumPy and the standard library can be."""
+    run = make_run(tmp_path, "InvertedPendulum-v5")
+    run_export(monkeypatch, run, "--to", "numpy", "--output", run / "brain.npz")
+    source = (run / "brain.py").read_text()
+    code = [line for line in source.split('"""', 2)[2].splitlines() if line.strip()]
+    assert len(code) <= 20
+    program = (
+        "import sys\n"
+        "for name in ('jax', 'flax', 'mjx_reinforce', 'scipy'): sys.modules[name] = None\n"
+        "import brain, numpy\n"
+        "print(brain.act(numpy.zeros(4))[0])"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", program], cwd=run, check=True, capture_output=True, text=True
+    )
+    assert float(ran.stdout) == pytest.approx(load(run).act(np.zeros(4))[0], abs=1e-6)
+
+
+def test_names_in_files_stay_text(tmp_path, monkeypatch):
+    run = make_run(tmp_path)
+    name = '"""\nraise SystemExit\n{env}'
+    for file in ("config.json", "policy/policy.json"):
+        change(run / file, env=name)
+    change_arrays(run / "policy" / "actor.npz", checksum=None)
+    run_export(monkeypatch, run, "--to", "numpy")
+    assert name == import_file(run / "seed_1.py").ENVIRONMENT
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["numpy", "--output", "policy.onnx"], "--to numpy writes .npz, got --output policy.onnx"),
+        (["onnx", "--output", "policy.npz"], "--to onnx writes .onnx, got --output policy.npz"),
+        (["numpy", "--output", "my-policy.npz"], "cannot import a module called 'my-policy'"),
+        (["numpy", "--output", "nowhere/policy.npz"], "cannot write to nowhere"),
+        (["numpy", "--output", "mine.npz"], "mine.py exists; pass --overwrite"),
+        (["numpy", "--output", "folder.npz", "--overwrite"], "folder.npz exists"),
+        (["onnx"], "pip install onnx"),
+        (["numpy", "--seed", "9"], "seed 9 is not among the 3"),
+        (["numpy", "--which", "best"], "has no policy/best"),
+    ],
+)
+def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
+    make_run(tmp_path)
+    (tmp_path / "mine.py").write_text("mine")
+    (tmp_path / "folder.npz").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(SystemExit, match="2"):
+        run_export(monkeypatch, ".", "--to", *arguments)
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+    assert (tmp_path / "mine.py").read_text() == "mine"
+
+
+def test_overwrite_is_by_request_alone(tmp_path, monkeypatch):
+    run = make_run(tmp_path)
+    (run / "seed_1.py").write_text("mine")
+    run_export(monkeypatch, run, "--to", "numpy", "--overwrite")
+    assert import_file(run / "seed_1.py").SEED == 1

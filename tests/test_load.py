@@ -1,0 +1,254 @@
+"""A trained policy in three lines: which seed, which action, and every damage named."""
+
+import re
+import sys
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from saved_runs import change, change_arrays, make_run, write
+
+from mjx_reinforce import act, load, load_policy, watch
+from mjx_reinforce.export import __main__ as export
+
+OBSERVATIONS = np.random.default_rng(0).normal(size=(5, 4))
+KERNEL = "params__network__params__Dense_0__kernel"
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "InvertedPendulum-v5"])
+def test_actions_are_the_mode_as_gymnasium_takes_it(tmp_path, env):
+    player = load(make_run(tmp_path, env), 1)
+    assert (player.env, player.seed, player.observation_size) == (env, 1, 4)
+    policy, actor = load_policy(tmp_path / "policy", 1)
+    expected = policy.distribution.mode(act(policy, actor, OBSERVATIONS.astype(np.float32)))
+    batch = player.act(OBSERVATIONS)
+    np.testing.assert_allclose(batch, expected, rtol=1e-6)
+    space = gymnasium.make(env).action_space
+    for observation, row in zip(OBSERVATIONS, batch, strict=True):
+        action = player.act(observation)
+        np.testing.assert_allclose(action, row, rtol=1e-6)
+        if env == "CartPole-v1":
+            assert space.contains(action)
+        else:
+            assert (action.shape, action.dtype) == (space.shape, space.dtype)
+
+
+def test_the_action_may_be_changed_in_place(tmp_path):
+    action = load(make_run(tmp_path, "InvertedPendulum-v5")).act(OBSERVATIONS[0])
+    action *= 2.0
+
+
+def test_a_generator_draws_actions(tmp_path):
+    player = load(make_run(tmp_path, "InvertedPendulum-v5"), 0)
+    many = np.tile(OBSERVATIONS[0], (4000, 1))
+    actions = player.act(many, np.random.default_rng(1))
+    np.testing.assert_array_equal(actions, player.act(many, np.random.default_rng(1)))
+    log_std = player.actor.params["constants"][0]
+    assert np.std(actions) == pytest.approx(np.exp(log_std), rel=0.05)
+    error = 5 * np.exp(log_std) / np.sqrt(4000)
+    assert np.mean(actions) == pytest.approx(player.act(OBSERVATIONS[0])[0], abs=error)
+    rng = np.random.default_rng(2)
+    assert player.act(many[0], rng) != player.act(many[0], rng)
+
+
+@pytest.mark.parametrize(
+    ("returns", "best", "worst", "median"),
+    [
+        ([2.0, 7.0, 5.0], 1, 0, 2),
+        ([7.0, None, 5.0], 0, 1, 2),  # not finite is below all others
+        ([5.0, 5.0, 5.0], 0, 0, 1),
+        ([-3, -4, -5], 0, 2, 1),
+    ],
+)
+def test_seeds_are_ranked_by_the_final_evaluation(tmp_path, returns, best, worst, median):
+    make_run(tmp_path)
+    write(tmp_path / "summary.json", {"final_returns": returns})
+    assert load(tmp_path).seed == best
+    assert load(tmp_path, "worst").seed == worst
+    assert load(str(tmp_path), "median").seed == median
+    expected = load_policy(tmp_path / "policy", best)[1]
+    jax.tree.map(np.testing.assert_array_equal, load(tmp_path).actor, expected)
+
+
+def test_the_best_policies_on_the_way_are_another_folder(tmp_path):
+    make_run(tmp_path)
+    with pytest.raises(ValueError, match="has no policy/best"):
+        load(tmp_path, which="best")
+    make_run(tmp_path, folder="policy/best", hidden_sizes=[3])
+    change(tmp_path / "summary.json", best_test_returns=[9.0, 7.0, 5.0])
+    assert load(tmp_path, which="last").seed == 1
+    player = load(tmp_path, which="best")
+    assert player.seed == 0
+    assert player.actor.params["network"]["params"]["Dense_0"]["kernel"].shape == (4, 3)
+    with pytest.raises(ValueError, match="which must be one of last, best, got 'first'"):
+        load(tmp_path, which="first")
+
+
+def test_unbounded_actions_survive_json(tmp_path):
+    run = make_run(
+        tmp_path, "InvertedPendulum-v5", action_low=[-np.inf, -1.0], action_high=[np.inf, 3.0]
+    )
+    policy, actor = load_policy(run / "policy", 0)
+    outputs = act(policy, actor, OBSERVATIONS[0].astype(np.float32))
+    expected = outputs[:2] * np.array([1.0, 2.0]) + np.array([0.0, 1.0])
+    np.testing.assert_allclose(load(run, 0).act(OBSERVATIONS[0]), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("shape", [(3,), (), (2, 3), (1, 2, 4), (4, 1)])
+def test_another_observation_is_named(tmp_path, shape):
+    with pytest.raises(ValueError, match=r"takes observations \[4\] or \[N, 4\], got one of shape"):
+        load(make_run(tmp_path)).act(np.zeros(shape))
+
+
+def remove(name):
+    return lambda run: shutil.rmtree(run / name) if (run / name).is_dir() else (run / name).unlink()
+
+
+def entries(name, **values):
+    return lambda run: change(run / name, **values)
+
+
+def arrays(**changes):
+    return lambda run: change_arrays(run / "policy" / "actor.npz", **changes)
+
+
+def content(name, value):
+    return lambda run: (run / name).write_bytes(value)
+
+
+def flip_a_bit(run):
+    path = run / "policy" / "actor.npz"
+    damaged = bytearray(path.read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    path.write_bytes(damaged)
+
+
+def cut(run):
+    path = run / "policy" / "actor.npz"
+    path.write_bytes(path.read_bytes()[:1000])
+
+
+JSON, NPZ = "policy/policy.json", "policy/actor.npz"
+#: What is done to a run, the file that the message names, and what it says besides.
+DAMAGE = {
+    "no run": (remove("config.json"), "config.json", "is no run directory"),
+    "config is no JSON": (content("config.json", b"["), "config.json", "is damaged"),
+    "config is a list": (content("config.json", b"[]"), "config.json", "holds no JSON object"),
+    "no horizon": (entries("config.json", horizon=...), "config.json", "KeyError('horizon')"),
+    "endless horizon": (entries("config.json", horizon=1e999), "config.json", "OverflowError"),
+    "no policy": (remove("policy"), "", "goes on, or was killed"),
+    "no summary": (remove("summary.json"), "", "no final evaluation: its training goes on"),
+    "running": (entries("summary.json", status="running"), "", "no final evaluation"),
+    "no returns": (entries("summary.json", final_returns=...), "summary.json", "has no final_"),
+    "text for returns": (entries("summary.json", final_returns="7"), "summary.json", "not a list"),
+    "nothing finite": (entries("summary.json", final_returns=[None] * 3), "summary.json", "none"),
+    "more returns": (entries("summary.json", final_returns=[1.0] * 4), "summary.json", "ranks 4"),
+    "another env": (entries("config.json", env="Reacher-v5"), "config.json", "different runs"),
+    "no settings": (remove(JSON), "policy.json", "cannot read"),
+    "empty settings": (content(JSON, b"{}"), "policy.json", "policy is missing"),
+    "half the settings": (content(JSON, b'{"policy": "ca'), "policy.json", "damaged"),
+    "deep settings": (content(JSON, b"[" * 100_000), "policy.json", "damaged"),
+    "no UTF-8": (content(JSON, b'{"\xff": 1}'), "policy.json", "damaged"),
+    "a key is missing": (entries(JSON, hidden_sizes=...), "policy.json", "hidden_sizes is missing"),
+    "unknown family": (entries(JSON, policy="categoric"), "policy.json", "Did you mean"),
+    "family of another space": (entries(JSON, policy="normal"), "policy.json", "is discrete"),
+    "family is a list": (entries(JSON, policy=[]), "policy.json", "policy must be the name"),
+    "bad initialiser": (entries(JSON, initializer="x"), "policy.json", "unknown initializer"),
+    "other hidden sizes": (entries(JSON, hidden_sizes=[8, 9]), NPZ, "it should be (3, 9)"),
+    "more layers": (entries(JSON, hidden_sizes=[8, 8, 8]), NPZ, "Dense_3/bias is missing"),
+    "fewer layers": (entries(JSON, hidden_sizes=[8]), NPZ, "Dense_2/bias' is not an array of"),
+    "hidden sizes of 0": (entries(JSON, hidden_sizes=[0]), "policy.json", "from 1 to 1048576"),
+    "hidden sizes of 1e9": (entries(JSON, hidden_sizes=[10**9]), "policy.json", "got [1000000000]"),
+    "hidden sizes of text": (entries(JSON, hidden_sizes="88"), "policy.json", "got '88'"),
+    "another observation": (entries(JSON, observation_size=5), NPZ, "should be (3, 5)"),
+    "half an observation": (entries(JSON, observation_size=4.0), "policy.json", "whole number"),
+    "more actions": (entries(JSON, num_actions=3), NPZ, "it should be (3, 3)"),
+    "std is text": (entries(JSON, initial_std="1"), "policy.json", "initial_std must be a number"),
+    "std is huge": (entries(JSON, initial_std=10**400), "policy.json", "must be a number"),
+    "another trunk": (entries(JSON, shared_trunk=False), "policy.json", "must come from the state"),
+    "another scaling": (entries(JSON, rescale=False), "policy.json", "checksum"),
+    "no arrays": (remove(NPZ), NPZ, "cannot read"),
+    "no archive": (content(NPZ, b"PK"), NPZ, "no whole NumPy archive"),
+    "an empty archive": (content(NPZ, b""), NPZ, "no whole NumPy archive"),
+    "half an archive": (cut, NPZ, "no whole NumPy archive"),
+    "an array is missing": (arrays(normalizer__m2=None), NPZ, "normalizer/m2 is missing"),
+    "an array too many": (arrays(x=lambda _: np.ones(3)), NPZ, "'x' is not an array"),
+    "no seed axis": (arrays(normalizer__count=lambda x: x[0]), NPZ, "an entry for each seed"),
+    "no seeds": (arrays(normalizer__count=lambda x: x[:0]), NPZ, "an entry for each seed"),
+    "one array without it": (arrays(**{KERNEL: lambda x: x[0]}), NPZ, "has shape (4, 8)"),
+    "a wrong shape": (arrays(**{KERNEL: lambda x: x[:, :3]}), NPZ, "should be (3, 4, 8)"),
+    "integers": (arrays(normalizer__mean=lambda x: x.astype(int)), NPZ, "it holds int64"),
+    "objects": (arrays(normalizer__mean=lambda x: x.astype(object)), NPZ, "no whole NumPy archive"),
+    "nan": (arrays(**{KERNEL: lambda x: x * np.nan}), NPZ, "of seed 1 has numbers that are not"),
+    "other numbers": (arrays(normalizer__mean=lambda x: x + 1), "policy.json", "checksum"),
+    "a bit": (flip_a_bit, NPZ, "damaged"),
+}
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damage_is_named_in_one_line(tmp_path, monkeypatch, capsys, name):
+    """By ``load`` and both command lines, before anything is compiled."""
+    damage, file, message = DAMAGE[name]
+    damage(make_run(tmp_path))
+    with pytest.raises(ValueError, match=re.escape(message)) as caught:
+        load(tmp_path)
+    said = str(caught.value)
+    assert file in said
+    assert "\n" not in said
+    for main, arguments in ((watch.main, []), (export.main, ["--to", "numpy"])):
+        monkeypatch.setattr(sys, "argv", ["program", str(tmp_path), *arguments])
+        with pytest.raises(SystemExit, match="2"):
+            main()
+        assert capsys.readouterr().err == f"error: {said}\n"
+
+
+def test_the_damage_of_one_seed_leaves_the_others(tmp_path):
+    make_run(tmp_path)
+    change_arrays(tmp_path / "policy" / "actor.npz", checksum=None)
+
+    def spoil(x):
+        x[0] = np.inf
+        return x
+
+    change_arrays(tmp_path / "policy" / "actor.npz", **{KERNEL: spoil})
+    assert load(tmp_path).seed == 1
+    with pytest.raises(ValueError, match="of seed 0 has numbers that are not finite"):
+        load(tmp_path, 0)
+    with pytest.raises(ValueError, match="of seed 0 has numbers that are not finite"):
+        load_policy(tmp_path / "policy")
+
+
+def test_a_family_with_the_same_shapes_is_not_taken_for_another(tmp_path):
+    make_run(tmp_path, "InvertedPendulum-v5")
+    for family in ("tanh-normal", "truncated-normal", "clipped-normal"):
+        change(tmp_path / "policy" / "policy.json", policy=family)
+        with pytest.raises(ValueError, match="do not belong together"):
+            load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("seed", "message"),
+    [
+        (3, "seed 3 is not among the 3"),
+        (-1, "seed -1 is not among the 3"),
+        ("first", "seed must be best, worst, median or a number, got 'first'"),
+        (1.5, "got 1.5"),
+    ],
+)
+def test_a_seed_that_is_none_is_named(tmp_path, seed, message):
+    with pytest.raises(ValueError, match=message):
+        load(make_run(tmp_path), seed)
+
+
+def test_a_seed_by_its_number_needs_no_summary(tmp_path):
+    make_run(tmp_path)
+    (tmp_path / "summary.json").unlink()
+    assert load(tmp_path, 2).seed == 2
+
+
+def test_a_policy_file_without_a_checksum_is_read(tmp_path):
+    make_run(tmp_path)
+    change_arrays(tmp_path / "policy" / "actor.npz", checksum=None)
+    change(tmp_path / "policy" / "policy.json", rescale=False)
+    assert load(tmp_path).seed == 1
