@@ -18,8 +18,10 @@ from mjx_reinforce import envs
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs.build import build, policy_settings
 from mjx_reinforce.runs.config import Config, check
-from mjx_reinforce.runs.files import prepare
+from mjx_reinforce.runs.files import choose_directory, prepare
+from mjx_reinforce.runs.flags import accept_all_characters, read
 from mjx_reinforce.runs.presets import PRESETS
+from mjx_reinforce.runs.relevance import check_read
 from mjx_reinforce.runs.settings import GROUPS
 
 _FILES = (
@@ -34,43 +36,47 @@ _FILES = (
 
 def main() -> None:
     """Reads the command line, trains, and exits: 0 done, 2 bad input, 130 interrupted."""
-    directory = None
+    accept_all_characters()
+    made: Sequence[Path] = ()
     try:
         with _collection_paused():
             config = parse(sys.argv[1:])
             check(config)
-            directory = prepare(config.output, config.env, config.overwrite)
+            directory = choose_directory(config.output, config.env)
+            made = prepare(directory, config.overwrite)
             env = envs.make(config.env)
             _configure_jax()
             learner, horizon = build(env, config)
     except ValueError as error:
-        _refuse(str(error), directory)
+        _refuse(str(error), made)
     try:
         interrupted = train(env, learner, horizon, config, directory)
     except RuntimeError as error:  # XLA's
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         remedy = "lower --num-seeds, --num-episodes, --eval-episodes or --horizon"
-        _refuse(f"this run does not fit into memory ({error}); {remedy}", directory)
+        _refuse(f"this run does not fit into memory ({error}); {remedy}", made)
     sys.exit(130 if interrupted else 0)
 
 
-def _refuse(message: str, directory: Path | None) -> NoReturn:
-    """Says what is wrong, leaves no empty run directory behind, and exits."""
-    if directory and not any(directory.iterdir()):
-        directory.rmdir()
-    print(f"error: {message}", file=sys.stderr)
+def _refuse(message: str, made: Sequence[Path]) -> NoReturn:
+    """Says in one line what is wrong, removes the folders that this run made, and exits."""
+    for folder in made:
+        with contextlib.suppress(OSError):  # it is not empty
+            folder.rmdir()
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(2)
 
 
 def parse(arguments: Sequence[str]) -> Config:
-    """Returns the settings that a command line asks for; --help and bad flags exit.
+    """Returns the settings that a command line asks for; --help exits.
 
     Args:
       arguments: a preset's name, if any, then flags.
 
     Raises:
-      ValueError: there is no such preset.
+      ValueError: there is no such preset or flag, a value is not of its type, or a setting that
+        is given would do nothing.
     """
     default, prog = Config(), "python -m mjx_reinforce.train"
     if arguments and not arguments[0].startswith("-"):
@@ -84,10 +90,12 @@ def parse(arguments: Sequence[str]) -> Config:
         for title, group in GROUPS.items()
     ]
     form = tyro.conf.OmitArgPrefixes[dataclasses.make_dataclass("Arguments", groups, frozen=True)]
-    parsed = tyro.cli(form, args=arguments, prog=prog, description=_description())
-    return Config(
+    parsed = read(form, arguments, prog, _description())
+    config = Config(
         **{name: x for title in GROUPS for name, x in vars(getattr(parsed, title)).items()}
     )
+    check_read(config, default)
+    return config
 
 
 def _description() -> str:

@@ -23,9 +23,10 @@ class Display:
     """A progress bar on a terminal, one line an evaluation elsewhere."""
 
     def __init__(self):
-        self.console = Console()
+        # What users name is printed as it is: "[bold]" and ":smile:" are no commands.
+        self.console = Console(markup=False, emoji=False)
         self._bar = Progress(
-            SpinnerColumn(),
+            SpinnerColumn("line" if self.console.options.ascii_only else "dots"),
             TextColumn("{task.description}"),
             BarColumn(),
             TaskProgressColumn(),
@@ -46,9 +47,9 @@ class Display:
         """Leaves the last state on the screen."""
         self._bar.stop()
 
-    def say(self, text: str) -> None:
-        """Prints a line above the bar."""
-        self.console.print(text, highlight=False, soft_wrap=True)
+    def say(self, text: str, style: str | None = None) -> None:
+        """Prints a line above the bar, in one of rich's styles."""
+        self.console.print(text, style=style, highlight=False, soft_wrap=True)
 
     def start(self, compile_seconds: float) -> None:
         """Marks the end of compilation, from where the time left is counted."""
@@ -70,7 +71,7 @@ class Display:
         """Names an update with numbers that are not finite, from ``Record.add_updates``."""
         what = f"{event['episodes']} non-finite episodes"
         what += ", update skipped" if event["skipped"] else ""
-        self.say(f"[yellow]seed {event['seed']}, update {event['update']}: {what}[/yellow]")
+        self.say(f"seed {event['seed']}, update {event['update']}: {what}", style="yellow")
 
 
 def print_summary(console: Console, summary: dict[str, Any], directory: Path) -> None:
