@@ -71,7 +71,7 @@ def test_a_preset_makes_sense(name):
     check(config)
     assert 20 < len(line) < 100
     assert train_module.parse([name]) == config
-    assert train_module.parse([name, "--discount", "0.5"]).discount == 0.5
+    assert train_module.parse([name, "--horizon", "7"]).horizon == 7
 
 
 def test_no_preset_is_the_default():
