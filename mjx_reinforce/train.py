@@ -18,7 +18,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs.build import build, policy_settings
 from mjx_reinforce.runs.config import Config, check
-from mjx_reinforce.runs.files import choose_directory, prepare
+from mjx_reinforce.runs.files import choose_directory, prepare, remove_empty
 from mjx_reinforce.runs.flags import accept_all_characters, read
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.relevance import check_read
@@ -61,9 +61,7 @@ def main() -> None:
 
 def _refuse(message: str, made: Sequence[Path]) -> NoReturn:
     """Says in one line what is wrong, removes the folders that this run made, and exits."""
-    for folder in made:
-        with contextlib.suppress(OSError):  # it is not empty
-            folder.rmdir()
+    remove_empty(made)
     print(f"error: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(2)
 

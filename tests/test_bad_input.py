@@ -3,15 +3,18 @@
 First command lines and calls by hand, then settings drawn at random.
 """
 
+import dataclasses
 import math
 import subprocess
 import sys
+import typing
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from rich.console import Console
+from rich.table import Table
 from toys import Survive
 
 from mjx_reinforce import ars, envs, reinforce
@@ -113,10 +116,10 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ("--num-seeds 1e3", "'1e3'"),
         ("--num-seeds", "Missing value for argument '--num-seeds'"),
         ("--num-seeds 3 4", "no flag takes '4'"),
-        ("--num-sedes 3", "unknown flag --num-sedes. Did you mean --num-seeds?"),
-        ("--num-sedes=3", "unknown flag --num-sedes. Did you mean --num-seeds?"),
-        ("--no-such-thing", "unknown flag --no-such-thing."),
-        ("-x", "unknown flag -x."),
+        ("--num-sedes 3", "unknown flag '--num-sedes'. Did you mean '--num-seeds'?"),
+        ("--num-sedes=3", "unknown flag '--num-sedes'. Did you mean '--num-seeds'?"),
+        ("--no-such-thing", "unknown flag '--no-such-thing'."),
+        ("-x", "unknown flag '-x'."),
         ("--algorithm ppo", "invalid choice 'ppo' for argument '--algorithm'"),
         ("--hidden-sizes a", "--hidden-sizes"),
         ("--hidden-sizes 4.5", "--hidden-sizes"),
@@ -365,28 +368,28 @@ def test_no_default_is_refused(name):
 # What users write is printed as it is.
 
 
-@pytest.mark.parametrize("text", ["t/[bold]x", "t/[/b]", "t/:smile:", "t/[link=http://x]y"])
-def test_paths_are_not_read_as_markup(text, capsys):
-    summary = {
-        "env": text,
-        "num_seeds": 1,
-        "iqm": 1.0,
-        "iqm_ci": [1.0, 1.0],
-        "final_returns": [1.0],
-        "solve_rate": None,
-        "env_steps_per_second": 1.0,
-        "useful_step_fraction": 1.0,
-        "compile_seconds": 1.0,
-        "run_seconds": 1.0,
-    }
+@pytest.mark.parametrize("text", ["t/[bold]x", "t/[/b]", "t/:smile:", "t/[link=x]y"])
+def test_text_is_not_read_as_markup(text, capsys):
+    """Neither in lines nor in tables; ``print_summary`` uses the display's console."""
     shown = display.Display()
     shown.say(text)
-    display.print_summary(shown.console, summary, Path(text))
-    printed = capsys.readouterr().out
-    assert printed.startswith(f"{text}\n")
-    assert f"{text}, 1 seeds" in printed
-    assert printed.endswith(f"Files in {text}\n")
-    assert isinstance(shown.console, Console)
+    shown.say(text, style="yellow")
+    table = Table(title=text)
+    table.add_row(text)
+    shown.console.print(table)
+    assert capsys.readouterr().out.count(text) == 4
+
+
+def test_a_run_in_a_folder_with_brackets_names_it(monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
+    monkeypatch.chdir(tmp_path)
+    arguments = "--env Survive-v0 --num-seeds 1 --max-updates 1 --hidden-sizes --output t/[/b]é"
+    monkeypatch.setattr(sys, "argv", ["train", *arguments.split()])
+    with pytest.raises(SystemExit) as stop:
+        train_module.main()
+    assert stop.value.code == 0
+    assert "t/[/b]é" in capsys.readouterr().out
+    assert (tmp_path / "t" / "[/b]é" / "summary.json").exists()
 
 
 @pytest.mark.parametrize("accent", ["é", "日本", "\U0001f916"])
@@ -414,54 +417,20 @@ _FEW = settings(derandomize=True, deadline=None, database=None, max_examples=150
 _MANY = settings(_FEW, max_examples=1000, suppress_health_check=[HealthCheck.too_slow])
 _TEXT = st.text(max_size=8)
 _WRONG_NUMBERS = st.sampled_from([math.nan, math.inf, -math.inf, 1e30, -1.0, 1e-50])
-_COUNTS = [
-    "num_episodes",
-    "max_updates",
-    "horizon",
-    "decay_updates",
-    "eval_every",
-    "eval_episodes",
-    "value_fits",
-    "minibatch_updates",
-    "minibatch_size",
-    "num_directions",
-    "env_steps",
-]
-_NUMBERS = [
-    "initial_std",
-    "learning_rate",
-    "final_learning_rate",
-    "max_grad_norm",
-    "value_learning_rate",
-    "step_size",
-    "noise_std",
-    "standardize_floor",
-    "entropy_cost",
-    "weight_decay",
-    "discount",
-]
-_NAMES = [
-    "policy",
-    "estimator",
-    "algorithm",
-    "engine",
-    "initializer",
-    "update",
-    "loss_per",
-    "optimizer",
-    "ars_update",
-]
-_SWITCHES = [
-    "stop_when_solved",
-    "one_start",
-    "overwrite",
-    "shared_trunk",
-    "rescale",
-    "discount_weights",
-    "standardize",
-    "shared_starts",
-]
-_SIZES = ("hidden_sizes", "value_hidden_sizes")
+
+
+def named(*kinds):
+    """Returns the settings with one of these annotations."""
+    return [field.name for field in dataclasses.fields(Config) if field.type in kinds]
+
+
+#: Whole numbers that are not at least 1 and less than 2^31.
+_OTHER_COUNTS = {"seed", "eval_seed", "num_seeds", "normalize_steps", "top_directions"}
+_COUNTS = sorted({*named(int, int | None)} - _OTHER_COUNTS)
+_NUMBERS, _SWITCHES = named(float, float | None), named(bool)
+_SIZES = named(tuple[int, ...])
+_NAMES = ["policy", "estimator"]
+_NAMES += [f.name for f in dataclasses.fields(Config) if typing.get_origin(f.type) is Literal]
 #: Values that must be refused, whatever the other settings are.
 WRONG = {
     **dict.fromkeys(
@@ -480,7 +449,8 @@ WRONG = {
     **dict.fromkeys(("seed", "eval_seed"), st.integers(max_value=-1) | st.integers(2**32) | _TEXT),
     "num_seeds": st.integers(max_value=0) | st.floats() | _TEXT,
     "normalize_steps": st.integers(max_value=-1) | st.integers(min_value=2**31) | _TEXT,
-    "env": _TEXT | st.none(),
+    "discount": st.floats(max_value=-1e-9) | st.floats(min_value=1.001) | st.just(math.nan) | _TEXT,
+    "env": _TEXT.filter(lambda text: ":" not in text) | st.none(),
     "output": _TEXT | st.integers(),
 }
 #: Values that make sense by themselves.

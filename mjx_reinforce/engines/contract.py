@@ -31,7 +31,7 @@ def check_environment(env: Any) -> None:
 def _check_limits(name: str, env: Any) -> None:
     """Raises ValueError for a time limit or threshold that is none."""
     limit = getattr(env, "max_episode_steps", None)
-    if limit is not None and not (isinstance(limit, numbers.Integral) and limit >= 1):
+    if limit is not None and not (isinstance(limit, numbers.Integral) and int(limit) >= 1):
         raise BadEnvironmentError(
             f"{name}.max_episode_steps must be a whole number, 1 or more, got {limit!r}"
         )
@@ -45,7 +45,7 @@ def _check_limits(name: str, env: Any) -> None:
 def _check_action_space(name: str, env: Any) -> None:
     """Raises ValueError for actions that cannot be drawn."""
     size, declared = env.action_size, getattr(env, "action_space", None)
-    if not (isinstance(size, numbers.Integral) and size >= 1):
+    if not (isinstance(size, numbers.Integral) and int(size) >= 1):
         raise BadEnvironmentError(
             f"{name}.action_size must be a whole number, 1 or more, got {size!r}"
         )
@@ -90,7 +90,7 @@ def _check_state(name: str, start: Any) -> None:
         ("reward", 0, "a scalar []", "sum it, or take an entry"),
         ("done", 0, "a scalar []", "reduce it, as with jnp.any"),
     ):
-        value = getattr(start, field, None)
+        value: Any = getattr(start, field, None)
         if not hasattr(value, "shape"):
             got = f"there is no {field}" if value is None else f"it is {_described(value)}"
             raise BadEnvironmentError(

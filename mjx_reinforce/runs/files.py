@@ -37,6 +37,7 @@ def prepare(directory: Path, overwrite: bool) -> list[Path]:
     Raises:
       ValueError: it exists and is not empty, is no directory, or cannot be written.
     """
+    made: list[Path] = []
     try:
         made = [path for path in (directory, *directory.parents) if not path.exists()]
         directory.mkdir(parents=True, exist_ok=True)
@@ -48,11 +49,19 @@ def prepare(directory: Path, overwrite: bool) -> list[Path]:
         with tempfile.TemporaryFile(dir=directory):
             pass
     except OSError as error:
+        remove_empty(made)
         raise ValueError(
             f"cannot write to the run directory {directory} ({error.strerror}); "
             "choose another --output"
         ) from error
     return made
+
+
+def remove_empty(folders: Sequence[Path]) -> None:
+    """Removes those folders, the innermost first, that have nothing in them."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 def create_csv(path: Path, columns: Sequence[str]) -> None:

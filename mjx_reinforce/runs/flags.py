@@ -55,7 +55,8 @@ def _about_unknown(unknown: Sequence[str], flags: Sequence[str]) -> str:
     if flag is None:
         return f"no flag takes {' '.join(map(repr, unknown))} (see --help)"
     near = difflib.get_close_matches(flag, flags, n=1)
-    return f"unknown flag {flag}. {f'Did you mean {near[0]}? ' if near else ''}(See --help.)"
+    hint = f" Did you mean {near[0]!r}?" if near else ""
+    return f"unknown flag {flag!r}.{hint} (See --help.)"
 
 
 def _first_section(box: str) -> str:
