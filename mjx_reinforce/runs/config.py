@@ -45,7 +45,7 @@ class Config(
 def check(config: Config) -> None:
     """Raises ValueError for settings that make no sense: what, the value, the remedy."""
     for field in dataclasses.fields(Config):
-        check_type(_flag(field.name), getattr(config, field.name), field.type)
+        check_type(flag(field.name), getattr(config, field.name), field.type)
     envs.check_id(config.env)
     check_name("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
     check_name("estimator", config.estimator, ESTIMATORS)
@@ -53,13 +53,14 @@ def check(config: Config) -> None:
         for name in names.split():
             value = getattr(config, name)
             if not ((value is None and name in _OPTIONAL) or holds(value)):
-                raise ValueError(f"{_flag(name)} must be {rule}, got {value}")
+                raise ValueError(f"{flag(name)} must be {rule}, got {value}")
     if config.env_steps is None and config.max_updates is None:
         raise ValueError("nothing would end this run: give --env-steps or --max-updates a number")
     (_check_reinforce if config.algorithm == "reinforce" else _check_ars)(config)
 
 
-def _flag(name: str) -> str:
+def flag(name: str) -> str:
+    """Returns the flag of a setting."""
     return f"--{name.replace('_', '-')}"
 
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.config import Config, flag
 
 #: Names of settings, when they are read, and how to say it. A setting may stand in several rows,
 #: the most general first. What stands in none is always read.
@@ -71,17 +71,16 @@ def check_read(config: Config, default: Config) -> None:
     for names, is_read, condition in READ:
         idle = [name for name in changed if name in names.split()]
         if idle and not is_read(config):
-            flags = " ".join(_flag(name, getattr(config, name)) for name in idle)
+            flags = " ".join(_given(name, getattr(config, name)) for name in idle)
             raise ValueError(
                 f"{flags} would do nothing: only {condition} reads that; "
                 f"{'leave it out' if len(idle) == 1 else 'leave them out'}, or choose {condition}"
             )
 
 
-def _flag(name: str, value: Any) -> str:
+def _given(name: str, value: Any) -> str:
     """Returns a setting as it stands on the command line."""
-    flag = name.replace("_", "-")
     if isinstance(value, bool):
-        return f"--{flag}" if value else f"--no-{flag}"
+        return flag(name) if value else flag(f"no_{name}")
     values = value if isinstance(value, tuple) else (value,)
-    return " ".join([f"--{flag}", *map(str, values)])
+    return " ".join([flag(name), *map(str, values)])
