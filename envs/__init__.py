@@ -84,7 +84,7 @@ def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
         ) from error
     if not callable(build):
         raise ValueError(
-            f"the environment {id!r} is a {type(build).__name__}, no class or function; "
+            f"the environment {id!r} is no class or function, but of type {type(build).__name__}; "
             "write module:Class"
         )
     return build
