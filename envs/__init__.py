@@ -7,9 +7,11 @@ directly. Nothing heavy is imported before ``make``.
 
 import contextlib
 import io
+import re
 from collections.abc import Callable
 from typing import Any
 
+from mjx_reinforce.checks import BadEnvironmentError, check_parts, explain
 from mjx_reinforce.registry import check_name, load
 
 _CART_POLE = "mjx_reinforce.envs.cart_pole:CartPole"
@@ -51,26 +53,52 @@ def make(id: str, /, **kwargs: Any) -> Any:
       **kwargs: arguments of the environment's class, over the table's.
 
     Raises:
-      ValueError: the id is unknown; the message lists the known ones.
+      ValueError: the id is unknown, with the known ones; it cannot be imported or built; or it
+        gives no environment.
     """
     check_id(id)
     entry, settings = (id, {}) if ":" in id else _TABLE[id]
+    build = _import(id, entry)
+    try:
+        env = build(**(settings | kwargs))
+    except BadEnvironmentError:
+        raise
+    except Exception as error:  # it may be the user's code, which may raise anything
+        if isinstance(error, ValueError) and ":" not in id:
+            raise
+        raise ValueError(f"cannot build the environment {id!r}: {explain(error)}") from error
+    check_parts(env)
+    return env
+
+
+def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
+    """Returns the class or function of an entry of the table, or of "module:Class"."""
     try:
         # MJX prints two lines when its optional Warp backend is not installed.
         with contextlib.redirect_stdout(io.StringIO()):
             build = load(entry)
-    except (ImportError, AttributeError) as error:
+    except (Exception, SystemExit) as error:  # an import runs the user's code
         raise ValueError(
-            f"cannot import the environment {id!r}: {error}; write module:Class of a module "
-            "that is in this folder or installed"
+            f"cannot import the environment {id!r}: {explain(error)}; write module:Class of a "
+            "module that is in this folder or installed"
         ) from error
-    return build(**(settings | kwargs))
+    if not callable(build):
+        raise ValueError(
+            f"the environment {id!r} is no class or function, but of type {type(build).__name__}; "
+            "write module:Class"
+        )
+    return build
 
 
 def check_id(id: str) -> None:
     """Raises ValueError for an id that ``make`` does not know; imports nothing."""
     if ":" not in id:
         check_name("environment", id, _TABLE)
+    elif not re.fullmatch(r"\w+(\.\w+)*:\w+", id):
+        raise ValueError(
+            f"the environment {id!r} is not of the form module:Class, such as own_model:Crane for "
+            "the class Crane in own_model.py"
+        )
 
 
 def register(id: str, entry: Callable[..., Any], /, **kwargs: Any) -> None:
@@ -82,8 +110,13 @@ def register(id: str, entry: Callable[..., Any], /, **kwargs: Any) -> None:
       **kwargs: arguments for it, which ``make`` may override.
 
     Raises:
-      ValueError: the id is taken.
+      ValueError: the id is taken or has other characters than letters, digits, "_", "." and "-",
+        or the entry is no class or function.
     """
+    if not re.fullmatch(r"[\w.-]+", id):
+        raise ValueError(f"an environment's id has letters, digits, _, . and - only, got {id!r}")
+    if not callable(entry):
+        raise ValueError(f"the entry of {id!r} must be a class or function, got {entry!r}")
     if id in _TABLE:
         raise ValueError(f"environment {id!r} is already registered; choose another id")
     _TABLE[id] = (entry, kwargs)

@@ -24,6 +24,7 @@ with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
     from mjx_reinforce.envs import models
+    from mjx_reinforce.envs.outcomes import check_outcome, check_start
     from mjx_reinforce.physics import mjx_internals
     from mjx_reinforce.physics import step as physics
     from mjx_reinforce.physics.mjx_internals import Simulation
@@ -141,7 +142,8 @@ class MujocoEnv(Env):
 
     def reset(self, rng: jax.Array) -> State:
         """Returns the start of an episode; consumes the key."""
-        return self.set_state(*self.initial(rng))
+        sizes = self.mj_model.nq, self.mj_model.nv
+        return self.set_state(*check_start(type(self).__name__, self.initial(rng), sizes))
 
     def set_state(self, qpos: jax.Array, qvel: jax.Array) -> State:
         """Returns the state at given positions and velocities, as Gymnasium's ``set_state``.
@@ -162,7 +164,7 @@ class MujocoEnv(Env):
         start, view = self._physics(data), Simulation(data)
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
-        terms = jax.tree.map(jnp.zeros_like, self.outcome(view, view, action)[2])
+        terms = jax.tree.map(jnp.zeros_like, self._checked_outcome(view, view, action)[2])
         return State(cast(Any, start), self.observe(view), zero, zero, terms)
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -174,7 +176,7 @@ class MujocoEnv(Env):
         if self.contact_forces:
             data = mjx.rne_postconstraint(self.model, data)
         view = Simulation(data)
-        reward, terminated, terms = self.outcome(Simulation(before), view, action)
+        reward, terminated, terms = self._checked_outcome(Simulation(before), view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
@@ -184,6 +186,10 @@ class MujocoEnv(Env):
             done=jnp.asarray(terminated, dtype),
             metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
         )
+
+    def _checked_outcome(self, before: Simulation, data: Simulation, action: jax.Array) -> Any:
+        """Returns what ``outcome`` returns, or raises ValueError where it is no outcome."""
+        return check_outcome(type(self).__name__, self.outcome(before, data, action))
 
     def _data(self, physics: Physics) -> mjx.Data:
         """Returns a fresh simulation at the given state."""

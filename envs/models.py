@@ -3,10 +3,13 @@
 import contextlib
 import importlib.resources
 import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from mujoco import MjModel  # pyright: ignore[reportAttributeAccessIssue] - a C extension
+
+from mjx_reinforce.checks import explain
 
 # MJX prints two lines when its optional Warp backend is not installed; this
 # package asks for the JAX implementation by name, so they only worry people.
@@ -40,7 +43,7 @@ def load(xml_file: str) -> Any:
     if "/" in xml_file or "\\" in xml_file:
         if not Path(xml_file).is_file():
             raise ValueError(f"there is no model {xml_file!r} in {Path.cwd()}")
-        model = MjModel.from_xml_path(xml_file)
+        model = _compile(MjModel.from_xml_path, xml_file, xml_file)
     else:
         asset = importlib.resources.files("mjx_reinforce.envs") / "assets" / xml_file
         if not asset.is_file():
@@ -48,10 +51,18 @@ def load(xml_file: str) -> Any:
                 f"the package has no model {xml_file!r}; give a path with a folder for your own, "
                 f"such as './{xml_file}'"
             )
-        model = MjModel.from_xml_string(asset.read_text(encoding="utf-8"))
+        model = _compile(MjModel.from_xml_string, asset.read_text(encoding="utf-8"), xml_file)
     if not model.nu:
         raise ValueError(f"the model {xml_file!r} has no actuators; add an <actuator> element")
     return model
+
+
+def _compile(compiler: Callable[[str], Any], source: str, xml_file: str) -> Any:
+    """Returns the model, or raises ValueError with the file's name and what MuJoCo says."""
+    try:
+        return compiler(source)
+    except Exception as error:  # mujoco.FatalError is no ValueError
+        raise ValueError(f"MuJoCo cannot compile {xml_file!r}: {explain(error)}") from error
 
 
 def to_mjx(model: Any, xml_file: str) -> mjx.Model:

@@ -7,6 +7,7 @@ Each argument stands once, with its default, unit and check, in the class that r
 import dataclasses
 from typing import Any
 
+from mjx_reinforce.checks import check_type, is_nan
 from mjx_reinforce.registry import check_name
 
 Range = tuple[float, float]
@@ -34,12 +35,29 @@ def build_settings(env: Any, arguments: dict[str, Any]) -> Any:
       arguments: the keyword arguments of its constructor.
 
     Raises:
-      ValueError: an argument is unknown, or its value is out of its range.
+      ValueError: an argument is unknown or missing, or its value is not of its type or range.
     """
-    known = {field.name: field for field in dataclasses.fields(env.Settings)}
+    task = type(env).__name__
+    known = {field.name: field for field in dataclasses.fields(env.Settings) if field.init}
     for name in arguments:
-        check_name(f"argument of {type(env).__name__}", name, known)
+        check_name(f"argument of {task}", name, known)
+    missing = [name for name, field in known.items() if _needed(field) and name not in arguments]
+    if missing:
+        raise ValueError(
+            f"{task} needs {', '.join(missing)}: pass them, or give them defaults in its Settings"
+        )
+    for name, field in known.items():
+        value = arguments.get(name, field.default)
+        if value is not dataclasses.MISSING:
+            check_type(f"{name} of {task}", value, field.type)
+        if is_nan(value):
+            raise ValueError(f"{name} of {task} must be a number, got nan")
     return env.Settings(**arguments)
+
+
+def _needed(field: dataclasses.Field[Any]) -> bool:
+    """Returns whether an argument has no default."""
+    return field.default is field.default_factory is dataclasses.MISSING
 
 
 def check_positive(name: str, value: int) -> None:

@@ -20,9 +20,12 @@ from mjx_reinforce import envs
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs import resume
 from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.runs.files import choose_directory, prepare, remove_empty
+from mjx_reinforce.runs.flags import accept_all_characters, read
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.presets import PRESETS
+from mjx_reinforce.runs.relevance import check_read
 from mjx_reinforce.runs.settings import GROUPS
 
 _FILES = (
@@ -42,6 +45,7 @@ def main() -> None:
     The status is 0 when done, 1 if files cannot be written or nothing is finite any more, 2 for bad
     input, 130 after Ctrl-C and 143 after SIGTERM.
     """
+    accept_all_characters()
     with Interrupt() as interrupt, contextlib.ExitStack() as held:
         sys.exit(_main(sys.argv[1:], interrupt, held))
 
@@ -50,38 +54,37 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
     """Returns the exit status of a command line; ``held`` keeps what is released at its end."""
     from mjx_reinforce.runs.files import locked
 
-    directory = None
+    made: Sequence[Path] = ()
     try:
         with _collection_paused():
             config = parse(arguments)
             check(config)
-            directory = _directory(config)
-            interrupt.on_exit(lambda: _remove_if_empty(directory))
+            directory, made = _directory(config)
+            interrupt.on_exit(lambda: remove_empty(made))
             held.enter_context(locked(directory))
             env = envs.make(config.env)
             configure_jax()
             start = _start(env, config)
     except ValueError as error:
-        _refuse(str(error), directory)
+        _refuse(str(error), made)
     try:
         return train(env, *start, config, directory, interrupt)
     except RuntimeError as error:  # XLA's
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         remedy = "lower --num-seeds, --num-episodes, --eval-episodes or --horizon"
-        _refuse(f"this run does not fit into memory ({error}); {remedy}", directory)
+        _refuse(f"this run does not fit into memory ({error}); {remedy}", made)
     except OSError as error:
         remedy = f"make room, then go on with --resume {directory}"
-        _refuse(f"cannot write the files of this run ({error}); {remedy}", directory, status=1)
+        _refuse(f"cannot write the files of this run ({error}); {remedy}", made, status=1)
 
 
-def _directory(config: Config) -> Path:
-    """Returns the run directory; makes it, unless the run goes on in its own."""
-    from mjx_reinforce.runs.files import prepare
-
+def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
+    """Returns the run directory and the folders that were made for it; one that goes on has its own."""
     if config.resume is not None:
-        return config.resume
-    return prepare(config.output, config.env, config.overwrite)
+        return config.resume, ()
+    directory = choose_directory(config.output, config.env)
+    return directory, prepare(directory, config.overwrite)
 
 
 def _start(env: Any, config: Config) -> tuple[Any, int, Any]:
@@ -100,26 +103,22 @@ def _start(env: Any, config: Config) -> tuple[Any, int, Any]:
     return learner, horizon, resume.find(learner, config, print)
 
 
-def _refuse(message: str, directory: Path | None, status: int = 2) -> NoReturn:
-    """Says what is wrong, leaves no empty run directory behind, and exits."""
-    _remove_if_empty(directory)
-    print(f"error: {message}", file=sys.stderr)
+def _refuse(message: str, made: Sequence[Path], status: int = 2) -> NoReturn:
+    """Says in one line what is wrong, removes the folders that this run made, and exits."""
+    remove_empty(made)
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
     sys.exit(status)
 
 
-def _remove_if_empty(directory: Path | None) -> None:
-    if directory and not any(directory.iterdir()):
-        directory.rmdir()
-
-
 def parse(arguments: Sequence[str]) -> Config:
-    """Returns the settings that a command line asks for; --help and bad flags exit.
+    """Returns the settings that a command line asks for; --help exits.
 
     Args:
       arguments: a preset's name, if any, then flags.
 
     Raises:
-      ValueError: there is no such preset, or the run to resume is not there or has other settings.
+      ValueError: there is no such preset or flag, a value is not of its type, a setting that is
+        given would do nothing, or the run to resume is not there or has other settings.
     """
     default, prog, preset = Config(), "python -m mjx_reinforce.train", None
     if arguments and not arguments[0].startswith("-"):
@@ -143,7 +142,7 @@ def parse(arguments: Sequence[str]) -> Config:
 
 
 def _read(arguments: Sequence[str], default: Config, prog: str) -> Config:
-    """Returns the settings that flags ask for, with others as given; --help and bad flags exit."""
+    """Returns the settings that flags ask for, with others as given; --help exits."""
     import tyro
 
     groups = [
@@ -151,10 +150,12 @@ def _read(arguments: Sequence[str], default: Config, prog: str) -> Config:
         for title, group in GROUPS.items()
     ]
     form = tyro.conf.OmitArgPrefixes[dataclasses.make_dataclass("Arguments", groups, frozen=True)]
-    parsed = tyro.cli(form, args=arguments, prog=prog, description=_description())
-    return Config(
+    parsed = read(form, arguments, prog, _description())
+    config = Config(
         **{name: x for title in GROUPS for name, x in vars(getattr(parsed, title)).items()}
     )
+    check_read(config, default)
+    return config
 
 
 def _description() -> str:

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "mjx_reinforce"
 #: Folders and root modules from the ground up; a file imports from its own folder and those before.
 ORDER = (
-    *("types", "registry", "fused", "physics", "envs", "policies", "engines", "learners"),
+    *("checks", "types", "registry", "fused", "physics", "envs", "policies", "engines", "learners"),
     *("reports", "export", "runs", "train", "watch"),
 )
 #: Who may know that our environments exist; all others take any environment as an argument.

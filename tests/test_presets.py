@@ -21,7 +21,7 @@ from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.presets import PRESETS
 
 TINY = ["--num-seeds", "2", "--max-updates", "2", "--horizon", "8"]
-TINY += ["--eval-every", "1", "--eval-episodes", "1", "--minibatch-updates", "3"]
+TINY += ["--eval-every", "1", "--eval-episodes", "1"]
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +41,17 @@ def run(monkeypatch, *arguments):
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_trains(name, monkeypatch, tmp_path):
-    arguments = [name, *TINY, "--output", "out", "--num-episodes", "2", "--num-directions", "2"]
+    ars = PRESETS[name][1].algorithm == "ars"
+    arguments = [
+        name,
+        *TINY,
+        "--output",
+        "out",
+        "--num-directions" if ars else "--num-episodes",
+        "2",
+    ]
+    if PRESETS[name][1].update == "minibatches":
+        arguments += ["--minibatch-updates", "3"]
     assert run(monkeypatch, *arguments) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     config = json.loads((tmp_path / "out" / "config.json").read_text())
@@ -61,7 +71,7 @@ def test_a_preset_makes_sense(name):
     check(config)
     assert 20 < len(line) < 100
     assert train_module.parse([name]) == config
-    assert train_module.parse([name, "--discount", "0.5"]).discount == 0.5
+    assert train_module.parse([name, "--horizon", "7"]).horizon == 7
 
 
 def test_no_preset_is_the_default():
@@ -105,11 +115,10 @@ def test_first_weights_are_pytorchs(name):
 
 
 @pytest.mark.parametrize("name", ["auto", "vmap", "fused", "kernel"])
-def test_engines_have_names(name, capsys):
+def test_engines_have_names(name):
     assert train_module.parse(["--engine", name]).engine == name
-    with pytest.raises(SystemExit):
+    with pytest.raises(ValueError, match="'vmap'"):
         train_module.parse(["--engine", "mjx"])
-    assert "'vmap'" in capsys.readouterr().err
 
 
 def test_an_unknown_preset_is_explained(monkeypatch, capsys):

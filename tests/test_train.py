@@ -161,8 +161,14 @@ def test_the_saved_policy_plays_like_the_trained_one(run, tmp_path):
         ),
         (["--max-grad-norm", "0"], "--max-grad-norm must be positive and finite, got 0.0"),
         (["--weight-decay", "-1"], "--weight-decay must be finite and not negative"),
-        (["--minibatch-size", "0"], "--minibatch-size must be at least 1"),
-        (["--value-learning-rate", "0"], "--value-learning-rate must be positive"),
+        (
+            ["--update", "minibatches", "--minibatch-size", "0"],
+            "--minibatch-size must be at least 1",
+        ),
+        (
+            ["--estimator", "value-baseline", "--value-learning-rate", "0"],
+            "--value-learning-rate must be positive",
+        ),
         (["--policy", "deterministic"], "no log-probability"),
         (["--update", "each-step"], "pass --decay-updates None"),
         (["--algorithm", "ars", "--one-start"], "--shared-starts"),

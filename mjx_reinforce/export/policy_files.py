@@ -26,7 +26,6 @@ from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.registry import DISTRIBUTIONS, check_name, load
 from mjx_reinforce.types import Box, Discrete
 
-
 #: The name in the archive of what says that it belongs to the settings beside it.
 _CHECKSUM = "checksum"
 

@@ -20,6 +20,7 @@ import optax
 
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
+from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.engines.rollouts import episode_returns
 from mjx_reinforce.learners.ars_increments import (
     check_linear,
@@ -88,6 +89,7 @@ def ars(
     Raises:
       ValueError: an argument makes no sense.
     """
+    check_environment(env)
     horizon = check_horizon(env, horizon)
     top = num_directions if top_directions is None else top_directions
     _check(num_directions, top, step_size, noise_std, update)

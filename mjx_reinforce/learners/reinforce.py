@@ -18,6 +18,7 @@ import optax
 
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
+from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.learners.learner import (
     Learner,
@@ -91,6 +92,7 @@ def reinforce(
     Raises:
       ValueError: an argument makes no sense for this environment.
     """
+    check_environment(env)
     size = observation_size(env)
     chosen = policy or mlp_policy(size, default_distribution(action_space(env)))
     return _Reinforce(

@@ -20,9 +20,11 @@ def build(env: Any, config: Config, policy: Any = None) -> tuple[Any, int]:
     Raises:
       ValueError: the settings do not fit the environment.
     """
+    from mjx_reinforce.engines.contract import check_environment
     from mjx_reinforce.export.policy_files import build_policy
     from mjx_reinforce.learners.learner import check_horizon
 
+    check_environment(env)
     if config.stop_when_solved and getattr(env, "reward_threshold", None) is None:
         raise ValueError(
             f"{config.env} names no return at which it is solved: leave --stop-when-solved out"

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mjx_reinforce import envs
+from mjx_reinforce.checks import check_type
 from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS, check_name
 from mjx_reinforce.runs.settings import (
     CheckpointSettings,
@@ -19,6 +20,10 @@ from mjx_reinforce.runs.settings import (
 
 #: The greatest number of updates, and of env steps of a seed: they are counted as int32.
 MAX_COUNT = 2**31 - 1
+#: The greatest learning rate.
+_MAX_RATE = 1000
+#: The greatest of other numbers, and one over the least: float32 holds their cubes.
+_MAX_SIZE = 1e12
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -41,6 +46,8 @@ class Config(
 
 def check(config: Config) -> None:
     """Raises ValueError for settings that make no sense: what, the value, the remedy."""
+    for field in dataclasses.fields(Config):
+        check_type(flag(field.name), getattr(config, field.name), field.type)
     envs.check_id(config.env)
     check_name("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
     check_name("estimator", config.estimator, ESTIMATORS)
@@ -48,10 +55,15 @@ def check(config: Config) -> None:
         for name in names.split():
             value = getattr(config, name)
             if not ((value is None and name in _OPTIONAL) or holds(value)):
-                raise ValueError(f"--{name.replace('_', '-')} must be {rule}, got {value}")
+                raise ValueError(f"{flag(name)} must be {rule}, got {value}")
     if config.env_steps is None and config.max_updates is None:
         raise ValueError("nothing would end this run: give --env-steps or --max-updates a number")
     (_check_reinforce if config.algorithm == "reinforce" else _check_ars)(config)
+
+
+def flag(name: str) -> str:
+    """Returns the flag of a setting."""
+    return f"--{name.replace('_', '-')}"
 
 
 def check_step_count(config: Config, horizon: int) -> None:
@@ -91,13 +103,23 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ),
     ("normalize_steps", lambda x: x >= 0, "at least 0"),
     ("env_steps", lambda x: x < 2**30, "less than 2^30, for each seed"),
-    ("max_updates", lambda x: x <= MAX_COUNT, "less than 2^31"),
+    (
+        "max_updates num_episodes horizon decay_updates eval_every eval_episodes normalize_steps "
+        "value_fits minibatch_updates minibatch_size num_directions",
+        lambda x: x <= MAX_COUNT,
+        "less than 2^31",
+    ),
     ("seed eval_seed", lambda x: 0 <= x < 2**32, "in [0, 2^32)"),
     ("discount", lambda x: 0 <= x <= 1, "in [0, 1]"),
     (
         "hidden_sizes value_hidden_sizes",
         lambda x: all(n >= 1 for n in x),
         "positive in every layer",
+    ),
+    (
+        "hidden_sizes value_hidden_sizes",
+        lambda x: all(n <= MAX_COUNT for n in x),
+        "less than 2^31 in every layer",
     ),
     (
         "initial_std learning_rate final_learning_rate max_grad_norm value_learning_rate "
@@ -109,6 +131,17 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         "standardize_floor entropy_cost weight_decay",
         lambda x: math.isfinite(x) and x >= 0,
         "finite and not negative",
+    ),
+    # Weights are about 1, and most optimisers move each of them by about the rate.
+    (
+        "learning_rate final_learning_rate value_learning_rate step_size",
+        lambda x: 1 / _MAX_SIZE <= x <= _MAX_RATE,
+        f"in [{1 / _MAX_SIZE:g}, {_MAX_RATE}], for a step moves a weight by about that",
+    ),
+    (
+        "initial_std noise_std max_grad_norm standardize_floor entropy_cost weight_decay",
+        lambda x: x == 0 or 1 / _MAX_SIZE <= x <= _MAX_SIZE,
+        f"in [{1 / _MAX_SIZE:g}, {_MAX_SIZE:g}], for runs compute in float32",
     ),
 )
 
@@ -129,6 +162,12 @@ def _check_reinforce(config: Config) -> None:
         raise ValueError(
             "--update each-step makes as many optimiser steps as an episode has, so a decay over "
             f"--decay-updates {config.decay_updates} has no length; pass --decay-updates None"
+        )
+    steps = (config.decay_updates or 0) * config.minibatch_updates
+    if config.update == "minibatches" and steps > MAX_COUNT:
+        raise ValueError(
+            f"the learning rate would decay over {steps:,} optimiser steps, more than the 2^31 - 1 "
+            "that can be counted; lower --decay-updates or --minibatch-updates"
         )
 
 

@@ -34,9 +34,10 @@ class Display:
     """A progress bar on a terminal, one line an evaluation elsewhere."""
 
     def __init__(self):
-        self.console = Console()
+        # What users name is printed as it is: "[bold]" and ":smile:" are no commands.
+        self.console = Console(markup=False, emoji=False)
         self._bar = _Bar(
-            SpinnerColumn(),
+            SpinnerColumn("line" if self.console.options.ascii_only else "dots"),
             TextColumn("{task.description}"),
             BarColumn(bar_width=30),
             TextColumn("{task.fields[done]}"),
@@ -57,8 +58,8 @@ class Display:
         self._bar.stop()
 
     def say(self, text: str, style: str | None = None) -> None:
-        """Prints a line above the bar."""
-        self.console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+        """Prints a line above the bar, in one of rich's styles."""
+        self.console.print(text, style=style, highlight=False, soft_wrap=True)
 
     def start(self, compile_seconds: float) -> None:
         """Marks the end of compilation, from where the time left is counted."""

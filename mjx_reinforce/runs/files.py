@@ -19,20 +19,28 @@ from mjx_reinforce.export.files import write_bytes
 _PACKAGES = ("mjx-reinforce", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "optax", "flax")
 
 
-def prepare(output: Path | None, env: str, overwrite: bool) -> Path:
+def choose_directory(output: Path | None, env: str) -> Path:
+    """Returns the run directory: ``output``, or ``runs/<env>-<time>`` if it is None."""
+    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")[:-3]
+    return Path("runs") / f"{env.replace(':', '.')}-{stamp}" if output is None else output
+
+
+def prepare(directory: Path, overwrite: bool) -> list[Path]:
     """Makes the run directory.
 
     Args:
-      output: where, or None for ``runs/<env>-<time>``.
-      env: the environment's id.
+      directory: where.
       overwrite: accept a directory that is not empty.
+
+    Returns:
+      The folders that were made, the innermost first.
 
     Raises:
       ValueError: it exists and is not empty, is no directory, or cannot be written.
     """
-    stamp = datetime.datetime.now().strftime("%Y%m%d-%H%M%S-%f")[:-3]
-    directory = Path("runs") / f"{env.replace(':', '.')}-{stamp}" if output is None else output
+    made: list[Path] = []
     try:
+        made = [path for path in (directory, *directory.parents) if not path.exists()]
         directory.mkdir(parents=True, exist_ok=True)
         # Where a run was killed as it wrote its first file, nothing was begun.
         names = [path.name for path in directory.iterdir()]
@@ -44,11 +52,19 @@ def prepare(output: Path | None, env: str, overwrite: bool) -> Path:
         with tempfile.TemporaryFile(dir=directory):
             pass
     except OSError as error:
+        remove_empty(made)
         raise ValueError(
             f"cannot write to the run directory {directory} ({error.strerror}); "
             "choose another --output"
         ) from error
-    return directory
+    return made
+
+
+def remove_empty(folders: Sequence[Path]) -> None:
+    """Removes those folders, the innermost first, that have nothing in them."""
+    for folder in folders:
+        with contextlib.suppress(OSError):
+            folder.rmdir()
 
 
 @contextlib.contextmanager

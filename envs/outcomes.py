@@ -1,0 +1,74 @@
+"""Checks of what a task's methods return, while they are traced."""
+
+from typing import Any
+
+from mjx_reinforce.checks import BadEnvironmentError
+
+
+def check_start(name: str, start: Any, sizes: tuple[int, int]) -> tuple[Any, Any]:
+    """Returns what ``initial`` returned, if it is positions and velocities.
+
+    Args:
+      name: of the task.
+      start: what it returned.
+      sizes: nq and nv of the model.
+
+    Raises:
+      ValueError: it is something else.
+    """
+    if not (isinstance(start, tuple | list) and len(start) == 2):
+        raise BadEnvironmentError(
+            f"{name}.initial must return qpos and qvel, got {_described(start)}"
+        )
+    for what, value, size in zip(("qpos", "qvel"), start, sizes, strict=True):
+        if _shape(value) != (size,):
+            raise BadEnvironmentError(
+                f"{name}.initial must return {what} [{size}], as the model has it, "
+                f"got {_described(value)}"
+            )
+    return start[0], start[1]
+
+
+def check_outcome(name: str, outcome: Any) -> tuple[Any, Any, dict[str, Any]]:
+    """Returns what ``outcome`` returned, if it is a reward, a termination, and terms.
+
+    Args:
+      name: of the task.
+      outcome: what it returned.
+
+    Raises:
+      ValueError: it is something else.
+    """
+    if not (isinstance(outcome, tuple | list) and len(outcome) == 3):
+        raise BadEnvironmentError(
+            f"{name}.outcome must return three values, the reward, whether the episode ended, and "
+            f"a dict of the reward's terms, got {_described(outcome)}"
+        )
+    reward, terminated, terms = outcome
+    if not isinstance(terms, dict):
+        raise BadEnvironmentError(
+            f"the third value of {name}.outcome must be a dict of the reward's terms, "
+            f"got {_described(terms)}"
+        )
+    named = {f"term {key!r}": value for key, value in terms.items()}
+    for what, value in {"reward": reward, "termination": terminated, **named}.items():
+        if _shape(value) != ():
+            raise BadEnvironmentError(
+                f"the {what} of {name}.outcome must be a scalar [], got {_described(value)}; "
+                "sum it, or take an entry"
+            )
+    return reward, terminated, terms
+
+
+def _shape(value: Any) -> tuple[int, ...] | None:
+    """Returns the shape of a number or an array, or None for what is neither."""
+    if isinstance(value, bool | int | float):
+        return ()
+    return tuple(value.shape) if hasattr(value, "shape") else None
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, tuple | list):
+        return f"a {type(value).__name__} of {len(value)}"
+    shape = _shape(value)
+    return f"{value!r}"[:80] if shape is None else f"the shape {list(shape)}"

@@ -1,0 +1,115 @@
+"""Checks of what users give, and one line for what their code, or a library, raised."""
+
+import math
+import numbers
+import sysconfig
+import textwrap
+import traceback
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+_HERE = Path(__file__).resolve().parent
+#: Code that no user wrote: Python's, installed packages, and ours.
+_LIBRARIES = (
+    *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")),
+    *(_HERE, (_HERE / "envs").resolve()),
+)
+#: Characters of somebody else's message that are shown.
+_LENGTH = 300
+#: What every environment has.
+_PARTS = ("reset", "step", "action_size")
+_KINDS: dict[Any, tuple[Any, str]] = {
+    bool: (bool, "True or False"),
+    int: (numbers.Integral, "a whole number"),
+    float: (numbers.Real, "a number"),
+    str: (str, "text"),
+    type(None): (type(None), "None"),
+}
+
+
+class BadEnvironmentError(ValueError):
+    """An environment's code does not do what an environment must."""
+
+
+def explain(error: BaseException) -> str:
+    """Returns in one line what was raised, and the last line of the user's own code before it.
+
+    The messages of JAX and MuJoCo have many lines, of which the first ones say what is wrong.
+    """
+    message = textwrap.shorten(str(error), _LENGTH, placeholder=" ...")
+    said = f"{type(error).__name__}: {message}" if message else type(error).__name__
+    own = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith("<") and not _in_library(Path(frame.filename).resolve())
+    ]
+    return f"{said} ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else said
+
+
+def _in_library(file: Path) -> bool:
+    return any(file.is_relative_to(folder) for folder in _LIBRARIES)
+
+
+def check_type(name: str, value: Any, kind: Any) -> None:
+    """Raises ValueError for a value that is not of its annotation.
+
+    Args:
+      name: what it is called, for the message.
+      value: what the user gave.
+      kind: the annotation. Of those that are neither numbers, text, None, Literal, tuples nor
+        unions of these, only classes are checked.
+    """
+    if not _fits(value, kind):
+        raise ValueError(f"{name} must be {_spoken(kind)}, got {value!r}")
+
+
+def _fits(value: Any, kind: Any) -> bool:
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, each) for each in inner)
+    if origin is typing.Literal:
+        return any(type(value) is type(each) and value == each for each in inner)
+    if origin is tuple:
+        if not isinstance(value, tuple | list):
+            return False
+        kinds = inner[:1] * len(value) if inner[-1] is ... else inner
+        return len(kinds) == len(value) and all(map(_fits, value, kinds))
+    if kind in (int, float) and isinstance(value, bool):
+        return False
+    expected = _KINDS[kind][0] if kind in _KINDS else kind
+    return isinstance(value, expected) if isinstance(expected, type) else True
+
+
+def _spoken(kind: Any) -> str:
+    """Returns an annotation in words."""
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(map(_spoken, inner))
+    if origin is typing.Literal:
+        return f"one of {', '.join(map(repr, inner))}"
+    if origin is tuple and inner[-1] is ...:
+        return f"a tuple, each entry {_spoken(inner[0])}"
+    if origin is tuple:
+        return f"({', '.join(map(_spoken, inner))})"
+    return _KINDS[kind][1] if kind in _KINDS else getattr(kind, "__name__", str(kind))
+
+
+def is_nan(value: Any) -> bool:
+    """Returns whether a value is a number that is none."""
+    return isinstance(value, numbers.Real) and math.isnan(value)
+
+
+def check_parts(env: Any) -> None:
+    """Raises ValueError for an object that has not the methods of an environment."""
+    name = type(env).__name__
+    try:
+        missing = [part for part in _PARTS if not hasattr(env, part)]
+    except Exception as error:  # action_size may be a property, the user's code
+        raise BadEnvironmentError(f"{name}.action_size fails: {explain(error)}") from error
+    if missing:
+        raise BadEnvironmentError(
+            f"{name} is no environment: it has no {', '.join(missing)}; "
+            "mjx_reinforce.Environment says what one has"
+        )

@@ -1,0 +1,86 @@
+"""Which setting is read under which condition; what would do nothing is refused."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from mjx_reinforce.runs.config import Config, flag
+
+#: Names of settings, when they are read, and how to say it. A setting may stand in several rows,
+#: the most general first. What stands in none is always read.
+READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
+    (
+        "num_episodes estimator discount discount_weights standardize standardize_floor "
+        "value_learning_rate value_fits value_hidden_sizes update minibatch_updates "
+        "minibatch_size loss_per entropy_cost optimizer learning_rate final_learning_rate "
+        "decay_updates weight_decay max_grad_norm",
+        lambda c: c.algorithm == "reinforce",
+        "--algorithm reinforce",
+    ),
+    (
+        "num_directions top_directions step_size noise_std shared_starts ars_update",
+        lambda c: c.algorithm == "ars",
+        "--algorithm ars",
+    ),
+    (
+        "value_learning_rate value_fits value_hidden_sizes",
+        lambda c: c.estimator == "value-baseline",
+        "--estimator value-baseline",
+    ),
+    ("standardize_floor", lambda c: c.standardize, "--standardize"),
+    (
+        "minibatch_updates minibatch_size",
+        lambda c: c.update == "minibatches",
+        "--update minibatches",
+    ),
+    # A minibatch is averaged over its own steps.
+    (
+        "loss_per",
+        lambda c: c.update != "minibatches",
+        "--update full-batch or --update each-step",
+    ),
+    ("final_learning_rate", lambda c: c.decay_updates is not None, "--decay-updates N"),
+    (
+        "initial_std",
+        lambda c: (
+            c.policy not in ("categorical", "deterministic")
+            and not (c.policy == "auto" and c.algorithm == "ars")
+        ),
+        "a --policy with a standard deviation",
+    ),
+    (
+        "rescale",
+        lambda c: c.policy != "categorical",
+        "a --policy for continuous actions",
+    ),
+)
+
+
+def check_read(config: Config, default: Config) -> None:
+    """Raises ValueError for settings that a user changed and that nothing would read.
+
+    Args:
+      config: the settings.
+      default: those that hold where the user gave none: our own, or a preset's.
+    """
+    changed = [
+        field.name
+        for field in dataclasses.fields(Config)
+        if getattr(config, field.name) != getattr(default, field.name)
+    ]
+    for names, is_read, condition in READ:
+        idle = [name for name in changed if name in names.split()]
+        if idle and not is_read(config):
+            flags = " ".join(_given(name, getattr(config, name)) for name in idle)
+            raise ValueError(
+                f"{flags} would do nothing: only {condition} reads that; "
+                f"{'leave it out' if len(idle) == 1 else 'leave them out'}, or choose {condition}"
+            )
+
+
+def _given(name: str, value: Any) -> str:
+    """Returns a setting as it stands on the command line."""
+    if isinstance(value, bool):
+        return flag(name) if value else flag(f"no_{name}")
+    values = value if isinstance(value, tuple) else (value,)
+    return " ".join([flag(name), *map(str, values)])

@@ -1,0 +1,520 @@
+"""Bad input: an error of one or two lines, status 2, nothing compiled, nothing left on the disk.
+
+First command lines and calls by hand, then settings drawn at random.
+"""
+
+import dataclasses
+import math
+import subprocess
+import sys
+import typing
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from rich.table import Table
+from toys import Survive
+
+from mjx_reinforce import ars, envs, reinforce
+from mjx_reinforce import train as train_module
+from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS
+from mjx_reinforce.runs import display
+from mjx_reinforce.runs.build import build
+from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.runs.presets import PRESETS
+from mjx_reinforce.runs.relevance import READ, check_read
+from mjx_reinforce.train import parse
+
+
+@pytest.fixture
+def refused(monkeypatch, tmp_path, capsys):
+    """Runs a command line that must be refused, and returns what it said."""
+    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train_module, "train", lambda *_: pytest.fail("it was not refused"))
+
+    def run(*arguments):
+        before = sorted(tmp_path.rglob("*"))
+        monkeypatch.setattr(sys, "argv", ["train", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            train_module.main()
+        printed = capsys.readouterr()
+        assert stop.value.code == 2
+        assert printed.out == ""
+        assert printed.err.startswith("error: ")
+        assert printed.err.count("\n") <= 2
+        assert len(printed.err) < 1000
+        assert sorted(tmp_path.rglob("*")) == before
+        return printed.err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--algorithm ars --learning-rate 0.1", "only --algorithm reinforce reads that"),
+        ("--algorithm ars --discount 0.5 --no-standardize", "leave them out"),
+        ("--algorithm ars --num-episodes 4", "--num-episodes 4 would do nothing"),
+        ("--algorithm ars --estimator value-baseline --value-fits 3", "would do nothing"),
+        ("--algorithm ars --max-grad-norm None", "--max-grad-norm None would do nothing"),
+        ("--num-directions 4", "--num-directions 4 would do nothing: only --algorithm ars"),
+        ("--shared-starts --step-size 0.5", "--step-size 0.5 --shared-starts would do nothing"),
+        ("--minibatch-size 64", "only --update minibatches reads that; leave it out"),
+        ("--minibatch-updates 5", "choose --update minibatches"),
+        ("--value-fits 5", "only --estimator value-baseline"),
+        ("--value-hidden-sizes", "--value-hidden-sizes would do nothing"),
+        ("--value-learning-rate 1e-2", "choose --estimator value-baseline"),
+        ("--final-learning-rate 1e-4 --decay-updates None", "only --decay-updates N"),
+        ("--no-standardize --standardize-floor 1", "only --standardize reads that"),
+        ("--update minibatches --loss-per step", "only --update full-batch"),
+        ("--env CartPole-v1 --policy categorical --initial-std 0.3", "standard deviation"),
+        ("--env CartPole-v1 --policy categorical --no-rescale", "continuous actions"),
+        ("--algorithm ars --initial-std 0.3", "standard deviation"),
+        ("gymnasium-tutorial --minibatch-size 64", "choose --update minibatches"),
+        ("continuous-cartpole-ars --learning-rate 0.1", "choose --algorithm reinforce"),
+        ("baseline-truncated-normal --final-learning-rate 1e-5", "--decay-updates N"),
+    ],
+)
+def test_settings_that_would_do_nothing_are_refused(refused, arguments, message):
+    assert message in refused(*arguments.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--learning-rate 1e30", "--learning-rate must be in [1e-12, 1000]"),
+        ("--learning-rate 1e-60", "got 1e-60"),
+        ("--learning-rate inf", "positive and finite, got inf"),
+        ("--final-learning-rate 1e9", "a step moves a weight by about that"),
+        ("--estimator value-baseline --value-learning-rate 1e9", "--value-learning-rate must be"),
+        ("--algorithm ars --step-size 1e9", "--step-size must be"),
+        ("--algorithm ars --noise-std 1e20", "in float32"),
+        ("--initial-std 1e20", "in float32"),
+        ("--initial-std -1", "positive and finite"),
+        ("--standardize-floor 1e30", "in float32"),
+        ("--entropy-cost -1", "not negative"),
+        ("--max-grad-norm nan", "positive and finite, got nan"),
+        ("--discount -0.1", "in [0, 1], got -0.1"),
+        ("--seed -1", "--seed must be in [0, 2^32), got -1"),
+        ("--eval-seed 4294967296", "--eval-seed must be in [0, 2^32)"),
+        ("--eval-every 0", "--eval-every must be at least 1"),
+        ("--eval-every 4294967296", "--eval-every must be less than 2^31"),
+        ("--horizon 99999999999999999999", "--horizon must be less than 2^31"),
+        ("--normalize-steps -1", "at least 0"),
+        ("--normalize-steps 99999999999", "less than 2^31"),
+        ("--hidden-sizes 32 -1", "positive in every layer"),
+        ("--hidden-sizes 99999999999", "less than 2^31 in every layer"),
+        ("--decay-updates 0", "--decay-updates must be at least 1"),
+        (
+            "--update minibatches --minibatch-updates 50000 --decay-updates 50000",
+            "decay over 2,500,000,000 optimiser steps",
+        ),
+        ("--num-seeds abc", "--num-seeds: invalid literal for int() with base 10: 'abc'"),
+        ("--num-seeds 1e3", "'1e3'"),
+        ("--num-seeds", "Missing value for argument '--num-seeds'"),
+        ("--num-seeds 3 4", "no flag takes '4'"),
+        ("--num-sedes 3", "unknown flag '--num-sedes'. Did you mean '--num-seeds'?"),
+        ("--num-sedes=3", "unknown flag '--num-sedes'. Did you mean '--num-seeds'?"),
+        ("--no-such-thing", "unknown flag '--no-such-thing'."),
+        ("-x", "unknown flag '-x'."),
+        ("--algorithm ppo", "invalid choice 'ppo' for argument '--algorithm'"),
+        ("--hidden-sizes a", "--hidden-sizes"),
+        ("--hidden-sizes 4.5", "--hidden-sizes"),
+        ("--learning-rate fast", "--learning-rate"),
+        ("--optimizer rmsprop", "('adam', 'adamw', 'sgd')"),
+        ("--one-start yes", "no flag takes 'yes'"),
+        ("gymnasium-tutorail", "Did you mean 'gymnasium-tutorial'"),
+        ("--env :X", "':X' is not of the form module:Class"),
+        ("--env os:", "not of the form module:Class"),
+        ("--env a:b:c", "not of the form module:Class"),
+        ("--env .relative:X", "not of the form module:Class"),
+        ("--env folder/own_model.py:Crane", "not of the form module:Class"),
+        ("--env os:path", "'os:path' is no class or function, but of type module"),
+        ("--env bad_envs:A_CONSTANT", "is no class or function, but of type int"),
+        ("--env nowhere:X", "No module named 'nowhere'"),
+        ("--env os:Nowhere", "has no attribute 'Nowhere'"),
+        ("--env json:JSONDecoder", "JSONDecoder is no environment: it has no reset, step"),
+        ("--env os:getcwd", "str is no environment"),
+        ("--env bad_envs:not_registered", "unknown environment 'Nowhere-v0'"),
+        ("--env mjx_reinforce.envs.base:MujocoEnv", "abstract"),
+        ("--env CartPole-v1 --policy normal", "continuous action space"),
+        ("--env Survive-v0 --policy categorical", "discrete action space"),
+        ("--env Survive-v0 --no-shared-trunk", "without a shared trunk"),
+        ("--env Survive-v0 --engine kernel", "kernel engine"),
+        ("--env Survive-v0 --output new/deep/run --no-shared-trunk", "without a shared trunk"),
+    ],
+)
+def test_bad_command_lines_are_refused(refused, arguments, message):
+    assert message in refused(*arguments.split())
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("raise RuntimeError('the robot\\n\\nis off')", "RuntimeError: the robot is off"),
+        ("class Broken(:", "SyntaxError"),
+        ("import sys; sys.exit(3)", "SystemExit: 3"),
+        ("import nowhere_at_all", "No module named 'nowhere_at_all'"),
+        ("1 / 0", "ZeroDivisionError: division by zero (own_broken.py, line 1)"),
+    ],
+)
+def test_a_module_that_cannot_be_imported_is_named(refused, monkeypatch, tmp_path, text, message):
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "own_broken", raising=False)
+    (tmp_path / "own_broken.py").write_text(text)
+    said = refused("--env", "own_broken:Mine")
+    assert message in said
+    assert "'own_broken:Mine'" in said
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("Nothing", "Nothing is no environment: it has no reset, step, action_size"),
+        ("NeedsArgument", "missing 1 required positional argument: 'size'"),
+        ("Raises", "RuntimeError: no such robot (bad_envs.py, line"),
+        ("Refuses", "could not be broadcast together"),
+        ("ActionSizeRaises", "ActionSizeRaises.action_size fails: KeyError: 'size' (bad_envs.py"),
+        ("ActionSizeIsText", "action_size must be a whole number, 1 or more, got 'one'"),
+        ("NoActions", "action_size must be a whole number, 1 or more, got 0"),
+        ("ForeignSpace", "ForeignSpace.action_space is a types.SimpleNamespace"),
+        ("SpaceOfTwo", "of 1 entries each as action_size says"),
+        ("SpaceUpsideDown", "must have low < high"),
+        ("LimitIsText", "max_episode_steps must be a whole number, 1 or more, got 'many'"),
+        ("LimitIsZero", "got 0"),
+        ("ThresholdIsNan", "reward_threshold must be a number or None, got nan"),
+        ("ResetRaises", "ResetRaises.reset fails: AttributeError:"),
+        ("ResetReturnsNone", "whose obs is a vector [O], and there is no obs"),
+        ("ResetWithoutReward", "whose reward is a scalar [], and there is no reward"),
+        ("ObservationDict", "whose obs is a vector [O], and it is a dict"),
+        ("ObservationMatrix", "must be a vector [O], its shape is [2, 3]"),
+        ("ObservationNumber", "must be a vector [O], its shape is []"),
+        ("ObservationEmpty", "must be a vector [O], its shape is [0]"),
+        ("RewardVector", "the reward of RewardVector.reset must be a scalar [], its shape is [1]"),
+        ("DoneVector", "the done of DoneVector.reset must be a scalar [], its shape is [3]"),
+        ("StepTypo", "StepTypo.step fails: NameError: name 'reward' is not defined (bad_envs.py"),
+        ("StepBranches", "StepBranches.step fails: TracerBoolConversionError"),
+        ("StepCallsNumpy", "StepCallsNumpy.step fails: TracerArrayConversionError"),
+        ("StepReturnsTuple", "with the entries that reset's has"),
+        ("StepRewardVector", "reward is float32[] after reset, and float32[1] after step"),
+        ("StepObservationGrows", "obs is float32[1] after reset, and float32[2] after step"),
+        ("StepRewardFloat", "reward is int32[] after reset, and float32[] after step"),
+        ("StepAddsInfo", "info['distance'] only after step"),
+        ("OutcomeOfTwo", "OutcomeOfTwo.outcome must return three values"),
+        ("OutcomeIsNumber", "got the shape []"),
+        ("OutcomeRewardVector", "the reward of OutcomeRewardVector.outcome must be a scalar []"),
+        ("OutcomeRewardOne", "got the shape [1]"),
+        ("OutcomeRewardNone", "must be a scalar [], got None"),
+        ("OutcomeEndVector", "the termination of OutcomeEndVector.outcome must be a scalar []"),
+        ("OutcomeTermVector", "the term 'cost' of OutcomeTermVector.outcome must be a scalar []"),
+        ("OutcomeTermsList", "must be a dict of the reward's terms, got a list of 1"),
+        ("OutcomeNoField", "mjx.Data has no field 'qposition'"),
+        ("InitialOfOne", "InitialOfOne.initial must return qpos and qvel, got the shape [2]"),
+        ("InitialTooLong", "must return qpos [2], as the model has it, got the shape [3]"),
+        ("ObserveMatrix", "must be a vector [O], its shape is [2, 2]"),
+        ("SettingsWithoutDefaults", "needs max_episode_steps, reward_threshold, xml_file"),
+        ("WrongSetting", "frame_skip of WrongSetting must be a whole number, got 'two'"),
+        ("UnknownSetting", "unknown argument of UnknownSetting 'skip'"),
+        ("NoSuchModel", "there is no model './nowhere.xml'"),
+    ],
+)
+def test_an_environment_with_a_mistake_is_refused(refused, name, message):
+    assert message in refused("--env", f"bad_envs:{name}", "--num-seeds", "1")
+
+
+def test_the_environments_that_those_change_are_right(monkeypatch):
+    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
+    for id in ("Survive-v0", "bad_envs:Pole"):
+        build(envs.make(id), Config(env=id, engine="vmap"))
+
+
+@pytest.mark.parametrize("learner", [reinforce, ars])
+def test_learners_refuse_them_too(learner):
+    import bad_envs
+
+    with pytest.raises(ValueError, match=r"StepTypo\.step fails: NameError"):
+        learner(bad_envs.StepTypo())
+
+
+MODEL = "<mujoco><worldbody>{}</worldbody></mujoco>"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "XML"),
+        ("not a model", "XML"),
+        (MODEL.format("<geom size='1'/"), "XML"),
+        (MODEL.format("<goem size='1'/>"), "unrecognized XML element.*goem"),
+        (MODEL.format("<geom size='a'/>"), "line 1"),
+        (MODEL.format("<geom type='mesh' mesh='far'/>"), "far"),
+        (MODEL.format("<body><joint/></body>"), "mass"),
+        (MODEL.format(""), "no actuators"),
+    ],
+)
+def test_an_error_in_a_model_names_the_file(monkeypatch, tmp_path, text, message):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.xml").write_text(text)
+    with pytest.raises(ValueError, match=rf"'\./mine\.xml'.*{message}") as caught:
+        envs.make("InvertedPendulum-v5", xml_file="./mine.xml")
+    assert str(caught.value).count("\n") <= 1
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.xml"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"frame_skip": 1.5}, "frame_skip of InvertedPendulum must be a whole number, got 1.5"),
+        ({"max_episode_steps": None}, "must be a whole number, got None"),
+        ({"reward_threshold": "high"}, "must be a number or None, got 'high'"),
+        ({"reset_noise_scale": float("nan")}, "must be a number, got nan"),
+        ({"reset_noise_scale": True}, "must be a number, got True"),
+        ({"xml_file": Path("a/b.xml")}, "xml_file of InvertedPendulum must be text"),
+        ({"solver": None}, "solver of InvertedPendulum must be text, got None"),
+    ],
+)
+def test_arguments_of_the_wrong_type_are_refused(wrong, message):
+    with pytest.raises(ValueError, match=message):
+        envs.make("InvertedPendulum-v5", **wrong)
+
+
+@pytest.mark.parametrize(
+    ("id", "entry", "message"),
+    [
+        ("CartPole-v1", Survive, "already registered"),
+        ("mine:Own", Survive, "letters, digits"),
+        ("../away", Survive, "letters, digits"),
+        ("Mine-v0", "bad_envs:Pole", "must be a class or function"),
+    ],
+)
+def test_what_cannot_be_registered_is_refused(id, entry, message):
+    with pytest.raises(ValueError, match=message):
+        envs.register(id, entry)
+    assert envs._TABLE.get(id, (None,))[0] is not entry
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"num_seeds": "4"},
+        {"num_seeds": 2.5},
+        {"num_seeds": True},
+        {"algorithm": "ppo"},
+        {"hidden_sizes": 32},
+        {"hidden_sizes": (32, None)},
+        {"standardize": 1},
+        {"env": None},
+        {"learning_rate": "fast"},
+        {"learning_rate": None},
+        {"output": "out"},
+    ],
+)
+def test_settings_of_the_wrong_type_are_refused(wrong):
+    (name,) = wrong
+    with pytest.raises(ValueError, match=f"--{name.replace('_', '-')} must be "):
+        check(Config(**wrong))
+
+
+# What is read.
+
+
+class Reader:
+    """Settings that remember which of them were looked at."""
+
+    def __init__(self, config):
+        self._config, self.read = config, set()
+
+    def __getattr__(self, name):
+        self.read.add(name)
+        return getattr(self._config, name)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"algorithm": "ars", "hidden_sizes": ()},
+        {"update": "minibatches"},
+        {"update": "each-step", "decay_updates": None},
+        {"standardize": False, "estimator": "value-baseline"},
+    ],
+)
+def test_the_table_says_what_is_read(changes):
+    """The settings of the table that building looks at are those whose conditions hold."""
+    config = Config(env="Survive-v0", engine="vmap", **changes)
+    reader = Reader(config)
+    build(Survive(), reader)
+    listed = {name for names, _, _ in READ for name in names.split()}
+    idle = {name for names, is_read, _ in READ if not is_read(config) for name in names.split()}
+    # These three are always handed on; the policy or the update does not look at them.
+    handed = {"initial_std", "rescale", "loss_per"}
+    assert (listed - idle) - handed == (listed & reader.read) - handed
+
+
+@pytest.mark.parametrize("name", [None, *PRESETS])
+def test_no_default_is_refused(name):
+    """Also where a flag says what holds anyway, or another mode makes presets' settings idle."""
+    start = [] if name is None else [name]
+    default = parse(start)
+    assert parse([*start, "--minibatch-size", str(default.minibatch_size)]) == default
+    for algorithm in ("reinforce", "ars"):
+        assert parse([*start, "--algorithm", algorithm]).algorithm == algorithm
+
+
+# What users write is printed as it is.
+
+
+@pytest.mark.parametrize("text", ["t/[bold]x", "t/[/b]", "t/:smile:", "t/[link=x]y"])
+def test_text_is_not_read_as_markup(text, capsys):
+    """Neither in lines nor in tables; ``print_summary`` uses the display's console."""
+    shown = display.Display()
+    shown.say(text)
+    shown.say(text, style="yellow")
+    table = Table(title=text)
+    table.add_row(text)
+    shown.console.print(table)
+    assert capsys.readouterr().out.count(text) == 4
+
+
+def test_a_run_in_a_folder_with_brackets_names_it(monkeypatch, tmp_path, capsys):
+    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
+    monkeypatch.chdir(tmp_path)
+    arguments = "--env Survive-v0 --num-seeds 1 --max-updates 1 --hidden-sizes --output t/[/b]é"
+    monkeypatch.setattr(sys, "argv", ["train", *arguments.split()])
+    with pytest.raises(SystemExit) as stop:
+        train_module.main()
+    assert stop.value.code == 0
+    assert "t/[/b]é" in capsys.readouterr().out
+    assert (tmp_path / "t" / "[/b]é" / "summary.json").exists()
+
+
+@pytest.mark.parametrize("accent", ["é", "日本", "\U0001f916"])
+def test_an_ascii_terminal_shows_escapes(tmp_path, accent):
+    code = (
+        "from pathlib import Path\n"
+        "from mjx_reinforce.runs.flags import accept_all_characters\n"
+        "from mjx_reinforce.runs.display import Display\n"
+        "accept_all_characters()\n"
+        f"Display().say({accent!r})\n"
+    )
+    environ = {"PYTHONIOENCODING": "ascii", "LANG": "C", "PYTHONPATH": ":".join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environ)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.decode("ascii").strip() == ascii(accent).strip("'")
+    command = [sys.executable, "-m", "mjx_reinforce.train", "--env", accent]
+    done = subprocess.run(command, capture_output=True, env=environ, cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.decode("ascii").startswith("error: unknown environment")
+
+
+# At random.
+
+_FEW = settings(derandomize=True, deadline=None, database=None, max_examples=150)
+_MANY = settings(_FEW, max_examples=1000, suppress_health_check=[HealthCheck.too_slow])
+_TEXT = st.text(max_size=8)
+_WRONG_NUMBERS = st.sampled_from([math.nan, math.inf, -math.inf, 1e30, -1.0, 1e-50])
+
+
+def named(*kinds):
+    """Returns the settings with one of these annotations."""
+    return [field.name for field in dataclasses.fields(Config) if field.type in kinds]
+
+
+#: Whole numbers that are not at least 1 and less than 2^31.
+_OTHER_COUNTS = {"seed", "eval_seed", "num_seeds", "normalize_steps", "top_directions"}
+_COUNTS = sorted({*named(int, int | None)} - _OTHER_COUNTS)
+_NUMBERS, _SWITCHES = named(float, float | None), named(bool)
+_SIZES = named(tuple[int, ...])
+_NAMES = ["policy", "estimator"]
+_NAMES += [f.name for f in dataclasses.fields(Config) if typing.get_origin(f.type) is Literal]
+#: Values that must be refused, whatever the other settings are.
+WRONG = {
+    **dict.fromkeys(
+        _COUNTS,
+        st.integers(max_value=0) | st.integers(min_value=2**31) | st.floats() | _TEXT,
+    ),
+    **dict.fromkeys(_NUMBERS, _WRONG_NUMBERS | st.floats(max_value=-1e-9) | _TEXT | st.booleans()),
+    **dict.fromkeys(_NAMES, _TEXT | st.none() | st.integers()),
+    **dict.fromkeys(_SWITCHES, st.integers() | _TEXT | st.none()),
+    **dict.fromkeys(
+        _SIZES,
+        st.lists(st.integers(max_value=0) | st.floats(), min_size=1, max_size=3).map(tuple)
+        | st.integers()
+        | _TEXT,
+    ),
+    **dict.fromkeys(("seed", "eval_seed"), st.integers(max_value=-1) | st.integers(2**32) | _TEXT),
+    "num_seeds": st.integers(max_value=0) | st.floats() | _TEXT,
+    "normalize_steps": st.integers(max_value=-1) | st.integers(min_value=2**31) | _TEXT,
+    "discount": st.floats(max_value=-1e-9) | st.floats(min_value=1.001) | st.just(math.nan) | _TEXT,
+    "env": _TEXT.filter(lambda text: ":" not in text) | st.none(),
+    "output": _TEXT | st.integers(),
+}
+#: Values that make sense by themselves.
+RIGHT = {
+    **dict.fromkeys(_COUNTS, st.integers(1, 9)),
+    **dict.fromkeys(_NUMBERS, st.floats(1e-6, 1.0)),
+    **dict.fromkeys(_SWITCHES, st.booleans()),
+    **dict.fromkeys(_SIZES, st.lists(st.integers(1, 9), max_size=2).map(tuple)),
+    "num_seeds": st.integers(1, 9),
+    "normalize_steps": st.none() | st.integers(0, 9),
+    "decay_updates": st.none() | st.integers(1, 9),
+    "top_directions": st.none() | st.integers(1, 9),
+    "algorithm": st.sampled_from(["reinforce", "ars"]),
+    "policy": st.sampled_from(["auto", *DISTRIBUTIONS]),
+    "estimator": st.sampled_from([*ESTIMATORS]),
+    "update": st.sampled_from(["full-batch", "minibatches", "each-step"]),
+    "ars_update": st.sampled_from(["paper", "document"]),
+    "loss_per": st.sampled_from(["episode", "step"]),
+    "initializer": st.sampled_from(["orthogonal", "torch"]),
+    "optimizer": st.sampled_from(["adam", "adamw", "sgd"]),
+}
+_SOME_RIGHT = st.fixed_dictionaries({}, optional=RIGHT)
+
+
+def refusal(function):
+    """Returns what a function said when it refused, or None; any other exception goes on."""
+    try:
+        function()
+    except ValueError as error:
+        message = str(error)
+        return message if 0 < len(message.splitlines()) <= 2 else pytest.fail(message)
+    except SystemExit as stop:  # --help
+        return pytest.fail(f"exit {stop.code}") if stop.code else None
+    return None
+
+
+@_MANY
+@given(
+    st.sampled_from(sorted(WRONG)).flatmap(lambda n: st.tuples(st.just(n), WRONG[n])), _SOME_RIGHT
+)
+def test_settings_out_of_range_are_refused(wrong, others):
+    name, value = wrong
+    assert refusal(lambda: check(Config(**(others | {name: value}))))
+
+
+@_FEW
+@given(_SOME_RIGHT)
+def test_settings_that_make_sense_alone_build_or_are_refused(others):
+    config = Config(**{"engine": "vmap", **others})
+
+    def read():
+        check_read(config, Config())
+        check(config)
+        build(Survive(), config)
+
+    refusal(read)
+
+
+_FLAGS = sorted(f"--{name.replace('_', '-')}" for name in {**WRONG, **RIGHT})
+_WORDS = st.sampled_from(_FLAGS) | _TEXT | st.integers().map(str) | st.floats().map(str)
+_WORDS |= st.sampled_from(["None", "True", "--", "-", "=", "--=", "nan", "1e400", "[bold]", "{}"])
+
+
+@_FEW
+@given(st.lists(_WORDS, min_size=1, max_size=6))
+def test_command_lines_are_read_or_refused(words):
+    refusal(lambda: check(parse(words)))
