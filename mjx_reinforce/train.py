@@ -80,7 +80,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
 
 
 def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
-    """Returns the run directory and the folders that were made for it; one that goes on has its own."""
+    """Returns the run directory, and the folders that were made for it."""
     if config.resume is not None:
         return config.resume, ()
     directory = choose_directory(config.output, config.env)

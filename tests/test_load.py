@@ -1,6 +1,7 @@
 """A trained policy in three lines: which seed, which action, and every damage named."""
 
 import re
+import shutil
 import sys
 
 import gymnasium
