@@ -18,6 +18,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs.build import build, policy_settings
 from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.runs.defaults import named_task, of_task
 from mjx_reinforce.runs.files import prepare
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.settings import GROUPS
@@ -72,7 +73,7 @@ def parse(arguments: Sequence[str]) -> Config:
     Raises:
       ValueError: there is no such preset.
     """
-    default, prog = Config(), "python -m mjx_reinforce.train"
+    default, prog = of_task(named_task(arguments)), "python -m mjx_reinforce.train"
     if arguments and not arguments[0].startswith("-"):
         name, *arguments = arguments
         check_name("preset", name, PRESETS)
@@ -96,6 +97,8 @@ def _description() -> str:
     return (
         "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. "
         f"Leaves {', '.join(_FILES)} in the run directory.\n\n"
+        "Defaults depend on the task: --help shows those of InvertedPendulum-v5, --help --env ID "
+        "those of another.\n\n"
         f"Presets, published programs whose settings replace the defaults:\n{presets}\n\n"
         f"Environments: {', '.join(envs.names())}."
     )
