@@ -3,10 +3,11 @@
 import contextlib
 import importlib.resources
 import io
+import warnings
 from pathlib import Path
 from typing import Any
 
-from mujoco import MjModel  # pyright: ignore[reportAttributeAccessIssue] - a C extension
+from mujoco import MjModel, MjSpec  # pyright: ignore[reportAttributeAccessIssue] - a C extension
 
 # MJX prints two lines when its optional Warp backend is not installed; this
 # package asks for the JAX implementation by name, so they only worry people.
@@ -48,7 +49,10 @@ def load(xml_file: str) -> Any:
                 f"the package has no model {xml_file!r}; give a path with a folder for your own, "
                 f"such as './{xml_file}'"
             )
-        model = MjModel.from_xml_string(asset.read_text(encoding="utf-8"))
+        with warnings.catch_warnings():
+            # HalfCheetah's total mass is given as Gymnasium gives it, which MuJoCo deprecates.
+            warnings.filterwarnings("ignore", ".*'settotalmass' is deprecated")
+            model = MjSpec.from_string(asset.read_text(encoding="utf-8")).compile()
     if not model.nu:
         raise ValueError(f"the model {xml_file!r} has no actuators; add an <actuator> element")
     return model

@@ -16,10 +16,13 @@ import tyro
 
 from mjx_reinforce import envs
 from mjx_reinforce.registry import check_name
+from mjx_reinforce.runs.alarms import silence_alarms
 from mjx_reinforce.runs.build import build, policy_settings
 from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.defaults import named_task, of_task
 from mjx_reinforce.runs.files import prepare
+from mjx_reinforce.runs.memory import check_size
+from mjx_reinforce.runs.plan import Plan, make_plan
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.settings import GROUPS
 
@@ -36,18 +39,21 @@ _FILES = (
 def main() -> None:
     """Reads the command line, trains, and exits: 0 done, 2 bad input, 130 interrupted."""
     directory = None
+    silence_alarms()
     try:
         with _collection_paused():
             config = parse(sys.argv[1:])
             check(config)
+            check_size(config)
             directory = prepare(config.output, config.env, config.overwrite)
             env = envs.make(config.env)
             _configure_jax()
             learner, horizon = build(env, config)
+            plan = make_plan(env, learner, horizon, config)
     except ValueError as error:
         _refuse(str(error), directory)
     try:
-        interrupted = train(env, learner, horizon, config, directory)
+        interrupted = train(env, learner, horizon, config, plan, directory)
     except RuntimeError as error:  # XLA's
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
@@ -117,7 +123,9 @@ def _configure_jax() -> None:
         jax.config.update("jax_default_matmul_precision", "highest")
 
 
-def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path) -> bool:
+def train(
+    env: Any, learner: Any, horizon: int, config: Config, plan: Plan, directory: Path
+) -> bool:
     """Trains to the budget, or to Ctrl-C, and writes the run's files.
 
     Args:
@@ -125,6 +133,7 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
       learner: how.
       horizon: the time limit of an episode in steps.
       config: the settings of the run.
+      plan: what is said of it beforehand.
       directory: where the files go.
 
     Returns:
@@ -140,9 +149,9 @@ def train(env: Any, learner: Any, horizon: int, config: Config, directory: Path)
 
     threshold = getattr(env, "reward_threshold", None)
     with Display() as display, Interrupt(display.say) as interrupt:
-        display.say(f"engine {learner.engine.name}: {learner.engine.why}; compiling")
+        display.say(plan.text)
         started = time.perf_counter()
-        with _collection_paused():
+        with _collection_paused(), display.compiling(plan.compiling):
             state = first_state(learner, config)
             programs = compile_programs(env, learner, horizon, config, state)
         compile_seconds = time.perf_counter() - started

@@ -15,6 +15,7 @@ from rich.progress import track
 
 from mjx_reinforce import envs
 from mjx_reinforce.export.films import Renderer, import_mujoco, mediapy_with_ffmpeg, write_film
+from mjx_reinforce.runs.alarms import silence_alarms
 
 #: Frames a second at most: what a film shows, and what GIF viewers play.
 _MAX_RATE = 30
@@ -47,6 +48,7 @@ class Settings:
 
 def main() -> None:
     """Reads the command line, films, and exits: 0 done, 2 bad input, 130 interrupted."""
+    silence_alarms()
     settings = tyro.cli(Settings, prog="python -m mjx_reinforce.watch")
     try:
         film(settings)

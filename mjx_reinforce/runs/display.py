@@ -1,6 +1,8 @@
 """What a user sees while a run goes on and when it ends."""
 
+import time
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,8 @@ from rich.progress import (
 from rich.table import Table
 
 from mjx_reinforce.runs import record
+from mjx_reinforce.runs.heartbeat import heartbeat
+from mjx_reinforce.runs.plan import duration
 
 
 class Display:
@@ -50,8 +54,21 @@ class Display:
         """Prints a line above the bar."""
         self.console.print(text, highlight=False, soft_wrap=True)
 
+    def compiling(self, expected: float | None) -> AbstractContextManager[None]:
+        """Returns a ``with`` block that shows that its contents go on.
+
+        Args:
+          expected: how long they take (s), or None if that is not known.
+        """
+        if not self.console.is_terminal:
+            return heartbeat(self.say, expected)
+        if expected is not None:
+            self._bar.update(self._task, description=f"compiling, about {duration(expected)}")
+        return nullcontext()
+
     def start(self, compile_seconds: float) -> None:
         """Marks the end of compilation, from where the time left is counted."""
+        self._began = time.perf_counter()
         self.say(f"compiled in {compile_seconds:.1f} s")
         self._bar.reset(self._task, total=1.0, description="training")
 
@@ -64,7 +81,14 @@ class Display:
         self._bar.update(self._task, completed=progress.fraction, description=text)
         if not self.console.is_terminal:
             steps = f"{progress.env_steps:12,.0f} env steps a seed"
-            self.say(f"update {progress.updates:5d}  {steps}  {text}")
+            self.say(f"update {progress.updates:5d}  {steps}  {text}{self._left(progress)}")
+
+    def _left(self, progress: record.Progress) -> str:
+        """Returns how long the run still takes, if it goes on as until now."""
+        if not 0 < progress.fraction < 1:
+            return ""
+        elapsed = time.perf_counter() - self._began
+        return f"  about {duration(elapsed / progress.fraction - elapsed)} left"
 
     def show_nonfinite(self, event: Mapping[str, Any]) -> None:
         """Names an update with numbers that are not finite, from ``Record.add_updates``."""
