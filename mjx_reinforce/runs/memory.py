@@ -12,6 +12,7 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
+from mjx_reinforce.runs.blocks import block_length
 from mjx_reinforce.runs.config import MAX_COUNT, Config
 from mjx_reinforce.runs.measured import TASKS, Task
 
@@ -62,7 +63,7 @@ def parts(config: Config, task: Task) -> list[Part]:
         Part(_FLOAT * network, "--hidden-sizes, --num-seeds or --num-episodes"),
         Part(_FLOAT * steps * values_hidden, "--value-hidden-sizes, --num-seeds or --horizon"),
         Part(_EVALUATED * evaluated, "--eval-episodes, --num-seeds or --horizon"),
-        Part(_FLOAT * _METRICS * seeds * config.eval_every, "--eval-every or --num-seeds"),
+        Part(_FLOAT * _METRICS * seeds * block_length(config), "--eval-every or --num-seeds"),
     ]
 
 

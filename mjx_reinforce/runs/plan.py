@@ -112,12 +112,12 @@ def this_machine() -> Machine:
 
 
 def duration(seconds: float) -> str:
-    """Returns a time for people, to one or two digits."""
+    """Returns a time for people, to two digits."""
     for unit, length in (("s", 1.0), ("min", 60.0), ("h", 3600.0)):
         number = seconds / length
         if number < 100 or unit == "h":
             break
-    return f"{float(f'{number:.2g}'):,.0f} {unit}" if number >= 1 else f"1 {unit}"
+    return f"{float(f'{max(number, 1):.2g}'):g} {unit}"
 
 
 def _range(seconds: float) -> str:

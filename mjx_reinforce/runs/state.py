@@ -13,14 +13,12 @@ from jax import lax
 
 from mjx_reinforce.learners.learner import Learner, TrainState
 from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.runs.blocks import block_length
 from mjx_reinforce.runs.config import MAX_COUNT, Config
 from mjx_reinforce.runs.evaluation import evaluate
 from mjx_reinforce.types import Environment
 
 Arrays = dict[str, np.ndarray]
-
-#: A block of so many updates has room for them whatever the budget is; it takes little memory.
-_ALWAYS_ROOM = 100
 
 
 @struct.dataclass(kw_only=True)
@@ -110,21 +108,6 @@ def _key(seed: int, domain: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(seed), domain)
 
 
-def block_length(config: Config) -> int:
-    """Returns how many updates a block between two evaluations has room for.
-
-    That is ``eval_every``, but where it is great no more than the budget can need, at one step an
-    episode. A block that is shorter anyway does not depend on the budget, so that a run with
-    another budget finds its programs in the compilation cache.
-    """
-    bounds = [config.eval_every]
-    if config.max_updates is not None:
-        bounds.append(config.max_updates)
-    if config.env_steps is not None:
-        bounds.append(-(-config.env_steps // config.episodes_per_update))
-    return min(config.eval_every, max(_ALWAYS_ROOM, min(bounds)))
-
-
 def _budget(config: Config) -> Budget:
     """Returns the budget; what has no limit has the greatest count."""
     limits = (config.env_steps, config.max_updates)
@@ -142,6 +125,7 @@ def _advance(learner: Learner, length: int) -> Callable[..., Any]:
         used = state.env_steps >= budget.env_steps
         return ~(used | (state.train_states.num_updates >= budget.updates))
 
+    @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
     def update(state: RunState, budget: Budget) -> tuple[RunState, dict[str, jax.Array]]:
         going = active(state, budget)
         train_states, metrics = jax.vmap(learner.step)(state.train_states, going)
