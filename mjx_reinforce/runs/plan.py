@@ -121,7 +121,8 @@ def duration(seconds: float) -> str:
 
 
 def _range(seconds: float) -> str:
-    return f"about {duration(seconds / _ACCURACY)} to {duration(seconds * _ACCURACY)}"
+    least, most = duration(seconds / _ACCURACY), duration(seconds * _ACCURACY)
+    return f"about {least} to {most}" if least != most else f"about {least}"
 
 
 def _what(config: Config) -> str:
