@@ -3,11 +3,12 @@
 import contextlib
 import importlib.resources
 import io
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from mujoco import MjModel  # pyright: ignore[reportAttributeAccessIssue] - a C extension
+from mujoco import MjModel, MjSpec  # pyright: ignore[reportAttributeAccessIssue] - a C extension
 
 from mjx_reinforce.checks import explain
 
@@ -51,7 +52,11 @@ def load(xml_file: str) -> Any:
                 f"the package has no model {xml_file!r}; give a path with a folder for your own, "
                 f"such as './{xml_file}'"
             )
-        model = _compile(MjModel.from_xml_string, asset.read_text(encoding="utf-8"), xml_file)
+        with warnings.catch_warnings():
+            # HalfCheetah's total mass is given as Gymnasium gives it, which MuJoCo deprecates.
+            warnings.filterwarnings("ignore", ".*'settotalmass' is deprecated")
+            text = asset.read_text(encoding="utf-8")
+            model = _compile(lambda text: MjSpec.from_string(text).compile(), text, xml_file)
     if not model.nu:
         raise ValueError(f"the model {xml_file!r} has no actuators; add an <actuator> element")
     return model

@@ -12,31 +12,20 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn
 
 from mjx_reinforce import envs
-from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs import resume
+from mjx_reinforce.runs.alarms import silence_alarms
+from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.files import choose_directory, prepare, remove_empty
-from mjx_reinforce.runs.flags import accept_all_characters, read
+from mjx_reinforce.runs.flags import accept_all_characters
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
-from mjx_reinforce.runs.presets import PRESETS
-from mjx_reinforce.runs.relevance import check_read
-from mjx_reinforce.runs.settings import GROUPS
-
-_FILES = (
-    "config.json",
-    "metrics.csv",
-    "returns.npz",
-    "summary.json",
-    "learning_curve.png",
-    "policy/",
-    "checkpoint/",
-)
+from mjx_reinforce.runs.memory import check_size
+from mjx_reinforce.runs.plan import Plan, make_plan
 
 
 def main() -> None:
@@ -46,6 +35,7 @@ def main() -> None:
     input, 130 after Ctrl-C and 143 after SIGTERM.
     """
     accept_all_characters()
+    silence_alarms()
     with Interrupt() as interrupt, contextlib.ExitStack() as held:
         sys.exit(_main(sys.argv[1:], interrupt, held))
 
@@ -59,16 +49,18 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
         with _collection_paused():
             config = parse(arguments)
             check(config)
+            check_size(config)
             directory, made = _directory(config)
             interrupt.on_exit(lambda: remove_empty(made))
             held.enter_context(locked(directory))
             env = envs.make(config.env)
             configure_jax()
-            start = _start(env, config)
+            learner, horizon, found = _start(env, config)
+            plan = make_plan(env, learner, horizon, config)
     except ValueError as error:
         _refuse(str(error), made)
     try:
-        return train(env, *start, config, directory, interrupt)
+        return train(env, learner, horizon, found, config, plan, directory, interrupt)
     except RuntimeError as error:  # XLA's
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
@@ -110,71 +102,13 @@ def _refuse(message: str, made: Sequence[Path], status: int = 2) -> NoReturn:
     sys.exit(status)
 
 
-def parse(arguments: Sequence[str]) -> Config:
-    """Returns the settings that a command line asks for; --help exits.
-
-    Args:
-      arguments: a preset's name, if any, then flags.
-
-    Raises:
-      ValueError: there is no such preset or flag, a value is not of its type, a setting that is
-        given would do nothing, or the run to resume is not there or has other settings.
-    """
-    default, prog, preset = Config(), "python -m mjx_reinforce.train", None
-    if arguments and not arguments[0].startswith("-"):
-        preset, *arguments = arguments
-        check_name("preset", preset, PRESETS)
-        default, prog = PRESETS[preset][1], f"{prog} {preset}"
-    else:
-        prog = f"{prog} [PRESET]"
-    config = _read(arguments, default, prog)
-    if config.resume is None:
-        return config
-    if preset is not None:
-        raise ValueError(f"--resume has the run's own settings: leave the preset {preset} out")
-    known = resume.read_settings(config.resume)
-    asked = _read(arguments, known, prog)
-    resume.check_settings(known, asked)
-    if resume.is_done(known, asked):
-        print(f"{known.resume} is finished; to go on, give a larger --env-steps or --max-updates")
-        sys.exit(0)
-    return asked
-
-
-def _read(arguments: Sequence[str], default: Config, prog: str) -> Config:
-    """Returns the settings that flags ask for, with others as given; --help exits."""
-    import tyro
-
-    groups = [
-        (title, group, group(**{f.name: getattr(default, f.name) for f in fields(group)}))
-        for title, group in GROUPS.items()
-    ]
-    form = tyro.conf.OmitArgPrefixes[dataclasses.make_dataclass("Arguments", groups, frozen=True)]
-    parsed = read(form, arguments, prog, _description())
-    config = Config(
-        **{name: x for title in GROUPS for name, x in vars(getattr(parsed, title)).items()}
-    )
-    check_read(config, default)
-    return config
-
-
-def _description() -> str:
-    width = max(map(len, PRESETS))
-    presets = "\n".join(f"  {name:{width}}  {line}" for name, (line, _) in PRESETS.items())
-    return (
-        "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. "
-        f"Leaves {', '.join(_FILES)} in the run directory.\n\n"
-        f"Presets, published programs whose settings replace the defaults:\n{presets}\n\n"
-        f"Environments: {', '.join(envs.names())}."
-    )
-
-
 def train(
     env: Any,
     learner: Any,
     horizon: int,
     found: Any,
     config: Config,
+    plan: Plan,
     directory: Path,
     interrupt: Interrupt,
 ) -> int:
@@ -186,6 +120,7 @@ def train(
       horizon: the time limit of an episode in steps.
       found: the checkpoint from which the run goes on, if any.
       config: the settings of the run.
+      plan: what is said of it beforehand.
       directory: where the files go.
       interrupt: what listens to signals.
 
@@ -199,8 +134,9 @@ def train(
 
     with Display() as display:
         interrupt.on_exit(display.console.show_cursor)
-        display.say(f"engine {learner.engine.name}: {learner.engine.why}; compiling")
-        session, compile_seconds = _compile(env, learner, horizon, config, directory, display)
+        display.say(plan.text)
+        with display.compiling(plan.compiling):
+            session, compile_seconds = _compile(env, learner, horizon, config, directory, display)
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
         interrupt.defer(display.say)
         _begin(session, horizon, found)

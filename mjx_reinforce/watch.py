@@ -16,6 +16,7 @@ from rich.progress import track
 from mjx_reinforce import envs
 from mjx_reinforce.export.films import Renderer, import_mujoco, mediapy_with_ffmpeg, write_film
 from mjx_reinforce.export.run_files import Run, Seed, Which, choose_seed, read_run
+from mjx_reinforce.runs.alarms import silence_alarms
 from mjx_reinforce.runs.flags import accept_all_characters
 from mjx_reinforce.runs.jax_setup import configure_jax
 
@@ -66,6 +67,7 @@ class Settings:
 def main() -> None:
     """Reads the command line, films, and exits: 0 done, 2 bad input, 130 interrupted."""
     accept_all_characters()
+    silence_alarms()
     settings = tyro.cli(Settings, prog="python -m mjx_reinforce.watch")
     try:
         film(settings)

@@ -17,6 +17,7 @@ from mujoco import mjx
 from mjx_reinforce import Environment, envs
 from mjx_reinforce.envs.settings import EpisodeSettings
 from mjx_reinforce.physics.mjx_internals import fenced
+from mjx_reinforce.runs.measured import TASKS
 from mjx_reinforce.types import Discrete, action_space, null_action, observation_size
 
 IDS = envs.names()
@@ -53,6 +54,15 @@ def test_shapes_and_dtypes_stay(env, x64):
         assert start.reward.shape == start.done.shape == ()
         assert start.obs.dtype == start.reward.dtype == start.done.dtype == dtype
         assert isinstance(env, Environment)
+
+
+def test_the_plan_of_a_run_knows_its_sizes(env, request):
+    task = TASKS.get(request.node.callspec.params["env"])
+    if task is None:
+        pytest.skip("it was not measured")
+    entries = 1 if isinstance(action_space(env), Discrete) else env.action_size
+    sizes = (env.observation_size, entries, env.max_episode_steps)
+    assert (task.observation, task.action, task.horizon) == sizes
 
 
 def test_bounds_and_limits(env):

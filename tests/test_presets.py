@@ -17,7 +17,8 @@ from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.runs.build import build, policy_settings
-from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.runs.config import check
+from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.presets import PRESETS
 
 TINY = ["--num-seeds", "2", "--max-updates", "2", "--horizon", "8"]
@@ -75,7 +76,7 @@ def test_a_preset_makes_sense(name):
 
 
 def test_no_preset_is_the_default():
-    assert train_module.parse([]) == Config()
+    assert train_module.parse([]) == of_task("InvertedPendulum-v5")
 
 
 @pytest.mark.parametrize(

@@ -173,7 +173,10 @@ def test_the_saved_policy_plays_like_the_trained_one(run, tmp_path):
         (["--update", "each-step"], "pass --decay-updates None"),
         (["--algorithm", "ars", "--one-start"], "--shared-starts"),
         (["--algorithm", "ars", "--top-directions", "9"], "at most --num-directions 8, got 9"),
-        (["--algorithm", "ars", "--ars-update", "document"], "pass --hidden-sizes alone"),
+        (
+            ["--algorithm", "ars", "--ars-update", "document", "--hidden-sizes", "8"],
+            "pass --hidden-sizes alone",
+        ),
         (["gymnasium"], "Did you mean 'gymnasium-tutorial'"),
         (["--output", "taken"], "is not empty"),
         (["--output", "taken/file"], "cannot write"),
@@ -199,7 +202,7 @@ def test_solving_needs_a_threshold(run, tmp_path, monkeypatch, capsys):
 
 
 def test_a_run_beyond_all_memory_is_refused(run, tmp_path, capsys):
-    size = ["--engine", "fused", "--num-seeds", str(10**13)]
+    size = ["--engine", "fused", "--num-seeds", str(10**9)]
     assert run(*ARGUMENTS, *size, "--output", "out") == 2
     error = capsys.readouterr().err
     assert "does not fit into memory" in error

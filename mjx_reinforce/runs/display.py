@@ -3,6 +3,7 @@
 import datetime
 import math
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from decimal import ROUND_DOWN, Decimal
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from rich.text import Text
 
 from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.runs import nonfinite, progress
+from mjx_reinforce.runs.heartbeat import heartbeat
+from mjx_reinforce.runs.plan import duration
 
 
 class _Bar(Progress):
@@ -60,6 +63,18 @@ class Display:
     def say(self, text: str, style: str | None = None) -> None:
         """Prints a line above the bar, in one of rich's styles."""
         self.console.print(text, style=style, highlight=False, soft_wrap=True)
+
+    def compiling(self, expected: float | None) -> AbstractContextManager[None]:
+        """Returns a ``with`` block that shows that its contents go on.
+
+        Args:
+          expected: how long they take (s), or None if that is not known.
+        """
+        if not self.console.is_terminal:
+            return heartbeat(self.say, expected)
+        if expected is not None:
+            self._bar.update(self._task, description=f"compiling, about {duration(expected)}")
+        return nullcontext()
 
     def start(self, compile_seconds: float) -> None:
         """Marks the end of compilation, from where the time left is counted."""

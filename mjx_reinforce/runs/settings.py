@@ -51,7 +51,7 @@ class PolicySettings:
     (discrete actions), deterministic (ars only); auto is categorical where the actions are
     discrete, else normal, or deterministic for ars."""
     hidden_sizes: tuple[int, ...] = (32, 32)
-    """Units of the policy network's tanh layers; the flag alone makes it linear."""
+    """Units of the policy network's tanh layers; none, as the flag alone says, make it linear."""
     shared_trunk: bool = True
     """Compute means and stds in one network; else stds from the state have their own."""
     initializer: Literal["orthogonal", "torch"] = "orthogonal"

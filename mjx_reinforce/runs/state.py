@@ -1,5 +1,6 @@
 """A run in progress: the state of all its seeds, and the compiled programs that move it on."""
 
+import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -12,7 +13,8 @@ from jax import lax
 
 from mjx_reinforce.learners.learner import Learner, TrainState
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.blocks import block_length
+from mjx_reinforce.runs.config import MAX_COUNT, Config
 from mjx_reinforce.runs.evaluation import evaluate
 from mjx_reinforce.types import Environment
 
@@ -31,13 +33,25 @@ class RunState:
     env_steps: jax.Array
 
 
+class Budget(NamedTuple):
+    """What each seed may use. It is an input of the programs: another budget compiles nothing.
+
+    env_steps: [] int32, a seed stops after the update that reaches it
+    updates: [] int32, how many it makes at most
+    """
+
+    env_steps: jax.Array
+    updates: jax.Array
+
+
 class Programs(NamedTuple):
     """The compiled programs of a run, over all seeds at once.
 
-    advance: (RunState) -> (RunState, metrics [K, S]), K = ``eval_every`` updates later, but for
-      seeds whose budget is used, which stand still; the memory of its argument is used again.
-      To the metrics of ``Learner.step`` it adds ``active`` (False for a seed that stood still),
-      and ``updates_total`` and ``env_steps_total``, the seed's counts after the update
+    advance: (RunState) -> (RunState, metrics [K, S]), ``eval_every`` updates later, or where all
+      budgets are used; a seed whose budget is used earlier stands still. The memory of its
+      argument is used again. To the metrics of ``Learner.step`` it adds ``active`` (False for a
+      seed that stood still), and ``updates_total`` and ``env_steps_total``, the seed's counts
+      after the update
     evaluate: (RunState) -> [S] each, what ``evaluation.evaluate`` returns for every seed
     test: (Actor [S, ...]) -> the same on start states that nothing else is played on
     """
@@ -70,16 +84,17 @@ def compile_programs(
       state: any state of the run; only its shapes are read.
     """
     key = _key(config.eval_seed, domain=1)
-    advance = jax.jit(_advance(learner, config), donate_argnums=0)
+    budget = _budget(config)
+    advance = jax.jit(_advance(learner, block_length(config)), donate_argnums=0)
     look = jax.jit(_evaluate(env, learner, horizon, config))
     with ThreadPoolExecutor() as pool:  # the first compiles while the second is traced
         looking = pool.submit(look.lower(state.train_states.actor, key).compile)
-        advancing = advance.lower(state).compile()
+        advancing = advance.lower(state, budget).compile()
         compiled = looking.result()
 
     def advanced(state: RunState) -> tuple[RunState, Arrays]:
-        state, metrics = advancing(state)
-        return state, _to_numpy(metrics)
+        state, (made, metrics) = advancing(state, budget)
+        return state, {name: x[: int(made)] for name, x in _to_numpy(metrics).items()}
 
     def evaluated(state: RunState) -> Arrays:
         return _to_numpy(compiled(state.train_states.actor, key))
@@ -98,23 +113,47 @@ def _key(seed: int, domain: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(seed), domain)
 
 
-def _advance(learner: Learner, config: Config) -> Callable[..., Any]:
-    """Returns a function that makes ``eval_every`` updates of all seeds."""
+def _budget(config: Config) -> Budget:
+    """Returns the budget; what has no limit has the greatest count."""
+    limits = (config.env_steps, config.max_updates)
+    return Budget(*(jnp.int32(MAX_COUNT if limit is None else limit) for limit in limits))
 
-    def update(state: RunState, _: None) -> tuple[RunState, dict[str, jax.Array]]:
-        active = jnp.ones(config.num_seeds, bool)
-        if config.env_steps is not None:
-            active &= state.env_steps < config.env_steps
-        if config.max_updates is not None:
-            active &= state.train_states.num_updates < config.max_updates
-        train_states, metrics = jax.vmap(learner.step)(state.train_states, active)
+
+def _advance(learner: Learner, length: int) -> Callable[..., Any]:
+    """Returns a function that makes ``length`` updates of all seeds, or fewer if that is the end.
+
+    Its result is the state, how many updates were made [], and their metrics [length, S], of
+    which the rows after the last update are zero.
+    """
+
+    def active(state: RunState, budget: Budget) -> jax.Array:
+        used = state.env_steps >= budget.env_steps
+        return ~(used | (state.train_states.num_updates >= budget.updates))
+
+    @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
+    def update(state: RunState, budget: Budget) -> tuple[RunState, dict[str, jax.Array]]:
+        going = active(state, budget)
+        train_states, metrics = jax.vmap(learner.step)(state.train_states, going)
         env_steps = state.env_steps + metrics["env_steps"]
         counts = {"updates_total": train_states.num_updates, "env_steps_total": env_steps}
         state = RunState(train_states=train_states, env_steps=env_steps)
-        return state, metrics | counts | {"active": active}
+        return state, metrics | counts | {"active": going}
 
-    def advance(state: RunState) -> tuple[RunState, dict[str, jax.Array]]:
-        return lax.scan(update, state, length=config.eval_every)
+    def advance(state: RunState, budget: Budget) -> tuple[RunState, Any]:
+        def unfinished(carry: Any) -> jax.Array:
+            made, state, _ = carry
+            return (made < length) & jnp.any(active(state, budget))
+
+        def body(carry: Any) -> Any:
+            made, state, rows = carry
+            state, row = update(state, budget)
+            write = functools.partial(lax.dynamic_update_index_in_dim, index=made, axis=0)
+            return made + 1, state, jax.tree.map(write, rows, row)
+
+        row = jax.eval_shape(update, state, budget)[1]
+        rows = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), row)
+        made, state, rows = lax.while_loop(unfinished, body, (jnp.int32(0), state, rows))
+        return state, (made, rows)
 
     return advance
 

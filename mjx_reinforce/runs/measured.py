@@ -1,0 +1,111 @@
+"""What the tasks were measured to take, so that a run can say beforehand how long it needs.
+
+Runs of ``train`` with four seeds of 16 episodes an update and a 32-32 policy, training and
+evaluating, on 2026-11-22; all figures are good to a factor of two.
+
+- Two CPU cores: two hardware threads of the host of an H200, while seven such programs ran on
+  others. Two quiet cores of another machine were up to twice as fast.
+- GPU: an H200. Compiling depends on the host: two of its threads took twice as long as stands here,
+  16 quiet ones half as long. The rates of many episodes are those of ``docs/engine.md``, halved
+  where there are no contacts, since training takes as long as playing there.
+"""
+
+from typing import NamedTuple
+
+
+class Task(NamedTuple):
+    """The sizes of a task, and what its runs are like.
+
+    observation: O, entries of an observation
+    action: A, entries of an action
+    horizon: the task's time limit (env steps)
+    useful: the part of the simulated env steps that belongs to an episode that still runs
+    base_memory: what a small run takes on a CPU, mostly for compiling (bytes)
+    """
+
+    observation: int
+    action: int
+    horizon: int
+    useful: float
+    base_memory: float
+
+
+class Speed(NamedTuple):
+    """How fast an engine plays and trains on a task.
+
+    engine: its name
+    compiling: from nothing, until the first update (s)
+    latency: one env step of however few episodes (s)
+    rate: env steps a second of however many
+    """
+
+    engine: str
+    compiling: float
+    latency: float
+    rate: float
+
+    def seconds(self, steps: float, episodes: int) -> float:
+        """Returns how long ``steps`` env steps take, ``episodes`` at a time (s)."""
+        return steps / episodes * (self.latency + episodes / self.rate)
+
+
+TASKS = {
+    "InvertedPendulum-v5": Task(4, 1, 1000, 0.6, 1.5e9),
+    "InvertedPendulum-v4": Task(4, 1, 1000, 0.6, 1.5e9),
+    "InvertedDoublePendulum-v5": Task(9, 1, 1000, 0.3, 1.8e9),
+    "Reacher-v5": Task(10, 2, 50, 1.0, 2.0e9),
+    "Pusher-v5": Task(23, 7, 100, 1.0, 3.3e9),
+    "Swimmer-v5": Task(8, 2, 1000, 1.0, 2.6e9),
+    "HalfCheetah-v5": Task(17, 6, 1000, 1.0, 2.6e9),
+    "Hopper-v5": Task(11, 3, 1000, 0.3, 2.8e9),
+    "Walker2d-v5": Task(17, 6, 1000, 0.3, 2.5e9),
+    "Ant-v5": Task(105, 8, 1000, 0.8, 2.9e9),
+    "Humanoid-v5": Task(348, 17, 1000, 0.35, 4.0e9),
+    "HumanoidStandup-v5": Task(348, 17, 1000, 1.0, 3.9e9),
+    "CartPole-v1": Task(4, 1, 500, 0.8, 1.3e9),
+    "CartPole-v0": Task(4, 1, 200, 0.8, 1.3e9),
+    "ContinuousCartPole-v0": Task(4, 1, 50, 1.0, 1.4e9),
+}
+
+_PENDULUM_CPU = Speed("fused", 14, 4e-5, 1.5e6)
+_PENDULUM_GPU = Speed("kernel", 13, 2.2e-5, 1.2e9)
+_CART_CPU = Speed("fused", 10, 4.5e-5, 4e6)
+_CART_GPU = Speed("kernel", 12, 2.1e-5, 1e9)
+
+#: On two CPU cores.
+CPU = {
+    "InvertedPendulum-v5": _PENDULUM_CPU,
+    "InvertedPendulum-v4": _PENDULUM_CPU,
+    "InvertedDoublePendulum-v5": Speed("fused", 22, 1e-4, 4e5),
+    "Reacher-v5": Speed("fused", 22, 4.6e-5, 4e5),
+    "Pusher-v5": Speed("vmap", 65, 0, 2.5e3),
+    "Swimmer-v5": Speed("fused", 41, 3e-4, 5e4),
+    "HalfCheetah-v5": Speed("vmap", 35, 0, 6.4e3),
+    "Hopper-v5": Speed("vmap", 38, 0, 3.4e3),
+    "Walker2d-v5": Speed("vmap", 38, 0, 2.8e3),
+    "Ant-v5": Speed("vmap", 43, 0, 7.6e2),
+    "Humanoid-v5": Speed("vmap", 78, 0, 4.5e2),
+    "HumanoidStandup-v5": Speed("vmap", 70, 0, 2.3e2),
+    "CartPole-v1": _CART_CPU,
+    "CartPole-v0": _CART_CPU,
+    "ContinuousCartPole-v0": _CART_CPU,
+}
+
+#: On one H200.
+GPU = {
+    "InvertedPendulum-v5": _PENDULUM_GPU,
+    "InvertedPendulum-v4": _PENDULUM_GPU,
+    "InvertedDoublePendulum-v5": Speed("kernel", 25, 3.4e-5, 5e8),
+    "Reacher-v5": Speed("kernel", 36, 5.6e-5, 7e8),
+    "Pusher-v5": Speed("vmap", 40, 4.8e-3, 1.3e6),
+    "Swimmer-v5": Speed("kernel", 180, 5e-5, 3e8),
+    "HalfCheetah-v5": Speed("vmap", 25, 4.2e-3, 1.2e6),
+    "Hopper-v5": Speed("vmap", 30, 1e-2, 1e6),
+    "Walker2d-v5": Speed("vmap", 30, 1.2e-2, 4.8e5),
+    "Ant-v5": Speed("vmap", 31, 2.3e-2, 1.7e5),
+    "Humanoid-v5": Speed("vmap", 62, 2.6e-2, 7.3e4),
+    "HumanoidStandup-v5": Speed("vmap", 63, 2.8e-2, 5.5e4),
+    "CartPole-v1": _CART_GPU,
+    "CartPole-v0": _CART_GPU,
+    "ContinuousCartPole-v0": _CART_GPU,
+}

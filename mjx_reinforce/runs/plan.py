@@ -1,0 +1,147 @@
+"""What a run will do, how long that takes about, and how much memory it needs."""
+
+import os
+from typing import Any, NamedTuple
+
+from mjx_reinforce.runs import measured
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.measured import Speed, Task
+from mjx_reinforce.runs.memory import check_fits, gigabytes, host_memory, needed, num_parameters
+
+#: The figures are good to this factor.
+_ACCURACY = 2.0
+#: Networks up to this many parameters are as fast as those that were measured.
+_MEASURED_PARAMETERS = 20_000
+#: CPU cores that make a run faster; it was not tried with more.
+_USEFUL_CORES = 4
+#: A small run of a task that was not measured takes so much memory, like most (bytes).
+_BASE_MEMORY = 2.5e9
+
+
+class Machine(NamedTuple):
+    """Where a run computes.
+
+    name: for people
+    speeds: what was measured on a machine of its kind
+    faster: how many times as fast as that one it is
+    memory: what arrays may take (bytes)
+    shared: whether that is the memory that compiling needs too
+    """
+
+    name: str
+    speeds: dict[str, Speed]
+    faster: float
+    memory: float
+    shared: bool
+
+
+class Plan(NamedTuple):
+    """What will be done.
+
+    text: a paragraph for people
+    compiling: how long it takes to compile (s), None if that is not known
+    """
+
+    text: str
+    compiling: float | None
+
+
+def make_plan(env: Any, learner: Any, horizon: int, config: Config) -> Plan:
+    """Returns the plan of a run on this machine.
+
+    Args:
+      env: what is trained on.
+      learner: how.
+      horizon: the time limit of an episode in steps.
+      config: the settings.
+
+    Raises:
+      ValueError: the run does not fit into the memory that is here.
+    """
+    task, machine = _task(env, horizon, config), this_machine()
+    base = task.base_memory if machine.shared else 0.0
+    check_fits(config, task, machine.memory, base)
+    speed = machine.speeds.get(config.env)
+    known = num_parameters(config, task) <= _MEASURED_PARAMETERS
+    if speed is None or speed.engine != learner.engine.name or not known:
+        time, compiling = "How long this takes here is not known", None
+    else:
+        seconds, bounded = training_seconds(config, task, speed)
+        seconds /= machine.faster
+        compiling = speed.compiling
+        time = f"Compiling takes {_range(compiling)}, or much less if this was compiled before; "
+        time += f"training {'at most ' + duration(seconds) if bounded else _range(seconds)}"
+    memory = gigabytes(base + needed(config, task))
+    text = (
+        f"Training {_what(config)} on {machine.name}, with the engine {learner.engine.name}: "
+        f"{learner.engine.why}. {time}. It needs about {memory} of memory."
+    )
+    return Plan(text, compiling)
+
+
+def training_seconds(config: Config, task: Task, speed: Speed) -> tuple[float, bool]:
+    """Returns how long a run trains and evaluates (s), and whether that is at most so long.
+
+    It is where the number of updates ends the run: nobody knows how long their episodes are.
+    """
+    horizon = config.horizon or task.horizon
+    episodes = config.episodes_per_update
+    bounds = []
+    if config.env_steps is not None:
+        bounds.append((config.env_steps / task.useful, False))
+    if config.max_updates is not None:
+        bounds.append((float(config.max_updates) * episodes * horizon, True))
+    steps, bounded = min(bounds)
+    evaluated = 2 * config.eval_episodes / (config.eval_every * episodes)
+    total = config.num_seeds * steps * (1 + evaluated)
+    return speed.seconds(total, config.num_seeds * episodes), bounded
+
+
+def this_machine() -> Machine:
+    """Returns where JAX computes."""
+    import jax
+
+    device = jax.devices()[0]
+    if device.platform == "cpu":
+        affinity = getattr(os, "sched_getaffinity", None)  # not on every system
+        cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+        name = f"{cores} CPU core{'s' * (cores > 1)}"
+        return Machine(name, measured.CPU, min(cores, _USEFUL_CORES) / 2, host_memory(), True)
+    memory = float((device.memory_stats() or {}).get("bytes_limit", float("inf")))
+    return Machine(f"one {device.device_kind}", measured.GPU, 1.0, memory, False)
+
+
+def duration(seconds: float) -> str:
+    """Returns a time for people, to two digits."""
+    for unit, length in (("s", 1.0), ("min", 60.0), ("h", 3600.0)):
+        number = seconds / length
+        if number < 100 or unit == "h":
+            break
+    return f"{float(f'{max(number, 1):.2g}'):g} {unit}"
+
+
+def _range(seconds: float) -> str:
+    least, most = duration(seconds / _ACCURACY), duration(seconds * _ACCURACY)
+    return f"about {least} to {most}" if least != most else f"about {least}"
+
+
+def _what(config: Config) -> str:
+    """Returns what is trained and for how long."""
+    budgets = []
+    if config.env_steps is not None:
+        budgets.append(f"{config.env_steps:,} env steps")
+    if config.max_updates is not None:
+        budgets.append(f"{config.max_updates:,} updates")
+    seeds = f"{config.num_seeds:,} seed{'s' * (config.num_seeds > 1)}"
+    return f"{seeds} of {config.env} by {config.algorithm}, {' or '.join(budgets)} each,"
+
+
+def _task(env: Any, horizon: int, config: Config) -> Task:
+    """Returns the sizes of a task, also of the user's own."""
+    from mjx_reinforce.types import Discrete, action_space, observation_size
+
+    if config.env in measured.TASKS:
+        return measured.TASKS[config.env]
+    discrete = isinstance(action_space(env), Discrete)
+    entries = 1 if discrete else env.action_size
+    return Task(observation_size(env), entries, horizon, 1.0, _BASE_MEMORY)

@@ -1,0 +1,276 @@
+"""What a run says before it starts: its defaults, its time, its memory, its signs of life."""
+
+import csv
+import dataclasses
+import os
+import subprocess
+import sys
+import time
+
+import jax
+import pytest
+from toys import Survive
+
+from mjx_reinforce import envs
+from mjx_reinforce import train as train_module
+from mjx_reinforce.runs import measured, memory, plan
+from mjx_reinforce.runs.blocks import block_length
+from mjx_reinforce.runs.build import build
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.runs.heartbeat import heartbeat
+from mjx_reinforce.runs.measured import Speed, Task
+from mjx_reinforce.runs.presets import PRESETS
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path):
+    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["train", "--env", "Survive-v0", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            train_module.main()
+        return stop.value.code
+
+    return run
+
+
+def updates(path):
+    with (path / "metrics.csv").open(newline="") as file:
+        return [int(row["update"]) for row in csv.DictReader(file)]
+
+
+# Defaults.
+
+
+@pytest.mark.parametrize("arguments", [["--env", "Ant-v5"], ["--seed", "3", "--env=Ant-v5"]])
+def test_a_task_has_its_own_defaults(arguments):
+    config = train_module.parse(arguments)
+    assert (config.env, config.eval_episodes, config.env_steps) == ("Ant-v5", 4, 100_000)
+    assert config.hidden_sizes == Config().hidden_sizes
+
+
+def test_a_flag_wins_over_the_tasks_default():
+    config = train_module.parse(["--env-steps", "7", "--env", "Ant-v5", "--eval-episodes", "9"])
+    assert (config.env_steps, config.eval_episodes) == (7, 9)
+    assert train_module.parse(["--env-steps", "None", "--env", "Ant-v5"]).env_steps is None
+
+
+def test_the_pendulum_has_a_linear_policy():
+    for id in ("InvertedPendulum-v4", "InvertedPendulum-v5"):
+        assert train_module.parse(["--env", id]).hidden_sizes == ()
+    assert train_module.parse(["--hidden-sizes", "32", "32"]).hidden_sizes == (32, 32)
+
+
+def test_a_task_without_an_entry_has_the_plain_defaults():
+    assert train_module.parse(["--env", "own:Task"]) == Config(env="own:Task")
+
+
+def test_a_preset_keeps_its_settings_on_another_task():
+    config = train_module.parse(["baseline-truncated-normal", "--env", "Ant-v5"])
+    assert config == dataclasses.replace(PRESETS["baseline-truncated-normal"][1], env="Ant-v5")
+
+
+def test_help_shows_the_defaults_of_the_task(capsys):
+    for arguments, default in ((["--help"], "280000"), (["--help", "--env", "Ant-v5"], "100000")):
+        with pytest.raises(SystemExit):
+            train_module.parse(arguments)
+        said = capsys.readouterr().out
+        assert f"(default: {default})" in said
+        assert "Defaults depend on the task" in said
+
+
+def test_what_was_measured_are_our_tasks():
+    assert set(measured.TASKS) == set(measured.CPU) == set(measured.GPU) <= set(envs.names())
+
+
+# Memory.
+
+
+@pytest.mark.parametrize(
+    ("settings", "remedy"),
+    [
+        ({"num_seeds": 10**6}, "lower --num-seeds"),
+        ({"horizon": 10**9}, "or --horizon"),
+        ({"num_episodes": 10**6}, "--num-episodes"),
+        ({"hidden_sizes": (100_000,)}, "lower --hidden-sizes"),
+        ({"hidden_sizes": (100_000, 100_000)}, "lower --hidden-sizes"),
+        ({"eval_episodes": 10**7}, "lower --eval-episodes"),
+        ({"eval_every": 10**9, "env_steps": None, "max_updates": 10**9}, "lower --eval-every"),
+        ({"algorithm": "ars", "num_directions": 10**6}, "or --horizon"),
+        ({"estimator": "value-baseline", "value_hidden_sizes": (10**6,)}, "--value-hidden-sizes"),
+        ({"num_seeds": 2**31}, "--num-seeds must be less than 2^31, got 2147483648"),
+        ({"hidden_sizes": (8, 2**40)}, "--hidden-sizes must be less than 2^31"),
+    ],
+)
+def test_what_cannot_be_is_refused(monkeypatch, settings, remedy):
+    monkeypatch.setattr(memory, "host_memory", lambda: 24e9)
+    monkeypatch.setattr(memory, "_may_have_accelerator", lambda: False)
+    with pytest.raises(ValueError, match=r".") as refusal:
+        memory.check_size(Config(**settings))
+    assert remedy in str(refusal.value)
+    assert str(refusal.value).count("\n") <= 1
+
+
+@pytest.mark.parametrize("id", measured.TASKS)
+def test_a_laptop_holds_every_tasks_defaults(monkeypatch, id):
+    monkeypatch.setattr(memory, "host_memory", lambda: 8e9)
+    memory.check_size(of_task(id))
+
+
+def test_a_thousand_seeds_fit_into_three_gigabytes(monkeypatch):
+    """2.6 GB were measured."""
+    config = dataclasses.replace(of_task("InvertedPendulum-v5"), num_seeds=1000, max_updates=3)
+    task = measured.TASKS[config.env]
+    assert 2.5e9 < task.base_memory + memory.needed(config, task) < 3.2e9
+
+
+def test_a_refusal_comes_before_jax(tmp_path):
+    code = (
+        "import sys\nfrom mjx_reinforce import train\n"
+        "try: train.main()\n"
+        "except SystemExit as stop: print(stop.code, 'jax' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, "--num-seeds", "1000000"],
+        check=True,
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"JAX_PLATFORMS": "cpu"},
+    )
+    assert done.stdout == "2 False\n"
+    assert "does not fit into memory" in done.stderr
+    assert done.stderr.count("\n") == 2
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_accelerators_memory_counts_where_there_is_one(monkeypatch):
+    monkeypatch.setattr(memory, "_may_have_accelerator", lambda: True)
+    config = Config(env="Survive-v0", num_seeds=10**5, max_updates=1)
+    memory.check_size(config)  # it is not known before JAX is imported
+    machine = plan.Machine("a GPU", {}, 1.0, 1e8, shared=False)
+    monkeypatch.setattr(plan, "this_machine", lambda: machine)
+    env = Survive()
+    learner, horizon = build(env, config)
+    with pytest.raises(ValueError, match=r"memory.*0\.1 GB are here"):
+        plan.make_plan(env, learner, horizon, config)
+
+
+# Time.
+
+
+def test_the_time_of_a_run_by_hand():
+    task = Task(observation=4, action=1, horizon=100, useful=0.5, base_memory=0.0)
+    speed = Speed("fused", 10.0, latency=0.01, rate=1000.0)
+    config = Config(num_seeds=2, num_episodes=5, env_steps=1000, eval_every=2, eval_episodes=5)
+    # 1000 / 0.5 steps a seed, twice that with evaluations, two seeds; 10 at a time take 0.02 s.
+    assert plan.training_seconds(config, task, speed) == (pytest.approx(8000 / 10 * 0.02), False)
+    # Two updates of 5 episodes of at most 100 steps are fewer.
+    config = dataclasses.replace(config, max_updates=2)
+    assert plan.training_seconds(config, task, speed) == (pytest.approx(4000 / 10 * 0.02), True)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [
+        (0.2, "1 s"),
+        (8.44, "8.4 s"),
+        (99.9, "100 s"),
+        (128, "2.1 min"),
+        (9e3, "2.5 h"),
+        (4e6, "1100 h"),
+    ],
+)
+def test_durations_are_for_people(seconds, said):
+    assert plan.duration(seconds) == said
+
+
+@pytest.mark.parametrize("engine", ["fused", "vmap"])
+def test_a_plan_says_what_is_known(monkeypatch, engine):
+    speeds = {"Survive-v0": Speed("fused", 40.0, 1.0, 1e9)}
+    monkeypatch.setattr(plan, "this_machine", lambda: plan.Machine("3 mills", speeds, 2, 1e9, True))
+    monkeypatch.setitem(measured.TASKS, "Survive-v0", Task(1, 1, 20, 0.5, 5e8))
+    config = Config(env="Survive-v0", env_steps=1600, engine=engine)
+    env = Survive()
+    learner, horizon = build(env, config)
+    text, compiling = plan.make_plan(env, learner, horizon, config)
+    assert text.startswith("Training 4 seeds of Survive-v0 by reinforce, 1,600 env steps each, on")
+    assert "on 3 mills, with the engine" in text
+    assert "0.5 GB of memory" in text
+    if engine == "fused":  # 1600 / 0.5 * 1.4 / 16 steps of a second, at twice the speed
+        assert compiling == 40
+        assert "takes about 20 s to 80 s" in text
+        assert "training about 70 s to 4.7 min" in text
+    else:
+        assert compiling is None
+        assert "is not known" in text
+
+
+def test_a_run_begins_with_its_plan(run, capsys):
+    assert run("--max-updates", "2", "--output", "out", "--hidden-sizes") == 0
+    first = capsys.readouterr().out.splitlines()[0]
+    assert first.startswith("Training 4 seeds of Survive-v0")
+    assert "280,000 env steps or 2 updates each" in first
+
+
+# While it compiles and after.
+
+
+def test_a_heartbeat_beats_until_the_end():
+    said = []
+    with heartbeat(said.append, 40.0, interval=0.01):
+        deadline = time.monotonic() + 10
+        while len(said) < 2 and time.monotonic() < deadline:
+            time.sleep(0.01)
+    count = len(said)
+    assert count >= 2
+    assert said[0] == "still compiling, 0 s; about 40 s expected"
+    time.sleep(0.05)
+    assert len(said) == count
+
+
+def test_alarms_are_silenced_for_the_command_line_alone(run, monkeypatch):
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "0")
+    run("--num-seeds", "0")
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "0"
+    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
+    run("--num-seeds", "0")
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
+
+
+def test_half_cheetah_warns_of_nothing(capfd):
+    envs.make("HalfCheetah-v5")
+    assert "deprecated" not in "".join(capfd.readouterr())
+
+
+def test_a_block_has_room_for_what_the_budget_can_need():
+    config = Config(num_episodes=10, env_steps=2005, eval_every=10**6)
+    assert block_length(config) == 201  # an episode has one step at least
+    assert block_length(dataclasses.replace(config, max_updates=150)) == 150
+    # The budget does not show in a block that is short anyway.
+    short = dataclasses.replace(config, eval_every=100)
+    assert block_length(short) == block_length(dataclasses.replace(short, max_updates=1)) == 100
+
+
+def test_a_block_ends_with_the_budget(run, tmp_path):
+    arguments = ["--max-updates", "7", "--hidden-sizes", "--num-seeds", "1"]
+    assert run(*arguments, "--eval-every", "1000000", "--output", "long") == 0
+    assert run(*arguments, "--eval-every", "7", "--output", "short") == 0
+    assert updates(tmp_path / "long") == updates(tmp_path / "short") == [0, 7]
+    ours, theirs = ((tmp_path / name / "policy" / "actor.npz") for name in ("long", "short"))
+    assert ours.read_bytes() == theirs.read_bytes()
+
+
+def test_another_budget_compiles_nothing(run, tmp_path):
+    events = []
+    jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
+    arguments = ["--hidden-sizes", "3", "--num-seeds", "3"]
+    assert run(*arguments, "--max-updates", "3", "--output", "first") == 0
+    events.clear()
+    assert run(*arguments, "--max-updates", "8", "--env-steps", "99999", "--output", "second") == 0
+    assert updates(tmp_path / "second")[::3] == [0, 5, 8]
+    assert "/jax/compilation_cache/cache_hits" in events
+    assert "/jax/compilation_cache/cache_misses" not in events
