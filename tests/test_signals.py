@@ -16,7 +16,7 @@ from test_resume import assert_same
 from mjx_reinforce import load_policy
 
 HERE = Path(__file__).parent
-#: The command line, with a toy among the environments; $SLOW makes each of its blocks take a while.
+#: The command line, with a toy among the environments.
 TRAIN = """
 import sys
 sys.path.insert(0, {here!r})
@@ -95,8 +95,7 @@ def test_an_interrupted_run_goes_on(tmp_path):
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_while_compiling_leaves_nothing(tmp_path, number, status):
     process = start(tmp_path, *HEAVY, real=True, cache=tmp_path / "cache")
-    line = process.stdout.readline()
-    assert line.endswith("compiling\n"), line
+    assert any("compiling" in line for line in process.stdout)
     time.sleep(1)
     process.send_signal(number)
     begun = time.monotonic()
@@ -116,13 +115,12 @@ def test_a_signal_while_importing_shows_no_traceback(tmp_path, delay):
 
 def test_a_second_signal_ends_at_once(tmp_path):
     """Although a block of updates takes minutes."""
-    process = start(tmp_path, *FOREVER, "--eval-every", 100_000_000)
+    process = start(tmp_path, *FOREVER, "--eval-every", 1_000_000)
     wait_for(lambda: rows(tmp_path) > 4, process)
     time.sleep(0.5)
     process.send_signal(signal.SIGINT)
     assert process.poll() is None
-    while "stopping after this block" not in process.stdout.readline():
-        pass
+    assert any("stopping after this block" in line for line in process.stdout)
     process.send_signal(signal.SIGINT)
     begun = time.monotonic()
     assert finish(process) == 130

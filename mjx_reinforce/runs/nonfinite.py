@@ -8,8 +8,8 @@ Arrays = dict[str, np.ndarray]
 
 #: What is said of a run that is ``hopeless``.
 HOPELESS = (
-    "stopped: every seed that still trained was broken in all updates of the last block, its "
-    "episodes or its new policy not finite; lower --learning-rate, or mend the environment"
+    "stopped: every seed that still trained was broken throughout the last updates, its episodes "
+    "or its new policy not finite; lower --learning-rate (ars: --step-size) or mend the task"
 )
 #: The fields of such an update, in the order of summary.json.
 FIELDS = {"seed": np.int64, "update": np.int64, "episodes": np.int64, "skipped": np.bool_}
