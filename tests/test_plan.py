@@ -95,7 +95,7 @@ def test_what_was_measured_are_our_tasks():
         ({"num_seeds": 10**6}, "lower --num-seeds"),
         ({"horizon": 10**9}, "or --horizon"),
         ({"num_episodes": 10**6}, "--num-episodes"),
-        ({"hidden_sizes": (100_000,)}, "lower --hidden-sizes"),
+        ({"hidden_sizes": (400_000,)}, "lower --hidden-sizes"),
         ({"hidden_sizes": (100_000, 100_000)}, "lower --hidden-sizes"),
         ({"eval_episodes": 10**7}, "lower --eval-episodes"),
         ({"eval_every": 10**9, "env_steps": None, "max_updates": 10**9}, "lower --eval-every"),
@@ -120,11 +120,16 @@ def test_a_laptop_holds_every_tasks_defaults(monkeypatch, id):
     memory.check_size(of_task(id))
 
 
-def test_a_thousand_seeds_fit_into_three_gigabytes(monkeypatch):
-    """2.6 GB were measured."""
+def test_the_memory_of_a_thousand_seeds():
+    """XLA says 1.16 GB, and what the process took in all was 1.9 GB."""
     config = dataclasses.replace(of_task("InvertedPendulum-v5"), num_seeds=1000, max_updates=3)
-    task = measured.TASKS[config.env]
-    assert 2.5e9 < task.base_memory + memory.needed(config, task) < 3.2e9
+    assert 1.16e9 < memory.needed(config, measured.TASKS[config.env]) < 2e9
+
+
+def test_the_memory_of_a_wide_network():
+    """XLA says 1.28 GB for four seeds of 20,000 units."""
+    config = dataclasses.replace(Config(), hidden_sizes=(20_000,))
+    assert 1.28e9 < memory.needed(config, measured.TASKS[config.env]) < 1.6e9
 
 
 def test_a_refusal_comes_before_jax(tmp_path):
