@@ -30,7 +30,9 @@ def make_run(directory, env="CartPole-v1", *, count=50.0, folder="policy", **set
     settings = {"env": env, "hidden_sizes": [8, 8], "initial_std": 0.5} | SPACES[env] | settings
     rng = np.random.default_rng(3)
 
-    def draw(array, scale=1.0):
+    def draw(array):
+        """A kernel is [I, J]: its units stay of the order of 1, as those of trained ones do."""
+        scale = 0.2 * array.shape[0] ** -0.5 if array.ndim == 2 else 1.0
         return (scale * rng.standard_normal((3, *array.shape))).astype(np.float32)
 
     params = jax.tree.map(draw, jax.eval_shape(build_policy(settings).init, jax.random.key(0)))
