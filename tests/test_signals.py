@@ -82,7 +82,7 @@ def test_a_signal_ends_the_run_after_the_block(tmp_path, number, status):
 
 
 def test_an_interrupted_run_goes_on(tmp_path):
-    budget = ["--env", "Survive-v0", "--env-steps", "None", "--max-updates", 3000]
+    budget = ["--env", "Survive-v0", "--env-steps", "None", "--max-updates", 1000]
     process = start(tmp_path, *budget, "--output", "out")
     wait_for(lambda: rows(tmp_path) > 20, process)
     process.send_signal(signal.SIGTERM)
