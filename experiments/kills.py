@@ -68,18 +68,19 @@ def main() -> None:
     settings = parser.parse_args()
     draw = random.Random(settings.seed)
     directory = Path(tempfile.mkdtemp(prefix="kills-"))
-    begun = time.monotonic()
-    if start(directory, *RUN, "--output", "whole").wait() != 0:
-        sys.exit(f"the run that is left alone failed, see {directory}")
-    longest = 1.2 * (time.monotonic() - begun)
-    run, kills = directory / "killed", 0
+    for name in ("first", "whole"):  # the second finds compiled programs, as most of those killed
+        begun = time.monotonic()
+        if start(directory, *RUN, "--output", name).wait() != 0:
+            sys.exit(f"the run that is left alone failed, see {directory}")
+    longest = time.monotonic() - begun
+    run, kills, finished = directory / "killed", 0, []
     while kills < settings.kills:
         process, number = start(directory, *arguments_for(run)), draw.choice(SIGNALS)
         try:
             process.wait(timeout=draw.uniform(0, longest))
             if process.returncode != 0:
                 sys.exit(f"status {process.returncode} without a kill, see {directory}")
-            run.rename(directory / f"finished-{kills}")
+            finished.append(run.rename(directory / f"finished-{len(finished)}"))
         except subprocess.TimeoutExpired:
             kills += 1
             process.send_signal(number)
@@ -87,16 +88,15 @@ def main() -> None:
             print(f"{kills}: {number.name}, exit status {code}, {status(run)}", flush=True)
     if start(directory, *arguments_for(run)).wait() != 0:
         sys.exit(f"the last resume failed, see {directory}")
-    finished = [run, *directory.glob("finished-*")]
     whole = results(directory / "whole")
     differing = [
         f"{path.name}: {name}"
-        for path in finished
+        for path in (run, *finished)
         for name, value in results(path).items()
         if value != whole[name]
     ]
     text = (directory / "output.txt").read_text()
-    print(f"{kills} kills, {len(finished)} runs ended; differing: {differing or 'nothing'}")
+    print(f"{kills} kills, {len(finished) + 1} runs ended; differing: {differing or 'nothing'}")
     print(f"tracebacks: {text.count('Traceback')}, alarms: {text.count('Error')}; see {directory}")
     sys.exit(1 if differing or "Traceback" in text else 0)
 

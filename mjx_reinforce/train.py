@@ -143,7 +143,8 @@ def train(
         display.start(compile_seconds)
         threading.Thread(target=load_libraries, daemon=True).start()
         interrupted = _loop(session, interrupt, evaluated=found is not None)
-    session.save()
+    if not session.saved:
+        session.save()
     summary = _finish(session, learner.engine.name, compile_seconds, interrupted)
     print_summary(display.console, summary, directory)
     if session.record.hopeless():

@@ -82,7 +82,7 @@ def test_a_signal_ends_the_run_after_the_block(tmp_path, number, status):
 
 
 def test_an_interrupted_run_goes_on(tmp_path):
-    budget = ["--env", "Survive-v0", "--env-steps", "None", "--max-updates", 3000]
+    budget = ["--env", "Survive-v0", "--env-steps", "None", "--max-updates", 1000]
     process = start(tmp_path, *budget, "--output", "out")
     wait_for(lambda: rows(tmp_path) > 20, process)
     process.send_signal(signal.SIGTERM)
@@ -104,8 +104,9 @@ def test_a_signal_while_compiling_leaves_nothing(tmp_path, number, status):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("delay", [0.15, 0.5, 1.5])
+@pytest.mark.parametrize("delay", [0.5, 1.5])
 def test_a_signal_while_importing_shows_no_traceback(tmp_path, delay):
+    """Not before Python itself has started, whose own message that would be."""
     process = start(tmp_path, *HEAVY, real=True, cache=tmp_path / "cache")
     time.sleep(delay)
     process.send_signal(signal.SIGINT)

@@ -51,6 +51,8 @@ class Session:
         self.state, self.best = state, best
         self._began = self._saved_at = time.perf_counter()
         self._saved_updates = 0
+        #: Whether the newest checkpoint is of the present state.
+        self.saved = False
         self._failing: set[str] = set()
 
     def restore(self, found: Checkpoint) -> None:
@@ -58,7 +60,7 @@ class Session:
         self.state, self.best = found.state
         self.record.restore(found.record)
         self._began = time.perf_counter() - found.seconds
-        self._saved_updates = self._updates()
+        self._saved_updates, self.saved = self._updates(), True
 
     def seconds(self) -> float:
         """Returns the wall time since the run began, without that of compiling."""
@@ -67,6 +69,7 @@ class Session:
     def advance(self) -> None:
         """Makes a block of updates."""
         self.state, metrics = self.programs.advance(self.state)
+        self.saved = False
         met = self.record.add_updates(metrics)
         self.display.show_nonfinite(met, self.config.num_seeds)
 
@@ -93,7 +96,7 @@ class Session:
     def save(self) -> None:
         """Writes a checkpoint, the policies, and how far the run is."""
         self._saved_at, self._saved_updates = time.perf_counter(), self._updates()
-        self._attempt("a checkpoint", self._save_checkpoint)
+        self.saved = self._attempt("a checkpoint", self._save_checkpoint)
         self._attempt("the policies", self.save_policies)
         reached = {
             "env": self.config.env,
@@ -133,15 +136,17 @@ class Session:
     def _updates(self) -> int:
         return int(self.record.updates.max())
 
-    def _attempt(self, what: str, write: Callable[[], None]) -> None:
-        """Writes something; the first of several failures in a row is shown."""
+    def _attempt(self, what: str, write: Callable[[], None]) -> bool:
+        """Returns whether something could be written; the first failure in a row is shown."""
         try:
             write()
             self._failing.discard(what)
+            return True
         except OSError as error:
             if what in self._failing:
-                return
+                return False
             self._failing.add(what)
             warning = f"cannot write {what} ({error.strerror or error})"
             with contextlib.suppress(OSError):  # the screen may be a file on the same disk
                 self.display.say(f"warning: {warning}; training goes on and tries again")
+            return False
