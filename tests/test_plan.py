@@ -99,7 +99,7 @@ def test_what_was_measured_are_our_tasks():
         ({"hidden_sizes": (100_000, 100_000)}, "lower --hidden-sizes"),
         ({"eval_episodes": 10**7}, "lower --eval-episodes"),
         ({"eval_every": 10**9, "env_steps": None, "max_updates": 10**9}, "lower --eval-every"),
-        ({"algorithm": "ars", "num_directions": 10**6}, "or --horizon"),
+        ({"algorithm": "ars", "num_directions": 10**6}, "--num-directions or --horizon"),
         ({"estimator": "value-baseline", "value_hidden_sizes": (10**6,)}, "--value-hidden-sizes"),
         ({"num_seeds": 2**31}, "--num-seeds must be less than 2^31, got 2147483648"),
         ({"hidden_sizes": (8, 2**40)}, "--hidden-sizes must be less than 2^31"),

@@ -54,13 +54,15 @@ def parts(config: Config, task: Task) -> list[Part]:
     steps = seeds * horizon * episodes
     values = task.observation + task.action + 3
     evaluated = seeds * horizon * 2 * config.eval_episodes
-    held = seeds * min(horizon, _CHUNK) * episodes * sum(config.hidden_sizes)
-    policies = seeds * (1 if config.algorithm == "reinforce" else 2 * config.num_directions)
+    follows = config.algorithm == "reinforce"  # a gradient; else it searches with many policies
+    fewer = "--num-episodes" if follows else "--num-directions"
+    held = seeds * (min(horizon, _CHUNK) if follows else 1) * episodes * sum(config.hidden_sizes)
+    policies = seeds if follows else seeds * 2 * config.num_directions
     network = _ACTIVATIONS * held + _PARAMETERS * policies * num_parameters(config, task)
     values_hidden = sum(config.value_hidden_sizes) if config.estimator == "value-baseline" else 0
     return [
-        Part(_FLOAT * _COPIES * steps * values, "--num-seeds, --num-episodes or --horizon"),
-        Part(_FLOAT * network, "--hidden-sizes, --num-seeds or --num-episodes"),
+        Part(_FLOAT * _COPIES * steps * values, f"--num-seeds, {fewer} or --horizon"),
+        Part(_FLOAT * network, f"--hidden-sizes, --num-seeds or {fewer}"),
         Part(_FLOAT * steps * values_hidden, "--value-hidden-sizes, --num-seeds or --horizon"),
         Part(_EVALUATED * evaluated, "--eval-episodes, --num-seeds or --horizon"),
         Part(_FLOAT * _METRICS * seeds * block_length(config), "--eval-every or --num-seeds"),
