@@ -249,7 +249,7 @@ MODEL = "<mujoco><worldbody>{}</worldbody></mujoco>"
         ("", "XML"),
         ("not a model", "XML"),
         (MODEL.format("<geom size='1'/"), "XML"),
-        (MODEL.format("<goem size='1'/>"), "unrecognized.*goem"),
+        (MODEL.format("<goem size='1'/>"), "unrecognized element Element .goem., line 1"),
         (MODEL.format("<geom size='a'/>"), "line 1"),
         (MODEL.format("<geom type='mesh' mesh='far'/>"), "far"),
         (MODEL.format("<body><joint/></body>"), "mass"),

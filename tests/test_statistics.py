@@ -177,7 +177,8 @@ def test_a_thousand_seeds_take_little_memory():
         "from mjx_reinforce.reports.statistics import iqm_interval\n"
         "iqm_interval(numpy.random.default_rng(0).normal(size=(200, 1000)))\n"
         # Not resource.getrusage: its maximum begins with the memory of the process that starts this.
-        "print(next(x for x in open('/proc/self/status') if x.startswith('VmHWM')).split()[1])"
+        "status = open('/proc/self/status').read()\n"
+        "print(status.split('VmHWM:')[1].split()[0])"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert float(done.stdout) < 500_000  # kB
