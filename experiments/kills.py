@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-RUN = ["--env", "InvertedPendulum-v5", "--horizon", "50", "--env-steps", "60000"]
+RUN = ["--env", "InvertedPendulum-v5", "--horizon", "50", "--env-steps", "600000"]
 RUN += ["--hidden-sizes", "4", "--eval-episodes", "2", "--checkpoint-every", "5"]
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 
