@@ -5,6 +5,7 @@ them, and all that comes later sees plain settings. Presets have their own.
 """
 
 import dataclasses
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,7 +37,7 @@ def of_task(env: str) -> Config:
 def named_task(arguments: Sequence[str]) -> str:
     """Returns the environment that a command line names with ``--env``, or the default one."""
     named = Config().env
-    for flag, following in zip(arguments, [*arguments[1:], ""], strict=True):
+    for flag, following in itertools.pairwise([*arguments, ""]):
         if flag == "--env" and following:
             named = following
         elif flag.startswith("--env="):
