@@ -176,7 +176,7 @@ def test_a_thousand_seeds_take_little_memory():
         "import numpy\n"
         "from mjx_reinforce.reports.statistics import iqm_interval\n"
         "iqm_interval(numpy.random.default_rng(0).normal(size=(200, 1000)))\n"
-        # Not resource.getrusage: its maximum begins with the memory of the process that starts this.
+        # Not resource.getrusage: its maximum begins with that of the process which starts this one.
         "status = open('/proc/self/status').read()\n"
         "print(status.split('VmHWM:')[1].split()[0])"
     )

@@ -96,7 +96,8 @@ _OPTIONAL = {field.name for field in dataclasses.fields(Config) if "None" in str
 _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     (
         "num_seeds num_episodes env_steps max_updates horizon decay_updates eval_every "
-        "checkpoint_every eval_episodes value_fits minibatch_updates minibatch_size num_directions top_directions",
+        "checkpoint_every eval_episodes value_fits minibatch_updates minibatch_size "
+        "num_directions top_directions",
         lambda x: x >= 1,
         "at least 1",
     ),
