@@ -2,12 +2,12 @@
 
 import dataclasses
 import functools
+import importlib.resources
 import inspect
 
 import gymnasium
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import pytest
 from brax.envs import wrappers
@@ -232,7 +232,7 @@ def test_register_once():
 
 
 def test_own_model_by_path(tmp_path):
-    source = envs.make("InvertedPendulum-v5").mj_model
-    mujoco.mj_saveLastXML(str(tmp_path / "mine.xml"), source)
+    asset = importlib.resources.files("mjx_reinforce.envs") / "assets" / "inverted_pendulum.xml"
+    (tmp_path / "mine.xml").write_text(asset.read_text())
     mine = envs.make("InvertedPendulum-v5", xml_file=str(tmp_path / "mine.xml"), frame_skip=1)
     assert mine.dt == pytest.approx(0.02)

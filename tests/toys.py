@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from mjx_reinforce import Box, Distribution
+from mjx_reinforce import Box, Discrete, Distribution
 
 
 @struct.dataclass
@@ -97,7 +97,8 @@ class Chain:
     """
 
     max_episode_steps = 3
-    action_size = 1
+    action_size = 2
+    action_space = Discrete(2)
     rewards = np.array([[1.0, -0.5], [2.0, 0.7], [-1.0, 3.0]])
 
     def reset(self, rng):
