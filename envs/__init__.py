@@ -63,7 +63,7 @@ def make(id: str, /, **kwargs: Any) -> Any:
         env = build(**(settings | kwargs))
     except BadEnvironmentError:
         raise
-    except Exception as error:  # it may be the user's code, which may raise anything
+    except (Exception, SystemExit) as error:  # the user's code may raise anything
         if isinstance(error, ValueError) and ":" not in id:
             raise
         raise ValueError(f"cannot build the environment {id!r}: {explain(error)}") from error
@@ -92,6 +92,11 @@ def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
 
 def check_id(id: str) -> None:
     """Raises ValueError for an id that ``make`` does not know; imports nothing."""
+    if re.search(r"\.py\b", id):
+        raise ValueError(
+            f"{id!r} is a file: write module:Class, such as own_model:Crane for the class Crane in "
+            "own_model.py"
+        )
     if ":" not in id:
         check_name("environment", id, _TABLE)
     elif not re.fullmatch(r"\w+(\.\w+)*:\w+", id):

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import jax.numpy as jnp
+
 from mjx_reinforce.checks import BadEnvironmentError
 
 
@@ -26,7 +28,8 @@ def check_start(name: str, start: Any, sizes: tuple[int, int]) -> tuple[Any, Any
                 f"{name}.initial must return {what} [{size}], as the model has it, "
                 f"got {_described(value)}"
             )
-    return start[0], start[1]
+    qpos, qvel = (jnp.asarray(x, jnp.result_type(x, float)) for x in start)  # also of integers
+    return qpos, qvel
 
 
 def check_outcome(name: str, outcome: Any) -> tuple[Any, Any, dict[str, Any]]:

@@ -3,7 +3,6 @@
 import math
 import numbers
 import sysconfig
-import textwrap
 import traceback
 import types
 import typing
@@ -38,7 +37,8 @@ def explain(error: BaseException) -> str:
 
     The messages of JAX and MuJoCo have many lines, of which the first ones say what is wrong.
     """
-    message = textwrap.shorten(str(error), _LENGTH, placeholder=" ...")
+    message = " ".join(str(error).split())
+    message = message if len(message) <= _LENGTH else f"{message[:_LENGTH]} ..."
     said = f"{type(error).__name__}: {message}" if message else type(error).__name__
     own = [
         frame
@@ -104,6 +104,8 @@ def is_nan(value: Any) -> bool:
 def check_parts(env: Any) -> None:
     """Raises ValueError for an object that has not the methods of an environment."""
     name = type(env).__name__
+    if isinstance(env, type):
+        raise BadEnvironmentError(f"{env.__name__} is a class, no environment yet: call it")
     try:
         missing = [part for part in _PARTS if not hasattr(env, part)]
     except Exception as error:  # action_size may be a property, the user's code

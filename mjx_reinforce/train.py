@@ -8,24 +8,27 @@ if __name__ == "__main__":  # Ctrl-C ends the imports below without a traceback
 import contextlib
 import dataclasses
 import gc
+import os
 import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from mjx_reinforce import envs
 from mjx_reinforce.runs import resume
 from mjx_reinforce.runs.alarms import silence_alarms
-from mjx_reinforce.runs.command_line import parse
+from mjx_reinforce.runs.command_line import parse, refuse
 from mjx_reinforce.runs.config import Config, check
-from mjx_reinforce.runs.files import choose_directory, prepare, remove_empty
+from mjx_reinforce.runs.files import check_writable, choose_directory, prepare, remove_empty
 from mjx_reinforce.runs.flags import accept_all_characters
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.memory import check_size
 from mjx_reinforce.runs.plan import Plan, make_plan
+from mjx_reinforce.runs.relevance import check_read_by_policy
+from mjx_reinforce.runs.sinks.sink import check_installed, open_sinks
 
 
 def main() -> None:
@@ -37,7 +40,17 @@ def main() -> None:
     accept_all_characters()
     silence_alarms()
     with Interrupt() as interrupt, contextlib.ExitStack() as held:
-        sys.exit(_main(sys.argv[1:], interrupt, held))
+        status = _main(sys.argv[1:], interrupt, held)
+    _drop_unwritten()
+    sys.exit(status)
+
+
+def _drop_unwritten() -> None:
+    """Drops output that its full disk or closed pipe does not take: Python would report it."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitStack) -> int:
@@ -50,6 +63,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             config = parse(arguments)
             check(config)
             check_size(config)
+            check_installed(config)
             directory, made = _directory(config)
             interrupt.on_exit(lambda: remove_empty(made))
             held.enter_context(locked(directory))
@@ -58,22 +72,24 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             learner, horizon, found = _start(env, config)
             plan = make_plan(env, learner, horizon, config)
     except ValueError as error:
-        _refuse(str(error), made)
+        refuse(str(error), made)
     try:
         return train(env, learner, horizon, found, config, plan, directory, interrupt)
     except RuntimeError as error:  # XLA's
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
         remedy = "lower --num-seeds, --num-episodes, --eval-episodes or --horizon"
-        _refuse(f"this run does not fit into memory ({error}); {remedy}", made)
+        refuse(f"this run does not fit into memory ({error}); {remedy}", made)
     except OSError as error:
-        remedy = f"make room, then go on with --resume {directory}"
-        _refuse(f"cannot write the files of this run ({error}); {remedy}", made, status=1)
+        begun = (directory / "config.json").exists()
+        remedy = "make room, then " + (f"go on with --resume {directory}" if begun else "try again")
+        refuse(f"cannot write the files of this run ({error}); {remedy}", made, status=1)
 
 
 def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
     """Returns the run directory, and the folders that were made for it."""
     if config.resume is not None:
+        check_writable(config.resume)
         return config.resume, ()
     directory = choose_directory(config.output, config.env)
     return directory, prepare(directory, config.overwrite)
@@ -85,21 +101,16 @@ def _start(env: Any, config: Config) -> tuple[Any, int, Any]:
     Raises:
       ValueError: the settings do not fit the environment, or the run cannot go on here.
     """
-    from mjx_reinforce.runs.build import build
+    from mjx_reinforce.runs.build import build, policy_settings
     from mjx_reinforce.runs.files import provenance
 
     learner, horizon = build(env, config)
     if config.resume is None:
+        if config.policy == "auto":
+            check_read_by_policy(config, policy_settings(env, config)["policy"])
         return learner, horizon, None
     resume.check_program(config.resume, provenance())
     return learner, horizon, resume.find(learner, config, print)
-
-
-def _refuse(message: str, made: Sequence[Path], status: int = 2) -> NoReturn:
-    """Says in one line what is wrong, removes the folders that this run made, and exits."""
-    remove_empty(made)
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
-    sys.exit(status)
 
 
 def train(
@@ -130,7 +141,6 @@ def train(
     with _collection_paused():
         from mjx_reinforce.reports.curves import load_libraries
         from mjx_reinforce.runs.display import Display, print_summary
-        from mjx_reinforce.runs.nonfinite import HOPELESS
 
     with Display() as display:
         interrupt.on_exit(display.console.show_cursor)
@@ -142,15 +152,18 @@ def train(
         _begin(session, horizon, found)
         display.start(compile_seconds)
         threading.Thread(target=load_libraries, daemon=True).start()
-        interrupted = _loop(session, interrupt, evaluated=found is not None)
+        _loop(session, interrupt)
     if not session.saved:
         session.save()
-    summary = _finish(session, learner.engine.name, compile_seconds, interrupted)
-    print_summary(display.console, summary, directory)
-    if session.record.hopeless():
-        display.say(HOPELESS, "red")
+    # A signal after that changes nothing: what is left takes a second or two.
+    test = session.test(lambda: interrupt.number is not None)
+    summary = _finish(session, learner.engine.name, compile_seconds, test)
+    with contextlib.suppress(OSError):  # as ``Display.say``
+        print_summary(display.console, summary, directory)
+    if summary["status"] == "stopped":
+        display.say(f"stopped: {summary['reason']}", "red")
         return 1
-    return 128 + interrupted if interrupted else 0
+    return 0 if interrupt.number is None or test else 128 + interrupt.number
 
 
 def _compile(
@@ -183,45 +196,54 @@ def _begin(session: Any, horizon: int, found: Any) -> None:
         settings = dataclasses.asdict(config) | {"horizon": horizon, "output": str(log.directory)}
         del settings["resume"]
         log.begin(settings)
+        session.sinks = open_sinks(config, log.directory, None)
         return
     budget = {name: getattr(config, name) for name in resume.BUDGETS}
     log.resume(resume.read_record(config.resume), budget, found)
     if found is not None:
         session.restore(found)
-    session.display.say(f"going on after {session.record.updates.max()} updates")
+    updates = session.record.updates.max()
+    session.sinks = open_sinks(config, log.directory, None if found is None else int(updates))
+    again = "" if updates else ": no checkpoint serves, so it begins again, to the same numbers"
+    session.display.say(f"going on after {updates} updates{again}")
 
 
-def _loop(session: Any, interrupt: Interrupt, *, evaluated: bool) -> int | None:
-    """Trains until the budget is used or nothing is finite, or a signal came; returns its number.
+def _loop(session: Any, interrupt: Interrupt) -> None:
+    """Trains until the budget is used or nothing is finite, or a signal came.
 
-    Args:
-      session: the run.
-      interrupt: what listens to signals.
-      evaluated: whether the present policies have been.
+    A block that was interrupted is not evaluated, which may take minutes: the resumed run begins
+    with that.
     """
-    if not evaluated:
-        session.evaluate()
-    while not (session.record.finished() or session.record.hopeless()):
-        if interrupt.number is not None:
-            return interrupt.number
+    while True:
+        if not session.record.evaluated():
+            session.evaluate()
+            session.save_if_due()
+        if session.record.finished() or session.record.hopeless() or interrupt.number is not None:
+            return
         session.advance()
-        session.evaluate()
-        session.save_if_due()
-    return None
+        if interrupt.number is not None:
+            return
 
 
 def _finish(
-    session: Any, engine: str, compile_seconds: float, interrupted: int | None
+    session: Any, engine: str, compile_seconds: float, test: dict[str, Any]
 ) -> dict[str, Any]:
-    """Writes the last files; returns the contents of summary.json."""
+    """Writes the last files; returns the contents of summary.json.
+
+    Args:
+      session: the run.
+      engine: the name of the engine that played.
+      compile_seconds: wall time of compiling.
+      test: from ``Session.test``, empty if the run was interrupted.
+    """
     from mjx_reinforce.reports.curves import draw_learning_curve
+    from mjx_reinforce.runs.nonfinite import HOPELESS
 
     config, record = session.config, session.record
-    # A run that was interrupted is to end soon, and is tested when it has been resumed.
-    test = {} if interrupted else session.test()
     run_seconds = session.seconds()
+    end = {"status": "stopped", "reason": HOPELESS} if record.hopeless() else {"status": "finished"}
     summary = {
-        "status": "interrupted" if interrupted else "finished",
+        **(end if test else {"status": "interrupted"}),
         **record.summary(engine, compile_seconds, run_seconds),
         "best_updates": session.best.num_updates.tolist(),
         **test,
@@ -231,6 +253,7 @@ def _finish(
     picture = draw_learning_curve(history, training, config.env, record.threshold, axis)
     session.save_policies()
     session.log.finish(training, picture, summary)
+    session.close_sinks()
     return summary
 
 

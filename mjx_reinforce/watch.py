@@ -5,6 +5,7 @@ import math
 import os
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,11 +18,14 @@ from mjx_reinforce import envs
 from mjx_reinforce.export.films import Renderer, import_mujoco, mediapy_with_ffmpeg, write_film
 from mjx_reinforce.export.run_files import Run, Seed, Which, choose_seed, read_run
 from mjx_reinforce.runs.alarms import silence_alarms
-from mjx_reinforce.runs.flags import accept_all_characters
+from mjx_reinforce.runs.flags import accept_all_characters, read
+from mjx_reinforce.runs.heartbeat import heartbeat
 from mjx_reinforce.runs.jax_setup import configure_jax
 
 #: Frames a second at most: what a film shows, and what GIF viewers play.
 _MAX_RATE = 30
+#: Pictures, spread over the film, whose colours it has.
+_SAMPLES = 4
 #: Settings that are whole numbers, with the least and the greatest that is accepted.
 _RANGES = (
     *(("width", 1, 4096), ("height", 1, 4096)),
@@ -53,7 +57,7 @@ class Settings:
     """Draw actions from the policy, as training does, instead of taking its mode."""
     output: Path | None = None
     """The film, .gif or, after pip install mediapy imageio-ffmpeg, .mp4.
-    By default RUN/seed-NUMBER.gif."""
+    By default RUN/seed-NUMBER.gif, or RUN/seed-NUMBER-gymnasium.gif."""
     seconds: float = 20.0
     """Length of the film at most, in simulated seconds; the episode is played to its end."""
     width: int = 480
@@ -68,11 +72,10 @@ def main() -> None:
     """Reads the command line, films, and exits: 0 done, 2 bad input, 130 interrupted."""
     accept_all_characters()
     silence_alarms()
-    settings = tyro.cli(Settings, prog="python -m mjx_reinforce.watch")
     try:
-        film(settings)
+        film(read(Settings, sys.argv[1:], "python -m mjx_reinforce.watch", Settings.__doc__ or ""))
     except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
@@ -96,7 +99,7 @@ def film(settings: Settings) -> None:
     renderer = Renderer(scene(env), settings.width, settings.height)
     simulators = _simulators(settings, env, player, run.horizon)
     name, play = list(simulators.items())[-1]
-    with Console(stderr=True).status("compiling and playing"):
+    with _waiting("compiling and playing"):
         episode = play(settings.episode, settings.noise)
         steps = f"{len(episode.rewards)} steps in {name}"
         print(f"{run.env}, seed {player.seed}: return {episode.total:.1f} in {steps}")
@@ -104,9 +107,16 @@ def film(settings: Settings) -> None:
             print(compare(settings, simulators))
     skip = max(1, math.ceil(1 / (env.dt * _MAX_RATE) - 1e-9))
     shown = episode.qpos[: max(1, round(settings.seconds / env.dt)) : skip]
+    samples = [renderer.draw(qpos) for qpos in shown[:: -(-len(shown) // _SAMPLES)]]
     frames = track(map(renderer.draw, shown), "drawing", len(shown), transient=True)
-    write_film(output, frames, 1 / (env.dt * skip))
+    write_film(output, frames, 1 / (env.dt * skip), samples)
     print(f"{len(shown)} frames in {output}")
+
+
+def _waiting(what: str) -> AbstractContextManager[Any]:
+    """Returns a ``with`` block that shows that its contents go on."""
+    console = Console(stderr=True)
+    return console.status(what) if console.is_terminal else heartbeat(console.print, None, what)
 
 
 def _make(run: Run, size: int) -> Any:
@@ -157,10 +167,11 @@ def check(settings: Settings, seed: int) -> Path:
         value = getattr(settings, name)
         if not least <= value <= most:
             raise ValueError(f"--{name} must be in [{least}, {most}], got {value}")
-    output = settings.output or settings.run / f"seed-{seed}.gif"
+    name = f"seed-{seed}{'-gymnasium' * (settings.backend == 'gymnasium')}.gif"
+    output = settings.output or settings.run / name
     if output.suffix.lower() not in (".gif", ".mp4"):
         raise ValueError(f"{output} is no film; end --output in .gif or .mp4")
-    if not os.access(output.parent, os.W_OK):
+    if not (output.parent.is_dir() and os.access(output.parent, os.W_OK)):
         raise ValueError(f"cannot write to {output.parent}; choose another --output")
     if output.is_dir() or (output.exists() and not settings.overwrite):
         raise ValueError(f"{output} exists; pass --overwrite or another --output")

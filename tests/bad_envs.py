@@ -43,6 +43,10 @@ class ActionSizeIsText(Survive):
     action_size = "one"
 
 
+class ActionSizeIsTrue(Survive):
+    action_size = True
+
+
 class NoActions(Survive):
     action_size = 0
 
@@ -57,6 +61,54 @@ class SpaceOfTwo(Survive):
 
 class SpaceUpsideDown(Survive):
     action_space = Box(np.array([1.0]), np.array([-1.0]))
+
+
+class SpaceOfText(Survive):
+    action_space = Box(np.array(["low"]), np.array(["more"]))
+
+
+class SpaceRagged(Survive):
+    action_space = Box([[1], [1, 2]], [3])
+
+
+class SpaceRaises(Survive):
+    @property
+    def action_space(self):
+        raise RuntimeError("no space")
+
+
+class LimitIsTrue(Survive):
+    max_episode_steps = True
+
+
+class LimitRaises(Survive):
+    @property
+    def max_episode_steps(self):
+        raise RuntimeError("no limit")
+
+
+class LimitMissing(Survive):
+    max_episode_steps = None
+
+
+class ThresholdRaises(Survive):
+    @property
+    def reward_threshold(self):
+        return {}["return"]
+
+
+class Exits(Survive):
+    def __init__(self):
+        raise SystemExit(3)
+
+
+class LongMessage(Survive):
+    def __init__(self):
+        raise ValueError("x" * 10_000)
+
+
+def not_called():
+    return Survive
 
 
 class LimitIsText(Survive):
@@ -106,6 +158,11 @@ class ObservationEmpty(Survive):
         return jnp.zeros(0)
 
 
+class ObservationComplex(Survive):
+    def observe(self, key):
+        return jnp.zeros(2, jnp.complex64)
+
+
 class RewardVector(Survive):
     def reset(self, rng):
         return super().reset(rng).replace(reward=jnp.zeros(1))
@@ -114,6 +171,11 @@ class RewardVector(Survive):
 class DoneVector(Survive):
     def reset(self, rng):
         return super().reset(rng).replace(done=jnp.zeros(3))
+
+
+class StepExits(Survive):
+    def step(self, state, action):
+        raise SystemExit(3)
 
 
 class StepTypo(Survive):
@@ -224,6 +286,13 @@ class OutcomeNoField(Pole):
 class InitialOfOne(Pole):
     def initial(self, rng):
         return jnp.zeros(2)
+
+
+class InitialOfIntegers(Pole):
+    """Is no mistake: they become numbers."""
+
+    def initial(self, rng):
+        return jnp.zeros(2, int), jnp.zeros(2, int)
 
 
 class InitialTooLong(Pole):

@@ -5,12 +5,14 @@ First command lines and calls by hand, then settings drawn at random.
 
 import dataclasses
 import math
+import os
 import subprocess
 import sys
 import typing
 from pathlib import Path
 from typing import Literal
 
+import jax
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -20,7 +22,7 @@ from toys import Survive
 from mjx_reinforce import ars, envs, reinforce
 from mjx_reinforce import train as train_module
 from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS
-from mjx_reinforce.runs import display
+from mjx_reinforce.runs import display, jax_setup
 from mjx_reinforce.runs.build import build
 from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.presets import PRESETS
@@ -73,6 +75,11 @@ def refused(monkeypatch, tmp_path, capsys):
         ("--env CartPole-v1 --policy categorical --initial-std 0.3", "standard deviation"),
         ("--env CartPole-v1 --policy categorical --no-rescale", "continuous actions"),
         ("--algorithm ars --initial-std 0.3", "standard deviation"),
+        # What auto stands for depends on the actions of the environment.
+        ("--env CartPole-v1 --initial-std 0.3", "--initial-std 0.3 would do nothing"),
+        ("--env CartPole-v1 --no-rescale", "--no-rescale would do nothing"),
+        ("--env CartPole-v1 --algorithm ars --no-rescale", "--no-rescale would do nothing"),
+        ("--overwrite", "choose --output DIR"),
         ("gymnasium-tutorial --minibatch-size 64", "choose --update minibatches"),
         ("continuous-cartpole-ars --learning-rate 0.1", "choose --algorithm reinforce"),
         ("baseline-truncated-normal --final-learning-rate 1e-5", "--decay-updates N"),
@@ -131,7 +138,15 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ("--env os:", "not of the form module:Class"),
         ("--env a:b:c", "not of the form module:Class"),
         ("--env .relative:X", "not of the form module:Class"),
-        ("--env folder/own_model.py:Crane", "not of the form module:Class"),
+        ("--env folder/own_model.py:Crane", "is a file: write module:Class, such as own_model"),
+        ("--env own_model.py", "'own_model.py' is a file"),
+        ("--env-steps nan", "--env-steps takes a whole number or None, got 'nan'"),
+        ("--env-steps 280,000", "--env-steps takes a whole number or None, got '280,000'"),
+        ("--max-grad-norm none", "--max-grad-norm takes a number or None, got 'none'"),
+        ("--hidden-sizes 32,32", "takes whole numbers with spaces between them, such as 32 32"),
+        ("-- --num-seeds 3", "leave -- out"),
+        ("--hidden-sizes " + "2 " * 101, "at most 100 layers"),
+        ("--update minibatches --minibatch-size 2000000000", "lower --minibatch-size"),
         ("--env os:path", "'os:path' is no class or function, but of type module"),
         ("--env bad_envs:A_CONSTANT", "is no class or function, but of type int"),
         ("--env nowhere:X", "No module named 'nowhere'"),
@@ -185,7 +200,20 @@ def test_a_module_that_cannot_be_imported_is_named(refused, monkeypatch, tmp_pat
         ("SpaceOfTwo", "of 1 entries each as action_size says"),
         ("SpaceUpsideDown", "must have low < high"),
         ("LimitIsText", "max_episode_steps must be a whole number, 1 or more, got 'many'"),
+        ("ActionSizeIsTrue", "action_size must be a whole number, 1 or more, got True"),
+        ("SpaceOfText", "must have low < high"),
+        ("SpaceRagged", "must have low < high"),
+        ("SpaceRaises", "SpaceRaises.action_space fails: RuntimeError: no space (bad_envs.py"),
         ("LimitIsZero", "got 0"),
+        ("LimitIsTrue", "max_episode_steps must be a whole number, 1 or more, got True"),
+        ("LimitRaises", "LimitRaises.max_episode_steps fails: RuntimeError: no limit"),
+        ("LimitMissing", "declares no max_episode_steps: give a horizon"),
+        ("ThresholdRaises", "ThresholdRaises.reward_threshold fails: KeyError: 'return'"),
+        ("Exits", "cannot build the environment 'bad_envs:Exits': SystemExit: 3"),
+        ("StepExits", "StepExits.step fails: SystemExit: 3"),
+        ("LongMessage", "ValueError: xxxx"),
+        ("not_called", "Survive is a class, no environment yet: call it"),
+        ("ObservationComplex", "must hold real numbers, it holds complex64"),
         ("ThresholdIsNan", "reward_threshold must be a number or None, got nan"),
         ("ResetRaises", "ResetRaises.reset fails: AttributeError:"),
         ("ResetReturnsNone", "whose obs is a vector [O], and there is no obs"),
@@ -198,6 +226,7 @@ def test_a_module_that_cannot_be_imported_is_named(refused, monkeypatch, tmp_pat
         ("DoneVector", "the done of DoneVector.reset must be a scalar [], its shape is [3]"),
         ("StepTypo", "StepTypo.step fails: NameError: name 'reward' is not defined (bad_envs.py"),
         ("StepBranches", "StepBranches.step fails: TracerBoolConversionError"),
+        ("StepBranches", "it is compiled by JAX: write jnp.where for `if`"),
         ("StepCallsNumpy", "StepCallsNumpy.step fails: TracerArrayConversionError"),
         ("StepReturnsTuple", "with the entries that reset's has"),
         ("StepRewardVector", "reward is float32[] after reset, and float32[1] after step"),
@@ -228,7 +257,7 @@ def test_an_environment_with_a_mistake_is_refused(refused, name, message):
 
 def test_the_environments_that_those_change_are_right(monkeypatch):
     monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
-    for id in ("Survive-v0", "bad_envs:Pole"):
+    for id in ("Survive-v0", "bad_envs:Pole", "bad_envs:InitialOfIntegers"):
         build(envs.make(id), Config(env=id, engine="vmap"))
 
 
@@ -411,6 +440,15 @@ def test_an_ascii_terminal_shows_escapes(tmp_path, accent):
     assert done.stderr.decode("ascii").startswith("error: unknown environment")
 
 
+@pytest.mark.parametrize("columns", ["1", "20", "0", "x", "200"])
+def test_help_is_of_some_hundred_lines_on_every_terminal(monkeypatch, capsys, columns):
+    monkeypatch.setenv("COLUMNS", columns)
+    with pytest.raises(SystemExit, match="0"):
+        parse(["--help"])
+    assert capsys.readouterr().out.count("\n") < 500
+    assert os.environ["COLUMNS"] == columns
+
+
 # At random.
 
 _FEW = settings(derandomize=True, deadline=None, database=None, max_examples=150)
@@ -518,3 +556,12 @@ _WORDS |= st.sampled_from(["None", "True", "--", "-", "=", "--=", "nan", "1e400"
 @given(st.lists(_WORDS, min_size=1, max_size=6))
 def test_command_lines_are_read_or_refused(words):
     refusal(lambda: check(parse(words)))
+
+
+def test_a_machine_without_the_chosen_device_is_named(monkeypatch):
+    def none():
+        raise RuntimeError("Unable to initialize backend 'tpu'")
+
+    monkeypatch.setattr(jax, "devices", none)
+    with pytest.raises(ValueError, match="JAX cannot compute here: Unable to initialize"):
+        jax_setup.configure_jax()

@@ -150,12 +150,27 @@ def test_the_critics_optimizer_keeps_its_state_and_sees_the_parameters():
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), twice, at_once)
 
 
-def test_equal_returns_leave_nothing_to_explain():
-    """A variance of 0 counts as 1e-8."""
-    explained = est._explained(
-        jnp.array([[1e-4], [-1e-4]]), jnp.ones((2, 1)), jnp.ones((2, 1), bool)
-    )
-    assert float(explained) == pytest.approx(0.0, abs=1e-3)
+@pytest.mark.parametrize("level", [0.0, 0.1, -1e6])
+def test_equal_returns_leave_nothing_to_explain(level):
+    """Neither a perfect baseline nor a bad one: NaN, also where their mean is rounded."""
+    residual = jnp.tile(jnp.array([1e-4, -1e-4, 0.0]), (7, 1))
+    explained = est.explained_variance(residual, jnp.full((7, 3), level), jnp.ones((7, 3), bool))
+    assert np.isnan(explained)
+
+
+@pytest.mark.parametrize("ended", ["zero", "skip"])
+def test_the_variance_that_leave_one_out_explains_by_hand(ended):
+    weight, _, metrics = update(est.leave_one_out(0.9, ended=ended), make_trajectory())
+    left, returns = np.asarray(weight)[MASK], returns_by_hand(0.9)[MASK]
+    expected = 1 - np.var(left) / np.var(returns)
+    assert float(metrics["explained_variance"]) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_perfect_baseline_explains_all_and_a_constant_nothing():
+    returns, mask = jnp.asarray(REWARD), jnp.asarray(MASK)
+    zero = jnp.where(mask, 0.0, 7.0)
+    assert float(est.explained_variance(zero, returns, mask)) == 1.0
+    assert float(est.explained_variance(returns - 3, returns, mask)) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("center", [False, True])
@@ -256,6 +271,7 @@ def test_a_seed_that_plays_nothing_stays_finite(name, wrap):
     estimator = wrap(load(ESTIMATORS[name])(0.9))
     weight, state, metrics = update(estimator, make_trajectory(mask=np.zeros((4, 3), bool)))
     assert np.all(np.asarray(weight) == 0.0)
+    assert np.isnan(metrics.pop("explained_variance", np.nan))
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves((state, metrics)))
 
 

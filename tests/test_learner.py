@@ -256,6 +256,8 @@ def test_a_broken_simulation_is_counted_and_stays_in_its_seed():
     assert np.all(metrics["nonfinite_episodes"] == 0)
     mixed, metrics = jax.vmap(step)(jnp.array([True, False]), keys)
     np.testing.assert_array_equal(metrics["nonfinite_episodes"], [4, 0])
+    for name in ("entropy", "gradient_norm", "kl", "policy_std", "gradient_snr", "weight_std"):
+        np.testing.assert_array_equal(np.isfinite(metrics[name]), [False, True], err_msg=name)
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[1], y[1]), healthy.actor, mixed.actor)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(mixed.actor))
 
@@ -267,6 +269,8 @@ def test_a_gradient_that_is_not_finite_is_skipped():
     state = learner.init(jax.random.key(0))
     after, metrics = train_step(learner, state)
     assert int(metrics["skipped_update"]) == 1
+    for name in ("entropy", "gradient_norm", "kl", "clipped_gradients"):
+        assert np.isnan(metrics[name]), name
     assert int(after.num_updates) == 1
     jax.tree.map(np.testing.assert_array_equal, state.actor, after.actor)
 

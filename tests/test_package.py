@@ -16,10 +16,10 @@ PACKAGE = ROOT / "mjx_reinforce"
 #: Folders and root modules from the ground up; a file imports from its own folder and those before.
 ORDER = (
     *("checks", "types", "registry", "fused", "physics", "envs", "policies", "engines", "learners"),
-    *("reports", "export", "runs", "train", "watch"),
+    *("export", "reports", "runs", "report", "sweeps", "sweep", "train", "watch", "__main__"),
 )
 #: Who may know that our environments exist; all others take any environment as an argument.
-MAY_IMPORT_ENVS = {"envs", "runs", "train", "watch"}
+MAY_IMPORT_ENVS = {"envs", "runs", "sweeps", "sweep", "train", "watch", "__main__"}
 
 
 def modules(root, parent):
@@ -34,7 +34,8 @@ FILES = dict([*modules(PACKAGE, ()), *modules(ROOT / "envs", ("envs",))])
 
 
 def folder(module):
-    return module.partition(".")[0]
+    """The first part of a name; the command lines of folders, their ``__main__``, are one."""
+    return "__main__" if module.endswith("__main__") else module.partition(".")[0]
 
 
 def imported(path):

@@ -86,6 +86,30 @@ def test_a_record_of_nothing_is_restored():
     assert copy.add_evaluation(evaluation(1, 2), 0.5)[0]["train_return"] == ""
 
 
+def test_a_block_waits_for_its_evaluation():
+    record = Record(Config(num_seeds=3, max_updates=100), 2.0)
+    assert not record.evaluated()
+    record.add_evaluation(evaluation(1, 2, 3), 0.1)
+    assert record.evaluated()
+    record.add_updates(block(np.random.default_rng(0), 4, 3, record.updates))
+    assert not record.evaluated()
+    copy = Record(Config(num_seeds=3, max_updates=100), 2.0)
+    copy.restore(record.arrays())
+    assert not copy.evaluated()
+    copy.add_evaluation(evaluation(1, 2, 3), 0.2)
+    assert copy.evaluated()
+
+
+def test_a_test_counts_among_what_was_simulated():
+    """Side by side with the longest, as an evaluation."""
+    record = filled()
+    fraction = record.summary("fused", 1.0, 2.0)["useful_step_fraction"]
+    simulated = record.env_steps.sum() / fraction
+    record.add_test({"simulated_steps": np.array([5, 9, 7], np.int32)})
+    more = record.summary("fused", 1.0, 2.0)["useful_step_fraction"]
+    assert record.env_steps.sum() / more == pytest.approx(simulated + 3 * 9)
+
+
 def test_a_seed_is_broken_while_nothing_of_it_is_finite():
     """All its episodes, or its policy. One good update ends it, standing still does not."""
     metrics = {
@@ -169,7 +193,7 @@ def test_the_end_table_has_counts():
     returns[0, :3] = 573.6, 600.0, np.nan
     counts = np.full((1, 1000), 50_000)
     history = {"eval_return": returns, "env_steps": counts, "episodes": counts}
-    more = {"env": "Task-v0", "num_seeds": 1000, "env_steps_per_second": 1e6}
+    more = {"status": "finished", "env": "Task-v0", "num_seeds": 1000, "env_steps_per_second": 1e6}
     more |= {"useful_step_fraction": 0.9999, "compile_seconds": 1.0, "run_seconds": 2.0}
     console = screen(80)
     display.print_summary(console, summarize(history, 950.0) | more, Path("t/[bold]x"))

@@ -1,15 +1,20 @@
 """Checkpoints: a run that goes on ends as one that never stopped, whatever happens to its files."""
 
 import errno
+import functools
 import json
+import os
+import resource
 import shutil
+import signal
 import sys
+import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import Survive
+from toys import Drift
 
 from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
@@ -21,28 +26,14 @@ from mjx_reinforce.runs import checkpoint
 from mjx_reinforce.runs.best import first_best, keep_best
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.files import locked
+from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.record import Record
-
-
-class Drift(Survive):
-    """Up to 20 steps; starts, returns and lengths vary, and one action in a hundred breaks it."""
-
-    def observe(self, key):
-        return jax.random.uniform(key, (1,), minval=-1.0)
-
-    def step(self, state, action):
-        obs = state.obs + 0.3 * action
-        reward = 1.0 - obs[0] ** 2
-        broken = (action[0] > 1.1) & (action[0] < 1.15)
-        done = (jnp.abs(obs[0]) > 1.2).astype(jnp.float32)
-        return state.replace(obs=jnp.where(broken, jnp.nan, obs), reward=reward, done=done)
-
+from mjx_reinforce.runs.session import Session
+from trainings import results
 
 SIZE = ["--num-seeds", "3", "--eval-episodes", "2", "--hidden-sizes", "4"]
 ANY = ["--env", "Drift-v0", "--env-steps", "None", *SIZE]
 COMMON = [*ANY, "--num-episodes", "4"]
-#: Parts of summary.json that a clock decides.
-CLOCKS = ("compile_seconds", "run_seconds", "env_steps_per_second")
 
 
 @pytest.fixture
@@ -58,22 +49,6 @@ def run(monkeypatch, tmp_path):
         return stop.value.code
 
     return run
-
-
-def results(directory):
-    """All that a run leaves, but for clocks and the story in config.json."""
-    rows = [line.split(",") for line in (directory / "metrics.csv").read_text().splitlines()]
-    clock = rows[0].index("wall_seconds")
-    summary = json.loads((directory / "summary.json").read_text())
-    with np.load(directory / "returns.npz", allow_pickle=False) as archive:
-        training = {name: archive[name].tobytes() for name in archive.files}
-    return {
-        "metrics": [row[:clock] + row[clock + 1 :] for row in rows],
-        "actor": (directory / "policy" / "actor.npz").read_bytes(),
-        "best": (directory / "policy" / "best" / "actor.npz").read_bytes(),
-        "training": training,
-        "summary": {name: value for name, value in summary.items() if name not in CLOCKS},
-    }
 
 
 def assert_same(one, other):
@@ -205,6 +180,77 @@ def test_a_run_that_cannot_end_is_resumed(run, trained, tmp_path, monkeypatch, c
     monkeypatch.chdir(tmp_path)
     assert run("--resume", "full") == 0
     assert_same(trained, tmp_path / "full")
+
+
+def signalled(method, when):
+    """The method, and after its ``when``-th call a signal, which has been heard when it returns."""
+    calls = []
+
+    @functools.wraps(method)
+    def called(*arguments):
+        result = method(*arguments)
+        calls.append(None)
+        if len(calls) == when:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.3)
+        return result
+
+    return called
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "when", "status", "rows"),
+    [
+        (RunLog, "begin", 1, 143, 1),
+        (Session, "advance", 2, 143, 2),  # whose evaluation is left to the run that goes on
+        (Session, "advance", 4, 143, 4),
+        (Session, "save_if_due", 2, 143, 2),
+        (Record, "add_test", 1, 143, 5),
+        (Record, "add_test", 2, 0, 5),  # nothing is left to stop
+        (Session, "save_policies", 5, 0, 5),
+    ],
+)
+def test_a_signal_anywhere_costs_nothing(
+    run, trained, tmp_path, monkeypatch, owner, name, when, status, rows
+):
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, signalled(getattr(owner, name), when))
+        arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "parts"]
+        assert run(*COMMON, *arguments) == status
+    summary = json.loads((tmp_path / "parts" / "summary.json").read_text())
+    assert summary["status"] == ("interrupted" if status else "finished")
+    assert ("final_test_returns" in summary) == (status == 0)
+    assert (tmp_path / "parts" / "metrics.csv").read_text().count("\n") == 1 + 3 * rows
+    if status:
+        assert run("--resume", "parts") == 0
+    assert_same(trained, tmp_path / "parts")
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_full_disk_is_refused_at_once(run, parts, tmp_path, monkeypatch, capsys, resumed):
+    """A limit on the size of files stands for it."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    arguments = ["--resume", "parts"] if resumed else [*COMMON, "--output", "new/out"]
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.setattr(train_module, "make_plan", pytest.fail)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        code = run(*arguments, "--max-updates", 30)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert code == 2
+    assert "(File too large); make room there" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_screen_that_takes_nothing_ends_no_run(run, trained, tmp_path, monkeypatch, capsys):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("rich.console.Console.print", full)
+    arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "out"]
+    assert run(*COMMON, *arguments) == 0
+    assert_same(trained, tmp_path / "out")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,13 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from mjx_reinforce.reports import bootstrap, curves
-from mjx_reinforce.reports.statistics import iqm, iqm_interval, steps_to_solve, summarize
+from mjx_reinforce.reports.statistics import (
+    iqm,
+    iqm_interval,
+    mean_interval,
+    steps_to_solve,
+    summarize,
+)
 
 
 def test_iqm_is_the_mean_of_the_middle_half():
@@ -36,14 +42,39 @@ def test_iqm_is_taken_along_its_axis():
     np.testing.assert_allclose(iqm(values.T, axis=0), [3.0, 4.0])
 
 
-def test_interval_is_the_percentile_bootstrap():
-    """5000 resamples of as many seeds, drawn from the generator of seed 0; at 95 %."""
+def by_scipy(values, tail):
+    """Percentiles of scipy's resamples of the seeds, sorted by their values at each point."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return stats.bootstrap(
+            (np.sort(values),),
+            iqm,
+            axis=-1,
+            n_resamples=5000,
+            confidence_level=1 - 2 * tail,
+            method="percentile",
+            vectorized=True,
+            rng=np.random.default_rng(0),
+        ).confidence_interval
+
+
+@pytest.mark.parametrize("confidence", [0.95, 0.5])
+def test_interval_is_the_expanded_percentile_bootstrap(confidence):
+    """Percentiles at the normal probability of Student's quantile."""
     values = np.random.default_rng(3).exponential(size=40)
-    drawn = np.random.default_rng(0).integers(0, 40, (5000, 40))
-    expected = np.quantile(iqm(values[drawn]), [0.025, 0.975])
-    np.testing.assert_allclose(iqm_interval(values), expected, rtol=1e-12)
-    expected = np.quantile(iqm(values[drawn]), [0.25, 0.75])
-    np.testing.assert_allclose(iqm_interval(values, confidence=0.5), expected, rtol=1e-12)
+    tail = stats.norm.cdf(stats.t.ppf((1 - confidence) / 2, 39))
+    expected = by_scipy(values, tail)
+    np.testing.assert_allclose(iqm_interval(values, confidence=confidence), expected, rtol=1e-12)
+
+
+def test_interval_of_the_mean_is_the_expanded_percentile_bootstrap():
+    """For ten seeds the normal quantile, times sqrt(9 / 10), is Student's, 2.262."""
+    tail = bootstrap.expanded_tail(0.95, 9, np.sqrt(0.9))
+    assert stats.norm.ppf(tail) * np.sqrt(0.9) == pytest.approx(-2.262, abs=5e-4)
+    values = np.random.default_rng(3).exponential(size=10)
+    drawn = np.random.default_rng(0).integers(0, 10, (5000, 10))
+    expected = np.quantile(np.sort(values)[drawn].mean(axis=1), [tail, 1 - tail])
+    np.testing.assert_allclose(mean_interval(values), expected, rtol=1e-12)
 
 
 def test_interval_of_two_seeds():
@@ -52,7 +83,7 @@ def test_interval_of_two_seeds():
     for low, high in (iqm_interval(values), iqm_interval(values.T, axis=0)):
         np.testing.assert_allclose(low, [0.0, 0.0, 10.0])
         np.testing.assert_allclose(high, [1.0, 2.0, 11.0])
-    low, high = iqm_interval(values, confidence=0.4)
+    low, high = iqm_interval(values, confidence=0.1)
     np.testing.assert_allclose(low, [0.5, 1.0, 10.5])
     np.testing.assert_allclose(high, [0.5, 1.0, 10.5])
 
@@ -96,20 +127,6 @@ def test_a_return_that_is_not_finite_solves_nothing():
     assert steps_to_solve(returns, np.array([[0, 0], [9, 9]]), 5.0) == [9, None]
 
 
-def by_scipy(values):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return stats.bootstrap(
-            (values,),
-            iqm,
-            axis=-1,
-            n_resamples=5000,
-            method="percentile",
-            vectorized=True,
-            rng=np.random.default_rng(0),
-        ).confidence_interval
-
-
 CURVES = {
     "smooth": lambda random, n: random.normal(size=(3, n)),
     "ties": lambda random, n: random.integers(0, 3, size=(3, n)),
@@ -121,17 +138,20 @@ CURVES = {
 
 @pytest.mark.parametrize("num_seeds", [2, 3, 4, 5, 7, 16, 101, 222])
 @pytest.mark.parametrize("kind", CURVES)
-def test_interval_is_that_of_scipy(kind, num_seeds):
+def test_resamples_are_those_of_scipy(kind, num_seeds):
     values = CURVES[kind](np.random.default_rng(num_seeds), num_seeds)
-    np.testing.assert_allclose(iqm_interval(values), by_scipy(values), rtol=1e-12, atol=1e-13)
+    found = bootstrap.percentiles(bootstrap.resampled_trim_means(values, 0.25), 0.025)
+    np.testing.assert_allclose(found, by_scipy(values, 0.025), rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize(("setting", "value"), [("_DEVIATIONS", 1), ("_DRAWS", 3000)])
+@pytest.mark.parametrize(("setting", "value"), [("_AT_ONCE", 700), ("_DRAWS", 3000)])
 def test_interval_does_not_depend_on_how_it_is_computed(monkeypatch, setting, value):
-    """Too few seeds looked at one by one are noticed, and resamples may come in parts."""
+    """Resamples may come in parts."""
     values = np.random.default_rng(2).exponential(size=(4, 150))
-    expected = by_scipy(values)
+    expected = iqm_interval(values)
     monkeypatch.setattr(bootstrap, setting, value)
+    for table in (bootstrap.draws, bootstrap._draws_between):
+        table.cache_clear()
     np.testing.assert_allclose(iqm_interval(values), expected, rtol=1e-12)
 
 
@@ -160,11 +180,12 @@ def test_a_failed_seed_is_worse_than_every_other(failed):
 def test_interval_of_failed_seeds(num_failed):
     """An end is NaN where resamples around it have no mean; the upper one goes last."""
     values = np.random.default_rng(5).normal(size=100)
-    drawn = np.random.default_rng(0).integers(0, 100, (5000, 100))
     values[:num_failed] = np.nan
-    means = np.sort(np.nan_to_num(iqm(values[drawn]), nan=-np.inf))
+    ordered = np.sort(np.nan_to_num(values, nan=-np.inf))
+    means = iqm(ordered[np.random.default_rng(0).integers(0, 100, (5000, 100))])
+    tail = bootstrap.expanded_tail(0.95, 99)
     with np.errstate(invalid="ignore"):
-        expected = np.quantile(means, [0.025, 0.975])
+        expected = np.quantile(np.nan_to_num(means, nan=-np.inf), [tail, 1 - tail])
     expected[~np.isfinite(expected)] = np.nan
     np.testing.assert_allclose(iqm_interval(values), expected, rtol=1e-12)
     assert np.isnan(expected).tolist() == [num_failed > 10, num_failed > 30]

@@ -410,11 +410,15 @@ def test_a_run_without_a_finite_number_stops(run, tmp_path, monkeypatch, capsys)
     assert run(*arguments, "--eval-every", "2", "--output", "out") == 1
     said = capsys.readouterr().out
     assert "stopped: every seed that still trained was broken" in said
+    assert run("--resume", "out") == 2
+    assert "out was stopped and would be again: every seed that" in capsys.readouterr().err
     assert "worst nan (3 of 3 seeds)" in said
     rows, summary = read(tmp_path / "out")
     assert {row["eval_return"] for row in rows} == {"nan"}
     assert {row["eval_return_stochastic"] for row in rows} == {"nan"}
     assert int(rows[-1]["update"]) == 6  # three blocks of two: the first with at least five
+    assert summary["status"] == "stopped"
+    assert summary["reason"].startswith("every seed that still trained was broken")
     assert summary["final_returns"] == [None] * 3
     assert summary["iqm"] is None
     assert summary["iqm_ci"] == [None, None]

@@ -80,6 +80,7 @@ def test_metrics_of_a_single_step_and_of_none(update):
     assert float(metrics["entropy"]) == pytest.approx(expected[3], rel=1e-5)
     params, _, metrics = run(update, make_problem(optax.sgd(0.1), mask=np.zeros((5, 3), bool)))
     assert_close(params, PARAMS)
+    assert np.isnan(metrics.pop("gradient_snr", np.nan))
     assert {name: float(x) for name, x in metrics.items()} == {"entropy": 0, "gradient_norm": 0}
 
 

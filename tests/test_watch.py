@@ -4,6 +4,7 @@ import functools
 import math
 import subprocess
 import sys
+import time
 
 import gymnasium
 import imageio_ffmpeg
@@ -180,7 +181,7 @@ def test_both_simulations_are_said_side_by_side(tmp_path, monkeypatch, capsys):
         totals = [play(i, False).total for i in range(2)]
         words = f"{label} {sum(totals) / 2:.1f} ({min(totals):.1f} to {max(totals):.1f})"
         assert words in said[1]
-    assert (run / "seed-1.gif").exists()
+    assert (run / "seed-1-gymnasium.gif").exists()
 
 
 def test_a_simulator_that_is_not_there_is_named(tmp_path, monkeypatch):
@@ -198,6 +199,8 @@ def test_a_simulator_that_is_not_there_is_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["--sed", 3], "error: unknown flag '--sed'. Did you mean '--seed'?"),
+        (["--width", "wide"], "error: Error parsing --width"),
         (["--seed", 3], "seed 3 is not among the 3"),
         (["--which", "best"], "has no policy/best"),
         (["--episodes", 0], "--episodes must be in [1, 10000], got 0"),
@@ -218,7 +221,9 @@ def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
     monkeypatch.setitem(sys.modules, "mediapy", None)
     with pytest.raises(SystemExit, match="2"):
         watch_run(monkeypatch, tmp_path, *arguments)
-    assert message in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
 
 
 def test_a_policy_of_another_environment_is_named(tmp_path, monkeypatch, capsys):
@@ -236,7 +241,7 @@ def test_a_policy_of_another_environment_is_named(tmp_path, monkeypatch, capsys)
 def test_an_mp4_is_what_was_drawn(tmp_path, width):
     frames = np.zeros((5, 32, width, 3), np.uint8)
     frames[:, :16, :, 0] = 40 * np.arange(1, 6)[:, None, None]
-    watch.write_film(tmp_path / "film.mp4", iter(frames), 25.0)
+    watch.write_film(tmp_path / "film.mp4", iter(frames), 25.0, [*frames[:1]])
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", tmp_path / "film.mp4"]
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     film = subprocess.run(command, capture_output=True, check=True)
@@ -244,6 +249,29 @@ def test_an_mp4_is_what_was_drawn(tmp_path, width):
     shown = np.frombuffer(film.stdout, np.uint8).reshape(frames.shape)
     assert np.abs(shown[..., 0].astype(int) - frames[..., 0]).mean() < 8
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
+
+
+def test_a_gif_has_the_colours_of_the_samples(tmp_path):
+    """They are more than 256, the second half of them in the later samples alone."""
+    ramp = np.arange(256, dtype=np.uint8)
+    frames = np.zeros((6, 8, 256, 3), np.uint8)
+    frames[:3, :, :, 0], frames[3:, :, :, 1] = ramp, ramp
+    for i, frame in enumerate(frames):
+        frame[:4, 40 * i : 40 * i + 40] = 255  # moves: equal pictures would become one
+    watch.write_film(tmp_path / "film.gif", iter(frames), 25.0, [*frames[::2]])
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames == 6
+        for i, frame in enumerate(frames):
+            film.seek(i)
+            shown = np.asarray(film.convert("RGB"), float)
+            assert np.abs(shown - frame).mean() < 1
+
+
+def test_what_takes_long_says_so_without_a_terminal(capfd, monkeypatch):
+    monkeypatch.setattr(watch, "heartbeat", functools.partial(watch.heartbeat, interval=0.01))
+    with watch._waiting("compiling and playing"):
+        time.sleep(0.2)
+    assert "still compiling and playing, 0 s" in capfd.readouterr().err
 
 
 def test_an_environment_without_a_model_is_refused():

@@ -90,6 +90,20 @@ class Survive(Toy):
         return state.replace(reward=jnp.ones(()), done=fell.astype(jnp.float32))
 
 
+class Drift(Survive):
+    """Up to 20 steps; starts, returns and lengths vary, and one action in a hundred breaks it."""
+
+    def observe(self, key):
+        return jax.random.uniform(key, (1,), minval=-1.0)
+
+    def step(self, state, action):
+        obs = state.obs + 0.3 * action
+        reward = 1.0 - obs[0] ** 2
+        broken = (action[0] > 1.1) & (action[0] < 1.15)
+        done = (jnp.abs(obs[0]) > 1.2).astype(jnp.float32)
+        return state.replace(obs=jnp.where(broken, jnp.nan, obs), reward=reward, done=done)
+
+
 class Chain:
     """Two arms, up to three pulls; arm 0 may end the episode. Rewards depend on pull and arm.
 

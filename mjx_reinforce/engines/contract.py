@@ -11,6 +11,10 @@ import numpy as np
 from mjx_reinforce.checks import BadEnvironmentError, check_parts, explain, is_nan
 from mjx_reinforce.types import Box, Discrete, action_space
 
+#: What JAX raises where Python or NumPy asks for the value of a traced array.
+_NEED_VALUES = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
+_TRACED = "; it is compiled by JAX: write jnp.where for `if`, and jnp for numpy, math and float()"
+
 
 def check_environment(env: Any) -> None:
     """Raises ValueError for an environment that cannot be played, in one line that says why.
@@ -30,12 +34,12 @@ def check_environment(env: Any) -> None:
 
 def _check_limits(name: str, env: Any) -> None:
     """Raises ValueError for a time limit or threshold that is none."""
-    limit = getattr(env, "max_episode_steps", None)
-    if limit is not None and not (isinstance(limit, numbers.Integral) and int(limit) >= 1):
+    limit = _declared(name, env, "max_episode_steps")
+    if limit is not None and not _is_count(limit):
         raise BadEnvironmentError(
             f"{name}.max_episode_steps must be a whole number, 1 or more, got {limit!r}"
         )
-    threshold = getattr(env, "reward_threshold", None)
+    threshold = _declared(name, env, "reward_threshold")
     if threshold is not None and (not isinstance(threshold, numbers.Real) or is_nan(threshold)):
         raise BadEnvironmentError(
             f"{name}.reward_threshold must be a number or None, got {threshold!r}"
@@ -44,8 +48,8 @@ def _check_limits(name: str, env: Any) -> None:
 
 def _check_action_space(name: str, env: Any) -> None:
     """Raises ValueError for actions that cannot be drawn."""
-    size, declared = env.action_size, getattr(env, "action_space", None)
-    if not (isinstance(size, numbers.Integral) and int(size) >= 1):
+    size, declared = env.action_size, _declared(name, env, "action_space")
+    if not _is_count(size):
         raise BadEnvironmentError(
             f"{name}.action_size must be a whole number, 1 or more, got {size!r}"
         )
@@ -54,11 +58,10 @@ def _check_action_space(name: str, env: Any) -> None:
             f"{name}.action_size is {size}, but its action_space has {declared.num_actions} actions"
         )
     if isinstance(declared, Box):
-        low, high = np.asarray(declared.low), np.asarray(declared.high)
-        if low.shape != (size,) or high.shape != (size,) or not np.all(low < high):
+        if not _are_bounds(declared, size):
             raise BadEnvironmentError(
                 f"{name}.action_space must have low < high, of {size} entries each as action_size "
-                f"says, got low {low.tolist()} and high {high.tolist()}"
+                f"says, got low {declared.low} and high {declared.high}"
             )
     elif declared is not None and not isinstance(declared, Discrete):
         raise BadEnvironmentError(
@@ -67,14 +70,37 @@ def _check_action_space(name: str, env: Any) -> None:
         )
 
 
+def _declared(name: str, env: Any, what: str) -> Any:
+    """Returns what an environment says of itself, None if it says nothing."""
+    try:
+        return getattr(env, what, None)
+    except Exception as error:  # it may be a property, the user's code
+        raise BadEnvironmentError(f"{name}.{what} fails: {explain(error)}") from error
+
+
+def _is_count(value: Any) -> bool:
+    """Returns whether a value is a whole number, 1 or more; True is none."""
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool) and int(value) >= 1
+
+
+def _are_bounds(space: Box, size: int) -> bool:
+    """Returns whether a space has two vectors of numbers [size], the lower one below the other."""
+    try:
+        low, high = np.asarray(space.low, float), np.asarray(space.high, float)
+    except (TypeError, ValueError):
+        return False
+    return low.shape == high.shape == (size,) and bool(np.all(low < high))
+
+
 def _shapes(name: str, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """Returns the shapes of what a method returns."""
     try:
         return jax.eval_shape(function, *arguments)
     except BadEnvironmentError:
         raise
-    except Exception as error:  # it is the user's code, which may raise anything
-        raise BadEnvironmentError(f"{name}.{what} fails: {explain(error)}") from error
+    except (Exception, SystemExit) as error:  # it is the user's code, which may raise anything
+        remedy = _TRACED if isinstance(error, _NEED_VALUES) else ""
+        raise BadEnvironmentError(f"{name}.{what} fails: {explain(error)}{remedy}") from error
 
 
 def _action(env: Any) -> jax.ShapeDtypeStruct:
@@ -101,6 +127,10 @@ def _check_state(name: str, start: Any) -> None:
             raise BadEnvironmentError(
                 f"the {field} of {name}.reset must be {shape}, its shape is "
                 f"{list(value.shape)}; {remedy}"
+            )
+        if not jnp.isrealobj(value):
+            raise BadEnvironmentError(
+                f"the {field} of {name}.reset must hold real numbers, it holds {value.dtype}"
             )
 
 

@@ -1,6 +1,7 @@
 """``python -m mjx_reinforce.export RUN --to numpy`` takes a trained policy out of the program."""
 
 import dataclasses
+import keyword
 import os
 import sys
 from pathlib import Path
@@ -8,7 +9,8 @@ from typing import Literal
 
 import tyro
 
-from mjx_reinforce.export.run_files import Seed, Which, choose_seed, read_run
+from mjx_reinforce.export.run_files import Seed, Which, read_run
+from mjx_reinforce.runs.flags import accept_all_characters, one_line_errors, read
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,14 +34,11 @@ class Settings:
 
 def main() -> None:
     """Reads the command line, exports, and exits: 0 done, 2 bad input, 130 interrupted."""
-    settings = tyro.cli(Settings, prog="python -m mjx_reinforce.export")
-    try:
+    accept_all_characters()
+    prog = "python -m mjx_reinforce.export"
+    with one_line_errors():
+        settings = read(Settings, sys.argv[1:], prog, Settings.__doc__ or "")
         print("\n".join(map(str, export(settings))))
-    except (ValueError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
 
 
 def export(settings: Settings) -> list[Path]:
@@ -50,16 +49,16 @@ def export(settings: Settings) -> list[Path]:
       OSError: a file cannot be written.
     """
     run = read_run(settings.run)
-    outputs = check(settings, choose_seed(run, settings.seed, settings.which))
     from mjx_reinforce.export.arithmetic import arithmetic
     from mjx_reinforce.export.files import write_arrays, write_bytes
     from mjx_reinforce.export.numpy_source import numpy_source
     from mjx_reinforce.export.onnx_model import import_onnx, onnx_model
     from mjx_reinforce.export.player import load_seed
 
+    player, saved = load_seed(run, settings.seed, settings.which)
+    outputs = check(settings, player.seed)
     if settings.to == "onnx":
         import_onnx()
-    player, saved = load_seed(run, settings.seed, settings.which)
     plain = arithmetic(saved)
     if settings.to == "onnx":
         write_bytes(outputs[0], onnx_model(plain, player.env, player.seed))
@@ -80,18 +79,29 @@ def check(settings: Settings, seed: int) -> list[Path]:
     output = settings.output or settings.run / f"seed_{seed}{suffix}"
     if output.suffix != suffix:
         raise ValueError(f"--to {settings.to} writes {suffix}, got --output {output}")
-    if not os.access(output.parent, os.W_OK):
+    if not (output.parent.is_dir() and os.access(output.parent, os.W_OK)):
         raise ValueError(f"cannot write to {output.parent}; choose another --output")
-    if settings.to == "numpy" and not output.stem.isidentifier():
-        raise ValueError(
-            f"Python cannot import a module called {output.stem!r}; "
-            "choose an --output of letters, digits and underscores, such as policy.npz"
-        )
+    if settings.to == "numpy":
+        _check_module(output.stem)
     outputs = [output, output.with_suffix(".py")] if settings.to == "numpy" else [output]
     for path in outputs:
         if path.is_dir() or (path.exists() and not settings.overwrite):
             raise ValueError(f"{path} exists; pass --overwrite or another --output")
     return outputs
+
+
+def _check_module(name: str) -> None:
+    """Raises ValueError for the name of a module that cannot be imported, or hides another."""
+    if not name.isidentifier() or keyword.iskeyword(name):
+        raise ValueError(
+            f"Python cannot import a module called {name!r}; "
+            "choose an --output of letters, digits and underscores, such as policy.npz"
+        )
+    if name == "numpy" or name in sys.stdlib_module_names:
+        raise ValueError(
+            f"{name}.py would hide Python's or NumPy's {name} from all programs beside it; "
+            "choose another --output, such as policy.npz"
+        )
 
 
 if __name__ == "__main__":

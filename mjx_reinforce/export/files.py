@@ -73,7 +73,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         with np.load(io.BytesIO(content), allow_pickle=False) as opened:
             return {name: np.asarray(opened[name]) for name in opened.files}
     except Exception as error:  # what zip and NumPy raise for damaged bytes has no common class
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
+        # NumPy's second sentence proposes to trust a pickle.
+        reason = f"{type(error).__name__}: {error}".splitlines()[0].partition(". ")[0]
         raise ValueError(f"{path} is damaged: it is no whole NumPy archive ({reason})") from error
 
 

@@ -42,12 +42,13 @@ def read_run(directory: str | Path) -> Run:
     if not path.is_file():
         raise ValueError(f"{directory} is no run directory: there is no {path}")
     settings = read_json(path)
-    try:
-        env_id, horizon = str(settings["env"]), int(settings["horizon"])
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ValueError(f"{path} is damaged: {error!r}") from error
-    if horizon < 1:
-        raise ValueError(f"{path} is damaged: the horizon is {horizon}")
+    env_id, horizon = settings.get("env"), settings.get("horizon")
+    if not isinstance(env_id, str):
+        raise ValueError(f"{path} is damaged: env must be text, got {env_id!r}")
+    if type(horizon) is not int or not 1 <= horizon < 2**31:
+        raise ValueError(
+            f"{path} is damaged: horizon must be a whole number from 1 to 2^31 - 1, got {horizon!r}"
+        )
     if not (directory / "policy").is_dir():
         raise ValueError(f"{directory} has no policy yet: {_NOT_YET}")
     return Run(directory, env_id, horizon)

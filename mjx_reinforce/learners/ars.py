@@ -28,6 +28,7 @@ from mjx_reinforce.learners.ars_increments import (
     overwrite_bias,
     paper_increment,
 )
+from mjx_reinforce.learners.diagnostics import nan_unless, signal_to_noise
 from mjx_reinforce.learners.learner import (
     Learner,
     Metrics,
@@ -190,12 +191,16 @@ class _Search:
         )
         learned = Actor(params=self._tie(moved), normalizer=normalizer)
         actor, skipped = keep_finite(learned, actor)
-        return dataclasses.replace(state, actor=actor), episode_metrics(trajectory) | {
+        diagnostics = {
             "entropy": jnp.zeros(()),
             "gradient_norm": optax.tree.norm(increment),
             "return_std": jnp.std(returns),
-            "skipped_update": skipped,
         }
+        if self.num_directions > 1:
+            diagnostics["gradient_snr"] = _signal_to_noise(trial.directions, returns)
+        sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
+        metrics = episode_metrics(trajectory) | nan_unless(sound, diagnostics)
+        return dataclasses.replace(state, actor=actor), metrics | {"skipped_update": skipped}
 
     def _act_each(self, actor: Actor, observation: jax.Array) -> jax.Array:
         """Returns the outputs [D, K] of D policies for an observation [D, O] of each."""
@@ -226,6 +231,18 @@ def _draw(key: jax.Array, params: Any, num_directions: int) -> Any:
         for k, x in zip(keys, leaves, strict=True)
     ]
     return jax.tree.unflatten(tree, drawn)
+
+
+def _signal_to_noise(directions: Any, returns: jax.Array) -> jax.Array:
+    """Returns the signal-to-noise ratio [] over all directions [D] of the mean step.
+
+    See ``diagnostics.signal_to_noise``; a direction's share is (r_plus - r_minus) delta. Where only
+    the best directions count, the step is another, of which nothing is said.
+    """
+    difference = returns[0] - returns[1]
+    each = jax.vmap(lambda r, delta: jax.tree.map(lambda x: r * x, delta))(difference, directions)
+    mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
+    return signal_to_noise(mean, each, len(difference))
 
 
 def _side_by_side(trajectory: Trajectory) -> Trajectory:

@@ -93,15 +93,18 @@ def leave_one_out(discount: float | jax.Array = 0.99, *, ended: str = "zero") ->
     if ended not in ("zero", "skip"):
         raise ValueError(f"ended must be 'zero' or 'skip', got {ended!r}")
 
-    def weigh(trajectory):
+    def update(state, trajectory):
         returns = discounted_returns(trajectory.reward, discount)
         counted = jnp.ones_like(trajectory.mask) if ended == "zero" else trajectory.mask
         others = jnp.sum(counted, axis=1, keepdims=True) - counted
         sums = jnp.sum(jnp.where(counted, returns, 0.0), axis=1, keepdims=True)
         baseline = (sums - jnp.where(counted, returns, 0.0)) / jnp.maximum(others, 1)
-        return returns - jnp.where(others > 0, baseline, 0.0)
+        weight = returns - jnp.where(others > 0, baseline, 0.0)
+        weight = jnp.where(trajectory.mask, weight, 0.0)
+        explained = explained_variance(weight, returns, trajectory.mask)
+        return weight, state, {"explained_variance": explained}
 
-    return _stateless(weigh, min_episodes=2)
+    return Estimator(lambda key, observation_size: (), update, min_episodes=2)
 
 
 def mean_log_prob(discount: float | jax.Array = 0.99) -> Estimator:
@@ -205,8 +208,8 @@ def value_baseline(
             return _Critic(optax.apply_updates(critic.params, updates), opt_state), loss / steps
 
         critic, losses = lax.scan(fit, critic, length=num_fits)
-        metrics = {"explained_variance": _explained(weight, returns, trajectory.mask)}
-        return weight, critic, metrics | {"value_loss": losses[0]}
+        explained = explained_variance(weight, returns, trajectory.mask)
+        return weight, critic, {"explained_variance": explained, "value_loss": losses[0]}
 
     return Estimator(init, update)
 
@@ -256,13 +259,13 @@ def discount_weights(estimator: Estimator, discount: float | jax.Array = 0.99) -
     return estimator._replace(update=update)
 
 
-def _stateless(weigh: Callable[[Trajectory], jax.Array], min_episodes: int = 1) -> Estimator:
+def _stateless(weigh: Callable[[Trajectory], jax.Array]) -> Estimator:
     """An estimator that learns nothing, from its weights [T, N]."""
 
     def update(state, trajectory):
         return jnp.where(trajectory.mask, weigh(trajectory), 0.0), state, {}
 
-    return Estimator(lambda key, observation_size: (), update, min_episodes)
+    return Estimator(lambda key, observation_size: (), update)
 
 
 def _episode_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
@@ -270,15 +273,28 @@ def _episode_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(mask, x, 0.0), axis=0) / jnp.maximum(jnp.sum(mask, axis=0), 1)
 
 
-def _explained(residual: jax.Array, returns: jax.Array, mask: jax.Array) -> jax.Array:
-    """Returns 1 - Var(residual) / Var(returns) over the mask: 1 is a perfect critic."""
+def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array) -> jax.Array:
+    """Returns how much of the returns a baseline explains, 1 - Var(residual) / Var(returns), [].
+
+    1 is a perfect baseline, 0 as good as a constant, and less is worse than none. It is NaN where
+    the returns do not vary, but for rounding: there is nothing to explain.
+
+    Args:
+      residual: [T, N] what the baseline leaves of the returns.
+      returns: [T, N] G.
+      mask: [T, N] which steps count.
+    """
+    steps = jnp.maximum(jnp.sum(mask), 1)
+
+    def mean(x):
+        return jnp.sum(jnp.where(mask, x, 0.0)) / steps
 
     def variance(x):
-        steps = jnp.maximum(jnp.sum(mask), 1)
-        mean = jnp.sum(jnp.where(mask, x, 0.0)) / steps
-        return jnp.sum(jnp.where(mask, (x - mean) ** 2, 0.0)) / steps
+        return mean((x - mean(x)) ** 2)
 
-    return 1.0 - variance(residual) / jnp.maximum(variance(returns), 1e-8)
+    total = variance(returns)
+    varies = total > 1e-12 * mean(returns) ** 2
+    return jnp.where(varies, 1.0 - variance(residual) / jnp.where(varies, total, 1.0), jnp.nan)
 
 
 def _check_discount(discount: float | jax.Array) -> None:

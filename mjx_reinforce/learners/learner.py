@@ -91,9 +91,12 @@ def _train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metric
       The next state, and metrics, each []: ``episode_return`` (mean over the N
       episodes; with ``_min`` and ``_max``), ``episode_length``, ``env_steps``
       (played in this update), ``simulated_steps`` (with those in which an
-      episode was over already), ``entropy``, ``gradient_norm``,
-      ``nonfinite_episodes``, ``skipped_update`` (1 where the proposed state was
-      not finite and the old one was kept), and the estimator's own.
+      episode was over already), ``nonfinite_episodes``, and ``skipped_update`` (1
+      where the proposed state was not finite and the old one was kept). Then the
+      diagnostics, NaN where an episode was not finite or the update was skipped:
+      ``entropy``, ``kl``, ``policy_std`` (see ``diagnostics.policy_metrics``),
+      ``gradient_norm``, ``gradient_snr``, ``clipped_gradients`` (see ``updates``),
+      ``explained_variance`` (of an estimator with a baseline), and the estimator's own.
     """
     return learner.step(state)
 
@@ -105,7 +108,7 @@ def check_horizon(env: Environment, horizon: int | None) -> int:
     """Returns the time limit in steps, or raises ValueError."""
     horizon = getattr(env, "max_episode_steps", None) if horizon is None else horizon
     if horizon is None:
-        raise ValueError("this environment declares no max_episode_steps: pass horizon=...")
+        raise ValueError("this environment declares no max_episode_steps: give a horizon")
     if horizon < 1:
         raise ValueError(f"the horizon must be at least one step, got {horizon}")
     return horizon

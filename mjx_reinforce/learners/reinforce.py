@@ -19,6 +19,7 @@ import optax
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.contract import check_environment
+from mjx_reinforce.learners.diagnostics import nan_unless, policy_metrics, visited_steps
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.learners.learner import (
     Learner,
@@ -204,9 +205,10 @@ class _Reinforce:
         state = dataclasses.replace(
             state, actor=actor, opt_state=opt_state, estimator_state=estimator_state
         )
-        return state, episode_metrics(trajectory) | metrics | update_metrics | {
-            "skipped_update": skipped
-        }
+        change = policy_metrics(self.policy, before[0], actor, visited_steps(trajectory))
+        sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
+        diagnostics = nan_unless(sound, metrics | update_metrics | change)
+        return state, episode_metrics(trajectory) | diagnostics | {"skipped_update": skipped}
 
 
 class _OneStart:

@@ -15,6 +15,7 @@ import optax
 from jax import lax
 
 from mjx_reinforce.engines.chunks import while_any
+from mjx_reinforce.learners.diagnostics import signal_to_noise
 from mjx_reinforce.learners.gradients import accumulate_gradient
 from mjx_reinforce.registry import check_name
 
@@ -38,23 +39,49 @@ class Problem(NamedTuple):
     divisor: int | jax.Array
 
 
-#: (problem, key, params, opt_state) -> (params, opt_state, metrics ``entropy`` and
-#: ``gradient_norm``, means over samples and optimiser steps); may consume the key.
+#: The gradient's noise is measured on one of so many episodes, and on so many at most.
+_NOISE_SHARE, _NOISE_EPISODES = 32, 64
+
+#: (problem, key, params, opt_state) -> (params, opt_state, metrics); may consume the key. The
+#: metrics are ``entropy``, the mean over samples; ``gradient_norm`` and, where ``make_optimizer``
+#: made the optimiser and it clips, ``clipped_gradients`` (1 or 0), means over optimiser steps; and
+#: what an update adds.
 Update = Callable[[Problem, jax.Array, Any, Any], tuple[Any, Any, dict[str, jax.Array]]]
 
 
 def full_batch() -> Update:
-    """One optimiser step on the gradient of the whole rollout."""
+    """One optimiser step on the gradient of the whole rollout.
+
+    Of two episodes or more, its metrics have ``gradient_snr``, the signal-to-noise ratio over
+    episodes of that gradient, see ``diagnostics.signal_to_noise``. The noise is estimated from one
+    episode in 32, at least from one and at most from 64: from few it is right on average alone.
+    """
 
     def update(problem, key, params, opt_state):
         del key
         mask = problem.samples[-1]
         _, grads, sums = accumulate_gradient(problem.surrogate, params, problem.samples)
-        params, opt_state, norm = _descend(problem, grads, problem.divisor, params, opt_state)
-        steps = jnp.maximum(jnp.sum(mask), 1)
-        return params, opt_state, {"entropy": sums["entropy"] / steps, "gradient_norm": norm}
+        metrics = {"entropy": sums["entropy"] / jnp.maximum(jnp.sum(mask), 1)}
+        if mask.shape[1] > 1:
+            metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
+        params, opt_state, step = _descend(problem, grads, problem.divisor, params, opt_state)
+        return params, opt_state, metrics | step
 
     return update
+
+
+def _signal_to_noise(problem: Problem, params: Any, grads: Any) -> jax.Array:
+    """Returns the signal-to-noise ratio [] of the gradients summed over all episodes."""
+    num_episodes = problem.samples[-1].shape[1]
+    few = min(max(1, num_episodes // _NOISE_SHARE), _NOISE_EPISODES)
+
+    def alone(episode):
+        samples = jax.tree.map(lambda x: x[:, None], episode)
+        return accumulate_gradient(problem.surrogate, params, samples)[1]
+
+    each = jax.vmap(alone, in_axes=1)(jax.tree.map(lambda x: x[:, :few], problem.samples))
+    mean = jax.tree.map(lambda g: g / num_episodes, grads)
+    return signal_to_noise(mean, each, num_episodes)
 
 
 def minibatches(num_updates: int, batch_size: int) -> Update:
@@ -86,11 +113,11 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
             params, opt_state = carry
             batch = jax.tree.map(lambda x: x[index], flat)
             grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, batch)
-            params, opt_state, norm = _descend(problem, grads, batch_size, params, opt_state)
-            return (params, opt_state), (sums["entropy"] / batch_size, norm)
+            params, opt_state, step = _descend(problem, grads, batch_size, params, opt_state)
+            return (params, opt_state), step | {"entropy": sums["entropy"] / batch_size}
 
-        (params, opt_state), (entropy, norm) = lax.scan(one, (params, opt_state), indices)
-        return params, opt_state, {"entropy": jnp.mean(entropy), "gradient_norm": jnp.mean(norm)}
+        (params, opt_state), steps = lax.scan(one, (params, opt_state), indices)
+        return params, opt_state, {name: jnp.mean(x) for name, x in steps.items()}
 
     return update
 
@@ -109,38 +136,70 @@ def each_step() -> Update:
         alive = jnp.any(mask, axis=1)
         horizon = alive.size
 
+        def one(t, params, opt_state):
+            now = jax.tree.map(
+                lambda x: lax.dynamic_index_in_dim(x, t, keepdims=False), problem.samples
+            )
+            grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, now)
+            params, opt_state, step = _descend(problem, grads, problem.divisor, params, opt_state)
+            return params, opt_state, step | sums
+
         def more(carry):
             t = carry[0]
             return (t < horizon) & alive[jnp.minimum(t, horizon - 1)]
 
         def body(carry):
-            t, params, opt_state, entropy, norms = carry
-            now = jax.tree.map(
-                lambda x: lax.dynamic_index_in_dim(x, t, keepdims=False), problem.samples
-            )
-            grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, now)
-            moved, moved_state, norm = _descend(problem, grads, problem.divisor, params, opt_state)
-            after = t + 1, moved, moved_state, entropy + sums["entropy"], norms + norm
+            t, params, opt_state, sums = carry
+            moved, moved_state, measured = one(t, params, opt_state)
+            after = t + 1, moved, moved_state, jax.tree.map(jnp.add, sums, measured)
             # Vmapped over seeds, the loop goes on until the seed with the longest episode is done.
             return jax.tree.map(lambda new, old: jnp.where(more(carry), new, old), after, carry)
 
-        zero = jnp.zeros(())
-        init = (jnp.zeros((), jnp.int32), params, opt_state, zero, zero)
-        t, params, opt_state, entropy, norms = while_any(more, body, init)
-        steps = jnp.maximum(jnp.sum(mask), 1)
-        metrics = {"entropy": entropy / steps, "gradient_norm": norms / jnp.maximum(t, 1)}
-        return params, opt_state, metrics
+        start = jnp.zeros((), jnp.int32)
+        measured = jax.eval_shape(one, start, params, opt_state)[2]
+        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), measured)
+        t, params, opt_state, sums = while_any(more, body, (start, params, opt_state, zeros))
+        entropy = sums.pop("entropy") / jnp.maximum(jnp.sum(mask), 1)
+        means = {name: x / jnp.maximum(t, 1) for name, x in sums.items()}
+        return params, opt_state, means | {"entropy": entropy}
 
     return update
 
 
 def _descend(
     problem: Problem, grads: Any, divisor: int | jax.Array, params: Any, opt_state: Any
-) -> tuple[Any, Any, jax.Array]:
-    """Makes one optimiser step on summed gradients; also returns the norm of their mean."""
+) -> tuple[Any, Any, dict[str, jax.Array]]:
+    """Makes one optimiser step on summed gradients; also returns the metrics of that step."""
     grads = jax.tree.map(lambda g: g / divisor, grads)
     changes, opt_state = problem.optimizer.update(grads, opt_state, params)
-    return optax.apply_updates(params, changes), opt_state, optax.tree.norm(grads)
+    metrics = {"gradient_norm": optax.tree.norm(grads)}
+    parts = jax.tree.leaves(opt_state, is_leaf=lambda x: isinstance(x, ClipState))
+    for part in parts:
+        if isinstance(part, ClipState):
+            metrics["clipped_gradients"] = part.clipped.astype(float)
+    return optax.apply_updates(params, changes), opt_state, metrics
+
+
+class ClipState(NamedTuple):
+    """State of ``clip_by_norm``: whether the last gradient was longer than its bound, bool []."""
+
+    clipped: jax.Array
+
+
+def clip_by_norm(max_norm: float | jax.Array) -> optax.GradientTransformation:
+    """``optax.clip_by_global_norm``, which also remembers whether it clipped."""
+    clip = optax.clip_by_global_norm(max_norm)
+
+    def init(params):
+        del params
+        return ClipState(jnp.zeros((), bool))
+
+    def update(updates, state, params=None):
+        del state, params
+        clipped = ClipState(optax.tree.norm(updates) > max_norm)
+        return clip.update(updates, optax.EmptyState())[0], clipped
+
+    return optax.GradientTransformation(init, update)
 
 
 def make_optimizer(
@@ -167,7 +226,7 @@ def make_optimizer(
     check_name("optimizer", name, dict.fromkeys(OPTIMIZERS))
     parts = []
     if max_grad_norm is not None:
-        parts.append(optax.clip_by_global_norm(max_grad_norm))
+        parts.append(clip_by_norm(max_grad_norm))
     if name == "adamw":
         return optax.chain(*parts, optax.adamw(learning_rate, weight_decay=weight_decay))
     if weight_decay:

@@ -44,6 +44,11 @@ def categorical(
         log_probs = jax.nn.log_softmax(outputs)
         return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
 
+    def kl(outputs, others):
+        log_probs = jax.nn.log_softmax(outputs)
+        apart = log_probs - jax.nn.log_softmax(others)
+        return jnp.sum(jnp.exp(log_probs) * apart, axis=-1)
+
     return Distribution(
         num_outputs=size,
         constants=(),
@@ -52,4 +57,5 @@ def categorical(
         mode=greatest,
         log_prob=log_prob,
         entropy=entropy,
+        kl=kl,
     )

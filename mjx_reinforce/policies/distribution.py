@@ -31,6 +31,9 @@ class Distribution(NamedTuple):
     entropy: (outputs [..., K]) -> [...], in nats
     num_scales: how many of ``num_outputs``, counted from the last, determine the width
       of the distribution; a second network may compute them
+    std: (outputs [..., K]) -> [..., A] the standard deviation in the action's unit, before what
+      the family does to keep actions in their range; None where there is none
+    kl: (outputs, other outputs) -> [...] the divergence KL(first || second) in nats, if it is known
     """
 
     num_outputs: int
@@ -41,3 +44,5 @@ class Distribution(NamedTuple):
     log_prob: Callable[[jax.Array, jax.Array], jax.Array]
     entropy: Callable[[jax.Array], jax.Array]
     num_scales: int = 0
+    std: Callable[[jax.Array], jax.Array] | None = None
+    kl: Callable[[jax.Array, jax.Array], jax.Array] | None = None

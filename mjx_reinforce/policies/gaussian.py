@@ -1,8 +1,9 @@
 """What the Gaussian families share: the means and standard deviations in a network's outputs."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -26,7 +27,7 @@ class GaussianOutputs(NamedTuple):
 
     size: int
     std: str
-    initial_std: float
+    initial_std: float | jax.Array
     middle: np.ndarray
     half: np.ndarray
 
@@ -46,24 +47,26 @@ class GaussianOutputs(NamedTuple):
             std = jax.nn.sigmoid(raw + float(np.log(initial / (1.0 - initial)))) + _MIN_STD
         return self.mean(outputs), std
 
-    def distribution(self, sample, mode, log_prob, entropy, noise=None) -> Distribution:
+    def distribution(self, sample, mode, log_prob, entropy, noise=None, kl=None) -> Distribution:
         """Returns the distribution of these functions; its noise is standard Normal by default."""
         constant = self.std == "parameter"
         draw = jax.random.normal if noise is None else noise
         return Distribution(
             num_outputs=self.size if constant else 2 * self.size,
-            constants=(float(np.log(self.initial_std)),) * self.size if constant else (),
+            constants=(_log(self.initial_std),) * self.size if constant else (),
             noise=lambda key, shape: draw(key, (*shape, self.size)),
             sample=sample,
             mode=mode,
             log_prob=log_prob,
             entropy=entropy,
             num_scales=0 if constant else self.size,
+            std=lambda outputs: self.split(outputs)[1],
+            kl=kl,
         )
 
 
 def gaussian_outputs(
-    name: str, space: Box | Discrete, std: str, initial_std: float, rescale: bool
+    name: str, space: Box | Discrete, std: str, initial_std: float | jax.Array, rescale: bool
 ) -> GaussianOutputs:
     """Checks the arguments of a Gaussian family and returns the layout of its outputs.
 
@@ -71,7 +74,8 @@ def gaussian_outputs(
       name: the family's name, for the messages.
       space: the action bounds, [A] each.
       std: "parameter", "softplus" or "sigmoid", as in ``normal``.
-      initial_std: the standard deviation before training, in the action's unit.
+      initial_std: the standard deviation before training, in the action's unit; for "parameter"
+        it may be traced, and is then taken on trust.
       rescale: False takes the network's output as the mean itself.
 
     Raises:
@@ -81,15 +85,25 @@ def gaussian_outputs(
     box = continuous_box(name, space)
     if std not in ("parameter", "softplus", "sigmoid"):
         raise ValueError(f"std must be 'parameter', 'softplus' or 'sigmoid', got {std!r}")
-    if not (np.isfinite(initial_std) and initial_std > 0):
-        raise ValueError(f"initial_std must be positive and finite, got {initial_std}")
-    if std == "sigmoid" and initial_std >= 1:
-        raise ValueError(f"a sigmoid std stays below 1, got initial_std={initial_std}")
+    if not isinstance(initial_std, jax.core.Tracer):
+        _check_initial_std(std, float(initial_std))
     size = len(box.low)
     middle, half = np.zeros(size, np.float32), np.ones(size, np.float32)
     if rescale:
         middle, half = middle_and_half_range(box)
     return GaussianOutputs(size, std, initial_std, middle, half)
+
+
+def _check_initial_std(std: str, initial_std: float) -> None:
+    if not (np.isfinite(initial_std) and initial_std > 0):
+        raise ValueError(f"initial_std must be positive and finite, got {initial_std}")
+    if std == "sigmoid" and initial_std >= 1:
+        raise ValueError(f"a sigmoid std stays below 1, got initial_std={initial_std}")
+
+
+def _log(x: Any) -> Any:
+    """Returns a logarithm, rounded once where the number is known."""
+    return jnp.log(x) if isinstance(x, jax.core.Tracer) else float(np.log(x))
 
 
 def normal_log_density(x: jax.Array, mean: jax.Array, std: jax.Array) -> jax.Array:
@@ -100,3 +114,16 @@ def normal_log_density(x: jax.Array, mean: jax.Array, std: jax.Array) -> jax.Arr
 def normal_entropy(std: jax.Array) -> jax.Array:
     """Returns the entropy [...] of a Normal in nats, entry by entry."""
     return jnp.log(std) + 0.5 + LOG_SQRT_2PI
+
+
+def normal_kl(
+    mean: jax.Array, std: jax.Array, other_mean: jax.Array, other_std: jax.Array
+) -> jax.Array:
+    """Returns KL(Normal(mean, std) || Normal(other_mean, other_std)) [...] in nats.
+
+    That is log(q / p) + (p^2 + d^2) / (2 q^2) - 1/2 with the standard deviations p and q and the
+    means d apart, arranged so that nearly equal ones do not cancel.
+    """
+    log_ratio = jnp.log(std / other_std)
+    width = 0.5 * jnp.expm1(2.0 * log_ratio) - log_ratio
+    return width + 0.5 * ((mean - other_mean) / other_std) ** 2

@@ -3,7 +3,12 @@
 import jax.numpy as jnp
 
 from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.policies.gaussian import gaussian_outputs, normal_entropy, normal_log_density
+from mjx_reinforce.policies.gaussian import (
+    gaussian_outputs,
+    normal_entropy,
+    normal_kl,
+    normal_log_density,
+)
 from mjx_reinforce.types import Box, Discrete
 
 
@@ -49,7 +54,13 @@ def normal(
     def entropy(outputs):
         return jnp.sum(normal_entropy(base.split(outputs)[1]), axis=-1)
 
-    return base.distribution(sample, lambda outputs: base.split(outputs)[0], log_prob, entropy)
+    def kl(outputs, others):
+        return jnp.sum(normal_kl(*base.split(outputs), *base.split(others)), axis=-1)
+
+    def mode(outputs):
+        return base.split(outputs)[0]
+
+    return base.distribution(sample, mode, log_prob, entropy, kl=kl)
 
 
 def normal_softplus(

@@ -84,12 +84,20 @@ def _draw_mean(
 
     A seed counts as failed, see ``iqm``, around a return that is not finite.
     """
-    curves = []
-    for s in range(returns.shape[1]):
-        moved = np.diff(steps[:, s], prepend=-1) > 0  # a seed that stands still keeps its value
-        curves.append(np.interp(grid, steps[moved, s], returns[moved, s]))
-    curves = np.stack(curves, axis=1)
+    curves = on_grid(grid, steps, returns)
     axes.plot(grid, iqm(curves), color=color, linewidth=2, label=label)
     if len(grid) and curves.shape[1] > 1:
         low, high = iqm_interval(curves)
         axes.fill_between(grid, low, high, color=color, alpha=0.25, linewidth=0)
+
+
+def on_grid(grid: np.ndarray, steps: np.ndarray, returns: np.ndarray) -> np.ndarray:
+    """Returns curves [E, S] read off, by linear interpolation, on a grid [K] of steps: [K, S].
+
+    A return that is not finite makes all that is read off beside it so, too.
+    """
+    curves = []
+    for s in range(returns.shape[1]):
+        moved = np.diff(steps[:, s], prepend=-1) > 0  # a seed that stands still keeps its value
+        curves.append(np.interp(grid, steps[moved, s], returns[moved, s]))
+    return np.stack(curves, axis=1)

@@ -2,8 +2,10 @@
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from pathlib import Path
+from typing import Any, NoReturn
 
 import tyro
 
@@ -12,6 +14,7 @@ from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs import resume
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import named_task, of_task
+from mjx_reinforce.runs.files import remove_empty
 from mjx_reinforce.runs.flags import read
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.relevance import check_read
@@ -37,23 +40,17 @@ def parse(arguments: Sequence[str]) -> Config:
 
     Raises:
       ValueError: there is no such preset or flag, a value is not of its type, a setting that is
-        given would do nothing, or the run to resume is not there or has other settings.
+        given would do nothing, or the run to resume is not there, has other settings, or was
+        stopped.
     """
-    default, preset = of_task(named_task(arguments)), None
-    prog = "python -m mjx_reinforce.train"
-    if arguments and not arguments[0].startswith("-"):
-        preset, *arguments = arguments
-        check_name("preset", preset, PRESETS)
-        default, prog = PRESETS[preset][1], f"{prog} {preset}"
-    else:
-        prog = f"{prog} [PRESET]"
-    config = _read(arguments, default, prog)
+    default, preset, flags, prog = start(arguments, "python -m mjx_reinforce.train")
+    config = _read(flags, default, prog)
     if config.resume is None:
         return config
     if preset is not None:
         raise ValueError(f"--resume has the run's own settings: leave the preset {preset} out")
     known = resume.read_settings(config.resume)
-    asked = _read(arguments, known, prog)
+    asked = _read(flags, known, prog)
     resume.check_settings(known, asked)
     if resume.is_done(known, asked):
         print(f"{known.resume} is finished; to go on, give a larger --env-steps or --max-updates")
@@ -61,29 +58,85 @@ def parse(arguments: Sequence[str]) -> Config:
     return asked
 
 
+def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequence[str], str]:
+    """Reads the preset of a command line.
+
+    Args:
+      arguments: a preset's name, if any, then flags.
+      prog: the name of the program, for --help.
+
+    Returns:
+      The default settings, the preset's name or None, the flags, and the program with its preset.
+
+    Raises:
+      ValueError: there is no such preset.
+    """
+    if not arguments or arguments[0].startswith("-"):
+        return of_task(named_task(arguments)), None, arguments, f"{prog} [PRESET]"
+    preset, *flags = arguments
+    check_name("preset", preset, PRESETS)
+    return PRESETS[preset][1], preset, flags, f"{prog} {preset}"
+
+
 def _read(arguments: Sequence[str], default: Config, prog: str) -> Config:
     """Returns the settings that flags ask for, with others as given; --help exits."""
-    groups = [
-        (title, group, group(**{f.name: getattr(default, f.name) for f in fields(group)}))
-        for title, group in GROUPS.items()
-    ]
-    form = tyro.conf.OmitArgPrefixes[dataclasses.make_dataclass("Arguments", groups, frozen=True)]
-    parsed = read(form, arguments, prog, _description())
-    config = Config(
-        **{name: x for title in GROUPS for name, x in vars(getattr(parsed, title)).items()}
-    )
+    config = join_groups(read_groups(GROUPS, arguments, default, prog, _description()))
     check_read(config, default)
     return config
 
 
-def _description() -> str:
+def read_groups(
+    groups: Mapping[str, type],
+    arguments: Sequence[str],
+    default: Config,
+    prog: str,
+    description: str,
+) -> dict[str, Any]:
+    """Returns each group of settings as flags ask for it; --help exits.
+
+    Args:
+      groups: dataclasses under their titles.
+      arguments: the flags.
+      default: holds for the settings of a run that no flag names.
+      prog: the name of the program, for --help.
+      description: of the program, likewise.
+
+    Raises:
+      ValueError: see ``flags.read``.
+    """
+    known = vars(default)
+    forms = [
+        (title, group, group(**{f.name: known[f.name] for f in fields(group) if f.name in known}))
+        for title, group in groups.items()
+    ]
+    form = tyro.conf.OmitArgPrefixes[dataclasses.make_dataclass("Arguments", forms, frozen=True)]
+    return dict(vars(read(form, arguments, prog, description)))
+
+
+def join_groups(groups: Mapping[str, Any]) -> Config:
+    """Returns the settings of a run from their groups, which ``read_groups`` returned."""
+    return Config(**{name: x for group in groups.values() for name, x in vars(group).items()})
+
+
+def presets() -> str:
+    """Returns the presets, a line each, for --help."""
     width = max(map(len, PRESETS))
-    presets = "\n".join(f"  {name:{width}}  {line}" for name, (line, _) in PRESETS.items())
+    return "\n".join(f"  {name:{width}}  {line}" for name, (line, _) in PRESETS.items())
+
+
+def _description() -> str:
     return (
         "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. "
         f"Leaves {', '.join(_FILES)} in the run directory.\n\n"
         "Defaults depend on the task: --help shows those of InvertedPendulum-v5, --help --env ID "
         "those of another.\n\n"
-        f"Presets, published programs whose settings replace the defaults:\n{presets}\n\n"
+        f"Presets, published programs whose settings replace the defaults:\n{presets()}\n\n"
         f"Environments: {', '.join(envs.names())}."
     )
+
+
+def refuse(message: str, made: Sequence[Path], status: int = 2) -> NoReturn:
+    """Says in one line what is wrong, removes the empty folders that were made, and exits."""
+    remove_empty(made)
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    sys.exit(status)

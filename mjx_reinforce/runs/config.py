@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import reprlib
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ from mjx_reinforce.runs.settings import (
     CheckpointSettings,
     EstimatorSettings,
     EvaluationSettings,
+    LogSettings,
     PolicySettings,
     RunSettings,
     SearchSettings,
@@ -24,10 +26,13 @@ MAX_COUNT = 2**31 - 1
 _MAX_RATE = 1000
 #: The greatest of other numbers, and one over the least: float32 holds their cubes.
 _MAX_SIZE = 1e12
+#: The greatest number of layers: each is a matrix of its own in the program.
+_MAX_LAYERS = 100
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Config(
+    LogSettings,
     CheckpointSettings,
     EvaluationSettings,
     SearchSettings,
@@ -55,7 +60,7 @@ def check(config: Config) -> None:
         for name in names.split():
             value = getattr(config, name)
             if not ((value is None and name in _OPTIONAL) or holds(value)):
-                raise ValueError(f"{flag(name)} must be {rule}, got {value}")
+                raise ValueError(f"{flag(name)} must be {rule}, got {reprlib.repr(value)}")
     if config.env_steps is None and config.max_updates is None:
         raise ValueError("nothing would end this run: give --env-steps or --max-updates a number")
     (_check_reinforce if config.algorithm == "reinforce" else _check_ars)(config)
@@ -120,6 +125,11 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         "hidden_sizes value_hidden_sizes",
         lambda x: all(n <= MAX_COUNT for n in x),
         "less than 2^31 in every layer",
+    ),
+    (
+        "hidden_sizes value_hidden_sizes",
+        lambda x: len(x) <= _MAX_LAYERS,
+        f"at most {_MAX_LAYERS} layers",
     ),
     (
         "initial_std learning_rate final_learning_rate max_grad_norm value_learning_rate "

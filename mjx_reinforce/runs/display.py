@@ -2,8 +2,9 @@
 
 import datetime
 import math
+import shlex
 from collections.abc import Iterable
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, nullcontext, suppress
 from decimal import ROUND_DOWN, Decimal
 from pathlib import Path
 from typing import Any
@@ -61,8 +62,13 @@ class Display:
         self._bar.stop()
 
     def say(self, text: str, style: str | None = None) -> None:
-        """Prints a line above the bar, in one of rich's styles."""
-        self.console.print(text, style=style, highlight=False, soft_wrap=True)
+        """Prints a line above the bar, in one of rich's styles.
+
+        A line that the screen does not take is lost: it may be a file on a full disk, or a pipe
+        that nobody reads, which is no reason to end a run.
+        """
+        with suppress(OSError):
+            self.console.print(text, style=style, highlight=False, soft_wrap=True)
 
     def compiling(self, expected: float | None) -> AbstractContextManager[None]:
         """Returns a ``with`` block that shows that its contents go on.
@@ -153,4 +159,8 @@ def print_summary(console: Console, summary: dict[str, Any], directory: Path) ->
     table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")
     table.add_row("training and evaluating", f"{summary['run_seconds']:.1f} s")
     console.print(table)
-    console.print(f"Files in {directory}", markup=False, highlight=False, soft_wrap=True)
+    said = f"Files in {directory}; python -m mjx_reinforce.report {shlex.quote(str(directory))}"
+    said += " makes a page of them"
+    if summary["status"] == "interrupted":
+        said = f"Interrupted: go on with --resume {directory}"
+    console.print(said, markup=False, highlight=False, soft_wrap=True)

@@ -17,6 +17,7 @@ def evaluate(
     *,
     num_episodes: int,
     horizon: int,
+    active: bool | jax.Array = True,
 ) -> dict[str, jax.Array]:
     """Plays N episodes with the policy's mode and N with its samples.
 
@@ -27,6 +28,7 @@ def evaluate(
       key: consumed; pass the same one each time to see the same start states.
       num_episodes: N, of each kind.
       horizon: T, the time limit in steps.
+      active: [] where False nothing is played, and what is returned says nothing.
 
     Returns:
       ``eval_return`` and ``eval_length`` [], means over the deterministic
@@ -43,6 +45,7 @@ def evaluate(
         num_episodes=2 * num_episodes,
         horizon=horizon,
         num_deterministic=num_episodes,
+        active=active,
     )
     returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
     returns = jnp.where(trajectory.nonfinite | ~jnp.isfinite(returns), jnp.nan, returns)

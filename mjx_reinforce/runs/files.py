@@ -16,6 +16,8 @@ from typing import Any
 
 from mjx_reinforce.export.files import write_bytes
 
+#: A disk with less room (bytes) is full: the files of a small run take about as much.
+_ROOM = 2**20
 _PACKAGES = ("mjx-reinforce", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "optax", "flax")
 
 
@@ -49,15 +51,30 @@ def prepare(directory: Path, overwrite: bool) -> list[Path]:
                 f"the run directory {directory} is not empty; choose another --output, "
                 "or pass --overwrite to replace the run in it"
             )
-        with tempfile.TemporaryFile(dir=directory):
-            pass
+        _try_to_write(directory)
     except OSError as error:
         remove_empty(made)
         raise ValueError(
             f"cannot write to the run directory {directory} ({error.strerror}); "
-            "choose another --output"
+            "make room there, or choose another --output"
         ) from error
     return made
+
+
+def check_writable(directory: Path) -> None:
+    """Raises ValueError if the run in a directory cannot go on there."""
+    try:
+        _try_to_write(directory)
+    except OSError as error:
+        raise ValueError(
+            f"cannot write to the run directory {directory} ({error.strerror}); make room there"
+        ) from error
+
+
+def _try_to_write(directory: Path) -> None:
+    """Writes a file that is gone at once, or raises OSError."""
+    with tempfile.TemporaryFile(dir=directory) as file:
+        file.write(bytes(_ROOM))
 
 
 def remove_empty(folders: Sequence[Path]) -> None:
@@ -90,21 +107,30 @@ def locked(directory: Path) -> Iterator[None]:
 
 def create_csv(path: Path, columns: Sequence[str]) -> None:
     """Writes a CSV file that has the names of its columns and no rows yet."""
-    write_bytes(path, _lines([dict(zip(columns, columns, strict=True))], columns))
+    write_bytes(path, csv_bytes(columns, []))
+
+
+def csv_bytes(columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """Returns a whole CSV file: the names of its columns, then its rows."""
+    return _lines([dict(zip(columns, columns, strict=True)), *rows], columns)
 
 
 def append_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Adds rows to a file of ``create_csv``, in time that does not depend on what it holds.
+    """Adds rows to a file of ``create_csv``; a row is whole once its line has ended."""
+    append(path, _lines(rows, columns))
 
-    A row is whole once its line has ended; where the disk is full, or Ctrl-C comes in
-    between, the file is left as it was.
+
+def append(path: Path, content: bytes) -> None:
+    """Adds bytes to a file, in time that does not depend on what it holds.
+
+    Where the disk is full, or Ctrl-C comes in between, the file is left as it was.
     """
-    content = memoryview(_lines(rows, columns))
+    left = memoryview(content)
     with path.open("ab", buffering=0) as file:
         size = file.tell()
         try:
-            while content:
-                content = content[file.write(content) :]
+            while left:
+                left = left[file.write(left) :]
         except BaseException:
             file.truncate(size)
             raise
@@ -129,7 +155,7 @@ def provenance() -> dict[str, Any]:
 
     return {
         "python": platform.python_version(),
-        "packages": {name: _version(name) for name in _PACKAGES},
+        "packages": {name: version(name) for name in _PACKAGES},
         "git_commit": _git_commit(),
         "device": str(jax.devices()[0].device_kind),
         "num_devices": jax.device_count(),
@@ -139,7 +165,8 @@ def provenance() -> dict[str, Any]:
     }
 
 
-def _version(package: str) -> str | None:
+def version(package: str) -> str | None:
+    """Returns the version of an installed package, None if it is not installed."""
     with contextlib.suppress(metadata.PackageNotFoundError):
         return metadata.version(package)
     return None

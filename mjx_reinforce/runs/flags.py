@@ -1,14 +1,32 @@
-"""Reading a command line, and writing to terminals that lack some characters."""
+"""Reading a command line, refusing in one line, and terminals that lack some characters."""
 
 import contextlib
 import dataclasses
 import difflib
 import io
+import os
+import re
+import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 import tyro
+
+#: Columns that --help is written for at least.
+_LEAST_WIDTH = 60
+#: What tyro says of a value that is not of its type -> what we say.
+_PLAIN = {
+    r"Error parsing (\S+): no type matching {None}\|INT .* from \['(.*?)'\].*": (
+        r"\1 takes a whole number or None, got '\2'"
+    ),
+    r"Error parsing (\S+): no type matching {None}\|FLOAT .* from \['(.*?)'\].*": (
+        r"\1 takes a number or None, got '\2'"
+    ),
+    r"Error parsing (\S+): Could not find valid parse for arguments: .*": (
+        r"\1 takes whole numbers with spaces between them, such as 32 32"
+    ),
+}
 
 
 def read(form: Any, arguments: Sequence[str], prog: str, description: str) -> Any:
@@ -26,7 +44,7 @@ def read(form: Any, arguments: Sequence[str], prog: str, description: str) -> An
     """
     box = io.StringIO()
     try:
-        with contextlib.redirect_stderr(box):
+        with contextlib.redirect_stderr(box), _room_for_help():
             parsed, unknown = tyro.cli(
                 form, args=arguments, prog=prog, description=description, return_unknown_args=True
             )
@@ -37,6 +55,21 @@ def read(form: Any, arguments: Sequence[str], prog: str, description: str) -> An
     if unknown:
         raise ValueError(_about_unknown(unknown, list(_flags(parsed))))
     return parsed
+
+
+@contextlib.contextmanager
+def _room_for_help() -> Iterator[None]:
+    """Lets a narrow terminal wrap lines itself: of 20 columns tyro makes thousands of lines."""
+    given = os.environ.get("COLUMNS")
+    if shutil.get_terminal_size().columns < _LEAST_WIDTH:
+        os.environ["COLUMNS"] = str(_LEAST_WIDTH)
+    try:
+        yield
+    finally:
+        if given is None:
+            os.environ.pop("COLUMNS", None)
+        else:
+            os.environ["COLUMNS"] = given
 
 
 def _flags(parsed: Any) -> Iterator[str]:
@@ -54,6 +87,8 @@ def _about_unknown(unknown: Sequence[str], flags: Sequence[str]) -> str:
     flag = next((text.partition("=")[0] for text in unknown if text.startswith("-")), None)
     if flag is None:
         return f"no flag takes {' '.join(map(repr, unknown))} (see --help)"
+    if flag in flags:
+        return f"{flag} stands after --, which ends the flags: leave -- out"
     near = difflib.get_close_matches(flag, flags, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return f"unknown flag {flag!r}.{hint} (See --help.)"
@@ -69,7 +104,22 @@ def _first_section(box: str) -> str:
                 break
         else:
             said.append(line)
-    return " ".join(said)
+    text = " ".join(said)
+    for pattern, replacement in _PLAIN.items():
+        text = re.sub(pattern, replacement, text)
+    return text
+
+
+@contextlib.contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Ends the program with one line and status 2 for bad input, with 130 after Ctrl-C."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 def accept_all_characters() -> None:

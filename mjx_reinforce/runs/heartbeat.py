@@ -1,4 +1,4 @@
-"""A sign of life while a program compiles, for those who have no terminal."""
+"""Signs of life of what takes long, for those who have no terminal."""
 
 import contextlib
 import threading
@@ -11,21 +11,27 @@ _INTERVAL = 15.0
 
 @contextlib.contextmanager
 def heartbeat(
-    say: Callable[[str], None], expected: float | None, interval: float = _INTERVAL
+    say: Callable[[str], None],
+    expected: float | None,
+    what: str = "compiling",
+    interval: float = _INTERVAL,
 ) -> Iterator[None]:
-    """Says again and again, while its block runs, that compiling goes on.
+    """Says again and again, while its block runs, that it goes on.
 
     Args:
       say: shows a line.
       expected: how long the block takes (s), or None if that is not known.
+      what: is done in it.
       interval: time between two lines (s).
     """
     ended, began = threading.Event(), time.perf_counter()
-    outlook = "" if expected is None else f"; about {expected:.0f} s expected"
 
     def beat() -> None:
         while not ended.wait(interval):
-            say(f"still compiling, {time.perf_counter() - began:.0f} s{outlook}")
+            passed = time.perf_counter() - began
+            known = expected is not None and passed < expected
+            outlook = f"; about {expected:.0f} s expected" if known else ""
+            say(f"still {what}, {passed:.0f} s{outlook}")
 
     thread = threading.Thread(target=beat, daemon=True)
     thread.start()

@@ -66,7 +66,7 @@ class Interrupt:
             _start(self._clean_up).join(timeout=1)
             os._exit(128 + number)
         self.number = number
-        said = "stopping after this block of updates; Ctrl-C again stops at once"
+        said = "stopping after the present block of updates or test; Ctrl-C again stops at once"
         _start(functools.partial(self._say, said))
 
     def _clean_up(self) -> None:

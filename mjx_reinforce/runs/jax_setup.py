@@ -5,7 +5,11 @@ from pathlib import Path
 
 
 def configure_jax() -> None:
-    """Turns on exact float32 products and the compilation cache, unless the user chose."""
+    """Turns on exact float32 products and the compilation cache, unless the user chose.
+
+    Raises:
+      ValueError: JAX finds no device, such as where JAX_PLATFORMS names one that is not here.
+    """
     import jax
 
     cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
@@ -15,3 +19,7 @@ def configure_jax() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     if settings["jax_default_matmul_precision"] is None:
         jax.config.update("jax_default_matmul_precision", "highest")
+    try:
+        jax.devices()
+    except RuntimeError as error:
+        raise ValueError(f"JAX cannot compute here: {error}") from error

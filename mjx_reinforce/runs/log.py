@@ -12,6 +12,7 @@ from mjx_reinforce.export.policy_files import save_policy
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.runs import checkpoint, files, rows
 from mjx_reinforce.runs.checkpoint import Checkpoint
+from mjx_reinforce.runs.sinks import sink
 
 #: The files of a run, besides those in ``checkpoint/``.
 _POLICY = ("policy/actor.npz", "policy/policy.json")
@@ -39,6 +40,7 @@ class RunLog:
         for name in _RESULTS:
             (self.directory / name).unlink(missing_ok=True)
         checkpoint.remove(self.directory / "checkpoint")
+        sink.remove(self.directory)
         write_json(self.directory / "config.json", {**settings, **files.provenance()})
         files.create_csv(self._metrics, rows.COLUMNS)
 

@@ -9,6 +9,7 @@ import importlib.util
 import itertools
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -23,6 +24,8 @@ _COPIES = 3
 _ACTIVATIONS = 2
 #: Parameters, gradient, two moments, and all that again while a seed's update is proposed.
 _PARAMETERS = 8
+#: The same of a value network: parameters, gradient, two moments.
+_CRITIC_PARAMETERS = 4
 #: Steps of an episode whose hidden units are held at once, see ``learners.gradients``.
 _CHUNK = 128
 #: Bytes of an env step that an evaluation plays: the reward, the mask, and copies.
@@ -59,11 +62,18 @@ def parts(config: Config, task: Task) -> list[Part]:
     held = seeds * (min(horizon, _CHUNK) if follows else 1) * episodes * sum(config.hidden_sizes)
     policies = seeds if follows else seeds * 2 * config.num_directions
     network = _ACTIVATIONS * held + _PARAMETERS * policies * num_parameters(config, task)
-    values_hidden = sum(config.value_hidden_sizes) if config.estimator == "value-baseline" else 0
+    critic = config.value_hidden_sizes if config.estimator == "value-baseline" else ()
+    critics = _CRITIC_PARAMETERS * seeds * _weights([task.observation, *critic, 1]) if critic else 0
+    widest = max([values, *config.hidden_sizes])
+    drawn = seeds * config.minibatch_size if config.update == "minibatches" else 0
     return [
+        Part(_FLOAT * drawn * widest, "--minibatch-size or --num-seeds"),
         Part(_FLOAT * _COPIES * steps * values, f"--num-seeds, {fewer} or --horizon"),
         Part(_FLOAT * network, f"--hidden-sizes, --num-seeds or {fewer}"),
-        Part(_FLOAT * steps * values_hidden, "--value-hidden-sizes, --num-seeds or --horizon"),
+        Part(
+            _FLOAT * (_ACTIVATIONS * steps * sum(critic) + critics),
+            "--value-hidden-sizes, --num-seeds or --horizon",
+        ),
         Part(_EVALUATED * evaluated, "--eval-episodes, --num-seeds or --horizon"),
         Part(_FLOAT * _METRICS * seeds * block_length(config), "--eval-every or --num-seeds"),
     ]
@@ -71,7 +81,11 @@ def parts(config: Config, task: Task) -> list[Part]:
 
 def num_parameters(config: Config, task: Task) -> int:
     """Returns how many parameters the policy has, about: mean and std have outputs of their own."""
-    widths = [task.observation, *config.hidden_sizes, 2 * task.action]
+    return _weights([task.observation, *config.hidden_sizes, 2 * task.action])
+
+
+def _weights(widths: Sequence[int]) -> int:
+    """Returns how many parameters a network has whose layers are so wide, the input first."""
     return sum((n + 1) * m for n, m in itertools.pairwise(widths))
 
 

@@ -6,9 +6,9 @@ import numpy as np
 
 Arrays = dict[str, np.ndarray]
 
-#: What is said of a run that is ``hopeless``.
+#: Why a run that is ``hopeless`` is stopped.
 HOPELESS = (
-    "stopped: every seed that still trained was broken throughout the last updates, its episodes "
+    "every seed that still trained was broken throughout the last updates, its episodes "
     "or its new policy not finite; lower --learning-rate (ars: --step-size) or mend the task"
 )
 #: The fields of such an update, in the order of summary.json.

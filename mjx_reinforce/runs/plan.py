@@ -58,7 +58,7 @@ def make_plan(env: Any, learner: Any, horizon: int, config: Config) -> Plan:
     Raises:
       ValueError: the run does not fit into the memory that is here.
     """
-    task, machine = _task(env, horizon, config), this_machine()
+    task, machine = task_of(env, horizon, config), this_machine()
     base = task.base_memory if machine.shared else 0.0
     check_fits(config, task, machine.memory, base)
     speed = machine.speeds.get(config.env)
@@ -71,6 +71,8 @@ def make_plan(env: Any, learner: Any, horizon: int, config: Config) -> Plan:
         compiling = speed.compiling
         time = f"Compiling takes {_range(compiling)}, or much less if this was compiled before; "
         time += f"training {'at most ' + duration(seconds) if bounded else _range(seconds)}"
+        if not bounded and task.useful < 1:
+            time += ", more if some seeds' episodes stay short, since all wait for the last"
     memory = gigabytes(base + needed(config, task))
     text = (
         f"Training {_what(config)} on {machine.name}, with the engine {learner.engine.name}: "
@@ -101,7 +103,7 @@ def this_machine() -> Machine:
     """Returns where JAX computes."""
     import jax
 
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     if device.platform == "cpu":
         affinity = getattr(os, "sched_getaffinity", None)  # not on every system
         cores = len(affinity(0)) if affinity else os.cpu_count() or 1
@@ -136,7 +138,7 @@ def _what(config: Config) -> str:
     return f"{seeds} of {config.env} by {config.algorithm}, {' or '.join(budgets)} each,"
 
 
-def _task(env: Any, horizon: int, config: Config) -> Task:
+def task_of(env: Any, horizon: int, config: Config) -> Task:
     """Returns the sizes of a task, also of the user's own."""
     from mjx_reinforce.types import Discrete, action_space, observation_size
 

@@ -138,15 +138,33 @@ class Record:
         Returns:
           The rows of metrics.csv, see ``rows``.
         """
+        self.keep_evaluation(result, seconds)
+        episodes = self.updates * self._config.episodes_per_update
+        return rows.of_evaluation(
+            result, self._last, self.updates, episodes, self.env_steps, seconds
+        )
+
+    def keep_evaluation(self, result: Arrays, seconds: float) -> None:
+        """Takes in an evaluation as ``add_evaluation`` does, without its rows."""
         episodes = self.updates * self._config.episodes_per_update
         counts = {"env_steps": self.env_steps, "episodes": episodes, "updates": self.updates}
         row = result | counts | {"seconds": np.asarray(seconds, np.float64)}
         self._tables["evaluations"].append({name: x[None] for name, x in row.items()})
         self._count_simulated(result["simulated_steps"])
         self.seconds = seconds
-        return rows.of_evaluation(
-            result, self._last, self.updates, episodes, self.env_steps, seconds
-        )
+
+    def add_test(self, result: Arrays) -> None:
+        """Counts what a test of final policies simulated, of ``evaluation.evaluate``."""
+        self._count_simulated(result["simulated_steps"])
+
+    def evaluated(self) -> bool:
+        """Returns whether the present policies have been evaluated."""
+        last = self._tables["evaluations"].latest(1)
+        return bool(last) and np.array_equal(last["updates"][0], self.updates)
+
+    def last_evaluation(self) -> Arrays:
+        """Returns what the last evaluation measured, [S] each."""
+        return {name: x[-1] for name, x in self._tables["evaluations"].latest(1).items()}
 
     def finished(self) -> bool:
         """Returns whether the budget is used, or all seeds are solved and that was to end it."""
@@ -180,6 +198,11 @@ class Record:
         past = self._tables["evaluations"].columns()
         return {name: past[name] for name in ("eval_return", "env_steps", "episodes")}
 
+    def nonfinite_updates(self) -> np.ndarray:
+        """Returns how many updates [S] of each seed met numbers that are not finite."""
+        seeds = self._tables["nonfinite"].columns()["seed"]
+        return np.bincount(seeds, minlength=self._config.num_seeds)
+
     def training(self) -> Arrays:
         """Returns ``episode_return`` and the ``env_steps`` and ``episodes`` after it, [U, S].
 
@@ -200,6 +223,7 @@ class Record:
             "env": self._config.env,
             "engine": engine,
             "num_seeds": self._config.num_seeds,
+            "threshold": self.threshold,
             **summarize(self.history(), self.threshold),
             "env_steps": self.env_steps.tolist(),
             "compile_seconds": compile_seconds,

@@ -28,6 +28,7 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
         "--estimator value-baseline",
     ),
     ("standardize_floor", lambda c: c.standardize, "--standardize"),
+    ("overwrite", lambda c: c.output is not None or c.resume is not None, "--output DIR"),
     (
         "minibatch_updates minibatch_size",
         lambda c: c.update == "minibatches",
@@ -63,19 +64,33 @@ def check_read(config: Config, default: Config) -> None:
       config: the settings.
       default: those that hold where the user gave none: our own, or a preset's.
     """
-    changed = [
-        field.name
-        for field in dataclasses.fields(Config)
-        if getattr(config, field.name) != getattr(default, field.name)
-    ]
+    given = changed(config, default)
     for names, is_read, condition in READ:
-        idle = [name for name in changed if name in names.split()]
+        idle = [name for name in given if name in names.split()]
         if idle and not is_read(config):
             flags = " ".join(_given(name, getattr(config, name)) for name in idle)
             raise ValueError(
                 f"{flags} would do nothing: only {condition} reads that; "
                 f"{'leave it out' if len(idle) == 1 else 'leave them out'}, or choose {condition}"
             )
+
+
+def check_read_by_policy(config: Config, policy: str) -> None:
+    """Raises ValueError for settings that differ from ours and that the policy does not read.
+
+    Args:
+      config: the settings.
+      policy: the distribution that stands for ``auto``, which depends on the environment.
+    """
+    chosen, default = dataclasses.replace(config, policy=policy), Config()
+    ours = {name: getattr(default, name) for name in ("initial_std", "rescale")}
+    check_read(chosen, dataclasses.replace(chosen, **ours))
+
+
+def changed(config: Config, default: Config) -> tuple[str, ...]:
+    """Returns the names of the settings in which two differ."""
+    names = (field.name for field in dataclasses.fields(Config))
+    return tuple(name for name in names if getattr(config, name) != getattr(default, name))
 
 
 def _given(name: str, value: Any) -> str:

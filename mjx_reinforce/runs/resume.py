@@ -32,7 +32,7 @@ def read_record(directory: Path) -> dict[str, Any]:
             f"cannot resume {directory}: there is no {path} ({error.strerror}), so nothing was "
             "begun there; start it anew with --output"
         ) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is damaged: {error}") from error
     if not isinstance(recorded, dict):
         raise ValueError(f"{path} is damaged: it is no object of names and values")
@@ -45,22 +45,28 @@ def read_settings(directory: Path) -> Config:
     Raises:
       ValueError: there is no such run, or its config.json is damaged or of another version.
     """
-    recorded, hints = read_record(directory), typing.get_type_hints(Config)
+    recorded = read_record(directory)
+    return dataclasses.replace(as_config(recorded, directory / "config.json"), resume=directory)
+
+
+def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
+    """Returns the settings that a file recorded, or raises ValueError, which names the file."""
+    hints = typing.get_type_hints(Config)
     settings = {}
     for field in dataclasses.fields(Config):
         if field.name in PLACES:
             continue
         if field.name not in recorded:
             raise ValueError(
-                f"{directory / 'config.json'} does not say {field.name}: it is damaged, or of "
+                f"{path} does not say {field.name}: it is damaged, or of "
                 "another version of the program; resume with the version that wrote it"
             )
         value = recorded[field.name]
         value = tuple(value) if isinstance(value, list) else value
         if not _fits(value, hints[field.name]):
-            raise ValueError(f"{directory / 'config.json'} is damaged: {field.name} is {value!r}")
+            raise ValueError(f"{path} is damaged: {field.name} is {value!r}")
         settings[field.name] = value
-    return Config(**settings, resume=directory)
+    return Config(**settings)
 
 
 def _fits(value: Any, hint: Any) -> bool:
@@ -97,15 +103,22 @@ def check_settings(known: Config, asked: Config) -> None:
 
 
 def is_done(known: Config, asked: Config) -> bool:
-    """Returns whether a run has finished and is asked for no more than it did."""
+    """Returns whether a run has finished and is asked for no more than it did.
+
+    Raises:
+      ValueError: it is asked for no more, and was stopped because nothing was finite any more.
+    """
     assert known.resume is not None
     if any(getattr(known, name) != getattr(asked, name) for name in BUDGETS[:-1]):
         return False
     try:
         summary = json.loads((known.resume / "summary.json").read_text(encoding="utf-8"))
-        return summary["status"] == "finished"
+        status = summary["status"]
     except (OSError, ValueError, KeyError, TypeError):
         return False
+    if status == "stopped":
+        raise ValueError(f"{known.resume} was stopped and would be again: {summary.get('reason')}")
+    return status == "finished"
 
 
 def check_program(directory: Path, present: Mapping[str, Any]) -> None:
@@ -115,7 +128,13 @@ def check_program(directory: Path, present: Mapping[str, Any]) -> None:
       directory: the run's.
       present: what ``files.provenance`` returns.
     """
-    recorded = read_record(directory)
+    check_same_program(directory, read_record(directory), present)
+
+
+def check_same_program(
+    directory: Path, recorded: Mapping[str, Any], present: Mapping[str, Any]
+) -> None:
+    """Raises ValueError as ``check_program``, of what a file in the directory recorded."""
     for name in _PROGRAM:
         old, new = recorded.get(name), present[name]
         if isinstance(old, dict) and isinstance(new, dict):

@@ -8,6 +8,7 @@ COLUMNS = (
     *("seed", "update", "episodes", "env_steps", "wall_seconds"),
     *("train_return", "eval_return", "eval_return_stochastic", "eval_length", "train_length"),
     *("entropy", "gradient_norm", "simulated_steps", "nonfinite_episodes", "skipped_update"),
+    *("kl", "policy_std", "explained_variance", "gradient_snr", "clipped_gradients"),
 )
 #: Columns that an evaluation measures.
 _EVALUATION = ("eval_return", "eval_return_stochastic", "eval_length")
@@ -20,6 +21,11 @@ _LAST_UPDATE = {
     "simulated_steps": "simulated_steps",
     "nonfinite_episodes": "nonfinite_episodes",
     "skipped_update": "skipped_update",
+    "kl": "kl",
+    "policy_std": "policy_std",
+    "explained_variance": "explained_variance",
+    "gradient_snr": "gradient_snr",
+    "clipped_gradients": "clipped_gradients",
 }
 
 
@@ -35,8 +41,8 @@ def of_evaluation(
 
     Args:
       evaluation: [S] each, what ``evaluation.evaluate`` returns.
-      last_update: [S] each, the metrics of each seed's last update; empty before the first, and
-        then their columns are too.
+      last_update: [S] each, the metrics of each seed's last update; empty before the first. The
+        columns of metrics that a learner does not have are empty.
       updates: [S] how many were made.
       episodes: [S] how many were played for them.
       env_steps: [S] and how many env steps.
@@ -53,6 +59,7 @@ def of_evaluation(
     for name in _EVALUATION:
         columns[name] = evaluation[name].tolist()
     for name, metric in _LAST_UPDATE.items():
-        columns[name] = last_update[metric].tolist() if last_update else [""] * num_seeds
+        measured = last_update.get(metric)
+        columns[name] = [""] * num_seeds if measured is None else measured.tolist()
     table = zip(*(columns[name] for name in COLUMNS), strict=True)
     return [dict(zip(COLUMNS, row, strict=True)) for row in table]

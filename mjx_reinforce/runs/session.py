@@ -1,6 +1,6 @@
 """A run as it goes on: its programs, its measurements, its screen and its files."""
 
-import contextlib
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
@@ -11,6 +11,7 @@ from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.record import Record
+from mjx_reinforce.runs.sinks.sink import Queue
 from mjx_reinforce.runs.state import Programs, RunState
 
 #: Between checkpoints, where the user has not said how many updates.
@@ -54,6 +55,8 @@ class Session:
         #: Whether the newest checkpoint is of the present state.
         self.saved = False
         self._failing: set[str] = set()
+        #: Where rows go besides metrics.csv.
+        self.sinks: list[Queue] = []
 
     def restore(self, found: Checkpoint) -> None:
         """Goes back to a checkpoint."""
@@ -80,8 +83,9 @@ class Session:
         seconds = self.seconds()
         rows = self.record.add_evaluation(result, seconds)
         self._attempt("metrics.csv", lambda: self.log.add_rows(rows))
-        progress = self.record.progress()
-        self._attempt("to the screen", lambda: self.display.show_progress(progress))
+        for sink in self.sinks:
+            self._attempt(sink.name, functools.partial(sink.write, rows))
+        self.display.show_progress(self.record.progress())
 
     def save_if_due(self) -> None:
         """Saves a checkpoint once there were enough updates, or about a minute, since the last."""
@@ -110,6 +114,11 @@ class Session:
         """Writes the last and the best policies, or raises OSError."""
         self.log.save_policies(self.state.train_states.actor, self.best.actor, self.policy)
 
+    def close_sinks(self) -> None:
+        """Ends the sinks."""
+        for sink in self.sinks:
+            self._attempt(sink.name, sink.close)
+
     def _save_checkpoint(self) -> None:
         content = Checkpoint(
             state=(self.state, self.best),
@@ -121,17 +130,25 @@ class Session:
         )
         self.log.save_checkpoint(content, even=content.is_even(self.config.eval_every))
 
-    def test(self) -> dict[str, Any]:
+    def test(self, interrupted: Callable[[], bool]) -> dict[str, Any]:
         """Plays the last and the best policies on starts used nowhere else, for summary.json.
 
         Choosing the best by its evaluations flatters these evaluations, but not the test.
+
+        Args:
+          interrupted: whether the run is to end soon; it is tested when it has been resumed.
+
+        Returns:
+          The returns of both, or nothing if it was interrupted.
         """
-        final = self.programs.test(self.state.train_states.actor)["eval_return"]
-        best = self.programs.test(self.best.actor)["eval_return"]
-        return {
-            "final_test_returns": final.tolist(),
-            "best_test_returns": best.tolist(),
-        }
+        returns = {}
+        for name, actor in (("final", self.state.train_states.actor), ("best", self.best.actor)):
+            if interrupted():
+                return {}
+            result = self.programs.test(actor)
+            self.record.add_test(result)
+            returns[f"{name}_test_returns"] = result["eval_return"].tolist()
+        return returns
 
     def _updates(self) -> int:
         return int(self.record.updates.max())
@@ -147,6 +164,5 @@ class Session:
                 return False
             self._failing.add(what)
             warning = f"cannot write {what} ({error.strerror or error})"
-            with contextlib.suppress(OSError):  # the screen may be a file on the same disk
-                self.display.say(f"warning: {warning}; training goes on and tries again")
+            self.display.say(f"warning: {warning}; training goes on and tries again")
             return False

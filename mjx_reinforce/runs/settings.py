@@ -163,6 +163,21 @@ class CheckpointSettings:
     --env-steps, --max-updates, --stop-when-solved, --checkpoint-every."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class LogSettings:
+    """Where the rows of metrics.csv go besides. The charts' step is the number of updates."""
+
+    tensorboard: bool = False
+    """Charts for TensorBoard in RUN/tensorboard: of each column the interquartile mean, quantiles
+    and a histogram over seeds, and the first 16 seeds. To see them: pip install tensorboard, then
+    tensorboard --logdir RUN."""
+    wandb: bool = False
+    """The same numbers for Weights & Biases (pip install wandb) in RUN/wandb, offline: wandb sync
+    uploads them. With WANDB_MODE=online in the environment they are sent as the run goes on."""
+    jsonl: bool = False
+    """All rows in RUN/metrics.jsonl too, a JSON object a line."""
+
+
 #: The groups of --help, in order, under their titles.
 GROUPS = {
     "run": RunSettings,
@@ -172,4 +187,5 @@ GROUPS = {
     "search": SearchSettings,
     "evaluation": EvaluationSettings,
     "checkpoints": CheckpointSettings,
+    "logs": LogSettings,
 }

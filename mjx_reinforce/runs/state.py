@@ -1,5 +1,6 @@
 """A run in progress: the state of all its seeds, and the compiled programs that move it on."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +20,8 @@ from mjx_reinforce.runs.evaluation import evaluate
 from mjx_reinforce.types import Environment
 
 Arrays = dict[str, np.ndarray]
+#: Returns the learner of settings that may be traced, of one seed each.
+BuildLearner = Callable[[dict[str, jax.Array]], Learner]
 
 
 @struct.dataclass(kw_only=True)
@@ -27,10 +30,12 @@ class RunState:
 
     train_states: [S, ...] the ``TrainState`` of every seed
     env_steps: [S] int32, how many each seed has played in training
+    settings: [S] each, settings that differ from seed to seed; none where all seeds have the same
     """
 
     train_states: TrainState
     env_steps: jax.Array
+    settings: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
 
 
 class Budget(NamedTuple):
@@ -63,12 +68,32 @@ class Programs(NamedTuple):
 
 def first_state(learner: Learner, config: Config) -> RunState:
     """Returns the state before the first update."""
-    key = _key(config.seed, domain=0)
-    init = jax.jit(jax.vmap(learner.init))
-    return RunState(
-        train_states=init(jax.random.split(key, config.num_seeds)),
-        env_steps=jnp.zeros(config.num_seeds, jnp.int32),
-    )
+    return jax.jit(beginning(lambda _: learner))(seed_keys(config), {})
+
+
+def seed_keys(config: Config) -> jax.Array:
+    """Returns the keys [S] that the seeds of a run begin with."""
+    return jax.random.split(_key(config.seed, domain=0), config.num_seeds)
+
+
+def beginning(build_learner: BuildLearner) -> Callable[..., RunState]:
+    """Returns a function to the state before the first update.
+
+    It takes the keys [S] of the seeds, and the settings [S] that differ between them.
+
+    Args:
+      build_learner: called while the settings of one seed are traced.
+    """
+
+    def init(key: jax.Array, settings: dict[str, jax.Array]) -> TrainState:
+        return build_learner(settings).init(key)
+
+    def begin(keys: jax.Array, settings: dict[str, jax.Array]) -> RunState:
+        states = jax.vmap(init)(keys, settings)
+        zeros = jnp.zeros(len(keys), jnp.int32)
+        return RunState(train_states=states, env_steps=zeros, settings=settings)
+
+    return begin
 
 
 def compile_programs(
@@ -83,10 +108,11 @@ def compile_programs(
       config: the settings of the run.
       state: any state of the run; only its shapes are read.
     """
-    key = _key(config.eval_seed, domain=1)
-    budget = _budget(config)
-    advance = jax.jit(_advance(learner, block_length(config)), donate_argnums=0)
-    look = jax.jit(_evaluate(env, learner, horizon, config))
+    key = evaluation_key(config)
+    budget = budget_of(config)
+    block = block_of_updates(lambda _: learner, block_length(config))
+    advance = jax.jit(block, donate_argnums=0)
+    look = jax.jit(evaluation(env, learner, horizon, config))
     with ThreadPoolExecutor() as pool:  # the first compiles while the second is traced
         looking = pool.submit(look.lower(state.train_states.actor, key).compile)
         advancing = advance.lower(state, budget).compile()
@@ -94,13 +120,13 @@ def compile_programs(
 
     def advanced(state: RunState) -> tuple[RunState, Arrays]:
         state, (made, metrics) = advancing(state, budget)
-        return state, {name: x[: int(made)] for name, x in _to_numpy(metrics).items()}
+        return state, {name: x[: int(made)] for name, x in to_numpy(metrics).items()}
 
     def evaluated(state: RunState) -> Arrays:
-        return _to_numpy(compiled(state.train_states.actor, key))
+        return to_numpy(compiled(state.train_states.actor, key))
 
     def tested(actor: Actor) -> Arrays:
-        return _to_numpy(compiled(actor, _key(config.eval_seed, domain=2)))
+        return to_numpy(compiled(actor, _key(config.eval_seed, domain=2)))
 
     return Programs(advanced, evaluated, tested)
 
@@ -113,30 +139,42 @@ def _key(seed: int, domain: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(seed), domain)
 
 
-def _budget(config: Config) -> Budget:
+def evaluation_key(config: Config) -> jax.Array:
+    """Returns the key of every evaluation but the last test."""
+    return _key(config.eval_seed, domain=1)
+
+
+def budget_of(config: Config) -> Budget:
     """Returns the budget; what has no limit has the greatest count."""
     limits = (config.env_steps, config.max_updates)
     return Budget(*(jnp.int32(MAX_COUNT if limit is None else limit) for limit in limits))
 
 
-def _advance(learner: Learner, length: int) -> Callable[..., Any]:
+def block_of_updates(build_learner: BuildLearner, length: int) -> Callable[..., Any]:
     """Returns a function that makes ``length`` updates of all seeds, or fewer if that is the end.
 
-    Its result is the state, how many updates were made [], and their metrics [length, S], of
-    which the rows after the last update are zero.
+    It takes a ``RunState`` and a ``Budget``. Its result is the state, how many updates were made
+    [], and their metrics [length, S], of which the rows after the last update are zero.
+
+    Args:
+      build_learner: called while the settings of one seed are traced.
+      length: rows of the metrics.
     """
 
     def active(state: RunState, budget: Budget) -> jax.Array:
         used = state.env_steps >= budget.env_steps
         return ~(used | (state.train_states.num_updates >= budget.updates))
 
+    def step(state: TrainState, settings: dict[str, jax.Array], going: jax.Array) -> Any:
+        return build_learner(settings).step(state, going)
+
     @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
     def update(state: RunState, budget: Budget) -> tuple[RunState, dict[str, jax.Array]]:
         going = active(state, budget)
-        train_states, metrics = jax.vmap(learner.step)(state.train_states, going)
+        train_states, metrics = jax.vmap(step)(state.train_states, state.settings, going)
         env_steps = state.env_steps + metrics["env_steps"]
         counts = {"updates_total": train_states.num_updates, "env_steps_total": env_steps}
-        state = RunState(train_states=train_states, env_steps=env_steps)
+        state = dataclasses.replace(state, train_states=train_states, env_steps=env_steps)
         return state, metrics | counts | {"active": going}
 
     def advance(state: RunState, budget: Budget) -> tuple[RunState, Any]:
@@ -158,16 +196,22 @@ def _advance(learner: Learner, length: int) -> Callable[..., Any]:
     return advance
 
 
-def _evaluate(env: Environment, learner: Learner, horizon: int, config: Config) -> Any:
-    """Returns a function that evaluates actors [S, ...], all on the same start states."""
+def evaluation(env: Environment, learner: Learner, horizon: int, config: Config) -> Any:
+    """Returns a function that evaluates actors [S, ...], all on the same start states.
 
-    def one(actor: Actor, key: jax.Array) -> dict[str, jax.Array]:
-        return evaluate(
-            env, learner, actor, key, num_episodes=config.eval_episodes, horizon=horizon
-        )
+    It also takes which of them are evaluated [S]; all by default.
+    """
 
-    return jax.vmap(one, in_axes=(0, None))
+    def one(actor: Actor, key: jax.Array, active: Any = True) -> dict[str, jax.Array]:
+        size = {"num_episodes": config.eval_episodes, "horizon": horizon}
+        return evaluate(env, learner, actor, key, **size, active=active)
+
+    def every(actor: Actor, key: jax.Array, *active: jax.Array) -> dict[str, jax.Array]:
+        return jax.vmap(one, in_axes=(0, None, *[0] * len(active)))(actor, key, *active)
+
+    return every
 
 
-def _to_numpy(tree: dict[str, jax.Array]) -> Arrays:
+def to_numpy(tree: dict[str, jax.Array]) -> Arrays:
+    """Returns arrays on the host; waits for them."""
     return {name: np.asarray(value) for name, value in jax.device_get(tree).items()}

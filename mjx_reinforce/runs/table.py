@@ -24,6 +24,8 @@ class Table:
 
     def latest(self, count: int) -> Arrays:
         """Returns the last ``count`` rows, of blocks none of which is empty, or all there are."""
+        if not self._blocks:
+            return {}
         tails = [{name: x[-count:] for name, x in b.items()} for b in self._blocks[-count:]]
         return {name: x[-count:] for name, x in _joined(tails).items()}
 

@@ -1,0 +1,213 @@
+"""How often each interval of mjx_reinforce/reports covers the truth, by simulation.
+
+Prints a Markdown table: interval and distribution by number of seeds, in percent of the draws,
+with the standard error of that share. ``--draws 10000`` takes minutes on one core.
+"""
+
+import argparse
+import functools
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from scipy import stats
+
+from mjx_reinforce.reports import aggregates, bootstrap, comparisons, survival
+
+SEEDS = (5, 20, 50, 200)
+Ends = tuple[np.ndarray, np.ndarray]
+
+
+def solved_or_not(u: np.ndarray) -> np.ndarray:
+    """Seven of ten seeds have the highest return there is, 1000; the others have 50 to 950."""
+    return np.where(u < 0.3, 50 + 3000 * u, 1000.0)
+
+
+def two_peaks(u: np.ndarray) -> np.ndarray:
+    """A third of the seeds have 100 to 300, the others 800 to 1000."""
+    return np.where(u < 1 / 3, 100 + 600 * u, 700 + 300 * u)
+
+
+#: What the optimality gap is taken to.
+_TARGETS = {"solved or not": 950.0, "two peaks": 900.0}
+#: Distributions of a return, as quantile functions.
+DISTRIBUTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "normal": stats.norm.ppf,
+    "skewed (exponential)": stats.expon.ppf,
+    "solved or not": solved_or_not,
+    "two peaks": two_peaks,
+    "heavy tail (Student's t, 3)": stats.t(3).ppf,
+}
+STATISTICS = ("mean", "median", "iqm", "optimality-gap", "cvar")
+
+
+def truth(quantile: Callable[[np.ndarray], np.ndarray], statistic: str, target: float) -> float:
+    """Returns a statistic of the distribution itself, from a million of its quantiles."""
+    if statistic == "median":
+        return float(quantile(np.array(0.5)))
+    values = quantile((np.arange(10**6) + 0.5) / 10**6)
+    if statistic == "optimality-gap":
+        return target - float(np.mean(np.minimum(values, target)))
+    low, high = {"mean": (0, 1), "iqm": (0.25, 0.75), "cvar": (0, 0.1)}[statistic]
+    return float(np.mean(values[int(low * 10**6) : int(high * 10**6)]))
+
+
+def percentile_interval(values: np.ndarray) -> Ends:
+    """Returns the IQM's plain percentile bootstrap interval, rliable's, of rows of values."""
+    parts = np.array_split(values, max(1, len(values) // 400))
+    ends = [bootstrap.percentiles(bootstrap.resampled_trim_means(p, 0.25), 0.025) for p in parts]
+    low, high = np.concatenate(ends, axis=1)
+    return low, high
+
+
+def one_sample(draws: int) -> Iterator[tuple[str, str, list[str]]]:
+    """Yields interval, distribution and coverage by seeds for statistics of one configuration."""
+    for statistic in STATISTICS:
+        for name, quantile in DISTRIBUTIONS.items():
+            target = _TARGETS.get(name, np.nan)
+            if statistic == "optimality-gap" and np.isnan(target):
+                continue
+            true = truth(quantile, statistic, target)
+            cells = []
+            for num_seeds in SEEDS:
+                values = quantile(np.random.default_rng(num_seeds).random((draws, num_seeds)))
+                found = aggregates.interval(statistic, values, target=target)
+                cells.append(share(found.low, found.high, true))
+            yield statistic, name, cells
+    for name, quantile in DISTRIBUTIONS.items():
+        true, cells = truth(quantile, "iqm", np.nan), []
+        for num_seeds in SEEDS:
+            values = quantile(np.random.default_rng(num_seeds).random((draws, num_seeds)))
+            cells.append(share(*percentile_interval(values), true))
+        yield "iqm, plain percentiles (rliable)", name, cells
+
+
+def stratified(draws: int) -> Iterator[tuple[str, str, list[str]]]:
+    """Yields the same for the IQM and the mean over five tasks, 1 apart from each other."""
+    shift = np.arange(5.0)
+    grid = stats.norm.ppf((np.arange(10**6) + 0.5) / 10**6)
+    middle = np.sort(np.add.outer(shift, grid[::5]).ravel())
+    for statistic, true in (("iqm", float(stats.trim_mean(middle, 0.25))), ("mean", 2.0)):
+        cells = []
+        for num_seeds in SEEDS:
+            tasks = np.arange(num_seeds) % 5
+            if num_seeds < 10:
+                cells.append("")
+                continue
+            random = np.random.default_rng(num_seeds)
+            values = random.normal(size=(draws, num_seeds)) + shift[tasks]
+            found = aggregates.interval(statistic, values, strata=tasks)
+            cells.append(share(found.low, found.high, true))
+        yield f"{statistic}, five tasks ({draws:,} draws)", "normal", cells
+
+
+def rates(draws: int) -> Iterator[tuple[str, str, list[str]]]:
+    """Yields the same for a rate: solved, collapsed, above a return of the profile."""
+    for rate in (0.5, 0.9, 0.97):
+        cells = []
+        for num_seeds in SEEDS:
+            count = np.random.default_rng(num_seeds).binomial(num_seeds, rate, draws)
+            _, low, high = aggregates.wilson(count, num_seeds)
+            cells.append(share(low, high, rate))
+        yield "rate (Wilson)", f"{100 * rate:.0f} %", cells
+
+
+def _one_luck(random: np.random.Generator, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Two configurations on the same seeds: each seed is lucky or not in both."""
+    luck = random.normal(size=shape)
+    return luck + random.normal(0.5, 0.5, shape), luck + random.normal(0, 0.5, shape)
+
+
+def _solved_twice(
+    random: np.random.Generator, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """One configuration solves nine seeds of ten, the other seven."""
+    first, second = random.random(shape), random.random(shape)
+    return np.where(first < 0.1, 50 + 9000 * first, 1000.0), solved_or_not(second)
+
+
+def _heavy(random: np.random.Generator, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    return random.standard_t(3, shape) + 1, random.standard_t(3, shape)
+
+
+PAIRS = {"normal, same luck": _one_luck, "solved or not": _solved_twice, "heavy tail": _heavy}
+
+
+def two_samples(draws: int) -> Iterator[tuple[str, str, list[str]]]:
+    """Yields the same for comparisons of two configurations."""
+    better = comparisons.probability_of_improvement
+    same = functools.partial(comparisons.probability_of_improvement, paired=True)
+    for name, pair in PAIRS.items():
+        x, y = pair(np.random.default_rng(1), (1000, 1000))
+        true = {
+            "probability of improvement": np.mean(better(x, y).value),
+            "the same, paired": np.mean(better(x, y).value),
+            "paired difference (t)": np.mean(x - y),
+        }
+        cells: dict[str, list[str]] = {kind: [] for kind in true}
+        for num_seeds in SEEDS:
+            x, y = pair(np.random.default_rng(num_seeds), (draws, num_seeds))
+            for kind, function in (
+                ("probability of improvement", better),
+                ("the same, paired", same),
+                ("paired difference (t)", comparisons.paired_difference),
+            ):
+                found = function(x, y)
+                cells[kind].append(share(found.low, found.high, float(true[kind])))
+        for kind, row in cells.items():
+            yield kind, name, row
+
+
+def times(draws: int) -> Iterator[tuple[str, str, list[str]]]:
+    """Yields the same for env steps to a threshold, which are lognormal with the median 1."""
+    for name, solved_share, earliest in (
+        ("1 of 10 never", 0.9, 1.0),
+        ("4 of 10 never", 0.6, 1.0),
+        ("2 of 10 never, trained for unlike times", 0.8, 0.5),
+    ):
+        last = float(stats.lognorm(1).ppf(solved_share))
+        until = earliest * last
+        quantiles = stats.lognorm(1).ppf((np.arange(10**6) + 0.5) / 10**6)
+        true = {"median steps": 1.0, "restricted mean": np.mean(np.minimum(quantiles, until))}
+        cells: dict[str, list[str]] = {kind: [] for kind in true}
+        for num_seeds in SEEDS:
+            random = np.random.default_rng(num_seeds)
+            time = random.lognormal(size=(draws, num_seeds))
+            end = random.uniform(until, last, time.shape)
+            runs = [*zip(np.minimum(time, end), time <= end, strict=True)]
+            medians = np.array([survival.median_steps(*run) for run in runs])
+            means = np.array([survival.restricted_mean(*run, until) for run in runs])
+            for kind, found in zip(true, (medians, means), strict=True):
+                cells[kind].append(share(found[:, 1], found[:, 2], float(true[kind])))
+        for kind, row in cells.items():
+            yield kind, name, row
+
+
+def share(low: np.ndarray, high: np.ndarray, true: float) -> str:
+    """Returns how many of the intervals cover the truth, in percent, with its standard error.
+
+    An end that is NaN bounds nothing, so it covers; where no draw has an interval, a dash.
+    """
+    if np.all(np.isnan(low) & np.isnan(high)):
+        return "-"
+    slack = 1e-9 * max(1.0, abs(true))
+    covered = float(np.mean(~(low > true + slack) & ~(high < true - slack)))
+    return f"{100 * covered:.1f} ± {100 * math.sqrt(covered * (1 - covered) / len(low)):.1f}"
+
+
+def main() -> None:
+    """Prints the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--draws", type=int, default=10_000)
+    draws = parser.parse_args().draws
+    print(f"Share of {draws:,} draws whose 95 % interval covers the truth, in percent\n")
+    print("| interval | distribution |", *(f"{n} seeds |" for n in SEEDS))
+    print("|---|---|" + "---|" * len(SEEDS))
+    parts = one_sample(draws), rates(draws), two_samples(draws), times(draws)
+    for part in (*parts, stratified(max(draws // 20, 10))):
+        for interval, distribution, cells in part:
+            print(f"| {interval} | {distribution} |", *(f"{c} |" for c in cells), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,26 @@
+"""Numbers, lists and tables as Markdown."""
+
+import math
+from collections.abc import Iterable, Sequence
+
+
+def percent(share: float, digits: int) -> str:
+    """Returns a share in percent; nothing where there is none."""
+    return "" if math.isnan(share) else f"{100 * share:.{digits}f} %"
+
+
+def number(needed: float | None) -> str:
+    """Returns a number of seeds; None and infinity are too many to count."""
+    return "more than 10,000" if needed is None or math.isinf(needed) else f"{needed:,.0f}"
+
+
+def listed(names: Iterable[str]) -> str:
+    """Returns names as "a, b and c"."""
+    names = list(names)
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Returns a table of a header and rows [R][C]."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)

@@ -1,0 +1,168 @@
+"""The sweeps of the seeds study: what is trained, and what is kept of each run."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_reinforce import envs
+from mjx_reinforce.export.files import read_arrays, read_json, write_arrays
+from mjx_reinforce.reports.statistics import iqm
+from mjx_reinforce.reports.survival import time_to_threshold
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.runs.interrupt import Interrupt
+from mjx_reinforce.runs.jax_setup import configure_jax
+from mjx_reinforce.sweeps.design import Design, read_design
+from mjx_reinforce.sweeps.perform import perform
+
+#: Root of all randomness of the study; no figure elsewhere in this repository uses it.
+SEED = 20_261_122
+#: A run whose episodes stay so short that this many updates do not use up its env steps ends here.
+MAX_UPDATES = 150
+#: All combinations of these are trained. The learning rates come last: they share a program.
+FACTORS: dict[str, list[Any]] = {
+    "estimator": ["reward-to-go", "leave-one-out", "value-baseline"],
+    "discount_weights": [False, True],
+    "standardize": [True, False],
+    "learning_rate": [3e-3, 1e-2, 3e-2],
+}
+#: Points in training, evenly spaced in env steps, at which curves are kept.
+_GRID = 57
+
+
+class Task(NamedTuple):
+    """What the study keeps of one task's runs; arrays [...] have one axis for each factor.
+
+    name: the environment's id
+    factors: the values of each setting that was swept, in the order of the axes
+    threshold: the return that counts as solved
+    budget: env steps of a run
+    untrained: mean return of the policies before training
+    final_return: [..., S] return at the last evaluation
+    average_return: [..., S] return averaged over the env steps of the budget
+    steps_to_solve: [..., S] env steps at the first evaluation at or above the threshold, the
+      whole budget where that came later or never
+    env_steps: [..., S] env steps that were trained
+    grid: [G] env steps
+    curves: [..., G] interquartile mean over seeds of the return at these
+    record: what sweep.json says, and ``nonfinite_runs``, runs that met numbers that are not finite
+    """
+
+    name: str
+    factors: dict[str, list[Any]]
+    threshold: float
+    budget: int
+    untrained: float
+    final_return: np.ndarray
+    average_return: np.ndarray
+    steps_to_solve: np.ndarray
+    env_steps: np.ndarray
+    grid: np.ndarray
+    curves: np.ndarray
+    record: dict[str, Any]
+
+
+_ARRAYS = ("final_return", "average_return", "steps_to_solve", "env_steps", "grid", "curves")
+
+
+def base_settings(task: str, num_seeds: int) -> Config:
+    """Returns what all runs of a task share: its default settings, but for these.
+
+    They are evaluated more often. The learned baseline has half as many units in each layer: its
+    fits take most of the time.
+    """
+    return dataclasses.replace(
+        of_task(task),
+        num_seeds=num_seeds,
+        seed=SEED,
+        max_updates=MAX_UPDATES,
+        eval_every=2,
+        value_hidden_sizes=(32, 32),
+    )
+
+
+def train(base: Config, directory: Path) -> bool:
+    """Trains all combinations of ``FACTORS``, or goes on with it, and measures the runs.
+
+    Args:
+      base: the settings that all runs share.
+      directory: of the sweep; one that was begun goes on where it stopped.
+
+    Returns:
+      Whether it ended; Ctrl-C stops it so that it can go on.
+
+    Raises:
+      ValueError: fewer than 8 seeds, a task without a threshold, or what ``perform`` refuses.
+    """
+    if base.num_seeds < 8:
+        raise ValueError(f"--num-seeds must be at least 8, half to choose, got {base.num_seeds}")
+    configure_jax()
+    if envs.make(base.env).reward_threshold is None:
+        raise ValueError(f"{base.env} names no return at which it is solved; choose another task")
+    begun = (directory / "sweep.json").exists()
+    if begun:
+        design = dataclasses.replace(read_design(directory), resume=directory)
+    else:
+        design = Design(base=dataclasses.replace(base, output=directory), over=FACTORS)
+    with Interrupt() as interrupt:
+        perform(design, interrupt, [])
+        ended = interrupt.number is None
+    if ended:
+        save(measure(directory), directory)
+    return ended
+
+
+def measure(directory: Path) -> Task:
+    """Returns what the study keeps of a finished sweep.
+
+    A return that is not finite counts as the worst finite one of the sweep.
+    """
+    record = read_json(directory / "sweep.json")
+    runs = read_arrays(directory / "curves.npz")
+    factors, threshold = record["over"], record["threshold"]
+    shape = [len(values) for values in factors.values()]
+    returns, steps = runs["eval_return"].astype(float), runs["env_steps"]
+    finite = np.isfinite(returns)
+    record["nonfinite_runs"] = int(np.sum(~finite.all(axis=0)))
+    returns = np.where(finite, returns, returns[finite].min())
+    budget = record["settings"]["env_steps"]
+    grid = np.linspace(0, budget, _GRID)
+    curves = np.stack([np.interp(grid, x, y) for x, y in zip(steps.T, returns.T, strict=True)])
+    first, solved = time_to_threshold(returns, steps, threshold)
+    measured = {
+        "final_return": returns[-1],
+        "average_return": np.trapezoid(curves, grid, axis=1) / budget,
+        "steps_to_solve": np.where(solved, np.minimum(first, budget), budget),
+        "env_steps": steps[-1],
+    }
+    return Task(
+        name=record["env"],
+        factors=factors,
+        threshold=threshold,
+        budget=budget,
+        untrained=float(np.mean(returns[0])),
+        grid=grid,
+        curves=iqm(curves.reshape(math.prod(shape), -1, _GRID), axis=1).reshape(*shape, _GRID),
+        record=record,
+        **{name: x.reshape(*shape, -1) for name, x in measured.items()},
+    )
+
+
+def save(task: Task, directory: Path) -> None:
+    """Writes study.npz: all that the page is made of, a few megabytes."""
+    facts = {name: x for name, x in task._asdict().items() if name not in _ARRAYS}
+    arrays = {name: np.asarray(getattr(task, name), np.float32) for name in _ARRAYS}
+    arrays["facts"] = np.array(json.dumps(facts))
+    write_arrays(directory / "study.npz", arrays, compressed=True)
+
+
+def load(path: Path) -> Task:
+    """Returns what ``save`` wrote, from the file or its directory; ValueError without one."""
+    arrays = read_arrays(path / "study.npz" if path.is_dir() else path)
+    kept: dict[str, Any] = json.loads(str(arrays.pop("facts")))
+    kept.update({name: x.astype(float) for name, x in arrays.items()})
+    return Task(**kept)

@@ -1,0 +1,137 @@
+"""Diagnostics: how an update changed the policy, and how noisy the gradient was that it followed.
+
+Nothing that is learned depends on them, and they cost a few percent of an update at most: the
+policies are compared at a few of the visited steps, and the noise is that of a few episodes.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from mjx_reinforce.policies.actor import Actor, act
+from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.policy import Policy
+from mjx_reinforce.types import Trajectory
+
+Metrics = dict[str, jax.Array]
+
+#: The policies before and after an update are compared at so many visited steps at most.
+MAX_STEPS = 64
+
+
+class Visited(NamedTuple):
+    """K steps of each of M episodes, evenly apart.
+
+    observation: [K, M, O]
+    action: [K, M, ...]
+    weight: [K, M] the share of all steps of the M episodes that each stands for; they sum to 1
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    weight: jax.Array
+
+    def mean(self, values: jax.Array) -> jax.Array:
+        """Returns the mean [] of values [K, M] over the visited steps."""
+        return jnp.sum(jnp.where(self.weight > 0, self.weight * values, 0.0))
+
+
+def visited_steps(trajectory: Trajectory) -> Visited:
+    """Returns at most ``MAX_STEPS`` steps; all of them, if each episode has at most K.
+
+    Of an episode of L steps, every s-th is taken, from the middle of the first s on, with s = L / K
+    rounded up. Together they count as L. Of more episodes than ``MAX_STEPS``, every second, third,
+    ... is taken.
+    """
+    apart = -(-trajectory.mask.shape[1] // MAX_STEPS)
+    mask = trajectory.mask[:, ::apart]
+    horizon, num_episodes = mask.shape
+    each = min(horizon, MAX_STEPS // num_episodes)
+    length = jnp.sum(mask, axis=0)
+    stride = jnp.maximum(-(-length // each), 1)
+    time = stride // 2 + stride * jnp.arange(each)[:, None]
+    inside = time < length
+    share = jnp.where(inside, length / jnp.maximum(jnp.sum(inside, axis=0), 1), 0.0)
+
+    def take(x):
+        index = jnp.minimum(time, horizon - 1).reshape(each, num_episodes, *(1,) * (x.ndim - 2))
+        return jnp.take_along_axis(x[:, ::apart], index, axis=0)
+
+    return Visited(
+        observation=take(trajectory.observation),
+        action=take(trajectory.action),
+        weight=share / jnp.maximum(jnp.sum(length), 1),
+    )
+
+
+def policy_metrics(policy: Policy, before: Actor, after: Actor, visited: Visited) -> Metrics:
+    """Returns what an update made of a policy, means [] over visited steps.
+
+    ``kl`` is that of ``kl_divergence`` in nats; it counts what the observations' new scale does to
+    the policy, too. ``policy_std`` is the standard deviation before the update, in the action's
+    unit, the mean over its entries; a family that has none has no such metric.
+    """
+    old = act(policy, before, visited.observation)
+    new = act(policy, after, visited.observation)
+    kl = kl_divergence(policy.distribution, old, new, visited.action)
+    metrics = {"kl": visited.mean(kl)}
+    if policy.distribution.std is not None:
+        std = jnp.mean(policy.distribution.std(old), axis=-1)
+        metrics["policy_std"] = visited.mean(std)
+    return metrics
+
+
+def kl_divergence(
+    distribution: Distribution, old: jax.Array, new: jax.Array, action: jax.Array
+) -> jax.Array:
+    """Returns KL(old || new) [...] in nats: exactly, or estimated from an action of the old one.
+
+    The estimate is k3 = r - 1 - log r with r = new(a) / old(a). It is never negative, and for an
+    action a that the new policy does not depend on it is unbiased, since E[r] = 1 (Schulman 2020,
+    "Approximating KL Divergence", http://joschu.net/blog/kl-approx.html). The actions here have
+    shaped the new policy, which biases the estimate by an order of 1 / the steps of the update.
+
+    Args:
+      distribution: the family of both.
+      old: its parameters [..., K] before the update.
+      new: its parameters after it.
+      action: [..., A] drawn from the old one; not read where the family knows its ``kl``.
+    """
+    if distribution.kl is not None:
+        return distribution.kl(old, new)
+    log_ratio = distribution.log_prob(new, action) - distribution.log_prob(old, action)
+    return jnp.expm1(log_ratio) - log_ratio
+
+
+def signal_to_noise(mean: Any, each: Any, num_episodes: int) -> jax.Array:
+    """Returns an estimate [] of |E g|^2 / tr Cov(g), where g is the mean of N episodes' gradients.
+
+    It is |g|^2 / noise - 1, and the noise is (1 / M) sum_m |g_m - g|^2 / (N - 1): unbiased for
+    tr Cov(g), and |g|^2 - noise for |E g|^2, where episodes are independent and alike (McCandlish
+    et al. 2018, arXiv:1812.06162, appendix A.1, has the same two). N over the ratio is their simple
+    noise scale, in episodes.
+
+    The ratio of two unbiased estimates is not unbiased, and is below 0 where the noise happens to
+    exceed |g|^2. To average over updates, average |g|^2 (``gradient_norm`` squared) and the noise,
+    which is |g|^2 / (1 + ratio), and then divide. With leave-one-out, episodes share their
+    baselines, so that |E g|^2 is estimated 1 + 1 / (N - 1)^2 times as large.
+
+    Args:
+      mean: g, a pytree.
+      each: g_m of M of the N episodes, the same with a leading axis [M].
+      num_episodes: N, at least 2.
+    """
+    apart = jax.tree.map(lambda one, g: one - g, each, mean)
+    squares = jax.vmap(lambda tree: optax.tree.norm(tree, squared=True))(apart)
+    noise = jnp.mean(squares) / (num_episodes - 1)
+    return optax.tree.norm(mean, squared=True) / noise - 1
+
+
+def nan_unless(finite: jax.Array, metrics: Metrics) -> Metrics:
+    """Returns metrics; those that are no integers are NaN unless ``finite`` [] holds."""
+    return {
+        name: jnp.where(finite, x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x
+        for name, x in metrics.items()
+    }

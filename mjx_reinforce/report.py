@@ -1,0 +1,187 @@
+"""``python -m mjx_reinforce.report RUN_OR_SWEEP`` makes a page of what runs and sweeps found."""
+
+import dataclasses
+import os
+import shlex
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from mjx_reinforce.export.files import write_bytes
+from mjx_reinforce.reports import columns, page, sources, tables
+from mjx_reinforce.reports.experiment import Experiment
+from mjx_reinforce.reports.figures import Figure, figures
+from mjx_reinforce.reports.findings import Findings, find
+from mjx_reinforce.reports.page import GENERATOR, Watch
+from mjx_reinforce.reports.vega import ONE, draw
+from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.runs.files import version
+from mjx_reinforce.runs.flags import accept_all_characters, read
+
+_PROGRAM = "python -m mjx_reinforce.report"
+_ABOUT = (
+    "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG) "
+    "and numbers (CSV) in a folder beside it."
+)
+
+
+#: Settings of a sweep that training a seed again does not take over.
+_NOT_AGAIN = ("env", "num_seeds", "output", "overwrite", "resume")
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """What is reported on, and where the page goes."""
+
+    sources: tyro.conf.Positional[tuple[Path, ...]]
+    """Run or sweep directories, all of one task. Several are compared."""
+    output: Path = Path("report.html")
+    """The page. Its pictures and tables go into a folder of the same name without .html."""
+    overwrite: bool = False
+    """Replace files that are no report of this program."""
+
+
+def main() -> None:
+    """Reads the command line, writes the report, and exits: 0 done, 2 bad input, 130 stopped."""
+    accept_all_characters()
+    try:
+        settings = read(Settings, sys.argv[1:], _PROGRAM, _ABOUT)
+        check_output(settings.output, settings.overwrite)
+        seconds = write(settings.sources, settings.output)
+    except (ValueError, OSError) as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    size = settings.output.stat().st_size / 1e6
+    print(f"{settings.output} ({size:.1f} MB, {seconds:.1f} s), pictures and tables beside it")
+
+
+def check_output(output: Path, overwrite: bool) -> None:
+    """Raises ValueError if the report cannot be written there, or would replace other files."""
+    if output.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"{output} is no page; end --output in .html")
+    if not os.access(output.parent, os.W_OK):
+        raise ValueError(f"cannot write to {output.parent}; choose another --output")
+    if output.is_dir() or output.is_symlink():
+        raise ValueError(f"{output} is a directory or a link; choose another --output")
+    beside = _beside(output)
+    if beside.exists() and not beside.is_dir():
+        raise ValueError(f"{beside} is in the way of the pictures; choose another --output")
+    if overwrite or is_ours(output):
+        return
+    for path in (output, beside):
+        if path.is_file() or (path.is_dir() and any(path.iterdir())):
+            raise ValueError(
+                f"{path} exists and is no report of this program; choose another --output, or "
+                "pass --overwrite to replace it"
+            )
+
+
+def is_ours(output: Path) -> bool:
+    """Returns whether a file is a page of this program."""
+    if not output.is_file():
+        return False
+    with output.open("rb") as file:
+        return f'<meta name="generator" content="{GENERATOR}">'.encode() in file.read(2000)
+
+
+def write(chosen: Sequence[Path], output: Path) -> float:
+    """Writes the page, and its pictures and tables beside it; returns how long it took (s).
+
+    Replaces what an earlier report left there; ``check_output`` refuses to replace anything else.
+
+    Args:
+      chosen: run and sweep directories, see ``sources.read``.
+      output: the page.
+
+    Raises:
+      ValueError: a source is damaged, or they are of different tasks.
+      OSError: a file cannot be read or written.
+    """
+    started = time.perf_counter()
+    experiment = sources.read(chosen)
+    findings = find(experiment)
+    drawn, data = figures(findings), tables.chart_tables(findings)
+    files = {
+        "results.csv": columns.results_csv(findings),
+        "summary.csv": columns.summary_csv(findings),
+    }
+    beside = _beside(output)
+    beside.mkdir(exist_ok=True)
+    for name, content in {**files, **_tables(findings, data)}.items():
+        write_bytes(beside / name, content.encode())
+    for figure in drawn:
+        write_bytes(beside / f"{figure.name}.png", _picture(findings, figure, data))
+    seconds = time.perf_counter() - started
+    ours = version("mjx-reinforce") or "not installed"
+    watch = how_to_watch(experiment, findings)
+    text = page.render(findings, drawn, data, files, watch, ours, seconds)
+    write_bytes(output, text.encode())
+    return time.perf_counter() - started
+
+
+def _beside(output: Path) -> Path:
+    """Returns the folder for a page's pictures and tables."""
+    return output.with_suffix("")
+
+
+def _tables(findings: Findings, data: Mapping[str, columns.Table]) -> dict[str, str]:
+    labels = [each.configuration.label for each in findings.results]
+    return {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
+
+
+def _picture(findings: Findings, figure: Figure, data: Mapping[str, columns.Table]) -> bytes:
+    """Returns a figure as a PNG file."""
+    labels = [each.configuration.label for each in findings.results]
+    data = {**data, **ONE}
+    names = [*figure.tables, *figure.hidden, *ONE]
+    needed = {name: columns.rows(data[name], labels) for name in names}
+    return draw(figure.spec, needed, findings.experiment.title)
+
+
+def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
+    """Returns how to see the worst seed of the best configuration: by its run, or trained again."""
+    best = findings.results[0]
+    directory = experiment.directories[findings.order[0]]
+    seed = int(best.configuration.seed[tables.worst_seeds(best)[0]])
+    if (directory / "config.json").is_file():
+        return Watch(
+            f"To watch the worst, seed {seed}:",
+            f"python -m mjx_reinforce.watch {shlex.quote(str(directory))} --seed {seed}",
+        )
+    flags = _flags(experiment.settings | best.configuration.settings)
+    return Watch(
+        f"A sweep keeps no policies. To watch the worst, seed {seed}, train it again:",
+        f"python -m mjx_reinforce.train {flags} --num-seeds {seed + 1} --output again\n"
+        f"python -m mjx_reinforce.watch again --seed {seed}",
+    )
+
+
+def _flags(settings: Mapping[str, Any]) -> str:
+    """Returns the flags of settings that are not the defaults of their task."""
+    defaults = dataclasses.asdict(of_task(settings["env"]))
+    given = {k: v for k, v in settings.items() if k in defaults and k not in _NOT_AGAIN}
+    changed = {
+        k: v for k, v in given.items() if v != defaults[k] and v != list(_items(defaults[k]))
+    }
+    flags = [f"--env {settings['env']}"]
+    for name, value in changed.items():
+        flag = f"--{name.replace('_', '-')}"
+        if isinstance(value, bool):
+            flags.append(flag if value else flag.replace("--", "--no-", 1))
+        else:
+            flags.append(" ".join([flag, *map(str, _items(value))]))
+    return " ".join(flags)
+
+
+def _items(value: Any) -> Sequence[Any]:
+    return value if isinstance(value, list | tuple) else (value,)
+
+
+if __name__ == "__main__":
+    main()

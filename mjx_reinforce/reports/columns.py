@@ -1,0 +1,98 @@
+"""Tables by columns, as the page embeds them, and as CSV files."""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.reports.experiment import say
+from mjx_reinforce.reports.findings import Findings, swept
+
+#: Columns by name, all of one length. ``configuration`` holds places among the results.
+Table = dict[str, list[Any]]
+
+
+def rows(table: Table, labels: Sequence[str]) -> list[dict[str, Any]]:
+    """Returns a table row by row, with the labels of its configurations."""
+    names = list(table)
+    listed = [dict(zip(names, row, strict=True)) for row in zip(*table.values(), strict=True)]
+    if "configuration" in table:
+        return [row | {"configuration": labels[row["configuration"]]} for row in listed]
+    return listed
+
+
+def short(values: Any, digits: int = 5) -> list[Any]:
+    """Returns numbers with a few digits, None where they are not finite."""
+    flat = np.asarray(values, float).ravel().tolist()
+    return [_integer(float(f"{x:.{digits}g}")) if math.isfinite(x) else None for x in flat]
+
+
+def _integer(value: float) -> float | int:
+    return int(value) if value.is_integer() else value
+
+
+def join(tables: Sequence[Table]) -> Table:
+    """Returns the rows of all tables."""
+    return {name: [x for table in tables for x in table[name]] for name in tables[0]}
+
+
+def results_csv(findings: Findings) -> str:
+    """Returns a row for each configuration and seed, as ``results.csv`` of a sweep."""
+    names = swept(findings)
+    header = ("configuration", *names, "seed", "final_return", "best_return")
+    lines: list[Sequence[Any]] = [(*header, "env_steps_to_solve", "env_steps", "nonfinite")]
+    for place, result in enumerate(findings.results):
+        part, solving = result.configuration, result.solving
+        settings = [say(part.settings.get(name)) for name in names]
+        best = short(np.fmax.reduce(part.eval_return, axis=0), 7)
+        final, end = short(result.final, 7), part.env_steps[-1].tolist()
+        for s, seed in enumerate(part.seed.tolist()):
+            solved = int(solving.steps[s]) if solving and solving.solved[s] else ""
+            values = (seed, final[s], best[s], solved, end[s], int(part.nonfinite[s]))
+            lines.append((place + 1, *settings, *values))
+    return _csv(lines)
+
+
+def summary_csv(findings: Findings) -> str:
+    """Returns the figures of each configuration, best first, in full digits."""
+    listed = []
+    for place, result in enumerate(findings.results):
+        row: dict[str, Any] = {
+            "rank": place + 1,
+            "configuration": result.configuration.label,
+            "seeds": len(result.final),
+        }
+        for name in ("mean", "iqm", "tail"):
+            estimate = getattr(result, name)
+            row |= {
+                name: estimate.value,
+                f"{name}_low": estimate.low,
+                f"{name}_high": estimate.high,
+            }
+        row["not_finite_at_end"] = int(np.sum(~np.isfinite(result.final)))
+        if (solving := result.solving) is not None:
+            row |= {"solved_at_end": solving.at_end, "ever_solved": solving.ever}
+            for name, estimate in (("solve_rate", solving.rate), ("median_steps", solving.median)):
+                row |= {
+                    name: estimate.value,
+                    f"{name}_low": estimate.low,
+                    f"{name}_high": estimate.high,
+                }
+            row["fell_back"] = int(solving.fell.sum())
+        listed.append(row)
+    return _csv([list(listed[0]), *(list(row.values()) for row in listed)])
+
+
+def table_csv(table: Table, labels: Sequence[str]) -> str:
+    """Returns a table as a CSV file."""
+    listed = rows(table, labels)
+    return _csv([list(table), *(list(row.values()) for row in listed)])
+
+
+def _csv(lines: Sequence[Sequence[Any]]) -> str:
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    return text.getvalue()

@@ -1,0 +1,65 @@
+"""The report's histograms: where all seeds are, at the moments that its slider stops at."""
+
+import numpy as np
+
+from mjx_reinforce.reports.columns import Table, short
+from mjx_reinforce.reports.findings import Findings, Result
+
+#: Bars of a histogram, and moments, at most.
+_BINS = 36
+_MOMENTS = 30
+
+
+def moments(findings: Findings) -> list[int]:
+    """Returns the points of the grid that the slider stops at."""
+    last = len(findings.grid) - 1
+    return np.unique(np.linspace(0, last, min(_MOMENTS, last + 1)).round().astype(int)).tolist()
+
+
+def edges(findings: Findings) -> np.ndarray:
+    """Returns the edges of the histograms' bars; what is beyond counts in the outer ones."""
+    values = np.concatenate([each.seeds.ravel() for each in findings.results])
+    values = values[np.isfinite(values)]
+    low, high = np.quantile(values, [0.001, 0.999]) if values.size else (0.0, 1.0)
+    if low == high:
+        low, high = low - 0.5, high + 0.5
+    return np.linspace(low, high, _BINS + 1)
+
+
+def distributions(findings: Findings) -> dict[str, Table]:
+    """Returns the histograms of all configurations at all moments, and what is said of each."""
+    borders = edges(findings)
+    bars: Table = {n: [] for n in ("configuration", "moment", "low", "high", "share", "height")}
+    said: Table = {n: [] for n in ("configuration", "moment", "said")}
+    starts, ends = short(borders[:-1]), short(borders[1:])
+    for place, result in enumerate(findings.results):
+        for moment, k in enumerate(moments(findings)):
+            values = result.seeds[k]
+            finite = np.clip(values[np.isfinite(values)], borders[0], borders[-1])
+            counts, _ = np.histogram(finite, borders)
+            share, tallest = counts / len(values), max(counts.max(), 1)
+            filled = np.flatnonzero(counts)
+            bars["configuration"] += [place] * len(filled)
+            bars["moment"] += [moment] * len(filled)
+            bars["low"] += [starts[b] for b in filled]
+            bars["high"] += [ends[b] for b in filled]
+            bars["share"] += short(share[filled], 3)
+            bars["height"] += short(counts[filled] / tallest, 3)
+            said["configuration"].append(place)
+            said["moment"].append(moment)
+            said["said"].append(_said(findings, result, k, values))
+    return {"histogram": bars, "moments": said}
+
+
+def _said(findings: Findings, result: Result, k: int, values: np.ndarray) -> str:
+    """Returns a configuration's label and what its seeds return at a point of the grid."""
+    label, finite = result.configuration.label, values[np.isfinite(values)]
+    failed = len(values) - len(finite)
+    if not len(finite):
+        over = findings.grid[k] > result.configuration.env_steps[-1].min()
+        return f"{label}\n{'its training had ended' if over else 'no seed is finite'}"
+    text = f"{label}\nmedian {np.median(finite):,.4g}, worst {finite.min():,.4g}"
+    if findings.experiment.threshold is not None:
+        solved = int(np.sum(finite >= findings.experiment.threshold))
+        text += f", {solved:,} of {len(values):,} solved"
+    return text + (f", {failed:,} not finite" if failed else "")

@@ -1,0 +1,126 @@
+"""What a report is about: configurations, each trained with many seeds."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class Configuration(NamedTuple):
+    """One choice of settings, trained with S seeds and evaluated E times.
+
+    label: what it is called, "learning rate 0.003, discount 0.99"
+    settings: those that were swept, or that differ between the sources
+    eval_return: [E, S] the deterministic return, NaN where it is not finite
+    env_steps: [E, S] trained until then
+    nonfinite: [S] updates that met numbers which are not finite
+    seed: [S] each seed's number in its source
+    """
+
+    label: str
+    settings: dict[str, Any]
+    eval_return: np.ndarray
+    env_steps: np.ndarray
+    nonfinite: np.ndarray
+    seed: np.ndarray
+
+
+class Source(NamedTuple):
+    """A run or a sweep as its directory holds it.
+
+    settings: of all its configurations
+    provenance: versions, device, commit, command
+    timings: seconds by name, of compiling and running
+    status: "running", "interrupted" or "finished"
+    """
+
+    directory: Path
+    env: str
+    threshold: float | None
+    configurations: list[Configuration]
+    settings: dict[str, Any]
+    provenance: dict[str, Any]
+    timings: dict[str, float]
+    status: str
+
+
+class Experiment(NamedTuple):
+    """All that a report is drawn from; the fields are named as those of ``Source``.
+
+    asked: the question, in a sentence
+    directories: of each configuration, where it was read
+    unfinished: the directories whose training goes on or was interrupted
+    disagree: names in the provenance of which the sources say different things
+    """
+
+    title: str
+    env: str
+    threshold: float | None
+    asked: str
+    configurations: list[Configuration]
+    settings: dict[str, Any]
+    provenance: dict[str, Any]
+    timings: dict[str, float]
+    directories: list[Path]
+    unfinished: list[Path]
+    disagree: list[str]
+
+
+def describe(settings: Mapping[str, Any]) -> str:
+    """Returns settings in words: "learning rate 0.003, discount 0.99"."""
+    return ", ".join(f"{spoken(name)} {say(value)}" for name, value in settings.items())
+
+
+def spoken(name: str) -> str:
+    """Returns the name of a setting in words."""
+    return name.replace("_", " ")
+
+
+def say(value: Any) -> str:
+    """Returns the value of a setting in words; sizes of layers as 32-32."""
+    if isinstance(value, list | tuple):
+        return "-".join(map(say, value)) or "none"
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return "none" if value is None else str(value)
+
+
+def count(number: int, noun: str) -> str:
+    """Returns a number and its noun: "1 seed", "1,024 seeds"."""
+    return f"{number:,} {noun}" + ("" if number == 1 else "s")
+
+
+def asked(env: str, configurations: Sequence[Configuration]) -> str:
+    """Returns the question that configurations answer."""
+    numbers = sorted({part.eval_return.shape[1] for part in configurations})
+    seeds = count(numbers[0], "seed")
+    if len(numbers) > 1:
+        seeds = f"{numbers[0]:,} to {count(numbers[-1], 'seed')}"
+    steps = max(int(part.env_steps[-1].max()) for part in configurations)
+    if len(configurations) == 1:
+        return f"What return does {env} reach with {seeds} and {steps:,} env steps a seed?"
+    swept = "; ".join(f"{spoken(k)} {v}" for k, v in _values(configurations).items())
+    return (
+        f"Which of {len(configurations):,} configurations of {env} ends with the greatest return, "
+        f"with {seeds} of each and up to {steps:,} env steps a seed? They differ in {swept}."
+    )
+
+
+def _values(configurations: Sequence[Configuration]) -> dict[str, str]:
+    """Returns the values of each setting that differs: all of them, or the first and last."""
+    found = {}
+    for name in configurations[0].settings:
+        values = ordered([part.settings.get(name) for part in configurations])
+        said = [say(value) for value in values]
+        found[name] = ", ".join(said) if len(said) <= 8 else f"from {said[0]} to {said[-1]}"
+    return found
+
+
+def ordered(values: Sequence[Any]) -> list[Any]:
+    """Returns the different values of a setting: numbers by size, others as they come."""
+    different = list({repr(value): value for value in values}.values())
+    numbers = all(isinstance(x, int | float) for x in different)
+    return sorted(different) if numbers else different

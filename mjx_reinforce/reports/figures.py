@@ -1,0 +1,203 @@
+"""The report's figures: each chart with its caption, and the names of its data."""
+
+from typing import Any, NamedTuple
+
+from mjx_reinforce.reports import charts, tables
+from mjx_reinforce.reports.distributions import edges, moments
+from mjx_reinforce.reports.experiment import count, ordered, spoken
+from mjx_reinforce.reports.findings import Findings, swept, values_of
+from mjx_reinforce.reports.vega import specification
+from mjx_reinforce.reports.words import interval, number
+
+#: So many configurations are shown at first, the best.
+SHOWN = 4
+
+
+class Figure(NamedTuple):
+    """A chart and what is said of it.
+
+    name: of its file
+    number: on the page
+    alt: for who cannot see it
+    spec: in Vega-Lite, without data
+    tables: the names of its data, which can be downloaded
+    hidden: those of data that can be found elsewhere
+    listed: the one that the page can show as a table, if any
+    """
+
+    name: str
+    number: int
+    title: str
+    caption: str
+    alt: str
+    spec: dict[str, Any]
+    tables: list[str]
+    listed: str | None = None
+    hidden: tuple[str, ...] = ()
+
+
+def figures(findings: Findings) -> list[Figure]:
+    """Returns the figures in the order of the page, numbered; several may share a number."""
+    made = []
+    for build in (_final, _curves, _solved, _distribution, _profile, _sensitivity, _worst):
+        built = build(findings, made[-1].number + 1 if made else 1)
+        made += built
+    return made
+
+
+def _labels(findings: Findings) -> list[str]:
+    return [each.configuration.label for each in findings.results]
+
+
+def _figure(findings: Findings, chart: Any, **fields: Any) -> Figure:
+    labels, last = _labels(findings), len(moments(findings)) - 1
+    spec = specification(chart, labels, labels[:SHOWN], float(findings.grid[-1]), last)
+    spec["description"] = fields["alt"]
+    return Figure(spec=spec, **fields)
+
+
+def _final(findings: Findings, place: int) -> list[Figure]:
+    if len(findings.results) == 1:
+        return []
+    best = findings.results[0]
+    return [
+        _figure(
+            findings,
+            charts.final(_labels(findings), findings.experiment.threshold),
+            name="final",
+            number=place,
+            title="The return at the end",
+            caption=(
+                "Points are means over seeds, thick lines their 95 % intervals, and pale bars the "
+                "middle eight tenths of the seeds."
+            ),
+            alt=(
+                f"{count(len(findings.results), 'row')}, best first. The best, "
+                f"{best.configuration.label}, is at {number(best.mean.value)}, 95 % interval "
+                f"{interval(best.mean)}. Table 1 has every number."
+            ),
+            tables=["final"],
+        )
+    ]
+
+
+def _curves(findings: Findings, place: int) -> list[Figure]:
+    drawn = "; with one configuration shown, thin lines are single seeds, from worst to best"
+    return [
+        _figure(
+            findings,
+            charts.curves(
+                _labels(findings), findings.experiment.threshold, float(findings.grid[-1])
+            ),
+            name="curves",
+            number=place,
+            title="Learning curves",
+            caption=(
+                "The interquartile mean over seeds of the return without exploration, and its 95 % "
+                f"bootstrap interval{drawn}. The dotted line is the slider's time below. Point at "
+                "a curve to read it."
+            ),
+            alt="Return over env steps, a line and a band for each configuration that is shown.",
+            tables=["curves", "seeds"],
+            listed="curves",
+        )
+    ]
+
+
+def _solved(findings: Findings, place: int) -> list[Figure]:
+    if findings.experiment.threshold is None:
+        return []
+    return [
+        _figure(
+            findings,
+            charts.solved(_labels(findings), float(findings.grid[-1])),
+            name="solved",
+            number=place,
+            title="How many have solved it",
+            caption=(
+                f"The share of seeds that have reached {number(findings.experiment.threshold)} at "
+                "least once, after Kaplan and Meier, with its pointwise 95 % interval. A seed that "
+                "fell back later still counts here; table 1 says how many did."
+            ),
+            alt="Share of seeds over env steps, a rising line for each configuration shown.",
+            tables=["solved"],
+            listed="solved",
+        )
+    ]
+
+
+def _distribution(findings: Findings, place: int) -> list[Figure]:
+    borders = edges(findings)
+    return [
+        _figure(
+            findings,
+            charts.distribution(_labels(findings)[:SHOWN], float(borders[0]), float(borders[-1])),
+            name="distribution",
+            number=place,
+            title="Where the seeds are",
+            caption=(
+                "Histograms of all seeds' returns, read off at the slider's time; the tallest bar "
+                "of each row has its height, and the outermost bars hold what lies beyond them."
+            ),
+            alt="A histogram of returns for each configuration shown, with its median and worst.",
+            tables=["histogram", "moments"],
+        )
+    ]
+
+
+def _profile(findings: Findings, place: int) -> list[Figure]:
+    return [
+        _figure(
+            findings,
+            charts.profile(_labels(findings), findings.experiment.threshold),
+            name="profile",
+            number=place,
+            title="Performance profiles",
+            caption=(
+                "The share of seeds that end above each return, with Wilson's 95 % interval. A "
+                "curve above another everywhere is better whatever return one asks for."
+            ),
+            alt="Share of seeds over the final return, a falling line for each configuration.",
+            tables=["profile"],
+            listed="profile",
+        )
+    ]
+
+
+def _sensitivity(findings: Findings, place: int) -> list[Figure]:
+    made = []
+    for n, name in enumerate(swept(findings)):
+        kind, values = tables.axis_of(findings, name), values_of(findings, name)
+        chart = charts.sensitivity(spoken(name), f"sensitivity-{n}", kind, ordered(values))
+        said = f"Mean return at the end over {spoken(name)}; table 1 has the numbers."
+        figure = _figure(
+            findings,
+            chart,
+            name=f"sensitivity-{n}",
+            number=place,
+            title=spoken(name),
+            caption="",
+            alt=said,
+            tables=[f"sensitivity-{n}"],
+        )
+        made.append(figure)
+    return made
+
+
+def _worst(findings: Findings, place: int) -> list[Figure]:
+    best = findings.results[0]
+    shown = min(tables.WORST, len(best.final))
+    return [
+        _figure(
+            findings,
+            charts.worst(findings.experiment.threshold),
+            name="worst",
+            number=place,
+            title=f"The worst {count(shown, 'seed')} of {best.configuration.label}",
+            caption="Thin lines, with a point for each evaluation; thick: the interquartile mean.",
+            alt="Returns over env steps of the worst seeds; the table below says how each ended.",
+            tables=["worst"],
+            listed="worst",
+            hidden=("band",),
+        )
+    ]

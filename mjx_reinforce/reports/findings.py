@@ -1,0 +1,225 @@
+"""The figures of a report: what an experiment's numbers say, best configuration first."""
+
+import functools
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_reinforce.reports.aggregates import interval, wilson
+from mjx_reinforce.reports.comparisons import Comparison, compare_all
+from mjx_reinforce.reports.curves import on_grid
+from mjx_reinforce.reports.experiment import Configuration, Experiment
+from mjx_reinforce.reports.power import seeds_needed, wrong_winner
+from mjx_reinforce.reports.statistics import Estimate, iqm, iqm_interval
+from mjx_reinforce.reports.survival import (
+    Survival,
+    collapses,
+    kaplan_meier,
+    median_steps,
+    restricted_mean,
+    time_to_threshold,
+)
+
+#: Env steps at which curves are read off.
+_GRID_POINTS = 60
+#: Ends that are so close are those of one budget.
+_ALIKE = 0.9
+#: So many configurations are compared pair by pair: the best.
+COMPARED = 16
+#: Seeds with which people compare, and of which the page says how often they err.
+FEW = (3, 5, 10)
+
+
+class Solving(NamedTuple):
+    """How the seeds of a configuration reached the threshold, and whether they kept it.
+
+    at_end, ever: how many seeds did
+    rate: the share at the end, Wilson's interval
+    fell: [S] who reached it and was below it at the end
+    steps: [S] env steps until the first time, or all of them
+    solved: [S] who ever did
+    survival: the share that has not, over env steps
+    median, mean: env steps until half of the seeds have; on average, each counted up to the
+      shortest training of any seed of the experiment
+    """
+
+    at_end: int
+    ever: int
+    rate: Estimate
+    fell: np.ndarray
+    steps: np.ndarray
+    solved: np.ndarray
+    survival: Survival
+    median: Estimate
+    mean: Estimate
+
+
+class Result(NamedTuple):
+    """What a configuration's final returns [S] say.
+
+    final: the last evaluation of each seed, NaN where not finite
+    scores: the same, with the worst finite one of the experiment in place of those
+    mean, tail: of the scores; the tail is the mean of the worst tenth
+    iqm: of the final returns, see ``statistics.iqm``
+    band: the interquartile mean over ``Findings.grid``, arrays [K]; NaN beyond its budget
+    seeds: [K, S] the curves on the grid
+    solving: None where the task has no threshold
+    """
+
+    configuration: Configuration
+    final: np.ndarray
+    scores: np.ndarray
+    mean: Estimate
+    tail: Estimate
+    iqm: Estimate
+    band: Estimate
+    seeds: np.ndarray
+    solving: Solving | None
+
+
+class Few(NamedTuple):
+    """What a comparison of the two best with few seeds would have said.
+
+    wrong: how often the mean of so many seeds names the other one, by the number of seeds
+    needed: seeds of each with which a test finds the difference four times of five, if any do
+    """
+
+    wrong: dict[int, float]
+    needed: int | None
+
+
+class Findings(NamedTuple):
+    """All figures of a report.
+
+    results: best first, see ``_rank``
+    order: of each result, the place of its configuration in the experiment
+    grid: [K] env steps
+    comparisons: of all pairs of the best results, which are numbered by their places here
+    """
+
+    experiment: Experiment
+    results: list[Result]
+    order: list[int]
+    grid: np.ndarray
+    comparisons: list[Comparison]
+    few: Few | None
+
+
+def find(experiment: Experiment) -> Findings:
+    """Computes all figures of a report."""
+    parts = experiment.configurations
+    ends = [int(part.env_steps[-1].min()) for part in parts]
+    # A seed stops after the update that reaches its budget, so that ends differ a little.
+    grid = _grid(parts, min(end for end in ends if end >= _ALIKE * max(ends)))
+    curves = [
+        np.where((grid <= end)[:, None], on_grid(grid, part.env_steps, part.eval_return), np.nan)
+        for part, end in zip(parts, ends, strict=True)
+    ]
+    bands = _bands(curves)
+    finals = np.concatenate([part.eval_return[-1] for part in parts])
+    worst = min(finals[np.isfinite(finals)], default=math.nan)
+    results = [
+        _result(part, band, seeds, worst)._replace(solving=_solving(part, experiment, min(ends)))
+        for part, band, seeds in zip(parts, bands, curves, strict=True)
+    ]
+    order = sorted(range(len(results)), key=lambda i: _rank(results[i]))
+    ranked = [results[i] for i in order]
+    comparisons = _compare(ranked[:COMPARED])
+    return Findings(experiment, ranked, order, grid, comparisons, _few(ranked))
+
+
+def _grid(parts: Sequence[Configuration], end: int) -> np.ndarray:
+    """Returns env steps from 0 to the end: evenly, and with more at the start for a log axis."""
+    first = min(int(part.env_steps[min(1, len(part.env_steps) - 1)].max()) for part in parts)
+    even = np.linspace(0, end, _GRID_POINTS - 12)
+    early = np.geomspace(max(first, 1), max(end, 2), 14)[:-1]
+    return np.unique(np.concatenate([even, early[early < end]]).round())
+
+
+def _bands(curves: Sequence[np.ndarray]) -> list[Estimate]:
+    """Returns the interquartile mean of each set of curves [K, S], and its interval.
+
+    Sets of as many seeds go through the bootstrap together, which draws the seeds once.
+    """
+    bands: dict[int, Estimate] = {}
+    for size in {each.shape[1] for each in curves}:
+        places = [i for i, each in enumerate(curves) if each.shape[1] == size]
+        together = np.stack([curves[i] for i in places])
+        low, high = iqm_interval(together)
+        for n, i in enumerate(places):
+            bands[i] = Estimate(iqm(together[n]), low[n], high[n])
+    return [bands[i] for i in range(len(curves))]
+
+
+def _result(part: Configuration, band: Estimate, seeds: np.ndarray, worst: float) -> Result:
+    final = part.eval_return[-1]
+    scores = np.where(np.isfinite(final), final, worst)
+    return Result(
+        configuration=part,
+        final=final,
+        scores=scores,
+        mean=interval("mean", scores),
+        tail=interval("cvar", scores),
+        iqm=Estimate(iqm(final), *iqm_interval(final)),
+        band=band,
+        seeds=seeds,
+        solving=None,
+    )
+
+
+def _solving(part: Configuration, experiment: Experiment, until: int) -> Solving | None:
+    if experiment.threshold is None:
+        return None
+    returns, threshold = part.eval_return, experiment.threshold
+    steps, solved = time_to_threshold(returns, part.env_steps, threshold)
+    at_end = int(np.sum(returns[-1] >= threshold))
+    return Solving(
+        at_end=at_end,
+        ever=int(solved.sum()),
+        rate=wilson(at_end, returns.shape[1]),
+        fell=collapses(returns, threshold),
+        steps=steps,
+        solved=solved,
+        survival=kaplan_meier(steps, solved),
+        median=median_steps(steps, solved),
+        mean=restricted_mean(steps, solved, until),
+    )
+
+
+def _rank(result: Result) -> tuple[float, float]:
+    """Returns the sorting key of a result: its mean, and where that is the same, its speed."""
+    speed = float(result.solving.mean.value) if result.solving else 0.0
+    mean = float(result.mean.value)
+    return math.inf if math.isnan(mean) else -mean, math.inf if math.isnan(speed) else speed
+
+
+def _compare(results: Sequence[Result]) -> list[Comparison]:
+    """Compares all pairs on the seeds that all of them have."""
+    if len(results) < 2:
+        return []
+    shared = functools.reduce(np.intersect1d, [each.configuration.seed for each in results])
+    if len(shared) < 2:
+        return []
+    return compare_all([each.scores[np.isin(each.configuration.seed, shared)] for each in results])
+
+
+def _few(results: Sequence[Result]) -> Few | None:
+    """Returns what few seeds would have said of the two best, where there are many seeds."""
+    if len(results) < 2 or min(len(each.final) for each in results[:2]) < 10 * FEW[0]:
+        return None
+    best, second = (each.scores for each in results[:2])
+    enough = [number for number in FEW if 10 * number <= min(len(best), len(second))]
+    wrong = {number: wrong_winner(best, second, number) for number in enough}
+    return Few(wrong, seeds_needed(best, second))
+
+
+def swept(findings: Findings) -> list[str]:
+    """Returns the settings of which configurations differ."""
+    return list(findings.results[0].configuration.settings) if len(findings.results) > 1 else []
+
+
+def values_of(findings: Findings, name: str) -> list[Any]:
+    """Returns the value of a setting in each result."""
+    return [each.configuration.settings.get(name) for each in findings.results]

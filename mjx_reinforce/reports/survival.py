@@ -1,0 +1,145 @@
+"""How many env steps seeds need to reach a threshold, where some never do; and who falls again."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from mjx_reinforce.reports.statistics import Estimate
+
+
+class Survival(NamedTuple):
+    """The Kaplan-Meier estimate of the share of seeds not yet solved, a step function [K].
+
+    steps: the env steps at which it falls (or a seed is censored), ascending.
+    probability: the share not yet solved after each of them.
+    low, high: its pointwise confidence interval.
+    """
+
+    steps: np.ndarray
+    probability: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def time_to_threshold(
+    eval_return: np.ndarray, env_steps: np.ndarray, threshold: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns each seed's env steps at its first evaluation at or above the threshold.
+
+    A seed that never got there is censored: it needs more than the steps it was trained for.
+
+    Args:
+      eval_return: [E, S] the return at each evaluation; one that is not finite solves nothing.
+      env_steps: [E, S] the env steps trained until then.
+      threshold: the return that counts as solved.
+
+    Returns:
+      The steps [S], those of the last evaluation for a censored seed, and who solved it [S].
+    """
+    reached = np.isfinite(eval_return) & (eval_return >= threshold)
+    solved = np.asarray(reached.any(axis=0))
+    when = np.where(solved, reached.argmax(axis=0), len(reached) - 1)
+    return np.take_along_axis(np.asarray(env_steps), when[None], axis=0)[0], solved
+
+
+def collapses(eval_return: np.ndarray, threshold: float) -> np.ndarray:
+    """Returns which seeds [S] reached the threshold and are below it at the last evaluation.
+
+    Args:
+      eval_return: [E, S]; a return that is not finite is below every threshold.
+      threshold: the return that counts as solved.
+    """
+    reached = np.isfinite(eval_return) & (eval_return >= threshold)
+    return reached.any(axis=0) & ~reached[-1]
+
+
+def kaplan_meier(steps: ArrayLike, solved: ArrayLike, confidence: float = 0.95) -> Survival:
+    """Returns the share of seeds not yet solved over env steps (Kaplan and Meier 1958).
+
+    Args:
+      steps: [S] when each seed solved the task, or how long it was trained without.
+      solved: [S] which of the two.
+      confidence: the level of the pointwise interval, from Greenwood's variance of the logarithm
+        of minus the logarithm; NaN where all seeds or none are left.
+    """
+    steps, solved = np.asarray(steps, float), np.asarray(solved, bool)
+    survival = stats.ecdf(stats.CensoredData(uncensored=steps[solved], right=steps[~solved])).sf
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The confidence interval is undefined", RuntimeWarning)
+        band = survival.confidence_interval(confidence, method="log-log")
+    return Survival(
+        survival.quantiles, survival.probabilities, band.low.probabilities, band.high.probabilities
+    )
+
+
+def median_steps(steps: ArrayLike, solved: ArrayLike, confidence: float = 0.95) -> Estimate:
+    """Returns the env steps after which half of the seeds have solved the task.
+
+    The interval is Brookmeyer and Crowley's (1982): the steps at which the Kaplan-Meier curve's
+    interval contains a half.
+
+    Args:
+      steps: as for ``kaplan_meier``.
+      solved: as for ``kaplan_meier``.
+      confidence: the interval's level.
+
+    Returns:
+      Env steps. NaN where half of the seeds never solved it; so is an end of the interval that
+      the data do not bound.
+    """
+    curve = kaplan_meier(steps, solved, confidence)
+    # Where the interval is not defined, no seed is left or all are.
+    low, high = (
+        np.where(np.isnan(ends), curve.probability, ends) for ends in (curve.low, curve.high)
+    )
+    return Estimate(*(_half(curve.steps, share) for share in (curve.probability, low, high)))
+
+
+def restricted_mean(
+    steps: ArrayLike, solved: ArrayLike, until: float, confidence: float = 0.95
+) -> Estimate:
+    """Returns the mean env steps to solve, each seed's counted up to ``until`` at most.
+
+    It is the area under the Kaplan-Meier curve up to there, which exists however few seeds solve
+    the task (Royston and Parmar 2013, BMC Medical Research Methodology 13:152). The interval is
+    Student's with Greenwood's variance; without censoring before ``until`` it is that of the mean
+    of ``min(steps, until)``.
+
+    Args:
+      steps: as for ``kaplan_meier``.
+      solved: as for ``kaplan_meier``.
+      until: env steps above 0, at most those of the longest training.
+      confidence: the interval's level.
+
+    Returns:
+      Env steps; the interval is NaN for one seed.
+
+    Raises:
+      ValueError: no seed was trained for so long.
+    """
+    steps, solved = np.asarray(steps, float), np.asarray(solved, bool)
+    if until > steps.max() and not solved.all():
+        raise ValueError(f"until: {until:,} env steps, but the longest seed has {steps.max():,.0f}")
+    survival = stats.ecdf(stats.CensoredData(uncensored=steps[solved], right=steps[~solved])).sf
+    edges = np.clip(np.concatenate([[0], survival.quantiles, [until]]), 0, until)
+    areas = np.diff(edges) * np.concatenate([[1.0], survival.probabilities])
+    after = np.cumsum(areas[:0:-1])[::-1]  # the area after each of the steps
+    at_risk = np.sum(steps >= survival.quantiles[:, None], axis=1)
+    events = np.sum(steps[solved] == survival.quantiles[:, None], axis=1)
+    left = at_risk - events
+    terms = after**2 * events / (at_risk * np.where(left > 0, left, 1))
+    num_seeds, value = len(steps), float(areas.sum())
+    if num_seeds < 2:
+        return Estimate(value, np.nan, np.nan)
+    error = np.sqrt(terms.sum() * num_seeds / (num_seeds - 1))
+    half = float(stats.t.isf((1 - confidence) / 2, num_seeds - 1) * error)
+    return Estimate(value, max(value - half, 0.0), min(value + half, until))
+
+
+def _half(steps: np.ndarray, share: np.ndarray) -> float:
+    """Returns the first step at which the share is at most a half, NaN if it never is."""
+    below = share <= 0.5
+    return float(steps[below.argmax()]) if below.any() else float("nan")

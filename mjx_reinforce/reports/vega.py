@@ -1,0 +1,140 @@
+"""What the report's charts share: their look, their scales, and how they are drawn."""
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import altair as alt
+
+from mjx_reinforce.reports.palette import colour, dash, in_light
+
+#: A data set of one row, of what is drawn once.
+ONE = {"one": {"row": [0]}}
+#: Layers over one another.
+Chart = alt.LayerChart | alt.FacetChart
+_IS_SHOWN = "indexof(shown, datum.configuration) >= 0"
+_FONT = "ui-sans-serif, system-ui, 'Helvetica Neue', Arial, 'Liberation Sans', sans-serif"
+
+
+def config() -> dict[str, Any]:
+    """Returns how all charts look."""
+    text = {"labelColor": "var(--ink)", "titleColor": "var(--soft)", "titleFontWeight": "normal"}
+    sizes = {"labelFontSize": 12, "titleFontSize": 12}
+    axis = {"gridColor": "var(--line)", "domainColor": "var(--soft)", "tickColor": "var(--soft)"}
+    return {
+        "font": _FONT,
+        "background": None,
+        "view": {"stroke": None},
+        "axis": {**text, **sizes, **axis, "gridOpacity": 0.7, "labelOverlap": True},
+        "axisX": {"grid": False, "tickCount": 6},
+        "axisY": {
+            "domain": False,
+            "ticks": False,
+            "tickCount": 5,
+            "titleAlign": "left",
+            "titleAngle": 0,
+            "titleAnchor": "start",
+            "titleY": -12,
+            "titleX": 0,
+        },
+        "legend": {**text, **sizes, "symbolStrokeWidth": 2.5, "symbolSize": 300, "labelLimit": 420},
+        "text": {"color": "var(--ink)", "fontSize": 12},
+        "rule": {"color": "var(--soft)"},
+    }
+
+
+def specification(
+    chart: Chart, labels: Sequence[str], shown: Sequence[str], end: float, moment: int
+) -> dict[str, Any]:
+    """Returns a chart as a Vega-Lite specification without its data.
+
+    Args:
+      chart: from ``charts``.
+      labels: of all configurations.
+      shown: of those that are shown at first.
+      end: the env step, and
+      moment: its number, at which the slider stands at first.
+    """
+    params = [
+        alt.param(name="shown", value=list(shown)),
+        alt.param(name="at", value=end),
+        alt.param(name="moment", value=moment),
+        alt.param(name="logarithmic", value=False),
+    ]
+    spec = chart.add_params(*params).properties(width="container").to_dict()
+    return spec | {"config": config(), "autosize": {"type": "fit-x", "contains": "padding"}}
+
+
+def draw(spec: dict[str, Any], datasets: dict[str, Any], title: str) -> bytes:
+    """Returns a specification and its data as a PNG file."""
+    import vl_convert
+
+    whole = spec | {"datasets": datasets, "width": 720, "background": "var(--paper)"}
+    whole["title"] = {"text": title, "anchor": "start", "color": "var(--ink)", "offset": 14}
+    return vl_convert.vegalite_to_png(json.loads(in_light(json.dumps(whole))), scale=2)
+
+
+def named(data: str) -> alt.Chart:
+    """Returns a chart of those rows that are shown; a log axis has no place for 0."""
+    return (
+        alt.Chart(alt.NamedData(data))
+        .transform_filter(_IS_SHOWN)
+        .transform_filter("!logarithmic || !(datum.env_steps <= 0)")
+    )
+
+
+def series(labels: Sequence[str], *, legend: bool = True) -> alt.Color:
+    """Returns the colours of configurations."""
+    legend = legend and len(labels) > 1
+    scale = alt.Scale(domain=list(labels), range=[colour(i) for i in range(len(labels))])
+    return alt.Color("configuration:N", scale=scale, legend=_legend() if legend else None)
+
+
+def dashes(labels: Sequence[str]) -> alt.StrokeDash:
+    """Returns the dashes of configurations."""
+    scale = alt.Scale(domain=list(labels), range=[dash(i) for i in range(len(labels))])
+    return alt.StrokeDash(
+        "configuration:N", scale=scale, legend=_legend() if len(labels) > 1 else None
+    )
+
+
+def _legend() -> alt.Legend:
+    return alt.Legend(
+        title=None,
+        orient="top",
+        direction="vertical",
+        columns=alt.ExprRef("max(1, floor(width / 280))"),
+        values=alt.ExprRef("shown"),
+        symbolType="stroke",
+        offset=26,
+        symbolOpacity=1,
+        labelFontSize=12,
+    )
+
+
+def moment_line(end: float) -> alt.Chart:
+    """Returns a line at the slider's env step, without one at the end of the axis."""
+    return (
+        alt.Chart(alt.NamedData("one"))
+        .transform_calculate(env_steps="at")
+        .transform_filter(f"datum.env_steps < {end} && datum.env_steps > 0")
+        .mark_rule(strokeDash=[2, 3])
+        .encode(x="env_steps:Q")
+    )
+
+
+def threshold_line(threshold: float | None, axis: str) -> list[alt.Chart]:
+    """Returns the line at the return that counts as solved, and its name."""
+    if threshold is None:
+        return []
+    ground = alt.Chart(alt.NamedData("one"))
+    rule = ground.mark_rule(strokeDash=[6, 4], opacity=0.8)
+    text = ground.mark_text(
+        align="left" if axis == "y" else "right",
+        dx=-5 if axis == "x" else 0,
+        dy=-6 if axis == "y" else 0,
+        color="var(--soft)",
+    )
+    where = {axis: alt.datum(threshold)}
+    named = {"y": {"x": alt.value(4)}, "x": {"y": alt.YValue(alt.ExprRef("height - 4"))}}[axis]
+    return [rule.encode(**where), text.encode(**where, **named, text=alt.value("solved"))]

@@ -1,0 +1,62 @@
+"""What charts show of an evaluation of many seeds: statistics, and a few seeds one by one."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.reports.statistics import iqm, iqm_interval
+
+#: Seeds that are shown one by one, the first ones: each is a curve for every column.
+MAX_SINGLE_SEEDS = 16
+#: Columns that say when an evaluation was; what is shown is their mean.
+_PROGRESS = ("env_steps", "episodes", "wall_seconds")
+_QUANTILES = (5, 25, 50, 75, 95)
+#: The interval is drawn from thousands of resamples, so the returns that matter alone have it.
+_WITH_INTERVAL = ("eval_return",)
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def step(rows: Rows) -> int:
+    """Returns the place of an evaluation on the axis of charts: the most updates of a seed."""
+    return max(row["update"] for row in rows)
+
+
+def measured(rows: Rows) -> dict[str, np.ndarray]:
+    """Returns the columns [S] of one evaluation that were measured."""
+    apart = ("seed", "update", *_PROGRESS)
+    names = [name for name, value in rows[0].items() if name not in apart and value != ""]
+    return {name: np.array([row[name] for row in rows], float) for name in names}
+
+
+def scalars(rows: Rows) -> dict[str, float]:
+    """Returns the numbers that are shown, by name, such as ``eval_return/iqm``.
+
+    For each column: ``iqm``, ``lowest`` (of returns, the worst seed), ``highest`` and quantiles;
+    for the evaluation's return also ``iqm_low`` and ``iqm_high``, its 95 % interval; and
+    ``seed_0`` and so on, of the first ``MAX_SINGLE_SEEDS``. A value that is not finite counts as
+    less than any other; what it reaches is NaN.
+
+    Args:
+      rows: of one evaluation.
+    """
+    shown = {f"progress/{name}": float(np.mean([row[name] for row in rows])) for name in _PROGRESS}
+    for name, values in measured(rows).items():
+        numbers = _summary(values)
+        if name in _WITH_INTERVAL:
+            low, high = iqm_interval(values)
+            numbers |= {"iqm_low": float(low), "iqm_high": float(high)}
+        numbers |= {f"seed_{i}": float(x) for i, x in enumerate(values[:MAX_SINGLE_SEEDS])}
+        shown |= {f"{name}/{key}": x for key, x in numbers.items()}
+    return shown
+
+
+def _summary(values: np.ndarray) -> dict[str, float]:
+    """Returns statistics over the seeds of values [S]."""
+    failed_last = np.where(np.isfinite(values), values, -np.inf)
+    # Not interpolated: between a failed seed and another there is no number.
+    found = np.percentile(failed_last, (0, *_QUANTILES, 100), method="inverted_cdf")
+    names = ("lowest", *(f"quantile_{q:02}" for q in _QUANTILES), "highest")
+    quantiles = np.where(np.isfinite(found), found, np.nan)
+    return {"iqm": float(iqm(values))} | dict(zip(names, quantiles.tolist(), strict=True))

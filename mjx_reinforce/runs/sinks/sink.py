@@ -1,0 +1,99 @@
+"""What a sink is, and which ones a run has."""
+
+import importlib.util
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+from mjx_reinforce.runs.config import Config
+
+#: The rows of one evaluation, one for each seed, as ``runs.rows`` makes them.
+Rows = Sequence[Mapping[str, Any]]
+
+#: Settings that need a package, and the package.
+_PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
+
+
+class Sink(Protocol):
+    """Takes the rows of evaluations, in order."""
+
+    def write(self, rows: Rows) -> None:
+        """Adds the rows of one evaluation; raises OSError, and adds nothing, if that fails."""
+        ...
+
+    def close(self) -> None:
+        """Ends it after the last rows; raises OSError if that fails."""
+        ...
+
+
+class Queue:
+    """A sink to which rows that could not be written are written later.
+
+    name: for people
+    """
+
+    def __init__(self, name: str, sink: Sink):
+        self.name, self._sink = name, sink
+        self._waiting: list[Rows] = []
+
+    def write(self, rows: Rows) -> None:
+        """Adds the rows of one evaluation after those that wait, or raises OSError."""
+        self._waiting.append(rows)
+        self._write_waiting()
+
+    def close(self) -> None:
+        """Writes the rows that wait, and ends the sink, or raises OSError."""
+        self._write_waiting()
+        self._sink.close()
+
+    def _write_waiting(self) -> None:
+        while self._waiting:
+            self._sink.write(self._waiting[0])
+            del self._waiting[0]
+
+
+def check_installed(config: Config) -> None:
+    """Raises ValueError for a sink whose package is missing; imports nothing."""
+    for name, package in _PACKAGES.items():
+        spec = importlib.util.find_spec(package)
+        # A folder of that name, such as W&B leaves, is found too, but has no origin.
+        if getattr(config, name) and (spec is None or spec.origin is None):
+            raise ValueError(
+                f"--{name} needs the package {package}, which is not installed; "
+                f"pip install {package}, or leave --{name} out"
+            )
+
+
+def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Queue]:
+    """Opens the sinks that the settings ask for, each where it is to go on.
+
+    Args:
+      config: the settings.
+      directory: of the run; its metrics.csv has the rows from before.
+      updates: after how many a resumed run goes on; None at the first evaluation.
+
+    Raises:
+      OSError: one of them cannot be written.
+    """
+    from mjx_reinforce.runs.sinks import json_lines, tensorboard, weights_and_biases
+
+    sinks = []
+    if config.jsonl:
+        sinks.append(Queue("metrics.jsonl", json_lines.JsonLines(directory)))
+    if config.tensorboard:
+        sinks.append(Queue("tensorboard/", tensorboard.TensorBoard(directory, updates)))
+    if config.wandb:
+        sinks.append(Queue("to W&B", weights_and_biases.WeightsAndBiases(directory)))
+    return sinks
+
+
+def remove(directory: Path) -> None:
+    """Removes what the sinks of an older run left; W&B keeps its runs apart itself."""
+    from mjx_reinforce.runs.sinks import json_lines, tensorboard, weights_and_biases
+
+    for path in (
+        directory / json_lines.NAME,
+        directory / weights_and_biases.NAME,
+        *(directory / tensorboard.NAME).glob(tensorboard.PATTERN),
+    ):
+        path.unlink(missing_ok=True)

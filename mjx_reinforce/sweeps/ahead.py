@@ -1,0 +1,33 @@
+"""Compiling what comes next while something else runs."""
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
+from typing import Any
+
+
+def one_ahead(tasks: Sequence[Callable[[], Any]]) -> Iterator[Any]:
+    """Yields the results of tasks in order; each begins when the one before is handed out.
+
+    The threads are daemons: whoever leaves early does not wait for a compiler.
+    """
+    waiting = [_started(tasks[0])] if tasks else []
+    for following in (*tasks[1:], None):
+        result = waiting.pop().result()
+        if following is not None:
+            waiting.append(_started(following))
+        yield result
+
+
+def _started(task: Callable[[], Any]) -> Future:
+    """Returns the result to come of a task, which begins in a thread of its own."""
+    future: Future = Future()
+
+    def work() -> None:
+        try:
+            future.set_result(task())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=work, daemon=True).start()
+    return future

@@ -1,0 +1,67 @@
+"""The command line of ``python -m mjx_reinforce.sweep``."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from mjx_reinforce.runs.command_line import join_groups, read_groups, start
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.relevance import changed
+from mjx_reinforce.runs.settings import GROUPS
+from mjx_reinforce.sweeps import grid
+from mjx_reinforce.sweeps.design import Design, SweepSettings, read_design
+from mjx_reinforce.sweeps.processes import ProcessSettings
+
+_PROG = "python -m mjx_reinforce.sweep"
+_DESCRIPTION = (
+    "Train many configurations, many seeds of each, side by side. Leaves sweep.json, results.csv "
+    "(a row for each configuration and seed), curves.npz and report.html in the output directory. "
+    "All settings of python -m mjx_reinforce.train may be given, with its presets, and most may be "
+    "swept. Seed 3 of a configuration is seed 3 of train with these settings, up to rounding."
+)
+
+
+def parse(arguments: Sequence[str]) -> Design:
+    """Returns the sweep that a command line asks for; --help exits.
+
+    Args:
+      arguments: a preset's name, if any, then flags.
+
+    Raises:
+      ValueError: see ``runs.command_line.parse`` and ``grid.read_over``.
+    """
+    default, preset, flags, prog = start(arguments, _PROG)
+    base, settings, processes = _read(flags, default, prog)
+    if base.resume is None:
+        return Design(
+            base=base,
+            given=changed(base, default),
+            over=grid.read_over(settings.over),
+            search=settings.search,
+            budget=settings.budget,
+            exact=settings.exact,
+            chunk_runs=settings.chunk_runs,
+            processes=processes,
+        )
+    if preset is not None:
+        raise ValueError(f"--resume has the sweep's own settings: leave the preset {preset} out")
+    return _resumed(flags, base.resume, prog)
+
+
+def _read(
+    flags: Sequence[str], default: Config, prog: str
+) -> tuple[Config, SweepSettings, ProcessSettings]:
+    """Returns the settings of the runs, of the sweep, and of its processes; --help exits."""
+    groups = {"sweep": SweepSettings, "hosts": ProcessSettings, **GROUPS}
+    parsed = read_groups(groups, flags, default, prog, _DESCRIPTION)
+    settings, processes = parsed.pop("sweep"), parsed.pop("hosts")
+    return join_groups(parsed), settings, processes
+
+
+def _resumed(flags: Sequence[str], directory: Path, prog: str) -> Design:
+    """Returns the sweep in a directory; raises ValueError if flags would change it."""
+    design = read_design(directory)
+    base, settings, processes = _read(flags, design.base, prog)
+    if dataclasses.replace(base, resume=None) != design.base or settings != SweepSettings():
+        raise ValueError(f"the sweep in {directory} goes on as it is: give --resume alone")
+    return dataclasses.replace(design, processes=processes, resume=directory)

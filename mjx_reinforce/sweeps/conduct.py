@@ -1,0 +1,223 @@
+"""Training the runs of a sweep, chunk by chunk, while the programs of the next group compile."""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_reinforce.runs.interrupt import Interrupt
+from mjx_reinforce.runs.progress import Progress
+from mjx_reinforce.runs.record import Record
+from mjx_reinforce.runs.state import RunState
+from mjx_reinforce.sweeps import carry, chunks, rungs
+from mjx_reinforce.sweeps.ahead import one_ahead
+from mjx_reinforce.sweeps.chunks import Runs, Saver
+from mjx_reinforce.sweeps.design import Design
+from mjx_reinforce.sweeps.devices import RUNS
+from mjx_reinforce.sweeps.groups import Group, learner_builder
+from mjx_reinforce.sweeps.plan import Part, divide
+from mjx_reinforce.sweeps.prepare import Prepared
+from mjx_reinforce.sweeps.processes import Processes
+from mjx_reinforce.sweeps.programs import Programs, compile_programs, shape_of_slot
+from mjx_reinforce.sweeps.results import SweepFiles
+from mjx_reinforce.sweeps.rungs import Rung
+
+
+class Stage(NamedTuple):
+    """The runs of one group in one rung.
+
+    number: of the group in the sweep
+    group: its configurations and their budget
+    part: how its runs are divided
+    chunks: its runs
+    """
+
+    number: int
+    group: Group
+    part: Part
+    chunks: list[Runs]
+
+    def of(self, runs: Sequence[Runs]) -> "Stage":
+        """Returns the stage with some of its chunks."""
+        return self._replace(chunks=list(runs))
+
+
+@dataclasses.dataclass
+class Clock:
+    """Where the time of a sweep goes (s).
+
+    compiling: with nothing trained beside it
+    running: training and evaluating
+    """
+
+    compiling: float = 0.0
+    running: float = 0.0
+
+
+class Conductor:
+    """Trains the chunks that have not ended yet; a file that cannot be written is an OSError."""
+
+    def __init__(
+        self,
+        prepared: Prepared,
+        design: Design,
+        processes: Processes,
+        files: SweepFiles,
+        display: Any,
+        interrupt: Interrupt | None,
+        ready: Callable[[float], None],
+    ):
+        """Takes what the sweep is made of.
+
+        Args:
+          prepared: its parts.
+          design: what it is to do.
+          processes: that share its chunks.
+          files: of the sweep.
+          display: its screen.
+          interrupt: what listens to signals, if anything does.
+          ready: is called once, when the first program has been compiled, with how long that
+            took (s), or when there is nothing to compile.
+        """
+        self._prepared, self._design, self._processes = prepared, design, processes
+        self._files, self._display = files, display
+        self._interrupt = interrupt
+        self._ready: Callable[[float], None] | None = ready
+        self._num_rungs = rungs.count(design.search, len(prepared.configurations))
+        self._rungs_done = self._total = self._done = 0
+        self._before: list[Stage] = []
+        self.clock = Clock()
+
+    def conduct(self) -> bool:
+        """Trains all rungs; returns whether they ended, or were interrupted."""
+        groups, search = self._prepared.groups, self._design.search
+        for rung in rungs.schedule(groups, search, self._files.measured):
+            if not self._train_rung(rung):
+                return False
+            self._processes.meet(f"rung {rung.name}")
+            self._rungs_done += 1
+        return True
+
+    def _begin_files(self, seconds: float) -> None:
+        """Calls ``ready``, once."""
+        ready, self._ready = self._ready, None
+        if ready is not None:
+            ready(seconds)
+
+    def _train_rung(self, rung: Rung) -> bool:
+        """Trains the chunks of a rung that are this process's; returns whether they ended."""
+        every = self._stages(rung)
+        stages = self._left(every)
+        self._total = sum(len(runs.seed) for stage in stages for runs in stage.chunks)
+        self._done = 0
+        programs = one_ahead([functools.partial(self._compile, stage) for stage in stages])
+        for stage in stages:
+            began = time.perf_counter()
+            compiled = next(programs)
+            seconds = time.perf_counter() - began
+            self.clock.compiling += seconds
+            self._begin_files(seconds)
+            for runs in stage.chunks:
+                began = time.perf_counter()
+                ended = self._train(rung, stage, compiled, runs)
+                self.clock.running += time.perf_counter() - began
+                if not ended:
+                    return False
+                self._done += len(runs.seed)
+        self._begin_files(0.0)  # where this process had nothing to do
+        self._before = every
+        return True
+
+    def _stages(self, rung: Rung) -> list[Stage]:
+        """Returns all runs of a rung."""
+        made = []
+        for number, group in rung.groups.items():
+            limit, devices = self._prepared.limits[number], self._prepared.devices.count
+            part = divide(group, limit, devices, exact=self._design.exact)
+            name = f"{rung.name}-{number:03d}"
+            made.append(Stage(number, group, part, chunks.split(group, name, part.num_chunks)))
+        return made
+
+    def _left(self, stages: Sequence[Stage]) -> list[Stage]:
+        """Returns what is still to be trained by this process."""
+        index, count = self._processes
+        every = [runs.name for stage in stages for runs in stage.chunks]
+        mine = {
+            name for i, name in enumerate(every) if i % count == index and not self._files.has(name)
+        }
+        left = [stage.of([runs for runs in stage.chunks if runs.name in mine]) for stage in stages]
+        return [stage for stage in left if stage.chunks]
+
+    def _compile(self, stage: Stage) -> Programs:
+        env, config = self._prepared.env, stage.group.config
+        return compile_programs(
+            env,
+            learner_builder(env, config),
+            self._prepared.horizon,
+            config,
+            tuple(stage.group.settings),
+            stage.part.width,
+            self._prepared.devices,
+        )
+
+    def _train(self, rung: Rung, stage: Stage, programs: Programs, runs: Runs) -> bool:
+        """Trains a chunk, from its last checkpoint if there is one; returns whether it ended."""
+        config = dataclasses.replace(stage.group.config, num_seeds=len(runs.seed))
+        record = Record(config, getattr(self._prepared.env, "reward_threshold", None))
+        saver = Saver(self._files.checkpoints(runs.name), stage.group.config)
+        like = [programs.like] * stage.part.slots
+        chunk = saver.find(like, record, self._display.say)
+        if chunk is None:
+            chunk = self._begin(rung, stage, programs, runs, record)
+        chunk = self._prepared.devices.put(chunk, RUNS)
+
+        def after(chunk: list[RunState], record: Record) -> bool:
+            self._display.show_progress(self._progress(record, len(runs.seed)))
+            if self._interrupt is not None and self._interrupt.number is not None:
+                saver.save(chunk, record)
+                return False
+            saver.save_if_due(chunk, record)
+            return True
+
+        ended = chunks.train(programs, chunk, record, num_runs=len(runs.seed), after=after)
+        if ended is None:
+            return False
+        keep = self._design.search == "halving"
+        if keep:  # for the next rung
+            saver.save(ended, record)
+        self._files.add(runs, record)
+        if not keep:
+            saver.remove()
+        return True
+
+    def _begin(
+        self, rung: Rung, stage: Stage, programs: Programs, runs: Runs, record: Record
+    ) -> list[RunState]:
+        """Returns the first states of a chunk: new ones, or those at the end of a rung before."""
+        slots = stage.part.slots
+        if rung.before is None:
+            return chunks.begin(programs, self._prepared.devices, stage.group, runs, slots)
+        before = next(old for old in self._before if old.number == stage.number)
+        group, part = before.group, before.part
+        build = learner_builder(self._prepared.env, group.config)
+        like = [shape_of_slot(build, tuple(group.settings), part.width)] * part.slots
+        states = carry.last_states(self._files, before.chunks, like, self._display.say)
+        chunk = carry.gather(states, before.chunks, runs, programs.width, stage.part.slots)
+        num_runs = len(runs.seed)
+        joined = np.concatenate([np.asarray(slot.train_states.num_updates) for slot in chunk])
+        record.updates = joined[:num_runs].astype(np.int64)
+        joined = np.concatenate([np.asarray(slot.env_steps) for slot in chunk])
+        record.env_steps = joined[:num_runs].astype(np.int64)
+        return chunk
+
+    def _progress(self, record: Record, num_runs: int) -> Progress:
+        """Returns how far the chunk is, but for the whole sweep where that differs."""
+        now = record.progress()
+        rung = (self._done + num_runs * min(now.fraction, 1.0)) / self._total
+        done = (self._rungs_done + rung) / self._num_rungs
+        passed = self.clock.running + record.seconds
+        left = passed * (1 - done) / done if done > 0 else float("nan")
+        return now._replace(fraction=done, seconds_left=left)

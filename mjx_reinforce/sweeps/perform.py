@@ -1,0 +1,176 @@
+"""A sweep from its design to its files."""
+
+import contextlib
+import shlex
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mjx_reinforce.export.files import read_json, write_json
+from mjx_reinforce.runs.files import choose_directory, locked, prepare
+from mjx_reinforce.runs.interrupt import Interrupt
+from mjx_reinforce.runs.jax_setup import configure_jax
+from mjx_reinforce.runs.resume import check_same_program
+from mjx_reinforce.sweeps.design import Design, as_record, check_design
+from mjx_reinforce.sweeps.processes import Processes, join_processes
+
+
+def perform(design: Design, interrupt: Interrupt | None, made: list[Path]) -> tuple[Path, bool]:
+    """Trains all runs of a sweep, or goes on with it, and writes its files.
+
+    Args:
+      design: of the sweep.
+      interrupt: what listens to signals, if anything does.
+      made: takes in the folders that are made for it.
+
+    Returns:
+      The directory of its files, and whether all runs ended: else it was interrupted.
+
+    Raises:
+      ValueError: the design makes no sense, or its directory is in use or has other files.
+      OSError: a file cannot be written.
+    """
+    check_design(design)
+    directory = design.resume or choose_directory(design.base.output, design.base.env)
+    known = {} if design.resume is None else read_json(directory / "sweep.json")
+    if known.get("status") == "finished":
+        _finish_again(directory, known)
+        return directory, True
+    processes = join_processes(design.processes)
+    with contextlib.ExitStack() as held:
+        if processes.index == 0:
+            if design.resume is None:
+                made += prepare(directory, design.base.overwrite)
+            held.enter_context(locked(directory))
+        configure_jax()
+        return directory, _perform(design, directory, known, processes, interrupt)
+
+
+def _finish_again(directory: Path, known: Mapping[str, Any]) -> None:
+    """Writes the report of a sweep that was stopped before it, if it was."""
+    with locked(directory):
+        if known.get("statistics_seconds") is None:
+            seconds = _report(directory)
+            write_json(directory / "sweep.json", {**known, "statistics_seconds": seconds})
+    print(f"the sweep in {directory} is finished")
+
+
+def _perform(
+    design: Design,
+    directory: Path,
+    known: Mapping[str, Any],
+    processes: Processes,
+    interrupt: Interrupt | None,
+) -> bool:
+    """Does what ``perform`` says, in a directory that is ours; ``known`` is its sweep.json."""
+    from mjx_reinforce.runs.display import Display
+    from mjx_reinforce.sweeps.conduct import Conductor
+    from mjx_reinforce.sweeps.prepare import prepare
+    from mjx_reinforce.sweeps.results import SweepFiles
+
+    prepared = prepare(design, known.get("chunk_runs"), processes.count)
+    contents = _contents(design, prepared, known)
+    if known:
+        _check_same(directory, known, contents)
+    configurations, threshold = prepared.configurations, contents["threshold"]
+    first = processes.index == 0
+    files = SweepFiles(directory, configurations, threshold, going_on=bool(known), first=first)
+    with Display() as display, contextlib.ExitStack() as compiling:
+        display.console.quiet = not first
+        display.say(prepared.plan)
+        compiling.enter_context(display.compiling(None))
+
+        def ready(seconds: float) -> None:
+            """Begins the files; not before there is a program, see ``train``."""
+            compiling.close()
+            display.start(seconds)
+            if interrupt is not None:
+                interrupt.defer(display.say)
+            if first:
+                files.open()
+                files.write(contents)
+            processes.meet("ready")
+
+        if interrupt is not None:
+            interrupt.on_exit(display.console.show_cursor)
+        conductor = Conductor(prepared, design, processes, files, display, interrupt, ready)
+        ended = conductor.conduct()
+        contents |= {
+            "status": "finished" if ended else "interrupted",
+            "compile_seconds": contents["compile_seconds"] + conductor.clock.compiling,
+            "run_seconds": contents["run_seconds"] + conductor.clock.running,
+        }
+        if first:
+            _finish(design, files, contents)
+            if ended:
+                display.say("writing the report")
+                contents["statistics_seconds"] = _report(directory)
+                files.write(contents)
+            display.say(_ending(directory, contents))
+    return ended
+
+
+def _finish(design: Design, files: Any, contents: dict[str, Any]) -> None:
+    """Writes the last files of a sweep, or those of one that was interrupted."""
+    from mjx_reinforce.sweeps.rungs import winner
+
+    files.finish()
+    if contents["status"] == "finished":
+        if design.search != "grid":
+            contents["winner"] = winner(files.measured)
+        files.remove_states()
+    files.write(contents)
+
+
+def _report(directory: Path) -> float:
+    """Writes the report of a sweep; returns how long that took (s)."""
+    from mjx_reinforce import report
+
+    return report.write([directory], directory / "report.html")
+
+
+def _contents(design: Design, prepared: Any, known: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what sweep.json says while the sweep goes on."""
+    from mjx_reinforce.runs.files import provenance
+
+    return {
+        "status": "running",
+        "env": design.base.env,
+        "threshold": getattr(prepared.env, "reward_threshold", None),
+        **as_record(design),
+        "num_seeds": design.base.num_seeds,
+        "configurations": [
+            {"configuration": number, **values}
+            for number, values in enumerate(prepared.configurations)
+        ],
+        "chunk_runs": prepared.limits,
+        "local_devices": prepared.devices.count,
+        "engine": prepared.engine,
+        "compile_seconds": known.get("compile_seconds", 0.0),
+        "run_seconds": known.get("run_seconds", 0.0),
+        "statistics_seconds": None,
+        "command": known.get("command", shlex.join(sys.argv)),
+        **provenance(),
+    }
+
+
+def _check_same(directory: Path, known: Mapping[str, Any], present: Mapping[str, Any]) -> None:
+    """Raises ValueError if a sweep cannot go on here."""
+    check_same_program(directory, known, present)
+    old, new = known.get("local_devices"), present["local_devices"]
+    if old != new:
+        raise ValueError(
+            f"{directory} was begun on {old} devices, and here are {new}; go on with as many"
+        )
+
+
+def _ending(directory: Path, contents: Mapping[str, Any]) -> str:
+    """Returns the line that ends a sweep."""
+    if contents["status"] == "interrupted":
+        return f"interrupted; go on with --resume {directory}"
+    return (
+        f"compiling took {contents['compile_seconds']:.1f} s, training and evaluating "
+        f"{contents['run_seconds']:.1f} s, statistics and report "
+        f"{contents['statistics_seconds']:.1f} s. Files in {directory}, first report.html"
+    )

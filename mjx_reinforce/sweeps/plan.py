@@ -1,0 +1,140 @@
+"""How a sweep is divided: groups, chunks that fit into memory, and what that means for people."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from mjx_reinforce.runs.memory import gigabytes, needed
+from mjx_reinforce.runs.plan import Machine, duration, task_of, this_machine, training_seconds
+from mjx_reinforce.sweeps.groups import Group
+
+#: Chunks take up to this part of the memory that is there.
+_MEMORY = 0.6
+
+
+class Part(NamedTuple):
+    """How the runs of a group are divided.
+
+    num_chunks: of about the same size
+    width: runs that a compiled program moves at once
+    slots: how many times that a chunk is
+    """
+
+    num_chunks: int
+    width: int
+    slots: int
+
+
+def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> Part:
+    """Returns how the runs of a group are divided.
+
+    Args:
+      group: whose configurations have ``group.config.num_seeds`` runs each.
+      limit: runs in a chunk at most.
+      num_devices: among which a chunk is divided.
+      exact: one run at a time.
+    """
+    total = len(group.members) * group.config.num_seeds
+    num_chunks = -(-total // limit)
+    each = -(-total // (num_chunks * num_devices))
+    return Part(num_chunks, num_devices, each) if exact else Part(num_chunks, each * num_devices, 1)
+
+
+def chunk_limit(
+    env: Any, horizon: int, group: Group, asked: int | None, num_devices: int, num_processes: int
+) -> int:
+    """Returns how many runs of a group a chunk may have.
+
+    Args:
+      env: what is trained on.
+      horizon: the time limit of an episode in steps.
+      group: whose runs are divided.
+      asked: what the user said, or None for what memory holds.
+      num_devices: of each process.
+      num_processes: each of which is to have a chunk.
+
+    Raises:
+      ValueError: not even one run for each device fits into memory.
+    """
+    total = len(group.members) * group.config.num_seeds
+    limit = _capacity(env, horizon, group, num_devices) if asked is None else asked
+    return min(limit, -(-total // num_processes))
+
+
+def _capacity(env: Any, horizon: int, group: Group, num_devices: int) -> int:
+    """Returns how many runs memory holds side by side."""
+    one = dataclasses.replace(group.config, num_seeds=1)
+    task, machine = task_of(env, horizon, one), this_machine()
+    memory = machine.memory - task.base_memory if machine.shared else machine.memory * num_devices
+    capacity = int(_MEMORY * memory / needed(one, task))
+    if capacity < num_devices:
+        raise ValueError(
+            f"not even one run for each of {num_devices} devices fits into memory: a run needs "
+            f"{gigabytes(needed(one, task))}; lower --num-episodes, --eval-episodes or --horizon"
+        )
+    return capacity
+
+
+def describe(
+    env: Any,
+    horizon: int,
+    learners: Sequence[Any],
+    groups: Sequence[Group],
+    parts: Sequence[Part],
+    num_devices: int,
+) -> str:
+    """Returns a paragraph on what a sweep will do.
+
+    Args:
+      env: what is trained on.
+      horizon: the time limit of an episode in steps.
+      learners: one of each group.
+      groups: of configurations.
+      parts: how the runs of each are divided.
+      num_devices: on which they are.
+    """
+    first, machine = groups[0].config, this_machine()
+    configurations = sum(len(group.members) for group in groups)
+    runs, chunks = configurations * first.num_seeds, sum(part.num_chunks for part in parts)
+    side = max(part.width * part.slots for part in parts)
+    memory = max(
+        needed(dataclasses.replace(group.config, num_seeds=part.width), task_of(env, horizon, one))
+        for group, part in zip(groups, parts, strict=True)
+        for one in (group.config,)
+    )
+    where = machine.name
+    if num_devices > 1:
+        where = f"{num_devices} devices" + (f" ({where} each)" if not machine.shared else "")
+    return (
+        f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
+        f"of {first.env}, on {where}, with the engine {learners[0].engine.name}: "
+        f"{_count(len(groups), 'compiled program')}, {_count(chunks, 'chunk')} of up to {side:,} "
+        f"runs. {_time(env, horizon, learners, groups, machine, num_devices)}. "
+        f"It needs about {gigabytes(memory)} of memory beside the programs."
+    )
+
+
+def _time(
+    env: Any,
+    horizon: int,
+    learners: Sequence[Any],
+    groups: Sequence[Group],
+    machine: Machine,
+    num_devices: int,
+) -> str:
+    """Returns about how long the training takes, where that is known."""
+    speed = machine.speeds.get(groups[0].config.env)
+    if speed is None or any(learner.engine.name != speed.engine for learner in learners):
+        return "How long this takes here is not known"
+    total = 0.0
+    for group in groups:
+        num_seeds = len(group.members) * group.config.num_seeds
+        config = dataclasses.replace(group.config, num_seeds=num_seeds)
+        total += training_seconds(config, task_of(env, horizon, config), speed)[0]
+    faster = machine.faster * (1 if machine.shared else num_devices)
+    compiling = duration(speed.compiling)
+    return f"Compiling takes about {compiling} each, training about {duration(total / faster)}"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'s' * (number > 1)}"

@@ -1,0 +1,34 @@
+"""What a sweep measured, read from its files."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_reinforce.export.files import read_arrays, read_json
+
+
+class Results(NamedTuple):
+    """What a sweep measured, of R runs in E evaluations.
+
+    directory: of its files
+    configurations: the values of what was swept, in each
+    configuration: [R] the number of each run's
+    seed: [R]
+    eval_return: [E, R] mean return of the policy's mode; NaN where it was not finite
+    env_steps: [E, R] trained until then
+    """
+
+    directory: Path
+    configurations: list[dict[str, Any]]
+    configuration: np.ndarray
+    seed: np.ndarray
+    eval_return: np.ndarray
+    env_steps: np.ndarray
+
+
+def read_results(directory: Path) -> Results:
+    """Returns what a finished sweep measured, or raises ValueError."""
+    listed = read_json(directory / "sweep.json")["configurations"]
+    values = [{k: x for k, x in one.items() if k != "configuration"} for one in listed]
+    return Results(directory, values, **read_arrays(directory / "curves.npz"))

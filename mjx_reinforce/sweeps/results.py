@@ -1,0 +1,207 @@
+"""The files of a sweep: DIR/sweep.json, results.csv, curves.npz, and the parts of them so far.
+
+A part is what one chunk of runs measured. It is written whole, when the chunk ends, and is all that
+results.csv and curves.npz are made of: whatever else a crash leaves is written anew.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.export.files import read_arrays, write_arrays, write_bytes, write_json
+from mjx_reinforce.reports.statistics import steps_to_solve
+from mjx_reinforce.runs import checkpoint, files
+from mjx_reinforce.runs.record import Record
+from mjx_reinforce.sweeps.chunks import Runs
+
+Arrays = dict[str, np.ndarray]
+
+_MEASURED = (
+    *("seed", "final_return", "best_return", "env_steps_to_solve"),
+    *("env_steps", "nonfinite"),
+)
+_RESULTS = ("sweep.json", "results.csv", "curves.npz")
+
+
+class SweepFiles:
+    """Writes the files of a sweep into its directory; each method raises OSError if that fails."""
+
+    def __init__(
+        self,
+        directory: Path,
+        configurations: Sequence[Mapping[str, Any]],
+        threshold: float | None,
+        *,
+        going_on: bool,
+        first: bool,
+    ):
+        """Takes what the rows of results.csv are made of.
+
+        Args:
+          directory: where.
+          configurations: the values of what is swept, in each.
+          threshold: the return that counts as solved, if any.
+          going_on: whether what is in the directory is of this sweep.
+          first: whether this is the process that writes more than parts.
+        """
+        self._first = first
+        self._going_on = going_on
+        self.directory, self.parts = directory, directory / "parts"
+        self._configurations, self._threshold = configurations, threshold
+        self._columns = ("configuration", *configurations[0], *_MEASURED)
+
+    def open(self) -> None:
+        """Begins, or takes the files back to the parts that are there."""
+        (self._resume if self._going_on else self._begin)()
+
+    def _begin(self) -> None:
+        """Writes a results.csv without rows; removes an older sweep."""
+        for path in [*self.parts.glob("*.npz"), *self.parts.glob("*/*.npz")]:
+            path.unlink()
+        for name in _RESULTS[1:]:  # a report is replaced when there is a new one
+            (self.directory / name).unlink(missing_ok=True)
+        self.parts.mkdir(exist_ok=True)
+        files.create_csv(self.directory / "results.csv", self._columns)
+
+    def _resume(self) -> None:
+        """Takes results.csv back to the parts that are there, and removes what a crash left."""
+        self.parts.mkdir(exist_ok=True)
+        for folder, names in ((self.directory, _RESULTS), (self.parts, ("*.npz",))):
+            for path in (path for name in names for path in folder.glob(f".{name}.*")):
+                path.unlink()
+        if measured := self._all():
+            self._write_rows(self._rows(measured))
+        else:
+            files.create_csv(self.directory / "results.csv", self._columns)
+
+    def write(self, contents: Mapping[str, Any]) -> None:
+        """Writes sweep.json."""
+        write_json(self.directory / "sweep.json", contents)
+
+    def has(self, chunk: str) -> bool:
+        """Returns whether a chunk has ended."""
+        return self._going_on and self._path(chunk).exists()
+
+    def checkpoints(self, chunk: str) -> Path:
+        """Returns the folder of a chunk's checkpoints."""
+        return self.parts / chunk
+
+    def add(self, runs: Runs, record: Record) -> None:
+        """Writes the part of a chunk, and appends its rows to results.csv."""
+        history = record.history()
+        part = {
+            "configuration": runs.configuration.astype(np.int32),
+            "seed": runs.seed.astype(np.int32),
+            "eval_return": history["eval_return"].astype(np.float32),
+            "env_steps": history["env_steps"].astype(np.int32),
+            "nonfinite": record.nonfinite_updates().astype(np.int32),
+        }
+        write_arrays(self._path(runs.name), part)
+        if self._first and runs.name.startswith("0-"):  # other rungs continue rows that are there
+            files.append_csv(self.directory / "results.csv", self._columns, self._rows(part))
+
+    def finish(self) -> None:
+        """Joins the parts so far to results.csv and curves.npz, sorted by configuration."""
+        if joined := self._all():
+            self._write_rows(self._rows(joined))
+            del joined["nonfinite"]
+            write_arrays(self.directory / "curves.npz", joined, compressed=True)
+
+    def remove_states(self) -> None:
+        """Removes what a sweep needs only while it goes on."""
+        for folder in self.parts.glob("*/"):
+            checkpoint.remove(folder)
+
+    def measured(self, rung: str) -> Arrays:
+        """Returns what the chunks of a rung measured so far, sorted; empty if nothing."""
+        paths = sorted(self.parts.glob(f"{rung}-*.npz"))
+        return join([read_arrays(path) for path in paths]) if paths else {}
+
+    def _path(self, chunk: str) -> Path:
+        return self.parts / f"{chunk}.npz"
+
+    def _all(self) -> Arrays:
+        """Returns what all chunks measured so far, but for those of fresh seeds."""
+        rungs = []
+        while measured := self.measured(str(len(rungs))):
+            rungs.append(measured)
+        return follow(rungs) if rungs else {}
+
+    def _write_rows(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Replaces results.csv at once."""
+        write_bytes(self.directory / "results.csv", files.csv_bytes(self._columns, rows))
+
+    def _rows(self, part: Arrays) -> list[dict[str, Any]]:
+        """Returns the rows of results.csv of a part."""
+        returns, env_steps = part["eval_return"], part["env_steps"]
+        columns = {
+            "seed": part["seed"].tolist(),
+            "final_return": returns[-1].tolist(),
+            "best_return": np.fmax.reduce(returns).tolist(),
+            "env_steps_to_solve": steps_to_solve(returns, env_steps, self._threshold),
+            "env_steps": env_steps[-1].tolist(),
+            "nonfinite": part["nonfinite"].tolist(),
+        }
+        rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        return [
+            {"configuration": number, **_spelled(self._configurations[number]), **row}
+            for number, row in zip(part["configuration"].tolist(), rows, strict=True)
+        ]
+
+
+def join(parts: Sequence[Arrays]) -> Arrays:
+    """Returns several parts as one, sorted by configuration and seed.
+
+    A run whose evaluations ended earlier repeats its last.
+    """
+    length = max(len(part["eval_return"]) for part in parts)
+    filled = [
+        {name: x if x.ndim == 1 else _fill(x, length) for name, x in part.items()} for part in parts
+    ]
+    joined = {name: np.concatenate([p[name] for p in filled], axis=-1) for name in filled[0]}
+    order = np.lexsort((joined["seed"], joined["configuration"]))
+    return {name: x[..., order] for name, x in joined.items()}
+
+
+def follow(rungs: Sequence[Arrays]) -> Arrays:
+    """Returns the measurements of runs that went on from rung to rung; others repeat their last.
+
+    Args:
+      rungs: from ``join``; each of runs that were in the one before, beginning with its last
+        evaluation once more.
+    """
+    joined = rungs[0]
+    runs = list(zip(joined["configuration"].tolist(), joined["seed"].tolist(), strict=True))
+    places = {run: i for i, run in enumerate(runs)}
+    for rung in rungs[1:]:
+        index = [
+            places[run]
+            for run in zip(rung["configuration"].tolist(), rung["seed"].tolist(), strict=True)
+        ]
+        for name in ("eval_return", "env_steps"):
+            later = np.repeat(joined[name][-1:], len(rung[name]) - 1, axis=0)
+            later[:, index] = rung[name][1:]
+            joined = joined | {name: np.concatenate([joined[name], later])}
+        nonfinite = joined["nonfinite"].copy()
+        nonfinite[index] += rung["nonfinite"]
+        joined = joined | {"nonfinite": nonfinite}
+    return joined
+
+
+def _fill(curves: np.ndarray, length: int) -> np.ndarray:
+    """Returns curves [E, R] with the last row repeated up to ``length``."""
+    return np.concatenate([curves, np.repeat(curves[-1:], length - len(curves), axis=0)])
+
+
+def _spelled(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns values for a CSV file: lists as on the command line, None as such."""
+    return {
+        name: ",".join(map(str, x)) or "none"
+        if isinstance(x, tuple)
+        else "None"
+        if x is None
+        else x
+        for name, x in values.items()
+    }

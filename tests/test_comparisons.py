@@ -1,0 +1,144 @@
+"""Comparisons of two configurations against hand counts, scipy and rliable."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rliable import metrics
+from scipy import stats
+
+from mjx_reinforce.reports.comparisons import (
+    compare_all,
+    holm,
+    paired_difference,
+    probability_of_improvement,
+)
+
+
+def test_holm_by_hand():
+    np.testing.assert_allclose(holm([0.01, 0.04, 0.03, 0.005]), [0.03, 0.06, 0.06, 0.02])
+    np.testing.assert_allclose(holm([0.5, 0.6]), [1.0, 1.0])
+    assert holm([]).shape == (0,)
+
+
+def test_improvement_by_hand():
+    """Of six pairs, x is above in three and equal in one."""
+    x, y = [1.0, 3.0], [0.0, 1.0, 4.0]
+    assert probability_of_improvement(x, y).value == pytest.approx(3.5 / 6)
+    assert probability_of_improvement([1, 3], [0, 4], paired=True).value == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("ties", [False, True])
+def test_improvement_is_that_of_rliable(ties):
+    random = np.random.default_rng(1)
+    x, y = random.normal(0.5, size=40), random.normal(size=50)
+    if ties:
+        x, y = np.round(x), np.round(y)
+    expected = metrics.probability_of_improvement(x[:, None], y[:, None])
+    assert probability_of_improvement(x, y).value == pytest.approx(expected, rel=1e-12)
+
+
+def test_improvement_interval_by_hand():
+    """DeLong's variance; Wilson's interval of as many trials as give a rate that variance."""
+    x, y = np.array([1.0, 3.0, 5.0]), np.array([0.0, 2.0, 6.0])
+    rate, of_x, of_y = 5 / 9, np.array([1, 2, 2]) / 3, np.array([3, 2, 0]) / 3
+    trials = rate * (1 - rate) / (of_x.var(ddof=1) / 3 + of_y.var(ddof=1) / 3)
+    z = stats.norm.ppf(0.975)
+    ends = np.roots([1 + z**2 / trials, -2 * rate - z**2 / trials, rate**2])
+    value, low, high = probability_of_improvement(x, y)
+    np.testing.assert_allclose([low, high], np.sort(ends))
+    assert value == pytest.approx(rate)
+
+
+def test_paired_interval_by_hand():
+    """What a seed adds to both shares varies less where its luck is the same."""
+    x, y = np.array([1.0, 3.0, 5.0]), np.array([0.0, 2.0, 6.0])
+    rate, of_both = 5 / 9, np.array([1 + 3, 2 + 2, 2 + 0]) / 3
+    trials = rate * (1 - rate) / (of_both.var(ddof=1) / 3)
+    z = stats.norm.ppf(0.975)
+    ends = np.roots([1 + z**2 / trials, -2 * rate - z**2 / trials, rate**2])
+    np.testing.assert_allclose(probability_of_improvement(x, y, paired=True)[1:], np.sort(ends))
+
+
+def test_improvement_of_all_over_all():
+    value, low, high = probability_of_improvement(np.arange(5) + 10.0, np.arange(5.0))
+    interval = stats.binomtest(5, 5).proportion_ci(method="wilson")
+    np.testing.assert_allclose([value, low, high], [1.0, *interval])
+
+
+def test_improvement_of_one_seed():
+    """Wilson's interval of one trial."""
+    for paired in (False, True):
+        value, low, high = probability_of_improvement([3.0], [1.0], paired=paired)
+        interval = stats.binomtest(1, 1).proportion_ci(method="wilson")
+        np.testing.assert_allclose([value, low, high], [1.0, *interval])
+
+
+def test_failed_seeds_lose_and_tie_among_themselves():
+    x, y = np.array([np.nan, 5.0]), np.array([-7.0, np.inf])
+    assert probability_of_improvement(x, y).value == pytest.approx((0 + 0.5 + 1 + 1) / 4)
+
+
+def test_paired_difference_is_that_of_the_t_test():
+    random = np.random.default_rng(1)
+    x, y = random.normal(size=(2, 30))
+    expected = stats.ttest_rel(x, y)
+    found = paired_difference(x, y)
+    np.testing.assert_allclose(found.value, np.mean(x - y))
+    np.testing.assert_allclose(found[1:3], expected.confidence_interval())
+    assert found.p_value == pytest.approx(expected.pvalue, rel=1e-9)
+
+
+def test_equal_differences():
+    x = np.arange(5.0)
+    assert paired_difference(x, x) == (0, 0, 0, 1)
+    assert paired_difference(x + 2, x) == (2, 2, 2, 0)
+    assert np.all(np.isnan(paired_difference([3.0], [1.0])[1:]))
+
+
+def test_a_failed_seed_counts_as_the_worst_of_both():
+    x, y = np.array([np.nan, 5.0, 6.0, 9.0]), np.array([4.0, 3.0, np.inf, 2.0])
+    assert paired_difference(x, y) == paired_difference([2.0, 5, 6, 9], [4.0, 3, 2, 2])
+    assert paired_difference([np.nan] * 3, [np.nan] * 3).p_value == 1
+
+
+def test_every_pair_is_compared_and_corrected():
+    random = np.random.default_rng(1)
+    values = [random.normal(mean, size=40) for mean in (0.0, 0.5, 2.0)]
+    found = compare_all(values)
+    assert [(pair.first, pair.second) for pair in found] == [(0, 1), (0, 2), (1, 2)]
+    raw = [stats.ttest_rel(values[p.first], values[p.second]).pvalue for p in found]
+    np.testing.assert_allclose([pair.p_value for pair in found], raw)
+    np.testing.assert_allclose([pair.adjusted for pair in found], holm(raw))
+    assert found[2].difference.high < 0
+    assert found[2].improvement.high < 0.5
+
+
+def test_pairs_of_unlike_length_are_refused():
+    with pytest.raises(ValueError, match="as many: 3 and 2"):
+        probability_of_improvement([1, 2, 3], [1, 2], paired=True)
+    with pytest.raises(ValueError, match="as many: 3 and 2"):
+        paired_difference([1, 2, 3], [1, 2])
+
+
+PAIRS = st.lists(st.tuples(st.integers(-5, 5), st.integers(-5, 5)), min_size=2, max_size=12)
+
+
+@settings(max_examples=40, deadline=None)
+@given(PAIRS, st.booleans())
+def test_what_one_wins_the_other_loses(pairs, paired):
+    x, y = np.array(pairs, float).T
+    value, low, high = probability_of_improvement(x, y, paired=paired)
+    other = probability_of_improvement(y, x, paired=paired)
+    np.testing.assert_allclose([value, low, high], 1 - np.array(other)[[0, 2, 1]], atol=1e-12)
+    assert -1e-12 <= low <= value <= high <= 1 + 1e-12
+    scaled = probability_of_improvement(np.exp(x), np.exp(y), paired=paired)
+    np.testing.assert_allclose(scaled, [value, low, high])
+
+
+@given(st.lists(st.floats(0, 1), min_size=1, max_size=10))
+def test_holm_keeps_the_order_and_lowers_nothing(p_values):
+    adjusted = holm(p_values)
+    assert np.all(adjusted >= p_values)
+    assert np.all(np.diff(adjusted[np.argsort(p_values)]) >= 0)
+    assert adjusted.max() <= 1

@@ -1,0 +1,214 @@
+"""The report: what is on the page, that it needs nothing else, and that it loses no file."""
+
+import html
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, opened_browser
+from fake_sweeps import make_sweep
+from test_sources import ONE, make_run
+
+from mjx_reinforce import report
+from mjx_reinforce.reports import distributions, findings, sources, tables, words
+
+HOSTILE = "x</script><script>alert(1)</script>\"'&"
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A sweep and its page."""
+    directory = make_sweep(tmp_path_factory.mktemp("sweeps") / "sweep", num_seeds=40)
+    page = directory / "report.html"
+    report.write([directory], page)
+    return directory, page
+
+
+@pytest.fixture(scope="module")
+def found(written):
+    return findings.find(sources.read([written[0]]))
+
+
+def content(page):
+    text = page.read_text(encoding="utf-8")
+    return json.loads(re.search(r'id="content">(.*?)</script>', text, re.S)[1])
+
+
+def visible(page):
+    """What the page says, without scripts and styles."""
+    text = re.sub(r"<(script|style)\b.*?</\1>", " ", page.read_text(encoding="utf-8"), flags=re.S)
+    text = html.unescape(re.sub(r"<[^>]+>", " ", text)).replace("\u00a0", " ")
+    return " ".join(text.split())
+
+
+def test_the_page_needs_nothing_else(written):
+    text = written[1].read_text(encoding="utf-8")
+    markup = re.sub(r"<script\b.*?</script>", "", text, flags=re.S)
+    assert not re.search(r'(src|href)="(?!#|data:)', markup)
+    assert "url(" not in markup
+    assert "@import" not in markup
+    assert not re.search(r"<script[^>]+src", text)
+
+
+def test_the_page_says_what_was_found(written, found):
+    said = visible(written[1])
+    best = found.results[0]
+    for sentence in (*words.answer(found), *words.distrust(found)):
+        assert " ".join(sentence.split()) in said
+    assert f"{best.solving.at_end} of its 40 seeds solve the task at the end" in said
+    for each in found.results:
+        assert each.configuration.label in said
+    for fact in (
+        "0123456789abcdef",
+        "mujoco 4.0.0",
+        "compile time",
+        "21.4 s",
+        "--over learning-rate",
+    ):
+        assert fact in said
+    assert "--learning-rate" in said  # how to train the worst seed again
+
+
+def test_the_figures_are_those_of_the_curves(found):
+    """The best by a mean that is worked out here, and its numbers."""
+    parts = found.experiment.configurations
+    finals = np.array([part.eval_return[-1] for part in parts])
+    scores = np.where(np.isfinite(finals), finals, np.nanmin(finals))
+    assert found.results[0].configuration.label == parts[scores.mean(axis=1).argmax()].label
+    assert [parts[i].label for i in found.order] == [r.configuration.label for r in found.results]
+    for result in found.results:
+        returns = result.configuration.eval_return
+        assert result.solving.ever == (np.nan_to_num(returns) >= 950).any(axis=0).sum()
+        assert result.solving.at_end == (returns[-1] >= 950).sum()
+        assert result.mean.low <= result.mean.value <= result.mean.high
+    assert len(found.comparisons) == 16 * 15 / 2
+
+
+def test_a_histogram_has_every_seed(found):
+    data = tables.chart_tables(found)["histogram"]
+    last = len(distributions.moments(found)) - 1
+    for place, result in enumerate(found.results):
+        rows = zip(data["configuration"], data["moment"], data["share"], strict=True)
+        share = sum(share for c, m, share in rows if (c, m) == (place, last))
+        finite = np.isfinite(result.seeds[-1]).mean()
+        assert share == pytest.approx(finite, abs=0.005)
+
+
+def test_solved_share_rises_to_those_who_ever_did(found):
+    data = tables.chart_tables(found)["solved"]
+    for place, result in enumerate(found.results):
+        shares = [
+            s for c, s in zip(data["configuration"], data["share"], strict=True) if c == place
+        ]
+        assert shares == sorted(shares)
+        assert shares[-1] <= result.solving.ever / 40 + 1e-4
+
+
+def test_numbers_and_pictures_lie_beside(written):
+    directory, page = written
+    beside = directory / "report"
+    lines = (beside / "results.csv").read_text().splitlines()
+    assert lines[0].startswith("configuration,learning_rate,discount,seed,final_return")
+    assert len(lines) == 1 + 16 * 40
+    assert content(page)["files"]["results.csv"].splitlines() == lines
+    for name in ("final", "curves", "solved", "distribution", "profile", "sensitivity-0", "worst"):
+        assert (beside / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_thousand_seeds_make_no_larger_charts(tmp_path):
+    """Charts take the same room whatever the seeds; only results.csv grows, a line for each."""
+    sizes = []
+    for seeds in (50, 200):
+        directory = make_sweep(tmp_path / str(seeds), num_seeds=seeds, over=ONE)
+        figures = findings.find(sources.read([directory]))
+        sizes.append(len(json.dumps(tables.chart_tables(figures))))
+    assert sizes[1] < 1.2 * sizes[0]
+
+
+def test_a_run_alone_and_names_that_are_markup(tmp_path):
+    directory = make_run(tmp_path / "<b>run", env=HOSTILE, note=HOSTILE)
+    page = tmp_path / "page.html"
+    report.write([directory], page)
+    text = page.read_text(encoding="utf-8")
+    assert "alert(1)</script>" not in text
+    assert text.count("<script") == 3
+    assert "<b>run" not in text
+    assert HOSTILE in visible(page)
+    assert "Pair by pair" not in visible(page)
+    assert f"watch '{directory}' --seed 0" in visible(page)
+
+
+def test_seeds_that_all_failed_are_no_answer(tmp_path):
+    directory = make_sweep(tmp_path / "sweep", num_seeds=5, over=ONE)
+    with np.load(directory / "curves.npz") as archive:
+        arrays = dict(archive)
+    arrays["eval_return"][2:] = np.nan
+    np.savez(directory / "curves.npz", **arrays)
+    report.write([directory], directory / "report.html")
+    assert "There is no answer" in visible(directory / "report.html")
+
+
+def run_report(*arguments):
+    command = [sys.executable, "-m", "mjx_reinforce.report", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120)
+
+
+def test_command_line(tmp_path):
+    """It writes, replaces its own page, and refuses what it did not write, in one line."""
+    run, page = make_run(tmp_path / "run"), tmp_path / "page.html"
+    done = run_report(run, "--output", page)
+    assert done.returncode == 0, done.stderr
+    assert str(page) in done.stdout
+    report.check_output(page, overwrite=False)
+    page.write_text("mine")
+    refused = run_report(run, "--output", page)
+    assert refused.returncode == 2
+    assert refused.stderr.startswith("error: ")
+    assert refused.stderr.count("\n") == 1
+    assert page.read_text() == "mine"
+    report.check_output(page, overwrite=True)
+
+
+@pytest.mark.parametrize("name", ["page.txt", "none/page.html", "folder.html", "page.html"])
+def test_outputs_that_cannot_be_are_refused(tmp_path, name):
+    (tmp_path / "folder.html").mkdir()
+    (tmp_path / "page").mkdir()
+    (tmp_path / "page" / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match=name.partition("/")[0].partition(".")[0]):
+        report.check_output(tmp_path / name, overwrite=False)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+def test_in_a_browser(written):
+    """No error, no request, nothing wider than a phone; the keyboard moves the slider."""
+    with opened_browser() as browser:
+        browser.open(written[1])
+        assert browser.run("document.querySelectorAll('.chart svg').length") == 8
+        rows = "document.querySelectorAll('#chart-distribution .mark-text.role-mark text').length"
+        before = browser.run("document.getElementById('chart-distribution').textContent")
+        browser.run("document.getElementById('moment').focus()")
+        browser.press("ArrowLeft")
+        browser.press("Home")
+        browser.wait_for("document.getElementById('moment-said').textContent.startsWith('0 env')")
+        after = "document.getElementById('chart-distribution').textContent"
+        browser.wait_for(f"{after} !== {json.dumps(before)}")
+        assert browser.run(rows) == 4
+        browser.hover("#chart-curves svg")
+        browser.wait_for("document.querySelector('#vg-tooltip-element.visible') !== null")
+        told = browser.run("document.getElementById('vg-tooltip-element').innerText")
+        assert any(label in told for label in content(written[1])["labels"])
+        browser.run("document.querySelector('[data-choose=\"1\"]').focus()")
+        browser.press(" ", "Space")
+        browser.wait_for(f"{rows} === 1")
+        browser.run("document.getElementById('log-x').click()")
+        browser.run("document.getElementById('log-y').click()")
+        browser.run("document.querySelector('details.data summary').click()")
+        browser.wait_for("document.querySelectorAll('details.data[open] tbody tr').length > 20")
+        assert browser.print().startswith(b"%PDF")
+        browser.open(written[1], width=390, height=844)
+        assert browser.run("document.documentElement.scrollWidth") == 390
+        assert browser.errors == []
+        assert not [r for r in browser.requests if not r.startswith(("file:", "data:", "blob:"))]

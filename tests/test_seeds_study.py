@@ -1,0 +1,219 @@
+"""The seeds study: its statistics, and its page from made-up numbers with a known answer."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import seeds_few
+import seeds_findings
+import seeds_page
+import seeds_runs
+from mjx_reinforce.reports.statistics import iqm
+from seeds_answers import CONTRASTS, best_rates, effects, paired_iqm_difference
+from seeds_few import any_pair, few_seeds
+from seeds_runs import Task, load, measure, save
+
+#: With a rate more than in the study, so that two are below its best and two are not.
+FACTORS = seeds_runs.FACTORS | {"learning_rate": [3e-3, 1e-2, 3e-2, 1e-1]}
+SHAPE = tuple(len(values) for values in FACTORS.values())
+SEEDS, BUDGET, COUNTS = 200, 1000, (3, 5, 10, 30, 100)
+LEARNED, _, _, GAMMA, NORMALISE = CONTRASTS
+
+
+def made_up(name, baseline, normalise):
+    """A task whose runs differ by known amounts.
+
+    A learned baseline adds ``baseline`` to every return; normalising adds ``normalise`` at the two
+    lower learning rates and takes it away at the two higher ones; nothing else matters. The third
+    learning rate is the best without normalising, the second one with it.
+    """
+    random = np.random.default_rng(0)
+    returns = 50 + random.normal(size=(*SHAPE, SEEDS))
+    returns[FACTORS["estimator"].index("value-baseline")] += baseline
+    returns += np.array([-10.0, -1.0, 0.0, -10.0])[:, None]
+    sign = np.array([1.0, 1.0, -1.0, -1.0])[:, None]
+    returns[:, :, FACTORS["standardize"].index(True)] += normalise * sign
+    return Task(
+        name=name,
+        factors=FACTORS,
+        threshold=50.0,
+        budget=BUDGET,
+        untrained=0.0,
+        final_return=returns,
+        average_return=returns - 10,
+        steps_to_solve=np.where(returns >= 50, 500.0, BUDGET),
+        env_steps=np.full(returns.shape, BUDGET),
+        grid=np.linspace(0, BUDGET, 3),
+        curves=np.repeat(iqm(returns, axis=-1)[..., None], 3, axis=-1),
+        record={
+            "env": name,
+            "num_seeds": SEEDS,
+            "settings": {
+                "hidden_sizes": [32, 32],
+                "value_hidden_sizes": [32, 32],
+                "value_fits": 10,
+                "max_updates": 150,
+            },
+            "nonfinite_runs": 0,
+            "compile_seconds": 1.0,
+            "run_seconds": 2.0,
+            "engine": "vmap",
+            "num_devices": 1,
+            "device": "a GPU",
+            "git_commit": "abc",
+            "packages": {"jax": "1"},
+        },
+    )
+
+
+@pytest.fixture(scope="module")
+def tasks():
+    return [made_up("Up-v0", baseline=5.0, normalise=3.0), made_up("Down-v0", -5.0, 0.0)]
+
+
+@pytest.fixture(scope="module")
+def found(tasks):
+    return effects(tasks)
+
+
+def only(found, task, contrast, measure, where):
+    wanted = (task, contrast.name, measure, where)
+    (effect,) = [e for e in found if (e.task, e.contrast, e.measure, e.where) == wanted]
+    return effect
+
+
+@pytest.mark.parametrize(("task", "sign"), [("Up-v0", 1), ("Down-v0", -1)])
+@pytest.mark.parametrize("where", ["best", "all", "0.003"])
+def test_a_known_difference_is_found(found, task, sign, where):
+    effect = only(found, task, LEARNED, "average return", where)
+    assert effect.difference.value == pytest.approx(5 * sign, abs=0.4)
+    assert effect.difference.low < effect.difference.value < effect.difference.high
+    assert effect.direction == sign
+    assert effect.adjusted > effect.difference.p_value
+
+
+def test_more_steps_are_worse(found):
+    effect = only(found, "Down-v0", LEARNED, "env steps to solve", "best")
+    assert effect.difference.value > 0
+    assert effect.direction == -1
+    assert effect.improvement < 0.5
+
+
+def test_what_does_nothing_is_not_found(found):
+    assert not any(e.direction for e in found if e.contrast == GAMMA.name)
+
+
+def test_each_arm_has_its_own_best_rate(tasks):
+    assert best_rates(tasks[0], NORMALISE) == (1e-2, 3e-2)
+    assert best_rates(tasks[1], NORMALISE) == (3e-2, 3e-2)
+
+
+def test_the_rates_are_not_chosen_on_the_seeds_that_are_reported(tasks):
+    task = tasks[1]
+    returns = task.average_return.copy()
+    returns[..., 0, 1::2] += 1000  # the worst rate, on the other half
+    assert best_rates(task._replace(average_return=returns), GAMMA) == (3e-2, 3e-2)
+
+
+def test_the_page_says_what_the_numbers_are(tasks, tmp_path, monkeypatch):
+    monkeypatch.setattr(seeds_few, "_DRAWS", 20)
+    seeds_page.write(seeds_findings.find(tasks, COUNTS), tmp_path)
+    page = (tmp_path / "seeds.md").read_text("utf-8")
+    assert "a learned baseline is better than no baseline on Up-v0; a learned baseline is" in page
+    assert "| gamma^t against no gamma^t | no difference found | no difference found |" in page
+    assert (
+        "On Up-v0 the learning rate decides: with both at the same one, normalisation gives the "
+        "higher average return at 0.003 and 0.01, no normalisation at 0.03 and 0.1."
+    ) in page
+    assert "On Down-v0 the learning rate decides" not in page
+    assert all((tmp_path / name).is_file() for name in _linked(page))
+
+
+def _linked(page):
+    return [part.partition(")")[0] for part in page.split("](")[1:]]
+
+
+def test_few_seeds_against_the_normal_distribution(tasks):
+    """Two arms 1 apart, of standard deviation 1: the means of n differ by 1 +- sqrt(2 / n)."""
+    task = tasks[1]
+    returns = task.final_return.copy()
+    one, other = (FACTORS["discount_weights"].index(x) for x in (True, False))
+    noise = np.random.default_rng(1).normal(size=SEEDS)
+    noise[1::2] = stats.norm.ppf((np.arange(SEEDS / 2) + 0.5) / (SEEDS / 2))
+    returns[:, one], returns[:, other] = 1 + noise, noise
+    found = few_seeds([task._replace(final_return=returns)], ["final return"], COUNTS)
+    (few,) = [few for few in found if few.contrast == GAMMA.name]
+    assert few.sure
+    for count in (3, 10):
+        expected = stats.norm.sf(np.sqrt(count / 2))
+        assert few.wrong[count] == pytest.approx(expected, abs=0.02)
+    assert few.needed == pytest.approx(17, abs=2)  # of Student's t-test, from tables
+
+
+def test_any_pair_is_any_that_differs(tasks):
+    task = tasks[1]
+    returns = np.zeros_like(task.final_return)
+    returns[FACTORS["estimator"].index("value-baseline")] = 1 + task.final_return[0] - 50
+    returns += 1e-9 * task.final_return
+    pair = any_pair(task._replace(final_return=returns), "final return", [1])
+    each = np.prod(SHAPE[1:])
+    assert pair.pairs >= each * 2 * each  # a learned baseline against both others
+
+
+def test_iqm_difference_by_simulation():
+    """Its interval covers, and its test decides as its interval does."""
+    random = np.random.default_rng(0)
+    covered = 0
+    for _ in range(400):
+        shared = random.normal(size=64)
+        x, y = shared + 0.5 * random.standard_t(3, 64), shared + 0.5 * random.standard_t(3, 64) + 1
+        difference = paired_iqm_difference(x, y)
+        covered += difference.low <= -1 <= difference.high
+        assert (difference.p_value < 0.05) == (difference.high < 0 or difference.low > 0)
+    assert 0.92 < covered / 400 < 0.98
+
+
+def test_iqm_difference_by_hand():
+    """Of eight seeds the middle four count; y is x in reverse order, less 1."""
+    x, y = np.arange(8.0), np.arange(8.0)[::-1] - 1
+    difference = paired_iqm_difference(x, y)
+    assert difference.value == 1
+    winsorised = np.array([2.0, 2, 2, 3, 4, 5, 5, 5])
+    error = np.sqrt(8 * np.var(2 * winsorised) / 12)
+    assert difference.p_value == pytest.approx(2 * stats.t.sf(1 / error, 3))
+    assert difference.high - 1 == pytest.approx(stats.t.ppf(0.975, 3) * error)
+
+
+def test_iqm_difference_of_saturated_returns():
+    x, y = np.full(64, 1000.0), np.full(64, 1000.0)
+    y[:10] = 3
+    assert paired_iqm_difference(x, y) == (0.0, 0.0, 0.0, 1.0)
+
+
+def test_what_is_kept_comes_back(tasks, tmp_path):
+    save(tasks[0], tmp_path)
+    loaded = load(tmp_path)
+    assert loaded.factors == FACTORS
+    assert loaded.record == tasks[0].record
+    np.testing.assert_allclose(loaded.final_return, tasks[0].final_return, rtol=1e-6)
+
+
+def test_runs_are_measured(tmp_path):
+    """Two seeds of two configurations, by hand; one return is not finite."""
+    from mjx_reinforce.export.files import write_arrays, write_json
+
+    runs = {
+        "configuration": np.array([0, 0, 1, 1]),
+        "seed": np.array([0, 1, 0, 1]),
+        "eval_return": np.array([[0, 0, 0, 0], [10, 2, np.nan, 10], [10, 4, 6, 8]], np.float32),
+        "env_steps": np.array([[0, 0, 0, 0], [50, 50, 50, 120], [100, 100, 90, 150]], np.int32),
+    }
+    write_arrays(tmp_path / "curves.npz", runs)
+    over = {"learning_rate": [0.1, 0.2]}
+    facts = {"env": "X", "threshold": 5, "over": over, "settings": {"env_steps": 100}}
+    write_json(tmp_path / "sweep.json", facts)
+    task = measure(tmp_path)
+    np.testing.assert_allclose(task.final_return, [[10, 4], [6, 8]])
+    np.testing.assert_allclose(task.steps_to_solve, [[50, 100], [90, 100]])
+    np.testing.assert_allclose(task.average_return[0], [7.5, 2.0], atol=0.01)
+    assert task.record["nonfinite_runs"] == 1

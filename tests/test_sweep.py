@@ -1,0 +1,360 @@
+"""Sweeps: the runs of ``train``, whatever is beside them, wherever they are, however they stop."""
+
+import csv
+import json
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toys import Drift
+
+from mjx_reinforce import envs
+from mjx_reinforce import sweep as sweep_module
+from mjx_reinforce import train as train_module
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.sweeps import conduct, perform, rungs, search
+from mjx_reinforce.sweeps.grid import configure, grid, read_over
+from mjx_reinforce.sweeps.groups import make_groups
+from mjx_reinforce.sweeps.reading import read_results
+from mjx_reinforce.sweeps.results import join
+
+SMALL = "--env Drift-v0 --num-episodes 4 --eval-episodes 2 --hidden-sizes 4 --env-steps None"
+RATES = "--over learning-rate 1e-2 3e-2 1e-1"
+
+
+@pytest.fixture
+def run(monkeypatch, tmp_path):
+    monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
+    monkeypatch.setattr(perform, "_report", lambda directory: 0.0)  # which tests of its own has
+    monkeypatch.chdir(tmp_path)
+
+    def run(command, module=sweep_module):
+        monkeypatch.setattr(sys, "argv", ["sweep", *command.split()])
+        with pytest.raises(SystemExit) as stop:
+            module.main()
+        return stop.value.code
+
+    return run
+
+
+def curves(directory):
+    with np.load(directory / "curves.npz", allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+def same(one, other):
+    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in one | other)
+
+
+def close(one, other):
+    """As near as rounding leaves runs of few updates."""
+    return all(np.allclose(one[n], other[n], rtol=1e-4, equal_nan=True) for n in one | other)
+
+
+def test_a_run_is_that_of_train(run):
+    """Of whichever configuration and group, and with a std of its own."""
+    over = "--over learning-rate 1e-2 3e-2 --over estimator leave-one-out total-return "
+    over += "--over initial-std 0.4 0.6"
+    assert run(f"{SMALL} --num-seeds 2 --max-updates 12 {over} --output swept") == 0
+    results = read_results(Path("swept"))
+    assert len(results.configurations) == 8
+    assert results.configurations[5] == {
+        "learning_rate": 3e-2,
+        "estimator": "leave-one-out",
+        "initial_std": 0.6,
+    }
+    alone = "--learning-rate 3e-2 --initial-std 0.6 --output alone"
+    assert run(f"{SMALL} --num-seeds 2 --max-updates 12 {alone}", train_module) == 0
+    rows = list(csv.DictReader(Path("alone/metrics.csv").read_text().splitlines()))
+    for name in ("eval_return", "env_steps"):
+        expected = np.array([float(row[name]) for row in rows]).reshape(-1, 2)
+        measured = getattr(results, name)[:, results.configuration == 5]
+        assert np.allclose(measured, expected, rtol=1e-4, equal_nan=True)
+    assert not same({"": results.eval_return[:, :2]}, {"": results.eval_return[:, 10:12]})
+
+
+def test_the_files_say_what_was_measured(run):
+    command = f"{SMALL} --num-seeds 2 --max-updates 7 --over hidden-sizes none 3,3 {RATES}"
+    assert run(f"{command} --output swept") == 0
+    rows = list(csv.DictReader(Path("swept/results.csv").read_text().splitlines()))
+    assert [(row["configuration"], row["seed"]) for row in rows] == [
+        (str(c), str(s)) for c in range(6) for s in range(2)
+    ]
+    assert [rows[0]["hidden_sizes"], rows[-1]["hidden_sizes"]] == ["none", "3,3"]
+    measured = curves(Path("swept"))
+    final = measured["eval_return"][-1]
+    assert np.allclose([float(row["final_return"]) for row in rows], final, equal_nan=True)
+    assert [int(row["env_steps"]) for row in rows] == measured["env_steps"][-1].tolist()
+    for index, row in enumerate(rows):
+        solved = np.flatnonzero(measured["eval_return"][:, index] >= Drift.reward_threshold)
+        expected = str(measured["env_steps"][solved[0], index]) if len(solved) else ""
+        assert row["env_steps_to_solve"] == expected
+    said = json.loads(Path("swept/sweep.json").read_text())
+    assert said["status"] == "finished"
+    assert said["configurations"][4] == {
+        "configuration": 4,
+        "hidden_sizes": [3, 3],
+        "learning_rate": 3e-2,
+    }
+    assert len(said["chunk_runs"]) == 2  # two networks, two programs
+
+
+def test_chunks_change_nothing_but_rounding(run):
+    command = f"{SMALL} --num-seeds 3 --max-updates 11 {RATES}"
+    assert run(f"{command} --output whole") == 0
+    assert run(f"{command} --chunk-runs 4 --output parts") == 0
+    assert len(list(Path("parts/parts").glob("*.npz"))) == 3
+    assert close(curves(Path("whole")), curves(Path("parts")))
+
+
+def test_an_exact_run_does_not_depend_on_the_others(run):
+    """Neither on its chunk, nor on what is swept beside it."""
+    command = f"{SMALL} --num-seeds 3 --max-updates 11 --exact"
+    assert run(f"{command} {RATES} --output whole") == 0
+    assert run(f"{command} {RATES} --chunk-runs 2 --output parts") == 0
+    whole = curves(Path("whole"))
+    assert same(whole, curves(Path("parts")))
+    more = "--over learning-rate 3e-2 1e-1 --over discount 0.9 0.99"
+    assert run(f"{command} {more} --output beside") == 0
+    beside = curves(Path("beside"))
+    assert same({"": whole["eval_return"][:, 3:6]}, {"": beside["eval_return"][:, 3:6]})
+
+
+def start(count, command, folder):
+    """Starts a sweep in a process that has so many devices."""
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={count}"
+    paths = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
+    environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": os.pathsep.join(paths)}
+    line = [sys.executable, "-m", "mjx_reinforce.sweep", *command.split()]
+    return subprocess.Popen(line, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("exact", [False, True])
+def test_devices_change_nothing_but_rounding(run, tmp_path, exact):
+    command = f"{SMALL} --num-seeds 3 --max-updates 11 {RATES} {'--exact' * exact}"
+    assert run(f"{command} --output one") == 0
+    elsewhere = command.replace("Drift-v0", "toys:Drift")
+    assert start(8, f"{elsewhere} --output eight", tmp_path).wait(timeout=120) == 0
+    one, eight = curves(tmp_path / "one"), curves(tmp_path / "eight")
+    assert (same if exact else close)(one, eight)
+
+
+class CrashError(Exception):
+    pass
+
+
+@pytest.mark.parametrize("where", ["after", "between"])
+def test_a_sweep_that_crashed_goes_on(run, monkeypatch, where):
+    """From a checkpoint inside a chunk, or after a chunk."""
+    command = f"{SMALL} --num-seeds 2 --max-updates 20 --checkpoint-every 5 {RATES} --chunk-runs 3"
+    assert run(f"{command} --output whole") == 0
+    owner, name = (conduct.Saver, "save") if where == "after" else (conduct.SweepFiles, "add")
+    calls, original = [], getattr(owner, name)
+
+    def crash(*arguments):
+        original(*arguments)
+        calls.append(arguments)
+        if len(calls) == (6 if where == "after" else 1):
+            raise CrashError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, crash)
+        patch.setattr(sys, "argv", ["sweep", *command.split(), "--output", "crashed"])
+        with pytest.raises(CrashError):
+            sweep_module.main()
+    assert json.loads(Path("crashed/sweep.json").read_text())["status"] == "running"
+    assert len(list(Path("crashed/parts").glob("*.npz"))) == 1
+    assert run("--resume crashed") == 0
+    assert same(curves(Path("whole")), curves(Path("crashed")))
+    assert Path("whole/results.csv").read_bytes() == Path("crashed/results.csv").read_bytes()
+    reported = []
+    monkeypatch.setattr(perform, "_report", lambda directory: reported.append(directory) or 1.0)
+    assert run("--resume crashed") == 0  # there is nothing left to do
+    assert reported == []
+    path = Path("crashed/sweep.json")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"statistics_seconds": None}))
+    assert run("--resume crashed") == 0  # killed before the report was written
+    assert reported == [Path("crashed")]
+    assert run("--resume crashed --learning-rate 0.5") == 2
+
+
+def test_what_ended_earlier_repeats_its_last_row():
+    joined = join(
+        [
+            {"configuration": np.array([1, 0]), "seed": np.array([0, 0]), "eval_return": np.eye(2)},
+            {
+                "configuration": np.array([0]),
+                "seed": np.array([1]),
+                "eval_return": np.full((3, 1), 7.0),
+            },
+        ]
+    )
+    assert joined["configuration"].tolist() == [0, 0, 1]
+    assert joined["seed"].tolist() == [0, 1, 0]
+    assert joined["eval_return"].tolist() == [[0, 7, 1], [1, 7, 0], [1, 7, 0]]
+
+
+def test_numbers_share_a_program_and_the_rest_does_not():
+    over = {"learning_rate": [1e-3, 1e-2], "max_grad_norm": [1.0, None, 2.0]}
+    configs = configure(Config(), grid(over))
+    groups = make_groups(configs, tuple(over), exact=False)
+    assert [group.members.tolist() for group in groups] == [[0, 2, 3, 5], [1, 4]]
+    assert groups[0].settings["max_grad_norm"].tolist() == [1.0, 2.0, 1.0, 2.0]
+    # Left alone, it follows the first rate.
+    assert np.allclose(groups[1].settings["final_learning_rate"], [1e-4, 1e-3])
+
+
+def test_values_are_read_as_their_settings_are():
+    over = read_over(
+        [
+            ("hidden-sizes", "none", "32,32"),
+            ("max-grad-norm", "None", "1"),
+            ("standardize", "True", "false"),
+            ("estimator", "total-return", "reward-to-go"),
+            ("eval_every", "2", "3"),
+        ]
+    )
+    assert over == {
+        "hidden_sizes": [(), (32, 32)],
+        "max_grad_norm": [None, 1.0],
+        "standardize": [True, False],
+        "estimator": ["total-return", "reward-to-go"],
+        "eval_every": [2, 3],
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "nothing is swept"),
+        ("--over learning-rat 1 2", "unknown setting 'learning_rat'"),
+        ("--over learning-rate", "needs two values or more"),
+        ("--over learning-rate 1e-3", "for one value pass --learning-rate"),
+        ("--over learning-rate 1e-3 1e-3", "has the value 0.001 twice"),
+        ("--over learning-rate 1e-3 x", "'x', which is no number"),
+        ("--over learning-rate 1 2 --over learning_rate 3 4", "given twice"),
+        ("--over learning-rate 1e-3 -1", "--learning-rate must be positive"),
+        ("--over env CartPole-v0 CartPole-v1", "cannot go over env"),
+        ("--over seed 1 2", "cannot go over seed"),
+        ("--over value-learning-rate 1e-3 1e-2", "would do nothing"),
+        ("--over learning-rate 1e-2 1e-3 --value-fits 3", "--value-fits 3 would do nothing"),
+        ("--over learning-rate 1e-2 1e-3 --stop-when-solved", "not for sweeps"),
+        ("--over learning-rate 1e-2 1e-3 --chunk-runs 0", "--chunk-runs must be at least 1"),
+        ("--over learning-rate 1e-2 1e-3 --jsonl", "--jsonl logs a run"),
+        ("--over tensorboard True False", "cannot go over tensorboard"),
+        ("--resume nowhere", "cannot read nowhere/sweep.json"),
+    ],
+)
+def test_bad_sweeps_are_refused(run, capsys, tmp_path, monkeypatch, arguments, message):
+    monkeypatch.setattr(conduct, "compile_programs", lambda *_: pytest.fail("it was compiled"))
+    assert run(f"--env Drift-v0 {arguments}") == 2
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
+    assert printed.out == ""
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_flag_that_one_configuration_reads_is_accepted():
+    configurations = grid({"estimator": ["leave-one-out", "value-baseline"]})
+    configure(Config(value_fits=3), configurations, given=["value_fits"])
+    with pytest.raises(ValueError, match="would do nothing"):
+        configure(Config(decay_updates=None), grid({"final_learning_rate": [1e-3, 1e-2]}))
+
+
+@pytest.mark.slow
+def test_halving_goes_on_with_the_better_half(run):
+    """The winner's training is that of a run alone, and its last figure is of other seeds."""
+    over = "--over learning-rate 1e-3 1e-1 --over estimator leave-one-out total-return "
+    command = f"{SMALL} --num-seeds 3 --max-updates 20 --search halving --budget 5 {over}"
+    assert run(f"{command} --output swept") == 0
+    results = read_results(Path("swept"))
+    configurations = results.configurations
+    rates = [values["learning_rate"] for values in configurations]
+    assert len(set(rates)) == 5
+    assert all(1e-3 <= rate <= 1e-1 for rate in rates)
+    last = results.env_steps[-1].reshape(5, 3)
+    winner = json.loads(Path("swept/sweep.json").read_text())["winner"]
+    chosen = winner["configuration"]
+    assert np.all(last[chosen] == last.max(axis=0))
+    alone = f"{SMALL} --num-seeds 3 --max-updates 20 "
+    alone += f"--learning-rate {rates[chosen]} --estimator {configurations[chosen]['estimator']}"
+    assert run(f"{alone} --output alone", train_module) == 0
+    summary = json.loads(Path("alone/summary.json").read_text())
+    runs = results.configuration == chosen
+    final = results.eval_return[-1, runs]
+    assert np.allclose(final, summary["final_returns"], rtol=1e-4, equal_nan=True)
+    assert results.env_steps[-1, runs].tolist() == summary["env_steps"]
+    assert run(f"{alone} --seed 1 --output fresh", train_module) == 0
+    summary = json.loads(Path("fresh/summary.json").read_text())
+    assert np.allclose(winner["final_returns"], summary["final_returns"], rtol=1e-4)
+    assert winner["iqm"] == pytest.approx(summary["iqm"], rel=1e-4)
+
+
+def test_half_the_configurations_stay_until_one_is_left():
+    returns = {"configuration": np.repeat(np.arange(6), 2), "eval_return": np.zeros((3, 12))}
+    returns["eval_return"][-1] = [5, 5, 1, 1, 9, 9, np.nan, np.nan, 5, 5, 7, 7]
+    assert rungs.best(returns, 3) == [0, 2, 5]  # of two that are equal, the first
+    configs = configure(Config(), grid({"learning_rate": [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2]}))
+    groups = make_groups(configs, ["learning_rate"], exact=False)
+
+    def measured(name):
+        assert name == str(len(seen) - 1)
+        kept = seen[-1].groups[0].members
+        return {"configuration": kept, "eval_return": kept[None].astype(float)}
+
+    seen = []
+    for rung in rungs.schedule(groups, "halving", measured):
+        seen.append(rung)
+    assert [rung.name for rung in seen] == ["0", "1", "2", "3", "fresh"]
+    kept = [rung.groups[0].members.tolist() for rung in seen]
+    assert kept == [[0, 1, 2, 3, 4, 5], [3, 4, 5], [4, 5], [5], [5]]
+    budgets = [rung.groups[0].config.env_steps for rung in seen]
+    assert budgets == [35_000, 70_000, 140_000, 280_000, 280_000]
+    assert [rung.groups[0].config.seed for rung in seen] == [0, 0, 0, 0, 1]
+    assert seen[-1].groups[0].settings["learning_rate"].tolist() == [3e-2]
+
+
+def test_ranges_are_drawn_as_their_settings_are():
+    over = {
+        "learning_rate": [1e-4, 1e-1],
+        "discount": [0.9, 0.999],
+        "num_episodes": [4, 7],
+        "estimator": ["leave-one-out", "total-return"],
+        "entropy_cost": [0.0, 0.25, 1.0],
+    }
+    drawn = search.draw(over, 400, seed=0)
+    assert drawn == search.draw(over, 400, seed=0)
+    assert drawn != search.draw(over, 400, seed=1)
+    columns = {name: [values[name] for values in drawn] for name in over}
+    # Half of the draws lie on each side of the middle of the scale: 200, standard deviation 10.
+    assert abs(np.sum(np.array(columns["learning_rate"]) < 10**-2.5) - 200) < 50
+    assert abs(np.sum(1 - np.array(columns["discount"]) < 1e-2) - 200) < 50
+    assert set(columns["num_episodes"]) == {4, 5, 6, 7}
+    assert set(columns["estimator"]) == set(over["estimator"])
+    assert set(columns["entropy_cost"]) == {0.0, 0.25, 1.0}
+    with pytest.raises(ValueError, match="only 2 different"):
+        search.draw({"estimator": over["estimator"]}, 3, seed=0)
+
+
+@pytest.mark.slow
+def test_two_processes_share_a_sweep(run, tmp_path):
+    command = f"{SMALL} --num-seeds 3 --max-updates 6 {RATES}"
+    assert run(f"{command} --output alone") == 0
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    command = command.replace("Drift-v0", "toys:Drift")
+    command += f" --output shared --distributed --coordinator localhost:{port} --num-processes 2"
+    started = [start(1, f"{command} --process-id {i}", tmp_path) for i in range(2)]
+    assert [process.wait(timeout=120) for process in started] == [0, 0]
+    assert len(list(Path("shared/parts").glob("*.npz"))) == 2
+    assert close(curves(Path("alone")), curves(Path("shared")))
+    rows = Path("shared/results.csv").read_text().splitlines()
+    assert len(rows) == 1 + 9
+    assert json.loads(Path("shared/sweep.json").read_text())["status"] == "finished"
