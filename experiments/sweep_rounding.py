@@ -1,8 +1,8 @@
 """How far does rounding move a run of a sweep when it is trained beside others, or on more devices?
 
-``python experiments/sweep_rounding.py`` trains the same 24 runs of InvertedPendulum side by side on
-one device, in two chunks, and on 2 and 8 (virtual) devices, and prints the largest difference in
-their parameters after 1, 2, 5, 10 and 20 updates, as a share of the largest parameter's size.
+``python experiments/sweep_rounding.py`` trains the same 24 runs of InvertedPendulum in one slot on
+one device, in two and in three slots, and on 2 and 8 (virtual) devices, and prints the largest
+difference in their parameters after 1, 2, 5, 10 and 20 updates, as a share of the largest.
 """
 
 import os
@@ -13,13 +13,19 @@ from pathlib import Path
 
 import numpy as np
 
-#: Name -> devices, and runs side by side.
-CASES = {"alike": (1, 24), "two chunks": (1, 12), "2 devices": (2, 24), "8 devices": (8, 24)}
+#: Name -> devices, and runs in a slot.
+CASES = {
+    "one slot": (1, 24),
+    "two slots": (1, 12),
+    "three slots": (1, 8),
+    "2 devices": (2, 24),
+    "8 devices": (8, 24),
+}
 UPDATES = (1, 2, 5, 10, 20)
 
 
 def train(width: int, output: Path) -> None:
-    """Trains the runs, ``width`` side by side, and keeps their parameters after each block."""
+    """Trains the runs, ``width`` in a slot, and keeps their parameters after each block."""
     import dataclasses
 
     import jax
@@ -41,21 +47,15 @@ def train(width: int, output: Path) -> None:
     group = make_groups(configs, ["learning_rate"], exact=False)[0]
     env, devices = envs.make(base.env), Devices()
     build, traced = learner_builder(env, group.config), tuple(group.settings)
-    programs = compile_programs(env, build, 1000, group.config, traced, width, devices)
-    kept = {str(count): [] for count in UPDATES}
-    for runs in split(group, "0", 24 // width):
-        chunk = begin(programs, devices, group, runs, 1)
-        for count in range(1, max(UPDATES) + 1):
-            chunk = programs.advance(chunk)[0]
-            if count in UPDATES:
-                leaves = jax.tree.leaves(chunk[0].train_states.actor.params)
-                flat = [np.asarray(x).reshape(width, -1) for x in leaves]
-                kept[str(count)].append(np.concatenate(flat, axis=1))
-    np.savez(
-        output,
-        allow_pickle=False,
-        **{count: np.concatenate(parts) for count, parts in kept.items()},
-    )
+    programs = compile_programs(env, build, 1000, group.config, traced, (width,), devices)
+    kept = {}
+    states = begin(programs, group, split(group, "0", 1)[0])
+    for count in range(1, max(UPDATES) + 1):
+        states = programs.advance(states, np.zeros(24))[0]
+        if count in UPDATES:
+            leaves = jax.tree.leaves(states.train_states.actor.params)
+            kept[str(count)] = np.concatenate([x.reshape(24, -1) for x in leaves], axis=1)
+    np.savez(output, allow_pickle=False, **kept)
 
 
 def main() -> None:
@@ -73,7 +73,7 @@ def main() -> None:
         subprocess.run(line, check=True, env=os.environ | {"XLA_FLAGS": flags.strip()})
         with np.load(output) as archive:
             measured[name] = {count: archive[count] for count in archive.files}
-    whole = measured.pop("alike")
+    whole = measured.pop("one slot")
     print("largest difference of a parameter over the largest parameter, after so many updates")
     print("| | " + " | ".join(map(str, UPDATES)) + " |\n|---|" + "---|" * len(UPDATES))
     for name, parts in measured.items():

@@ -16,11 +16,17 @@ from mjx_reinforce import envs
 from mjx_reinforce import sweep as sweep_module
 from mjx_reinforce import train as train_module
 from mjx_reinforce.runs.config import Config
-from mjx_reinforce.sweeps import conduct, perform, rungs, search
+from mjx_reinforce.runs.packing import pack
+from mjx_reinforce.sweeps import conduct, perform, plan, programs, rungs, search
 from mjx_reinforce.sweeps.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.groups import make_groups
 from mjx_reinforce.sweeps.reading import read_results
 from mjx_reinforce.sweeps.results import join
+
+
+class CrashError(Exception):
+    pass
+
 
 SMALL = "--env Drift-v0 --num-episodes 4 --eval-episodes 2 --hidden-sizes 4 --env-steps None"
 RATES = "--over learning-rate 1e-2 3e-2 1e-1"
@@ -124,6 +130,64 @@ def test_an_exact_run_does_not_depend_on_the_others(run):
     assert same({"": whole["eval_return"][:, 3:6]}, {"": beside["eval_return"][:, 3:6]})
 
 
+#: Runs end one by one, for the noisier their actions are the shorter are their episodes.
+STEPS = f"{SMALL} --env-steps 300 --eval-every 1 --over initial-std 0.3 1 3"
+
+
+def in_place(chosen, lengths, widths, num_devices):
+    """A packing that leaves all runs in their lanes until the last has ended."""
+    del lengths, num_devices
+    lanes = np.full(-(-len(chosen) // widths[0]) * widths[0], -1)
+    lanes[: len(chosen)] = np.arange(len(chosen))
+    return lanes.reshape(-1, widths[0])
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_packing_changes_nothing(run, monkeypatch, exact):
+    """Neither which runs share a slot, nor how wide it is, nor that those that ended lie aside."""
+    command = f"{STEPS} --num-seeds 4 {'--exact' * exact}"
+    shapes = []
+
+    def packed(*arguments):
+        shapes.append(pack(*arguments).shape)
+        return pack(*arguments)
+
+    monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
+    monkeypatch.setattr(programs, "pack", packed)
+    assert run(f"{command} --output packed") == 0
+    assert shapes[0] == ((12, 1) if exact else (3, 4))
+    assert shapes[-1] == (1, 1)
+    assert len(set(shapes)) > 3
+    monkeypatch.setattr(plan, "_CPU_EPISODES", (48,))
+    monkeypatch.setattr(programs, "pack", in_place)
+    assert run(f"{command} --output wide") == 0
+    one, other = curves(Path("packed")), curves(Path("wide"))
+    assert len(set(one["env_steps"][-1])) > 6
+    assert (same if exact else close)(one, other)
+
+
+def test_a_crash_among_runs_that_ended_changes_nothing(run, monkeypatch):
+    """A checkpoint holds the runs that train and those that lie aside."""
+    monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
+    command = f"{STEPS} --num-seeds 4 --checkpoint-every 1"
+    assert run(f"{command} --output whole") == 0
+    save, ended = conduct.Saver.save, []
+
+    def crash(self, states, record):
+        save(self, states, record)
+        ended.append((states.env_steps >= 300).sum())
+        if 3 < ended[-1] < 9:
+            raise CrashError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(conduct.Saver, "save", crash)
+        patch.setattr(sys, "argv", ["sweep", *command.split(), "--output", "crashed"])
+        with pytest.raises(CrashError):
+            sweep_module.main()
+    assert run("--resume crashed") == 0
+    assert same(curves(Path("whole")), curves(Path("crashed")))
+
+
 def start(count, command, folder):
     """Starts a sweep in a process that has so many devices."""
     flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={count}"
@@ -136,16 +200,12 @@ def start(count, command, folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("exact", [False, True])
 def test_devices_change_nothing_but_rounding(run, tmp_path, exact):
-    command = f"{SMALL} --num-seeds 3 --max-updates 11 {RATES} {'--exact' * exact}"
+    command = f"{STEPS} --num-seeds 3 {'--exact' * exact}"
     assert run(f"{command} --output one") == 0
     elsewhere = command.replace("Drift-v0", "toys:Drift")
     assert start(8, f"{elsewhere} --output eight", tmp_path).wait(timeout=120) == 0
     one, eight = curves(tmp_path / "one"), curves(tmp_path / "eight")
     assert (same if exact else close)(one, eight)
-
-
-class CrashError(Exception):
-    pass
 
 
 @pytest.mark.parametrize("where", ["after", "between"])
@@ -340,6 +400,22 @@ def test_ranges_are_drawn_as_their_settings_are():
     assert set(columns["entropy_cost"]) == {0.0, 0.25, 1.0}
     with pytest.raises(ValueError, match="only 2 different"):
         search.draw({"estimator": over["estimator"]}, 3, seed=0)
+
+
+@pytest.mark.parametrize("report", [True, False])
+def test_from_python_a_report_can_be_left_out(monkeypatch, tmp_path, capsys, report):
+    monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
+    monkeypatch.setattr(perform, "_report", lambda directory: 1.5)
+    base = Config(
+        env="Drift-v0", num_seeds=2, num_episodes=4, eval_episodes=2, env_steps=None, max_updates=2
+    )
+    results = sweep_module.sweep(
+        base, {"learning_rate": [1e-2, 3e-2]}, output=tmp_path / "out", report=report
+    )
+    assert results.eval_return.shape[1] == 4
+    known = json.loads((tmp_path / "out" / "sweep.json").read_text())
+    assert known["statistics_seconds"] == (1.5 if report else None)
+    assert ("statistics and report" in capsys.readouterr().out) == report
 
 
 @pytest.mark.slow

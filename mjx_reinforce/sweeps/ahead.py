@@ -7,20 +7,20 @@ from typing import Any
 
 
 def one_ahead(tasks: Sequence[Callable[[], Any]]) -> Iterator[Any]:
-    """Yields the results of tasks in order; each begins when the one before is handed out.
-
-    The threads are daemons: whoever leaves early does not wait for a compiler.
-    """
-    waiting = [_started(tasks[0])] if tasks else []
+    """Yields the results of tasks in order; each begins when the one before is handed out."""
+    waiting = [started(tasks[0])] if tasks else []
     for following in (*tasks[1:], None):
         result = waiting.pop().result()
         if following is not None:
-            waiting.append(_started(following))
+            waiting.append(started(following))
         yield result
 
 
-def _started(task: Callable[[], Any]) -> Future:
-    """Returns the result to come of a task, which begins in a thread of its own."""
+def started(task: Callable[[], Any]) -> Future:
+    """Returns the result to come of a task, which begins in a thread of its own.
+
+    Python waits for it before it exits: a compiler that is cut off there ends the process.
+    """
     future: Future = Future()
 
     def work() -> None:
@@ -29,5 +29,5 @@ def _started(task: Callable[[], Any]) -> Future:
         except BaseException as error:
             future.set_exception(error)
 
-    threading.Thread(target=work, daemon=True).start()
+    threading.Thread(target=work).start()
     return future

@@ -16,12 +16,11 @@ from mjx_reinforce.sweeps import carry, chunks, rungs
 from mjx_reinforce.sweeps.ahead import one_ahead
 from mjx_reinforce.sweeps.chunks import Runs, Saver
 from mjx_reinforce.sweeps.design import Design
-from mjx_reinforce.sweeps.devices import RUNS
 from mjx_reinforce.sweeps.groups import Group, learner_builder
 from mjx_reinforce.sweeps.plan import Part, divide
 from mjx_reinforce.sweeps.prepare import Prepared
 from mjx_reinforce.sweeps.processes import Processes
-from mjx_reinforce.sweeps.programs import Programs, compile_programs, shape_of_slot
+from mjx_reinforce.sweeps.programs import Programs, compile_programs, shape_of_states
 from mjx_reinforce.sweeps.results import SweepFiles
 from mjx_reinforce.sweeps.rungs import Rung
 
@@ -159,7 +158,7 @@ class Conductor:
             self._prepared.horizon,
             config,
             tuple(stage.group.settings),
-            stage.part.width,
+            stage.part.widths,
             self._prepared.devices,
         )
 
@@ -168,21 +167,19 @@ class Conductor:
         config = dataclasses.replace(stage.group.config, num_seeds=len(runs.seed))
         record = Record(config, getattr(self._prepared.env, "reward_threshold", None))
         saver = Saver(self._files.checkpoints(runs.name), stage.group.config)
-        like = [programs.like] * stage.part.slots
-        chunk = saver.find(like, record, self._display.say)
-        if chunk is None:
-            chunk = self._begin(rung, stage, programs, runs, record)
-        chunk = self._prepared.devices.put(chunk, RUNS)
+        states = saver.find(programs.shape_of(len(runs.seed)), record, self._display.say)
+        if states is None:
+            states = self._begin(rung, stage, programs, runs, record)
 
-        def after(chunk: list[RunState], record: Record) -> bool:
+        def after(states: RunState, record: Record) -> bool:
             self._display.show_progress(self._progress(record, len(runs.seed)))
             if self._interrupt is not None and self._interrupt.number is not None:
-                saver.save(chunk, record)
+                saver.save(states, record)
                 return False
-            saver.save_if_due(chunk, record)
+            saver.save_if_due(states, record)
             return True
 
-        ended = chunks.train(programs, chunk, record, num_runs=len(runs.seed), after=after)
+        ended = chunks.train(programs, states, record, after)
         if ended is None:
             return False
         keep = self._design.search == "halving"
@@ -195,23 +192,18 @@ class Conductor:
 
     def _begin(
         self, rung: Rung, stage: Stage, programs: Programs, runs: Runs, record: Record
-    ) -> list[RunState]:
+    ) -> RunState:
         """Returns the first states of a chunk: new ones, or those at the end of a rung before."""
-        slots = stage.part.slots
         if rung.before is None:
-            return chunks.begin(programs, self._prepared.devices, stage.group, runs, slots)
+            return chunks.begin(programs, stage.group, runs)
         before = next(old for old in self._before if old.number == stage.number)
-        group, part = before.group, before.part
-        build = learner_builder(self._prepared.env, group.config)
-        like = [shape_of_slot(build, tuple(group.settings), part.width)] * part.slots
-        states = carry.last_states(self._files, before.chunks, like, self._display.say)
-        chunk = carry.gather(states, before.chunks, runs, programs.width, stage.part.slots)
-        num_runs = len(runs.seed)
-        joined = np.concatenate([np.asarray(slot.train_states.num_updates) for slot in chunk])
-        record.updates = joined[:num_runs].astype(np.int64)
-        joined = np.concatenate([np.asarray(slot.env_steps) for slot in chunk])
-        record.env_steps = joined[:num_runs].astype(np.int64)
-        return chunk
+        build = learner_builder(self._prepared.env, before.group.config)
+        shape_of = functools.partial(shape_of_states, build, tuple(before.group.settings))
+        states = carry.last_states(self._files, before.chunks, shape_of, self._display.say)
+        states = carry.choose(states, before.chunks, runs)
+        record.updates = states.train_states.num_updates.astype(np.int64)
+        record.env_steps = states.env_steps.astype(np.int64)
+        return states
 
     def _progress(self, record: Record, num_runs: int) -> Progress:
         """Returns how far the chunk is, but for the whole sweep where that differs."""

@@ -32,9 +32,9 @@ class SweepSettings:
     budget: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """How many configurations random and halving begin with."""
     chunk_runs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """Runs that are trained side by side at most; as many as memory holds if not given."""
+    """Runs that are under way at once at most; as many as memory holds if not given."""
     exact: bool = False
-    """Train one run at a time, on one device of each process, so that no result depends in any bit
+    """Move every run by itself, on one device of each process, so that no result depends in any bit
     on the runs beside it, on chunks, or on how many devices there are. It takes many times as
     long."""
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from mjx_reinforce.export.files import read_json, write_json
 from mjx_reinforce.runs.files import choose_directory, locked, prepare
+from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.resume import check_same_program
@@ -16,13 +17,16 @@ from mjx_reinforce.sweeps.design import Design, as_record, check_design
 from mjx_reinforce.sweeps.processes import Processes, join_processes
 
 
-def perform(design: Design, interrupt: Interrupt | None, made: list[Path]) -> tuple[Path, bool]:
+def perform(
+    design: Design, interrupt: Interrupt | None, made: list[Path], *, report: bool = True
+) -> tuple[Path, bool]:
     """Trains all runs of a sweep, or goes on with it, and writes its files.
 
     Args:
       design: of the sweep.
       interrupt: what listens to signals, if anything does.
       made: takes in the folders that are made for it.
+      report: whether its page is written at its end.
 
     Returns:
       The directory of its files, and whether all runs ended: else it was interrupted.
@@ -44,7 +48,7 @@ def perform(design: Design, interrupt: Interrupt | None, made: list[Path]) -> tu
                 made += prepare(directory, design.base.overwrite)
             held.enter_context(locked(directory))
         configure_jax()
-        return directory, _perform(design, directory, known, processes, interrupt)
+        return directory, _perform(design, directory, known, processes, interrupt, report)
 
 
 def _finish_again(directory: Path, known: Mapping[str, Any]) -> None:
@@ -62,6 +66,7 @@ def _perform(
     known: Mapping[str, Any],
     processes: Processes,
     interrupt: Interrupt | None,
+    report: bool,
 ) -> bool:
     """Does what ``perform`` says, in a directory that is ours; ``known`` is its sweep.json."""
     from mjx_reinforce.runs.display import Display
@@ -69,7 +74,8 @@ def _perform(
     from mjx_reinforce.sweeps.prepare import prepare
     from mjx_reinforce.sweeps.results import SweepFiles
 
-    prepared = prepare(design, known.get("chunk_runs"), processes.count)
+    with heartbeat(to_screen, None, "writing the simulation out"):
+        prepared = prepare(design, known.get("chunk_runs"), processes.count)
     contents = _contents(design, prepared, known)
     if known:
         _check_same(directory, known, contents)
@@ -95,6 +101,7 @@ def _perform(
         if interrupt is not None:
             interrupt.on_exit(display.console.show_cursor)
         conductor = Conductor(prepared, design, processes, files, display, interrupt, ready)
+        conductor.clock.compiling += prepared.engine_seconds
         ended = conductor.conduct()
         contents |= {
             "status": "finished" if ended else "interrupted",
@@ -103,7 +110,7 @@ def _perform(
         }
         if first:
             _finish(design, files, contents)
-            if ended:
+            if ended and report:
                 display.say("writing the report")
                 contents["statistics_seconds"] = _report(directory)
                 files.write(contents)
@@ -169,8 +176,10 @@ def _ending(directory: Path, contents: Mapping[str, Any]) -> str:
     """Returns the line that ends a sweep."""
     if contents["status"] == "interrupted":
         return f"interrupted; go on with --resume {directory}"
-    return (
+    took = (
         f"compiling took {contents['compile_seconds']:.1f} s, training and evaluating "
-        f"{contents['run_seconds']:.1f} s, statistics and report "
-        f"{contents['statistics_seconds']:.1f} s. Files in {directory}, first report.html"
+        f"{contents['run_seconds']:.1f} s"
     )
+    if (seconds := contents["statistics_seconds"]) is None:
+        return f"{took}. Files in {directory}"
+    return f"{took}, statistics and report {seconds:.1f} s. Files in {directory}, first report.html"

@@ -4,25 +4,28 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from mjx_reinforce.runs.memory import gigabytes, needed
+from mjx_reinforce.runs.memory import gigabytes, needed, num_cores
 from mjx_reinforce.runs.plan import Machine, duration, task_of, this_machine, training_seconds
 from mjx_reinforce.sweeps.groups import Group
 
 #: Chunks take up to this part of the memory that is there.
 _MEMORY = 0.6
+#: Episodes side by side in a slot of a device; the widest slot first. On two CPU cores a run costs
+#: the same beside 7 others or 255, and narrow slots waste less on runs of other lengths. An H200
+#: needs 65,536 episodes for most of its speed; for few runs a narrow slot answers sooner.
+_CPU_EPISODES = (128,)
+_GPU_EPISODES = (65_536, 8_192)
 
 
 class Part(NamedTuple):
     """How the runs of a group are divided.
 
     num_chunks: of about the same size
-    width: runs that a compiled program moves at once
-    slots: how many times that a chunk is
+    widths: runs that a compiled program moves at once, the most first
     """
 
     num_chunks: int
-    width: int
-    slots: int
+    widths: tuple[int, ...]
 
 
 def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> Part:
@@ -32,12 +35,16 @@ def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> Part:
       group: whose configurations have ``group.config.num_seeds`` runs each.
       limit: runs in a chunk at most.
       num_devices: among which a chunk is divided.
-      exact: one run at a time.
+      exact: one run a slot.
     """
     total = len(group.members) * group.config.num_seeds
     num_chunks = -(-total // limit)
-    each = -(-total // (num_chunks * num_devices))
-    return Part(num_chunks, num_devices, each) if exact else Part(num_chunks, each * num_devices, 1)
+    if exact:
+        return Part(num_chunks, (num_devices,))
+    most = -(-total // (num_chunks * num_devices))
+    side = _CPU_EPISODES if this_machine().shared else _GPU_EPISODES
+    each = {min(most, -(-count // group.config.episodes_per_update)) for count in side}
+    return Part(num_chunks, tuple(num_devices * width for width in sorted(each, reverse=True)))
 
 
 def chunk_limit(
@@ -96,11 +103,15 @@ def describe(
     first, machine = groups[0].config, this_machine()
     configurations = sum(len(group.members) for group in groups)
     runs, chunks = configurations * first.num_seeds, sum(part.num_chunks for part in parts)
-    side = max(part.width * part.slots for part in parts)
-    memory = max(
-        needed(dataclasses.replace(group.config, num_seeds=part.width), task_of(env, horizon, one))
+    at_once = num_cores() if machine.shared else 1  # slots
+    side = max(
+        -(-len(group.members) * group.config.num_seeds // part.num_chunks)
         for group, part in zip(groups, parts, strict=True)
-        for one in (group.config,)
+    )
+    memory = max(
+        needed(dataclasses.replace(group.config, num_seeds=at_once * part.widths[0]), task)
+        for group, part in zip(groups, parts, strict=True)
+        for task in (task_of(env, horizon, group.config),)
     )
     where = machine.name
     if num_devices > 1:

@@ -22,6 +22,7 @@ class Prepared(NamedTuple):
     groups: of configurations
     limits: how many runs of each group a chunk may have
     engine: the name of what plays the episodes
+    engine_seconds: wall time that making it took, for all groups
     plan: a paragraph for people
     """
 
@@ -32,6 +33,7 @@ class Prepared(NamedTuple):
     groups: list[Group]
     limits: list[int]
     engine: str
+    engine_seconds: float
     plan: str
 
 
@@ -63,5 +65,5 @@ def prepare(design: Design, limits: Sequence[int] | None, num_processes: int) ->
     ]
     learners = [learner for learner, _ in built]
     plan = describe(env, horizon, learners, groups, parts, devices.count)
-    engine = learners[0].engine.name
-    return Prepared(env, horizon, devices, configurations, groups, list(limits), engine, plan)
+    engine = learners[0].engine.name, sum(learner.engine.seconds for learner in learners)
+    return Prepared(env, horizon, devices, configurations, groups, list(limits), *engine, plan)

@@ -1,9 +1,8 @@
-"""The compiled programs of a group: those of a run, for a chunk of runs on all devices."""
+"""The compiled programs of a group: those of a run, for slots of runs on all devices."""
 
-import dataclasses
 import functools
-from collections.abc import Callable, Collection
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.runs.blocks import block_length
-from mjx_reinforce.runs.config import MAX_COUNT, Config
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.keys import plain, with_keys
+from mjx_reinforce.runs.memory import num_cores
+from mjx_reinforce.runs.packing import join, pack, put_back, spread, take, training
 from mjx_reinforce.runs.state import (
     Arrays,
     Budget,
@@ -22,51 +24,99 @@ from mjx_reinforce.runs.state import (
     budget_of,
     evaluation,
     evaluation_key,
-    to_numpy,
 )
+from mjx_reinforce.sweeps.ahead import started
 from mjx_reinforce.sweeps.devices import NONE, RUNS, SECOND, Devices
 
 
-class Programs(NamedTuple):
-    """The compiled programs of a group. They move ``width`` runs at once: a slot of a chunk.
+class Movers(NamedTuple):
+    """What moves the runs of one slot on. States have the data of keys in their place.
 
-    A chunk in progress is a list of the states of its slots.
-
-    width: a multiple of the number of devices
-    like: the shapes of a slot
-    begin: (keys [W], settings [W] each, padding [W]) -> the first state of a slot; a run that is
-      padding stands still from the start
-    block: (slot) -> (slot, (updates made [D], metrics [K, W], moved [W])), as
-      ``state.block_of_updates``, with whether each run made an update
-    look: (slot, which [W]) -> evaluation [W] of the present policies of these runs
-    every: [W] that is all of them
+    block: (states [W]) -> (states [W], metrics [K, W], whether each run made an update [W]), as
+      ``state.block_of_updates``
+    look: (states [W], which [W]) -> evaluation [W] of the present policies of these runs
     """
 
-    width: int
-    like: RunState
-    begin: Callable[..., RunState]
-    block: Callable[[RunState], tuple[RunState, Any]]
+    block: Callable[[RunState], tuple[RunState, dict[str, jax.Array], jax.Array]]
     look: Callable[[RunState, jax.Array], dict[str, jax.Array]]
-    every: jax.Array
 
-    def advance(self, chunk: list[RunState]) -> tuple[list[RunState], Arrays, Arrays]:
-        """Makes a block of updates of all runs, see ``state.Programs``, and evaluates them.
+
+class Programs(NamedTuple):
+    """The compiled programs of a group. States of runs [R] are on the host between them.
+
+    begin: (keys [R], settings [R] each) -> the first states
+    movers: by the width of a slot; the narrower ones may still be compiling
+    budget: of each run
+    devices: among which a slot is divided
+    shape_of: the shapes of the states of so many runs
+    """
+
+    begin: Callable[..., RunState]
+    movers: dict[int, "Future[Movers]"]
+    budget: Budget
+    devices: Devices
+    shape_of: Callable[[int], RunState]
+
+    def advance(
+        self, states: RunState, lengths: np.ndarray
+    ) -> tuple[RunState, Arrays, Arrays, np.ndarray]:
+        """Makes a block of updates of the runs that still train, and evaluates them.
+
+        Args:
+          states: [R] of all runs, at least one of which still trains.
+          lengths: [R] about how long their episodes are, see ``packing.pack``.
 
         Returns:
-          The chunk, the metrics [K, R] and the evaluation [R], which says nothing of runs that
-          made no update: their ``active`` is False in all metrics.
+          The states, the metrics [K, R] as ``state.Programs.advance`` returns them, the evaluation
+          [R], and which runs were evaluated [R]: those that made an update.
         """
-        blocks = [self.block(slot) for slot in chunk]
-        chunk = [slot for slot, _ in blocks]
-        # Begun before the host waits for anything.
-        looked = [self.look(slot, moved) for slot, (_, _, moved) in blocks]
-        made = max(int(np.max(made)) for _, (made, _, _) in blocks)
-        metrics = _joined([to_numpy(metrics) for _, (_, metrics, _) in blocks])
-        return chunk, {name: x[:made] for name, x in metrics.items()}, _fetch(looked)
+        chosen = training(states, self.budget)
+        lanes, movers = self._pack(chosen, lengths)
 
-    def evaluate(self, chunk: list[RunState]) -> Arrays:
+        def move(runs: np.ndarray) -> Any:
+            slot, metrics, moved = movers.block(self._put(take(states, runs)))
+            looked = movers.look(slot, moved)  # begun before the host waits for the block
+            return jax.device_get((slot, metrics, looked))
+
+        slots, rows, looked = zip(*_side_by_side(move, lanes), strict=True)
+        metrics = spread(len(chosen), lanes, rows)
+        states = put_back(states, lanes, slots)
+        counts = {"updates_total": states.train_states.num_updates}
+        counts["env_steps_total"] = states.env_steps
+        for name, count in counts.items():  # of a run that stands still too
+            metrics[name] = np.where(metrics["active"], metrics[name], count)
+        made = int(metrics["active"].any(axis=1).sum())
+        metrics = {name: x[:made] for name, x in metrics.items()}
+        return states, metrics, spread(len(chosen), lanes, looked), chosen
+
+    def evaluate(self, states: RunState) -> Arrays:
         """Evaluates the present policies of all runs [R]."""
-        return _fetch([self.look(slot, self.every) for slot in chunk])
+        every = np.ones(len(states.env_steps), bool)
+        lanes, movers = self._pack(every, np.zeros(len(every)))
+
+        def look(runs: np.ndarray) -> Any:
+            slot = self._put(take(states, runs))
+            return jax.device_get(movers.look(slot, self._put(runs >= 0)))
+
+        return spread(len(every), lanes, _side_by_side(look, lanes))
+
+    def _pack(self, chosen: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, Movers]:
+        """Returns the runs of each slot, and what moves them."""
+        lanes = pack(chosen, lengths, list(self.movers), self.devices.count)
+        return lanes, self.movers[lanes.shape[1]].result()
+
+    def _put(self, slot: Any) -> Any:
+        return self.devices.put(slot, RUNS)
+
+
+def _side_by_side(move: Callable[[np.ndarray], Any], lanes: np.ndarray) -> list[Any]:
+    """Returns the results for all slots [slots, width], as many at once as there are cores.
+
+    A slot alone leaves a part of the cores waiting for each other, and its results are fetched
+    while the next one is moved.
+    """
+    with ThreadPoolExecutor(num_cores()) as pool:
+        return list(pool.map(move, lanes))
 
 
 def compile_programs(
@@ -75,10 +125,10 @@ def compile_programs(
     horizon: int,
     config: Config,
     traced: Collection[str],
-    width: int,
+    widths: Sequence[int],
     devices: Devices,
 ) -> Programs:
-    """Compiles the programs of a group.
+    """Compiles the programs of a group for the widest slot, and begins with the narrower ones.
 
     Args:
       env: what is trained on.
@@ -86,81 +136,91 @@ def compile_programs(
       horizon: T, the time limit of an episode in steps.
       config: the settings, in which those that are traced stand for any value.
       traced: the names of those that are.
-      width: how many runs are moved at once, a multiple of the number of devices.
+      widths: how many runs a slot may have, the most first; multiples of the number of devices.
       devices: where.
     """
-    key, budget = devices.put((evaluation_key(config), budget_of(config)), NONE)
-    begin = devices.jit(_with_padding(beginning(build_learner)), (RUNS,) * 3, RUNS)
-    first = devices.shapes(jax.eval_shape(functools.partial(_arguments, traced, width)), RUNS)
-    like = devices.shapes(shape_of_slot(build_learner, traced, width), RUNS)
-    block = _with_totals(block_of_updates(build_learner, block_length(config)))
-    advance = devices.jit(block, (RUNS, NONE), (RUNS, (RUNS, SECOND, RUNS)), donate_argnums=0)
-    # Policies and engines are those of any of its learners.
-    look = evaluation(env, build_learner({}), horizon, config)
-    look = devices.jit(look, (RUNS, NONE, RUNS), RUNS)
-    with ThreadPoolExecutor() as pool:  # each compiles while the next is traced
-        beginning_ = pool.submit(begin.lower(*first).compile)
-        every = devices.put(np.ones(width, bool), RUNS)
-        looking = pool.submit(look.lower(like.train_states.actor, key, every).compile)
-        advancing = advance.lower(like, budget).compile()
-        began, looked = beginning_.result(), looking.result()
-    return Programs(
-        width,
-        like,
-        began,
-        lambda slot: advancing(slot, budget),
-        lambda slot, which: looked(slot.train_states.actor, key, which),
-        every,
+    widest, *narrower = widths
+    compile_for = functools.partial(_movers, env, build_learner, horizon, config, traced, devices)
+    beginning_ = started(functools.partial(_begin, build_learner, traced, widest, devices))
+    movers: dict[int, Future[Movers]] = {widest: Future()}
+    movers[widest].set_result(compile_for(widest))
+    movers |= {width: started(functools.partial(compile_for, width)) for width in narrower}
+    budget = jax.device_get(budget_of(config))
+    shape_of = functools.partial(shape_of_states, build_learner, traced)
+    return Programs(beginning_.result(), movers, budget, devices, shape_of)
+
+
+def shape_of_states(
+    build_learner: BuildLearner, traced: Collection[str], num_runs: int
+) -> RunState:
+    """Returns the shapes of the states of so many runs, with the data of keys in their place."""
+    return jax.eval_shape(
+        lambda *arguments: plain(beginning(build_learner)(*arguments)),
+        *_arguments(traced, num_runs),
     )
 
 
-def shape_of_slot(build_learner: BuildLearner, traced: Collection[str], width: int) -> RunState:
-    """Returns the shapes of the states of ``width`` runs."""
-    arguments = jax.eval_shape(functools.partial(_arguments, traced, width))
-    return jax.eval_shape(_with_padding(beginning(build_learner)), *arguments)
+def _arguments(traced: Collection[str], width: int) -> tuple[Any, dict[str, jax.Array]]:
+    """Returns the shapes of the arguments of ``beginning``."""
+    zeros = {name: jnp.zeros(width) for name in traced}
+    return jax.eval_shape(lambda: (jax.random.split(jax.random.key(0), width), zeros))
 
 
-def _arguments(traced: Collection[str], width: int) -> tuple[Any, dict[str, jax.Array], Any]:
-    """Returns arguments of ``Programs.begin``."""
-    keys = jax.random.split(jax.random.key(0), width)
-    return keys, {name: jnp.zeros(width) for name in traced}, jnp.zeros(width, bool)
+def _begin(
+    build_learner: BuildLearner, traced: Collection[str], width: int, devices: Devices
+) -> Callable[..., RunState]:
+    """Compiles ``Programs.begin``, which begins ``width`` runs at once."""
+
+    def first(keys: jax.Array, settings: Any) -> RunState:
+        return plain(beginning(build_learner)(keys, settings))
+
+    shapes = devices.shapes(_arguments(traced, width), RUNS)
+    compiled = devices.jit(first, (RUNS, RUNS), RUNS).lower(*shapes).compile()
+
+    def begin(keys: jax.Array, settings: Arrays) -> RunState:
+        count = len(keys)
+        slots = []
+        for start in range(0, count, width):
+            index = np.minimum(np.arange(start, start + width), count - 1)
+            values = {
+                name: np.asarray(x[index], shapes[1][name].dtype) for name, x in settings.items()
+            }
+            slots.append(compiled(*devices.put((keys[index], values), RUNS)))
+        return join(jax.device_get(slots), count)
+
+    return begin
 
 
-def _with_padding(begin: Callable[..., RunState]) -> Callable[..., RunState]:
-    """Returns ``begin`` with a third argument [W]: the runs that have no budget."""
+def _movers(
+    env: Any,
+    build_learner: BuildLearner,
+    horizon: int,
+    config: Config,
+    traced: Collection[str],
+    devices: Devices,
+    width: int,
+) -> Movers:
+    """Compiles what moves slots of ``width`` runs; the arguments are ``compile_programs``'."""
+    key, budget = devices.put((evaluation_key(config), budget_of(config)), NONE)
+    like = jax.eval_shape(beginning(build_learner), *_arguments(traced, width))
+    updates = block_of_updates(build_learner, block_length(config))
 
-    def begin_padded(keys: jax.Array, settings: Any, padding: jax.Array) -> RunState:
-        state = begin(keys, settings)
-        used = jnp.where(padding, MAX_COUNT, state.env_steps)
-        return dataclasses.replace(state, env_steps=used)
+    def block(states: RunState, budget: Budget) -> Any:
+        before = states.train_states.num_updates
+        after, (_, metrics) = updates(with_keys(states, like), budget)
+        return plain(after), metrics, after.train_states.num_updates > before
 
-    return begin_padded
-
-
-def _with_totals(block: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns ``block`` with the counts in every row after its last update, and which runs moved.
-
-    Another device may make more updates, and the counts of all are read in one row.
-    """
-
-    def filled(state: RunState, budget: Budget) -> Any:
-        before = state.train_states.num_updates
-        state, (made, rows) = block(state, budget)
-        moved = state.train_states.num_updates > before
-        counts = {"updates_total": state.train_states.num_updates}
-        counts["env_steps_total"] = state.env_steps
-        for name, count in counts.items():
-            late = jnp.arange(len(rows[name]))[:, None] >= made
-            rows = rows | {name: jnp.where(late, count, rows[name])}
-        return state, (made[None], rows, moved)
-
-    return filled
-
-
-def _joined(slots: list[Arrays]) -> Arrays:
-    """Returns the arrays of all slots side by side, the runs on their last axis."""
-    return {name: np.concatenate([slot[name] for slot in slots], axis=-1) for name in slots[0]}
-
-
-def _fetch(slots: list[dict[str, jax.Array]]) -> Arrays:
-    return _joined([to_numpy(slot) for slot in slots])
+    # Policies and engines are those of any of its learners.
+    look = evaluation(env, build_learner({}), horizon, config)
+    shapes = devices.shapes(jax.eval_shape(plain, like), RUNS)
+    which = devices.shapes(jax.ShapeDtypeStruct((width,), bool), RUNS)
+    advance = devices.jit(block, (RUNS, NONE), (RUNS, SECOND, RUNS))
+    look = devices.jit(look, (RUNS, NONE, RUNS), RUNS)
+    with ThreadPoolExecutor() as pool:  # the first compiles while the second is traced
+        looking = pool.submit(look.lower(shapes.train_states.actor, key, which).compile)
+        advancing = advance.lower(shapes, budget).compile()
+        looked = looking.result()
+    return Movers(
+        lambda states: advancing(states, budget),
+        lambda states, which: looked(states.train_states.actor, key, which),
+    )
