@@ -54,10 +54,13 @@ def mutmut(folder: Path, *arguments: str) -> str:
 def read(folder: Path) -> dict[str, dict[str, int | None]]:
     """Returns module -> mutant -> exit code of its tests, None if they did not run."""
     records = sorted((folder / "mutants").rglob("*.py.meta"))
-    return {
-        record.name.removesuffix(".py.meta"): json.loads(record.read_text())["exit_code_by_key"]
-        for record in records
-    }
+    return {_name(record): json.loads(record.read_text())["exit_code_by_key"] for record in records}
+
+
+def _name(record: Path) -> str:
+    """Returns the name of a module, of a package that of its folder."""
+    name = record.name.removesuffix(".py.meta")
+    return record.parent.name if name == "__init__" else name
 
 
 def draw(mutants: list[str], sample: int | None, seed: int) -> list[str]:

@@ -10,12 +10,12 @@ STARTED = time.perf_counter()
 
 import numpy as np  # noqa: E402, which is part of the time
 
-from mjx_reinforce.reports import (  # noqa: E402
+from mjx_reinforce.reports import statistics  # noqa: E402
+from mjx_reinforce.reports.statistics import (  # noqa: E402
     aggregates,
     comparisons,
     power,
     profiles,
-    statistics,
     survival,
 )
 

@@ -12,12 +12,13 @@ from typing import Any
 import tyro
 
 from mjx_reinforce.export.files import write_bytes
-from mjx_reinforce.reports import columns, page, sources, tables
+from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
-from mjx_reinforce.reports.figures import Figure, figures
 from mjx_reinforce.reports.findings import Findings, find
-from mjx_reinforce.reports.page import GENERATOR, Watch
-from mjx_reinforce.reports.vega import ONE, draw
+from mjx_reinforce.reports.page import columns, document, tables
+from mjx_reinforce.reports.page.document import GENERATOR, Watch
+from mjx_reinforce.reports.page.figures import Figure, figures
+from mjx_reinforce.reports.page.vega import ONE, draw
 from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.files import version
 from mjx_reinforce.runs.flags import accept_all_characters, read
@@ -120,7 +121,7 @@ def write(chosen: Sequence[Path], output: Path) -> float:
     seconds = time.perf_counter() - started
     ours = version("mjx-reinforce") or "not installed"
     watch = how_to_watch(experiment, findings)
-    text = page.render(findings, drawn, data, files, watch, ours, seconds)
+    text = document.render(findings, drawn, data, files, watch, ours, seconds)
     write_bytes(output, text.encode())
     return time.perf_counter() - started
 

@@ -138,16 +138,24 @@ class Browser:
         self.call("Input.dispatchKeyEvent", type="keyDown", **common, **text)
         self.call("Input.dispatchKeyEvent", type="keyUp", **common)
 
-    def hover(self, selector):
-        """Moves the mouse to the middle of an element."""
+    def hover(self, selector, until):
+        """Moves the mouse in the middle of an element until JavaScript is true.
+
+        A chart that is still being drawn misses the first move.
+        """
         x, y = self.run(
             "(() => { document.documentElement.style.scrollBehavior = 'auto';"
             f"const found = document.querySelector('{selector}');"
             "found.scrollIntoView({block: 'center'}); const r = found.getBoundingClientRect();"
             "return [r.x + r.width / 2, r.y + r.height / 2]; })()"
         )
-        for at in (x - 2, x):
-            self.call("Input.dispatchMouseEvent", type="mouseMoved", x=at, y=y)
+        end = time.monotonic() + _SECONDS
+        while not self.run(until):
+            if time.monotonic() > end:
+                raise TimeoutError(f"never: {until}; {self.errors}")
+            for at in (x - 2, x):
+                self.call("Input.dispatchMouseEvent", type="mouseMoved", x=at, y=y)
+            time.sleep(0.1)
 
     def screenshot(self, *, whole=False, clip=None):
         """Returns a PNG of what is seen, or of the whole page."""
@@ -190,11 +198,13 @@ def opened_browser():
 
 
 def picture(image, height):
-    """Returns the top of a picture with few colours, which makes a small PNG file."""
+    """Returns the top of a picture as a small PNG file."""
     content = io.BytesIO()
     with Image.open(io.BytesIO(image)) as whole:
         top = whole.crop((0, 0, whole.width, min(height, whole.height)))
-        top.convert("RGB").quantize(96).save(content, "png", optimize=True)
+        # By coverage: a curve's colour is that of few points among much white and grey.
+        few = top.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+        few.save(content, "png", optimize=True)
     return content.getvalue()
 
 

@@ -13,7 +13,8 @@ from fake_sweeps import make_sweep
 from test_sources import ONE, make_run
 
 from mjx_reinforce import report
-from mjx_reinforce.reports import distributions, findings, sources, tables, words
+from mjx_reinforce.reports import findings, sources
+from mjx_reinforce.reports.page import distributions, tables, words
 
 HOSTILE = "x</script><script>alert(1)</script>\"'&"
 
@@ -181,6 +182,77 @@ def test_outputs_that_cannot_be_are_refused(tmp_path, name):
         report.check_output(tmp_path / name, overwrite=False)
 
 
+def test_ties_are_said_as_ties(tmp_path):
+    """Equal means are not "0.0 above", and p = 1 is not "or more"."""
+    directory = make_sweep(tmp_path / "sweep", num_seeds=8, over=ONE)
+    with np.load(directory / "curves.npz") as archive:
+        arrays = dict(archive)
+    arrays["eval_return"][-1] = 1000.0
+    np.savez(directory / "curves.npz", **arrays)
+    said = " ".join(words.answer(findings.find(sources.read([directory]))))
+    assert "The mean equals that of the next" in said
+    assert "chance too often (p = 1)." in said
+
+
+def test_a_configuration_that_ended_earlier_stays_at_its_end(tmp_path):
+    """At the slider's last stop its histogram is of its final returns, and says so."""
+    directory = make_sweep(tmp_path / "sweep", num_seeds=40, over=ONE)
+    with np.load(directory / "curves.npz") as archive:
+        arrays = dict(archive)
+    arrays["env_steps"][:, arrays["configuration"] == 0] //= 2
+    np.savez(directory / "curves.npz", **arrays)
+    shown = findings.find(sources.read([directory]))
+    place = shown.order.index(0)
+    drawn = distributions.distributions(shown)
+    last = len(distributions.moments(shown)) - 1
+    said = drawn["moments"]["said"][place * (last + 1) : (place + 1) * (last + 1)]
+    assert "its end: " in said[last]
+    assert "its end: " not in said[0]
+    bars = drawn["histogram"]
+    rows = zip(bars["configuration"], bars["moment"], bars["share"], strict=True)
+    final = arrays["eval_return"][-1, arrays["configuration"] == 0]
+    share = sum(share for c, m, share in rows if (c, m) == (place, last))
+    assert share == pytest.approx(np.isfinite(final).mean(), abs=0.005)
+
+
+@pytest.mark.parametrize(("seeds", "worst"), [(1, 1), (4, 1), (8, 2), (200, 10)])
+def test_the_worst_are_a_quarter_at_most(tmp_path, seeds, worst):
+    directory = make_sweep(tmp_path / "sweep", num_seeds=seeds, over=ONE)
+    best = findings.find(sources.read([directory])).results[0]
+    places = tables.worst_seeds(best)
+    assert len(places) == worst
+    assert best.scores[places].max() <= np.delete(best.scores, places).min(initial=np.inf)
+
+
+#: Charts whose legend, words or axes lie outside their picture, where print cuts them.
+OVERFLOW = """[...document.querySelectorAll('.chart')].filter((chart) => {
+  const box = (name) => chart.querySelector(name).getBoundingClientRect();
+  const [whole, drawn] = [box('svg'), box('svg g')];
+  return drawn.top < whole.top - 1 || drawn.bottom > whole.bottom + 1;
+}).map((chart) => chart.id)"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+def test_charts_are_whole_at_any_width_and_on_paper(tmp_path):
+    directory = make_sweep(
+        tmp_path / "sweep", num_seeds=8, over={"learning_rate": [1e-3, 3e-3, 1e-2]}
+    )
+    page = directory / "report.html"
+    report.write([directory], page)
+    with opened_browser() as browser:
+        for width in (1280, 700, 390):
+            browser.open(page, width=width)
+            assert browser.run(OVERFLOW) == []
+            browser.run("dispatchEvent(new Event('beforeprint'))")
+            assert browser.run(OVERFLOW) == []
+            drawn = "document.querySelector('#chart-curves svg').getAttribute('width')"
+            assert browser.run(drawn) == "780"
+            browser.run("dispatchEvent(new Event('afterprint'))")
+            whole = browser.run("document.querySelector('figure').clientWidth")
+            assert browser.run(drawn) == str(whole)
+        assert browser.errors == []
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
 def test_in_a_browser(written):
     """No error, no request, nothing wider than a phone; the keyboard moves the slider."""
@@ -196,8 +268,8 @@ def test_in_a_browser(written):
         after = "document.getElementById('chart-distribution').textContent"
         browser.wait_for(f"{after} !== {json.dumps(before)}")
         assert browser.run(rows) == 4
-        browser.hover("#chart-curves svg")
-        browser.wait_for("document.querySelector('#vg-tooltip-element.visible') !== null")
+        visible = "document.querySelector('#vg-tooltip-element.visible') !== null"
+        browser.hover("#chart-curves svg", until=visible)
         told = browser.run("document.getElementById('vg-tooltip-element').innerText")
         assert any(label in told for label in content(written[1])["labels"])
         browser.run("document.querySelector('[data-choose=\"1\"]').focus()")

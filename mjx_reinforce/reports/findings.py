@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.reports.aggregates import interval, wilson
-from mjx_reinforce.reports.comparisons import Comparison, compare_all
 from mjx_reinforce.reports.curves import on_grid
 from mjx_reinforce.reports.experiment import Configuration, Experiment
-from mjx_reinforce.reports.power import seeds_needed, wrong_winner
 from mjx_reinforce.reports.statistics import Estimate, iqm, iqm_interval
-from mjx_reinforce.reports.survival import (
+from mjx_reinforce.reports.statistics.aggregates import interval, wilson
+from mjx_reinforce.reports.statistics.comparisons import Comparison, compare_all
+from mjx_reinforce.reports.statistics.power import seeds_needed, wrong_winner
+from mjx_reinforce.reports.statistics.survival import (
     Survival,
     collapses,
     kaplan_meier,

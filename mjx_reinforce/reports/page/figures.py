@@ -2,12 +2,12 @@
 
 from typing import Any, NamedTuple
 
-from mjx_reinforce.reports import charts, tables
-from mjx_reinforce.reports.distributions import edges, moments
 from mjx_reinforce.reports.experiment import count, ordered, spoken
 from mjx_reinforce.reports.findings import Findings, swept, values_of
-from mjx_reinforce.reports.vega import specification
-from mjx_reinforce.reports.words import interval, number
+from mjx_reinforce.reports.page import charts, tables
+from mjx_reinforce.reports.page.distributions import edges, moments
+from mjx_reinforce.reports.page.vega import specification
+from mjx_reinforce.reports.page.words import interval, number
 
 #: So many configurations are shown at first, the best.
 SHOWN = 4
@@ -136,8 +136,9 @@ def _distribution(findings: Findings, place: int) -> list[Figure]:
             number=place,
             title="Where the seeds are",
             caption=(
-                "Histograms of all seeds' returns, read off at the slider's time; the tallest bar "
-                "of each row has its height, and the outermost bars hold what lies beyond them."
+                "Histograms of all seeds' returns, read off at the slider's time, or where the "
+                "training had ended before it; the tallest bar of each row has its height, and "
+                "the outermost bars hold what lies beyond them."
             ),
             alt="A histogram of returns for each configuration shown, with its median and worst.",
             tables=["histogram", "moments"],
@@ -186,14 +187,15 @@ def _sensitivity(findings: Findings, place: int) -> list[Figure]:
 
 def _worst(findings: Findings, place: int) -> list[Figure]:
     best = findings.results[0]
-    shown = min(tables.WORST, len(best.final))
+    shown = len(tables.worst_seeds(best))
+    which = "worst seed" if shown == 1 else f"worst {shown} seeds"
     return [
         _figure(
             findings,
             charts.worst(findings.experiment.threshold),
             name="worst",
             number=place,
-            title=f"The worst {count(shown, 'seed')} of {best.configuration.label}",
+            title=f"The {which} of {best.configuration.label}",
             caption="Thin lines, with a point for each evaluation; thick: the interquartile mean.",
             alt="Returns over env steps of the worst seeds; the table below says how each ended.",
             tables=["worst"],

@@ -1,22 +1,23 @@
 """The report's figures as tables, from which its charts are drawn."""
 
+import math
 from typing import Literal
 
 import numpy as np
 
-from mjx_reinforce.reports.columns import Table, join, short
-from mjx_reinforce.reports.distributions import distributions
 from mjx_reinforce.reports.experiment import ordered, say
 from mjx_reinforce.reports.findings import Findings, Result, swept, values_of
-from mjx_reinforce.reports.profiles import performance_profile
+from mjx_reinforce.reports.page.columns import Table, join, short
+from mjx_reinforce.reports.page.distributions import distributions
+from mjx_reinforce.reports.statistics.profiles import performance_profile
 
 #: Points of a curve, at most.
 _POINTS = 80
 #: Seeds that are drawn one by one: of one configuration, and of all together.
 _DRAWN_OF_ONE = 40
 _DRAWN_OF_ALL = 480
-#: How many of the worst seeds are named.
-WORST = 10
+#: How many of the worst seeds are named, and what share of all, at most.
+_WORST, _WORST_SHARE = 10, 0.25
 
 
 def chart_tables(findings: Findings) -> dict[str, Table]:
@@ -126,8 +127,9 @@ def _profile(findings: Findings) -> Table:
 
 
 def worst_seeds(result: Result) -> np.ndarray:
-    """Returns the places of the worst seeds of a configuration, the worst first."""
-    return np.argsort(np.nan_to_num(result.final, nan=-np.inf), kind="stable")[:WORST]
+    """Returns the places of the worst seeds of a configuration, the worst first: at least one."""
+    number = min(_WORST, math.ceil(_WORST_SHARE * len(result.final)))
+    return np.argsort(np.nan_to_num(result.final, nan=-np.inf), kind="stable")[:number]
 
 
 def worst_curves(findings: Findings) -> dict[str, Table]:

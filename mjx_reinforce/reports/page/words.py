@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.reports.comparisons import Comparison
 from mjx_reinforce.reports.experiment import count, ordered, say, spoken
 from mjx_reinforce.reports.findings import COMPARED, Findings, Result
 from mjx_reinforce.reports.statistics import Estimate
+from mjx_reinforce.reports.statistics.comparisons import Comparison
 
 #: What counts as a difference after Holm's correction.
 LEVEL = 0.05
@@ -44,7 +44,9 @@ def steps(value: float) -> str:
 
 
 def p_value(value: float) -> str:
-    """Returns a p value, "p = 0.012" or "p < 0.001"."""
+    """Returns a p value, "p = 0.012", "p < 0.001" or "p = 1"."""
+    if value >= 0.9995:
+        return "p = 1"
     return "p < 0.001" if value < 0.001 else f"p = {value:.3f}"
 
 
@@ -91,7 +93,7 @@ def _ahead(findings: Findings) -> Iterator[str]:
     sizes = {len(each.final) for each in findings.results[:COMPARED]}
     where = "The mean" if len(sizes) == 1 else "Over the seeds that all have, the mean"
     yield (
-        f"{where} is {number(next_best.difference.value)} above that of the next, {label} "
+        f"{where} {_above(float(next_best.difference.value))} that of the next, {label} "
         f"(95 % interval {interval(next_best.difference)}; {p_value(next_best.adjusted)} after "
         f"Holm's correction for {count(len(findings.comparisons), 'pair')}). Of two seeds, one of "
         f"each, that of the best ends higher with a probability of {percent(improvement.value)} "
@@ -99,13 +101,17 @@ def _ahead(findings: Findings) -> Iterator[str]:
     )
     ties = unsure(findings)
     if ties:
+        least = p_value(min(c.adjusted for c in against if c.adjusted >= LEVEL))
         names = [f"“{each.configuration.label}”" for each in ties[:3]]
         more = f" and {len(ties) - 3} more" if len(ties) > 3 else ""
         yield (
             f"It cannot be told from {', '.join(names)}{more}: a difference as large comes by "
-            f"chance too often ({p_value(min(c.adjusted for c in against if c.adjusted >= LEVEL))} "
-            "or more)."
+            f"chance too often ({least}{'' if least == 'p = 1' else ' or more'})."
         )
+
+
+def _above(difference: float) -> str:
+    return f"is {number(difference)} above" if difference else "equals"
 
 
 def _solving(findings: Findings) -> Iterator[str]:

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mjx_reinforce.reports.aggregates import wilson
 from mjx_reinforce.reports.statistics import Estimate, worst_if_not_finite
+from mjx_reinforce.reports.statistics.aggregates import wilson
 
 
 def performance_profile(

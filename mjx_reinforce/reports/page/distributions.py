@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from mjx_reinforce.reports.columns import Table, short
 from mjx_reinforce.reports.findings import Findings, Result
+from mjx_reinforce.reports.page.columns import Table, short
 
 #: Bars of a histogram, and moments, at most.
 _BINS = 36
@@ -33,8 +33,10 @@ def distributions(findings: Findings) -> dict[str, Table]:
     said: Table = {n: [] for n in ("configuration", "moment", "said")}
     starts, ends = short(borders[:-1]), short(borders[1:])
     for place, result in enumerate(findings.results):
+        end = result.configuration.env_steps[-1].min()
         for moment, k in enumerate(moments(findings)):
-            values = result.seeds[k]
+            ended = bool(findings.grid[k] > end)
+            values = result.final if ended else result.seeds[k]
             finite = np.clip(values[np.isfinite(values)], borders[0], borders[-1])
             counts, _ = np.histogram(finite, borders)
             share, tallest = counts / len(values), max(counts.max(), 1)
@@ -47,18 +49,18 @@ def distributions(findings: Findings) -> dict[str, Table]:
             bars["height"] += short(counts[filled] / tallest, 3)
             said["configuration"].append(place)
             said["moment"].append(moment)
-            said["said"].append(_said(findings, result, k, values))
+            said["said"].append(_said(findings, result, values, ended))
     return {"histogram": bars, "moments": said}
 
 
-def _said(findings: Findings, result: Result, k: int, values: np.ndarray) -> str:
-    """Returns a configuration's label and what its seeds return at a point of the grid."""
+def _said(findings: Findings, result: Result, values: np.ndarray, ended: bool) -> str:
+    """Returns a configuration's label and what its seeds return, which may be its last returns."""
     label, finite = result.configuration.label, values[np.isfinite(values)]
     failed = len(values) - len(finite)
     if not len(finite):
-        over = findings.grid[k] > result.configuration.env_steps[-1].min()
-        return f"{label}\n{'its training had ended' if over else 'no seed is finite'}"
-    text = f"{label}\nmedian {np.median(finite):,.4g}, worst {finite.min():,.4g}"
+        return f"{label}\nno seed is finite"
+    text = f"{label}\n{'its end: ' if ended else ''}median {np.median(finite):,.4g}"
+    text += f", worst {finite.min():,.4g}"
     if findings.experiment.threshold is not None:
         solved = int(np.sum(finite >= findings.experiment.threshold))
         text += f", {solved:,} of {len(values):,} solved"

@@ -6,16 +6,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from mjx_reinforce.reports import bootstrap
 from mjx_reinforce.reports.statistics import (
     Estimate,
+    bootstrap,
     finite_or_nan,
     iqm,
     iqm_interval,
     mean_interval,
     worst_if_not_finite,
 )
-from mjx_reinforce.reports.tails import cvar, cvar_interval
+from mjx_reinforce.reports.statistics.tails import cvar, cvar_interval
 
 
 def optimality_gap(values: ArrayLike, target: float = 1.0) -> np.ndarray:

@@ -6,12 +6,14 @@ from typing import Any
 
 import altair as alt
 
-from mjx_reinforce.reports.palette import colour, dash, in_light
+from mjx_reinforce.reports.page.palette import colour, dash, in_light
 
 #: A data set of one row, of what is drawn once.
 ONE = {"one": {"row": [0]}}
 #: Layers over one another.
 Chart = alt.LayerChart | alt.FacetChart
+#: Pixels of a configuration's name in a legend, at most.
+_LABEL_LIMIT = 420
 _IS_SHOWN = "indexof(shown, datum.configuration) >= 0"
 _FONT = "ui-sans-serif, system-ui, 'Helvetica Neue', Arial, 'Liberation Sans', sans-serif"
 
@@ -37,7 +39,13 @@ def config() -> dict[str, Any]:
             "titleY": -12,
             "titleX": 0,
         },
-        "legend": {**text, **sizes, "symbolStrokeWidth": 2.5, "symbolSize": 300, "labelLimit": 420},
+        "legend": {
+            **text,
+            **sizes,
+            "symbolStrokeWidth": 2.5,
+            "symbolSize": 300,
+            "labelLimit": _LABEL_LIMIT,
+        },
         "text": {"color": "var(--ink)", "fontSize": 12},
         "rule": {"color": "var(--soft)"},
     }
@@ -87,26 +95,31 @@ def series(labels: Sequence[str], *, legend: bool = True) -> alt.Color:
     """Returns the colours of configurations."""
     legend = legend and len(labels) > 1
     scale = alt.Scale(domain=list(labels), range=[colour(i) for i in range(len(labels))])
-    return alt.Color("configuration:N", scale=scale, legend=_legend() if legend else None)
+    return alt.Color("configuration:N", scale=scale, legend=_legend(labels) if legend else None)
 
 
 def dashes(labels: Sequence[str]) -> alt.StrokeDash:
     """Returns the dashes of configurations."""
     scale = alt.Scale(domain=list(labels), range=[dash(i) for i in range(len(labels))])
     return alt.StrokeDash(
-        "configuration:N", scale=scale, legend=_legend() if len(labels) > 1 else None
+        "configuration:N", scale=scale, legend=_legend(labels) if len(labels) > 1 else None
     )
 
 
-def _legend() -> alt.Legend:
+def _legend(labels: Sequence[str]) -> alt.Legend:
+    """Returns a legend in as many columns as the page has room for.
+
+    Not as the chart has: that is narrowed to leave room for the axis once the legend is laid out.
+    """
+    column = min(7 * max(map(len, labels)), _LABEL_LIMIT) + 50
     return alt.Legend(
         title=None,
         orient="top",
-        direction="vertical",
-        columns=alt.ExprRef("max(1, floor(width / 280))"),
+        direction="horizontal",
+        columns=alt.ExprRef(f"max(1, floor((width && containerSize()[0] || width) / {column}))"),
         values=alt.ExprRef("shown"),
         symbolType="stroke",
-        offset=26,
+        offset=36,
         symbolOpacity=1,
         labelFontSize=12,
     )
@@ -129,12 +142,11 @@ def threshold_line(threshold: float | None, axis: str) -> list[alt.Chart]:
         return []
     ground = alt.Chart(alt.NamedData("one"))
     rule = ground.mark_rule(strokeDash=[6, 4], opacity=0.8)
-    text = ground.mark_text(
-        align="left" if axis == "y" else "right",
-        dx=-5 if axis == "x" else 0,
-        dy=-6 if axis == "y" else 0,
-        color="var(--soft)",
-    )
-    where = {axis: alt.datum(threshold)}
-    named = {"y": {"x": alt.value(4)}, "x": {"y": alt.YValue(alt.ExprRef("height - 4"))}}[axis]
-    return [rule.encode(**where), text.encode(**where, **named, text=alt.value("solved"))]
+    said, name = {axis: alt.datum(threshold)}, alt.value("solved")
+    if axis == "y":  # below the line, at its end: curves come from below and end above
+        text = ground.mark_text(align="right", baseline="top", dy=5, color="var(--soft)")
+        text = text.encode(**said, x=alt.XValue(alt.ExprRef("width - 4")), text=name)
+    else:
+        text = ground.mark_text(align="right", baseline="bottom", dx=-5, color="var(--soft)")
+        text = text.encode(**said, y=alt.YValue(alt.ExprRef("height - 5")), text=name)
+    return [rule.encode(**said), text]

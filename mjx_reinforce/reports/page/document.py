@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 import jinja2
 from markupsafe import Markup
 
-from mjx_reinforce.reports import charts, palette, tables, vega, words
-from mjx_reinforce.reports.columns import Table, short
-from mjx_reinforce.reports.distributions import moments
 from mjx_reinforce.reports.experiment import count, say, spoken
-from mjx_reinforce.reports.figures import SHOWN, Figure
 from mjx_reinforce.reports.findings import COMPARED, Findings, Result
-from mjx_reinforce.reports.words import interval, number, percent, steps
+from mjx_reinforce.reports.page import charts, palette, tables, vega, words
+from mjx_reinforce.reports.page.columns import Table, short
+from mjx_reinforce.reports.page.distributions import moments
+from mjx_reinforce.reports.page.figures import SHOWN, Figure
+from mjx_reinforce.reports.page.words import interval, number, percent, steps
 
 #: What tells a page of ours from another file.
 GENERATOR = "mjx_reinforce.report"
-_FILES = resources.files("mjx_reinforce.reports") / "page_files"
+_FILES = resources.files("mjx_reinforce.reports.page") / "files"
 _METHODS = (
     "Configurations are ordered by the mean of their seeds' final returns; where means are equal, "
     "by the env steps to solve.",
@@ -108,8 +108,12 @@ def _read(name: str) -> str:
 
 
 def _unbroken(value: Any) -> Any:
-    """Returns a text in which no line ends before a percent sign, and anything else as it is."""
-    return value.replace(" %", "\u00a0%") if type(value) is str else value
+    """Returns a text in which no line breaks "95 %" and "p = 0.01", and anything else as it is."""
+    if type(value) is not str:
+        return value
+    for broken in (" %", "p = ", "p < "):
+        value = value.replace(broken, broken.replace(" ", "\u00a0"))
+    return value
 
 
 def _json(value: Any) -> str:
@@ -284,7 +288,8 @@ def _provenance(findings: Findings) -> dict[str, Any]:
 def _plain(value: Any) -> str:
     """Returns an entry of the provenance in words."""
     if isinstance(value, Mapping):
-        return "; ".join(f"{key} {_plain(item)}" for key, item in value.items() if item is not None)
+        listed = ((spoken(key), _plain(x)) for key, x in value.items() if x is not None)
+        return "; ".join(f"{key} {said}" for key, said in listed)
     if isinstance(value, list):
-        return "; ".join(map(_plain, value))
+        return ", ".join(map(_plain, value))
     return say(value)

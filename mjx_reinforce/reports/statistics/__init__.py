@@ -7,7 +7,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from mjx_reinforce.reports.bootstrap import expanded_tail, percentiles, resampled_trim_means
+from mjx_reinforce.reports.statistics.bootstrap import (
+    expanded_tail,
+    percentiles,
+    resampled_trim_means,
+)
 
 #: What an interquartile mean leaves out at each end.
 _QUARTER = 0.25

@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike
 
-from mjx_reinforce.reports import bootstrap
-from mjx_reinforce.reports.statistics import finite_or_nan, worst_if_not_finite
+from mjx_reinforce.reports.statistics import bootstrap, finite_or_nan, worst_if_not_finite
 
 #: Fewer seeds in the tail than this have no interval: at 95 % none covers, see docs/statistics.md.
 _LEAST_TAIL = 5

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from mjx_reinforce.reports.aggregates import wilson
 from mjx_reinforce.reports.statistics import Estimate, worst_if_not_finite
+from mjx_reinforce.reports.statistics.aggregates import wilson
 
 
 class Difference(NamedTuple):

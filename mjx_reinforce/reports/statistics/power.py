@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from mjx_reinforce.reports.comparisons import failures_as_worst
 from mjx_reinforce.reports.statistics import iqm
+from mjx_reinforce.reports.statistics.comparisons import failures_as_worst
 
 _DRAWS = 2000
 #: Up to so many seeds tests are drawn; beyond, means are as good as normal.

@@ -9,7 +9,14 @@ from typing import Any, Literal
 
 import altair as alt
 
-from mjx_reinforce.reports.vega import Chart, dashes, moment_line, named, series, threshold_line
+from mjx_reinforce.reports.page.vega import (
+    Chart,
+    dashes,
+    moment_line,
+    named,
+    series,
+    threshold_line,
+)
 
 #: Height of a configuration's row, in pixels.
 ROW = 66
@@ -123,7 +130,7 @@ def distribution(labels: Sequence[str], low: float, high: float) -> Chart:
     said = (
         named("moments")
         .transform_filter(of_moment)
-        .transform_calculate(base=row, top="datum.base + 0.97")
+        .transform_calculate(base=row, top="datum.base + 0.92")
     )
     text = said.mark_text(
         align="left", baseline="top", lineBreak="\n", lineHeight=15, limit=alt.ExprRef("width")

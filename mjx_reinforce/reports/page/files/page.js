@@ -164,6 +164,18 @@
   Object.values(toggles).forEach((toggle) => toggle?.addEventListener("change", async () => {
     for (const name of ["curves", "solved"]) if (name in specs) await draw(name);
   }));
+  // On paper, charts are as wide as PRINTED pixels here, whatever the window: it is not resized.
+  const PRINTED = 780;
+  const ROWS = ["final", "distribution"];  // with words between them
+  const redraw = (whole, height) => {
+    const page = document.querySelector("figure").clientWidth;
+    for (const [name, view] of Object.entries(views)) {
+      if (!ROWS.includes(name)) view.height(specs[name].height * height);
+      view.width(view.container().clientWidth * whole / page).run();
+    }
+  };
+  addEventListener("beforeprint", () => redraw(PRINTED, 0.8));
+  addEventListener("afterprint", () => redraw(document.querySelector("figure").clientWidth, 1));
   if (slider) {
     const output = document.getElementById("moment-said");
     const tell = () => {
