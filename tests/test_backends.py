@@ -12,6 +12,7 @@ from mjx_reinforce import fused
 from mjx_reinforce.fused import folding, ops
 from mjx_reinforce.fused.backends import BACKENDS
 from mjx_reinforce.fused.backends.backend import Backend
+from mjx_reinforce.fused.backends.llvm_text import Text
 from mjx_reinforce.fused.backends.xla import XLA
 from mjx_reinforce.fused.graph import Graph
 from mjx_reinforce.registry import load
@@ -37,10 +38,12 @@ SETTINGS = {
         "read": lambda place: jnp.linspace(1.0, 2.0, 4),
         "batch_shape": (4,),
         "any_lane": fused.any_lane,
-    }
+    },
+    "llvm": {"text": Text(4), "inputs": lambda number: ("%input", np.dtype(np.float32))},
 }
 PARAMS = {
     "convert_element_type": {"new_dtype": np.dtype(np.int32)},
+    "bitcast_convert_type": {"new_dtype": np.dtype(np.int32)},
     "reduce_precision": {"exponent_bits": 8, "mantissa_bits": 7},
     "round": {"rounding_method": lax.RoundingMethod.TO_NEAREST_EVEN},
 }
@@ -61,7 +64,7 @@ def operands_of(name):
 
 
 def dtype_of(op, operands):
-    if op.name == "convert_element_type":
+    if "new_dtype" in dict(op.params):
         return dict(op.params)["new_dtype"]
     return np.dtype(bool) if ops.FACTS[op.name].is_predicate else operands[-1].dtype
 
@@ -96,7 +99,7 @@ def test_constants_fold_to_what_jax_computes(name):
     assert (folded.dtype, np.ndim(folded)) == (dtype, 0)
     assert np.isfinite(folded)
     for num_lanes in {1, len(operands)}:
-        graph = Graph(branch_cost=0, unrolled=0)
+        graph = Graph(branch_cost=0, unrolled=0, unrolled_arrays=0)
         leaves = [graph.leaf(x.dtype, True, position=(0, i)) for i, x in enumerate(operands)]
         mixed = (*leaves[:num_lanes], *operands[num_lanes:])
         backend = XLA(lambda place: jnp.full(2, operands[place[1]]), (2,), fused.any_lane)
@@ -107,7 +110,7 @@ def test_constants_fold_to_what_jax_computes(name):
 
 @pytest.mark.parametrize("name", [n for n, facts in ops.FACTS.items() if facts.commutes])
 def test_operations_that_commute_are_shared(name):
-    graph = Graph(branch_cost=0, unrolled=0)
+    graph = Graph(branch_cost=0, unrolled=0, unrolled_arrays=0)
     x, y = (graph.leaf(operands_of(name)[0].dtype, True) for _ in range(2))
     assert graph.call(name, x, y) is graph.call(name, y, x)
 

@@ -42,11 +42,12 @@ def cond_rule(
 def _choose_among(graph: Graph, branches: list[Branch], choice: Node) -> list[Scalar]:
     """Returns the results of the branch that each lane takes."""
     order = range(len(branches))
-    if len(branches) == 2 and _try(graph, branches[0])[0]:
+    if len(branches) == 2 and _try(graph, branches[0], 0)[0]:
         order = (1, 0)  # the cheap branch first: its results are what a skipped one falls back on
     results: list[Scalar] | None = None
     for k in order:
-        results = _merge(graph, branches[k], _takes(graph, choice, k, len(branches)), results)
+        needed = _takes(graph, choice, k, len(branches))
+        results = _merge(graph, branches[k], k, needed, results)
     return results or []
 
 
@@ -63,12 +64,12 @@ def _takes(graph: Graph, choice: Node, k: int, count: int) -> Scalar:
 
 
 def _merge(
-    graph: Graph, branch: Branch, needed: Scalar, fallback: list[Scalar] | None
+    graph: Graph, branch: Branch, k: int, needed: Scalar, fallback: list[Scalar] | None
 ) -> list[Scalar]:
-    """Adds one branch's results to those of the branches before it."""
-    expensive, trial = _try(graph, branch)
+    """Adds the results of branch k to those of the branches before it."""
+    expensive, dtypes = _try(graph, branch, k)
     if expensive and isinstance(needed, Node) and needed not in graph.certain:
-        return _gate(graph, branch, needed, fallback or [x.dtype.type(0) for x in trial])
+        return _gate(graph, branch, needed, fallback or [dtype.type(0) for dtype in dtypes])
     results = branch()
     return results if fallback is None else _select(graph, needed, results, fallback)
 
@@ -85,11 +86,19 @@ def _gate(graph: Graph, branch: Branch, needed: Node, cold: list[Scalar]) -> lis
     return [off if out is None else out for out, off in zip(gate.outs, cold, strict=True)]
 
 
-def _try(graph: Graph, branch: Branch) -> tuple[bool, list[Scalar]]:
-    """Returns whether a branch is expensive, and its results; what it makes is dropped."""
-    with graph.branch() as scope:
-        results = branch()
-    return scope.has_loop or scope.cost > graph.branch_cost, results
+def _try(graph: Graph, branch: Branch, k: int) -> tuple[bool, list[np.dtype]]:
+    """Returns whether branch k is expensive, and the dtypes of its results.
+
+    What it makes is dropped. A branch that was expensive once remains so where less is assumed.
+    """
+    place = (graph.path, "expensive", k)
+    if place not in graph.learned:
+        with graph.branch() as scope:
+            dtypes = [result.dtype for result in branch()]
+        if not scope.has_loop and scope.cost <= graph.branch_cost:
+            return False, dtypes
+        graph.learned[place] = dtypes
+    return True, graph.learned[place]
 
 
 def _select(graph: Graph, needed: Scalar, on: list[Scalar], off: list[Scalar]) -> list[Scalar]:

@@ -46,12 +46,14 @@ def _apply(graph: Graph, eqn: Any, used: list[bool], operands: list[np.ndarray])
     """Applies the rule of one equation; what has no rule may call a program that can be run."""
     name = eqn.primitive.name
     if name in _CONTROL:
-        return _CONTROL[name](graph, functools.partial(run, graph), eqn, used, *operands)
+        with graph.evaluating(eqn):
+            return _CONTROL[name](graph, functools.partial(run, graph), eqn, used, *operands)
     if name in _RULES:
         return _settled(eqn, _RULES[name](graph, eqn, *operands))
     program = jaxprs.callee(eqn)
     if program is not None:
-        return run(graph, program, operands, used)
+        with graph.evaluating(eqn):
+            return run(graph, program, operands, used)
     if all(map(arrays.is_numeric, operands)):
         return jaxprs.evaluate(eqn.primitive.bind, eqn.params, operands)
     raise UnsupportedPrimitive(name, jaxprs.source(eqn))

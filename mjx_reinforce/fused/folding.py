@@ -24,6 +24,8 @@ def fold(op: Op, operands: Sequence[Any], dtype: np.dtype) -> Any:
     name = op.name
     if name == "convert_element_type":
         result = np.asarray(operands[0]).astype(dtype)
+    elif name == "bitcast_convert_type":
+        result = np.asarray(operands[0]).view(dtype)
     elif name in _BY_NUMPY:
         result = _BY_NUMPY[name](*operands)
     else:

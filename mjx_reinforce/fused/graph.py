@@ -6,7 +6,7 @@ of a branch, because then it would run also where the branch is skipped.
 """
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from typing import Any
 
 import numpy as np
@@ -24,13 +24,21 @@ class Graph:
         branch_cost: a branch of more scalar operations than this is skipped where no element of
             the batch needs it.
         unrolled: a scan that reads and makes no arrays is written out up to this length.
+        unrolled_arrays: one that reads or makes arrays is written out up to this length.
+        path: the equations that are being evaluated, from the outermost one, by their ids.
+        learned: what was found out on a path. The body of a loop is evaluated again and again, each
+            time with less assumed of what never changes, and what was found out inside still holds.
         certain: predicates of the branches and loops around the present scope. Its code runs only
             if each of them is true for at least one element of the batch.
     """
 
-    def __init__(self, branch_cost: int, unrolled: int):
+    def __init__(self, branch_cost: int, unrolled: int, unrolled_arrays: int):
         self.branch_cost = branch_cost
         self.unrolled = unrolled
+        self.unrolled_arrays = unrolled_arrays
+        self.path: tuple[int, ...] = ()
+        self.learned: dict[Hashable, Any] = {}
+        self._evaluated: dict[int, Any] = {}  # kept, so that no id is given twice
         self.certain: set[Node] = set()
         self._scopes = [Scope(depth=0, floor=0)]
         self._count = 0
@@ -45,6 +53,16 @@ class Graph:
     def captures(self) -> bool:
         """Whether the program closes over an array whose value is not known yet."""
         return bool(self._captured)
+
+    @contextlib.contextmanager
+    def evaluating(self, eqn: Any) -> Iterator[None]:
+        """Lengthens the path by an equation."""
+        self._evaluated[id(eqn)] = eqn
+        before, self.path = self.path, (*self.path, id(eqn))
+        try:
+            yield
+        finally:
+            self.path = before
 
     @contextlib.contextmanager
     def loop_body(self) -> Iterator[Scope]:

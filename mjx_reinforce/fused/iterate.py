@@ -34,7 +34,8 @@ def iterate(
 
     Every carry is first assumed to keep its initial value. The body is evaluated on that
     assumption, carries that break it are dropped from it, and so on until it holds: then it holds
-    in every iteration. The same is done for 'all lanes agree'.
+    in every iteration. The same is done for 'all lanes agree'. Where this loop was built before, as
+    part of an outer loop's body, that begins with what was found then.
 
     Args:
         graph: where the loop is made.
@@ -45,8 +46,12 @@ def iterate(
         xs: for each element, its value in each iteration.
     """
     plan = _Plan(step, list(inits), length, active, list(xs))
-    fixed = [True] * len(plan.inits)
-    varying = [varies(init) for init in plan.inits]
+    place = (graph.path, active)
+    fixed, varying = graph.learned.get(place) or (
+        [True] * len(plan.inits),
+        [False] * len(plan.inits),
+    )
+    varying = [v or varies(init) for v, init in zip(varying, plan.inits, strict=True)]
     while True:
         loop = _trace_body(graph, plan, fixed, varying)
         moved = [f and not same(n, i) for f, n, i in zip(fixed, loop.nexts, inits, strict=True)]
@@ -54,6 +59,7 @@ def iterate(
         fixed = [f and not m for f, m in zip(fixed, moved, strict=True)]
         varying = [v or s for v, s in zip(varying, spread, strict=True)]
         if not any(moved) and not any(s and not f for s, f in zip(spread, fixed, strict=True)):
+            graph.learned[place] = fixed, varying
             return _close(graph, loop, varying)
 
 

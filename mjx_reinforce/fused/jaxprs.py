@@ -5,6 +5,8 @@ moves something, it moves here.
 """
 
 import functools
+import hashlib
+import re
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -48,6 +50,38 @@ def trace(fn: Callable, *examples: Any) -> tuple[Program, Any]:
     return program(closed), out_shape
 
 
+def fingerprint(traced: Program) -> str:
+    """Returns a hash of a program and of the constants in it, the same in every process."""
+    digest = hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)).encode())
+    for const in [*traced.consts, *_inner_constants(traced.jaxpr)]:
+        value = as_numpy(const)
+        if value is None:
+            digest.update(b"unknown")
+        else:
+            digest.update(f"{value.dtype}{value.shape}".encode() + value.tobytes())
+    return digest.hexdigest()
+
+
+def _inner_constants(jaxpr: core.Jaxpr) -> list[Any]:
+    """Returns the constants of the programs that a program calls."""
+    found = []
+    for eqn in jaxpr.eqns:
+        for inner in _subprograms(eqn.params.values()):
+            found += [*inner.consts, *_inner_constants(inner.jaxpr)]
+    return found
+
+
+def _subprograms(params: Iterable[Any]) -> list[Program]:
+    """Returns the programs among the parameters of an equation."""
+    found = []
+    for value in params:
+        if isinstance(value, (tuple, list)):
+            found += _subprograms(value)
+        elif isinstance(value, (core.Jaxpr, core.ClosedJaxpr)):
+            found.append(program(value))
+    return found
+
+
 def program(closed: Any) -> Program:
     """Returns the program of a closed or an open jaxpr."""
     return Program(getattr(closed, "jaxpr", closed), list(getattr(closed, "consts", ())))
@@ -61,6 +95,13 @@ def callee(eqn: Any) -> Program | None:
     if eqn.primitive.name == "call_hi_primitive":  # JAX 0.12: composite primitives
         avals = [variable.aval for variable in eqn.invars]
         return program(jax.make_jaxpr(eqn.params["_prim"].expand)(*avals))
+    if eqn.primitive.name == "random_bits":  # a key is an array of its words
+        implementation = eqn.invars[0].aval.dtype._impl
+        width, shape = eqn.params["bit_width"], eqn.params["shape"]
+        words = jax.ShapeDtypeStruct(implementation.key_shape, np.uint32)
+        return program(
+            jax.make_jaxpr(lambda key: implementation.random_bits(key, width, shape))(words)
+        )
     return None
 
 

@@ -45,7 +45,16 @@ _OTHERS = (
     *("asinh", "acosh", "atanh"),
 )
 _WITH_PARAMS = (
-    *("convert_element_type", "bessel_i0e", "bessel_i1e", "clz", "digamma", "erf", "erf_inv"),
+    *(
+        "convert_element_type",
+        "bitcast_convert_type",
+        "bessel_i0e",
+        "bessel_i1e",
+        "clz",
+        "digamma",
+        "erf",
+        "erf_inv",
+    ),
     *("erfc", "igamma", "igamma_grad_a", "igammac", "lgamma", "polygamma", "population_count"),
     *("round", "zeta", "random_gamma_grad", "reduce_precision", "regularized_incomplete_beta"),
     *("shift_right_arithmetic", "shift_right_logical"),

@@ -22,7 +22,7 @@ class Scalarized:
 
     Attributes:
         in_tree: the structure of its arguments.
-        in_shapes: the shape of each leaf of the arguments.
+        in_avals: shape and dtype of each leaf of the arguments.
         out_tree: the structure of its result.
         out_avals: shape and dtype of each leaf of the result.
         outputs: the scalars of each leaf of the result.
@@ -31,7 +31,7 @@ class Scalarized:
     """
 
     in_tree: Any
-    in_shapes: list[tuple[int, ...]]
+    in_avals: list[Any]
     out_tree: Any
     out_avals: list[Any]
     outputs: list[list[Scalar]]
@@ -92,8 +92,8 @@ class Scalarized:
             The result, each leaf an object array of lanes.
         """
         leaves = [
-            _lanes(leaf, shape)
-            for leaf, shape in zip(self.in_tree.flatten_up_to(args), self.in_shapes, strict=True)
+            _lanes(leaf, aval.shape)
+            for leaf, aval in zip(self.in_tree.flatten_up_to(args), self.in_avals, strict=True)
         ]
         batch_shape = np.broadcast_shapes(*(np.shape(lane) for leaf in leaves for lane in leaf))
 
@@ -129,6 +129,7 @@ def build(
     varying: Sequence[bool],
     branch_cost: int,
     unrolled: int = loops.UNROLLED_LENGTH,
+    unrolled_arrays: int = loops.UNROLLED_LENGTH,
 ) -> Scalarized:
     """Writes a function out.
 
@@ -138,10 +139,11 @@ def build(
         varying: which of their leaves differ from lane to lane.
         branch_cost: as in `scalarize`.
         unrolled: a scan that reads and makes no arrays is written out up to this length.
+        unrolled_arrays: one that reads or makes arrays is written out up to this length.
     """
     program, out_shape = jaxprs.trace(fn, *examples)
-    leaves, in_tree = jax.tree.flatten(tuple(examples))
-    graph = Graph(branch_cost, unrolled)
+    in_tree = jax.tree.structure(tuple(examples))
+    graph = Graph(branch_cost, unrolled, unrolled_arrays)
     inputs = [
         _inputs(graph, number, variable.aval, varies)
         for number, (variable, varies) in enumerate(zip(program.jaxpr.invars, varying, strict=True))
@@ -152,7 +154,7 @@ def build(
     out_avals, out_tree = jax.tree.flatten(out_shape)
     return Scalarized(
         in_tree=in_tree,
-        in_shapes=[np.shape(leaf) for leaf in leaves],
+        in_avals=[variable.aval for variable in program.jaxpr.invars],
         out_tree=out_tree,
         out_avals=out_avals,
         outputs=outputs,

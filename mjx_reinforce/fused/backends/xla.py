@@ -1,15 +1,15 @@
 """Turns the scalar graph back into JAX: one elementwise operation for each node."""
 
 import functools
-import itertools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import jax
 import numpy as np
 from jax import lax
 
 from mjx_reinforce.fused.backends.backend import Backend
+from mjx_reinforce.fused.backends.places import Places, evenly_spaced
 from mjx_reinforce.fused.backends.xla_operations import LANES_ONLY, OPERATIONS
 from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
@@ -148,37 +148,14 @@ class XLA(Backend[Any]):
     def _stack(self, row: list[Scalar], varying: bool, values: Values) -> jax.Array:
         return jax.numpy.stack([self._materialize(x, varying, values) for x in row])
 
-    def _places(self, loop: LiveLoop) -> list["_Places"]:
+    def _places(self, loop: LiveLoop) -> list[Places]:
         """Returns where each element's values are; nothing if not all can be read in a loop."""
         if not self._read_anywhere:
             return []
-        places = [place for e in loop.elements if (place := _evenly_spaced(e.values))]
+        places = [place for e in loop.elements if (place := evenly_spaced(e.values))]
         return places if len(places) == len(loop.elements) else []
 
 
 def _computed(value: Any, before: Any) -> Any:
     """Returns a constant as the result of an operation: Triton takes no literal from a loop."""
     return lax.select(lax.eq(before, before), value, value) if is_constant(value) else value
-
-
-class _Places(NamedTuple):
-    """Evenly spaced elements of one input."""
-
-    leaf: int
-    start: int
-    stride: int
-
-    def at(self, t: Any) -> tuple[int, Any]:
-        """Returns the t-th place; t may be traced."""
-        return self.leaf, self.start + self.stride * t
-
-
-def _evenly_spaced(row: Sequence[Scalar]) -> _Places | None:
-    """Returns where the elements of a row are, if they are evenly spaced in one input."""
-    if not all(isinstance(x, Node) and x.op is None and x.owner is None for x in row):
-        return None
-    leaves = {x.position[0] for x in row}
-    strides = {b.position[1] - a.position[1] for a, b in itertools.pairwise(row)}
-    if len(leaves) != 1 or len(strides) != 1:
-        return None
-    return _Places(leaves.pop(), row[0].position[1], strides.pop())

@@ -19,6 +19,7 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "atanh": lax.atanh,
     "bessel_i0e": lax.bessel_i0e,
     "bessel_i1e": lax.bessel_i1e,
+    "bitcast_convert_type": lax.bitcast_convert_type,
     "cbrt": lax.cbrt,
     "ceil": lax.ceil,
     "clz": lax.clz,

@@ -4,7 +4,8 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays, folding, ops, simplify
+from mjx_reinforce.fused import arrays, folding, jaxprs, ops, simplify
+from mjx_reinforce.fused.errors import UnsupportedPrimitive
 from mjx_reinforce.fused.graph import Graph
 
 
@@ -27,6 +28,12 @@ def _convert(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
     if eqn.invars[0].aval.dtype == aval.dtype:
         return [x]
     return [_apply(graph, ops.conversion(np.dtype(aval.dtype)), aval, (x,))]
+
+
+def _bitcast(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
+    if x.shape != eqn.outvars[0].aval.shape:
+        raise UnsupportedPrimitive("bitcast_convert_type to another size", jaxprs.source(eqn))
+    return _elementwise(graph, eqn, x)
 
 
 def _add_any(graph: Graph, eqn: Any, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
@@ -61,6 +68,7 @@ def _pow(graph: Graph, eqn: Any, x: np.ndarray, y: np.ndarray) -> list[np.ndarra
 RULES = {
     **dict.fromkeys(ops.FACTS, _elementwise),
     "convert_element_type": _convert,
+    "bitcast_convert_type": _bitcast,
     "add_any": _add_any,
     "square": _square,
     "clamp": _clamp,

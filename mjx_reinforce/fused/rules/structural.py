@@ -118,6 +118,8 @@ RULES = {
     "name": _identity,
     "optimization_barrier": _identity,
     "pvary": _identity,
+    "random_wrap": _identity,
+    "random_unwrap": _identity,
     "sharding_constraint": _identity,
     "stop_gradient": _identity,
 }

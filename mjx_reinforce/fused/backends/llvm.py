@@ -1,0 +1,169 @@
+"""Turns the scalar graph into LLVM IR: one instruction on a lane vector for each node."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import numpy as np
+
+from mjx_reinforce.fused.backends.backend import Backend
+from mjx_reinforce.fused.backends.llvm_operations import OPERATIONS
+from mjx_reinforce.fused.backends.llvm_text import Text, literal
+from mjx_reinforce.fused.backends.places import Places, evenly_spaced
+from mjx_reinforce.fused.errors import UnsupportedPrimitive
+from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
+from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
+from mjx_reinforce.fused.ops import Op
+
+
+@dataclasses.dataclass(frozen=True)
+class Memory:
+    """A value that stays in memory and is loaded wherever it is used: registers are few.
+
+    Attributes:
+        pointer: where its lane vector lies.
+        dtype: of its entries.
+    """
+
+    pointer: str
+    dtype: np.dtype
+
+
+#: An operand, or where it lies.
+Value = str | Memory
+
+
+class LLVM(Backend[Value]):
+    """Writes LLVM IR into a `Text`; a value is a lane vector."""
+
+    OPERATIONS = OPERATIONS
+
+    def __init__(self, text: Text, inputs: Callable[[int], tuple[str, np.dtype]]):
+        """Says what is written into, and where the inputs are.
+
+        Args:
+            text: the body of a function.
+            inputs: the pointer to an argument's lane vectors, one after the other, and its dtype,
+                by the argument's number. What it points to must stay as it is until the end.
+        """
+        self._text = text
+        self._inputs = inputs
+
+    def constant(self, number: Any) -> Value:
+        """A constant in every lane."""
+        return self._text.constant(number)
+
+    def leaf(self, node: Node) -> Value:
+        """An input stays in memory."""
+        if isinstance(node.owner, Captured):
+            raise UnsupportedPrimitive("an array of an outer transformation", "machine code")
+        number, position = node.position
+        pointer, dtype = self._inputs(number)
+        return Memory(self._text.at(pointer, dtype, position), dtype)
+
+    def value(self, scalar: Scalar, values: dict[Node, Value]) -> str:
+        """Returns a scalar's operand, loading it where it is in memory."""
+        value = super().value(scalar, values)
+        if isinstance(value, Memory):
+            return self._text.load(value.pointer, value.dtype)
+        return value
+
+    def node(self, node: Node, operands: list[Value]) -> Value:
+        """Writes one operation."""
+        op = cast(Op, node.op)  # leaves are not scheduled
+        kinds = [np.dtype(arg.dtype) for arg in node.args]
+        return OPERATIONS[op.name](self._text, op, node.dtype, kinds, cast(list[str], operands))
+
+    def gate(self, gate: LiveGate, values: dict[Node, Value]) -> Sequence[Value]:
+        """Writes a branch that is taken if some lane needs it."""
+        text = self._text
+        needed = text.any(self.value(gate.predicate, values))
+        cold = [self.value(out.cold, values) for out in gate.outs]
+        before, hot_block, after = text.block, text.label(), text.label()
+        text.line(f"br i1 {needed}, label %{hot_block}, label %{after}")
+        text.start(hot_block)
+        inner = self.inside(gate.body, values)
+        hot = [self.value(out.hot, inner) for out in gate.outs]
+        hot_end = text.block
+        text.line(f"br label %{after}")
+        text.start(after)
+        return [
+            text.let(f"phi {text.type(out.leaf.dtype)} [{x}, %{before}], [{y}, %{hot_end}]")
+            for out, x, y in zip(gate.outs, cold, hot, strict=True)
+        ]
+
+    def loop(
+        self, loop: LiveLoop, values: dict[Node, Value]
+    ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
+        """Writes a loop, which ends when no lane goes on or its length is reached."""
+        text = self._text
+        inits = [self.value(carry.init, values) for carry in loop.carries]
+        readers = [self._reader(e.leaf, e.values, values) for e in loop.elements]
+        kept = [text.reserve(_dtype(r.value), loop.length or 0) for r in loop.records]
+        before, head, body, after = text.block, text.label(), text.label(), text.label()
+        text.line(f"br label %{head}")
+        text.start(head)
+        holes = [text.hole() for _ in range(len(loop.carries) + 1)]
+        count, *names = [hole.name for hole in holes]
+        text.line(f"br i1 {self._goes_on(loop, count, names)}, label %{body}, label %{after}")
+        text.start(body)
+        known: dict[Node, Value] = dict(zip((c.leaf for c in loop.carries), names, strict=True))
+        for element, reader in zip(loop.elements, readers, strict=True):
+            known[element.leaf] = reader(count)
+        inner = self.inside(loop.body, values, known)
+        for record, array in zip(loop.records, kept, strict=True):
+            dtype = _dtype(record.value)
+            text.store(self.value(record.value, inner), self._text.at(array, dtype, count), dtype)
+        nexts = [self.value(carry.next, inner) for carry in loop.carries]
+        nexts = [text.let(f"add i64 {count}, 1"), *nexts]
+        kinds = ["i64", *(text.type(carry.leaf.dtype) for carry in loop.carries)]
+        for hole, kind, init, following in zip(holes, kinds, ["0", *inits], nexts, strict=True):
+            text.fill(hole, f"phi {kind} [{init}, %{before}], [{following}, %{text.block}]")
+        text.line(f"br label %{head}")
+        text.start(after)
+        return names, [
+            [
+                Memory(self._text.at(array, _dtype(r.value), t), _dtype(r.value))
+                for t in range(len(r.outs))
+            ]
+            for r, array in zip(loop.records, kept, strict=True)
+        ]
+
+    def _goes_on(self, loop: LiveLoop, count: str, carries: list[str]) -> str:
+        """Returns an i1: whether another iteration runs."""
+        text = self._text
+        conditions = []
+        if loop.length is not None:
+            conditions.append(text.let(f"icmp slt i64 {count}, {loop.length}"))
+        if loop.active is not None:
+            conditions.append(text.any(carries[loop.active]))
+        if len(conditions) == 2:
+            return text.let(f"and i1 {conditions[0]}, {conditions[1]}")
+        return conditions[0]
+
+    def _reader(
+        self, leaf: Node, row: list[Scalar], values: dict[Node, Value]
+    ) -> Callable[[str], Value]:
+        """Returns what an element is in the iteration of a number, an i64."""
+        text, dtype = self._text, leaf.dtype
+        place = evenly_spaced(row)
+        if place is not None:
+            return lambda count: self._place(place, dtype, count)
+        if all(map(is_constant, row)):
+            table = text.table(dtype, [literal(x) for x in row])
+            return lambda count: text.spread(dtype, table, count)
+        array = text.reserve(dtype, len(row))
+        for t, x in enumerate(row):
+            text.store(self.value(x, values), self._text.at(array, dtype, t), dtype)
+        return lambda count: Memory(self._text.at(array, dtype, count), dtype)
+
+    def _place(self, place: Places, dtype: np.dtype, count: str) -> Value:
+        pointer, _ = self._inputs(place.leaf)
+        step = self._text.let(f"mul i64 {count}, {place.stride}")
+        return Memory(
+            self._text.at(pointer, dtype, self._text.let(f"add i64 {step}, {place.start}")), dtype
+        )
+
+
+def _dtype(scalar: Any) -> np.dtype:
+    return np.dtype(scalar.dtype)

@@ -1,0 +1,62 @@
+"""The transcendental operations of the scalar graph in LLVM IR."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.fused.backends import (
+    llvm_exponential,
+    llvm_float64,
+    llvm_inverse_trigonometry,
+    llvm_logarithm,
+    llvm_special,
+    llvm_trigonometry,
+)
+from mjx_reinforce.fused.backends.llvm_lanes import Lanes
+from mjx_reinforce.fused.backends.llvm_text import Text
+
+_FLOAT32: dict[str, Callable[..., Lanes]] = {
+    "acos": llvm_inverse_trigonometry.acos,
+    "acosh": llvm_logarithm.acosh,
+    "asin": llvm_inverse_trigonometry.asin,
+    "asinh": llvm_logarithm.asinh,
+    "atan": llvm_inverse_trigonometry.atan,
+    "atan2": llvm_inverse_trigonometry.atan2,
+    "atanh": llvm_logarithm.atanh,
+    "cbrt": llvm_special.cbrt,
+    "cos": llvm_trigonometry.cos,
+    "cosh": llvm_exponential.cosh,
+    "erf": llvm_special.erf,
+    "erf_inv": llvm_special.erf_inv,
+    "erfc": llvm_special.erfc,
+    "exp": llvm_exponential.exp,
+    "exp2": llvm_exponential.exp2,
+    "expm1": llvm_exponential.expm1,
+    "log": llvm_logarithm.log,
+    "log1p": llvm_logarithm.log1p,
+    "logistic": llvm_exponential.logistic,
+    "pow": llvm_special.pow,
+    "sin": llvm_trigonometry.sin,
+    "sinh": llvm_exponential.sinh,
+    "tan": llvm_trigonometry.tan,
+    "tanh": llvm_exponential.tanh,
+}
+_FLOAT64: dict[str, Callable[..., Lanes]] = {
+    **{name: llvm_float64.library(name) for name in llvm_float64.LIBRARY},
+    "erf_inv": llvm_float64.erf_inv,
+    "logistic": llvm_float64.logistic,
+}
+_OF_DTYPE = {"float32": _FLOAT32, "float64": _FLOAT64}
+
+
+def _function(name: str) -> Callable[..., str]:
+    def write(text: Text, dtype: Any, *operands: str) -> str:
+        lanes = [Lanes(text, np.dtype(dtype), x) for x in operands]
+        return _OF_DTYPE[np.dtype(dtype).name][name](*lanes).name
+
+    return write
+
+
+#: name of the operation -> (where to write, float32 or float64, operands) -> the result
+FUNCTIONS: dict[str, Callable[..., str]] = {name: _function(name) for name in _FLOAT32}

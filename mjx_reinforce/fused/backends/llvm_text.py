@@ -1,0 +1,261 @@
+"""LLVM IR as text: what every part of the LLVM backend writes into."""
+
+import struct
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+
+#: The LLVM type of one value of each dtype. A bool in memory is a byte.
+_SCALARS = {
+    "bool": "i1",
+    "int8": "i8",
+    "int32": "i32",
+    "int64": "i64",
+    "uint8": "i8",
+    "uint32": "i32",
+    "uint64": "i64",
+    "float32": "float",
+    "float64": "double",
+}
+
+
+Written = TypeVar("Written")
+
+
+def scalar_type(dtype: Any) -> str:
+    """Returns the LLVM type of one value.
+
+    Raises:
+        TypeError: the dtype has none here.
+    """
+    name = np.dtype(dtype).name
+    if name not in _SCALARS:
+        raise TypeError(f"machine code is not written for values of {name}")
+    return _SCALARS[name]
+
+
+def literal(number: Any) -> str:
+    """Returns a NumPy scalar as LLVM writes it."""
+    number = np.asarray(number)
+    if number.dtype == np.bool_:
+        return "true" if number else "false"
+    if number.dtype.kind == "f":  # the bits of the double that has the same value
+        return f"0x{struct.unpack('<Q', struct.pack('<d', float(number)))[0]:016X}"
+    return str(int(number))
+
+
+class Hole(NamedTuple):
+    """An instruction that is written later.
+
+    Attributes:
+        name: its result.
+        place: the number of its line.
+    """
+
+    name: str
+    place: int
+
+
+class Text:
+    """The body of a function as it is written; a value is the text of an operand.
+
+    Attributes:
+        lanes: how many values a lane vector holds; 1 writes scalars.
+        declared: the intrinsics and library functions that were called, as declarations.
+        block: the basic block that is being written.
+    """
+
+    def __init__(self, lanes: int):
+        """Starts an empty body."""
+        self.lanes = lanes
+        self.declared: set[str] = set()
+        self.block = "start"
+        self._reserved: list[str] = []
+        self._tables: dict[str, str] = {}
+        self._lines: list[str] = []
+        self._count = 0
+        self._known: dict[Hashable, Any] = {}
+
+    def function(self, signature: str) -> str:
+        """Returns a module with a function of this signature, such as "void @f(ptr %x)"."""
+        tables = [f"{name} = internal constant {table}" for table, name in self._tables.items()]
+        body = ["entry:", *self._reserved, "  br label %start", "start:", *self._lines]
+        lines = [*tables, f"define {signature} {{", *body, "}", *sorted(self.declared)]
+        return "\n".join(lines) + "\n"
+
+    def type(self, dtype: Any) -> str:
+        """Returns the type of a lane vector."""
+        scalar = scalar_type(dtype)
+        return scalar if self.lanes == 1 else f"<{self.lanes} x {scalar}>"
+
+    def constant(self, number: Any) -> str:
+        """Returns a NumPy scalar as a lane vector that has it in every lane."""
+        if self.lanes == 1:
+            return literal(number)
+        return f"splat ({scalar_type(np.asarray(number).dtype)} {literal(number)})"
+
+    def line(self, text: str) -> None:
+        """Writes an instruction that has no result."""
+        self._lines.append(f"  {text}")
+
+    def let(self, expression: str) -> str:
+        """Writes an instruction; returns its result."""
+        name = self.name()
+        self._lines.append(f"  {name} = {expression}")
+        return name
+
+    def name(self) -> str:
+        """Returns a name that is used nowhere else."""
+        self._count += 1
+        return f"%v{self._count}"
+
+    def call(self, function: str, dtype: Any, *operands: str) -> str:
+        """Calls an intrinsic such as "llvm.sqrt" on lane vectors of one dtype."""
+        kind = self.type(dtype)
+        scalar = {"float": "f32", "double": "f64"}.get(scalar_type(dtype), scalar_type(dtype))
+        suffix = scalar if self.lanes == 1 else f"v{self.lanes}{scalar}"
+        name = f"@{function}.{suffix}"
+        self.declared.add(f"declare {kind} {name}({', '.join([kind] * len(operands))})")
+        return self.let(f"call {kind} {name}({', '.join(f'{kind} {x}' for x in operands)})")
+
+    def label(self) -> str:
+        """Returns the name of a basic block to come."""
+        self._count += 1
+        return f"b{self._count}"
+
+    def start(self, block: str) -> None:
+        """Begins a basic block."""
+        self._lines.append(f"{block}:")
+        self.block = block
+        self._known = {}
+
+    def once(self, key: Hashable, write: Callable[[], Written]) -> Written:
+        """Returns what was written under a key where it is known to have been, or writes it.
+
+        It is known until the next `start`, but that what is done `unless_none` ends no knowledge.
+        """
+        if key not in self._known:
+            self._known[key] = write()
+        return self._known[key]
+
+    def unless_none(self, mask: str) -> AbstractContextManager[None]:
+        """Writes what is done only if some lane of a mask is set."""
+        return self.when(self.any(mask))
+
+    def phi(self, dtype: Any, values: dict[str, str]) -> str:
+        """Returns at the start of a basic block the value of the block from which it is entered."""
+        pairs = ", ".join(f"[{value}, %{block}]" for block, value in values.items())
+        return self.let(f"phi {self.type(dtype)} {pairs}")
+
+    def any(self, mask: str) -> str:
+        """Returns an i1: whether some lane of a mask is set."""
+        if self.lanes == 1:
+            return mask
+        kind = f"<{self.lanes} x i1>"
+        name = f"@llvm.vector.reduce.or.v{self.lanes}i1"
+        self.declared.add(f"declare i1 {name}({kind})")
+        return self.let(f"call i1 {name}({kind} {mask})")
+
+    @contextmanager
+    def when(self, condition: str) -> Iterator[None]:
+        """Writes what is done only if an i1 is set; what is known before stays known."""
+        inside, after = self.label(), self.label()
+        known = self._known
+        self.line(f"br i1 {condition}, label %{inside}, label %{after}")
+        self.start(inside)
+        yield
+        self.line(f"br label %{after}")
+        self.start(after)
+        self._known = known
+
+    def hole(self) -> Hole:
+        """Leaves a line for an instruction that reads what comes later."""
+        self._lines.append("")
+        return Hole(self.name(), len(self._lines) - 1)
+
+    def fill(self, hole: Hole, expression: str) -> None:
+        """Writes the instruction of a hole."""
+        self._lines[hole.place] = f"  {hole.name} = {expression}"
+
+    def reserve(self, dtype: Any, count: int) -> str:
+        """Returns a pointer to room for lane vectors, which lasts until the function returns."""
+        name = self.name()
+        self._reserved.append(f"  {name} = alloca [{count} x {self.type(dtype)}], align 64")
+        return name
+
+    def table(self, dtype: Any, literals: list[str]) -> str:
+        """Returns a pointer to constant scalars."""
+        scalar = scalar_type(dtype)
+        entries = ", ".join(f"{scalar} {x}" for x in literals)
+        text = f"[{len(literals)} x {scalar}] [{entries}]"
+        return self._tables.setdefault(text, f"@t{len(self._tables)}")
+
+    def spread(self, dtype: Any, table: str, index: str) -> str:
+        """Returns an entry of a table in every lane."""
+        scalar = scalar_type(dtype)
+        place = self.let(f"getelementptr inbounds {scalar}, ptr {table}, i64 {index}")
+        return self.broadcast(scalar, self.let(f"load {scalar}, ptr {place}"))
+
+    def broadcast(self, scalar: str, value: str) -> str:
+        """Returns a scalar in every lane."""
+        if self.lanes == 1:
+            return value
+        kind = f"<{self.lanes} x {scalar}>"
+        first = self.let(f"insertelement {kind} poison, {scalar} {value}, i64 0")
+        none = f"<{self.lanes} x i32> zeroinitializer"
+        return self.let(f"shufflevector {kind} {first}, {kind} poison, {none}")
+
+    def at(self, pointer: str, dtype: Any, index: int | str) -> str:
+        """Returns the pointer to a lane vector of an array of them."""
+        return self.let(f"getelementptr inbounds {self.type(dtype)}, ptr {pointer}, i64 {index}")
+
+    def load(self, pointer: str, dtype: Any) -> str:
+        """Loads a lane vector."""
+        return self.let(f"load {self.type(dtype)}, ptr {pointer}")
+
+    def store(self, value: str, pointer: str, dtype: Any) -> None:
+        """Stores a lane vector."""
+        self.line(f"store {self.type(dtype)} {value}, ptr {pointer}")
+
+    def scatter(self, value: str, base: str, index: str, mask: str, dtype: Any) -> None:
+        """Stores each lane's value at its own index of an array, where the mask is set."""
+        scalar, kind, lanes = scalar_type(dtype), self.type(dtype), self.lanes
+        if lanes == 1:
+            with self.when(mask):
+                place = self.let(f"getelementptr inbounds {scalar}, ptr {base}, i64 {index}")
+                self.line(f"store {scalar} {value}, ptr {place}")
+            return
+        places = self.let(f"getelementptr inbounds {scalar}, ptr {base}, <{lanes} x i64> {index}")
+        bits = {"float": "f32", "double": "f64"}.get(scalar, scalar)
+        name = f"@llvm.masked.scatter.v{lanes}{bits}.v{lanes}p0"
+        pointers, bools = f"<{lanes} x ptr>", f"<{lanes} x i1>"
+        self.declared.add(f"declare void {name}({kind}, {pointers}, i32, {bools})")
+        align = np.dtype(dtype).itemsize
+        self.line(
+            f"call void {name}({kind} {value}, {pointers} {places}, i32 {align}, {bools} {mask})"
+        )
+
+    def mask(self, flags: str) -> str:
+        """Returns a vector of bools as an integer of as many bits."""
+        if self.lanes == 1:
+            return flags
+        return self.let(f"bitcast {self.type(bool)} {flags} to i{self.lanes}")
+
+    def bit(self, mask: str, number: int) -> str:
+        """Returns an i1: whether a bit of a mask is set."""
+        if self.lanes == 1:
+            return mask
+        masked = self.let(f"and i{self.lanes} {mask}, {1 << number}")
+        return self.let(f"icmp ne i{self.lanes} {masked}, 0")
+
+    def saturate(self, dtype: Any, before: Any, value: str) -> str:
+        """Converts a float to the nearest integer that there is, and NaN to 0."""
+        sign = "s" if np.dtype(dtype).kind == "i" else "u"
+        new, old = self.type(dtype), self.type(before)
+        lanes = "" if self.lanes == 1 else f"v{self.lanes}"
+        bits = {"float": "f32", "double": "f64"}[scalar_type(before)]
+        name = f"@llvm.fpto{sign}i.sat.{lanes}{scalar_type(dtype)}.{lanes}{bits}"
+        self.declared.add(f"declare {new} {name}({old})")
+        return self.let(f"call {new} {name}({old} {value})")

@@ -1,0 +1,88 @@
+"""Sine, cosine and tangent of float32 lanes."""
+
+from mjx_reinforce.fused.backends.llvm_lanes import Lanes
+
+#: x + _ROUND - _ROUND is the integer nearest to x, |x| < 2^22, and the lowest bits of x + _ROUND
+#: are those of that integer.
+_ROUND = 1.5 * 2.0**23
+#: pi / 2 in three parts; the first has 8 bits, so that its product with 16 bits is exact.
+_HALF_PI = (1.5703125, 0.0004838267923332751, 2.5633440682570896e-12)
+#: Up to here the three parts leave an error below 1e-6, with fused operations below 1e-9.
+_LARGE = 1e5
+SIGN = -(2**31)
+#: The first 192 binary digits of 2^-8 / (2 pi).
+_TURN = (0x0028BE60DB939105, 0x4A7F09D5F47D4D37, 0x7036D8A5664F10E4)
+
+
+def _large(x: Lanes) -> tuple[Lanes, Lanes]:
+    """Returns x - n pi / 2 within pi / 4 and the last bits of the integer n, for x > 65,536.
+
+    After Payne and Hanek: x is an integer of 24 bits times 2^e, and of its product with
+    1 / (2 pi) what is not a whole turn is in the 64 digits that start at digit e.
+    """
+    bits = x.bits()
+    integer = ((bits & 0x7FFFFF) | 0x800000).convert("zext", "int64")
+    start = ((bits >> 23) - (127 + 23 - 8)).convert("zext", "int64")
+    low, middle, high = (start.like(digits) for digits in _TURN)
+    first = start < 64
+    turn = integer * first.where(low, middle).call("fshl", first.where(middle, high), start)
+    n = (turn + 2**61) >> 62
+    rest = ((turn - (n << 62)) >> 32).convert("trunc", "int32").convert("sitofp", "float32")
+    rest = (x < float("inf")).where(rest * (6.283185307179586 / 2**32), float("nan"))
+    return rest, n.convert("trunc", "int32")
+
+
+def _reduced(x: Lanes) -> tuple[Lanes, Lanes]:
+    """Returns x - n pi / 2 within pi / 4 and the last bits of the integer n, for x >= 0."""
+    rounded = x * (2 / 3.141592653589793) + _ROUND
+    n = rounded - _ROUND
+    small = x - n * _HALF_PI[0] - n * _HALF_PI[1] - n * _HALF_PI[2], rounded.bits()
+    is_large = x > _LARGE
+    before = x.text.block
+    with x.text.unless_none(is_large.name):
+        large = [is_large.where(*pair) for pair in zip(_large(x), small, strict=True)]
+        inside = x.text.block
+    rest, n = (
+        a._replace(name=x.text.phi(a.dtype, {before: a.name, inside: b.name}))
+        for a, b in zip(small, large, strict=True)
+    )
+    return rest, n
+
+
+def _sine_and_cosine(x: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """Returns sine and cosine of |x| - n pi / 2, within pi / 4, and the last bits of n."""
+
+    def write() -> tuple[Lanes, Lanes, Lanes]:
+        rest, n = _reduced(abs(x))
+        square = rest * rest
+        # Cephes, sinf.c and cosf.c.
+        sine = square.polynomial(-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1)
+        cosine = square.polynomial(
+            2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2
+        )
+        sine = sine * (square * rest) + rest
+        return sine, cosine * (square * square) + (square * -0.5 + 1), n
+
+    return x.text.once(("sine and cosine", x.name), write)
+
+
+def sin(x: Lanes) -> Lanes:
+    """Returns the sine."""
+    sine, cosine, n = _sine_and_cosine(x)
+    size = ((n & 1).compare("eq", 0)).where(sine, cosine)
+    return (size.bits() ^ ((x.bits() ^ (n << 30)) & SIGN)).bits()
+
+
+def cos(x: Lanes) -> Lanes:
+    """Returns the cosine."""
+    sine, cosine, n = _sine_and_cosine(x)
+    size = ((n & 1).compare("eq", 0)).where(cosine, sine)
+    return (size.bits() ^ (((n + 1) << 30) & SIGN)).bits()
+
+
+def tan(x: Lanes) -> Lanes:
+    """Returns the tangent."""
+    sine, cosine, n = _sine_and_cosine(x)
+    is_even = (n & 1).compare("eq", 0)
+    size = is_even.where(sine, cosine) / is_even.where(cosine, sine)
+    return (size.bits() ^ ((x.bits() ^ (n << 31)) & SIGN)).bits()
