@@ -59,6 +59,8 @@ class Trajectory:
     reward: [T, N] what the action earned; zero where the episode is over
     mask: [T, N] True while the episode runs, its last step included
     nonfinite: [N] True where the simulation left the finite numbers
+    simulated: [] int32, env steps that were simulated for these episodes, those in which an
+      episode was over already included
     """
 
     observation: jax.Array
@@ -66,6 +68,16 @@ class Trajectory:
     reward: jax.Array
     mask: jax.Array
     nonfinite: jax.Array
+    simulated: jax.Array
+
+    def first(self, steps: int) -> "Trajectory":
+        """Returns the first so many steps of every episode."""
+        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            observation=self.observation[:steps],
+            action=self.action[:steps],
+            reward=self.reward[:steps],
+            mask=self.mask[:steps],
+        )
 
 
 def action_space(env: Environment) -> Box | Discrete:

@@ -32,6 +32,7 @@ def make_trajectory(lengths, horizon, poison=0.0):
         reward=jnp.asarray(mask, float),
         mask=jnp.asarray(mask),
         nonfinite=jnp.zeros(len(lengths), bool),
+        simulated=jnp.int32(mask.size),
     )
 
 

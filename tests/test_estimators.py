@@ -32,6 +32,7 @@ def make_trajectory(mask=MASK, observation=0.0, action=0.0, reward=0.0):
         reward=jnp.asarray(np.where(mask, REWARD, reward)),
         mask=jnp.asarray(mask),
         nonfinite=jnp.zeros(mask.shape[1], bool),
+        simulated=jnp.int32(mask.size),
     )
 
 

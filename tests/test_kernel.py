@@ -8,12 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from players import actor_and_act, assert_same_episodes
 from toys import Chain, Survive, ToyState, categorical
 
-from mjx_reinforce import envs, fused, mlp_policy, normal, types
+from mjx_reinforce import envs, fused
 from mjx_reinforce.engines import kernel, rollouts
-from mjx_reinforce.policies import normalize
-from mjx_reinforce.policies.actor import Actor
 
 HORIZON = 24  # one chunk; a fresh pendulum falls after 6 to 30 steps
 
@@ -21,30 +20,6 @@ HORIZON = 24  # one chunk; a fresh pendulum falls after 6 to 30 steps
 @pytest.fixture(scope="module")
 def pendulum():
     return envs.make("InvertedPendulum-v5")
-
-
-def actor_and_act(env, hidden_sizes, seed=0, distribution=None):
-    size = types.observation_size(env)
-    policy = mlp_policy(size, distribution or normal(types.action_space(env)), hidden_sizes)
-    key = jax.random.key(seed)
-    statistics = normalize.update(
-        normalize.init(size), jax.random.normal(key, (5, 3, size)), jnp.ones((5, 3), bool), 100
-    )
-    actor = Actor(params=policy.init(key), normalizer=statistics)
-
-    def act(actor, observation):
-        return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))
-
-    return actor, act, policy.distribution
-
-
-def assert_same_episodes(got, want, *, rounding):
-    np.testing.assert_array_equal(got.mask, want.mask)
-    np.testing.assert_array_equal(got.nonfinite, want.nonfinite)
-    for name in ("observation", "action", "reward"):
-        np.testing.assert_allclose(
-            getattr(got, name), getattr(want, name), atol=rounding, rtol=rounding, err_msg=name
-        )
 
 
 @pytest.mark.parametrize("hidden_sizes", [(5, 6), (7, 5, 6)])

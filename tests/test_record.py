@@ -39,7 +39,10 @@ def block(random, num_updates, num_seeds, first):
 def evaluation(*returns):
     values = np.array(returns, np.float32)
     whole = {"eval_return": values, "eval_return_stochastic": values / 2, "eval_length": values}
-    return whole | {"simulated_steps": np.full(len(values), 7, np.int32)}
+    return whole | {
+        "simulated_steps": np.full(len(values), 7, np.int32),
+        "eval_steps": np.full(len(values), 6, np.int32),
+    }
 
 
 def filled():
@@ -101,13 +104,14 @@ def test_a_block_waits_for_its_evaluation():
 
 
 def test_a_test_counts_among_what_was_simulated():
-    """Side by side with the longest, as an evaluation."""
     record = filled()
-    fraction = record.summary("fused", 1.0, 2.0)["useful_step_fraction"]
-    simulated = record.env_steps.sum() / fraction
-    record.add_test({"simulated_steps": np.array([5, 9, 7], np.int32)})
-    more = record.summary("fused", 1.0, 2.0)["useful_step_fraction"]
-    assert record.env_steps.sum() / more == pytest.approx(simulated + 3 * 9)
+    counts = {name: int(record.arrays()[name]) for name in ("simulated", "evaluated")}
+    assert counts["evaluated"] == 3 * 3 * 6
+    tested = {"simulated_steps": np.array([5, 9, 7]), "eval_steps": np.array([4, 3, 2])}
+    record.add_test({name: x.astype(np.int32) for name, x in tested.items()})
+    useful = record.env_steps.sum() + counts["evaluated"] + 4 + 3 + 2
+    fraction = useful / (counts["simulated"] + 5 + 9 + 7)
+    assert record.summary("fused", 1.0, 2.0)["useful_step_fraction"] == pytest.approx(fraction)
 
 
 def test_a_seed_is_broken_while_nothing_of_it_is_finite():
@@ -214,6 +218,7 @@ def evaluated(reward, mask, nonfinite_episodes):
         reward=jnp.asarray(reward),
         mask=jnp.asarray(mask),
         nonfinite=jnp.asarray(nonfinite_episodes),
+        simulated=jnp.int32(mask.size),
     )
     engine = SimpleNamespace(rollout=lambda *_, **__: trajectory)
     learner = SimpleNamespace(engine=engine, act=None, policy=SimpleNamespace(distribution=None))
@@ -229,7 +234,7 @@ def test_an_evaluation_with_a_broken_episode_is_nan(broken, is_nan):
     got = [result["eval_return"], result["eval_return_stochastic"]]
     np.testing.assert_allclose(got, np.where(is_nan, np.nan, [-2.5, -4.5]), rtol=1e-6)
     assert result["eval_length"] == 2.5
-    assert result["simulated_steps"] >= 4 * 5
+    assert result["simulated_steps"] == 4 * 5
 
 
 def test_a_return_that_overflows_is_nan():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from toys import Chain, Toy, ToyState, categorical
 
-from mjx_reinforce import Distribution, Trajectory
+from mjx_reinforce import Distribution
 from mjx_reinforce.engines import rollouts
 
 #: Two entries of an action, noise added; the mode is what the network says.
@@ -111,7 +111,7 @@ def test_noise_is_drawn_by_the_chunk(horizon, chunk):
     ("length", "steps"), [(1, 50), (49, 50), (50, 50), (51, 100), (100, 100), (101, 150)]
 )
 def test_the_simulation_stops_when_all_episodes_are_over(length, steps):
-    """And ``simulated_steps`` says how many were made: whole chunks of 50 here."""
+    """And ``simulated`` says how many were made: whole chunks of 50 here."""
     made = []
 
     class Fixed(Counter):
@@ -129,7 +129,7 @@ def test_the_simulation_stops_when_all_episodes_are_over(length, steps):
     jax.effects_barrier()
     assert rollouts.episode_lengths(trajectory).tolist() == [length] * 4
     assert len(made) == steps
-    assert int(rollouts.simulated_steps(trajectory)) == 4 * steps
+    assert int(trajectory.simulated) == 4 * steps
 
 
 @pytest.mark.parametrize("entry", ["observation", "reward"])
@@ -187,7 +187,7 @@ def test_a_seed_that_stands_still_plays_nothing(active):
     assert trajectory.mask.all() == active
     if not active:
         assert all(not np.any(x) for x in jax.tree.leaves(trajectory))
-        assert int(rollouts.simulated_steps(trajectory)) == 0
+        assert int(trajectory.simulated) == 0
 
 
 def test_seeds_side_by_side_are_each_its_own():
@@ -236,16 +236,18 @@ def test_discrete_actions_have_no_last_axis():
         ([18, 1], 51, 68),
     ],
 )
-def test_simulated_steps_by_hand(lengths, horizon, expected):
-    mask = jnp.arange(horizon)[:, None] < jnp.array(lengths)
-    empty = jnp.zeros((horizon, 2))
-    trajectory = Trajectory(
-        observation=empty[..., None],
-        action=empty[..., None],
-        reward=jnp.where(mask, 0.5, 0.0),
-        mask=mask,
-        nonfinite=jnp.zeros(2, bool),
-    )
-    assert int(rollouts.simulated_steps(trajectory)) == expected
-    assert rollouts.episode_lengths(trajectory).tolist() == lengths
-    np.testing.assert_allclose(rollouts.episode_returns(trajectory), 0.5 * np.array(lengths))
+def test_simulated_steps_of_seeds_side_by_side(lengths, horizon, expected):
+    """All seeds are simulated until the last is over, in whole chunks."""
+
+    def one(length):
+        class Fixed(Counter):
+            def reset(self, rng):
+                return super().reset(rng).replace(info=(length - 0.5) / horizon)
+
+        actor, size = jnp.array([0.1, 2.0]), {"num_episodes": 1, "horizon": horizon}
+        env, key = Fixed(length=horizon), jax.random.key(0)
+        return rollouts.rollout(env, act, actor, PLAIN, key, active=length > 0, **size)
+
+    trajectory = jax.vmap(one)(jnp.array(lengths))
+    assert int(jnp.sum(trajectory.simulated)) == expected
+    assert jax.vmap(rollouts.episode_lengths)(trajectory)[:, 0].tolist() == lengths

@@ -1,12 +1,14 @@
 """The choice of an engine: the same episodes, from the same noise, at different speeds.
 
 ``vmap`` maps the environment's step with ``jax.vmap``. ``fused`` writes it out in
-scalars and lets XLA fuse what is left (``mjx_reinforce.fused``). ``kernel`` writes
-out the whole step, policy included, and repeats it in one kernel on an NVIDIA GPU
-(``mjx_reinforce.engines.kernel``). Trajectories agree up to rounding.
+scalars and lets XLA fuse what is left (``mjx_reinforce.fused``). ``native`` and ``kernel`` write
+out the whole step, policy included, and repeat it in one program: machine code for a CPU
+(``mjx_reinforce.engines.native``), a kernel on an NVIDIA GPU (``mjx_reinforce.engines.kernel``).
+Trajectories agree up to rounding.
 """
 
 import functools
+import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,6 +16,7 @@ import jax
 
 from mjx_reinforce import fused
 from mjx_reinforce.engines import kernel
+from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.engines.rollouts import rollout
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.registry import check_name
@@ -44,39 +47,58 @@ class Player(NamedTuple):
 class Engine(NamedTuple):
     """A way to play episodes.
 
-    name: "vmap", "fused" or "kernel"
+    name: "vmap", "fused", "native" or "kernel"
     why: the reason it was chosen, for people
     rollout: as ``mjx_reinforce.engines.rollouts.rollout``
+    seconds: wall time that making it took, most of it for machine code
     """
 
     name: str
     why: str
     rollout: Callable[..., Trajectory]
+    seconds: float = 0.0
 
 
-NAMES = ("auto", "vmap", "fused", "kernel")
+NAMES = ("auto", "vmap", "fused", "native", "kernel")
 
 
-def choose(name: str, env: Environment, player: Player | None = None) -> Engine:
+def choose(
+    name: str, env: Environment, player: Player | None = None, horizon: int | None = None
+) -> Engine:
     """Returns an engine by name; "auto" is the fastest that supports the environment.
 
     Args:
       name: one of ``NAMES``.
       env: what is played.
       player: who plays it; None where every episode has parameters of its own, which
-        the kernel cannot hold.
+        the kernel and machine code cannot hold.
+      horizon: T, the time limit in steps, for machine code.
 
     Raises:
       ValueError: the name is unknown, or the engine does not support the environment.
     """
+    began = time.perf_counter()
+    engine = _choose(name, env, player, horizon)
+    return engine._replace(seconds=time.perf_counter() - began)
+
+
+def _choose(name: str, env: Environment, player: Player | None, horizon: int | None) -> Engine:
     check_name("engine", name, dict.fromkeys(NAMES))
     why = "chosen by name"
     if name == "vmap":
         return Engine(name, why, rollout)
+    against = _against_native(name, env, player, horizon)
+    if not against:
+        why = "machine code for this CPU" if name == "auto" else why
+        return Engine("native", why, native.rollout)
+    if name == "native":
+        raise ValueError(f"the native engine cannot play this: {against}; choose auto")
+    tried = name == "auto" and jax.default_backend() == "cpu"
+    instead = f"; machine code cannot play this: {against}" if tried else ""
     contacts = getattr(env, "num_contacts", 0)
     if name == "auto" and contacts:
-        why = f"the fastest for models with contacts, here up to {contacts}"
-        return Engine("vmap", why, rollout)
+        why = f"the fastest of the others for models with contacts, here up to {contacts}"
+        return Engine("vmap", why + instead, rollout)
     reason = _against_kernel(name, env, player)
     if name != "fused" and not reason:
         if name == "auto":
@@ -90,10 +112,22 @@ def choose(name: str, env: Environment, player: Player | None = None) -> Engine:
     reason = unsupported_by_fused(env, step)
     if not reason:
         why = "the env step is small enough to write out" if name == "auto" else why
-        return Engine("fused", why, functools.partial(rollout, env_step=step))
+        return Engine("fused", why + instead, functools.partial(rollout, env_step=step))
     if name == "fused":
         raise ValueError(f"the fused engine does not support this environment: {reason}")
-    return Engine("vmap", f"fused does not support this environment: {reason}", rollout)
+    why = f"fused does not support this environment: {reason}"
+    return Engine("vmap", why + instead, rollout)
+
+
+def _against_native(
+    name: str, env: Environment, player: Player | None, horizon: int | None
+) -> str | None:
+    """Returns why machine code must not play this; None if it can."""
+    if name not in ("auto", "native"):
+        return "another engine was chosen"
+    if player is None or horizon is None:
+        return "every episode has a policy of its own"
+    return native.unsupported(env, *player, horizon)
 
 
 def _against_kernel(name: str, env: Environment, player: Player | None) -> str | None:

@@ -47,7 +47,7 @@ def play_chunks(
     records: Any,
     *,
     episode_axis: int,
-) -> tuple[Any, Any]:
+) -> tuple[Any, Any, jax.Array]:
     """Plays chunk after chunk until every episode is over or the time is up.
 
     Args:
@@ -59,7 +59,8 @@ def play_chunks(
       episode_axis: of the noise, where N is; 1 as above, or -1 for [length, E, N].
 
     Returns:
-      The progress at the end, and the records.
+      The progress at the end, the records, and how many env steps [] were simulated. That counts
+      all lanes until the last episode is over, of all seeds that are vmapped together.
     """
     horizon = jax.tree.leaves(records)[0].shape[0]
     length = chunk_length(horizon)
@@ -79,4 +80,5 @@ def play_chunks(
         return (chunk < horizon // length) & jnp.any(progress.alive != 0)
 
     init = (jnp.zeros((), jnp.int32), keys, progress, records)
-    return while_any(unfinished, advance, init)[2:]
+    chunks, _, progress, records = while_any(unfinished, advance, init)
+    return progress, records, chunks * length * progress.alive.size

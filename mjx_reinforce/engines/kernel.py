@@ -8,21 +8,19 @@ episodes, up to rounding.
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-from jax import lax
 from jax.experimental import pallas as pl
 
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.chunks import chunk_length, play_chunks
 from mjx_reinforce.engines.pallas_block import BLOCK, WARP, Progress, chunk_player, record_shapes
+from mjx_reinforce.engines.unit_by_unit import unit_by_unit
 from mjx_reinforce.fused import UnsupportedPrimitive, scalarized
 from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.policies.networks import MLP
 from mjx_reinforce.types import Environment, Trajectory
 
 #: A step of more scalar operations than this compiles for minutes and spills its registers.
@@ -74,7 +72,7 @@ def rollout(
     )
     shapes = record_shapes(step, horizon, episodes.size)
     length = chunk_length(horizon)
-    progress, records = play_chunks(
+    progress, records, simulated = play_chunks(
         chunk_player(step, actor, length, block, num_deterministic, interpret),
         distribution,
         noise_keys,
@@ -89,6 +87,7 @@ def rollout(
         reward=reward[:, 0],
         mask=jnp.arange(horizon)[:, None] < progress.steps[:num_episodes],
         nonfinite=progress.nonfinite[:num_episodes] != 0,
+        simulated=simulated,
     )
 
 
@@ -127,7 +126,7 @@ def _write_out(
     """Writes one step of one episode out in scalars; the actor is shared by all episodes."""
 
     def step(actor, state, noise, deterministic, alive):
-        with nn.intercept_methods(_unit_by_unit):
+        with nn.intercept_methods(unit_by_unit):
             return episode.step(
                 env.step, act, distribution, actor, state, noise, alive, deterministic
             )
@@ -141,31 +140,3 @@ def _write_out(
     num_shared = len(jax.tree.leaves(actor))
     varying = [number >= num_shared for number in range(num_leaves)]
     return scalarized.build(step, examples, varying, _BRANCH_COST, _UNROLLED)
-
-
-def _unit_by_unit(
-    call: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any], context: Any
-) -> Any:
-    """Computes an `MLP` of one observation two layers at a time, as a loop; for flax to call.
-
-    Each unit of the first layer is computed and at once added to all units of the second. Written
-    out, a network of 64 and 64 units would be a program of 9,000 operations.
-    """
-    network = context.module
-    if not (isinstance(network, MLP) and context.method_name == "__call__" and args[0].ndim == 1):
-        return call(*args, **kwargs)
-    params = network.variables["params"]
-    layers = [params[f"Dense_{i}"] for i in range(len(params))]
-    x = args[0]
-
-    def add_unit(sums, weights):
-        into, bias, out = weights
-        return sums + jnp.tanh(jnp.dot(x, into) + bias) * out, None
-
-    while len(layers) > 1:
-        first, second, *layers = layers
-        x, _ = lax.scan(
-            add_unit, second["bias"], (first["kernel"].T, first["bias"], second["kernel"])
-        )
-        x = jnp.tanh(x) if layers else x
-    return jnp.dot(x, layers[0]["kernel"]) + layers[0]["bias"] if layers else x

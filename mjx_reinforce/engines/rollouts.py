@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from mjx_reinforce.engines import episode
-from mjx_reinforce.engines.chunks import chunk_length, play_chunks
+from mjx_reinforce.engines.chunks import play_chunks
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Environment, Trajectory
 
@@ -71,7 +71,7 @@ def rollout(
     none = jnp.zeros(num_episodes, bool)
     progress = _Progress(state, none | active, none)
     records = _empty_records(step, progress, distribution, horizon)
-    progress, (observation, action, reward, mask) = play_chunks(
+    progress, (observation, action, reward, mask), simulated = play_chunks(
         lambda noise, progress: lax.scan(step, progress, noise),
         distribution,
         noise_keys,
@@ -85,6 +85,7 @@ def rollout(
         reward=reward,
         mask=mask,
         nonfinite=progress.nonfinite,
+        simulated=simulated,
     )
 
 
@@ -128,15 +129,3 @@ def episode_returns(trajectory: Trajectory) -> jax.Array:
 def episode_lengths(trajectory: Trajectory) -> jax.Array:
     """Returns how many steps [N] every episode took."""
     return jnp.sum(trajectory.mask, axis=0)
-
-
-def simulated_steps(trajectory: Trajectory) -> jax.Array:
-    """Returns how many env steps [] were simulated: N times the longest episode, in whole chunks.
-
-    This counts one seed alone. Seeds that are vmapped together all run as long as the slowest,
-    which ``runs.record.Record`` counts.
-    """
-    horizon, num_episodes = trajectory.mask.shape
-    length = chunk_length(horizon)
-    longest = jnp.max(episode_lengths(trajectory))
-    return num_episodes * length * ((longest + length - 1) // length)

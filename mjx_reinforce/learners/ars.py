@@ -258,6 +258,7 @@ def _side_by_side(trajectory: Trajectory) -> Trajectory:
         reward=join(trajectory.reward),
         mask=join(trajectory.mask),
         nonfinite=trajectory.nonfinite.reshape(-1),
+        simulated=jnp.sum(trajectory.simulated),
     )
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from mjx_reinforce.engines.choice import Engine
-from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns, simulated_steps
+from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.policy import Policy
 from mjx_reinforce.types import Environment, Trajectory
@@ -95,7 +95,8 @@ def _train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metric
       where the proposed state was not finite and the old one was kept). Then the
       diagnostics, NaN where an episode was not finite or the update was skipped:
       ``entropy``, ``kl``, ``policy_std`` (see ``diagnostics.policy_metrics``),
-      ``gradient_norm``, ``gradient_snr``, ``clipped_gradients`` (see ``updates``),
+      ``gradient_norm``, ``gradient_snr`` (of ``full_batch`` and ``ars`` alone),
+      ``clipped_gradients`` (see ``updates``),
       ``explained_variance`` (of an estimator with a baseline), and the estimator's own.
     """
     return learner.step(state)
@@ -134,6 +135,6 @@ def episode_metrics(trajectory: Trajectory) -> Metrics:
         "episode_return_max": jnp.max(returns),
         "episode_length": jnp.mean(lengths),
         "env_steps": jnp.sum(lengths),
-        "simulated_steps": simulated_steps(trajectory),
+        "simulated_steps": trajectory.simulated,
         "nonfinite_episodes": jnp.sum(trajectory.nonfinite),
     }

@@ -155,7 +155,7 @@ def print_summary(console: Console, summary: dict[str, Any], directory: Path) ->
         table.add_row("last policies, best policies, on fresh starts", f"{last:.1f}, {best:.1f}")
     table.add_row("env steps a second", f"{summary['env_steps_per_second']:,.0f}")
     useful = percent(summary["useful_step_fraction"])
-    table.add_row("steps trained on, of all simulated", useful)
+    table.add_row("steps of episodes, of all simulated", useful)
     table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")
     table.add_row("training and evaluating", f"{summary['run_seconds']:.1f} s")
     console.print(table)

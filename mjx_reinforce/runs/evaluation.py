@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns, simulated_steps
+from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.learners.learner import Learner
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.types import Environment
@@ -32,9 +32,9 @@ def evaluate(
 
     Returns:
       ``eval_return`` and ``eval_length`` [], means over the deterministic
-      episodes, ``eval_return_stochastic`` [], over the sampled ones, and
-      ``simulated_steps`` []. A return is NaN if one of its episodes left the finite
-      numbers: what that earned until then says nothing.
+      episodes, ``eval_return_stochastic`` [], over the sampled ones, ``eval_steps`` [],
+      the steps of all episodes, and ``simulated_steps`` []. A return is NaN if one of its
+      episodes left the finite numbers: what that earned until then says nothing.
     """
     trajectory = learner.engine.rollout(
         env,
@@ -53,5 +53,6 @@ def evaluate(
         "eval_return": jnp.mean(returns[:num_episodes]),
         "eval_return_stochastic": jnp.mean(returns[num_episodes:]),
         "eval_length": jnp.mean(lengths[:num_episodes]),
-        "simulated_steps": simulated_steps(trajectory),
+        "eval_steps": jnp.sum(lengths),
+        "simulated_steps": trajectory.simulated,
     }

@@ -46,7 +46,7 @@ class Record:
         }
         self._last: Arrays = {}
         self._broken_in_a_row = np.zeros(config.num_seeds, np.int64)
-        self._simulated = 0
+        self._simulated = self._evaluated = 0
 
     def arrays(self) -> Arrays:
         """Returns all that was measured, by name, for ``restore``."""
@@ -56,6 +56,7 @@ class Record:
             "seconds": np.asarray(self.seconds, np.float64),
             "broken_in_a_row": self._broken_in_a_row,
             "simulated": np.asarray(self._simulated, np.int64),
+            "evaluated": np.asarray(self._evaluated, np.int64),
         }
         tables = {name: table.columns() for name, table in self._tables.items()}
         for group, columns in (tables | {"last": self._last}).items():
@@ -75,6 +76,7 @@ class Record:
                 groups[group][name] = values
         self.updates, self.env_steps = arrays["updates"], arrays["env_steps"]
         self.seconds, self._simulated = float(arrays["seconds"]), int(arrays["simulated"])
+        self._evaluated = int(arrays["evaluated"])
         self._broken_in_a_row = arrays["broken_in_a_row"]
         self._last = groups.pop("last")
         self._tables = {name: Table(columns) for name, columns in groups.items()}
@@ -106,19 +108,12 @@ class Record:
         }
         self._tables["training"].append({name: x[made] for name, x in training.items()})
         self.env_steps, self.updates = env_steps[-1], updates[-1]
-        self._count_simulated(metrics["simulated_steps"])
+        self._simulated += _sum(metrics["simulated_steps"])
         self._remember(metrics)
         self._broken_in_a_row = nonfinite.broken_in_a_row(self._broken_in_a_row, metrics, episodes)
         met = nonfinite.nonfinite_updates(metrics)
         self._tables["nonfinite"].append(met)
         return met
-
-    def _count_simulated(self, steps: np.ndarray) -> None:
-        """Counts env steps [..., S] that were simulated side by side.
-
-        All seeds step on until the slowest is done, also those whose budget is used.
-        """
-        self._simulated += int(steps.max(axis=-1).sum()) * steps.shape[-1]
 
     def _remember(self, metrics: Arrays) -> None:
         """Keeps each seed's metrics of its last update; a seed that stands still makes none."""
@@ -150,12 +145,16 @@ class Record:
         counts = {"env_steps": self.env_steps, "episodes": episodes, "updates": self.updates}
         row = result | counts | {"seconds": np.asarray(seconds, np.float64)}
         self._tables["evaluations"].append({name: x[None] for name, x in row.items()})
-        self._count_simulated(result["simulated_steps"])
+        self._count(result)
         self.seconds = seconds
 
     def add_test(self, result: Arrays) -> None:
         """Counts what a test of final policies simulated, of ``evaluation.evaluate``."""
-        self._count_simulated(result["simulated_steps"])
+        self._count(result)
+
+    def _count(self, result: Arrays) -> None:
+        self._simulated += _sum(result["simulated_steps"])
+        self._evaluated += _sum(result["eval_steps"])
 
     def evaluated(self) -> bool:
         """Returns whether the present policies have been evaluated."""
@@ -229,6 +228,11 @@ class Record:
             "compile_seconds": compile_seconds,
             "run_seconds": run_seconds,
             "env_steps_per_second": float(env_steps / run_seconds),
-            "useful_step_fraction": float(env_steps / max(self._simulated, 1)),
+            "useful_step_fraction": float((env_steps + self._evaluated) / max(self._simulated, 1)),
             "nonfinite": nonfinite.as_events(self._tables["nonfinite"].columns()),
         }
+
+
+def _sum(steps: np.ndarray) -> int:
+    """Returns the sum of counts that may be too many for their own type."""
+    return int(steps.sum(dtype=np.int64))

@@ -7,7 +7,7 @@ import numpy as np
 COLUMNS = (
     *("seed", "update", "episodes", "env_steps", "wall_seconds"),
     *("train_return", "eval_return", "eval_return_stochastic", "eval_length", "train_length"),
-    *("entropy", "gradient_norm", "simulated_steps", "nonfinite_episodes", "skipped_update"),
+    *("entropy", "gradient_norm", "nonfinite_episodes", "skipped_update"),
     *("kl", "policy_std", "explained_variance", "gradient_snr", "clipped_gradients"),
 )
 #: Columns that an evaluation measures.
@@ -18,7 +18,6 @@ _LAST_UPDATE = {
     "train_length": "episode_length",
     "entropy": "entropy",
     "gradient_norm": "gradient_norm",
-    "simulated_steps": "simulated_steps",
     "nonfinite_episodes": "nonfinite_episodes",
     "skipped_update": "skipped_update",
     "kl": "kl",

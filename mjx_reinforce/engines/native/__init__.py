@@ -1,0 +1,1 @@
+"""The native engine: machine code for CPUs, made with llvmlite, called by XLA without Python."""

@@ -1,0 +1,78 @@
+"""JAX's random numbers, one step of a chunk at a time.
+
+JAX draws the noise of a chunk of steps at once. Its generator hashes a key and a counter (Threefry
+2x32, Salmon et al. 2011), so the numbers of one step can be had alone: they start at another count.
+Written for ``jax_threefry_partitionable``, JAX's default.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax.extend import random
+
+_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+_PARITY = 0x1BD11BDA
+
+
+def hash_pair(key: jax.Array, count: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns Threefry 2x32 with 20 rounds of the counters (0, count), two words of each.
+
+    Args:
+      key: [2] uint32.
+      count: [...] uint32.
+    """
+    keys = (key[0], key[1], key[0] ^ key[1] ^ jnp.uint32(_PARITY))
+    x, y = jnp.broadcast_to(keys[0], count.shape), count + keys[1]
+    for group in range(5):
+        for rotation in _ROTATIONS[group % 2]:
+            x = x + y
+            y = x ^ ((y << jnp.uint32(rotation)) | (y >> jnp.uint32(32 - rotation)))
+        x = x + keys[(group + 1) % 3]
+        y = y + keys[(group + 2) % 3] + jnp.uint32(group + 1)
+    return x, y
+
+
+def split(key: jax.Array) -> jax.Array:
+    """Returns the data [2, 2] of the two keys that ``jax.random.split`` makes of a key [2]."""
+    return jnp.stack(hash_pair(key, jnp.arange(2, dtype=jnp.uint32)), axis=-1)
+
+
+def at_counter(key: jax.Array, count: jax.Array) -> jax.Array:
+    """Returns a key whose numbers are those that another key gives from a count on.
+
+    Args:
+      key: [2] uint32, the data of the other key.
+      count: [] uint32, how many numbers are skipped.
+    """
+    return jax.random.wrap_key_data(jnp.append(key, count), impl=_implementation())
+
+
+def _bits(data: jax.Array, width: int, shape: tuple[int, ...]) -> jax.Array:
+    """Draws random bits, as JAX's generator does for arrays of any shape."""
+    size = 1
+    for length in shape:
+        size *= length
+    x, y = hash_pair(data[:2], data[2] + jnp.arange(size, dtype=jnp.uint32))
+    if width == 64:
+        bits = (x.astype(jnp.uint64) << jnp.uint64(32)) | y.astype(jnp.uint64)
+    else:
+        bits = (x ^ y).astype(f"uint{width}")
+    return bits.reshape(shape)
+
+
+def _refuse(*_: object) -> jax.Array:
+    raise NotImplementedError("noise that is drawn with more than one key")
+
+
+@functools.cache
+def _implementation() -> object:
+    return random.define_prng_impl(
+        key_shape=(3,),
+        seed=_refuse,
+        split=_refuse,
+        random_bits=_bits,
+        fold_in=_refuse,
+        name="threefry2x32 from a count",
+        tag="count",
+    )

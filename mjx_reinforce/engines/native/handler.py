@@ -1,0 +1,98 @@
+"""The way from XLA to the player, in LLVM IR: a handler of XLA's FFI, and the threads of a job.
+
+The player defines ``@work(ptr %job)``. All threads of a job call it once; it fetches items by
+adding 1 to ``next``, atomically, until that is ``total`` or more, and before it returns it adds the
+lane steps it simulated to ``simulated``, likewise. Item k is episode k % ``episodes`` of seed
+``active``[k / ``episodes``]. All results are zero when it starts; arrays are aligned to 16 bytes.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from string import Template
+
+_TEXT = Path(__file__).with_name("handler.ll")
+#: The functions to be called from outside.
+NAMES = ("handler", "open", "share", "close")
+#: The fields of a job, %Job.
+FIELDS = (
+    "refs",  # i64: who may still look at the job; the last one frees it
+    "running",  # i64: threads of the pool that work
+    "next",  # i64: the item to be fetched next
+    "total",  # i64: items
+    "episodes",  # i64: episodes of each seed, N
+    "horizon",  # i64: steps of an episode at most, T
+    "simulated",  # i64: lane steps
+    "active",  # ptr to i64: the active seeds
+    "data",  # ptr to ptr: the arguments' data, then the results'
+    "seeds",  # i64: seeds, active or not, S
+    "num_active",  # i64: active seeds
+    "bytes",  # ptr to i64: the size of each result
+    "chunks",  # i64: parts in which the results are set to zero
+    "chunk",  # i64: the part to be set to zero next
+    "filled",  # i64: parts that are zero
+)
+_POINTERS = ("active", "data", "bytes")
+#: The arguments and results that mean something here.
+ACTIVE, THREADS, KEYS = 0, 1, 3
+REWARD, SIMULATED = 2, 5
+#: Bytes from the start of a struct to a member, in xla/ffi/api/c_api.h of major version 0.
+OFFSETS = {
+    "XLA_FFI_CallFrame.extension_start": 8,
+    "XLA_FFI_CallFrame.api": 16,
+    "XLA_FFI_CallFrame.ctx": 24,
+    "XLA_FFI_CallFrame.args.args": 72,
+    "XLA_FFI_CallFrame.rets.rets": 112,
+    "XLA_FFI_Buffer.data": 24,
+    "XLA_FFI_Buffer.rank": 32,
+    "XLA_FFI_Buffer.dims": 40,
+    "XLA_FFI_Metadata_Extension.extension_base.type": 8,
+    "XLA_FFI_Metadata_Extension.metadata": 24,
+    "XLA_FFI_Metadata.api_version.major_version": 24,
+    "XLA_FFI_Metadata.api_version.minor_version": 28,
+    "XLA_FFI_Metadata.traits": 32,
+    "XLA_FFI_Api.api_version.minor_version": 36,
+    "XLA_FFI_Api.XLA_FFI_Error_Destroy": 64,
+    "XLA_FFI_Api.XLA_FFI_ThreadPool_Schedule": 136,
+    "XLA_FFI_Api.XLA_FFI_ThreadPool_NumThreads": 144,
+}
+
+
+def handler_text(num_args: int, result_bytes: Sequence[int], lanes: int = 1) -> str:
+    """Returns the IR of all but ``@work``; it defines %Job.
+
+    ``@handler`` is for XLA. Others ``@open`` a job, ``@share`` it in any number of threads, and
+    ``@close`` it when these have returned.
+
+    Args:
+      num_args: the number of arguments: active [*B] int32, threads [*B] int32 (at most so many, 0
+        for all), the number of deterministic episodes [*B] int32, keys [*B, N, 2] uint32, and
+        the player's.
+      result_bytes: the bytes of an element of each result: observation [*B, T, N, O],
+        action [*B, T, N, A], reward [*B, T, N], length [*B, N], broken [*B, N],
+        simulated [*B] int32.
+      lanes: the items that a thread plays at once; fewer are not worth a thread.
+    """
+    num_results = len(result_bytes)
+    data_bytes, sizes_bytes = 8 * (num_args + num_results), 8 * num_results
+    job_bytes = 8 * len(FIELDS)
+    values = {name.replace(".", "_"): offset for name, offset in OFFSETS.items()}
+    values |= {field: f"i32 0, i32 {number}" for number, field in enumerate(FIELDS)}
+    values |= {
+        "job": ", ".join("ptr" if field in _POINTERS else "i64" for field in FIELDS),
+        "num_args": num_args,
+        "num_results": num_results,
+        "num_buffers": num_args + num_results,
+        "element_bytes": ", ".join(f"i64 {size}" for size in result_bytes),
+        "job_bytes": job_bytes,
+        "data_bytes": data_bytes,
+        "sizes_bytes": sizes_bytes,
+        "fixed_bytes": job_bytes + data_bytes + sizes_bytes,
+        "lanes": lanes,
+        "lanes_less_1": lanes - 1,
+        "active_arg": ACTIVE,
+        "threads_arg": THREADS,
+        "keys_arg": KEYS,
+        "reward_ret": REWARD,
+        "simulated_data": num_args + SIMULATED,
+    }
+    return Template(_TEXT.read_text("utf-8")).substitute(values)

@@ -1,0 +1,113 @@
+"""The memory of a group of lanes: what each lane's episode is, entry by entry."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.fused.backends.llvm_text import Text
+
+#: So that every lane vector can be loaded whole.
+ALIGNMENT = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class Field:
+    """Lane vectors that lie one after the other.
+
+    Attributes:
+        offset: where they begin, in bytes.
+        dtype: of their entries.
+        count: how many there are.
+    """
+
+    offset: int
+    dtype: np.dtype
+    count: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Where everything is.
+
+    Attributes:
+        inputs: the leaves of the arguments of a step: actor, state, keys, t, deterministic, alive.
+        actor: how many of them are the actor's.
+        state: how many of them are the state's.
+        broken: 1 where an episode left the finite numbers.
+        seed: which seed a lane plays for.
+        episode: which of its episodes.
+        size: of all, in bytes.
+    """
+
+    inputs: list[Field]
+    actor: int
+    state: int
+    broken: Field
+    seed: Field
+    episode: Field
+    size: int
+
+    @property
+    def actor_fields(self) -> list[Field]:
+        """The actor's leaves that are not empty."""
+        return [field for field in self.inputs[: self.actor] if field.count]
+
+    @property
+    def state_fields(self) -> list[Field]:
+        """The state's leaves that are not empty."""
+        leaves = self.inputs[self.actor : self.actor + self.state]
+        return [field for field in leaves if field.count]
+
+    @property
+    def key(self) -> Field:
+        """The key [2] of an episode; behind it lies that of its present chunk."""
+        return dataclasses.replace(self.inputs[self.actor + self.state], count=2)
+
+    @property
+    def step(self) -> Field:
+        """How many steps an episode has taken."""
+        return self.inputs[-3]
+
+    @property
+    def deterministic(self) -> Field:
+        """1 where actions are the mode."""
+        return self.inputs[-2]
+
+    @property
+    def alive(self) -> Field:
+        """1 where an episode is running."""
+        return self.inputs[-1]
+
+
+def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> Layout:
+    """Returns where the lanes' values are.
+
+    Args:
+        leaves: shape and dtype of each leaf of the arguments of a step.
+        actor: how many of them, the first ones, are the actor's.
+        state: how many of those after them are the state's.
+        lanes: how many lanes there are.
+
+    Raises:
+        TypeError: numbers of another size than 4 or 8 bytes.
+    """
+    for leaf in leaves:
+        if np.dtype(leaf.dtype).itemsize not in (4, 8):
+            raise TypeError(f"its state has numbers of {leaf.dtype}, not of 32 or 64 bits")
+    end = 0
+
+    def field(dtype: Any, count: int) -> Field:
+        nonlocal end
+        begin = end
+        end += -(-count * np.dtype(dtype).itemsize * lanes // ALIGNMENT) * ALIGNMENT
+        return Field(begin, np.dtype(dtype), count)
+
+    inputs = [field(x.dtype, int(np.prod(x.shape, dtype=int))) for x in leaves]
+    others = [field(np.int32, 1), field(np.int64, 1), field(np.int64, 1)]
+    return Layout(inputs, actor, state, *others, size=end)
+
+
+def pointer(text: Text, memory: str, field: Field) -> str:
+    """Returns the pointer to the first lane vector of a field."""
+    return text.let(f"getelementptr inbounds i8, ptr {memory}, i64 {field.offset}")

@@ -1,0 +1,53 @@
+"""Compiled objects on disk: written whole or not at all, checked when read, bounded in size."""
+
+import contextlib
+import hashlib
+import os
+import tempfile
+from pathlib import Path
+
+#: Where a folder holds more bytes than this, what was used longest ago goes.
+LIMIT = 256 * 2**20
+_DIGEST = hashlib.sha256().digest_size
+
+
+def read(folder: Path, key: str) -> bytes | None:
+    """Returns the object of a key; None if there is none, or it is damaged."""
+    path = folder / f"{key}.o"
+    try:
+        data = path.read_bytes()
+        os.utime(path)
+    except OSError:
+        return None
+    whole = hashlib.sha256(data[_DIGEST:]).digest() == data[:_DIGEST]
+    return data[_DIGEST:] if whole else None
+
+
+def write(folder: Path, key: str, data: bytes, limit: int = LIMIT) -> None:
+    """Keeps an object and forgets the oldest; a folder that cannot be written keeps nothing."""
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=folder, suffix=".o")
+        try:
+            with open(handle, "wb") as file:
+                file.write(hashlib.sha256(data).digest() + data)
+            os.replace(name, folder / f"{key}.o")
+        except BaseException:
+            os.unlink(name)
+            raise
+        _forget(folder, limit)
+
+
+def _forget(folder: Path, limit: int) -> None:
+    """Removes what was used longest ago until no more than ``limit`` bytes are left."""
+    found = []
+    for path in folder.glob("*.o"):
+        with contextlib.suppress(OSError):  # another process removed it
+            found.append((path.stat().st_mtime_ns, path.stat().st_size, path))
+    total = sum(size for _, size, _ in found)
+    for _, size, path in sorted(found):
+        if total <= limit:
+            return
+        with contextlib.suppress(OSError):
+            path.unlink()
+        total -= size

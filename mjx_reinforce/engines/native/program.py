@@ -1,0 +1,91 @@
+"""From an environment and a policy to machine code, made once and kept on disk."""
+
+import functools
+import hashlib
+from importlib import resources
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from mjx_reinforce.engines import episode
+from mjx_reinforce.engines.native import handler, machine, player, queue, seam, step
+from mjx_reinforce.engines.native.denormals import flush
+from mjx_reinforce.fused import jaxprs, scalarized
+from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.types import Environment
+
+#: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
+_LOOPS = {"unrolled": 1, "unrolled_arrays": 1}
+#: The folders whose files decide what is written for a step.
+_WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
+
+
+class Program(NamedTuple):
+    """Machine code that plays.
+
+    code: of ``seam.call``
+    record: shape and dtype of the observation, the action and the reward of a step
+    """
+
+    code: machine.Code
+    record: list[jax.ShapeDtypeStruct]
+
+
+def build(
+    env: Environment, act: episode.Act, actor: Any, distribution: Distribution, length: int
+) -> Program:
+    """Returns the program of an environment and a policy, compiled unless memory or disk has it.
+
+    Args:
+      env: what is played.
+      act: (actor, observation [O]) -> outputs of the distribution.
+      actor: what ``act`` reads, or its shapes.
+      distribution: the family whose parameters the outputs are.
+      length: steps whose noise is drawn with one key.
+
+    Raises:
+      UnsupportedPrimitive: the step has an operation that cannot be written.
+    """
+    examples = step.examples(env, actor)
+    function = step.step_function(env, act, distribution, length)
+    traced, shapes = jaxprs.trace(function, *examples)
+    write = functools.partial(_write, function, examples)
+    target = machine.this_machine()
+    source = f"{jaxprs.fingerprint(traced)} {_writers()} {step.BRANCH_COST}"
+    code = machine.load(source, lambda: write(target), handler.NAMES, target, seam.cache_folder())
+    return Program(code, shapes.record)
+
+
+def _write(function: Any, examples: tuple[Any, ...], target: machine.Machine) -> str:
+    """Writes a step, and all around it, as LLVM IR."""
+    actor, carried, *_ = examples
+    num_actor = len(jax.tree.leaves(actor))
+    varying = [True] * len(jax.tree.leaves(examples))
+    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **_LOOPS)
+    buffers = [x for x in jax.tree.leaves((actor, carried.state)) if np.prod(x.shape)]
+    records = [np.dtype(x.dtype).itemsize for x in written.out_avals[: queue.NUM_RECORDS]]
+    num_args, lanes = queue.NUM_CONTROLS + len(buffers), target.lanes
+    entry = handler.handler_text(num_args, [*records, 4, 4, 4], lanes)
+    return entry + player.player_text(written, num_actor, lanes, flush(target.triple))
+
+
+@functools.cache
+def _writers() -> str:
+    """Returns a hash of the files that decide what is written."""
+    digest = hashlib.sha256()
+    for name in _WRITERS:
+        for file in _files(resources.files(name)):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _files(folder: Any) -> list[Any]:
+    """Returns the files of a package that are part of the program, in order of their names."""
+    found = []
+    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
+        if entry.is_dir():
+            found += _files(entry)
+        elif entry.name.endswith((".py", ".ll")):
+            found.append(entry)
+    return found

@@ -1,0 +1,103 @@
+"""Complete episodes in machine code: the whole rollout is one call.
+
+`rollout` is `rollouts.rollout` for CPUs. Start states are drawn by the same calls as everywhere,
+noise from the same keys, so the same key gives the same episodes, up to rounding.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_reinforce.engines import episode
+from mjx_reinforce.engines.chunks import chunk_length
+from mjx_reinforce.engines.native import seam
+from mjx_reinforce.engines.native.program import Program, build
+from mjx_reinforce.engines.native.step import stored
+from mjx_reinforce.fused import UnsupportedPrimitive
+from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.types import Environment, Trajectory
+
+
+def rollout(
+    env: Environment,
+    act: episode.Act,
+    actor: Any,
+    distribution: Distribution,
+    key: jax.Array,
+    *,
+    num_episodes: int,
+    horizon: int,
+    num_deterministic: int = 0,
+    active: bool | jax.Array = True,
+    threads: int = 0,
+) -> Trajectory:
+    """Plays N episodes from fresh resets; arguments and result are those of `rollouts.rollout`.
+
+    Vmapped over seeds it remains one call, in which no lane waits for another: an episode that is
+    over makes room for the next, of whatever seed.
+
+    At most ``threads`` threads play; 0 stands for all that XLA has.
+
+    Raises:
+      ValueError: machine code cannot play this; see ``unsupported``.
+    """
+    try:
+        program = build(env, act, actor, distribution, chunk_length(horizon))
+    except UnsupportedPrimitive as error:
+        raise ValueError(f"the native engine cannot play this: {error}") from error
+    begin = functools.partial(episode.begin, env, key)
+    state, keys = jax.vmap(begin)(jnp.arange(num_episodes))
+    results = _results(program, horizon, num_episodes)
+    observation, action, reward, length, broken, simulated = seam.call(
+        program.code,
+        results,
+        jnp.asarray(active, jnp.int32),
+        jnp.int32(threads),
+        jnp.int32(num_deterministic),
+        jax.random.key_data(keys),
+        *(x.reshape(-1) for x in jax.tree.leaves(actor) if x.size),
+        *(stored(x).reshape(num_episodes, -1) for x in jax.tree.leaves(state) if x.size),
+    )
+    return Trajectory(
+        observation=observation,
+        action=action.reshape(horizon, num_episodes, *program.record[1].shape),
+        reward=reward,
+        mask=jnp.arange(horizon)[:, None] < length,
+        nonfinite=broken != 0,
+        simulated=simulated,
+    )
+
+
+def unsupported(
+    env: Environment, act: episode.Act, actor: Any, distribution: Distribution, horizon: int
+) -> str | None:
+    """Returns why machine code cannot play this here, or None; it is compiled if it can."""
+    reason = seam.unavailable()
+    if reason:
+        return reason
+    try:
+        build(env, act, actor, distribution, chunk_length(horizon))
+    except (UnsupportedPrimitive, TypeError) as error:
+        return str(error)
+    except RuntimeError as error:
+        return f"LLVM refuses its program: {' '.join(str(error).split())}"
+    return None
+
+
+def _results(program: Program, horizon: int, num_episodes: int) -> list[jax.ShapeDtypeStruct]:
+    """Returns the shapes of what a call returns; see ``handler.handler_text``."""
+    shape = jax.ShapeDtypeStruct
+    observation, action, reward = program.record
+    size = int(np.prod(action.shape, dtype=int))
+    flags = shape((num_episodes,), jnp.int32)
+    return [
+        shape((horizon, num_episodes, *observation.shape), observation.dtype),
+        shape((horizon, num_episodes, size), action.dtype),
+        shape((horizon, num_episodes), reward.dtype),
+        flags,
+        flags,
+        shape((), jnp.int32),
+    ]

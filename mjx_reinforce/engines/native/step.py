@@ -1,0 +1,107 @@
+"""One step of one episode as a scalar graph: noise, policy, physics, reward, end."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import linen as nn
+from jax import lax
+
+from mjx_reinforce.engines import episode
+from mjx_reinforce.engines.native.counter import at_counter, split
+from mjx_reinforce.engines.unit_by_unit import unit_by_unit
+from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.types import Environment
+
+#: A branch of more scalar operations is skipped where no lane needs it.
+BRANCH_COST = 40
+
+
+class Carried(NamedTuple):
+    """What an episode carries from step to step.
+
+    state: the leaves of the environment's state, bools as int32
+    keys: [2, 2] uint32: the episode's key, and the key of the noise of its present chunk
+    """
+
+    state: list[Any]
+    keys: Any
+
+
+class Written(NamedTuple):
+    """What a step returns.
+
+    record: observation [O], action [A] or [], reward []
+    alive: [] int32, 1 where the episode goes on
+    broken: [] int32, 1 where it left the finite numbers
+    carried: what goes on into the next step
+    """
+
+    record: list[Any]
+    alive: Any
+    broken: Any
+    carried: Carried
+
+
+def step_function(
+    env: Environment, act: episode.Act, distribution: Distribution, length: int
+) -> Callable[..., Written]:
+    """Returns (actor, carried, t, deterministic, alive) -> ``Written``, for one episode.
+
+    Args:
+      env: what is played.
+      act: (actor, observation [O]) -> outputs of the distribution.
+      distribution: the family whose parameters the outputs are.
+      length: steps whose noise is drawn with one key, as ``chunks.play_chunks`` does.
+    """
+    shapes = jax.eval_shape(env.reset, jax.random.key(0))
+    leaves, tree = jax.tree.flatten(shapes)
+    words = _words_per_step(distribution)
+
+    def step(actor, carried, t, deterministic, alive):
+        state = [
+            (x != 0) if leaf.dtype == bool else x
+            for x, leaf in zip(carried.state, leaves, strict=True)
+        ]
+        state, alive = tree.unflatten(state), alive != 0
+        at = t % length
+        keys = lax.cond(at == 0, lambda keys: split(keys[0]), lambda keys: keys, carried.keys)
+        offset = (at * words).astype(jnp.uint32)
+        noise = distribution.noise(at_counter(keys[1], offset), ())
+        with nn.intercept_methods(unit_by_unit):
+            played = episode.step(
+                env.step, act, distribution, actor, state, noise, alive, deterministic != 0
+            )
+        after = jax.tree.leaves(episode.hold(alive, played.state, state))
+        return Written(
+            record=[played.observation, played.action, played.reward],
+            alive=played.alive.astype(jnp.int32),
+            broken=played.broken.astype(jnp.int32),
+            carried=Carried([stored(x) for x in after], keys),
+        )
+
+    return step
+
+
+def stored(x: jax.Array) -> jax.Array:
+    """Returns a leaf of the state as it is kept between steps: bools as int32."""
+    return x.astype(jnp.int32) if x.dtype == bool else x
+
+
+def examples(env: Environment, actor: Any) -> tuple[Any, ...]:
+    """Returns the shapes of the arguments of a step."""
+    shape = jax.ShapeDtypeStruct
+    state = jax.eval_shape(
+        lambda: [stored(x) for x in jax.tree.leaves(env.reset(jax.random.key(0)))]
+    )
+    flag = shape((), jnp.int32)
+    actor = jax.tree.map(lambda x: shape(x.shape, x.dtype), actor)
+    return actor, Carried(state, shape((2, 2), jnp.uint32)), flag, flag, flag
+
+
+def _words_per_step(distribution: Distribution) -> int:
+    """Returns how many random words the noise of a step takes."""
+    noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
+    return int(np.prod(noise.shape, dtype=int))

@@ -1,0 +1,264 @@
+"""The native engine plays the same episodes as `rollouts.rollout`, in machine code."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from players import actor_and_act, assert_same_episodes
+from toys import Survive, ToyState, categorical
+
+from mjx_reinforce import Box, envs
+from mjx_reinforce.engines import choice, rollouts
+from mjx_reinforce.engines.native import machine, program, rollout, seam
+from mjx_reinforce.registry import DISTRIBUTIONS, load
+from mjx_reinforce.types import Discrete
+
+if reason := seam.unavailable():
+    pytest.skip(reason, allow_module_level=True)
+
+
+class Drifting(Survive):
+    """Ends by chance and by what it does; its state has a counter, a flag and a limit besides."""
+
+    max_episode_steps = 120
+
+    def __init__(self, space=None, length=40.0):
+        self.length = length
+        if space is not None:
+            self.action_space = space
+            discrete = isinstance(space, Discrete)
+            self.action_size = space.num_actions if discrete else len(space.low)
+
+    def reset(self, rng):
+        *obs, part = jax.random.uniform(rng, (3,))
+        info = (jnp.int32(0), jnp.bool_(False), self.length * (0.1 + 2 * part))
+        return ToyState(2 * jnp.stack(obs) - 1, jnp.zeros(()), jnp.zeros(()), info)
+
+    def step(self, state, action):
+        count, flag, limit = state.info
+        moved = 0.9 * state.obs + 0.1 * jnp.sum(action)
+        done = (count + moved[1] >= limit) & ~flag
+        info = (count + 1, count % 7 == 3, limit)
+        earned = jnp.mean(jnp.asarray(action, moved.dtype))
+        return state.replace(obs=moved, reward=earned, done=done.astype(moved.dtype), info=info)
+
+
+def played(play, env, player, num_seeds=3, num_episodes=5, **options):
+    """Plays several seeds at once, each with its own key; the result on the host."""
+    actor, act, distribution = player
+    settings = {"num_episodes": num_episodes, "horizon": env.max_episode_steps} | options
+
+    @jax.jit
+    def all_seeds(keys, actor):
+        def one(key, scale):
+            scaled = jax.tree.map(lambda x: x * scale, actor)
+            return play(env, act, scaled, distribution, key, **settings)
+
+        return jax.vmap(one)(keys, jnp.linspace(1.0, 0.5, num_seeds))
+
+    keys = jax.random.split(jax.random.key(4), num_seeds)
+    return jax.tree.map(np.asarray, all_seeds(keys, actor))
+
+
+def both(env, player, other=rollouts.rollout, **options):
+    got = played(rollout.rollout, env, player, **options)
+    return got, played(other, env, player, **options)
+
+
+@pytest.mark.parametrize("name", sorted(DISTRIBUTIONS))
+def test_every_distribution_draws_the_same_noise(name):
+    """Over three chunks, in lanes that are at different steps."""
+    space = Box(np.array([-3.0]), np.array([1.0]))
+    try:
+        distribution = load(DISTRIBUTIONS[name])(space)
+    except ValueError:
+        space = Discrete(3)
+        distribution = load(DISTRIBUTIONS[name])(space)
+    env = Drifting(space)
+    player = actor_and_act(env, (4,), distribution=distribution)
+    got, want = both(env, player, num_deterministic=2)
+    assert len(np.unique(want.mask.sum(axis=1))) > 5
+    assert_same_episodes(got, want, rounding=2e-5)
+    assert np.all(got.observation[~got.mask] == 0)
+    assert np.all(got.action[~got.mask] == 0)
+
+
+@pytest.mark.parametrize("hidden_sizes", [(), (7, 5, 6)])
+def test_the_pendulum(hidden_sizes):
+    env = envs.make("InvertedPendulum-v5")
+    fused, options = choice.choose("fused", env).rollout, {"horizon": 50, "num_episodes": 20}
+    got, want = both(env, actor_and_act(env, hidden_sizes), fused, **options)
+    assert not want.mask[:, -1].all()
+    assert_same_episodes(got, want, rounding=2e-5)
+
+
+@pytest.mark.parametrize("id", ["CartPole-v1", pytest.param("Reacher-v5", marks=pytest.mark.slow)])
+def test_tasks_without_contacts(id):
+    env = envs.make(id)
+    distribution = categorical(env.action_space.num_actions) if id == "CartPole-v1" else None
+    player, fused = actor_and_act(env, (4,), distribution=distribution), choice.choose("fused", env)
+    got, want = both(env, player, fused.rollout, horizon=20, num_seeds=2)
+    assert_same_episodes(got, want, rounding=1e-4)
+
+
+def test_no_lane_waits():
+    """Lengths from 4 to 84, a lane's next episode of any seed: nearly all that is played counts."""
+    env = Drifting()
+    got = played(rollout.rollout, env, actor_and_act(env, ()), num_seeds=64, num_episodes=32)
+    lengths = got.mask.sum(axis=1)
+    assert lengths.max() > 4 * lengths.min()
+    assert lengths.sum() > 0.9 * got.simulated.sum()
+    assert np.all(got.simulated > 0)
+
+
+def test_a_seed_that_stands_still_plays_nothing():
+    env = Drifting()
+    actor, act, distribution = actor_and_act(env, ())
+
+    @jax.jit
+    def play(active):
+        def one(active, key):
+            size = {"num_episodes": 4, "horizon": 60}
+            return rollout.rollout(env, act, actor, distribution, key, active=active, **size)
+
+        return jax.vmap(one)(active, jax.random.split(jax.random.key(1), 3))
+
+    every, some, none = (play(jnp.array(x)) for x in ([1, 1, 1], [1, 0, 1], [0, 0, 0]))
+    for leaf, whole in zip(jax.tree.leaves(some), jax.tree.leaves(every), strict=True):
+        assert not np.any(leaf[1])
+        if leaf.ndim > 1:
+            np.testing.assert_array_equal(leaf[::2], whole[::2])
+    assert not any(np.any(x) for x in jax.tree.leaves(none))
+
+
+def assert_identical(got, want):
+    for name in ("observation", "action", "reward", "mask", "nonfinite"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_number_of_threads_changes_nothing(threads):
+    env = Drifting()
+    player = actor_and_act(env, (5,))
+    options = {"num_episodes": 40, "horizon": 60}
+    want = played(rollout.rollout, env, player, **options)
+    some = played(functools.partial(rollout.rollout, threads=threads), env, player, **options)
+    assert_identical(some, want)
+    assert_identical(played(rollout.rollout, env, player, **options), want)
+
+
+@pytest.mark.parametrize("level", ["x86-64", "x86-64-v3"])
+def test_older_cpus(level, monkeypatch):
+    """Fewer lanes, no fused products: the same episodes up to rounding."""
+    env = Drifting()
+    player = actor_and_act(env, (5,))
+    want = played(rollout.rollout, env, player, horizon=30)
+    monkeypatch.setenv(machine.VARIABLE, level)
+    try:
+        machine.this_machine()
+    except ValueError as error:
+        pytest.skip(str(error))
+    jax.clear_caches()
+    assert_same_episodes(played(rollout.rollout, env, player, horizon=30), want, rounding=2e-5)
+
+
+def test_a_nan_stays_in_its_lane():
+    class Breaking(Drifting):
+        def step(self, state, action):
+            after = super().step(state, action)
+            broken = after.obs[0] > 0.75
+            return after.replace(obs=jnp.where(broken, jnp.nan, after.obs))
+
+    calm, env = Drifting(), Breaking()
+    player = actor_and_act(env, (4,))
+    got, want = both(env, player, num_episodes=20)
+    assert 0 < want.nonfinite.mean() < 1
+    assert_same_episodes(got, want, rounding=2e-5)
+    sound = ~got.nonfinite
+    alone = played(rollout.rollout, calm, player, num_episodes=20)
+    kept = sound & (alone.observation[..., 0].max(axis=1) < 0.75)
+    assert kept.any()
+    for name in ("observation", "action", "reward"):
+        one, other = (np.moveaxis(getattr(x, name), 1, 2)[kept] for x in (got, alone))
+        np.testing.assert_array_equal(one, other)
+
+
+def test_double_precision():
+    with jax.enable_x64(True):
+        env = Drifting()
+        got, want = both(env, actor_and_act(env, (4, 3)), num_episodes=20)
+        assert got.observation.dtype == np.float64
+        assert_same_episodes(got, want, rounding=1e-12)
+    jax.clear_caches()
+
+
+def test_no_code_is_made_twice(tmp_path, monkeypatch):
+    """Not in a process, and not in the next, which reads it from the disk."""
+    env = envs.make("CartPole-v1")
+    actor, act, distribution = actor_and_act(
+        env, (), distribution=categorical(env.action_space.num_actions)
+    )
+    monkeypatch.setattr(seam, "cache_folder", lambda: tmp_path)
+    first = program.build(env, act, actor, distribution, 17)
+    assert first.code.compiled
+    assert program.build(env, act, actor, distribution, 17).code is first.code
+    assert program.build(env, act, actor, distribution, 19).code is not first.code
+    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(program.scalarized, "build", None)
+    assert not program.build(env, act, actor, distribution, 17).code.compiled
+
+
+def test_constants_are_part_of_the_code():
+    class Pays(Drifting):
+        def step(self, state, action):
+            after = super().step(state, action)
+            return after.replace(reward=after.reward * self.prices[0])
+
+    actor, act, distribution = actor_and_act(Drifting(), ())
+    keys = set()
+    for price in (2.0, 3.0, 3.0):
+        env = Pays()
+        env.prices = jnp.array([price])
+        keys.add(program.build(env, act, actor, distribution, 10).code.key)
+    assert len(keys) == 2
+
+
+def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
+    env = envs.make("CartPole-v1")
+    actor, act, distribution = actor_and_act(
+        env, (), distribution=categorical(env.action_space.num_actions)
+    )
+    player = choice.Player(act, actor, distribution)
+    assert choice.choose("auto", env, player, 500).name == "native"
+    assert choice.choose("auto", env).name == "fused"
+
+    class Gamma(Drifting):
+        def step(self, state, action):
+            after = super().step(state, action)
+            return after.replace(reward=jax.lax.lgamma(after.reward + 5.0))
+
+    class Bytes(Drifting):
+        def reset(self, rng):
+            state = super().reset(rng)
+            return state.replace(info=(*state.info, jnp.int8(1)))
+
+        def step(self, state, action):
+            after = super().step(state.replace(info=state.info[:3]), action)
+            return after.replace(info=(*after.info, state.info[3]))
+
+    small = Bytes()
+    actor, act, distribution = actor_and_act(small, ())
+    chosen = choice.choose("auto", small, choice.Player(act, actor, distribution), 500)
+    assert chosen.name == "fused"
+    assert "machine code cannot play this: its state has numbers of int8" in chosen.why
+    gamma = Gamma()
+    actor, act, distribution = actor_and_act(gamma, ())
+    player = choice.Player(act, actor, distribution)
+    assert choice.choose("auto", gamma, player, 500).name == "fused"
+    with pytest.raises(ValueError, match=r"native engine cannot play this: .*lgamma.*choose auto"):
+        choice.choose("native", gamma, player, 500)
+    monkeypatch.setattr(seam, "unavailable", lambda: "llvmlite is not installed")
+    with pytest.raises(ValueError, match="llvmlite is not installed; choose auto"):
+        choice.choose("native", env, player, 500)
