@@ -282,3 +282,34 @@ def test_nonsense_is_refused():
         reinforce(Toy(), loss_per="batch")
     with pytest.raises(ValueError, match="at least one unit"):
         mlp_policy(1, normal(Toy.action_space), (32, 0))
+
+
+@pytest.mark.parametrize(
+    ("length", "update"),
+    [(50, updates.full_batch()), (51, updates.full_batch()), (30, updates.each_step())],
+)
+def test_short_episodes_are_learned_from_in_short(length, update, monkeypatch):
+    """Of 400 steps at most, where no episode took more than 50: the same, up to rounding."""
+
+    class Ends(Survive):
+        max_episode_steps = 400
+
+        def reset(self, rng):
+            return super().reset(rng).replace(info=jnp.zeros(()))
+
+        def step(self, state, action):
+            count = state.info + 1.0
+            done = (count >= length).astype(jnp.float32)
+            return state.replace(reward=jnp.cos(action[0] + count), done=done, info=count)
+
+    learned = []
+    for few in (8, 10**6):
+        monkeypatch.setattr("mjx_reinforce.learners.reinforce._FEW", few)
+        learner = reinforce(
+            Ends(), num_episodes=3, update=update, optimizer=optax.sgd(1.0), engine="vmap"
+        )
+        seeds = jax.vmap(learner.init)(jax.random.split(jax.random.key(0), 2))
+        program = jax.jit(jax.vmap(learner.step))
+        learned.append(jax.tree.map(np.asarray, program(seeds)[0].actor.params))
+    assert np.abs(learned[0]["constants"]).max() > 0
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6), *learned)

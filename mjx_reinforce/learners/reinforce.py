@@ -18,7 +18,9 @@ import optax
 
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
+from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.contract import check_environment
+from mjx_reinforce.fused import any_lane
 from mjx_reinforce.learners.diagnostics import nan_unless, policy_metrics, visited_steps
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.learners.learner import (
@@ -44,6 +46,10 @@ from mjx_reinforce.types import (
     action_space,
     observation_size,
 )
+
+#: Episodes are short if none is longer than the horizon divided by this. An update passes over all
+#: steps that there may be, so it takes its time from the horizon, not from the episodes.
+_FEW = 8
 
 
 def default_distribution(space: Box | Discrete) -> Distribution:
@@ -88,7 +94,8 @@ def reinforce(
         the state near the middle, statistics that never stop shrink, and magnify the
         observations until the policy fails.)
       one_start: reset every episode of a seed with the same key, drawn once at ``init``.
-      engine: how episodes are played: "auto", "vmap", "fused" or "kernel", see ``engines.choice``.
+      engine: how episodes are played: "auto", "vmap", "fused", "native" or "kernel", see
+        ``engines.choice``.
 
     Raises:
       ValueError: an argument makes no sense for this environment.
@@ -142,7 +149,7 @@ class _Reinforce:
         """Returns the learner, whose episodes are played by the engine of that name."""
         actor = jax.eval_shape(self._first_actor, jax.random.key(0))
         player = choice.Player(self._act, actor, self.policy.distribution)
-        chosen = choice.choose(engine, self.env, player)
+        chosen = choice.choose(engine, self.env, player, self.horizon)
         play = functools.partial(self._play, chosen)
         return Learner(self._init, play, self._learn, self.policy, chosen)
 
@@ -183,6 +190,19 @@ class _Reinforce:
         )
 
     def _learn(
+        self, state: TrainState, trajectory: Trajectory, key: jax.Array
+    ) -> tuple[TrainState, Metrics]:
+        """Learns; where all episodes, of all seeds, were short, from their first steps alone."""
+        few = len(trajectory.mask) // _FEW
+        if few < CHUNK_STEPS:
+            return self._learn_from(state, trajectory, key)
+        return jax.lax.cond(
+            any_lane(jnp.any(trajectory.mask[few])),
+            lambda: self._learn_from(state, trajectory, key),
+            lambda: self._learn_from(state, trajectory.first(few), key),
+        )
+
+    def _learn_from(
         self, state: TrainState, trajectory: Trajectory, key: jax.Array
     ) -> tuple[TrainState, Metrics]:
         actor, mask = state.actor, trajectory.mask
