@@ -8,13 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from mjx_reinforce.reports.comparisons import (
+from mjx_reinforce.reports.statistics import iqm
+from mjx_reinforce.reports.statistics.comparisons import (
     Difference,
     holm,
     paired_difference,
     probability_of_improvement,
 )
-from mjx_reinforce.reports.statistics import iqm
 from seeds_runs import Task
 
 #: Where a setting is not compared: the program's defaults.

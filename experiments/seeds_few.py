@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from mjx_reinforce.reports.comparisons import holm, paired_difference
-from mjx_reinforce.reports.power import seeds_needed, wrong_winner
+from mjx_reinforce.reports.statistics.comparisons import holm, paired_difference
+from mjx_reinforce.reports.statistics.power import seeds_needed, wrong_winner
 from seeds_answers import CONTRASTS, LEVEL, MEASURES, REPORTING, Contrast, arm, best_rates
 from seeds_runs import Task
 

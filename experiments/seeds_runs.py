@@ -11,7 +11,7 @@ import numpy as np
 from mjx_reinforce import envs
 from mjx_reinforce.export.files import read_arrays, read_json, write_arrays
 from mjx_reinforce.reports.statistics import iqm
-from mjx_reinforce.reports.survival import time_to_threshold
+from mjx_reinforce.reports.statistics.survival import time_to_threshold
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.interrupt import Interrupt

@@ -62,6 +62,7 @@ def sweep(
     output: Path | str | None = None,
     exact: bool = False,
     chunk_runs: int | None = None,
+    report: bool = True,
 ) -> Results:
     """Trains many configurations, ``base.num_seeds`` of each, as the command line does.
 
@@ -69,8 +70,9 @@ def sweep(
       base: the settings that are not swept, such as ``defaults.of_task("InvertedPendulum-v5")``.
       over: names of settings and the values of each; all combinations are trained.
       output: the directory of the results; ``runs/<env>-<time>`` if not given.
-      exact: train one run at a time, so that no result depends in any bit on the others.
-      chunk_runs: runs that are trained side by side at most; as many as memory holds by default.
+      exact: move every run by itself, so that no result depends in any bit on the others.
+      chunk_runs: runs that are under way at once at most; as many as memory holds by default.
+      report: write report.html; ``mjx_reinforce.report`` can do so later.
 
     Returns:
       What was measured; the same is in the files of the directory.
@@ -81,7 +83,7 @@ def sweep(
     directory = None if output is None else Path(output)
     base = dataclasses.replace(base, output=directory)
     design = Design(base=base, over=over, exact=exact, chunk_runs=chunk_runs)
-    directory, _ = perform(design, None, [])
+    directory, _ = perform(design, None, [], report=report)
     return read_results(directory)
 
 

@@ -23,6 +23,7 @@ from mjx_reinforce.runs.command_line import parse, refuse
 from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.files import check_writable, choose_directory, prepare, remove_empty
 from mjx_reinforce.runs.flags import accept_all_characters
+from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.memory import check_size
@@ -69,7 +70,8 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             held.enter_context(locked(directory))
             env = envs.make(config.env)
             configure_jax()
-            learner, horizon, found = _start(env, config)
+            with heartbeat(to_screen, None, "writing the simulation out"):
+                learner, horizon, found = _start(env, config)
             plan = make_plan(env, learner, horizon, config)
     except ValueError as error:
         refuse(str(error), made)
@@ -149,7 +151,7 @@ def train(
             session, compile_seconds = _compile(env, learner, horizon, config, directory, display)
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
         interrupt.defer(display.say)
-        _begin(session, horizon, found)
+        _begin(session, found)
         display.start(compile_seconds)
         threading.Thread(target=load_libraries, daemon=True).start()
         _loop(session, interrupt)
@@ -182,18 +184,19 @@ def _compile(
     with _collection_paused():
         state = first_state(learner, config)
         programs = compile_programs(env, learner, horizon, config, state)
-    seconds = time.perf_counter() - started
+    seconds = learner.engine.seconds + time.perf_counter() - started
     record = Record(config, getattr(env, "reward_threshold", None))
     best, policy = first_best(state.train_states), policy_settings(env, config)
-    session = Session(config, policy, programs, record, RunLog(directory), display, state, best)
+    known = dataclasses.replace(config, horizon=horizon)
+    session = Session(known, policy, programs, record, RunLog(directory), display, state, best)
     return session, seconds
 
 
-def _begin(session: Any, horizon: int, found: Any) -> None:
+def _begin(session: Any, found: Any) -> None:
     """Writes the first files, or takes the run and its files back to where it goes on."""
     config, log = session.config, session.log
     if config.resume is None:
-        settings = dataclasses.asdict(config) | {"horizon": horizon, "output": str(log.directory)}
+        settings = dataclasses.asdict(config) | {"output": str(log.directory)}
         del settings["resume"]
         log.begin(settings)
         session.sinks = open_sinks(config, log.directory, None)

@@ -7,8 +7,14 @@ from hypothesis import strategies as st
 from rliable import library, metrics
 from scipy import stats
 
-from mjx_reinforce.reports import aggregates, bootstrap, tails
-from mjx_reinforce.reports.aggregates import cvar, interval, median_interval, optimality_gap, wilson
+from mjx_reinforce.reports.statistics import aggregates, bootstrap, tails
+from mjx_reinforce.reports.statistics.aggregates import (
+    cvar,
+    interval,
+    median_interval,
+    optimality_gap,
+    wilson,
+)
 
 NAMES = ("mean", "median", "iqm", "optimality-gap", "cvar")
 RLIABLE = {

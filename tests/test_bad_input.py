@@ -147,6 +147,14 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ("-- --num-seeds 3", "leave -- out"),
         ("--hidden-sizes " + "2 " * 101, "at most 100 layers"),
         ("--update minibatches --minibatch-size 2000000000", "lower --minibatch-size"),
+        (
+            "--estimator value-baseline --value-fits 2000000000",
+            "--value-fits must be at most 1,000,000, for an update makes so many steps",
+        ),
+        (
+            "--update minibatches --minibatch-updates 1000001",
+            "--minibatch-updates must be at most 1,000,000",
+        ),
         ("--env os:path", "'os:path' is no class or function, but of type module"),
         ("--env bad_envs:A_CONSTANT", "is no class or function, but of type int"),
         ("--env nowhere:X", "No module named 'nowhere'"),

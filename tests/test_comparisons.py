@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from rliable import metrics
 from scipy import stats
 
-from mjx_reinforce.reports.comparisons import (
+from mjx_reinforce.reports.statistics.comparisons import (
     compare_all,
+    failures_as_worst,
     holm,
     paired_difference,
     probability_of_improvement,
@@ -142,3 +143,13 @@ def test_holm_keeps_the_order_and_lowers_nothing(p_values):
     assert np.all(adjusted >= p_values)
     assert np.all(np.diff(adjusted[np.argsort(p_values)]) >= 0)
     assert adjusted.max() <= 1
+
+
+def test_the_worst_is_that_of_each_row():
+    """Of whole numbers too, and 0 where nothing is finite."""
+    x = np.array([[1.0, np.nan, 5.0], [-7.0, 2.0, np.inf], [np.nan] * 3])
+    y = np.array([[4.0, 3.0, 9.0], [np.nan, 8.0, 6.0], [np.nan] * 3])
+    one, other = failures_as_worst(x, y)
+    np.testing.assert_array_equal(one, [[1, 1, 5], [-7, 2, -7], [0, 0, 0]])
+    np.testing.assert_array_equal(other, [[4, 3, 9], [-7, 8, 6], [0, 0, 0]])
+    assert failures_as_worst([1, 2], [3, 4])[1].dtype == float

@@ -1,12 +1,13 @@
 """Performance profiles against rliable and scipy."""
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from rliable import library
 from scipy import stats
 
-from mjx_reinforce.reports.profiles import performance_profile
+from mjx_reinforce.reports.statistics.profiles import performance_profile
 
 
 def test_profile_is_that_of_rliable():
@@ -35,3 +36,10 @@ def test_profiles_fall(values):
         assert np.all(np.diff(line) <= 1e-12)
     share, low, high = performance_profile(values, thresholds)
     assert np.all((low <= share) & (share <= high))
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.99])
+def test_the_band_has_the_level_that_is_asked_for(confidence):
+    band = performance_profile([1.0, 2.0, 3.0, 4.0], [2.5], confidence)
+    expected = stats.binomtest(2, 4).proportion_ci(confidence, method="wilson")
+    np.testing.assert_allclose([band.low[0], band.high[0]], expected, atol=1e-14)

@@ -1,5 +1,6 @@
 """Checkpoints: a run that goes on ends as one that never stopped, whatever happens to its files."""
 
+import csv
 import errno
 import functools
 import json
@@ -292,6 +293,32 @@ def test_what_cannot_be_resumed_is_named(run, parts, capsys, change, message):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"learning_rate": 0.5}, "learning_rate is 0.5, but the run was trained with 0.01"),
+        ({"hidden_sizes": [8]}, "hidden_sizes is [8], but the run was trained with [4]"),
+        ({"seed": 1}, "seed is 1, but the run was trained with 0"),
+        ({"horizon": 7}, "horizon is 7, but the run was trained with"),
+    ],
+)
+def test_settings_changed_by_hand_are_noticed(run, parts, capsys, change, message):
+    path = parts / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    assert run("--resume", "parts") == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") <= 2
+
+
+def test_a_budget_changed_by_hand_is_a_budget(run, parts):
+    path = parts / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"max_updates": 24}))
+    assert run("--resume", "parts") == 0
+    with (parts / "metrics.csv").open(newline="") as file:
+        assert [row["update"] for row in csv.DictReader(file)][-3:] == ["24"] * 3
+
+
 @pytest.mark.parametrize("content", [None, "{", "[]", "{}"])
 def test_what_is_no_run_is_named(run, tmp_path, capsys, content):
     (tmp_path / "out").mkdir()
@@ -358,7 +385,13 @@ def test_a_record_comes_back_whole():
     record = Record(config, threshold=1.0)
 
     def evaluation():
-        names = ("eval_return", "eval_return_stochastic", "eval_length", "simulated_steps")
+        names = (
+            "eval_return",
+            "eval_return_stochastic",
+            "eval_length",
+            "simulated_steps",
+            "eval_steps",
+        )
         return {name: rng.random(2, np.float32) for name in names}
 
     def block():

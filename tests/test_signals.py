@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -112,6 +113,33 @@ def test_a_signal_while_importing_shows_no_traceback(tmp_path, delay):
     process.send_signal(signal.SIGINT)
     assert finish(process) in (130, -signal.SIGINT)
     assert not (tmp_path / "out").exists()
+
+
+IMPORTING = """
+import os, signal, sys
+
+class Interrupting:
+    def find_spec(self, name, path=None, target=None):
+        if name == "mjx_reinforce.train":
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupting())
+from mjx_reinforce.__main__ import main
+main()
+"""
+
+
+def test_ctrl_c_ends_the_imports_of_the_script_quietly():
+    """Of ``mjx-reinforce``, whose file imports the function and calls it; a shell says 130."""
+    assert entry_point("mjx-reinforce") == "mjx_reinforce.__main__:main"
+    shell = ["bash", "-c", '"$0" -c "$1"; exit $?', sys.executable, IMPORTING]
+    done = subprocess.run(shell, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+def entry_point(name):
+    project = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    return project["scripts"][name]
 
 
 def test_a_second_signal_ends_at_once(tmp_path):

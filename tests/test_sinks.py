@@ -30,7 +30,7 @@ def evaluation(update, num_seeds=20, first=False):
     names = ("eval_return", "eval_return_stochastic", "eval_length")
     measured = dict.fromkeys(names, values)
     metrics = ("episode_return", "episode_length", "entropy", "gradient_norm")
-    counts = ("simulated_steps", "nonfinite_episodes", "skipped_update")
+    counts = ("nonfinite_episodes", "skipped_update")
     last = dict.fromkeys(metrics, values) | dict.fromkeys(counts, updates)
     return rows.of_evaluation(
         measured, {} if first else last, updates, 4 * updates, 40 * updates, 0.1 * update

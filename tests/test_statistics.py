@@ -9,8 +9,9 @@ import pytest
 from matplotlib.figure import Figure
 from scipy import stats
 
-from mjx_reinforce.reports import bootstrap, curves
+from mjx_reinforce.reports import curves
 from mjx_reinforce.reports.statistics import (
+    bootstrap,
     iqm,
     iqm_interval,
     mean_interval,

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from mjx_reinforce.reports.survival import (
+from mjx_reinforce.reports.statistics.survival import (
     collapses,
     kaplan_meier,
     median_steps,

@@ -194,6 +194,15 @@ def test_bad_input_is_explained_before_anything_starts(run, tmp_path, capsys, ar
     assert (tmp_path / "taken" / "file").read_text() == "mine"
 
 
+@pytest.mark.parametrize("files", [("config.json", "metrics.csv"), ("sweep.json",)])
+def test_a_run_is_not_put_into_another(run, tmp_path, capsys, files):
+    for name in files:
+        (tmp_path / name).write_text("{}")
+    assert run(*ARGUMENTS, "--output", "new/deep", "--overwrite") == 2
+    assert f"new/deep would be inside the run {tmp_path}" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
 def test_solving_needs_a_threshold(run, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(Survive, "reward_threshold", None)
     assert run(*ARGUMENTS, "--stop-when-solved", "--output", "out") == 2
@@ -267,7 +276,8 @@ METRICS = {  # two updates of two seeds; the second seed stands still in the sec
 def evaluation(*returns):
     values = np.array(returns, np.float32)
     measured = {"eval_return": values, "eval_return_stochastic": values / 2, "eval_length": values}
-    return measured | {"simulated_steps": np.arange(1, len(values) + 1)}
+    counts = np.arange(1, len(values) + 1)
+    return measured | {"simulated_steps": counts + 1, "eval_steps": counts}
 
 
 def test_a_record_of_two_seeds_by_hand():
@@ -296,7 +306,7 @@ def test_a_record_of_two_seeds_by_hand():
     summary = record.summary("fused", 3.0, 2.0)
     assert summary["env_steps_to_solve"] == [None, 0]
     # 2 (60 + 40) in training and 2 (2 + 2) in evaluations: each waits for the other.
-    assert summary["useful_step_fraction"] == 110 / 208
+    assert summary["useful_step_fraction"] == 116 / 160
     assert summary["env_steps_per_second"] == 55
     assert len(summary["nonfinite"]) == 1
     record.add_evaluation(evaluation(8, 8), 2.0)

@@ -19,6 +19,7 @@ import jax
 import numpy as np
 
 from mjx_reinforce.export.files import write_bytes
+from mjx_reinforce.runs.keys import is_key, plain
 
 Arrays = dict[str, np.ndarray]
 
@@ -35,6 +36,7 @@ class Checkpoint(NamedTuple):
     metrics_bytes: length of metrics.csv
     env_steps: the budget of a seed, or None
     max_updates: the other budget, or None
+    settings: all settings of the run, as config.json has them; None in a sweep's
     number: its place among the run's checkpoints, once it is saved
     """
 
@@ -44,6 +46,7 @@ class Checkpoint(NamedTuple):
     metrics_bytes: int
     env_steps: int | None
     max_updates: int | None
+    settings: dict[str, Any] | None = None
     number: int = 0
 
     def is_even(self, eval_every: int) -> bool:
@@ -95,6 +98,14 @@ def load(folder: Path, like: Any, say: Callable[[str], None]) -> Iterator[Checkp
             say(f"checkpoint {path.name} is damaged; trying the one before")
         else:
             yield _decode(content, path, like)
+
+
+def settings_of(folder: Path) -> dict[str, Any]:
+    """Returns the settings with which the newest whole checkpoint was written; {} if none has."""
+    for content in filter(None, map(_read, _files(folder))):
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            return json.loads(str(archive["rest"])).get("settings") or {}
+    return {}
 
 
 def remove(folder: Path, after: int = 0) -> None:
@@ -161,8 +172,8 @@ def _decode(content: bytes, path: Path, like: Any) -> Checkpoint:
 
 def _flatten(tree: Any) -> Arrays:
     """Returns the leaves of a pytree on the host under the names of their paths; keys as data."""
-    leaves, _ = jax.tree.flatten_with_path(tree)
-    raw = {_name(path): _data(leaf) for path, leaf in leaves}
+    leaves, _ = jax.tree.flatten_with_path(plain(tree))
+    raw = {_name(path): leaf for path, leaf in leaves}
     return {name: np.asarray(value) for name, value in jax.device_get(raw).items()}
 
 
@@ -173,7 +184,8 @@ def _unflatten(arrays: Arrays, like: Any) -> Any:
       ValueError: an array is missing, or superfluous, or has another shape or type.
     """
     leaves, structure = jax.tree.flatten_with_path(like)
-    expected = {_name(path): jax.eval_shape(_data, leaf) for path, leaf in leaves}
+    shapes, _ = jax.tree.flatten_with_path(jax.eval_shape(plain, like))
+    expected = {_name(path): shape for path, shape in shapes}
     if wrong := sorted(expected.keys() ^ arrays.keys()):
         raise ValueError(f"{wrong[0]} is in one of the two only")
     for name, shape in expected.items():
@@ -187,15 +199,7 @@ def _name(path: Any) -> str:
     return "state/" + jax.tree_util.keystr(path, simple=True, separator="/")
 
 
-def _is_key(leaf: Any) -> bool:
-    return jax.numpy.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-
-
-def _data(leaf: Any) -> Any:
-    return jax.random.key_data(leaf) if _is_key(leaf) else leaf
-
-
 def _leaf(values: np.ndarray, old: Any) -> jax.Array:
     """Returns values in memory of the device's own, which may be donated; a key where it was."""
     array = jax.numpy.array(values)
-    return jax.random.wrap_key_data(array) if _is_key(old) else array
+    return jax.random.wrap_key_data(array) if is_key(old) else array

@@ -26,6 +26,8 @@ MAX_COUNT = 2**31 - 1
 _MAX_RATE = 1000
 #: The greatest of other numbers, and one over the least: float32 holds their cubes.
 _MAX_SIZE = 1e12
+#: The most steps that an update may make one after the other, besides those of the episodes.
+_MAX_STEPS = 1_000_000
 #: The greatest number of layers: each is a matrix of its own in the program.
 _MAX_LAYERS = 100
 
@@ -110,9 +112,14 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("env_steps", lambda x: x < 2**30, "less than 2^30, for each seed"),
     (
         "max_updates num_episodes horizon decay_updates eval_every eval_episodes normalize_steps "
-        "value_fits minibatch_updates minibatch_size num_directions checkpoint_every",
+        "minibatch_size num_directions checkpoint_every",
         lambda x: x <= MAX_COUNT,
         "less than 2^31",
+    ),
+    (
+        "value_fits minibatch_updates",
+        lambda x: x <= _MAX_STEPS,
+        f"at most {_MAX_STEPS:,}, for an update makes so many steps one after the other",
     ),
     ("seed eval_seed", lambda x: 0 <= x < 2**32, "in [0, 2^32)"),
     ("discount", lambda x: 0 <= x <= 1, "in [0, 1]"),

@@ -38,8 +38,14 @@ def prepare(directory: Path, overwrite: bool) -> list[Path]:
       The folders that were made, the innermost first.
 
     Raises:
-      ValueError: it exists and is not empty, is no directory, or cannot be written.
+      ValueError: it exists and is not empty, is no directory, is in that of another run, or
+        cannot be written.
     """
+    if (outer := _run_around(directory)) is not None:
+        raise ValueError(
+            f"the run directory {directory} would be inside the run {outer}; choose another "
+            "--output"
+        )
     made: list[Path] = []
     try:
         made = [path for path in (directory, *directory.parents) if not path.exists()]
@@ -59,6 +65,15 @@ def prepare(directory: Path, overwrite: bool) -> list[Path]:
             "make room there, or choose another --output"
         ) from error
     return made
+
+
+def _run_around(directory: Path) -> Path | None:
+    """Returns the run or sweep that a directory is in, if any."""
+    for parent in directory.resolve().parents:
+        run = (parent / "config.json").exists() and (parent / "metrics.csv").exists()
+        if run or (parent / "sweep.json").exists():
+            return parent
+    return None
 
 
 def check_writable(directory: Path) -> None:

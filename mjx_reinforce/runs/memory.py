@@ -139,6 +139,12 @@ def host_memory() -> float:
     return memory if text == "max" else min(memory, float(text))
 
 
+def num_cores() -> int:
+    """Returns how many CPU cores this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)  # not on every system
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
 def gigabytes(size: float) -> str:
     """Returns a number of bytes for people."""
     return f"{size / 1e9:,.1f} GB" if size < 1e10 else f"{size / 1e9:,.0f} GB"

@@ -1,12 +1,18 @@
 """What a run will do, how long that takes about, and how much memory it needs."""
 
-import os
 from typing import Any, NamedTuple
 
 from mjx_reinforce.runs import measured
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.measured import Speed, Task
-from mjx_reinforce.runs.memory import check_fits, gigabytes, host_memory, needed, num_parameters
+from mjx_reinforce.runs.memory import (
+    check_fits,
+    gigabytes,
+    host_memory,
+    needed,
+    num_cores,
+    num_parameters,
+)
 
 #: The figures are good to this factor.
 _ACCURACY = 2.0
@@ -105,8 +111,7 @@ def this_machine() -> Machine:
 
     device = jax.local_devices()[0]
     if device.platform == "cpu":
-        affinity = getattr(os, "sched_getaffinity", None)  # not on every system
-        cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+        cores = num_cores()
         name = f"{cores} CPU core{'s' * (cores > 1)}"
         return Machine(name, measured.CPU, min(cores, _USEFUL_CORES) / 2, host_memory(), True)
     memory = float((device.memory_stats() or {}).get("bytes_limit", float("inf")))

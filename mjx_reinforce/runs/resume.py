@@ -83,6 +83,12 @@ def _fits(value: Any, hint: Any) -> bool:
     return type(value) is hint
 
 
+def recordable(config: Config) -> dict[str, Any]:
+    """Returns the settings as config.json has them, but for where the run is."""
+    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in PLACES}
+    return json.loads(json.dumps(settings))
+
+
 def check_settings(known: Config, asked: Config) -> None:
     """Raises ValueError if more than the budget of a run is to change.
 
@@ -157,8 +163,8 @@ def find(learner: Any, config: Config, say: Callable[[str], None]) -> Any:
       say: shows a line about each file that does not serve.
 
     Raises:
-      ValueError: the budget is smaller than what the run did, or a checkpoint is of another
-        version.
+      ValueError: the budget is smaller than what the run did, config.json was changed by hand, or
+        a checkpoint is of another version.
     """
     import jax
 
@@ -171,6 +177,7 @@ def find(learner: Any, config: Config, say: Callable[[str], None]) -> Any:
         return state, first_best(state.train_states)
 
     assert config.resume is not None
+    _check_unchanged(config, checkpoint.settings_of(config.resume / "checkpoint"))
     like = jax.eval_shape(fresh)
     length = _size(config.resume / "metrics.csv")
     for found in checkpoint.load(config.resume / "checkpoint", like, say):
@@ -179,6 +186,22 @@ def find(learner: Any, config: Config, say: Callable[[str], None]) -> Any:
         elif _serves(found, config):
             return found
     return None
+
+
+def _check_unchanged(config: Config, trained: Mapping[str, Any]) -> None:
+    """Raises ValueError if config.json was changed by hand since a checkpoint was written.
+
+    Args:
+      config: what config.json says now, but for the budget.
+      trained: the settings in the checkpoint.
+    """
+    said = recordable(config)
+    for name, value in trained.items():
+        if name not in BUDGETS and said.get(name) != value:
+            raise ValueError(
+                f"{config.resume}/config.json says that {name} is {said.get(name)}, but the run "
+                f"was trained with {value}; put that back, or start another run"
+            )
 
 
 def _size(path: Path) -> int:

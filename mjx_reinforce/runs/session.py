@@ -11,6 +11,7 @@ from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.record import Record
+from mjx_reinforce.runs.resume import recordable
 from mjx_reinforce.runs.sinks.sink import Queue
 from mjx_reinforce.runs.state import Programs, RunState
 
@@ -127,6 +128,7 @@ class Session:
             metrics_bytes=self.log.metrics_bytes(),
             env_steps=self.config.env_steps,
             max_updates=self.config.max_updates,
+            settings=recordable(self.config),
         )
         self.log.save_checkpoint(content, even=content.is_even(self.config.eval_every))
 

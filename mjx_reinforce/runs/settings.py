@@ -32,9 +32,10 @@ class RunSettings:
     one_start: bool = False
     """Begin all training episodes of a seed in one state; each seed has its own. Evaluations keep
     their own starts, so they show what the policy does where it was not trained."""
-    engine: Literal["auto", "vmap", "fused", "kernel"] = "auto"
+    engine: Literal["auto", "vmap", "fused", "native", "kernel"] = "auto"
     """How episodes are played: vmap (the step mapped by jax.vmap), fused (the step written out as
-    scalar operations), kernel (the whole episode in one GPU kernel), or auto, the fastest here."""
+    scalar operations), native (whole episodes in machine code for this CPU), kernel (in one GPU
+    kernel), or auto, the fastest here."""
     output: Path | None = None
     """Run directory; runs/<env>-<time> if not given."""
     overwrite: bool = False
@@ -97,7 +98,7 @@ class UpdateSettings:
 
     update: Literal["full-batch", "minibatches", "each-step"] = "full-batch"
     """full-batch: one optimiser step a rollout; minibatches: several, on steps drawn from it;
-    each-step: one for every time step, in order."""
+    each-step: one for every time step, in order. Only full-batch measures gradient_snr."""
     minibatch_updates: int = 50
     """Optimiser steps a rollout, of minibatches."""
     minibatch_size: int = 128
@@ -165,7 +166,12 @@ class CheckpointSettings:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LogSettings:
-    """Where the rows of metrics.csv go besides. The charts' step is the number of updates."""
+    """Where the rows of metrics.csv go besides. The charts' step is the number of updates.
+
+    A column is empty where nothing is measured: gradient_snr, the signal-to-noise ratio of the
+    gradient over episodes, needs --update full-batch or ars, and two episodes or directions;
+    explained_variance a baseline; clipped_gradients --max-grad-norm.
+    """
 
     tensorboard: bool = False
     """Charts for TensorBoard in RUN/tensorboard: of each column the interquartile mean, quantiles
