@@ -39,7 +39,7 @@ def shapes(tree):
 @pytest.mark.parametrize("id", sorted(HEAVY - {"Hopper-v5"}))
 def test_a_training_step_is_traced(id):
     """The state comes back as it was: it can be trained on, and scanned over."""
-    learner = reinforce(envs.make(id), num_episodes=2, horizon=3)
+    learner = reinforce(envs.make(id), num_episodes=2, horizon=3, engine="vmap")
     state = jax.eval_shape(learner.init, jax.random.key(0))
     after, metrics = jax.eval_shape(learner.step, state)
     assert shapes(after) == shapes(state)

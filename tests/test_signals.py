@@ -28,7 +28,7 @@ train.main()
 """
 FOREVER = ["--env", "Survive-v0", "--env-steps", "1000000000", "--output", "out"]
 #: It takes minutes to compile.
-HEAVY = ["--env", "Hopper-v5", "--output", "out"]
+HEAVY = ["--env", "Hopper-v5", "--engine", "vmap", "--output", "out"]
 
 
 def start(directory, *arguments, real=False, cache=None):
