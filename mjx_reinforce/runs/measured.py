@@ -4,7 +4,8 @@ Runs of ``train`` with four seeds of 16 episodes an update and a 32-32 policy, t
 evaluating, on 2026-11-22; all figures are good to a factor of two.
 
 - Two CPU cores: two hardware threads of the host of an H200, while seven such programs ran on
-  others. Two quiet cores of another machine were up to twice as fast.
+  others. Two quiet cores of another machine were up to twice as fast. Those of ``native`` are of
+  two cores of a shared machine; with contacts, the rates of rollouts, halved.
 - GPU: an H200. Compiling depends on the host: two of its threads took twice as long as stands here,
   16 quiet ones half as long. The rates of many episodes are those of ``docs/engine.md``, halved
   where there are no contacts, since training takes as long as playing there.
@@ -67,7 +68,7 @@ TASKS = {
     "ContinuousCartPole-v0": Task(4, 1, 50, 1.0, 1.4e9),
 }
 
-_PENDULUM_CPU = Speed("fused", 14, 4e-5, 1.5e6)
+_PENDULUM_CPU = Speed("native", 12, 2e-5, 8e6)
 _PENDULUM_GPU = Speed("kernel", 13, 2.2e-5, 1.2e9)
 _CART_CPU = Speed("fused", 10, 4.5e-5, 4e6)
 _CART_GPU = Speed("kernel", 12, 2.1e-5, 1e9)
@@ -80,9 +81,9 @@ CPU = {
     "Reacher-v5": Speed("fused", 22, 4.6e-5, 4e5),
     "Pusher-v5": Speed("vmap", 65, 0, 2.5e3),
     "Swimmer-v5": Speed("fused", 41, 3e-4, 5e4),
-    "HalfCheetah-v5": Speed("vmap", 35, 0, 6.4e3),
-    "Hopper-v5": Speed("vmap", 38, 0, 3.4e3),
-    "Walker2d-v5": Speed("vmap", 38, 0, 2.8e3),
+    "HalfCheetah-v5": Speed("native", 20, 0, 1.4e5),
+    "Hopper-v5": Speed("native", 20, 0, 1.7e5),
+    "Walker2d-v5": Speed("native", 25, 0, 8.5e4),
     "Ant-v5": Speed("vmap", 43, 0, 7.6e2),
     "Humanoid-v5": Speed("vmap", 78, 0, 4.5e2),
     "HumanoidStandup-v5": Speed("vmap", 70, 0, 2.3e2),
