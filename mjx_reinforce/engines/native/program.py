@@ -52,7 +52,7 @@ def build(
     traced, shapes = jaxprs.trace(function, *examples)
     write = functools.partial(_write, function, examples)
     target = machine.this_machine()
-    source = f"{jaxprs.fingerprint(traced)} {_writers()} {step.BRANCH_COST}"
+    source = f"{jaxprs.fingerprint(traced)} {_writers()}"
     code = machine.load(source, lambda: write(target), handler.NAMES, target, seam.cache_folder())
     return Program(code, shapes.record)
 
