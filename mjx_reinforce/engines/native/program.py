@@ -6,10 +6,20 @@ from importlib import resources
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engines import episode
-from mjx_reinforce.engines.native import handler, machine, player, queue, seam, step
+from mjx_reinforce.engines.native import (
+    gpu_player,
+    handler,
+    machine,
+    player,
+    ptx,
+    queue,
+    seam,
+    step,
+)
 from mjx_reinforce.engines.native.denormals import flush
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.policies.distribution import Distribution
@@ -24,11 +34,11 @@ _WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
 class Program(NamedTuple):
     """Machine code that plays.
 
-    code: of ``seam.call``
+    code: of ``seam.call`` on a CPU, of ``seam.launch`` on a GPU
     record: shape and dtype of the observation, the action and the reward of a step
     """
 
-    code: machine.Code
+    code: machine.Code | ptx.Kernel
     record: list[jax.ShapeDtypeStruct]
 
 
@@ -49,15 +59,35 @@ def build(
     """
     examples = step.examples(env, actor)
     function = step.step_function(env, act, distribution, length)
+    on_cpu = jax.default_backend() == "cpu"
+    if not on_cpu:  # a thread without an episode does not play
+        function, examples = _while_running(function), examples[:-1]
     traced, shapes = jaxprs.trace(function, *examples)
-    write = functools.partial(_write, function, examples)
-    target = machine.this_machine()
-    source = f"{jaxprs.fingerprint(traced)} {_writers()}"
-    code = machine.load(source, lambda: write(target), handler.NAMES, target, seam.cache_folder())
+    source, folder = f"{jaxprs.fingerprint(traced)} {_writers()}", seam.cache_folder()
+    if on_cpu:
+        target = machine.this_machine()
+        write = functools.partial(_write_cpu, function, examples, target)
+        code = machine.load(source, write, handler.NAMES, target, folder)
+    else:
+        write = functools.partial(_write_gpu, function, examples)
+        code = ptx.load(source, write, seam.compute_capability(), folder)
     return Program(code, shapes.record)
 
 
-def _write(function: Any, examples: tuple[Any, ...], target: machine.Machine) -> str:
+def _while_running(function: Any) -> Any:
+    """Returns a step of episodes that are running."""
+    return lambda *args: function(*args, jnp.int32(1))
+
+
+def _write_gpu(function: Any, examples: tuple[Any, ...]) -> str:
+    """Writes a step, and the kernel around it, as LLVM IR."""
+    actor = examples[0]
+    varying = [True] * len(jax.tree.leaves(examples))
+    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **_LOOPS)
+    return gpu_player.kernel_text(written, len(jax.tree.leaves(actor)))
+
+
+def _write_cpu(function: Any, examples: tuple[Any, ...], target: machine.Machine) -> str:
     """Writes a step, and all around it, as LLVM IR."""
     actor, carried, *_ = examples
     num_actor = len(jax.tree.leaves(actor))

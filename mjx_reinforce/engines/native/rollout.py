@@ -1,10 +1,11 @@
 """Complete episodes in machine code: the whole rollout is one call.
 
-`rollout` is `rollouts.rollout` for CPUs. Start states are drawn by the same calls as everywhere,
-noise from the same keys, so the same key gives the same episodes, up to rounding.
+`rollout` is `rollouts.rollout` for CPUs and NVIDIA GPUs. Start states are drawn by the same calls
+as everywhere, noise from the same keys, so the same key gives the same episodes, up to rounding.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.chunks import chunk_length
-from mjx_reinforce.engines.native import seam
+from mjx_reinforce.engines.native import machine, seam
 from mjx_reinforce.engines.native.program import Program, build
 from mjx_reinforce.engines.native.step import stored
 from mjx_reinforce.fused import UnsupportedPrimitive
@@ -50,17 +51,21 @@ def rollout(
         raise ValueError(f"the native engine cannot play this: {error}") from error
     begin = functools.partial(episode.begin, env, key)
     state, keys = jax.vmap(begin)(jnp.arange(num_episodes))
-    results = _results(program, horizon, num_episodes)
-    observation, action, reward, length, broken, simulated = seam.call(
-        program.code,
-        results,
+    given = (
         jnp.asarray(active, jnp.int32),
-        jnp.int32(threads),
         jnp.int32(num_deterministic),
         jax.random.key_data(keys),
         *(x.reshape(-1) for x in jax.tree.leaves(actor) if x.size),
         *(stored(x).reshape(num_episodes, -1) for x in jax.tree.leaves(state) if x.size),
     )
+    if isinstance(program.code, machine.Code):
+        results = _results(program, horizon, num_episodes)
+        played = seam.call(program.code, results, given[0], jnp.int32(threads), *given[1:])
+    else:
+        played = _episodes_before_numbers(
+            seam.launch(program.code, program.record, horizon, *given)
+        )
+    observation, action, reward, length, broken, simulated = played
     return Trajectory(
         observation=observation,
         action=action.reshape(horizon, num_episodes, *program.record[1].shape),
@@ -69,6 +74,12 @@ def rollout(
         nonfinite=broken != 0,
         simulated=simulated,
     )
+
+
+def _episodes_before_numbers(results: Sequence[jax.Array]) -> Sequence[jax.Array]:
+    """Returns a kernel's results with the records' axes in the order that a CPU writes them in."""
+    observation, action, reward = (jnp.swapaxes(x, 1, 2) for x in results[:3])
+    return observation, action, reward[..., 0], *results[3:]
 
 
 def unsupported(

@@ -1,0 +1,93 @@
+"""From LLVM IR to PTX, the assembly language that NVIDIA's driver takes."""
+
+import hashlib
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mjx_reinforce.engines.native import objects
+
+#: Threads of a block at most.
+MOST_THREADS = 128
+#: Blocks that a multiprocessor holds at once: each thread has 128 registers. More threads are worth
+#: more than what is spilled.
+_RESIDENT_BLOCKS = 4
+#: LLVM's name of NVIDIA's GPUs.
+TRIPLE = "nvptx64-nvidia-cuda"
+_LOADED: dict[str, "Kernel"] = {}
+_LOCK = threading.Lock()
+#: Denormals are zero, as in our machine code for CPUs.
+_ATTRIBUTES = f"""
+attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
+  "nvvm.maxntid"="{MOST_THREADS}" "nvvm.minctasm"="{_RESIDENT_BLOCKS}" }}
+"""
+
+
+class Kernel(NamedTuple):
+    """A kernel as PTX.
+
+    key: a name for all that it depends on
+    text: PTX; its entry is "play"
+    compiled: whether it was compiled now, and not read from disk
+    """
+
+    key: str
+    text: str
+    compiled: bool
+
+
+def load(source: str, write: Callable[[], str], capability: str, folder: Path | None) -> Kernel:
+    """Returns a kernel, compiled unless memory or disk has it.
+
+    Args:
+      source: all that the text of the kernel depends on, or a hash of it.
+      write: returns ``gpu_player.kernel_text``.
+      capability: the compute capability of the GPU, such as "9.0".
+      folder: where kernels are kept; None keeps none.
+
+    Raises:
+      RuntimeError: the text is no LLVM IR, or LLVM has no code for such a GPU.
+    """
+    key = _key(source, capability)
+    with _LOCK:
+        if key not in _LOADED:
+            found = objects.read(folder, key) if folder else None
+            data = found or _compile(write(), capability).encode()
+            _LOADED[key] = Kernel(key, data.decode(), compiled=not found)
+            if folder and not found:
+                objects.write(folder, key, data)
+        return _LOADED[key]
+
+
+def _key(source: str, capability: str) -> str:
+    import llvmlite
+    import llvmlite.binding as llvm
+
+    made_by = ("1", llvmlite.__version__, str(llvm.llvm_version_info), capability, _ATTRIBUTES)
+    return hashlib.sha256("\n".join((*made_by, source)).encode()).hexdigest()
+
+
+def _compile(text: str, capability: str) -> str:
+    """Returns PTX."""
+    import llvmlite.binding as llvm
+
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    target = llvm.Target.from_triple(TRIPLE).create_target_machine(
+        cpu=f"sm_{capability.replace('.', '')}", opt=3
+    )
+    header = f'target datalayout = "{target.target_data}"\ntarget triple = "{TRIPLE}"\n'
+    module = llvm.parse_assembly(header + text + _ATTRIBUTES)
+    _into_registers(module, target)
+    # Division as XLA's GPU programs have it, within 2 units in the last place.
+    return target.emit_assembly(module).replace("div.rn.ftz.f32", "div.full.ftz.f32")
+
+
+def _into_registers(module: Any, target: Any) -> None:
+    """Makes registers of what need not lie in memory."""
+    import llvmlite.binding as llvm
+
+    passes = llvm.create_new_module_pass_manager()
+    passes.add_sroa_pass()
+    passes.run(module, llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options()))
