@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.engines.native.lockstep import LONG, Lockstep, operations, some_of_block
 from mjx_reinforce.fused import scalarized
-from mjx_reinforce.fused.backends.llvm import LLVM
 from mjx_reinforce.fused.backends.llvm_text import Text
 
 _BOOL, _INT, _LONG = np.dtype(bool), np.dtype(np.int32), np.dtype(np.int64)
@@ -22,6 +22,16 @@ CONTROLS = ("sizes", "active", "deterministic", "keys")
 RESULTS = ("observation", "action", "reward", "length", "broken", "simulated", "next")
 #: The arguments of a step behind the actor and the state: keys, t, deterministic.
 _NUM_OTHERS = 3
+
+
+#: A block's threads, and how many blocks a multiprocessor holds at once, for programs that fit into
+#: its instruction caches and for longer ones. A thread has 128 registers: more threads are worth
+#: more than what does not fit into these.
+_SHORT, _LONG_ONE = (32, 16), (512, 1)
+#: Denormals are zero, as in machine code for CPUs.
+_ATTRIBUTES = """attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
+  "nvvm.maxntid"="{}" "nvvm.minctasm"="{}" }}
+"""
 
 
 class _Leaf(NamedTuple):
@@ -79,9 +89,9 @@ class _Kernel:
             text.load(text.at("%sizes", _INT, k), _INT) for k in range(3)
         )
         items = text.let(f"mul i32 {self.seeds}, {self.episodes}")
-        for place, value in ((self.row, "0"), (self.waited, "0"), (self.running, "0")):
-            text.store(value, place, _INT)
+        text.store("0", self.waited, _INT)
         text.store(items, self.limit, _INT)
+        self._begin("0", "0", "0")  # a thread without an episode has the values of one
         head, body, end = text.label(), text.label(), text.label()
         text.line(f"br label %{head}")
         text.start(head)
@@ -89,14 +99,12 @@ class _Kernel:
         with text.when(idle):
             self._fetch(items)
         running = text.let(f"icmp ne i32 {text.load(self.running, _INT)}, 0")
-        text.declared.add("declare i1 @llvm.nvvm.vote.any.sync(i32, i1)")
-        some = text.let(f"call i1 @llvm.nvvm.vote.any.sync(i32 -1, i1 {running})")
+        some = some_of_block(text, running)
         text.line(f"br i1 {some}, label %{body}, label %{end}")
         text.start(body)
         waited = text.let(f"add i32 {text.load(self.waited, _INT)}, 1")
         text.store(waited, self.waited, _INT)
-        with text.when(running):
-            self._play()
+        self._play(running)
         text.line(f"br label %{head}")
         text.start(end)
         self._count_steps()
@@ -106,7 +114,9 @@ class _Kernel:
         written = [f"%{name}" for name in RESULTS]
         parameters = [f"ptr noalias readonly {x}" for x in pointers]
         parameters += [f"ptr {x}" for x in unread] + [f"ptr {x}" for x in written]
-        return text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
+        block = _LONG_ONE if operations(self.step.schedule) > LONG else _SHORT
+        kernel = text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
+        return kernel + _ATTRIBUTES.format(*block)
 
     def _fetch(self, items: str) -> None:
         """Writes how a thread takes the next episode of an active seed, if there is one."""
@@ -132,11 +142,11 @@ class _Kernel:
         active = text.load(text.at("%active", _INT, self._wide(seed)), _INT)
         text.line(f"br i1 {text.let(f'icmp ne i32 {active}, 0')}, label %{fill}, label %{head}")
         text.start(fill)
-        self._begin(item, seed)
+        self._begin(item, seed, "1")
         text.line(f"br label %{end}")
         text.start(end)
 
-    def _begin(self, item: str, seed: str) -> None:
+    def _begin(self, item: str, seed: str, running: str) -> None:
         """Writes how a thread begins an episode."""
         text = self.text
         place = self._wide(item)
@@ -152,7 +162,7 @@ class _Kernel:
             (mode, self.mode.pointer),
             ("0", self.at.pointer),
             (item, self.row),
-            ("1", self.running),
+            (running, self.running),
         ):
             text.store(value, where, _INT)
 
@@ -165,19 +175,30 @@ class _Kernel:
             value = text.load(text.at(start, leaf.dtype, k), leaf.dtype)
             text.store(value, text.at(leaf.pointer, leaf.dtype, k), leaf.dtype)
 
-    def _play(self) -> None:
-        """Writes a step of the thread's episode, and its end if it ends by it."""
+    def _play(self, running: str) -> None:
+        """Writes a step of the thread's episode, which counts if it is running, and its end."""
         text = self.text
         seed = text.let(f"udiv i32 {text.load(self.row, _INT)}, {self.episodes}")
         actor = [self._row(leaf, seed) for leaf in self.shared]
         leaves = [*actor, *self.own]
-        emit = LLVM(text, lambda number: (leaves[number].pointer, leaves[number].dtype))
+        emit = Lockstep(text, lambda number: (leaves[number].pointer, leaves[number].dtype))
         values = emit.compile(self.step.schedule, self.step.outputs)
         *records, (goes_on,), (broken,) = values[:5]
+        with text.when(running):
+            self._keep(records, seed, values[5:])
+            self._end(goes_on, broken)
+
+    def _keep(self, records: list[list[Any]], seed: str, carried: list[list[Any]]) -> None:
+        """Writes what a step leaves: records, and what goes on into the next."""
+        text = self.text
         self._record(records, seed)
-        for leaf, to in zip(values[5:], self.own, strict=False):
+        for leaf, to in zip(carried, self.own, strict=False):
             for k, value in enumerate(leaf):
                 text.store(value, text.at(to.pointer, to.dtype, k), to.dtype)
+
+    def _end(self, goes_on: str, broken: str) -> None:
+        """Writes the end of an episode, if it has come."""
+        text = self.text
         steps = text.let(f"add i32 {text.load(self.at.pointer, _INT)}, 1")
         text.store(steps, self.at.pointer, _INT)
         late = text.let(f"icmp sge i32 {steps}, {self.horizon}")

@@ -1,27 +1,18 @@
 """From LLVM IR to PTX, the assembly language that NVIDIA's driver takes."""
 
 import hashlib
+import re
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mjx_reinforce.engines.native import objects
 
-#: Threads of a block at most.
-MOST_THREADS = 128
-#: Blocks that a multiprocessor holds at once: each thread has 128 registers. More threads are worth
-#: more than what is spilled.
-_RESIDENT_BLOCKS = 4
 #: LLVM's name of NVIDIA's GPUs.
 TRIPLE = "nvptx64-nvidia-cuda"
 _LOADED: dict[str, "Kernel"] = {}
 _LOCK = threading.Lock()
-#: Denormals are zero, as in our machine code for CPUs.
-_ATTRIBUTES = f"""
-attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
-  "nvvm.maxntid"="{MOST_THREADS}" "nvvm.minctasm"="{_RESIDENT_BLOCKS}" }}
-"""
 
 
 class Kernel(NamedTuple):
@@ -29,11 +20,13 @@ class Kernel(NamedTuple):
 
     key: a name for all that it depends on
     text: PTX; its entry is "play"
+    threads: of a block, at most
     compiled: whether it was compiled now, and not read from disk
     """
 
     key: str
     text: str
+    threads: int
     compiled: bool
 
 
@@ -53,10 +46,11 @@ def load(source: str, write: Callable[[], str], capability: str, folder: Path | 
     with _LOCK:
         if key not in _LOADED:
             found = objects.read(folder, key) if folder else None
-            data = found or _compile(write(), capability).encode()
-            _LOADED[key] = Kernel(key, data.decode(), compiled=not found)
+            text = found.decode() if found else _compile(write(), capability)
+            threads = int(re.findall(r"\.maxntid (\d+)", text)[0])
+            _LOADED[key] = Kernel(key, text, threads, compiled=not found)
             if folder and not found:
-                objects.write(folder, key, data)
+                objects.write(folder, key, text.encode())
         return _LOADED[key]
 
 
@@ -64,7 +58,7 @@ def _key(source: str, capability: str) -> str:
     import llvmlite
     import llvmlite.binding as llvm
 
-    made_by = ("1", llvmlite.__version__, str(llvm.llvm_version_info), capability, _ATTRIBUTES)
+    made_by = ("1", llvmlite.__version__, str(llvm.llvm_version_info), capability)
     return hashlib.sha256("\n".join((*made_by, source)).encode()).hexdigest()
 
 
@@ -78,16 +72,6 @@ def _compile(text: str, capability: str) -> str:
         cpu=f"sm_{capability.replace('.', '')}", opt=3
     )
     header = f'target datalayout = "{target.target_data}"\ntarget triple = "{TRIPLE}"\n'
-    module = llvm.parse_assembly(header + text + _ATTRIBUTES)
-    _into_registers(module, target)
+    module = llvm.parse_assembly(header + text)
     # Division as XLA's GPU programs have it, within 2 units in the last place.
     return target.emit_assembly(module).replace("div.rn.ftz.f32", "div.full.ftz.f32")
-
-
-def _into_registers(module: Any, target: Any) -> None:
-    """Makes registers of what need not lie in memory."""
-    import llvmlite.binding as llvm
-
-    passes = llvm.create_new_module_pass_manager()
-    passes.add_sroa_pass()
-    passes.run(module, llvm.create_pass_builder(target, llvm.create_pipeline_tuning_options()))

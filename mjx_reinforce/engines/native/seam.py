@@ -145,7 +145,7 @@ def _launch(
     given = [jnp.array([seeds, episodes, horizon], jnp.int32), *args]
     zeros = [jnp.zeros(x.shape, x.dtype) for x in results]
     aliases = {len(given) + k: k for k in range(len(results))}
-    blocks, threads = _grid(seeds * episodes)
+    blocks, threads = _grid(seeds * episodes, kernel.threads)
     call = jax.ffi.ffi_call(_PTX, results, input_output_aliases=aliases)
     return call(
         *given,
@@ -163,15 +163,15 @@ def _launch(
     )[:-1]
 
 
-def _grid(items: int) -> tuple[int, int]:
-    """Returns how many blocks of how many threads play so many episodes.
+def _grid(items: int, most: int) -> tuple[int, int]:
+    """Returns how many blocks of how many threads, at most so many, play so many episodes.
 
     Few episodes are spread over all multiprocessors. Blocks beyond those that run at once find no
     episode left, and end.
     """
     processors = jax.devices()[0].core_count
     threads = _LEAST_THREADS
-    while threads < ptx.MOST_THREADS and threads * processors < items:
+    while threads < most and threads * processors < items:
         threads *= 2
     return min(-(-items // threads), _MOST_BLOCKS * processors), threads
 

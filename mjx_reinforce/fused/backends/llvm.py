@@ -74,10 +74,14 @@ class LLVM(Backend[Value]):
         kinds = [np.dtype(arg.dtype) for arg in node.args]
         return OPERATIONS[op.name](self._text, op, node.dtype, kinds, cast(list[str], operands))
 
+    def some(self, mask: str) -> str:
+        """Returns an i1: whether some lane of a mask is set, for a gate or a loop."""
+        return self._text.any(mask)
+
     def gate(self, gate: LiveGate, values: dict[Node, Value]) -> Sequence[Value]:
         """Writes a branch that is taken if some lane needs it."""
         text = self._text
-        needed = text.any(self.value(gate.predicate, values))
+        needed = self.some(self.value(gate.predicate, values))
         cold = [self.value(out.cold, values) for out in gate.outs]
         before, hot_block, after = text.block, text.label(), text.label()
         text.line(f"br i1 {needed}, label %{hot_block}, label %{after}")
@@ -105,8 +109,9 @@ class LLVM(Backend[Value]):
         text.start(head)
         holes = [text.hole() for _ in range(len(loop.carries) + 1)]
         count, *names = [hole.name for hole in holes]
-        text.line(f"br i1 {self._goes_on(loop, count, names)}, label %{body}, label %{after}")
+        text.line(f"br i1 {self.goes_on(loop, count, names)}, label %{body}, label %{after}")
         text.start(body)
+        skipped = self.may_skip(loop, names)
         known: dict[Node, Value] = dict(zip((c.leaf for c in loop.carries), names, strict=True))
         for element, reader in zip(loop.elements, readers, strict=True):
             known[element.leaf] = reader(count)
@@ -115,8 +120,11 @@ class LLVM(Backend[Value]):
             dtype = _dtype(record.value)
             text.store(self.value(record.value, inner), self._text.at(array, dtype, count), dtype)
         nexts = [self.value(carry.next, inner) for carry in loop.carries]
+        kinds = [text.type(carry.leaf.dtype) for carry in loop.carries]
+        if skipped:
+            nexts = self._joined(*skipped, kinds, names, nexts)
         nexts = [text.let(f"add i64 {count}, 1"), *nexts]
-        kinds = ["i64", *(text.type(carry.leaf.dtype) for carry in loop.carries)]
+        kinds = ["i64", *kinds]
         for hole, kind, init, following in zip(holes, kinds, ["0", *inits], nexts, strict=True):
             text.fill(hole, f"phi {kind} [{init}, %{before}], [{following}, %{text.block}]")
         text.line(f"br label %{head}")
@@ -129,14 +137,34 @@ class LLVM(Backend[Value]):
             for r, array in zip(loop.records, kept, strict=True)
         ]
 
-    def _goes_on(self, loop: LiveLoop, count: str, carries: list[str]) -> str:
+    def may_skip(self, loop: LiveLoop, carries: list[str]) -> tuple[str, str] | None:
+        """Writes at the start of a loop's body a branch around it, for what does not go on.
+
+        Returns:
+            The block with the branch, and the one to come behind the body; None for no branch.
+        """
+        return None
+
+    def _joined(
+        self, before: str, after: str, kinds: list[str], olds: list[str], news: list[str]
+    ) -> list[str]:
+        """Ends a body that may have been skipped; returns the carries."""
+        text, end = self._text, self._text.block
+        text.line(f"br label %{after}")
+        text.start(after)
+        return [
+            text.let(f"phi {kind} [{old}, %{before}], [{new}, %{end}]")
+            for kind, old, new in zip(kinds, olds, news, strict=True)
+        ]
+
+    def goes_on(self, loop: LiveLoop, count: str, carries: list[str]) -> str:
         """Returns an i1: whether another iteration runs."""
         text = self._text
         conditions = []
         if loop.length is not None:
             conditions.append(text.let(f"icmp slt i64 {count}, {loop.length}"))
         if loop.active is not None:
-            conditions.append(text.any(carries[loop.active]))
+            conditions.append(self.some(carries[loop.active]))
         if len(conditions) == 2:
             return text.let(f"and i1 {conditions[0]}, {conditions[1]}")
         return conditions[0]
