@@ -38,7 +38,6 @@ ENGINES = {
     "vmap": ("vmap", "exact"),
     "fused": ("fused", "exact"),
     "native": ("native", "exact"),
-    "kernel": ("kernel", "exact"),
 }
 KEYS = (
     "what",
@@ -61,8 +60,8 @@ class Settings:
     env: tuple[str, ...] = ("InvertedPendulum-v5",)
     """Environments."""
     engine: tuple[str, ...] = ()
-    """Rows of the table: mjx, "mjx, 1 iteration", vmap, fused, native (CPUs) and kernel (NVIDIA
-    GPUs); all but vmap if not given."""
+    """Rows of the table: mjx, "mjx, 1 iteration", vmap, fused and native; all but vmap if not
+    given."""
     batch: tuple[int, ...] = (128, 512, 2048, 8192)
     """Episodes played at once."""
     max_mjx_batch: int = 2048
@@ -80,7 +79,7 @@ class Settings:
     png: Path = Path("benchmark.png")
     """Where to draw steps per second against batch."""
     quick: bool = False
-    """InvertedPendulum on mjx, fused and C MuJoCo only, in under two minutes."""
+    """InvertedPendulum on mjx, fused, native and C MuJoCo only, in under two minutes."""
 
 
 @struct.dataclass
@@ -120,7 +119,7 @@ def main() -> None:
     if settings.quick:
         settings = dataclasses.replace(
             settings,
-            engine=("mjx", "fused", "native")[: 3 if jax.default_backend() == "cpu" else 2],
+            engine=("mjx", "fused", "native"),
             batch=(128, 1024, 4096),
             max_mjx_batch=128,
             repeats=3,
@@ -128,8 +127,7 @@ def main() -> None:
         )
     jax.config.update("jax_default_matmul_precision", "highest")
     if not settings.engine:
-        ours = "native" if jax.default_backend() == "cpu" else "kernel"
-        engine = ("mjx", "mjx, 1 iteration", "fused", ours)
+        engine = ("mjx", "mjx, 1 iteration", "fused", "native")
         settings = dataclasses.replace(settings, engine=engine)
     rows = []
     for env in settings.env:

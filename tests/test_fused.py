@@ -384,39 +384,6 @@ def test_scalarize_takes_lanes_and_a_reduction():
     assert reductions == [(4,)]
 
 
-def test_pallas_kernel_in_interpreter():
-    pallas = pytest.importorskip("jax.experimental.pallas")
-    written = fused.scalarize(lambda x: line_search(x)[0] + 0.1, jnp.ones(()))
-
-    def kernel(x_ref, y_ref):
-        y_ref[...] = written(x_ref[...], any_lane=lambda p: jnp.max(p.astype(jnp.int32)) > 0)[()]
-
-    x = jnp.linspace(0.5, 4, 8)
-    out = jax.ShapeDtypeStruct(x.shape, x.dtype)
-    y = pallas.pallas_call(kernel, out_shape=out, interpret=True)(x)
-    np.testing.assert_allclose(y, jax.vmap(lambda x: line_search(x)[0] + 0.1)(x), rtol=1e-6)
-
-
-def test_a_loop_over_an_argument_reads_it_one_by_one():
-    def weigh(weights, x):
-        add = lambda total, w: (total + w[0] * jnp.tanh(w[1] * x), None)  # noqa: E731
-        return lax.scan(add, x, (weights[:, 0], weights[:, 1]))[0]
-
-    weights = jnp.arange(12.0).reshape(6, 2) / 10
-    x = jnp.linspace(-1, 1, 5)
-    examples = (weights, jnp.ones(()))
-    written = scalarized.build(weigh, examples, [False, True], branch_cost=400)
-    places = []
-
-    def read(place):
-        places.append(place)
-        return weights.reshape(-1)[place[1]] if place[0] == 0 else x
-
-    values = written.emit(read, x.shape, fused.any_lane, read_anywhere=True)
-    np.testing.assert_allclose(values[0][0], jax.vmap(lambda x: weigh(weights, x))(x), rtol=1e-6)
-    assert len(places) == 3  # one place for each column, and x
-
-
 def test_short_loops_can_stay_loops():
     step = lambda _, x: jnp.sin(x) + x  # noqa: E731
     counts = [

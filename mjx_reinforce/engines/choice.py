@@ -1,10 +1,9 @@
 """The choice of an engine: the same episodes, from the same noise, at different speeds.
 
 ``vmap`` maps the environment's step with ``jax.vmap``. ``fused`` writes it out in
-scalars and lets XLA fuse what is left (``mjx_reinforce.fused``). ``native`` and ``kernel`` write
-out the whole step, policy included, and repeat it in one program: machine code for a CPU
-(``mjx_reinforce.engines.native``), a kernel on an NVIDIA GPU (``mjx_reinforce.engines.kernel``).
-Trajectories agree up to rounding.
+scalars and lets XLA fuse what is left (``mjx_reinforce.fused``). ``native`` writes out the whole
+step, policy included, and repeats it in one program (``mjx_reinforce.engines.native``): machine code
+for a CPU, a kernel for an NVIDIA GPU. Trajectories agree up to rounding.
 """
 
 import functools
@@ -15,7 +14,6 @@ from typing import Any, NamedTuple
 import jax
 
 from mjx_reinforce import fused
-from mjx_reinforce.engines import kernel
 from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.engines.rollouts import rollout
 from mjx_reinforce.policies.distribution import Distribution
@@ -26,9 +24,6 @@ from mjx_reinforce.types import Environment, Trajectory, null_action
 MAX_OPERATIONS = 20_000
 #: On a CPU, branches of more operations are skipped where no episode needs them.
 _CPU_BRANCH_COST = 32
-#: A greater network is faster as the matrix products of ``fused``: on an H200 the kernel played
-#: 1.5 times as fast with 16 and 32 units, and 0.86 times as fast with 64 and 64.
-_MAX_KERNEL_PARAMETERS = 2_000
 
 
 class Player(NamedTuple):
@@ -47,7 +42,7 @@ class Player(NamedTuple):
 class Engine(NamedTuple):
     """A way to play episodes.
 
-    name: "vmap", "fused", "native" or "kernel"
+    name: "vmap", "fused" or "native"
     why: the reason it was chosen, for people
     rollout: as ``mjx_reinforce.engines.rollouts.rollout``
     seconds: wall time that making it took, most of it for machine code
@@ -59,7 +54,7 @@ class Engine(NamedTuple):
     seconds: float = 0.0
 
 
-NAMES = ("auto", "vmap", "fused", "native", "kernel")
+NAMES = ("auto", "vmap", "fused", "native")
 
 
 def choose(
@@ -71,7 +66,7 @@ def choose(
       name: one of ``NAMES``.
       env: what is played.
       player: who plays it; None where every episode has parameters of its own, which
-        the kernel and machine code cannot hold.
+        machine code cannot hold.
       horizon: T, the time limit in steps, for machine code.
 
     Raises:
@@ -89,23 +84,16 @@ def _choose(name: str, env: Environment, player: Player | None, horizon: int | N
         return Engine(name, why, rollout)
     against = _against_native(name, env, player, horizon)
     if not against:
-        why = "machine code for this CPU" if name == "auto" else why
+        device = "CPU" if jax.default_backend() == "cpu" else "GPU"
+        why = f"machine code for this {device}" if name == "auto" else why
         return Engine("native", why, native.rollout)
     if name == "native":
         raise ValueError(f"the native engine cannot play this: {against}; choose auto")
-    tried = name == "auto" and jax.default_backend() == "cpu"
-    instead = f"; machine code cannot play this: {against}" if tried else ""
+    instead = f"; machine code cannot play this: {against}" if name == "auto" else ""
     contacts = getattr(env, "num_contacts", 0)
     if name == "auto" and contacts:
         why = f"the fastest of the others for models with contacts, here up to {contacts}"
         return Engine("vmap", why + instead, rollout)
-    reason = _against_kernel(name, env, player)
-    if name != "fused" and not reason:
-        if name == "auto":
-            why = "an NVIDIA GPU, and a step and a policy that fit into one kernel"
-        return Engine("kernel", why, kernel.rollout)
-    if name == "kernel":
-        raise ValueError(f"the kernel engine cannot play this: {reason}; choose auto")
     # On a GPU a real branch makes the host wait for its predicate; computing both sides is cheap.
     cost = _CPU_BRANCH_COST if jax.default_backend() == "cpu" else MAX_OPERATIONS
     step = fused.vmap(env.step, in_axes=-1, out_axes=-1, branch_cost=cost)
@@ -128,21 +116,6 @@ def _against_native(
     if player is None or horizon is None:
         return "every episode has a policy of its own"
     return native.unsupported(env, *player, horizon)
-
-
-def _against_kernel(name: str, env: Environment, player: Player | None) -> str | None:
-    """Returns why the kernel must not, or for "auto" should not, play this; None if it can."""
-    if name == "fused":
-        return "another engine was chosen"
-    platform = jax.default_backend()
-    if platform not in ("gpu", "cuda"):
-        return f"it runs on NVIDIA GPUs, this is JAX on a {platform}"
-    if player is None:
-        return "every episode has a policy of its own"
-    size = sum(x.size for x in jax.tree.leaves(player.actor))
-    if name == "auto" and size > _MAX_KERNEL_PARAMETERS:
-        return f"the policy has {size:,} parameters, more than {_MAX_KERNEL_PARAMETERS:,}"
-    return kernel.unsupported(env, *player)
 
 
 def unsupported_by_fused(env: Environment, step: Any) -> str | None:

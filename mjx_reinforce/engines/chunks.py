@@ -45,8 +45,6 @@ def play_chunks(
     keys: jax.Array,
     progress: Any,
     records: Any,
-    *,
-    episode_axis: int,
 ) -> tuple[Any, Any, jax.Array]:
     """Plays chunk after chunk until every episode is over or the time is up.
 
@@ -56,7 +54,6 @@ def play_chunks(
       keys: [N] of every episode's noise; consumed.
       progress: where the episodes are; ``progress.alive`` [N] is 0 or False where one is over.
       records: arrays [horizon, ...] of zeros, which the chunks fill.
-      episode_axis: of the noise, where N is; 1 as above, or -1 for [length, E, N].
 
     Returns:
       The progress at the end, the records, and how many env steps [] were simulated. That counts
@@ -64,7 +61,7 @@ def play_chunks(
     """
     horizon = jax.tree.leaves(records)[0].shape[0]
     length = chunk_length(horizon)
-    draw = jax.vmap(functools.partial(draw_noise, distribution, length), out_axes=(0, episode_axis))
+    draw = jax.vmap(functools.partial(draw_noise, distribution, length), out_axes=(0, 1))
 
     def advance(carry):
         chunk, keys, progress, records = carry

@@ -77,7 +77,6 @@ def rollout(
         noise_keys,
         progress,
         records,
-        episode_axis=1,
     )
     return Trajectory(
         observation=jnp.swapaxes(observation, 1, 2),

@@ -58,7 +58,6 @@ class Scalarized:
         read: Callable[[tuple[int, int]], Any],
         batch_shape: tuple[int, ...],
         any_lane: Callable,
-        read_anywhere: bool = False,
     ) -> list[list[Any]]:
         """Emits the operations.
 
@@ -66,27 +65,18 @@ class Scalarized:
             read: returns the lane of an argument from (number of the leaf, row-major position).
             batch_shape: the shape of one lane.
             any_lane: reduces a lane of bools to one bool.
-            read_anywhere: whether `read` also takes a position that is a traced integer; then a
-                loop over the elements of an argument reads them one by one.
 
         Returns:
             For each leaf of the result, its elements: lanes, shared values and constants.
         """
-        return self.compile(
-            "xla",
-            read=read,
-            batch_shape=batch_shape,
-            any_lane=any_lane,
-            read_anywhere=read_anywhere,
-        )
+        return self.compile("xla", read=read, batch_shape=batch_shape, any_lane=any_lane)
 
     def __call__(self, *args: Any, any_lane: Callable = lanes.any_lane) -> Any:
         """Evaluates the function on lanes.
 
         Args:
             *args: like the examples, but each leaf is an object array or a nested list of lanes.
-            any_lane: reduces a lane of bools to one bool; a Pallas kernel on a GPU has no
-                `jnp.any` and passes a maximum over int32.
+            any_lane: reduces a lane of bools to one bool.
 
         Returns:
             The result, each leaf an object array of lanes.
@@ -112,7 +102,7 @@ def scalarize(fn: Callable, *examples: Any, branch_cost: int = 400) -> Scalarize
     """Writes a function out in scalars, to be evaluated on lanes in any memory.
 
     What comes back emits only elementwise operations, loops and branches, and constants only as
-    NumPy scalars, so a Pallas kernel can call it on values in registers.
+    NumPy scalars.
 
     Args:
         fn: a function of one example.

@@ -94,7 +94,7 @@ def reinforce(
         the state near the middle, statistics that never stop shrink, and magnify the
         observations until the policy fails.)
       one_start: reset every episode of a seed with the same key, drawn once at ``init``.
-      engine: how episodes are played: "auto", "vmap", "fused", "native" or "kernel", see
+      engine: how episodes are played: "auto", "vmap", "fused" or "native", see
         ``engines.choice``.
 
     Raises:

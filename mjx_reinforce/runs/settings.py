@@ -32,10 +32,10 @@ class RunSettings:
     one_start: bool = False
     """Begin all training episodes of a seed in one state; each seed has its own. Evaluations keep
     their own starts, so they show what the policy does where it was not trained."""
-    engine: Literal["auto", "vmap", "fused", "native", "kernel"] = "auto"
+    engine: Literal["auto", "vmap", "fused", "native"] = "auto"
     """How episodes are played: vmap (the step mapped by jax.vmap), fused (the step written out as
-    scalar operations), native (whole episodes in machine code for this CPU), kernel (in one GPU
-    kernel), or auto, the fastest here."""
+    scalar operations), native (whole episodes in machine code for this CPU or NVIDIA GPU), or auto,
+    the fastest here."""
     output: Path | None = None
     """Run directory; runs/<env>-<time> if not given."""
     overwrite: bool = False

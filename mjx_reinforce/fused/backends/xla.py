@@ -9,7 +9,6 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.fused.backends.backend import Backend
-from mjx_reinforce.fused.backends.places import Places, evenly_spaced
 from mjx_reinforce.fused.backends.xla_operations import LANES_ONLY, OPERATIONS
 from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
@@ -25,10 +24,9 @@ class XLA(Backend[Any]):
 
     def __init__(
         self,
-        read: Callable[[tuple[int, Any]], Any],
+        read: Callable[[tuple[int, int]], Any],
         batch_shape: tuple[int, ...],
         any_lane: Callable[[Any], Any],
-        read_anywhere: bool = False,
     ):
         """Says where the program runs.
 
@@ -36,12 +34,10 @@ class XLA(Backend[Any]):
             read: returns the lane of an input from (number of the argument, position in it).
             batch_shape: the shape of one lane.
             any_lane: reduces a lane of bools to one bool.
-            read_anywhere: whether `read` takes traced positions too.
         """
         self._read = read
         self._batch_shape = batch_shape
         self._any_lane = any_lane
-        self._read_anywhere = read_anywhere
 
     def constant(self, number: Any) -> Any:
         """A constant stays a NumPy scalar."""
@@ -82,24 +78,14 @@ class XLA(Backend[Any]):
         """Emits a `fori_loop`, a `scan` or a `while_loop`."""
         init = [self._materialize(c.init, c.out.varying, values) for c in loop.carries]
         body = functools.partial(self._iteration, loop, values)
-        places = self._places(loop)
-        if places and not loop.records:
-            final = lax.fori_loop(
-                0,
-                loop.length,
-                lambda t, carry: body(carry, [self._read(place.at(t)) for place in places])[0],
-                init,
-            )
-        elif loop.records or loop.elements:
+        if loop.records or loop.elements:
             rows = [self._stack(e.values, e.leaf.varying, values) for e in loop.elements]
             final, stacked = lax.scan(body, init, rows, length=loop.length)
             return final, [
                 [kept[t] for t in range(len(record.outs))]
                 for record, kept in zip(loop.records, stacked, strict=True)
             ]
-        else:
-            final = self._repeat(loop, body, init)
-        return final, []
+        return self._repeat(loop, body, init), []
 
     def _iteration(
         self, loop: LiveLoop, values: Values, carry: list[Any], row: Sequence[Any] = ()
@@ -108,10 +94,7 @@ class XLA(Backend[Any]):
         known = dict(zip((c.leaf for c in loop.carries), carry, strict=True))
         known.update(zip((e.leaf for e in loop.elements), row, strict=True))
         inner = self.inside(loop.body, values, known)
-        nexts = [
-            _computed(self._materialize(c.next, c.out.varying, inner), before)
-            for c, before in zip(loop.carries, carry, strict=True)
-        ]
+        nexts = [self._materialize(c.next, c.out.varying, inner) for c in loop.carries]
         return nexts, [self.value(record.value, inner) for record in loop.records]
 
     def _repeat(self, loop: LiveLoop, body: Callable, init: list[Any]) -> list[Any]:
@@ -147,15 +130,3 @@ class XLA(Backend[Any]):
 
     def _stack(self, row: list[Scalar], varying: bool, values: Values) -> jax.Array:
         return jax.numpy.stack([self._materialize(x, varying, values) for x in row])
-
-    def _places(self, loop: LiveLoop) -> list[Places]:
-        """Returns where each element's values are; nothing if not all can be read in a loop."""
-        if not self._read_anywhere:
-            return []
-        places = [place for e in loop.elements if (place := evenly_spaced(e.values))]
-        return places if len(places) == len(loop.elements) else []
-
-
-def _computed(value: Any, before: Any) -> Any:
-    """Returns a constant as the result of an operation: Triton takes no literal from a loop."""
-    return lax.select(lax.eq(before, before), value, value) if is_constant(value) else value
