@@ -11,11 +11,12 @@ from toys import Survive, ToyState, categorical
 
 from mjx_reinforce import Box, envs
 from mjx_reinforce.engines import choice, rollouts
-from mjx_reinforce.engines.native import machine, program, rollout, seam
+from mjx_reinforce.engines.native import available, program, rollout
+from mjx_reinforce.engines.native.cpu import machine, seam
 from mjx_reinforce.registry import DISTRIBUTIONS, load
 from mjx_reinforce.types import Discrete
 
-if reason := seam.unavailable():
+if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
 
 

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from jax import lax
 
-from mjx_reinforce.engines.native import handler, machine, objects, seam
+from mjx_reinforce.engines.native import available, objects
+from mjx_reinforce.engines.native.cpu import handler, machine, seam
 
 ACTIVE = [1, 0, 1, 1, 0, 7]
 HERE = Path(__file__).parent
@@ -175,8 +176,8 @@ def test_results_are_zeroed_by_all_threads():
 
 LOAD = """
 from pathlib import Path
-from mjx_reinforce.engines.native import seam
-code = items.load(seam.cache_folder())
+from mjx_reinforce.engines.native import objects
+code = items.load(objects.folder())
 items.check(jax.jit(lambda a: items.play(code, a))(jax.numpy.array([1, 0, 1])), [1, 0, 1])
 print(code.compiled)
 """
@@ -227,11 +228,11 @@ def test_a_cache_that_cannot_be_written_is_none(tmp_path):
 
 def test_objects_are_kept_where_jax_keeps_programs():
     before = jax.config.values["jax_compilation_cache_dir"]
-    assert seam.cache_folder() == Path(before) / "native"
+    assert objects.folder() == Path(before) / "native"
     try:
         for folder in (None, "gs://bucket/cache"):
             jax.config.update("jax_compilation_cache_dir", folder)
-            assert seam.cache_folder() is None
+            assert objects.folder() is None
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
 
@@ -417,22 +418,30 @@ def test_an_unknown_level_is_named(monkeypatch):
 
 
 def test_it_says_why_it_is_unavailable(monkeypatch):
-    assert seam.unavailable() is None
+    assert available.unavailable() is None
     with monkeypatch.context() as patch:
         patch.setitem(sys.modules, "llvmlite", None)
-        assert "llvmlite cannot be loaded" in (seam.unavailable() or "")
+        assert "llvmlite cannot be loaded" in (available.unavailable() or "")
     with monkeypatch.context() as patch:
         patch.setattr("llvmlite.binding.llvm_version_info", (15, 0, 7))
-        assert "too old" in (seam.unavailable() or "")
+        assert "too old" in (available.unavailable() or "")
     with monkeypatch.context() as patch:
-        patch.setattr(jax, "default_backend", lambda: "gpu")
-        assert "JAX on a gpu" in (seam.unavailable() or "")
+        patch.setattr(jax, "default_backend", lambda: "tpu")
+        assert "JAX on a tpu" in (available.unavailable() or "")
     with jax.default_prng_impl("rbg"):
-        assert "not as rbg" in (seam.unavailable() or "")
+        assert "not as rbg" in (available.unavailable() or "")
 
 
 def test_the_engine_is_imported_without_llvmlite():
-    names = ("machine", "handler", "seam", "objects")
+    names = (
+        "available",
+        "objects",
+        "cpu.machine",
+        "cpu.handler",
+        "cpu.seam",
+        "gpu.ptx",
+        "gpu.seam",
+    )
     program = "".join(f"import mjx_reinforce.engines.native.{name}\n" for name in names)
     assert run(f"{program}print('llvmlite' in sys.modules)") == ["False"]
 

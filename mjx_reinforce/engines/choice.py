@@ -2,8 +2,8 @@
 
 ``vmap`` maps the environment's step with ``jax.vmap``. ``fused`` writes it out in
 scalars and lets XLA fuse what is left (``mjx_reinforce.fused``). ``native`` writes out the whole
-step, policy included, and repeats it in one program (``mjx_reinforce.engines.native``): machine code
-for a CPU, a kernel for an NVIDIA GPU. Trajectories agree up to rounding.
+step, policy included, and repeats it in machine code for a CPU or in a kernel for an NVIDIA GPU
+(``mjx_reinforce.engines.native``). Trajectories agree up to rounding.
 """
 
 import functools

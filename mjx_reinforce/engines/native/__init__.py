@@ -1,1 +1,1 @@
-"""The native engine: machine code for CPUs, made with llvmlite, called by XLA without Python."""
+"""The native engine: machine code, made with llvmlite, that XLA calls without Python."""

@@ -6,6 +6,8 @@ import os
 import tempfile
 from pathlib import Path
 
+import jax
+
 #: Where a folder holds more bytes than this, what was used longest ago goes.
 LIMIT = 256 * 2**20
 _DIGEST = hashlib.sha256().digest_size
@@ -51,3 +53,11 @@ def _forget(folder: Path, limit: int) -> None:
         with contextlib.suppress(OSError):
             path.unlink()
         total -= size
+
+
+def folder() -> Path | None:
+    """Returns where compiled objects are kept: beside JAX's programs; None if JAX keeps none."""
+    folder = jax.config.values["jax_compilation_cache_dir"]
+    if not folder or "://" in folder or not jax.config.values["jax_enable_compilation_cache"]:
+        return None
+    return Path(folder) / "native"

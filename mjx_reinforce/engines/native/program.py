@@ -10,17 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engines import episode
-from mjx_reinforce.engines.native import (
-    gpu_player,
-    handler,
-    machine,
-    player,
-    ptx,
-    queue,
-    seam,
-    step,
-)
-from mjx_reinforce.engines.native.denormals import flush
+from mjx_reinforce.engines.native import available, objects, step
+from mjx_reinforce.engines.native.cpu import handler, machine, player, queue
+from mjx_reinforce.engines.native.cpu.denormals import flush
+from mjx_reinforce.engines.native.gpu import player as gpu_player
+from mjx_reinforce.engines.native.gpu import ptx
+from mjx_reinforce.engines.native.gpu import seam as gpu_seam
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Environment
@@ -59,18 +54,18 @@ def build(
     """
     examples = step.examples(env, actor)
     function = step.step_function(env, act, distribution, length)
-    on_cpu = jax.default_backend() == "cpu"
+    on_cpu = available.platform() == "cpu"
     if not on_cpu:  # a thread without an episode does not play
         function, examples = _while_running(function), examples[:-1]
     traced, shapes = jaxprs.trace(function, *examples)
-    source, folder = f"{jaxprs.fingerprint(traced)} {_writers()}", seam.cache_folder()
+    source, folder = f"{jaxprs.fingerprint(traced)} {_writers()}", objects.folder()
     if on_cpu:
         target = machine.this_machine()
         write = functools.partial(_write_cpu, function, examples, target)
         code = machine.load(source, write, handler.NAMES, target, folder)
     else:
         write = functools.partial(_write_gpu, function, examples)
-        code = ptx.load(source, write, seam.compute_capability(), folder)
+        code = ptx.load(source, write, gpu_seam.compute_capability(), folder)
     return Program(code, shapes.record)
 
 

@@ -14,7 +14,10 @@ import numpy as np
 
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.chunks import chunk_length
-from mjx_reinforce.engines.native import machine, seam
+from mjx_reinforce.engines.native import available
+from mjx_reinforce.engines.native.cpu import machine
+from mjx_reinforce.engines.native.cpu import seam as cpu
+from mjx_reinforce.engines.native.gpu import seam as gpu
 from mjx_reinforce.engines.native.program import Program, build
 from mjx_reinforce.engines.native.step import stored
 from mjx_reinforce.fused import UnsupportedPrimitive
@@ -60,11 +63,9 @@ def rollout(
     )
     if isinstance(program.code, machine.Code):
         results = _results(program, horizon, num_episodes)
-        played = seam.call(program.code, results, given[0], jnp.int32(threads), *given[1:])
+        played = cpu.call(program.code, results, given[0], jnp.int32(threads), *given[1:])
     else:
-        played = _episodes_before_numbers(
-            seam.launch(program.code, program.record, horizon, *given)
-        )
+        played = _episodes_before_numbers(gpu.launch(program.code, program.record, horizon, *given))
     observation, action, reward, length, broken, simulated = played
     return Trajectory(
         observation=observation,
@@ -86,7 +87,7 @@ def unsupported(
     env: Environment, act: episode.Act, actor: Any, distribution: Distribution, horizon: int
 ) -> str | None:
     """Returns why machine code cannot play this here, or None; it is compiled if it can."""
-    reason = seam.unavailable()
+    reason = available.unavailable()
     if reason:
         return reason
     try:

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.engines.native import handler
-from mjx_reinforce.engines.native.denormals import Flush
-from mjx_reinforce.engines.native.lanes import ALIGNMENT, Field, Layout, layout
-from mjx_reinforce.engines.native.queue import NUM_CONTROLS, NUM_RECORDS, queue_text
+from mjx_reinforce.engines.native.cpu import handler
+from mjx_reinforce.engines.native.cpu.denormals import Flush
+from mjx_reinforce.engines.native.cpu.lanes import ALIGNMENT, Field, Layout, layout
+from mjx_reinforce.engines.native.cpu.queue import NUM_CONTROLS, NUM_RECORDS, queue_text
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.fused.backends.llvm import LLVM
 from mjx_reinforce.fused.backends.llvm_text import Text

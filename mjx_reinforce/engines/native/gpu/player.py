@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.engines.native.lockstep import LONG, Lockstep, operations, some_of_block
+from mjx_reinforce.engines.native.gpu.lockstep import LONG, Lockstep, operations, some_of_block
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.fused.backends.llvm_text import Text
 

@@ -8,8 +8,8 @@ writes down how a lane's episode ended and then gives it the next.
 from importlib.resources import files
 from string import Template
 
-from mjx_reinforce.engines.native import handler
-from mjx_reinforce.engines.native.lanes import Field, Layout
+from mjx_reinforce.engines.native.cpu import handler
+from mjx_reinforce.engines.native.cpu.lanes import Field, Layout
 
 #: The buffers of a call: so many arguments of its own, those of the actor and the state, the
 #: results, of which so many are records of steps.
@@ -44,7 +44,7 @@ def queue_text(places: Layout, lanes: int) -> str:
             ]
         ),
     }
-    template = files("mjx_reinforce.engines.native").joinpath("queue.ll").read_text("utf-8")
+    template = files("mjx_reinforce.engines.native.cpu").joinpath("queue.ll").read_text("utf-8")
     return Template(template).substitute(values)
 
 

@@ -35,7 +35,7 @@ def load(source: str, write: Callable[[], str], capability: str, folder: Path | 
 
     Args:
       source: all that the text of the kernel depends on, or a hash of it.
-      write: returns ``gpu_player.kernel_text``.
+      write: returns ``player.kernel_text``.
       capability: the compute capability of the GPU, such as "9.0".
       folder: where kernels are kept; None keeps none.
 

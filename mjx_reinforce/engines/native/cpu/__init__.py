@@ -1,0 +1,1 @@
+"""Machine code for CPUs: an episode is a lane of a vector."""

@@ -1,0 +1,84 @@
+"""How JAX calls machine code on a CPU; here and in the GPU's ``seam`` alone stands ``jax.ffi``.
+
+XLA's CPU runtime calls the handler itself, within compiled programs and loops, without Python.
+Where it does not take the handler, ``jax.pure_callback`` runs the same code: about 1 ms a call
+instead of 1 µs, and XLA's programs are not cached then.
+"""
+
+import ctypes
+import functools
+import os
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+
+from mjx_reinforce.engines.native.cpu import handler
+from mjx_reinforce.engines.native.cpu.machine import Code
+
+#: key of the code -> how JAX calls it
+_WAYS: dict[str, str] = {}
+
+
+def call(code: Code, results: Sequence[jax.ShapeDtypeStruct], *args: Any) -> Sequence[jax.Array]:
+    """Calls machine code under any transformation but differentiation.
+
+    Args:
+      code: functions of ``handler.NAMES``.
+      results: shapes and dtypes of what it returns, as ``handler.handler_text`` says.
+      args: arrays, likewise; vmapped, all get the new axis in front.
+    """
+    if way(code) == "callback":
+        play = functools.partial(_play, code, results)
+        return jax.pure_callback(play, results, *args, vmap_method="broadcast_all")
+    return jax.ffi.ffi_call(_target(code), results, vmap_method="broadcast_all")(*args)
+
+
+def way(code: Code) -> str:
+    """Returns how JAX calls the code: "ffi", or "callback" where XLA does not take its handler."""
+    if code.key not in _WAYS:
+        _WAYS[code.key] = "ffi" if _register(code) else "callback"
+    return _WAYS[code.key]
+
+
+def _target(code: Code) -> str:
+    """Returns XLA's name of the handler; programs in JAX's cache find it again by it."""
+    return f"mjx_reinforce_{code.key}"
+
+
+def _register(code: Code) -> bool:
+    """Tells XLA where the handler is; returns whether it took it."""
+    jax.devices()  # a handler refused before XLA has started would keep it from starting
+    address = ctypes.c_void_p(code.addresses["handler"])
+    try:
+        jax.ffi.register_ffi_target(_target(code), jax.ffi.pycapsule(address), platform="cpu")
+    except (AttributeError, RuntimeError):  # jax.ffi has changed; XLA speaks another version
+        return False
+    return True
+
+
+def _play(code: Code, results: Sequence[jax.ShapeDtypeStruct], *args: Any) -> list[np.ndarray]:
+    """Plays without XLA: on threads of its own, from NumPy arrays."""
+    given = [np.asarray(x, order="C") for x in args]
+    active, threads, keys = (given[i] for i in (handler.ACTIVE, handler.THREADS, handler.KEYS))
+    mapped = active.shape[: active.ndim - len(results[handler.SIMULATED].shape)]
+    made: list[Any] = [np.empty(mapped + x.shape, x.dtype) for x in results]
+    data = (ctypes.c_void_p * (len(given) + len(made)))(*(x.ctypes.data for x in [*given, *made]))
+    sizes = (ctypes.c_int64 * len(made))(*(x.nbytes for x in made))
+    episodes, horizon = keys.shape[-2], made[handler.REWARD].shape[-2]
+    job = _function(code, "open", 2, 3)(data, sizes, active.size, episodes, horizon)
+    most = os.cpu_count() or 1
+    count = min(int(threads.flat[0]) or most, most)
+    with ThreadPoolExecutor(count) as pool:
+        for _ in range(count):
+            pool.submit(_function(code, "share", 1, 0), job)
+    _function(code, "close", 1, 0)(job)
+    return made
+
+
+def _function(code: Code, name: str, num_pointers: int, num_integers: int) -> Any:
+    """Returns a function for Python to call; it returns a pointer."""
+    kinds = [ctypes.c_void_p] * num_pointers + [ctypes.c_int64] * num_integers
+    return ctypes.CFUNCTYPE(ctypes.c_void_p, *kinds)(code.addresses[name])

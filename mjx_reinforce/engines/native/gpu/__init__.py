@@ -1,0 +1,1 @@
+"""Kernels for NVIDIA GPUs: an episode is a thread."""

@@ -1,0 +1,167 @@
+"""How JAX launches kernels on an NVIDIA GPU.
+
+A kernel goes to XLA as PTX, in a call that XLA's GPU compiler knows itself: it is launched within
+compiled programs and loops without Python. That call is internal to XLA, so it is tried once in
+each process before it is relied on.
+"""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from mjx_reinforce.engines.native.gpu import player, ptx
+
+#: XLA's name of what launches a kernel.
+_PTX = "__gpu$xla.gpu.ptx"
+#: Threads of a block at least, a warp, and blocks on each multiprocessor at most.
+_LEAST_THREADS, _MOST_BLOCKS = 32, 16
+#: A kernel that adds 1 to the number that is its second argument and its result.
+_PROBE = """
+.version 7.0
+.target sm_70
+.address_size 64
+.visible .entry probe(.param .u64 given, .param .u64 unread, .param .u64 written) {
+  .reg .b64 %p<3>;
+  .reg .b32 %x<3>;
+  ld.param.u64 %p1, [given];
+  ld.param.u64 %p2, [written];
+  ld.global.u32 %x1, [%p1];
+  ld.global.u32 %x2, [%p2];
+  add.s32 %x1, %x1, %x2;
+  st.global.u32 [%p2], %x1;
+  ret;
+}
+"""
+
+
+def unavailable() -> str | None:
+    """Returns why kernels of ours cannot run on this GPU, None if they can."""
+    import llvmlite.binding as llvm
+
+    capability = compute_capability()
+    if capability.partition(".")[0] not in map(str, range(7, 100)):
+        return f"it runs on NVIDIA GPUs of compute capability 7.0 or more, this is {capability!r}"
+    if jax.config.values["jax_enable_x64"]:
+        return "on GPUs it plays in float32 alone, and jax_enable_x64 is set"
+    llvm.initialize_all_targets()
+    try:
+        llvm.Target.from_triple(ptx.TRIPLE)
+    except RuntimeError as error:
+        return f"this llvmlite has no code for GPUs: {error}"
+    return _refused()
+
+
+@functools.cache
+def _refused() -> str | None:
+    """Returns why XLA does not launch kernels, None if it does: in a loop, into its own results."""
+
+    def add(_: Any, x: jax.Array) -> jax.Array:
+        result = [jax.ShapeDtypeStruct((1,), jnp.int32)]
+        return _call(_PROBE, "probe", result, (1, 1), [jnp.ones(1, jnp.int32), x])[0]
+
+    try:
+        with jax.ensure_compile_time_eval():
+            found = jax.jit(lambda x: lax.fori_loop(0, 3, add, x))(jnp.zeros(1, jnp.int32))
+            return (
+                None if int(found[0]) == 3 else f"XLA launched a kernel and gave {found[0]}, not 3"
+            )
+    except Exception as error:  # what XLA raises has no type of its own
+        return f"XLA does not launch its kernels: {' '.join(str(error).split())[:200]}"
+
+
+def compute_capability() -> str:
+    """Returns that of the GPU, such as "9.0"; what other devices say instead; "" if nothing."""
+    return str(getattr(jax.devices()[0], "compute_capability", ""))
+
+
+def launch(
+    kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: Any
+) -> Sequence[jax.Array]:
+    """Runs a kernel on a GPU; vmapped, it remains one launch.
+
+    Args:
+      kernel: of ``player.kernel_text``.
+      record: shape and dtype of the observation, the action and the reward of a step.
+      horizon: T, the steps of an episode at most.
+      args: active [], deterministic [], keys [N, 2], and the leaves of actor and state [N, ...].
+
+    Returns:
+      What the kernel does, without the seeds' axis.
+    """
+
+    @jax.custom_batching.custom_vmap
+    def play(*args):  # [S, ...]
+        return _launch(kernel, record, horizon, *args)
+
+    @play.def_vmap
+    def _(size, mapped, *args):
+        along = [
+            x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
+            for x, is_mapped in zip(args, mapped, strict=True)
+        ]
+        results = play(*(x.reshape(-1, *x.shape[2:]) for x in along))
+        return [x.reshape(size, -1, *x.shape[1:]) for x in results], [True] * len(results)
+
+    return [x[0] for x in play(*(x[None] for x in args))]
+
+
+def _launch(
+    kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: Any
+) -> Sequence[jax.Array]:
+    keys = args[2]
+    seeds, episodes = keys.shape[:2]
+    shape = jax.ShapeDtypeStruct
+    observation, action, reward = (
+        shape((seeds, horizon, int(np.prod(x.shape, dtype=int)), episodes), x.dtype) for x in record
+    )
+    counts = [shape(x, jnp.int32) for x in ((seeds, episodes), (seeds, episodes), (seeds,), (1,))]
+    results = [observation, action, reward, *counts]
+    given = [jnp.array([seeds, episodes, horizon], jnp.int32), *args]
+    zeros = [jnp.zeros(x.shape, x.dtype) for x in results]
+    grid = _grid(seeds * episodes, kernel.threads)
+    return _call(kernel.text, player.ENTRY, results, grid, [*given, *zeros])[:-1]
+
+
+def _call(
+    text: str,
+    entry: str,
+    results: Sequence[jax.ShapeDtypeStruct],
+    grid: tuple[int, int],
+    args: Sequence[jax.Array],
+) -> Sequence[jax.Array]:
+    """Launches so many blocks of so many threads, which write over the last arguments."""
+    first = len(args) - len(results)
+    aliases = {first + k: k for k in range(len(results))}
+    blocks, threads = map(np.int32, grid)
+    one = np.int32(1)
+    return jax.ffi.ffi_call(_PTX, results, input_output_aliases=aliases)(
+        *args,
+        name=entry,
+        kernel_type="ptx",
+        kernel_data=text,
+        grid_x=blocks,
+        grid_y=one,
+        grid_z=one,
+        block_x=threads,
+        block_y=one,
+        block_z=one,
+        shared_mem_bytes=np.int32(0),
+    )
+
+
+def _grid(items: int, most: int) -> tuple[int, int]:
+    """Returns how many blocks of how many threads, at most so many, play so many episodes.
+
+    Few episodes are spread over all multiprocessors. Blocks beyond those that run at once find no
+    episode left, and end.
+    """
+    processors = jax.devices()[0].core_count
+    threads = _LEAST_THREADS
+    while threads < most and threads * processors < items:
+        threads *= 2
+    return min(-(-items // threads), _MOST_BLOCKS * processors), threads

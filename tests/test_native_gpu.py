@@ -1,0 +1,174 @@
+"""The native engine's kernels for GPUs: what they play, run on this CPU, and what they are."""
+
+import shutil
+import subprocess
+
+import gpu_on_cpu
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from players import actor_and_act, assert_same_episodes
+from test_native import Drifting, both, played
+from toys import Chain, categorical
+
+from mjx_reinforce import envs
+from mjx_reinforce.engines import choice
+from mjx_reinforce.engines.native import available, rollout, step
+from mjx_reinforce.engines.native.gpu import lockstep, player, ptx, seam
+from mjx_reinforce.fused import scalarized
+
+if reason := available.unavailable():
+    pytest.skip(reason, allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    env = envs.make("InvertedPendulum-v5")
+    return env, actor_and_act(env, (5, 6))
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_same_episodes_as_everywhere(pendulum, monkeypatch, threads):
+    """Of a task, and of a toy whose state has a counter, a flag and a limit of its own."""
+    gpu_on_cpu.emulate(monkeypatch, threads)
+    for env, player in (pendulum, (toy := Drifting(), actor_and_act(toy, (4,)))):
+        got, want = both(env, player, num_deterministic=2)
+        assert got.mask[:, 0].all()
+        assert not got.mask[:, -1].all()
+        assert_same_episodes(got, want, rounding=2e-5)
+
+
+def test_actions_may_be_integers(monkeypatch):
+    gpu_on_cpu.emulate(monkeypatch)
+    env = Chain()
+    got, want = both(env, actor_and_act(env, (4,), distribution=categorical(2)))
+    assert got.action.dtype == want.action.dtype
+    assert_same_episodes(got, want, rounding=1e-6)
+
+
+def test_steps_are_counted_for_the_seed_that_played_them(pendulum, monkeypatch):
+    gpu_on_cpu.emulate(monkeypatch)
+    result = played(rollout.rollout, *pendulum, num_episodes=7)
+    np.testing.assert_array_equal(result.simulated, result.mask.sum((1, 2)))
+
+
+def test_seeds_that_are_not_active_are_not_played(pendulum, monkeypatch):
+    gpu_on_cpu.emulate(monkeypatch)
+    env, (actor, act, distribution) = pendulum
+
+    def one(key, active):
+        size = {"num_episodes": 5, "horizon": 20}
+        return rollout.rollout(env, act, actor, distribution, key, active=active, **size)
+
+    keys = jax.random.split(jax.random.key(0), 4)
+    all_seeds, some = (
+        jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(keys, jnp.array(active)))
+        for active in ([True] * 4, [False, True, False, True])
+    )
+    assert all_seeds.mask[:, 0].all()
+    for got, want in zip(jax.tree.leaves(some), jax.tree.leaves(all_seeds), strict=True):
+        assert not got[[0, 2]].any()
+        np.testing.assert_array_equal(got[[1, 3]], want[[1, 3]])
+
+
+def test_in_step_or_apart_an_episode_is_the_same(monkeypatch):
+    """Hopper's loops and branches, entered by all threads together or by each alone."""
+    gpu_on_cpu.emulate(monkeypatch)
+    env = envs.make("Hopper-v5")
+    player = actor_and_act(env, (4,))
+    results = []
+    for long in (10**9, 3_000, 0):
+        monkeypatch.setattr(lockstep, "LONG", long)
+        results.append(played(rollout.rollout, env, player, horizon=30))
+    for got in results[1:]:
+        jax.tree.map(np.testing.assert_array_equal, got, results[0])
+
+
+def kernel_text(env, sizes):
+    actor, act, distribution = actor_and_act(env, sizes)
+    examples = step.examples(env, actor)[:-1]
+    function = step.step_function(env, act, distribution, 50)
+    written = scalarized.build(
+        lambda *args: function(*args, jnp.int32(1)),
+        examples,
+        [True] * len(jax.tree.leaves(examples)),
+        step.BRANCH_COST,
+        unrolled=1,
+        unrolled_arrays=1,
+    )
+    return player.kernel_text(written, len(jax.tree.leaves(actor)))
+
+
+@pytest.mark.parametrize(("name", "threads"), [("InvertedPendulum-v5", 32), ("Hopper-v5", 512)])
+@pytest.mark.parametrize("capability", ["7.5", "9.0"])
+def test_ptx(name, threads, capability, tmp_path):
+    """It is one kernel that calls nothing; NVIDIA's assembler takes it, where there is one."""
+    text = kernel_text(envs.make(name), (4,))
+    made = ptx.load(text, lambda: text, capability, tmp_path)
+    assert made.compiled
+    assert made.threads == threads
+    assert made.text.count(".entry play(") == 1
+    assert f".target sm_{capability.replace('.', '')}" in made.text
+    assert "call" not in made.text
+    ptx._LOADED.clear()
+    again = ptx.load(text, lambda: pytest.fail("it is on disk"), capability, tmp_path)
+    assert again == made._replace(compiled=False)
+    if shutil.which("ptxas"):
+        source = tmp_path / "play.ptx"
+        source.write_text(made.text)
+        architecture = f"-arch=sm_{capability.replace('.', '')}"
+        subprocess.run(["ptxas", "-O0", architecture, source, "-o", "/dev/null"], check=True)
+
+
+def test_one_launch_for_all_seeds_in_loops(pendulum, monkeypatch):
+    """Vmapped twice, in a scan, it is one custom call that writes over zeros."""
+    env, (actor, act, distribution) = pendulum
+
+    def one(key):
+        return rollout.rollout(env, act, actor, distribution, key, num_episodes=8, horizon=50)
+
+    def repeated(keys):
+        def body(keys, _):
+            seeds = jax.vmap(jax.vmap(one))(keys)
+            return jax.vmap(jax.vmap(lambda k: jax.random.split(k)[0]))(keys), seeds.reward.sum()
+
+        return jax.lax.scan(body, keys, length=3)
+
+    text = gpu_on_cpu.lowered(monkeypatch, repeated, jax.random.split(jax.random.key(0), (2, 3)))
+    calls = [line for line in text.splitlines() if "@__gpu$xla.gpu.ptx" in line]
+    assert len(calls) == 1
+    assert "tensor<6x50x4x8xf32>" in calls[0]
+    assert calls[0].count("operand_index") == len(player.RESULTS)
+    assert "grid_x = 2 : i32" in calls[0]
+    assert "block_x = 32 : i32" in calls[0]
+
+
+def test_it_says_why_there_are_no_kernels(monkeypatch):
+    monkeypatch.setattr(seam, "compute_capability", lambda: "gfx90a")
+    assert "this is 'gfx90a'" in (seam.unavailable() or "")
+    monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
+    with jax.enable_x64(True):
+        assert "float32 alone" in (seam.unavailable() or "")
+    assert "does not launch its kernels" in (seam.unavailable() or "")  # this is a CPU
+
+
+def test_another_engine_plays_where_kernels_are_not_launched(pendulum, monkeypatch):
+    monkeypatch.setattr(available, "platform", lambda: "gpu")
+    monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
+    env, player = pendulum
+    chosen = choice.choose("auto", env, choice.Player(player[1], player[0], player[2]), 50)
+    assert chosen.name == "fused"
+    assert "does not launch its kernels" in chosen.why
+    with pytest.raises(ValueError, match="does not launch its kernels"):
+        choice.choose("native", env, choice.Player(player[1], player[0], player[2]), 50)
+
+
+def test_few_episodes_are_spread_over_all_multiprocessors(monkeypatch):
+    monkeypatch.setattr(jax, "devices", lambda: [type("GPU", (), {"core_count": 100})])
+    assert seam._grid(1, 512) == (1, 32)
+    assert seam._grid(1_600, 512) == (50, 32)
+    assert seam._grid(6_400, 512) == (100, 64)
+    assert seam._grid(51_200, 512) == (100, 512)
+    assert seam._grid(10**7, 512) == (1_600, 512)
+    assert seam._grid(10**7, 32) == (1_600, 32)
