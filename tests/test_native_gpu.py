@@ -32,8 +32,8 @@ def pendulum():
 def test_the_same_episodes_as_everywhere(pendulum, monkeypatch, threads):
     """Of a task, and of a toy whose state has a counter, a flag and a limit of its own."""
     gpu_on_cpu.emulate(monkeypatch, threads)
-    for env, player in (pendulum, (toy := Drifting(), actor_and_act(toy, (4,)))):
-        got, want = both(env, player, num_deterministic=2)
+    for env, who in (pendulum, (toy := Drifting(), actor_and_act(toy, (4,)))):
+        got, want = both(env, who, num_deterministic=2, horizon=100)
         assert got.mask[:, 0].all()
         assert not got.mask[:, -1].all()
         assert_same_episodes(got, want, rounding=2e-5)
@@ -49,7 +49,7 @@ def test_actions_may_be_integers(monkeypatch):
 
 def test_steps_are_counted_for_the_seed_that_played_them(pendulum, monkeypatch):
     gpu_on_cpu.emulate(monkeypatch)
-    result = played(rollout.rollout, *pendulum, num_episodes=7)
+    result = played(rollout.rollout, *pendulum, num_episodes=7, horizon=100)
     np.testing.assert_array_equal(result.simulated, result.mask.sum((1, 2)))
 
 
@@ -76,11 +76,11 @@ def test_in_step_or_apart_an_episode_is_the_same(monkeypatch):
     """Hopper's loops and branches, entered by all threads together or by each alone."""
     gpu_on_cpu.emulate(monkeypatch)
     env = envs.make("Hopper-v5")
-    player = actor_and_act(env, (4,))
+    who = actor_and_act(env, (4,))
     results = []
     for long in (10**9, 3_000, 0):
         monkeypatch.setattr(lockstep, "LONG", long)
-        results.append(played(rollout.rollout, env, player, horizon=30))
+        results.append(played(rollout.rollout, env, who, horizon=30))
     for got in results[1:]:
         jax.tree.map(np.testing.assert_array_equal, got, results[0])
 
@@ -156,12 +156,13 @@ def test_it_says_why_there_are_no_kernels(monkeypatch):
 def test_another_engine_plays_where_kernels_are_not_launched(pendulum, monkeypatch):
     monkeypatch.setattr(available, "platform", lambda: "gpu")
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
-    env, player = pendulum
-    chosen = choice.choose("auto", env, choice.Player(player[1], player[0], player[2]), 50)
+    env, (actor, act, distribution) = pendulum
+    who = choice.Player(act, actor, distribution)
+    chosen = choice.choose("auto", env, who, 50)
     assert chosen.name == "fused"
     assert "does not launch its kernels" in chosen.why
     with pytest.raises(ValueError, match="does not launch its kernels"):
-        choice.choose("native", env, choice.Player(player[1], player[0], player[2]), 50)
+        choice.choose("native", env, who, 50)
 
 
 def test_few_episodes_are_spread_over_all_multiprocessors(monkeypatch):
