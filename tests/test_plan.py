@@ -189,6 +189,8 @@ def test_the_time_of_a_run_by_hand():
     config = Config(num_seeds=2, num_episodes=5, env_steps=1000, eval_every=2, eval_episodes=5)
     # 1000 / 0.5 steps a seed, twice that with evaluations, two seeds; 10 at a time take 0.02 s.
     assert plan.training_seconds(config, task, speed) == (pytest.approx(8000 / 10 * 0.02), False)
+    native = plan.training_seconds(config, task, speed._replace(engine="native"))
+    assert native == (pytest.approx(4000 / 10 * 0.02), False)  # no episode waits for another
     # Two updates of 5 episodes of at most 100 steps are fewer.
     config = dataclasses.replace(config, max_updates=2)
     assert plan.training_seconds(config, task, speed) == (pytest.approx(4000 / 10 * 0.02), True)

@@ -77,7 +77,7 @@ def make_plan(env: Any, learner: Any, horizon: int, config: Config) -> Plan:
         compiling = speed.compiling
         time = f"Compiling takes {_range(compiling)}, or much less if this was compiled before; "
         time += f"training {'at most ' + duration(seconds) if bounded else _range(seconds)}"
-        if not bounded and task.useful < 1:
+        if not bounded and useful_part(task, speed) < 1:
             time += ", more if some seeds' episodes stay short, since all wait for the last"
     memory = gigabytes(base + needed(config, task))
     text = (
@@ -96,13 +96,18 @@ def training_seconds(config: Config, task: Task, speed: Speed) -> tuple[float, b
     episodes = config.episodes_per_update
     bounds = []
     if config.env_steps is not None:
-        bounds.append((config.env_steps / task.useful, False))
+        bounds.append((config.env_steps / useful_part(task, speed), False))
     if config.max_updates is not None:
         bounds.append((float(config.max_updates) * episodes * horizon, True))
     steps, bounded = min(bounds)
     evaluated = 2 * config.eval_episodes / (config.eval_every * episodes)
     total = config.num_seeds * steps * (1 + evaluated)
     return speed.seconds(total, config.num_seeds * episodes), bounded
+
+
+def useful_part(task: Task, speed: Speed) -> float:
+    """Returns the part of the simulated env steps that counts; with ``native`` no episode waits."""
+    return 1.0 if speed.engine == "native" else task.useful
 
 
 def this_machine() -> Machine:
