@@ -63,22 +63,24 @@ class Shown:
 
 
 def act(actor: jax.Array, observation: jax.Array) -> jax.Array:
-    """Returns outputs of a mean of zero and a standard deviation of half the range."""
-    return jnp.broadcast_to(actor, (*observation.shape[:-1], actor.size))
+    """Returns outputs whose mean are the last velocities, the same number in both precisions."""
+    size = actor.size // 2
+    fixed = jnp.broadcast_to(actor[size:], (*observation.shape[:-1], size))
+    return jnp.concatenate([observation[..., -size:], fixed], axis=-1)
 
 
-def play(engine: Any, env: Shown, states: int, steps: int) -> Any:
-    """Plays ``states`` episodes of ``steps`` steps."""
+def play(engine: Any, env: Shown, states: int, steps: int, deterministic: bool) -> Any:
+    """Plays ``states`` episodes of ``steps`` steps, without noise if so wished."""
     distribution = normal(env.action_space)
     actor = jnp.concatenate([jnp.zeros(env.action_size), jnp.asarray(distribution.constants)])
-    size = {"num_episodes": states, "horizon": steps}
+    size = {"num_episodes": states, "horizon": steps, "num_deterministic": states * deterministic}
     roll = jax.jit(lambda actor, key: engine(env, act, actor, distribution, key, **size))
     return jax.tree.map(np.asarray, roll(actor, jax.random.key(0)))
 
 
 def after_a_step(engine: Any, id: str, table: np.ndarray) -> np.ndarray:
     """Returns qpos, qvel and the reward after one env step, [states, nq + nv + 1]."""
-    played = play(engine, Shown(id, table), len(table), 2)
+    played = play(engine, Shown(id, table), len(table), 2, True)
     return np.column_stack([played.observation[1], played.reward[0]]).astype(np.float64)
 
 
@@ -100,7 +102,7 @@ def main() -> None:
                 table, reference = arrays["states"], arrays["after"]
         else:
             with jax.enable_x64(True):
-                played = play(native.rollout, Shown(id), settings.states, STEPS + 1)
+                played = play(native.rollout, Shown(id), settings.states, STEPS + 1, False)
                 table = played.observation[STEPS].astype(np.float32)
                 reference = after_a_step(rollouts.rollout, id, table)
                 rows["native, float64"] = after_a_step(native.rollout, id, table)
