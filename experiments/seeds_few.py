@@ -1,5 +1,6 @@
 """What few seeds would have concluded, resampled from the many of the study."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -37,6 +38,11 @@ class FewSeeds(NamedTuple):
     def sure(self) -> bool:
         """Whether all seeds together say which one is better."""
         return self.adjusted < LEVEL
+
+    @property
+    def equal(self) -> bool:
+        """Whether all seeds together have the same mean in both arms, so that none is wrong."""
+        return all(math.isnan(wrong) for wrong in self.wrong.values())
 
 
 def few_seeds(

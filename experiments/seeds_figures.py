@@ -160,18 +160,20 @@ def _wrong_winner(few: Sequence[FewSeeds], pairs: Sequence[AnyPair]) -> Any:
     figure, axes = _figure(1, len(pairs), 1 + 3.8 * len(pairs), 4.4, sharey=True)
     for ax, pair in zip(axes[0], pairs, strict=True):
         ours = [x for x in few if (x.task, x.measure) == (pair.task, pair.measure)]
-        for colour, marker, found in zip(_COLOURS, _MARKERS, ours, strict=False):
+        for i, (colour, marker, found) in enumerate(zip(_COLOURS, _MARKERS, ours, strict=False)):
+            thicker = len(ours) - i  # so that a line shows behind one that coincides with it
             ax.plot(
                 list(found.wrong),
                 [100 * x for x in found.wrong.values()],
                 color=colour,
                 marker=marker,
-                markersize=3,
+                markersize=2.5 + 0.9 * thicker,
+                linewidth=0.6 + 0.6 * thicker,
                 linestyle="-" if found.sure else ":",
             )
         percent = [100 * x for x in pair.wrong.values()]
         ax.plot(list(pair.wrong), percent, color="grey", linewidth=3, alpha=0.6)
-        ax.set(xscale="log", xlabel="seeds of each", title=pair.task, ylim=(-1, 56))
+        ax.set(xscale="log", xlabel="seeds of each", title=pair.task, ylim=(-1, 65))
         ticks = (2, 3, 5, 10, 20, 50, 100)
         ax.set_xticks(ticks, map(str, ticks))
         ax.minorticks_off()

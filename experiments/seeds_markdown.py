@@ -6,7 +6,12 @@ from collections.abc import Iterable, Sequence
 
 def percent(share: float, digits: int) -> str:
     """Returns a share in percent; nothing where there is none."""
-    return "" if math.isnan(share) else f"{100 * share:.{digits}f} %"
+    return "" if math.isnan(share) else f"{fixed(100 * share, digits)} %"
+
+
+def fixed(x: float, digits: int) -> str:
+    """Returns a number with so many decimals; what rounds to zero has no sign."""
+    return f"{x:z,.{digits}f}"
 
 
 def number(needed: float | None) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from seeds_answers import LEVEL, MEASURES, Contrast, Effect
 from seeds_few import FewSeeds
 from seeds_findings import Findings
-from seeds_markdown import number, percent, table
+from seeds_markdown import fixed, number, percent, table
 from seeds_runs import Task
 
 #: Numbers of seeds in the tables of the comparisons, and of any pair.
@@ -39,7 +39,7 @@ def _cell(task: Task, effect: Effect) -> str:
     show = _shower(task, effect.measure)
     mark = "**" if effect.adjusted < LEVEL else ""
     value, low, high, _ = effect.difference
-    signed = f"{'+' if value > 0 else ''}{show(value)}"
+    signed = f"{'+' if value > 0 and show(value) != show(0.0) else ''}{show(value)}"
     return (
         f"{show(effect.first)} / {show(effect.second)}: "
         f"{mark}{signed}{mark} ({show(low)}, {show(high)})"
@@ -51,18 +51,20 @@ def _shower(task: Task, measure: str) -> Callable[[float], str]:
     if measure == "solved at the end":
         return lambda x: percent(x, 1)
     if measure == "env steps to solve":
-        return lambda x: f"{x / 1000:,.1f}k"
+        return lambda x: f"{fixed(x / 1000, 1)}k"
     digits = 0 if abs(task.threshold) >= 1000 else 1 if abs(task.threshold) >= 100 else 2
-    return lambda x: f"{x:,.{digits}f}"
+    return lambda x: fixed(x, digits)
 
 
 def few_table(found: Findings) -> str:
     """Returns how often few seeds name the wrong arm: a row a comparison."""
     rows = []
     for x in found.few:
-        wrong = [percent(x.wrong[n], 1) for n in FEW]
-        sure = "yes" if x.sure else "no"
-        rows.append([x.measure, x.task, x.contrast, sure, *wrong, number(x.needed)])
+        cells = ["no", *("equal" for _ in FEW), ""]
+        if not x.equal:
+            wrong = [percent(x.wrong[n], 1) for n in FEW]
+            cells = ["yes" if x.sure else "no", *wrong, number(x.needed)]
+        rows.append([x.measure, x.task, x.contrast, *cells])
     header = ["by the mean", "task", "", "sure winner", *(f"{n} seeds" for n in FEW)]
     return table([*header, "seeds for 80 % power"], rows)
 

@@ -34,11 +34,26 @@ def _verdict(contrast: Contrast, found: Sequence[Effect]) -> str:
         return "better in one measure, worse in another"
     if direction == 0:
         return "no difference found"
-    average = next(effect for effect in found if effect.measure == "average return")
-    share = average.improvement if direction > 0 else 1 - average.improvement
+    share, measure = _share(found, direction)
     size = next(word for limit, word in _SIZES if share < limit)
     better = contrast.names[0 if direction > 0 else 1]
-    return f"{better}: {size}better ({percent(share, 0)})"
+    named = "" if measure == "average return" else f" in {measure}"
+    return f"{better}: {size}better ({percent(share, 0)}{named})"
+
+
+def _share(found: Sequence[Effect], direction: int) -> tuple[float, str]:
+    """Returns how probably a seed of the better arm is better, and by which measure.
+
+    That is the average return, or where it does not surely differ the measure that says most.
+    """
+    shares = {
+        effect.measure: effect.improvement if direction > 0 else 1 - effect.improvement
+        for effect in found
+        if effect.direction
+    }
+    most = max(shares, key=shares.__getitem__)
+    measure = "average return" if "average return" in shares else most
+    return shares[measure], measure
 
 
 def _direction(found: Sequence[Effect]) -> int | None:
@@ -111,9 +126,9 @@ def short_few(found: Findings) -> str:
         rows.append([f"{count}", percent(mean, 0), most])
     needed = [math.inf if few.needed is None else few.needed for few in sure]
     return (
-        f"{begin} So often would fewer seeds have named the other one:\n\n"
+        f"{begin} So often would fewer seeds have named the other:\n\n"
         f"{table(['seeds of each', 'on average', 'at worst'], rows)}\n\n"
-        f"To find the difference with a power of 80 %, a t-test needs {number(min(needed))} to "
+        f"To find these differences with a power of 80 %, a t-test needs {number(min(needed))} to "
         f"{number(max(needed))} seeds of each arm, {number(median(needed))} in the median."
     )
 
@@ -140,14 +155,15 @@ def caveats(found: Findings) -> str:
 
 
 def provenance(tasks: Sequence[Task]) -> str:
-    """Returns a clause on what the runs were trained with."""
-    return listed(
-        dict.fromkeys(
-            f"{record['num_devices']} x {record['device']}, JAX {record['packages']['jax']}, "
-            f"commit {str(record['git_commit'])[:10]}"
-            for record in (task.record for task in tasks)
-        )
-    )
+    """Returns a clause on what the runs of each task were trained with."""
+    clauses = []
+    for task in tasks:
+        record = task.record
+        commit = record["git_commit"]
+        program = f"commit {commit[:10]}" if commit else "a commit that was not recorded"
+        where = f"{record['num_devices']} x {record['device']}"
+        clauses.append(f"{task.name} on {where} with JAX {record['packages']['jax']}, {program}")
+    return "; ".join(clauses)
 
 
 def _capital(text: str) -> str:

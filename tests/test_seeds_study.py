@@ -8,6 +8,7 @@ import seeds_few
 import seeds_findings
 import seeds_page
 import seeds_runs
+import seeds_words
 from mjx_reinforce.reports.statistics import iqm
 from seeds_answers import CONTRASTS, best_rates, effects, paired_iqm_difference
 from seeds_few import any_pair, few_seeds
@@ -217,3 +218,22 @@ def test_runs_are_measured(tmp_path):
     np.testing.assert_allclose(task.steps_to_solve, [[50, 100], [90, 100]])
     np.testing.assert_allclose(task.average_return[0], [7.5, 2.0], atol=0.01)
     assert task.record["nonfinite_runs"] == 1
+
+
+def test_arms_that_end_alike_name_nobody_wrong(tasks):
+    alike = tasks[0]._replace(final_return=np.full((*SHAPE, SEEDS), 50.0))
+    found = few_seeds([alike], ["final return"], COUNTS)
+    assert all(few.equal and not few.sure and few.needed is None for few in found)
+    assert not any(few.equal for few in few_seeds(tasks[:1], ["final return"], COUNTS))
+
+
+def test_what_is_better_by_another_measure_says_by_which(monkeypatch):
+    monkeypatch.setattr(seeds_few, "_DRAWS", 20)
+    task = made_up("Fast-v0", 0.0, 0.0)
+    steps = np.random.default_rng(1).uniform(300, 700, task.steps_to_solve.shape)
+    steps[FACTORS["estimator"].index("value-baseline")] -= 300
+    task = task._replace(steps_to_solve=steps)
+    answers = seeds_words.short_answers(seeds_findings.find([task], COUNTS))
+    (row,) = [line for line in answers.splitlines() if line.startswith(f"| {LEARNED.name} |")]
+    assert "a learned baseline: much better (9" in row
+    assert row.endswith("% in env steps to solve) |")

@@ -328,11 +328,22 @@ def test_a_flag_that_one_configuration_reads_is_accepted():
 
 
 @pytest.mark.slow
-def test_halving_goes_on_with_the_better_half(run):
-    """The winner's training is that of a run alone, and its last figure is of other seeds."""
+def test_halving_goes_on_with_the_better_half(run, monkeypatch):
+    """The winner's training is that of a run alone, and its last figure is of other seeds.
+
+    Every rung has the programs of the first.
+    """
+    compiled = []
+
+    def compile_programs(*arguments):
+        compiled.append(arguments)
+        return programs.compile_programs(*arguments)
+
+    monkeypatch.setattr(conduct, "compile_programs", compile_programs)
     over = "--over learning-rate 1e-3 1e-1 --over estimator leave-one-out total-return "
     command = f"{SMALL} --num-seeds 3 --max-updates 20 --search halving --budget 5 {over}"
     assert run(f"{command} --output swept") == 0
+    assert len(compiled) == 2  # of an estimator each
     results = read_results(Path("swept"))
     configurations = results.configurations
     rates = [values["learning_rate"] for values in configurations]

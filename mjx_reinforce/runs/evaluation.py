@@ -18,8 +18,9 @@ def evaluate(
     num_episodes: int,
     horizon: int,
     active: bool | jax.Array = True,
+    sampled: bool = True,
 ) -> dict[str, jax.Array]:
-    """Plays N episodes with the policy's mode and N with its samples.
+    """Plays N episodes with the policy's mode, and N with its samples.
 
     Args:
       env: what is played.
@@ -29,12 +30,13 @@ def evaluate(
       num_episodes: N, of each kind.
       horizon: T, the time limit in steps.
       active: [] where False nothing is played, and what is returned says nothing.
+      sampled: whether the second N are played; the first are the same without them.
 
     Returns:
       ``eval_return`` and ``eval_length`` [], means over the deterministic
-      episodes, ``eval_return_stochastic`` [], over the sampled ones, ``eval_steps`` [],
-      the steps of all episodes, and ``simulated_steps`` []. A return is NaN if one of its
-      episodes left the finite numbers: what that earned until then says nothing.
+      episodes, ``eval_return_stochastic`` [], over the sampled ones if there are any,
+      ``eval_steps`` [], the steps of all episodes, and ``simulated_steps`` []. A return is NaN if
+      one of its episodes left the finite numbers: what that earned until then says nothing.
     """
     trajectory = learner.engine.rollout(
         env,
@@ -42,16 +44,16 @@ def evaluate(
         actor,
         learner.policy.distribution,
         key,
-        num_episodes=2 * num_episodes,
+        num_episodes=(1 + sampled) * num_episodes,
         horizon=horizon,
         num_deterministic=num_episodes,
         active=active,
     )
     returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
     returns = jnp.where(trajectory.nonfinite | ~jnp.isfinite(returns), jnp.nan, returns)
-    return {
+    stochastic = {"eval_return_stochastic": jnp.mean(returns[num_episodes:])} if sampled else {}
+    return stochastic | {
         "eval_return": jnp.mean(returns[:num_episodes]),
-        "eval_return_stochastic": jnp.mean(returns[num_episodes:]),
         "eval_length": jnp.mean(lengths[:num_episodes]),
         "eval_steps": jnp.sum(lengths),
         "simulated_steps": trajectory.simulated,

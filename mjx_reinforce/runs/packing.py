@@ -58,29 +58,33 @@ def take(states: RunState, lanes: np.ndarray) -> RunState:
 
 def put_back(states: RunState, lanes: np.ndarray, slots: Sequence[RunState]) -> RunState:
     """Returns the states of all runs, those in ``lanes`` from their slots."""
+    runs, places = _matched(lanes)
 
     def replace(old: np.ndarray, *new: np.ndarray) -> np.ndarray:
-        return _spread(old, lanes, np.stack(new))
+        replaced = old.copy()
+        replaced[runs] = np.concatenate(new)[places]
+        return replaced
 
     return jax.tree.map(replace, states, *slots)
 
 
 def spread(num_runs: int, lanes: np.ndarray, slots: Sequence[Arrays]) -> Arrays:
     """Returns measurements [..., R] of all runs, zero for those in no slot, from [..., W] each."""
+    runs, places = _matched(lanes)
 
     def of_all(name: str) -> np.ndarray:
-        measured = np.stack([np.moveaxis(slot[name], -1, 0) for slot in slots])
-        zeros = np.zeros((num_runs, *measured.shape[2:]), measured.dtype)
-        return np.moveaxis(_spread(zeros, lanes, measured), 0, -1)
+        measured = np.concatenate([slot[name] for slot in slots], axis=-1)
+        every = np.zeros((*measured.shape[:-1], num_runs), measured.dtype)
+        every[..., runs] = measured[..., places]
+        return every
 
     return {name: of_all(name) for name in slots[0]}
 
 
-def _spread(old: np.ndarray, lanes: np.ndarray, new: np.ndarray) -> np.ndarray:
-    """Returns ``old`` [R, ...] with ``new`` [slots, width, ...] where a lane has a run."""
-    replaced, real = old.copy(), lanes >= 0
-    replaced[lanes[real]] = new[real]
-    return replaced
+def _matched(lanes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the runs in lanes [slots, width], and the place of each, counted through all."""
+    places = np.flatnonzero(lanes >= 0)
+    return lanes.flat[places], places
 
 
 def join(slots: Sequence[Any], count: int) -> Any:

@@ -16,6 +16,11 @@ from mjx_reinforce.runs.progress import BLOCKS, Progress, measure
 from mjx_reinforce.runs.table import Table
 
 Arrays = dict[str, np.ndarray]
+#: The metrics of a block that the record is made of; others are for metrics.csv alone.
+COUNTED = (
+    *("active", "updates_total", "env_steps_total", "simulated_steps"),
+    *("episode_return", "nonfinite_episodes", "skipped_update"),
+)
 
 
 class Record:
@@ -82,25 +87,39 @@ class Record:
         self._tables = {name: Table(columns) for name, columns in groups.items()}
 
     def add_updates(self, metrics: Arrays) -> Arrays:
-        """Takes in a block of updates.
-
-        A training return is NaN if one of its episodes left the finite numbers.
+        """Takes in a block of updates, and keeps what rows of metrics.csv say of it.
 
         Args:
           metrics: [K, S] each, of K updates: those of ``Learner.step`` and of
             ``state.Programs.advance``.
 
         Returns:
+          What ``keep_updates`` does.
+        """
+        met = self.keep_updates(metrics)
+        finite = metrics["nonfinite_episodes"] == 0
+        returns = np.where(finite, metrics["episode_return"], np.nan)
+        self._remember(metrics | {"episode_return": returns})
+        return met
+
+    def keep_updates(self, metrics: Arrays) -> Arrays:
+        """Takes in a block of updates.
+
+        A training return is NaN if one of its episodes left the finite numbers.
+
+        Args:
+          metrics: [K, S] each, of K updates, ``COUNTED`` and maybe others.
+
+        Returns:
           The updates in it that met numbers which are not finite, see
           ``nonfinite.nonfinite_updates``.
         """
         active, episodes = metrics["active"], self._config.episodes_per_update
-        finite = metrics["nonfinite_episodes"] == 0
-        metrics = metrics | {"episode_return": np.where(finite, metrics["episode_return"], np.nan)}
+        counted = active & (metrics["nonfinite_episodes"] == 0)
         env_steps = metrics["env_steps_total"].astype(np.int64)
         updates = metrics["updates_total"].astype(np.int64)
         made = active.any(axis=1)
-        returns = np.where(active, metrics["episode_return"], np.nan)
+        returns = np.where(counted, metrics["episode_return"], np.nan)
         training = {
             "episode_return": returns,
             "env_steps": env_steps,
@@ -109,7 +128,6 @@ class Record:
         self._tables["training"].append({name: x[made] for name, x in training.items()})
         self.env_steps, self.updates = env_steps[-1], updates[-1]
         self._simulated += _sum(metrics["simulated_steps"])
-        self._remember(metrics)
         self._broken_in_a_row = nonfinite.broken_in_a_row(self._broken_in_a_row, metrics, episodes)
         met = nonfinite.nonfinite_updates(metrics)
         self._tables["nonfinite"].append(met)
@@ -167,7 +185,7 @@ class Record:
 
     def finished(self) -> bool:
         """Returns whether the budget is used, or all seeds are solved and that was to end it."""
-        last = self._tables["evaluations"].latest(1)["eval_return"]
+        last = self._tables["evaluations"].latest(1, "eval_return")["eval_return"]
         solved = self.threshold is not None and np.all(last >= self.threshold)
         used = self._used(self.env_steps, self.updates)
         return bool(used.min() >= 1.0 or (self._config.stop_when_solved and solved))
@@ -186,9 +204,19 @@ class Record:
             used = np.maximum(used, updates / self._config.max_updates)
         return used
 
-    def progress(self) -> Progress:
-        """Returns how far the run is, as of its last evaluation."""
-        past = self._tables["evaluations"].latest(BLOCKS + 1)
+    def used(self) -> float:
+        """Returns the part of the budgets of all seeds that is used."""
+        used = self._used(self.env_steps, self.updates)
+        return float(np.minimum(used, 1.0).mean())
+
+    def progress(self, blocks: int = BLOCKS) -> Progress:
+        """Returns how far the run is, as of its last evaluation.
+
+        Args:
+          blocks: the latest ones, from which the time left is estimated.
+        """
+        names = ("eval_return", "env_steps", "updates", "seconds")
+        past = self._tables["evaluations"].latest(blocks + 1, *names)
         fractions = self._used(past["env_steps"], past["updates"]).min(axis=-1)
         return measure(past, fractions)
 

@@ -196,15 +196,18 @@ def block_of_updates(build_learner: BuildLearner, length: int) -> Callable[..., 
     return advance
 
 
-def evaluation(env: Environment, learner: Learner, horizon: int, config: Config) -> Any:
+def evaluation(
+    env: Environment, learner: Learner, horizon: int, config: Config, *, sampled: bool = True
+) -> Any:
     """Returns a function that evaluates actors [S, ...], all on the same start states.
 
-    It also takes which of them are evaluated [S]; all by default.
+    It also takes which of them are evaluated [S]; all by default. ``sampled`` is that of
+    ``evaluation.evaluate``.
     """
 
     def one(actor: Actor, key: jax.Array, active: Any = True) -> dict[str, jax.Array]:
         size = {"num_episodes": config.eval_episodes, "horizon": horizon}
-        return evaluate(env, learner, actor, key, **size, active=active)
+        return evaluate(env, learner, actor, key, **size, active=active, sampled=sampled)
 
     def every(actor: Actor, key: jax.Array, *active: jax.Array) -> dict[str, jax.Array]:
         return jax.vmap(one, in_axes=(0, None, *[0] * len(active)))(actor, key, *active)

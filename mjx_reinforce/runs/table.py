@@ -22,11 +22,16 @@ class Table:
             self._blocks = [_joined(self._blocks)]
         return dict(self._blocks[0]) if self._blocks else {}
 
-    def latest(self, count: int) -> Arrays:
-        """Returns the last ``count`` rows, of blocks none of which is empty, or all there are."""
+    def latest(self, count: int, *names: str) -> Arrays:
+        """Returns the last ``count`` rows, of blocks none of which is empty, or all there are.
+
+        Args:
+          count: how many rows.
+          names: of the columns; all if none is named.
+        """
         if not self._blocks:
             return {}
-        tails = [{name: x[-count:] for name, x in b.items()} for b in self._blocks[-count:]]
+        tails = [{name: b[name][-count:] for name in names or b} for b in self._blocks[-count:]]
         return {name: x[-count:] for name, x in _joined(tails).items()}
 
 

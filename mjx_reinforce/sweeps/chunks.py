@@ -12,7 +12,7 @@ from mjx_reinforce.runs import checkpoint
 from mjx_reinforce.runs.checkpoint import Checkpoint
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.record import Record
-from mjx_reinforce.runs.state import RunState, seed_keys
+from mjx_reinforce.runs.state import RunState
 from mjx_reinforce.sweeps.groups import Group
 from mjx_reinforce.sweeps.programs import Programs
 
@@ -59,7 +59,7 @@ def split(group: Group, name: str, num_chunks: int) -> list[Runs]:
 def begin(programs: Programs, group: Group, runs: Runs) -> RunState:
     """Returns the states of the runs of a chunk before their first update."""
     settings = {name: values[runs.place] for name, values in group.settings.items()}
-    return programs.begin(seed_keys(group.config)[runs.seed], settings)
+    return programs.begin(programs.keys[runs.seed], settings)
 
 
 class Saver:
@@ -93,9 +93,13 @@ class Saver:
         checkpoint.save(self._folder, content, even=False)
         self._saved_at, self._saved_updates = time.perf_counter(), int(record.updates.max())
 
-    def find(self, like: RunState, record: Record, say: Callable[[str], None]) -> RunState | None:
+    def find(
+        self, like: Callable[[], RunState], record: Record, say: Callable[[str], None]
+    ) -> RunState | None:
         """Returns the newest state that was saved, with its record restored, or None."""
-        for found in checkpoint.load(self._folder, like, say):
+        if not self._folder.exists():
+            return None
+        for found in checkpoint.load(self._folder, like(), say):
             record.restore(found.record)
             return jax.device_get(found.state)
         return None
@@ -128,7 +132,7 @@ def train(
     while not record.finished():
         last = record.last_evaluation()
         states, metrics, evaluation, moved = programs.advance(states, last["eval_steps"])
-        record.add_updates(metrics)
+        record.keep_updates(metrics)
         # A run that stood still was not played again.
         evaluation = {name: np.where(moved, x, last[name]) for name, x in evaluation.items()}
         record.keep_evaluation(evaluation, time.perf_counter() - began)

@@ -30,13 +30,11 @@ class Stage(NamedTuple):
 
     number: of the group in the sweep
     group: its configurations and their budget
-    part: how its runs are divided
     chunks: its runs
     """
 
     number: int
     group: Group
-    part: Part
     chunks: list[Runs]
 
     def of(self, runs: Sequence[Runs]) -> "Stage":
@@ -88,6 +86,7 @@ class Conductor:
         self._num_rungs = rungs.count(design.search, len(prepared.configurations))
         self._rungs_done = self._total = self._done = 0
         self._before: list[Stage] = []
+        self._compiled: dict[int, Programs] = {}
         self.clock = Clock()
 
     def conduct(self) -> bool:
@@ -134,11 +133,14 @@ class Conductor:
         """Returns all runs of a rung."""
         made = []
         for number, group in rung.groups.items():
-            limit, devices = self._prepared.limits[number], self._prepared.devices.count
-            part = divide(group, limit, devices, exact=self._design.exact)
-            name = f"{rung.name}-{number:03d}"
-            made.append(Stage(number, group, part, chunks.split(group, name, part.num_chunks)))
+            name, count = f"{rung.name}-{number:03d}", self._divide(number, group).num_chunks
+            made.append(Stage(number, group, chunks.split(group, name, count)))
         return made
+
+    def _divide(self, number: int, group: Group) -> Part:
+        """Returns how the runs of a group in some rung are divided."""
+        limit, devices = self._prepared.limits[number], self._prepared.devices.count
+        return divide(group, limit, devices, exact=self._design.exact)
 
     def _left(self, stages: Sequence[Stage]) -> list[Stage]:
         """Returns what is still to be trained by this process."""
@@ -151,23 +153,30 @@ class Conductor:
         return [stage for stage in left if stage.chunks]
 
     def _compile(self, stage: Stage) -> Programs:
-        env, config = self._prepared.env, stage.group.config
-        return compile_programs(
-            env,
-            learner_builder(env, config),
-            self._prepared.horizon,
-            config,
-            tuple(stage.group.settings),
-            stage.part.widths,
-            self._prepared.devices,
-        )
+        """Returns the programs of a group, which are those of its runs in the first rung."""
+        if stage.number not in self._compiled:
+            env, whole = self._prepared.env, self._prepared.groups[stage.number]
+            programs = compile_programs(
+                env,
+                learner_builder(env, whole.config),
+                self._prepared.horizon,
+                whole.config,
+                tuple(whole.settings),
+                self._divide(stage.number, whole).widths,
+                self._prepared.devices,
+            )
+            if self._num_rungs == 1:
+                return programs
+            self._compiled[stage.number] = programs
+        return self._compiled[stage.number].of(stage.group.config)
 
     def _train(self, rung: Rung, stage: Stage, programs: Programs, runs: Runs) -> bool:
         """Trains a chunk, from its last checkpoint if there is one; returns whether it ended."""
         config = dataclasses.replace(stage.group.config, num_seeds=len(runs.seed))
         record = Record(config, getattr(self._prepared.env, "reward_threshold", None))
         saver = Saver(self._files.checkpoints(runs.name), stage.group.config)
-        states = saver.find(programs.shape_of(len(runs.seed)), record, self._display.say)
+        like = functools.partial(programs.shape_of, len(runs.seed))
+        states = saver.find(like, record, self._display.say)
         if states is None:
             states = self._begin(rung, stage, programs, runs, record)
 
@@ -206,9 +215,12 @@ class Conductor:
         return states
 
     def _progress(self, record: Record, num_runs: int) -> Progress:
-        """Returns how far the chunk is, but for the whole sweep where that differs."""
-        now = record.progress()
-        rung = (self._done + num_runs * min(now.fraction, 1.0)) / self._total
+        """Returns how far the chunk is, but for the whole sweep where that differs.
+
+        That counts the budgets of all runs: those that lie aside cost nothing.
+        """
+        now = record.progress(1)
+        rung = (self._done + num_runs * record.used()) / self._total
         done = (self._rungs_done + rung) / self._num_rungs
         passed = self.clock.running + record.seconds
         left = passed * (1 - done) / done if done > 0 else float("nan")

@@ -1,6 +1,7 @@
 """The compiled programs of a group: those of a run, for slots of runs on all devices."""
 
 import functools
+import threading
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -14,6 +15,7 @@ from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.keys import plain, with_keys
 from mjx_reinforce.runs.memory import num_cores
 from mjx_reinforce.runs.packing import join, pack, put_back, spread, take, training
+from mjx_reinforce.runs.record import COUNTED
 from mjx_reinforce.runs.state import (
     Arrays,
     Budget,
@@ -24,6 +26,7 @@ from mjx_reinforce.runs.state import (
     budget_of,
     evaluation,
     evaluation_key,
+    seed_keys,
 )
 from mjx_reinforce.sweeps.ahead import started
 from mjx_reinforce.sweeps.devices import NONE, RUNS, SECOND, Devices
@@ -32,30 +35,38 @@ from mjx_reinforce.sweeps.devices import NONE, RUNS, SECOND, Devices
 class Movers(NamedTuple):
     """What moves the runs of one slot on. States have the data of keys in their place.
 
-    block: (states [W]) -> (states [W], metrics [K, W], whether each run made an update [W]), as
-      ``state.block_of_updates``
+    block: (states [W], budget) -> (states [W], ``record.COUNTED`` metrics [K, W], whether each run
+      made an update [W]), as ``state.block_of_updates``
     look: (states [W], which [W]) -> evaluation [W] of the present policies of these runs
     """
 
-    block: Callable[[RunState], tuple[RunState, dict[str, jax.Array], jax.Array]]
+    block: Callable[[RunState, Budget], tuple[RunState, dict[str, jax.Array], jax.Array]]
     look: Callable[[RunState, jax.Array], dict[str, jax.Array]]
 
 
 class Programs(NamedTuple):
     """The compiled programs of a group. States of runs [R] are on the host between them.
 
-    begin: (keys [R], settings [R] each) -> the first states
+    begin: (data of keys [R, 2], settings [R] each) -> the first states
     movers: by the width of a slot; the narrower ones may still be compiling
+    keys: [S, 2], the data of those that the seeds begin with
     budget: of each run
+    limits: the budget on all devices
     devices: among which a slot is divided
     shape_of: the shapes of the states of so many runs
     """
 
     begin: Callable[..., RunState]
     movers: dict[int, "Future[Movers]"]
+    keys: np.ndarray
     budget: Budget
+    limits: Budget
     devices: Devices
     shape_of: Callable[[int], RunState]
+
+    def of(self, config: Config) -> "Programs":
+        """Returns the same programs for settings with another budget or another seed."""
+        return self._replace(**_inputs(config, self.devices))
 
     def advance(
         self, states: RunState, lengths: np.ndarray
@@ -67,14 +78,14 @@ class Programs(NamedTuple):
           lengths: [R] about how long their episodes are, see ``packing.pack``.
 
         Returns:
-          The states, the metrics [K, R] as ``state.Programs.advance`` returns them, the evaluation
-          [R], and which runs were evaluated [R]: those that made an update.
+          The states, the ``record.COUNTED`` metrics [K, R] as ``state.Programs.advance`` returns
+          them, the evaluation [R], and which runs were evaluated [R]: those that made an update.
         """
         chosen = training(states, self.budget)
         lanes, movers = self._pack(chosen, lengths)
 
         def move(runs: np.ndarray) -> Any:
-            slot, metrics, moved = movers.block(self._put(take(states, runs)))
+            slot, metrics, moved = movers.block(self._put(take(states, runs)), self.limits)
             looked = movers.look(slot, moved)  # begun before the host waits for the block
             return jax.device_get((slot, metrics, looked))
 
@@ -130,6 +141,8 @@ def compile_programs(
 ) -> Programs:
     """Compiles the programs of a group for the widest slot, and begins with the narrower ones.
 
+    These are traced while the widest are compiled: a sweep of some seconds soon needs them.
+
     Args:
       env: what is trained on.
       build_learner: from the traced settings of a run to its learner.
@@ -139,15 +152,26 @@ def compile_programs(
       widths: how many runs a slot may have, the most first; multiples of the number of devices.
       devices: where.
     """
-    widest, *narrower = widths
     compile_for = functools.partial(_movers, env, build_learner, horizon, config, traced, devices)
-    beginning_ = started(functools.partial(_begin, build_learner, traced, widest, devices))
-    movers: dict[int, Future[Movers]] = {widest: Future()}
-    movers[widest].set_result(compile_for(widest))
-    movers |= {width: started(functools.partial(compile_for, width)) for width in narrower}
-    budget = jax.device_get(budget_of(config))
-    shape_of = functools.partial(shape_of_states, build_learner, traced)
-    return Programs(beginning_.result(), movers, budget, devices, shape_of)
+    compile_for = functools.partial(compile_for, threading.Lock())
+    movers = {width: started(functools.partial(compile_for, width)) for width in widths}
+    begin = started(functools.partial(_begin, build_learner, traced, widths[0], devices))
+    inputs = started(functools.partial(_inputs, config, devices))
+    movers[widths[0]].result()
+    return Programs(
+        begin=begin.result(),
+        movers=movers,
+        devices=devices,
+        shape_of=functools.partial(shape_of_states, build_learner, traced),
+        **inputs.result(),
+    )
+
+
+def _inputs(config: Config, devices: Devices) -> dict[str, Any]:
+    """Returns what is no part of a program, as ``Programs`` has it."""
+    keys, budget = jax.random.key_data(seed_keys(config)), budget_of(config)
+    keys, limits = jax.device_get(keys), devices.put(budget, NONE)
+    return {"keys": keys, "budget": jax.device_get(budget), "limits": limits}
 
 
 def shape_of_states(
@@ -172,12 +196,12 @@ def _begin(
     """Compiles ``Programs.begin``, which begins ``width`` runs at once."""
 
     def first(keys: jax.Array, settings: Any) -> RunState:
-        return plain(beginning(build_learner)(keys, settings))
+        return plain(beginning(build_learner)(jax.random.wrap_key_data(keys), settings))
 
-    shapes = devices.shapes(_arguments(traced, width), RUNS)
+    shapes = devices.shapes(jax.eval_shape(plain, _arguments(traced, width)), RUNS)
     compiled = devices.jit(first, (RUNS, RUNS), RUNS).lower(*shapes).compile()
 
-    def begin(keys: jax.Array, settings: Arrays) -> RunState:
+    def begin(keys: np.ndarray, settings: Arrays) -> RunState:
         count = len(keys)
         slots = []
         for start in range(0, count, width):
@@ -198,29 +222,31 @@ def _movers(
     config: Config,
     traced: Collection[str],
     devices: Devices,
+    tracing: threading.Lock,
     width: int,
 ) -> Movers:
-    """Compiles what moves slots of ``width`` runs; the arguments are ``compile_programs``'."""
-    key, budget = devices.put((evaluation_key(config), budget_of(config)), NONE)
-    like = jax.eval_shape(beginning(build_learner), *_arguments(traced, width))
-    updates = block_of_updates(build_learner, block_length(config))
+    """Compiles what moves slots of ``width`` runs; the arguments are ``compile_programs``'.
 
-    def block(states: RunState, budget: Budget) -> Any:
-        before = states.train_states.num_updates
-        after, (_, metrics) = updates(with_keys(states, like), budget)
-        return plain(after), metrics, after.train_states.num_updates > before
+    Programs are traced one after the other, by whoever holds ``tracing``.
+    """
+    with ThreadPoolExecutor() as pool, tracing:  # the first compiles while the second is traced
+        like = jax.eval_shape(beginning(build_learner), *_arguments(traced, width))
+        updates = block_of_updates(build_learner, block_length(config))
 
-    # Policies and engines are those of any of its learners.
-    look = evaluation(env, build_learner({}), horizon, config)
-    shapes = devices.shapes(jax.eval_shape(plain, like), RUNS)
-    which = devices.shapes(jax.ShapeDtypeStruct((width,), bool), RUNS)
-    advance = devices.jit(block, (RUNS, NONE), (RUNS, SECOND, RUNS))
-    look = devices.jit(look, (RUNS, NONE, RUNS), RUNS)
-    with ThreadPoolExecutor() as pool:  # the first compiles while the second is traced
+        def block(states: RunState, budget: Budget) -> Any:
+            before = states.train_states.num_updates
+            after, (_, metrics) = updates(with_keys(states, like), budget)
+            counted = {name: metrics[name] for name in COUNTED}
+            return plain(after), counted, after.train_states.num_updates > before
+
+        # Policies and engines are those of any of its learners.
+        look = evaluation(env, build_learner({}), horizon, config, sampled=False)
+        key, budget = devices.put((evaluation_key(config), budget_of(config)), NONE)
+        shapes = devices.shapes(jax.eval_shape(plain, like), RUNS)
+        which = devices.shapes(jax.ShapeDtypeStruct((width,), bool), RUNS)
+        advance = devices.jit(block, (RUNS, NONE), (RUNS, SECOND, RUNS))
+        look = devices.jit(look, (RUNS, NONE, RUNS), RUNS)
         looking = pool.submit(look.lower(shapes.train_states.actor, key, which).compile)
-        advancing = advance.lower(shapes, budget).compile()
-        looked = looking.result()
-    return Movers(
-        lambda states: advancing(states, budget),
-        lambda states, which: looked(states.train_states.actor, key, which),
-    )
+        advancing = pool.submit(advance.lower(shapes, budget).compile)
+    looked, advanced = looking.result(), advancing.result()
+    return Movers(advanced, lambda states, which: looked(states.train_states.actor, key, which))
