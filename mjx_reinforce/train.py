@@ -178,12 +178,11 @@ def _compile(
         from mjx_reinforce.runs.log import RunLog
         from mjx_reinforce.runs.record import Record
         from mjx_reinforce.runs.session import Session
-        from mjx_reinforce.runs.state import compile_programs, first_state
+        from mjx_reinforce.runs.state import compile_programs
 
     started = time.perf_counter()
     with _collection_paused():
-        state = first_state(learner, config)
-        programs = compile_programs(env, learner, horizon, config, state)
+        state, programs = compile_programs(env, learner, horizon, config)
     seconds = learner.engine.seconds + time.perf_counter() - started
     record = Record(config, getattr(env, "reward_threshold", None))
     best, policy = first_best(state.train_states), policy_settings(env, config)

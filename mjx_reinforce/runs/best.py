@@ -24,6 +24,7 @@ class Best:
     num_updates: jax.Array
 
 
+@jax.jit
 def first_best(train_states: TrainState) -> Best:
     """Returns the state before the first evaluation, in memory of its own."""
     actor, num_updates = jax.tree.map(jnp.copy, (train_states.actor, train_states.num_updates))

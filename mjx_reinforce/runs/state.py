@@ -97,26 +97,27 @@ def beginning(build_learner: BuildLearner) -> Callable[..., RunState]:
 
 
 def compile_programs(
-    env: Environment, learner: Learner, horizon: int, config: Config, state: RunState
-) -> Programs:
-    """Compiles the programs of a run.
+    env: Environment, learner: Learner, horizon: int, config: Config
+) -> tuple[RunState, Programs]:
+    """Returns the state before the first update, and the compiled programs of a run.
 
     Args:
       env: what is trained on.
       learner: how.
       horizon: T, the time limit of an episode in steps.
       config: the settings of the run.
-      state: any state of the run; only its shapes are read.
     """
     key = evaluation_key(config)
     budget = budget_of(config)
     block = block_of_updates(lambda _: learner, block_length(config))
     advance = jax.jit(block, donate_argnums=0)
     look = jax.jit(evaluation(env, learner, horizon, config))
-    with ThreadPoolExecutor() as pool:  # the first compiles while the second is traced
-        looking = pool.submit(look.lower(state.train_states.actor, key).compile)
-        advancing = advance.lower(state, budget).compile()
-        compiled = looking.result()
+    shapes = jax.eval_shape(functools.partial(first_state, learner, config))
+    with ThreadPoolExecutor() as pool:  # one compiles while the next is traced
+        beginning = pool.submit(first_state, learner, config)
+        looking = pool.submit(look.lower(shapes.train_states.actor, key).compile)
+        advancing = advance.lower(shapes, budget).compile()
+        compiled, first = looking.result(), beginning.result()
 
     def advanced(state: RunState) -> tuple[RunState, Arrays]:
         state, (made, metrics) = advancing(state, budget)
@@ -128,7 +129,7 @@ def compile_programs(
     def tested(actor: Actor) -> Arrays:
         return to_numpy(compiled(actor, _key(config.eval_seed, domain=2)))
 
-    return Programs(advanced, evaluated, tested)
+    return first, Programs(advanced, evaluated, tested)
 
 
 def _key(seed: int, domain: int) -> jax.Array:

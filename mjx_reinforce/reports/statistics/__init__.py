@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import stats
 
 from mjx_reinforce.reports.statistics.bootstrap import (
     expanded_tail,
@@ -43,8 +42,10 @@ def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
     whatever the sign of returns. Where so many failed that they reach the middle half, there is
     no mean: it is NaN.
     """
-    failed_last = np.where(np.isfinite(values), values, -np.inf)
-    return finite_or_nan(stats.trim_mean(failed_last, _QUARTER, axis=axis))
+    failed_first = np.where(np.isfinite(values), values, -np.inf)
+    ranked = np.sort(np.moveaxis(failed_first, axis, -1), axis=-1)
+    cut = int(_QUARTER * ranked.shape[-1])
+    return finite_or_nan(ranked[..., cut : ranked.shape[-1] - cut].mean(axis=-1))
 
 
 def iqm_interval(
