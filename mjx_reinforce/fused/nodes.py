@@ -128,10 +128,15 @@ class Loop:
     stacked: list[list[Node]] = dataclasses.field(default_factory=list)
 
     def results(self) -> tuple[list[Scalar], list[list[Scalar]]]:
-        """Returns the final carry, and each of ys in each iteration."""
-        carry = [
-            init if out is None else out for init, out in zip(self.inits, self.outs, strict=True)
-        ]
+        """Returns the final carry, and each of ys in each iteration.
+
+        A carry that every iteration sets to the same is that, and not what the loop ends with.
+        """
+        certain = self.active is None and bool(self.length)  # that an iteration runs
+        carry = []
+        for init, following, out in zip(self.inits, self.nexts, self.outs, strict=True):
+            inside = isinstance(following, Node) and following.scope is self.body
+            carry.append(init if out is None else out if inside or not certain else following)
         ys = [
             stacked or [y] * (self.length or 0)
             for y, stacked in zip(self.ys, self.stacked, strict=True)

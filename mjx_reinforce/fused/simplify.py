@@ -1,7 +1,7 @@
 """Algebra on scalars: what need not be computed.
 
 Everything here keeps IEEE results, but for two deviations that the speed comes from:
-  - x * 0 is 0 and 0 / x is 0, also where x is infinite or NaN;
+  - x * 0, 0 / x and x - x are 0, also where x is infinite or NaN;
   - the sign of a zero is not kept (x + 0 is x, 0 - x is -x, a masked product is +0).
 
 A division by a constant becomes a product only where the reciprocal is exact.
@@ -85,6 +85,8 @@ def _add(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
 def _sub(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     if _is(y, 0):
         return x
+    if x is y:
+        return x.dtype.type(0)
     if _is(x, 0):
         return graph.call("neg", y)
     if _negated(y) is not None:

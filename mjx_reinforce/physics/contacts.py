@@ -28,6 +28,7 @@ from mjx_reinforce.physics.mjx_internals import (
     collision_with,
     make_frame,
 )
+from mjx_reinforce.physics.pairs import one_by_one
 
 # What C takes for zero (mjMINVAL); in single precision, what rounding may leave of a zero distance
 # between points a few metres from the origin. Axes that cross, as in a planar Hopper, have that.
@@ -105,11 +106,21 @@ def _direction(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
     return unit, jnp.where(short, 0, length)
 
 
+_OURS = {
+    (mjx.GeomType.PLANE, mjx.GeomType.CAPSULE): plane_capsule,
+    (mjx.GeomType.SPHERE, mjx.GeomType.CAPSULE): sphere_capsule,
+    (mjx.GeomType.CAPSULE, mjx.GeomType.CAPSULE): capsule_capsule,
+}
+_ROUND = (
+    mjx.GeomType.SPHERE,
+    mjx.GeomType.CAPSULE,
+    mjx.GeomType.ELLIPSOID,
+    mjx.GeomType.CYLINDER,
+)
 _collision = collision_with(
-    {
-        (mjx.GeomType.PLANE, mjx.GeomType.CAPSULE): plane_capsule,
-        (mjx.GeomType.SPHERE, mjx.GeomType.CAPSULE): sphere_capsule,
-        (mjx.GeomType.CAPSULE, mjx.GeomType.CAPSULE): capsule_capsule,
+    lambda table: {
+        pair: one_by_one(function) if set(pair) <= set(_ROUND) else function
+        for pair, function in (table | _OURS).items()
     }
 )
 

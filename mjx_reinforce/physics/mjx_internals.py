@@ -18,7 +18,8 @@ whose source it depends on: a new MJX fails there first.
   arm, ten bodies deep, takes a second a state; with a fence between levels, 50 us.
 - The contacts of cylinders and ellipsoids are found in ten steps of gradient descent, a loop that
   depends on nothing else in the forward pass. jaxlib 0.10.2 runs such a loop beside other work, and
-  for some programs (Pusher, 512 episodes) waits forever for it. Here the steps are written out.
+  for some programs (Pusher, 512 episodes) waits forever for it. Here the steps are written out for
+  XLA, and a loop for `fused`.
 """
 
 import contextlib
@@ -39,6 +40,8 @@ from mujoco.mjx._src.collision_types import Collision, GeomInfo
 from mujoco.mjx._src.forward import _advance as advance
 from mujoco.mjx._src.math import make_frame
 from mujoco.mjx._src.smooth import solve_m
+
+from mjx_reinforce.physics.by_engine import by_engine
 
 __all__ = [
     "Collision",
@@ -108,24 +111,29 @@ for _function, _module, _name in (
     check_lookup(_module, _function, _name)
 
 
+_Colliders = dict[tuple[mjx.GeomType, mjx.GeomType], Callable[..., Any]]
+
+
 def collision_with(
-    functions: dict[tuple[mjx.GeomType, mjx.GeomType], Callable[..., Any]],
+    functions: Callable[[_Colliders], _Colliders],
 ) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
-    """Returns a copy of `mjx.collision` with some collision functions replaced.
+    """Returns a copy of `mjx.collision` with other collision functions.
 
     MJX finds its collision functions in one table, a global of a module; the copy has a table of
     its own, and MJX stays as it is.
 
     Args:
-        functions: a `collider` for each pair of types of geoms, in MJX's order.
+        functions: from MJX's table, a `collider` for each pair of types of geoms in MJX's order,
+            makes the copy's.
     """
     plain = inspect.unwrap(mjx.collision)
-    table = {**collision_driver._COLLISION_FUNC, **functions}
+    table = functions(dict(collision_driver._COLLISION_FUNC))
     return types.FunctionType(plain.__code__, {**plain.__globals__, "_COLLISION_FUNC": table})
 
 
 _lock = threading.RLock()
 _level = scan._nvmap
+_descent = collision_sdf._gradient_descent
 
 
 def fenced(fn: Callable[..., Any]) -> Callable[..., Any]:
@@ -150,10 +158,14 @@ def _fenced_level(*inputs: Any) -> Any:
 
 def _descend(objective: Callable[..., Any], x: jax.Array, niter: int) -> tuple[Any, jax.Array]:
     """Returns the least distance found [] and where [3], as MJX's `_gradient_descent`."""
-    state = collision_sdf.GradientState(dist=1e10, x=x)  # type: ignore
-    for _ in range(niter):
-        state = collision_sdf._gradient_step(objective, state)
-    return state.dist, state.x
+
+    def written_out(x: jax.Array) -> tuple[Any, jax.Array]:
+        state = collision_sdf.GradientState(dist=1e10, x=x)  # type: ignore
+        for _ in range(niter):
+            state = collision_sdf._gradient_step(objective, state)
+        return state.dist, state.x
+
+    return by_engine(lambda x: _descent(objective, x, niter), written_out, x)
 
 
 @contextlib.contextmanager
