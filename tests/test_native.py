@@ -11,8 +11,8 @@ from toys import Survive, ToyState, categorical
 
 from mjx_reinforce import Box, envs
 from mjx_reinforce.engines import choice, rollouts
-from mjx_reinforce.engines.native import available, program, rollout
-from mjx_reinforce.engines.native.cpu import machine, seam
+from mjx_reinforce.engines.native import available, objects, program, rollout
+from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.registry import DISTRIBUTIONS, load
 from mjx_reinforce.types import Discrete
 
@@ -201,7 +201,7 @@ def test_no_code_is_made_twice(tmp_path, monkeypatch):
     actor, act, distribution = actor_and_act(
         env, (), distribution=categorical(env.action_space.num_actions)
     )
-    monkeypatch.setattr(seam, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(objects, "folder", lambda: tmp_path)
     first = program.build(env, act, actor, distribution, 17)
     assert first.code.compiled
     assert program.build(env, act, actor, distribution, 17).code is first.code
@@ -260,6 +260,6 @@ def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
     assert choice.choose("auto", gamma, player, 500).name == "fused"
     with pytest.raises(ValueError, match=r"native engine cannot play this: .*lgamma.*choose auto"):
         choice.choose("native", gamma, player, 500)
-    monkeypatch.setattr(seam, "unavailable", lambda: "llvmlite is not installed")
+    monkeypatch.setattr(available, "unavailable", lambda: "llvmlite is not installed")
     with pytest.raises(ValueError, match="llvmlite is not installed; choose auto"):
         choice.choose("native", env, player, 500)
