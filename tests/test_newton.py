@@ -100,7 +100,7 @@ def test_the_line_search_finds_the_root_among_kinks():
         # Newton's own line has its root at a step of 1.
         slope = -(curvature + (row_slope + row_curvature)[active].sum())
         zero = jnp.zeros(())
-        start = newton._Point(zero, zero, jnp.asarray(residual), jnp.asarray(active), zero)
+        start = newton._Point(zero, zero, jnp.asarray(residual), jnp.asarray(active))
         found = newton._line_search(
             rows, start, jnp.asarray(change), jnp.asarray(slope), jnp.asarray(curvature), 50
         )

@@ -39,8 +39,8 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         active, solver = limits.reached(model, data), limits.solve
     elif fields.ne or fields.nf:  # rows that are always active
         active, solver = jnp.array(True), _iterate
-    else:  # inactive rows have a Jacobian of zero
-        active, solver = jnp.any(fields.efc_J != 0), _iterate
+    else:
+        active, solver = _some_active(data), _iterate
     solution = jax.lax.cond(
         active,
         lambda: solver(model, data),
@@ -51,6 +51,16 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
         ),
     )
     return with_solution(data, *solution)
+
+
+def _some_active(data: mjx.Data) -> jax.Array:
+    """Returns whether some row is active []: a touching contact, or another row that is not zero.
+
+    A NaN counts as active, so that it gets to the acceleration as it does in MJX.
+    """
+    fields = jax_fields(data)
+    others = jnp.any(fields.efc_J[: fields.ne + fields.nf + fields.nl] != 0)
+    return others | ~jnp.all(fields.contact.dist - fields.contact.includemargin >= 0)
 
 
 def _iterate(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:

@@ -29,6 +29,7 @@ from mjx_reinforce.physics.mjx_internals import (
     make_frame,
 )
 from mjx_reinforce.physics.pairs import one_by_one
+from mjx_reinforce.physics.rows import make_constraint
 
 # What C takes for zero (mjMINVAL); in single precision, what rounding may leave of a zero distance
 # between points a few metres from the origin. Axes that cross, as in a planar Hopper, have that.
@@ -135,5 +136,5 @@ def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.tendon_armature(model, data)
     data = mjx.factor_m(model, data)
     data = _collision(model, data)
-    data = mjx.make_constraint(model, data)
+    data = make_constraint(model, data)
     return mjx.transmission(model, data)

@@ -4,7 +4,7 @@ No other file imports MJX's private modules or reads the private part of its dat
 
 - Names that MJX keeps private, here without underscore: the imports, and `advance`.
 - Fields of `mjx.Data` that only MJX's JAX implementation has: `jax_fields`, `with_solution`,
-  `Simulation`, `num_contacts`.
+  `rows_of`, `with_rows`, `with_contact`, `Simulation`, `num_contacts`.
 - Functions of MJX in which a name is given another meaning: `collision_with` and `fenced`. They
   would do nothing, silently, if MJX stopped looking that name up; `check_lookup` raises then.
 
@@ -55,7 +55,10 @@ __all__ = [
     "jax_fields",
     "make_frame",
     "num_contacts",
+    "rows_of",
     "solve_m",
+    "with_contact",
+    "with_rows",
     "with_solution",
 ]
 
@@ -202,6 +205,25 @@ def with_solution(
         {"qacc": qacc, "qfrc_constraint": qfrc_constraint, "_impl.efc_force": efc_force}
     )
     return cast(mjx.Data, solved)  # flax types it as any PyTreeNode
+
+
+_ROW_FIELDS = ("efc_J", "efc_D", "efc_aref", "efc_pos", "efc_margin", "efc_frictionloss")
+
+
+def rows_of(data: mjx.Data) -> list[jax.Array]:
+    """Returns what `mjx.make_constraint` makes."""
+    return [getattr(jax_fields(data), name) for name in _ROW_FIELDS]
+
+
+def with_rows(data: mjx.Data, rows: list[jax.Array]) -> mjx.Data:
+    """Returns the data with rows as `rows_of` lists them."""
+    names = (f"_impl.{name}" for name in _ROW_FIELDS)
+    return cast(mjx.Data, data.tree_replace(dict(zip(names, rows, strict=True))))
+
+
+def with_contact(data: mjx.Data, contact: Any, dim: Any) -> mjx.Data:
+    """Returns the data with other contacts, of these dimensions."""
+    return cast(mjx.Data, data.tree_replace({"_impl.contact": contact.replace(dim=dim)}))
 
 
 class Simulation:

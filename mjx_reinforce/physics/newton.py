@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
+from mjx_reinforce.physics import contact_rows
 from mjx_reinforce.physics.mjx_internals import jax_fields
 
 # mjMINVAL: what C takes for zero.
@@ -43,20 +44,18 @@ class _Rows(NamedTuple):
 
 
 class _Point(NamedTuple):
-    """An acceleration and its cost.
+    """An acceleration and what the next step needs of it.
 
     qacc: [nv]
     imbalance: [nv] M a minus the unconstrained forces
     residual: [rows] J a - r
     active: [rows] whether a row pushes
-    cost: [] what is minimised
     """
 
     qacc: jax.Array
     imbalance: jax.Array
     residual: jax.Array
     active: jax.Array
-    cost: jax.Array
 
 
 class _Search(NamedTuple):
@@ -115,37 +114,60 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
     fields = jax_fields(data)
     equality = jnp.arange(fields.efc_D.shape[0]) < fields.ne
     rows = _Rows(fields.efc_J, fields.efc_aref, fields.efc_D, equality)
+    division = contact_rows.blocks(fields.ne + fields.nf + fields.nl, fields.contact.dim)
+    # A NaN counts as touching, so that it gets to the acceleration.
+    touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
     inertia = mjx.full_m(model, data)
+
+    def along(direction: jax.Array) -> jax.Array:
+        return contact_rows.along(division, rows.jacobian, direction, touching)
+
     smallest = model.opt.tolerance * jnp.maximum(jnp.trace(inertia), _MIN_TRACE)
 
     def improve(search: _Search) -> _Search:
         before = search.point
-        qacc, decrement = _newton_step(inertia, rows, before, model.opt.ls_iterations)
-        after = _evaluate(inertia, rows, data, qacc)
+        direction, decrement = _newton_direction(division, inertia, rows, before)
+        change, change_of_imbalance = along(direction), inertia @ direction
+        slope = jnp.dot(direction, before.imbalance)
+        curvature = jnp.dot(direction, change_of_imbalance)
+        length = _line_search(rows, before, change, slope, curvature, model.opt.ls_iterations)
+        after = _point(
+            rows,
+            before.qacc + length * direction,
+            before.imbalance + length * change_of_imbalance,
+            before.residual + length * change,
+        )
         settled = jnp.all(after.active == before.active) | (decrement < smallest)
         return _Search(after, search.count + 1, settled)
 
-    start = _evaluate(inertia, rows, data, data.qacc_smooth)
+    def begin(qacc: jax.Array) -> _Point:
+        imbalance = inertia @ qacc - data.qfrc_smooth
+        return _point(rows, qacc, imbalance, along(qacc) - rows.reference)
+
+    start = begin(data.qacc_smooth)
     if not model.opt.disableflags & mjx.DisableBit.WARMSTART:
-        warm = _evaluate(inertia, rows, data, data.qacc_warmstart)
-        start = jax.tree.map(lambda w, s: jnp.where(warm.cost < start.cost, w, s), warm, start)
+        warm = begin(data.qacc_warmstart)
+        better = _cost(rows, data, warm) < _cost(rows, data, start)
+        start = jax.tree.map(lambda w, s: jnp.where(better, w, s), warm, start)
     end = jax.lax.while_loop(
         lambda search: ~search.settled & (search.count < model.opt.iterations),
         improve,
         _Search(start, jnp.int32(0), jnp.array(False)),
     ).point
     force = _force(rows, end)
-    return end.qacc, rows.jacobian.T @ force, force
+    joint_force = contact_rows.weighted(division, inertia, rows.jacobian, force, force)[1]
+    return end.qacc, joint_force, force
 
 
-def _evaluate(inertia: jax.Array, rows: _Rows, data: mjx.Data, qacc: jax.Array) -> _Point:
-    """Returns an acceleration [nv] with its cost and what the next step needs of it."""
-    residual = rows.jacobian @ qacc - rows.reference
-    active = rows.equality | (residual < 0)
-    imbalance = inertia @ qacc - data.qfrc_smooth
-    penalty = jnp.sum(jnp.where(active, rows.constraint_mass * residual**2, 0))
-    cost = (jnp.dot(imbalance, qacc - data.qacc_smooth) + penalty) / 2
-    return _Point(qacc, imbalance, residual, active, cost)
+def _point(rows: _Rows, qacc: jax.Array, imbalance: jax.Array, residual: jax.Array) -> _Point:
+    """Returns an acceleration [nv] with which rows push."""
+    return _Point(qacc, imbalance, residual, rows.equality | (residual < 0))
+
+
+def _cost(rows: _Rows, data: mjx.Data, point: _Point) -> jax.Array:
+    """Returns what is minimised, []."""
+    penalty = jnp.sum(jnp.where(point.active, rows.constraint_mass * point.residual**2, 0))
+    return (jnp.dot(point.imbalance, point.qacc - data.qacc_smooth) + penalty) / 2
 
 
 def _force(rows: _Rows, point: _Point) -> jax.Array:
@@ -153,25 +175,23 @@ def _force(rows: _Rows, point: _Point) -> jax.Array:
     return jnp.where(point.active, -rows.constraint_mass * point.residual, 0)
 
 
-def _newton_step(
-    inertia: jax.Array, rows: _Rows, point: _Point, max_rounds: int
+def _newton_direction(
+    division: contact_rows.Blocks, inertia: jax.Array, rows: _Rows, point: _Point
 ) -> tuple[jax.Array, jax.Array]:
-    """Returns the least costly acceleration [nv] in the direction of Newton's step.
+    """Returns Newton's step [nv].
 
     Also returns by how much the cost would fall [] along the whole step if no row changed. That is
     half the product of gradient and step, up to the sign; it keeps its digits near the minimum,
     where the difference of two costs would be rounding error.
     """
-    gradient = point.imbalance - rows.jacobian.T @ _force(rows, point)
     active_mass = jnp.where(point.active, rows.constraint_mass, 0)
-    hessian = inertia + (rows.jacobian.T * active_mass) @ rows.jacobian
-    factor = jax.scipy.linalg.cho_factor(hessian)
+    hessian, joint_force = contact_rows.weighted(
+        division, inertia, rows.jacobian, active_mass, _force(rows, point)
+    )
+    gradient = point.imbalance - joint_force
+    factor = jax.scipy.linalg.cho_factor(hessian, lower=True)
     direction = -jax.scipy.linalg.cho_solve(factor, gradient)
-    change = rows.jacobian @ direction
-    slope = jnp.dot(direction, point.imbalance)
-    curvature = jnp.dot(direction, inertia @ direction)
-    length = _line_search(rows, point, change, slope, curvature, max_rounds)
-    return point.qacc + length * direction, -jnp.dot(gradient, direction) / 2
+    return direction, -jnp.dot(gradient, direction) / 2
 
 
 def _line_search(

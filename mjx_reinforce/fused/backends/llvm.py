@@ -48,6 +48,8 @@ class LLVM(Backend[Value]):
         """
         self._text = text
         self._inputs = inputs
+        # Where a loop before has kept a value: the array of that value, and the iteration.
+        self._kept: dict[Scalar, tuple[str, int]] = {}
 
     def constant(self, number: Any) -> Value:
         """A constant in every lane."""
@@ -129,6 +131,8 @@ class LLVM(Backend[Value]):
             text.fill(hole, f"phi {kind} [{init}, %{before}], [{following}, %{text.block}]")
         text.line(f"br label %{head}")
         text.start(after)
+        for record, array in zip(loop.records, kept, strict=True):
+            self._kept.update({out: (array, t) for t, out in enumerate(record.outs)})
         return names, [
             [
                 Memory(self._text.at(array, _dtype(r.value), t), _dtype(r.value))
@@ -177,6 +181,9 @@ class LLVM(Backend[Value]):
         place = evenly_spaced(row)
         if place is not None:
             return lambda count: self._place(place, dtype, count)
+        kept = self._kept_in_order(row)
+        if kept is not None:
+            return lambda count: Memory(self._text.at(kept, dtype, count), dtype)
         if all(map(is_constant, row)):
             table = text.table(dtype, [literal(x) for x in row])
             return lambda count: text.spread(dtype, table, count)
@@ -184,6 +191,12 @@ class LLVM(Backend[Value]):
         for t, x in enumerate(row):
             text.store(self.value(x, values), self._text.at(array, dtype, t), dtype)
         return lambda count: Memory(self._text.at(array, dtype, count), dtype)
+
+    def _kept_in_order(self, row: list[Scalar]) -> str | None:
+        """Returns the array in which an earlier loop has kept these values, or None."""
+        array, _ = self._kept.get(row[0], (None, 0))
+        in_order = all(self._kept.get(x) == (array, t) for t, x in enumerate(row))
+        return array if in_order else None
 
     def _place(self, place: Places, dtype: np.dtype, count: str) -> Value:
         pointer, _ = self._inputs(place.leaf)

@@ -1,0 +1,76 @@
+"""Machine code visits pairs of geoms, contacts and rows in loops, and skips what is apart."""
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from mujoco import mjx
+from players import actor_and_act
+from toys import Survive, ToyState
+
+from mjx_reinforce.engines import rollouts
+from mjx_reinforce.engines.native import rollout, seam
+from mjx_reinforce.physics import step as physics
+from mjx_reinforce.physics.mjx_internals import jax_fields
+
+if reason := seam.unavailable():
+    pytest.skip(reason, allow_module_level=True)
+
+SCENE = """
+<mujoco><worldbody><geom type="plane" size="5 5 1"/>
+  <body pos="0 0 0.2"><freejoint/><geom type="capsule" size="0.1 0.3"/>
+    <body pos="0.2 0 0"><joint axis="0 1 0" range="-0.5 0.5" limited="true"/>
+      <geom type="capsule" size="0.08 0.2" pos="0.2 0 0" condim="1" priority="1"/></body></body>
+  <body pos="0.4 0 0.3"><joint type="slide" axis="0 0 1"/>
+    <geom type="cylinder" size="0.15 0.1" condim="4"/></body>
+  <body pos="0.9 0.2 0.1"><joint type="slide" axis="1 0 0"/><joint axis="0 0 1"/>
+    <geom type="capsule" size="0.1 0.2" condim="6"/></body>
+</worldbody></mujoco>"""
+
+
+class Scene(Survive):
+    """Its second observation is what the physics makes of the random state that it starts from."""
+
+    action_size = 1
+
+    def __init__(self):
+        model = mujoco.MjModel.from_xml_string(SCENE)  # pyright: ignore
+        self.model, self.data = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
+        self.size = 2 * model.nv + len(jax_fields(self.data).contact.dim)
+
+    def reset(self, rng):
+        nq, nv = self.model.nq, self.model.nv
+        random = jax.random.normal(rng, (nq + 2 * nv,))
+        info = self.model.qpos0 + 0.2 * random[:nq], 3 * random[nq : nq + nv], 30 * random[-nv:]
+        return ToyState(jnp.zeros(self.size), jnp.zeros(()), jnp.zeros(()), info)
+
+    def step(self, state, action):
+        qpos, qvel, warmstart = state.info
+        data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+        data = physics.forward(self.model, data)
+        contact = jax_fields(data).contact
+        touching = (contact.dist < contact.includemargin).astype(qpos.dtype)
+        return state.replace(obs=jnp.concatenate([data.qacc, data.qfrc_constraint, touching]))
+
+
+@pytest.mark.slow
+def test_contacts_of_all_kinds():
+    with jax.enable_x64(True):
+        env = Scene()
+        actor, act, distribution = actor_and_act(env, ())
+
+        def play(engine):
+            roll = lambda key: engine(  # noqa: E731
+                env, act, actor, distribution, key, num_episodes=64, horizon=2
+            )
+            return np.asarray(jax.jit(roll)(jax.random.key(0)).observation[1])
+
+        ours, theirs = play(rollout.rollout), play(rollouts.rollout)
+    jax.clear_caches()
+    nv, dims = env.model.nv, jax_fields(env.data).contact.dim
+    for dim in (1, 3, 4, 6):
+        assert 0 < theirs[:, 2 * nv :][:, dims == dim].mean() < 1, dim
+    np.testing.assert_array_equal(ours[:, 2 * nv :], theirs[:, 2 * nv :])
+    scale = 1 + np.abs(theirs).max(axis=1, keepdims=True)
+    assert np.max(np.abs(ours - theirs) / scale) < 1e-11
