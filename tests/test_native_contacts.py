@@ -10,11 +10,11 @@ from players import actor_and_act
 from toys import Survive, ToyState
 
 from mjx_reinforce.engines import rollouts
-from mjx_reinforce.engines.native import rollout, seam
+from mjx_reinforce.engines.native import available, rollout
 from mjx_reinforce.physics import step as physics
 from mjx_reinforce.physics.mjx_internals import jax_fields
 
-if reason := seam.unavailable():
+if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
 
 SCENE = """
