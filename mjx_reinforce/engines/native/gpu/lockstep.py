@@ -15,7 +15,7 @@ from mjx_reinforce.fused.liveness import LiveGate, LiveLoop, Schedule
 from mjx_reinforce.fused.nodes import Node
 
 #: Gates and loops of more operations are entered by all threads of a block at once.
-LONG = 3000
+LONG = 3_000
 _SOME = (
     "{{ .reg .pred p, q; setp.ne.b32 p, $1, 0; barrier.red.or.pred q, 0, p; "
     "selp.b32 $0, 1, 0, q; }}"

@@ -13,7 +13,7 @@ from mjx_reinforce.engines.native.gpu.lockstep import LONG, Lockstep, operations
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.fused.backends.llvm_text import Text
 
-_BOOL, _INT, _LONG = np.dtype(bool), np.dtype(np.int32), np.dtype(np.int64)
+_INT = np.dtype(np.int32)
 #: The kernel's name. Its attributes are #0.
 ENTRY = "play"
 #: What a kernel reads before the actor and the state, by name; see ``kernel_text``.
@@ -22,12 +22,10 @@ CONTROLS = ("sizes", "active", "deterministic", "keys")
 RESULTS = ("observation", "action", "reward", "length", "broken", "simulated", "next")
 #: The arguments of a step behind the actor and the state: keys, t, deterministic.
 _NUM_OTHERS = 3
-
-
 #: A block's threads, and how many blocks a multiprocessor holds at once, for programs that fit into
 #: its instruction caches and for longer ones. A thread has 128 registers: more threads are worth
 #: more than what does not fit into these.
-_SHORT, _LONG_ONE = (32, 16), (512, 1)
+_SHORT_BLOCKS, _LONG_BLOCKS = (32, 16), (512, 1)
 #: Denormals are zero, as in machine code for CPUs.
 _ATTRIBUTES = """attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
   "nvvm.maxntid"="{}" "nvvm.minctasm"="{}" }}
@@ -51,7 +49,7 @@ def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
     are results, which it does not read; and the results, which are zero when it starts:
     observation [S, T, O, N], action [S, T, A, N], reward [S, T, N], length [S, N] int32,
     broken [S, N] int32, simulated [S] int32 and next [1] int32, the item to be fetched next. Item k
-    is episode k % N of seed k / N. A thread counts the steps that it waits for others in its warp
+    is episode k % N of seed k / N. A thread counts the steps that it waits for others in its block
     as simulated for the seed it played last.
 
     Args:
@@ -65,7 +63,7 @@ class _Kernel:
     """Writes ``@play``."""
 
     def __init__(self, step: scalarized.Scalarized, num_actor: int):
-        self.text, self.step, self.num_actor = Text(1), step, num_actor
+        self.text, self.step = Text(1), step
         avals = [(np.dtype(x.dtype), int(np.prod(x.shape, dtype=int))) for x in step.in_avals]
         actor, own = avals[:num_actor], avals[num_actor:]
         state = own[: len(own) - _NUM_OTHERS]
@@ -114,9 +112,9 @@ class _Kernel:
         written = [f"%{name}" for name in RESULTS]
         parameters = [f"ptr noalias readonly {x}" for x in pointers]
         parameters += [f"ptr {x}" for x in unread] + [f"ptr {x}" for x in written]
-        block = _LONG_ONE if operations(self.step.schedule) > LONG else _SHORT
+        blocks = _LONG_BLOCKS if operations(self.step.schedule) > LONG else _SHORT_BLOCKS
         kernel = text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
-        return kernel + _ATTRIBUTES.format(*block)
+        return kernel + _ATTRIBUTES.format(*blocks)
 
     def _fetch(self, items: str) -> None:
         """Writes how a thread takes the next episode of an active seed, if there is one."""
