@@ -166,7 +166,7 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ("--env CartPole-v1 --policy normal", "continuous action space"),
         ("--env Survive-v0 --policy categorical", "discrete action space"),
         ("--env Survive-v0 --no-shared-trunk", "without a shared trunk"),
-        ("--env Survive-v0 --engine kernel", "kernel engine"),
+        ("--env Survive-v0 --engine kernel", "invalid choice 'kernel'"),
         ("--env Survive-v0 --output new/deep/run --no-shared-trunk", "without a shared trunk"),
     ],
 )

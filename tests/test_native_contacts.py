@@ -1,5 +1,7 @@
 """Machine code visits pairs of geoms, contacts and rows in loops, and skips what is apart."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -9,7 +11,7 @@ from mujoco import mjx
 from players import actor_and_act
 from toys import Survive, ToyState
 
-from mjx_reinforce.engines import rollouts
+from mjx_reinforce.engines import episode, rollouts
 from mjx_reinforce.engines.native import available, rollout
 from mjx_reinforce.physics import step as physics
 from mjx_reinforce.physics.mjx_internals import jax_fields
@@ -46,12 +48,17 @@ class Scene(Survive):
         return ToyState(jnp.zeros(self.size), jnp.zeros(()), jnp.zeros(()), info)
 
     def step(self, state, action):
-        qpos, qvel, warmstart = state.info
+        return state.replace(obs=self.forward(state.info))
+
+    def forward(self, info, moved=0.0):
+        """Returns what the physics makes of a state, or of one with slightly greater positions."""
+        qpos, qvel, warmstart = info
+        qpos = qpos * (1 + moved)
         data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
         data = physics.forward(self.model, data)
         contact = jax_fields(data).contact
         touching = (contact.dist < contact.includemargin).astype(qpos.dtype)
-        return state.replace(obs=jnp.concatenate([data.qacc, data.qfrc_constraint, touching]))
+        return jnp.concatenate([data.qacc, data.qfrc_constraint, touching])
 
 
 @pytest.mark.slow
@@ -67,10 +74,20 @@ def test_contacts_of_all_kinds():
             return np.asarray(jax.jit(roll)(jax.random.key(0)).observation[1])
 
         ours, theirs = play(rollout.rollout), play(rollouts.rollout)
+        starts, _ = jax.vmap(functools.partial(episode.begin, env, jax.random.key(0)))(
+            jnp.arange(len(theirs))
+        )
+        forward = jax.jit(jax.vmap(env.forward, in_axes=(0, None)))
+        moved = [np.asarray(forward(starts.info, x)) for x in (1e-15, 1e-14, 1e-13, -1e-13, -1e-12)]
     jax.clear_caches()
+    # MJX's descent to a cylinder jumps between contacts in some of these states, for any rounding.
+    scale = 1 + np.abs(theirs).max(axis=1)
+    steady = [np.abs(x - theirs).max(axis=1) / scale < 1e-9 for x in moved]
+    steady = np.all(steady, axis=0)
+    assert steady.sum() > 48
+    ours, theirs = ours[steady], theirs[steady]
     nv, dims = env.model.nv, jax_fields(env.data).contact.dim
     for dim in (1, 3, 4, 6):
         assert 0 < theirs[:, 2 * nv :][:, dims == dim].mean() < 1, dim
     np.testing.assert_array_equal(ours[:, 2 * nv :], theirs[:, 2 * nv :])
-    scale = 1 + np.abs(theirs).max(axis=1, keepdims=True)
-    assert np.max(np.abs(ours - theirs) / scale) < 1e-11
+    assert np.max(np.abs(ours - theirs).max(axis=1) / scale[steady]) < 1e-11

@@ -115,7 +115,7 @@ def test_first_weights_are_pytorchs(name):
             assert 0.8 * bound < float(jnp.max(jnp.abs(x))) <= bound
 
 
-@pytest.mark.parametrize("name", ["auto", "vmap", "fused", "native", "kernel"])
+@pytest.mark.parametrize("name", ["auto", "vmap", "fused", "native"])
 def test_engines_have_names(name):
     assert train_module.parse(["--engine", name]).engine == name
     with pytest.raises(ValueError, match="'vmap'"):
