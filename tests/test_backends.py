@@ -99,7 +99,7 @@ def test_constants_fold_to_what_jax_computes(name):
     assert (folded.dtype, np.ndim(folded)) == (dtype, 0)
     assert np.isfinite(folded)
     for num_lanes in {1, len(operands)}:
-        graph = Graph(branch_cost=0, unrolled=0, unrolled_arrays=0)
+        graph = Graph(branch_cost=0, unrolled=0, unrolled_arrays=0, unrolled_on_request=0)
         leaves = [graph.leaf(x.dtype, True, position=(0, i)) for i, x in enumerate(operands)]
         mixed = (*leaves[:num_lanes], *operands[num_lanes:])
         backend = XLA(lambda place: jnp.full(2, operands[place[1]]), (2,), fused.any_lane)
@@ -110,7 +110,7 @@ def test_constants_fold_to_what_jax_computes(name):
 
 @pytest.mark.parametrize("name", [n for n, facts in ops.FACTS.items() if facts.commutes])
 def test_operations_that_commute_are_shared(name):
-    graph = Graph(branch_cost=0, unrolled=0, unrolled_arrays=0)
+    graph = Graph(branch_cost=0, unrolled=0, unrolled_arrays=0, unrolled_on_request=0)
     x, y = (graph.leaf(operands_of(name)[0].dtype, True) for _ in range(2))
     assert graph.call(name, x, y) is graph.call(name, y, x)
 

@@ -25,6 +25,7 @@ class Graph:
             the batch needs it.
         unrolled: a scan that reads and makes no arrays is written out up to this length.
         unrolled_arrays: one that reads or makes arrays is written out up to this length.
+        unrolled_on_request: one whose `unroll` is more than 1 is, up to this length.
         path: the equations that are being evaluated, from the outermost one, by their ids.
         learned: what was found out on a path. The body of a loop is evaluated again and again, each
             time with less assumed of what never changes, and what was found out inside still holds.
@@ -32,10 +33,13 @@ class Graph:
             if each of them is true for at least one element of the batch.
     """
 
-    def __init__(self, branch_cost: int, unrolled: int, unrolled_arrays: int):
+    def __init__(
+        self, branch_cost: int, unrolled: int, unrolled_arrays: int, unrolled_on_request: int
+    ):
         self.branch_cost = branch_cost
         self.unrolled = unrolled
         self.unrolled_arrays = unrolled_arrays
+        self.unrolled_on_request = unrolled_on_request
         self.path: tuple[int, ...] = ()
         self.learned: dict[Hashable, Any] = {}
         self._evaluated: dict[int, Any] = {}  # kept, so that no id is given twice

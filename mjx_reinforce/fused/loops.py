@@ -58,7 +58,9 @@ def scan_rule(graph: Graph, run: Callable, eqn: Any, used: Any, *operands: np.nd
     rows = [ins.unpack([x[t : t + 1] for x in operands[split:]]) for t in order]
     has_arrays = len(operands) > split or len(eqn.outvars) > parts.num_carry
     limit = graph.unrolled_arrays if has_arrays else graph.unrolled
-    if length <= max(limit, 0 if eqn.params["unroll"] < length else length):
+    if eqn.params["unroll"] > 1:
+        limit = length if eqn.params["unroll"] >= length else graph.unrolled_on_request
+    if length <= limit:
         final, table = _unroll(step, carry.unpack(init), rows)
     else:
         final, table = _as_loop(graph, step, carry.unpack(init), rows, length)

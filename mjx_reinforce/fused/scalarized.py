@@ -120,6 +120,7 @@ def build(
     branch_cost: int,
     unrolled: int = loops.UNROLLED_LENGTH,
     unrolled_arrays: int = loops.UNROLLED_LENGTH,
+    unrolled_on_request: int = loops.UNROLLED_LENGTH,
 ) -> Scalarized:
     """Writes a function out.
 
@@ -130,10 +131,11 @@ def build(
         branch_cost: as in `scalarize`.
         unrolled: a scan that reads and makes no arrays is written out up to this length.
         unrolled_arrays: one that reads or makes arrays is written out up to this length.
+        unrolled_on_request: one whose `unroll` is more than 1 is, up to this length.
     """
     program, out_shape = jaxprs.trace(fn, *examples)
     in_tree = jax.tree.structure(tuple(examples))
-    graph = Graph(branch_cost, unrolled, unrolled_arrays)
+    graph = Graph(branch_cost, unrolled, unrolled_arrays, unrolled_on_request)
     inputs = [
         _inputs(graph, number, variable.aval, varies)
         for number, (variable, varies) in enumerate(zip(program.jaxpr.invars, varying, strict=True))

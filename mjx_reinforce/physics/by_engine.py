@@ -5,6 +5,9 @@ from typing import Any
 
 from jax import lax
 
+#: The `unroll` of a scan over contacts: machine code may write its iterations out.
+UNROLL = 2
+
 
 def by_engine(one: Callable, many: Callable, *args: Any) -> Any:
     """Computes `many` in XLA; `fused`, which knows no platform, takes the default, `one`.

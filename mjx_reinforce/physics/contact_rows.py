@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from mjx_reinforce.physics.by_engine import by_engine
+from mjx_reinforce.physics.by_engine import UNROLL, by_engine
 
 
 class Blocks(NamedTuple):
@@ -59,7 +59,7 @@ def weighted(
         zero = jnp.zeros_like(start)
         sums = whole(start, *(x[: division.others] for x in rows))
         for group in _by_group(division, rows):
-            sums, _ = lax.scan(add, sums, group)
+            sums, _ = lax.scan(add, sums, group, unroll=UNROLL)
         return sums
 
     return by_engine(by_contact, whole, start, jacobian, mass, force)
@@ -91,7 +91,7 @@ def along(
             division.groups, _by_group(division, (jacobian,)), strict=True
         ):
             block = rows, touching[first : first + count]
-            parts.append(lax.scan(product, None, block)[1].reshape(-1))
+            parts.append(lax.scan(product, None, block, unroll=UNROLL)[1].reshape(-1))
             first += count
         return jnp.concatenate(parts)
 

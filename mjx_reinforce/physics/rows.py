@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from mujoco import mjx
 
-from mjx_reinforce.physics.by_engine import by_engine
+from mjx_reinforce.physics.by_engine import UNROLL, by_engine
 from mjx_reinforce.physics.mjx_internals import (
     jax_fields,
     rows_of,
@@ -65,5 +65,5 @@ def _contact_rows(model: mjx.Model, data: mjx.Data, dim: int, chosen: np.ndarray
         )
 
     contacts = jax.tree.map(lambda x: x[chosen], contact)
-    rows = lax.scan(make, None, contacts)[1]
+    rows = lax.scan(make, None, contacts, unroll=UNROLL)[1]
     return [x.reshape(-1, *x.shape[2:]) for x in rows]

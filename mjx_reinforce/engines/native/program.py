@@ -21,7 +21,9 @@ from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Environment
 
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
-_LOOPS = {"unrolled": 1, "unrolled_arrays": 1}
+_LOOPS = {"unrolled": 1, "unrolled_arrays": 1, "unrolled_on_request": 1}
+#: On GPUs all but those over many contacts are written out, whose arrays would be in memory.
+_GPU_LOOPS = {**_LOOPS, "unrolled_on_request": 25}
 #: The folders whose files decide what is written for a step.
 _WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
 
@@ -78,7 +80,7 @@ def _write_gpu(function: Any, examples: tuple[Any, ...]) -> str:
     """Writes a step, and the kernel around it, as LLVM IR."""
     actor = examples[0]
     varying = [True] * len(jax.tree.leaves(examples))
-    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **_LOOPS)
+    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **_GPU_LOOPS)
     return gpu_player.kernel_text(written, len(jax.tree.leaves(actor)))
 
 

@@ -16,8 +16,12 @@ from mjx_reinforce.fused.nodes import Node
 
 #: Gates and loops of more operations are entered by all threads of a block at once.
 LONG = 3_000
+#: The threads of a warp come together before they meet the others of their block: an H200 was seen
+#: to wait forever where they came to a barrier one by one.
+_TOGETHER = "bar.warp.sync 0xffffffff;"
+_MEET = f"{_TOGETHER} bar.sync 0;"
 _SOME = (
-    "{{ .reg .pred p, q; setp.ne.b32 p, $1, 0; barrier.red.or.pred q, 0, p; "
+    f"{{{{ .reg .pred p, q; setp.ne.b32 p, $1, 0; {_TOGETHER} bar.red.or.pred q, 0, p; "
     "selp.b32 $0, 1, 0, q; }}"
 )
 
@@ -61,7 +65,7 @@ class Lockstep(LLVM):
     def goes_on(self, loop: LiveLoop, count: str, carries: list[str]) -> str:
         """Returns an i1: whether another iteration runs; all threads of a long loop meet here."""
         if self._together and loop.active is None:
-            self._text.line('call void asm sideeffect "barrier.sync 0;", ""() convergent')
+            self._text.line(f'call void asm sideeffect "{_MEET}", ""() convergent')
         return super().goes_on(loop, count, carries)
 
     def may_skip(self, loop: LiveLoop, carries: list[str]) -> tuple[str, str] | None:

@@ -23,9 +23,8 @@ RESULTS = ("observation", "action", "reward", "length", "broken", "simulated", "
 #: The arguments of a step behind the actor and the state: keys, t, deterministic.
 _NUM_OTHERS = 3
 #: A block's threads, and how many blocks a multiprocessor holds at once, for programs that fit into
-#: its instruction caches and for longer ones. A thread has 128 registers: more threads are worth
-#: more than what does not fit into these.
-_SHORT_BLOCKS, _LONG_BLOCKS = (32, 16), (512, 1)
+#: its instruction caches and for longer ones. A thread has 128 registers, in a longer program 255.
+_SHORT_BLOCKS, _LONG_BLOCKS = (32, 16), (128, 2)
 #: Denormals are zero, as in machine code for CPUs.
 _ATTRIBUTES = """attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
   "nvvm.maxntid"="{}" "nvvm.minctasm"="{}" }}
