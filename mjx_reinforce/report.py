@@ -16,7 +16,7 @@ from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
 from mjx_reinforce.reports.findings import Findings, find
 from mjx_reinforce.reports.page import columns, document, tables
-from mjx_reinforce.reports.page.document import GENERATOR, Watch
+from mjx_reinforce.reports.page.document import GENERATOR, Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.vega import ONE, draw
 from mjx_reinforce.runs.defaults import of_task
@@ -115,14 +115,14 @@ def write(chosen: Sequence[Path], output: Path) -> float:
     beside = _beside(output)
     beside.mkdir(exist_ok=True)
     for name, content in {**files, **_tables(findings, data)}.items():
-        write_bytes(beside / name, content.encode())
+        write_bytes(beside / name, encoded(content))
     for figure in drawn:
         write_bytes(beside / f"{figure.name}.png", _picture(findings, figure, data))
     seconds = time.perf_counter() - started
     ours = version("mjx-reinforce") or "not installed"
     watch = how_to_watch(experiment, findings)
     text = document.render(findings, drawn, data, files, watch, ours, seconds)
-    write_bytes(output, text.encode())
+    write_bytes(output, encoded(text))
     return time.perf_counter() - started
 
 

@@ -121,11 +121,13 @@ def _waiting(what: str) -> AbstractContextManager[Any]:
 
 def _make(run: Run, size: int) -> Any:
     """Returns the run's environment; raises ValueError if its observations are not of a size."""
+    from mjx_reinforce.types import observation_size
+
     env = envs.make(run.env)
-    if env.observation_size != size:
+    if observation_size(env) != size:
         raise ValueError(
             f"the policy in {run.directory} takes observations of {size} entries, {run.env} has "
-            f"{env.observation_size}: config.json and policy/ are of different runs"
+            f"{observation_size(env)}: config.json and policy/ are of different runs"
         )
     return env
 
@@ -192,7 +194,10 @@ def scene(env: Any) -> Any:
         from mjx_reinforce.envs import models
 
         return models.load(env.scene)
-    raise ValueError(f"{type(env).__name__} has no mj_model, so there is nothing to draw")
+    raise ValueError(
+        f"{type(env).__name__} has no mj_model, so there is nothing to draw; "
+        "play its policy with mjx_reinforce.load"
+    )
 
 
 if __name__ == "__main__":

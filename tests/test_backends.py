@@ -1,6 +1,7 @@
 """Every backend knows every operation, and a new one is a class and a line."""
 
 import ast
+import itertools
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from mjx_reinforce.fused.backends.backend import Backend
 from mjx_reinforce.fused.backends.llvm_text import Text
 from mjx_reinforce.fused.backends.xla import XLA
 from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.nodes import is_constant
 from mjx_reinforce.registry import load
 
 #: Operands of which every float operation is finite.
@@ -37,7 +39,6 @@ SETTINGS = {
     "xla": {
         "read": lambda place: jnp.linspace(1.0, 2.0, 4),
         "batch_shape": (4,),
-        "any_lane": fused.any_lane,
     },
     "llvm": {"text": Text(4), "inputs": lambda number: ("%input", np.dtype(np.float32))},
 }
@@ -91,20 +92,22 @@ def test_a_backend_walks_loops_and_gates(name):
 
 @pytest.mark.parametrize("name", ops.FACTS)
 def test_constants_fold_to_what_jax_computes(name):
-    """The same operation on constants, on lanes, and on a lane and constants."""
+    """The same operation on constants, on lanes, and on both, in every order."""
     op = ops.Op(name, tuple(sorted(PARAMS.get(name, {}).items())))
     operands = operands_of(name)
     dtype = dtype_of(op, operands)
     folded = folding.fold(op, operands, dtype)
     assert (folded.dtype, np.ndim(folded)) == (dtype, 0)
     assert np.isfinite(folded)
-    for num_lanes in {1, len(operands)}:
+    _, *mixes = itertools.product([False, True], repeat=len(operands))
+    for mix in mixes:
         graph = Graph(branch_cost=0, unrolled=0, unrolled_arrays=0, unrolled_on_request=0)
         leaves = [graph.leaf(x.dtype, True, position=(0, i)) for i, x in enumerate(operands)]
-        mixed = (*leaves[:num_lanes], *operands[num_lanes:])
-        backend = XLA(lambda place: jnp.full(2, operands[place[1]]), (2,), fused.any_lane)
-        node = graph.apply(op, mixed, dtype)
-        (results,) = backend.compile([node] if node.op else [], [[node]])
+        mixed = [leaf if lane else x for leaf, x, lane in zip(leaves, operands, mix, strict=True)]
+        backend = XLA(lambda place: jnp.full(2, operands[place[1]]), (2,))
+        node = graph.apply(op, tuple(mixed), dtype)
+        steps = [] if is_constant(node) or node.op is None else [node]
+        (results,) = backend.compile(steps, [[node]])
         np.testing.assert_allclose(results[0], [folded] * 2, rtol=1e-5)
 
 

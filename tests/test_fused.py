@@ -369,21 +369,6 @@ def test_x64():
         assert_same(lambda x: line_search(x)[0] + 1 / 3, x, rtol=1e-15)
 
 
-def test_scalarize_takes_lanes_and_a_reduction():
-    reductions = []
-
-    def any_lane(x):
-        reductions.append(x.shape)
-        return jnp.max(x.astype(jnp.int32)) > 0
-
-    written = fused.scalarize(lambda x, n: (x[0] * x[1], collatz(n)[1]), jnp.ones(2), 1)
-    lanes = [jnp.ones(4), 2 * jnp.ones(4)]
-    product, steps = written(lanes, jnp.array([1, 2, 3, 6]), any_lane=any_lane)
-    np.testing.assert_array_equal(product[()], 2 * np.ones(4))
-    np.testing.assert_array_equal(steps[()], [0, 1, 7, 8])
-    assert reductions == [(4,)]
-
-
 def test_short_loops_can_stay_loops():
     step = lambda _, x: jnp.sin(x) + x  # noqa: E731
     counts = [

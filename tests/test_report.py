@@ -142,6 +142,13 @@ def test_a_run_alone_and_names_that_are_markup(tmp_path):
     assert f"watch '{directory}' --seed 0" in visible(page)
 
 
+def test_a_path_that_the_locale_cannot_read_is_escaped(tmp_path):
+    """Where Python reads the file system as ASCII, a path's other bytes are surrogates."""
+    directory = make_run(tmp_path / "run\udce6")
+    report.write([directory], tmp_path / "page.html")
+    assert r"run\udce6" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
 def test_seeds_that_all_failed_are_no_answer(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=5, over=ONE)
     with np.load(directory / "curves.npz") as archive:

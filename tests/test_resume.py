@@ -282,7 +282,12 @@ def test_only_the_budget_may_change(run, parts, capsys, arguments, message):
         (lambda old: {"device": "TPU"}, "was begun with device TPU"),
         (lambda old: {"num_seeds": "four"}, "num_seeds is 'four'"),
         (lambda old: {"hidden_sizes": [1.5]}, "hidden_sizes is (1.5,)"),
-        (lambda old: {"eval_every": None}, "eval_every is None"),
+        (lambda old: {"eval_every": None}, "eval_every is None: it is damaged, or of another"),
+        (
+            lambda old: {"engine": "kernel"},
+            "engine is 'kernel', not one of auto, vmap, fused, native: it is damaged, or of "
+            "another version of the program; resume with the version that wrote it",
+        ),
     ],
 )
 def test_what_cannot_be_resumed_is_named(run, parts, capsys, change, message):
@@ -290,7 +295,9 @@ def test_what_cannot_be_resumed_is_named(run, parts, capsys, change, message):
     config = json.loads(path.read_text())
     path.write_text(json.dumps(config | change(config)))
     assert run("--resume", "parts") == 2
-    assert message in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize(

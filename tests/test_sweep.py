@@ -307,6 +307,11 @@ def test_values_are_read_as_their_settings_are():
         ("--over learning-rate 1e-2 1e-3 --chunk-runs 0", "--chunk-runs must be at least 1"),
         ("--over learning-rate 1e-2 1e-3 --jsonl", "--jsonl logs a run"),
         ("--over tensorboard True False", "cannot go over tensorboard"),
+        ("--over learning-rate 1 2 --num-seeds 2000000000", "results of 4,000,000,000 runs do not"),
+        (
+            "--over discount 0 1 --search random --budget 2000000000",
+            "lower --num-seeds or --budget",
+        ),
         ("--resume nowhere", "cannot read nowhere/sweep.json"),
     ],
 )

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.fused import lanes, scalarized
+from mjx_reinforce.fused import scalarized
 
 
 def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 32) -> Callable:
@@ -45,7 +45,7 @@ def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 3
         leaves = jax.tree.leaves((args, kwargs))
         batch = _batch_size(leaves, axes)
         rows = [_rows(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
-        values = written.emit(lambda place: _row(rows, *place), (batch,), lanes.any_lane)
+        values = written.compile("xla", read=lambda place: _row(rows, *place), batch_shape=(batch,))
         out_tree = written.out_tree
         target = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
         ends = _axes(out_axes, target)
@@ -158,7 +158,8 @@ def _assemble(scalars: list[Any], aval: Any, axis: int | None, batch: int) -> ja
     elif axis is None:
         stacked = jnp.stack([jnp.asarray(scalar, aval.dtype) for scalar in scalars])
     else:
-        stacked = jnp.stack([scalarized.full(scalar, (batch,)) for scalar in scalars])
+        lanes = [x if np.ndim(x) else lax.broadcast(x, (batch,)) for x in scalars]
+        stacked = jnp.stack(lanes)
     if axis is None:
         return stacked.reshape(aval.shape)
     ndim = len(aval.shape) + 1

@@ -84,10 +84,12 @@ def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
     parts = []
     for (source, part), settings in zip(pairs, full, strict=True):
         own = {name: settings.get(name) for name in differ}
-        parts.append(part._replace(settings=own, label=describe(own) or source.directory.name))
+        parts.append(
+            part._replace(settings=own, label=describe(own) or _name(source.directory.name))
+        )
     repeated = {label for label, times in Counter(p.label for p in parts).items() if times > 1}
     return [
-        part._replace(label=f"{part.label} in {source.directory}")
+        part._replace(label=f"{part.label} in {_name(source.directory)}")
         if part.label in repeated
         else part
         for (source, _), part in zip(pairs, parts, strict=True)
@@ -118,3 +120,8 @@ def _side_by_side(sources: Sequence[Source]) -> tuple[dict[str, Any], list[str]]
         if not same and name in _COMPARABLE:
             disagree.append(name)
     return merged, disagree
+
+
+def _name(path: Path | str) -> str:
+    """Returns a path for people, with escapes for bytes that a locale of ASCII cannot read."""
+    return str(path).encode(errors="backslashreplace").decode()

@@ -16,6 +16,7 @@ BUDGETS = ("env_steps", "max_updates", "stop_when_solved", "checkpoint_every")
 PLACES = ("output", "overwrite", "resume")
 #: Entries of config.json on which every number of a run depends, besides its settings.
 _PROGRAM = ("packages", "git_commit", "device", "x64", "xla_flags")
+_OTHER = "damaged, or of another version of the program; resume with the version that wrote it"
 
 
 def read_record(directory: Path) -> dict[str, Any]:
@@ -57,16 +58,19 @@ def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
         if field.name in PLACES:
             continue
         if field.name not in recorded:
-            raise ValueError(
-                f"{path} does not say {field.name}: it is damaged, or of "
-                "another version of the program; resume with the version that wrote it"
-            )
+            raise ValueError(f"{path} does not say {field.name}: it is {_OTHER}")
         value = recorded[field.name]
         value = tuple(value) if isinstance(value, list) else value
         if not _fits(value, hints[field.name]):
-            raise ValueError(f"{path} is damaged: {field.name} is {value!r}")
+            says = f"{path} says {field.name} is {value!r}"
+            raise ValueError(f"{says}{_choices(hints[field.name])}: it is {_OTHER}")
         settings[field.name] = value
     return Config(**settings)
+
+
+def _choices(hint: Any) -> str:
+    names = typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
+    return f", not one of {', '.join(names)}" if names else ""
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -1,6 +1,7 @@
 """What a sweep is to do: the settings that all runs share, those that are swept, and how."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -9,11 +10,14 @@ import tyro
 
 from mjx_reinforce.export.files import read_json
 from mjx_reinforce.runs.config import Config, check
-from mjx_reinforce.runs.memory import check_size
+from mjx_reinforce.runs.memory import check_size, gigabytes, host_memory
 from mjx_reinforce.runs.resume import PLACES, as_config
 from mjx_reinforce.sweeps.grid import check_over, configure, grid
 from mjx_reinforce.sweeps.processes import ProcessSettings, check_processes
 from mjx_reinforce.sweeps.search import draw
+
+#: What writing results.csv and curves.npz needs for a run with two evaluations (bytes).
+_RESULT = 760
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -108,12 +112,25 @@ def check_design(design: Design) -> None:
         raise ValueError(f"--chunk-runs must be at least 1, got {design.chunk_runs}")
     check_over(design.base, design.over)
     _check_search(design)
+    _check_results(design)
     check_processes(design.processes)
     if design.processes.distributed and design.base.output is None and design.resume is None:
         raise ValueError("--distributed needs --output, a directory that all processes see")
     configs = configure(design.base, design.configurations(), design.given)
     for config in configs:
         check_size(dataclasses.replace(config, num_seeds=1))
+
+
+def _check_results(design: Design) -> None:
+    """Raises ValueError where memory does not hold what results.csv is made of."""
+    configurations = design.budget or math.prod(map(len, design.over.values()))
+    runs = configurations * design.base.num_seeds
+    if runs * _RESULT > host_memory():
+        raise ValueError(
+            f"the results of {runs:,} runs do not fit into memory: they need about "
+            f"{gigabytes(runs * _RESULT)}, {gigabytes(host_memory())} are here; lower --num-seeds "
+            f"or {'--budget' if design.budget else 'the number of values after --over'}"
+        )
 
 
 def _check_search(design: Design) -> None:

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from mjx_reinforce.fused.nodes import Node, Scalar
 
@@ -13,10 +13,6 @@ class Places(NamedTuple):
     leaf: int
     start: int
     stride: int
-
-    def at(self, t: Any) -> tuple[int, Any]:
-        """Returns the t-th place; t may be traced."""
-        return self.leaf, self.start + self.stride * t
 
 
 def evenly_spaced(row: Sequence[Scalar]) -> Places | None:

@@ -9,7 +9,8 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.fused.backends.backend import Backend
-from mjx_reinforce.fused.backends.xla_operations import LANES_ONLY, OPERATIONS
+from mjx_reinforce.fused.backends.xla_operations import OPERATIONS
+from mjx_reinforce.fused.lanes import any_lane
 from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
 from mjx_reinforce.fused.ops import Op
@@ -22,22 +23,15 @@ class XLA(Backend[Any]):
 
     OPERATIONS = OPERATIONS
 
-    def __init__(
-        self,
-        read: Callable[[tuple[int, int]], Any],
-        batch_shape: tuple[int, ...],
-        any_lane: Callable[[Any], Any],
-    ):
+    def __init__(self, read: Callable[[tuple[int, int]], Any], batch_shape: tuple[int, ...]):
         """Says where the program runs.
 
         Args:
             read: returns the lane of an input from (number of the argument, position in it).
             batch_shape: the shape of one lane.
-            any_lane: reduces a lane of bools to one bool.
         """
         self._read = read
         self._batch_shape = batch_shape
-        self._any_lane = any_lane
 
     def constant(self, number: Any) -> Any:
         """A constant stays a NumPy scalar."""
@@ -55,9 +49,9 @@ class XLA(Backend[Any]):
     def node(self, node: Node, operands: list[Any]) -> Any:
         """Emits one operation."""
         op = cast(Op, node.op)  # leaves are not scheduled
-        lanes_only = op.name in LANES_ONLY
+        mixes = op.name != "select_n"  # alone in taking no NumPy scalars beside lanes
         values = [
-            value if is_constant(arg) and not lanes_only else self._spread(value, node.varying)
+            value if is_constant(arg) and mixes else self._spread(value, node.varying)
             for arg, value in zip(node.args, operands, strict=True)
         ]
         return OPERATIONS[op.name](*values, **dict(op.params))
@@ -117,7 +111,7 @@ class XLA(Backend[Any]):
 
     def _any_of(self, predicate: Any) -> Any:
         """Returns whether a predicate holds in any lane; one that all lanes share is the answer."""
-        return self._any_lane(predicate) if np.ndim(predicate) else predicate
+        return any_lane(predicate) if np.ndim(predicate) else predicate
 
     def _spread(self, value: Any, varying: bool) -> Any:
         """Gives a constant or a shared value the shape of a lane."""

@@ -79,13 +79,3 @@ OPERATIONS: dict[str, Callable[..., Any]] = {
     "xor": lax.bitwise_xor,
     "zeta": lax.zeta,
 }
-
-#: Operations whose operands must all have the shape of a lane: no NumPy scalars beside lanes.
-LANES_ONLY = frozenset(
-    {
-        *("bessel_i0e", "bessel_i1e", "clz", "digamma", "erf", "erf_inv", "erfc", "igamma"),
-        *("igamma_grad_a", "igammac", "lgamma", "polygamma", "population_count", "round", "zeta"),
-        *("random_gamma_grad", "reduce_precision", "regularized_incomplete_beta", "select_n"),
-        *("shift_right_arithmetic", "shift_right_logical"),
-    }
-)

@@ -122,8 +122,13 @@ def _json(value: Any) -> str:
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
+def encoded(text: str) -> bytes:
+    """Returns UTF-8, with escapes for bytes of a path that a locale of ASCII cannot read."""
+    return text.encode(errors="backslashreplace")
+
+
 def _size(text: str) -> str:
-    size = len(text.encode())
+    size = len(encoded(text))
     return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(1, round(size / 1e3))} kB"
 
 
