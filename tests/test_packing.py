@@ -17,23 +17,19 @@ def test_each_run_has_one_lane_and_each_device_its_share(num_devices, active):
     random = np.random.default_rng(active)
     chosen = random.permutation(100) < active
     lengths = random.integers(1, 21, 100)
-    slots = pack(chosen, lengths, [32, 8], num_devices)
-    wide, left = divmod(active, 32)
-    expected = [32] * (wide + (left > 16)) + [8] * (0 if left > 16 else -(-left // 8))
-    assert [len(runs) for runs in slots] == expected
-    every = np.concatenate(slots)
-    assert sorted(every[every >= 0]) == np.flatnonzero(chosen).tolist()
-    for runs in slots:
-        shares = (runs.reshape(num_devices, -1) >= 0).sum(axis=-1)
-        assert shares.max() - shares.min() <= 1
-    each = [lengths[runs[runs >= 0]] for runs in slots]
+    lanes = pack(chosen, lengths, [32, 8], num_devices)
+    assert lanes.shape == ((-(-active // 32), 32) if active > 16 else (-(-active // 8), 8))
+    assert sorted(lanes[lanes >= 0]) == np.flatnonzero(chosen).tolist()
+    shares = (lanes.reshape(len(lanes), num_devices, -1) >= 0).sum(axis=-1)
+    assert np.all(shares.max(axis=1) - shares.min(axis=1) <= 1)
+    each = [lengths[slot[slot >= 0]] for slot in lanes]
     assert all(a.max() <= b.min() for a, b in itertools.pairwise(each))
 
 
 def test_runs_of_equal_lengths_stay_in_order():
     """So that a resumed run packs as it would have."""
-    every = np.concatenate(pack(np.ones(40, bool), np.full(40, 3), [16], 1))
-    assert every[every >= 0].tolist() == list(range(40))
+    lanes = pack(np.ones(40, bool), np.full(40, 3), [16], 1)
+    assert lanes[lanes >= 0].tolist() == list(range(40))
 
 
 def test_no_bit_of_a_state_changes_on_its_way():

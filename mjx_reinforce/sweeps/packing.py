@@ -14,32 +14,23 @@ import numpy as np
 
 def pack(
     chosen: np.ndarray, lengths: np.ndarray, widths: Sequence[int], num_devices: int
-) -> list[np.ndarray]:
+) -> np.ndarray:
     """Returns the runs of each slot.
 
     Args:
       chosen: [R] which runs are packed, at least one.
       lengths: [R] about how long their episodes are; runs of equal lengths share a slot.
-      widths: that slots may have, multiples of the number of devices, the most first. Each is
-        filled as often as it can be; what is left goes there too if it fills more than half.
+      widths: that slots may have, multiples of the number of devices, the most first. The first of
+        which these runs fill more than half of a slot is taken, or else the last.
       num_devices: among which a slot is divided; each gets as many runs as the others, or one less.
 
     Returns:
-      [width] of each slot, the number of the run in each lane, -1 where there is none.
+      [slots, width], the number of the run in each lane, -1 where there is none.
     """
     runs = np.flatnonzero(chosen)
     runs = runs[np.argsort(lengths[runs], kind="stable")]
-    slots = []
-    for width in widths:
-        narrowest = width == widths[-1]
-        while len(runs) > (0 if narrowest else width // 2):
-            slots.append(_deal(runs[:width], width, num_devices))
-            runs = runs[width:]
-    return slots
-
-
-def _deal(runs: np.ndarray, width: int, num_devices: int) -> np.ndarray:
-    """Returns the lanes of a slot, dealt one by one to the devices, each of which has a part."""
-    lanes = np.full(width, -1)
-    lanes[: len(runs)] = runs
-    return lanes.reshape(-1, num_devices).T.reshape(-1)
+    width = next((width for width in widths if len(runs) > width // 2), widths[-1])
+    lanes = np.full((-(-len(runs) // width), width), -1)
+    lanes.flat[: len(runs)] = runs
+    dealt = lanes.reshape(len(lanes), width // num_devices, num_devices)
+    return dealt.swapaxes(1, 2).reshape(lanes.shape)

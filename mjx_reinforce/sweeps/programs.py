@@ -85,50 +85,48 @@ class Programs(NamedTuple):
         Returns:
           What each block measured, of the runs that made an update; none without any.
         """
-        slots = self._pack(training, lengths)
-        count = blocks if [len(runs) for runs in slots] == [min(self.movers)] else 1
+        lanes, movers = self._pack(training, lengths)
+        count = blocks if lanes.shape == (1, min(self.movers)) else 1
 
         def move(runs: np.ndarray) -> Any:
-            movers, measured = self._movers(runs), []
+            measured = []
             slot, which = self._put((states[runs], runs >= 0))
             for _ in range(count):  # the host does not wait for any
                 slot, moved, counts = movers.block(slot, which, self.limits)
                 measured.append((moved, counts | movers.look(slot, moved)))
             return jax.device_get((slot, measured))
 
-        rows, measured = zip(*_side_by_side(move, slots), strict=True)
-        every = np.concatenate(slots)
-        states[every[every >= 0]] = np.concatenate(rows)[every >= 0]
-        measured = [_joined(slots, block) for block in zip(*measured, strict=True)]
+        rows, measured = zip(*_side_by_side(move, lanes), strict=True)
+        states[lanes[lanes >= 0]] = np.stack(rows)[lanes >= 0]
+        measured = [_joined(lanes, block) for block in zip(*measured, strict=True)]
         return [block for block in measured if len(block.runs)]
 
     def evaluate(self, states: np.ndarray) -> Measured:
         """Evaluates the present policies of all runs [R, B]."""
-        slots = self._pack(np.ones(len(states), bool), np.zeros(len(states)))
+        lanes, movers = self._pack(np.ones(len(states), bool), np.zeros(len(states)))
 
         def look(runs: np.ndarray) -> Any:
             slot, which = self._put((states[runs], runs >= 0))
-            return runs >= 0, jax.device_get(self._movers(runs).look(slot, which))
+            return runs >= 0, jax.device_get(movers.look(slot, which))
 
-        return _joined(slots, _side_by_side(look, slots))
+        return _joined(lanes, _side_by_side(look, lanes))
 
-    def _pack(self, chosen: np.ndarray, lengths: np.ndarray) -> list[np.ndarray]:
-        return pack(chosen, lengths, list(self.movers), self.devices.count)
-
-    def _movers(self, runs: np.ndarray) -> Movers:
-        return self.movers[len(runs)].result()
+    def _pack(self, chosen: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, Movers]:
+        """Returns the runs of each slot, and what moves them."""
+        lanes = pack(chosen, lengths, list(self.movers), self.devices.count)
+        return lanes, self.movers[lanes.shape[1]].result()
 
     def _put(self, slot: Any) -> Any:
         return self.devices.put(slot, RUNS)
 
 
-def _side_by_side(move: Callable[[np.ndarray], Any], slots: Sequence[np.ndarray]) -> list[Any]:
-    """Returns the results for all slots, as many at once as there are cores.
+def _side_by_side(move: Callable[[np.ndarray], Any], lanes: np.ndarray) -> list[Any]:
+    """Returns the results for all slots [slots, width], as many at once as there are cores.
 
     A slot alone leaves a part of the cores waiting for each other, and its results are fetched
     while the next one is moved.
     """
-    return [move(slots[0])] if len(slots) == 1 else list(_threads().map(move, slots))
+    return [move(lanes[0])] if len(lanes) == 1 else list(_threads().map(move, lanes))
 
 
 @functools.cache
@@ -137,12 +135,12 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_cores())
 
 
-def _joined(slots: Sequence[np.ndarray], of_slots: Sequence[Any]) -> Measured:
+def _joined(lanes: np.ndarray, slots: Sequence[Any]) -> Measured:
     """Returns what was measured in slots, each of which has (which lanes count [W], values [W])."""
-    counts, values = zip(*of_slots, strict=True)
+    counts, values = zip(*slots, strict=True)
     kept = np.concatenate(counts)
-    joined = {name: np.concatenate([v[name] for v in values])[kept] for name in values[0]}
-    return Measured(np.concatenate(slots)[kept], joined)
+    joined = {name: np.concatenate([slot[name] for slot in values])[kept] for name in values[0]}
+    return Measured(lanes.reshape(-1)[kept], joined)
 
 
 def compile_programs(
