@@ -49,7 +49,8 @@ class SweepFiles:
         self._first = first
         self._going_on = going_on
         self.directory, self.parts = directory, directory / "parts"
-        self._configurations, self._threshold = configurations, threshold
+        self._configurations = [_spelled(values) for values in configurations]
+        self._threshold = threshold
         self._columns = ("configuration", *configurations[0], *_MEASURED)
 
     def open(self) -> None:
@@ -146,7 +147,7 @@ class SweepFiles:
         }
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         return [
-            {"configuration": number, **_spelled(self._configurations[number]), **row}
+            {"configuration": number, **self._configurations[number], **row}
             for number, row in zip(part["configuration"].tolist(), rows, strict=True)
         ]
 
