@@ -3,42 +3,22 @@
 import itertools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.learners.learner import TrainState
-from mjx_reinforce.runs.config import MAX_COUNT
-from mjx_reinforce.runs.packing import pack, put_back, spread, take, training
-from mjx_reinforce.runs.state import Budget, RunState
-
-
-def states(env_steps, updates):
-    count = len(env_steps)
-    return RunState(
-        train_states=TrainState(
-            key=np.arange(2 * count, dtype=np.uint32).reshape(count, 2),
-            num_updates=np.array(updates, np.int32),
-            actor=np.arange(3.0 * count).reshape(count, 3),
-            opt_state=(),
-            estimator_state=(),
-        ),
-        env_steps=np.array(env_steps, np.int32),
-    )
-
-
-def test_a_run_trains_until_one_of_its_budgets_is_used():
-    runs = states([0, 99, 100, 300, 5], [3, 8, 2, 1, 9])
-    assert training(runs, Budget(100, 9)).tolist() == [True, True, False, False, False]
+from mjx_reinforce.sweeps.layout import Layout
+from mjx_reinforce.sweeps.packing import pack
 
 
 @pytest.mark.parametrize("num_devices", [1, 2, 8])
-@pytest.mark.parametrize("active", [1, 7, 8, 9, 40, 61, 100])
+@pytest.mark.parametrize("active", [1, 7, 8, 9, 16, 17, 24, 25, 40, 61, 100])
 def test_each_run_has_one_lane_and_each_device_its_share(num_devices, active):
     random = np.random.default_rng(active)
     chosen = random.permutation(100) < active
     lengths = random.integers(1, 21, 100)
-    lanes = pack(chosen, lengths, [16, 8], num_devices)
-    assert lanes.shape == ((1, 8) if active <= 8 else (-(-active // 16), 16))
+    lanes = pack(chosen, lengths, [32, 8], num_devices)
+    assert lanes.shape == ((-(-active // 32), 32) if active > 16 else (-(-active // 8), 8))
     assert sorted(lanes[lanes >= 0]) == np.flatnonzero(chosen).tolist()
     shares = (lanes.reshape(len(lanes), num_devices, -1) >= 0).sum(axis=-1)
     assert np.all(shares.max(axis=1) - shares.min(axis=1) <= 1)
@@ -52,20 +32,25 @@ def test_runs_of_equal_lengths_stay_in_order():
     assert lanes[lanes >= 0].tolist() == list(range(40))
 
 
-def test_states_go_to_their_lanes_and_back():
-    before = states([10, 20, 30, 40, 50], range(5))
-    lanes = np.array([[3, 0], [4, -1]])
-    slots = [take(before, runs) for runs in lanes]
-    assert slots[1].env_steps.tolist() == [50, MAX_COUNT]
-    moved = [jax.tree.map(lambda x: x + 1, slot) for slot in slots]
-    after = put_back(before, lanes, moved)
-    for old, new in zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True):
-        assert np.array_equal(new[[0, 3, 4]], old[[0, 3, 4]] + 1)
-        assert np.array_equal(new[[1, 2]], old[[1, 2]])
-    assert before.env_steps.tolist() == [10, 20, 30, 40, 50]
-
-
-def test_measurements_go_to_their_runs():
-    lanes = np.array([[3, 0], [2, -1]])
-    slots = [{"x": np.array([[1, 2], [3, 4]])}, {"x": np.array([[5, 6], [7, 8]])}]
-    assert spread(5, lanes, slots)["x"].tolist() == [[2, 0, 5, 1, 0], [4, 0, 7, 3, 0]]
+def test_no_bit_of_a_state_changes_on_its_way():
+    random = np.random.default_rng(0)
+    states = {
+        "key": random.integers(0, 2**32, (5, 2), np.uint32),
+        "number": random.integers(-(2**31), 2**31, 5).astype(np.int32),
+        "matrix": random.integers(0, 2**32, (5, 3, 2), np.uint32).view(np.float32),  # NaNs too
+        "which": random.random((5, 3)) < 0.5,
+        "nothing": np.zeros((5, 0), np.float32),
+    }
+    layout = Layout(states)
+    rows = layout.rows(states)
+    assert rows.shape == (5, 8 + 4 + 24 + 3)
+    moved = jax.jit(layout.traced_rows)(jax.jit(layout.traced_states)(rows))
+    assert np.array_equal(moved, rows)
+    some = layout.states(rows[[3, 1]])
+    for name, old in states.items():
+        assert some[name].dtype == old.dtype
+        assert some[name].tobytes() == old[[3, 1]].tobytes()
+    inside = jax.jit(lambda x: jax.tree.map(jnp.asarray, layout.traced_states(x)))(rows)
+    assert np.array_equal(inside["number"], states["number"])
+    assert np.array_equal(inside["which"], states["which"])
+    assert np.array_equal(inside["matrix"].view(jnp.uint32), states["matrix"].view(np.uint32))

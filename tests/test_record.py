@@ -15,7 +15,7 @@ from mjx_reinforce.runs import display, nonfinite
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.evaluation import evaluate
 from mjx_reinforce.runs.progress import Progress
-from mjx_reinforce.runs.record import COUNTED, Record
+from mjx_reinforce.runs.record import Record
 from mjx_reinforce.types import Trajectory
 
 
@@ -240,18 +240,3 @@ def test_an_evaluation_with_a_broken_episode_is_nan(broken, is_nan):
 def test_a_return_that_overflows_is_nan():
     result = evaluated(np.full((2, 2), -3e38, np.float32), np.ones((2, 2), bool), np.zeros(2, bool))
     assert np.isnan(result["eval_return"])
-
-
-def test_used_is_the_mean_share_of_all_budgets():
-    record = Record(Config(num_seeds=4, env_steps=100, max_updates=10), None)
-    record.env_steps, record.updates = np.array([50, 10, 130, 0]), np.array([1, 5, 2, 0])
-    assert record.used() == pytest.approx((0.5 + 0.5 + 1.0 + 0.0) / 4)
-
-
-def test_a_record_is_made_of_few_metrics():
-    one, other = (Record(Config(num_seeds=3, max_updates=100), 2.0) for _ in range(2))
-    metrics = block(np.random.default_rng(0), 4, 3, one.updates)
-    met = one.add_updates(metrics)
-    same(met, other.keep_updates({name: metrics[name] for name in COUNTED}))
-    kept = {name: x for name, x in one.arrays().items() if not name.startswith("last.")}
-    same(kept, other.arrays())

@@ -16,10 +16,10 @@ from mjx_reinforce import envs
 from mjx_reinforce import sweep as sweep_module
 from mjx_reinforce import train as train_module
 from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.packing import pack
-from mjx_reinforce.sweeps import conduct, perform, plan, programs, rungs, search
+from mjx_reinforce.sweeps import chunks, conduct, perform, plan, programs, rungs, search
 from mjx_reinforce.sweeps.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.groups import make_groups
+from mjx_reinforce.sweeps.packing import pack
 from mjx_reinforce.sweeps.reading import read_results
 from mjx_reinforce.sweeps.results import join
 
@@ -166,6 +166,30 @@ def test_packing_changes_nothing(run, monkeypatch, exact):
     assert (same if exact else close)(one, other)
 
 
+def test_blocks_without_a_pause_change_nothing(run, monkeypatch):
+    """Runs that one slot holds make several blocks before the host looks at them."""
+    command = f"{STEPS} --num-seeds 2"
+    monkeypatch.setattr(plan, "_CPU_EPISODES", (24,))
+    made, advance = [], programs.Programs.advance
+
+    def counted(*arguments):
+        blocks = advance(*arguments)
+        made.append(len(blocks))
+        return blocks
+
+    monkeypatch.setattr(programs.Programs, "advance", counted)
+    monkeypatch.setattr(chunks, "_SECONDS", 60.0)
+    assert run(f"{command} --output several") == 0
+    assert made[:4] == [1, 2, 4, 8]
+    several, total = curves(Path("several")), sum(made)
+    monkeypatch.setattr(chunks, "_SECONDS", 0.0)
+    made.clear()
+    assert run(f"{command} --output each") == 0
+    assert set(made) == {1}
+    assert len(made) == total == len(several["env_steps"]) - 1
+    assert same(several, curves(Path("each")))
+
+
 def test_a_crash_among_runs_that_ended_changes_nothing(run, monkeypatch):
     """A checkpoint holds the runs that train and those that lie aside."""
     monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
@@ -173,9 +197,9 @@ def test_a_crash_among_runs_that_ended_changes_nothing(run, monkeypatch):
     assert run(f"{command} --output whole") == 0
     save, ended = conduct.Saver.save, []
 
-    def crash(self, states, record):
-        save(self, states, record)
-        ended.append((states.env_steps >= 300).sum())
+    def crash(self, states, history):
+        save(self, states, history)
+        ended.append((history.now["env_steps"] >= 300).sum())
         if 3 < ended[-1] < 9:
             raise CrashError
 

@@ -160,7 +160,8 @@ def cut(path: Path, length: int) -> None:
 def _lines(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> bytes:
     """Returns rows as the lines of a CSV file."""
     text = io.StringIO(newline="")
-    csv.DictWriter(text, columns, lineterminator="\n").writerows(rows)
+    values = ([row.get(name, "") for name in columns] for row in rows)
+    csv.writer(text, lineterminator="\n").writerows(values)
     return text.getvalue().encode()
 
 

@@ -16,11 +16,6 @@ from mjx_reinforce.runs.progress import BLOCKS, Progress, measure
 from mjx_reinforce.runs.table import Table
 
 Arrays = dict[str, np.ndarray]
-#: The metrics of a block that the record is made of; others are for metrics.csv alone.
-COUNTED = (
-    *("active", "updates_total", "env_steps_total", "simulated_steps"),
-    *("episode_return", "nonfinite_episodes", "skipped_update"),
-)
 
 
 class Record:
@@ -87,41 +82,26 @@ class Record:
         self._tables = {name: Table(columns) for name, columns in groups.items()}
 
     def add_updates(self, metrics: Arrays) -> Arrays:
-        """Takes in a block of updates, and keeps what rows of metrics.csv say of it.
+        """Takes in a block of updates.
+
+        A training return is NaN if one of its episodes left the finite numbers.
 
         Args:
           metrics: [K, S] each, of K updates: those of ``Learner.step`` and of
             ``state.Programs.advance``.
 
         Returns:
-          What ``keep_updates`` does.
-        """
-        met = self.keep_updates(metrics)
-        finite = metrics["nonfinite_episodes"] == 0
-        returns = np.where(finite, metrics["episode_return"], np.nan)
-        self._remember(metrics | {"episode_return": returns})
-        return met
-
-    def keep_updates(self, metrics: Arrays) -> Arrays:
-        """Takes in a block of updates.
-
-        A training return is NaN if one of its episodes left the finite numbers.
-
-        Args:
-          metrics: [K, S] each, of K updates, ``COUNTED`` and maybe others.
-
-        Returns:
           The updates in it that met numbers which are not finite, see
           ``nonfinite.nonfinite_updates``.
         """
         active, episodes = metrics["active"], self._config.episodes_per_update
-        counted = active & (metrics["nonfinite_episodes"] == 0)
+        finite = metrics["nonfinite_episodes"] == 0
         env_steps = metrics["env_steps_total"].astype(np.int64)
         updates = metrics["updates_total"].astype(np.int64)
         made = active.any(axis=1)
-        returns = np.where(counted, metrics["episode_return"], np.nan)
+        returns = np.where(finite, metrics["episode_return"], np.nan)
         training = {
-            "episode_return": returns,
+            "episode_return": np.where(active, returns, np.nan),
             "env_steps": env_steps,
             "episodes": updates * episodes,
         }
@@ -131,6 +111,7 @@ class Record:
         self._broken_in_a_row = nonfinite.broken_in_a_row(self._broken_in_a_row, metrics, episodes)
         met = nonfinite.nonfinite_updates(metrics)
         self._tables["nonfinite"].append(met)
+        self._remember(metrics | {"episode_return": returns})
         return met
 
     def _remember(self, metrics: Arrays) -> None:
@@ -151,20 +132,15 @@ class Record:
         Returns:
           The rows of metrics.csv, see ``rows``.
         """
-        self.keep_evaluation(result, seconds)
-        episodes = self.updates * self._config.episodes_per_update
-        return rows.of_evaluation(
-            result, self._last, self.updates, episodes, self.env_steps, seconds
-        )
-
-    def keep_evaluation(self, result: Arrays, seconds: float) -> None:
-        """Takes in an evaluation as ``add_evaluation`` does, without its rows."""
         episodes = self.updates * self._config.episodes_per_update
         counts = {"env_steps": self.env_steps, "episodes": episodes, "updates": self.updates}
         row = result | counts | {"seconds": np.asarray(seconds, np.float64)}
         self._tables["evaluations"].append({name: x[None] for name, x in row.items()})
         self._count(result)
         self.seconds = seconds
+        return rows.of_evaluation(
+            result, self._last, self.updates, episodes, self.env_steps, seconds
+        )
 
     def add_test(self, result: Arrays) -> None:
         """Counts what a test of final policies simulated, of ``evaluation.evaluate``."""
@@ -178,10 +154,6 @@ class Record:
         """Returns whether the present policies have been evaluated."""
         last = self._tables["evaluations"].latest(1)
         return bool(last) and np.array_equal(last["updates"][0], self.updates)
-
-    def last_evaluation(self) -> Arrays:
-        """Returns what the last evaluation measured, [S] each."""
-        return {name: x[-1] for name, x in self._tables["evaluations"].latest(1).items()}
 
     def finished(self) -> bool:
         """Returns whether the budget is used, or all seeds are solved and that was to end it."""
@@ -204,19 +176,10 @@ class Record:
             used = np.maximum(used, updates / self._config.max_updates)
         return used
 
-    def used(self) -> float:
-        """Returns the part of the budgets of all seeds that is used."""
-        used = self._used(self.env_steps, self.updates)
-        return float(np.minimum(used, 1.0).mean())
-
-    def progress(self, blocks: int = BLOCKS) -> Progress:
-        """Returns how far the run is, as of its last evaluation.
-
-        Args:
-          blocks: the latest ones, from which the time left is estimated.
-        """
+    def progress(self) -> Progress:
+        """Returns how far the run is, as of its last evaluation."""
         names = ("eval_return", "env_steps", "updates", "seconds")
-        past = self._tables["evaluations"].latest(blocks + 1, *names)
+        past = self._tables["evaluations"].latest(BLOCKS + 1, *names)
         fractions = self._used(past["env_steps"], past["updates"]).min(axis=-1)
         return measure(past, fractions)
 
@@ -224,11 +187,6 @@ class Record:
         """Returns ``eval_return``, and ``env_steps`` and ``episodes`` until then, [E, S] each."""
         past = self._tables["evaluations"].columns()
         return {name: past[name] for name in ("eval_return", "env_steps", "episodes")}
-
-    def nonfinite_updates(self) -> np.ndarray:
-        """Returns how many updates [S] of each seed met numbers that are not finite."""
-        seeds = self._tables["nonfinite"].columns()["seed"]
-        return np.bincount(seeds, minlength=self._config.num_seeds)
 
     def training(self) -> Arrays:
         """Returns ``episode_return`` and the ``env_steps`` and ``episodes`` after it, [U, S].

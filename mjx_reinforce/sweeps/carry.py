@@ -3,9 +3,9 @@
 from collections.abc import Callable, Sequence
 
 import jax
+import numpy as np
 
 from mjx_reinforce.runs import checkpoint
-from mjx_reinforce.runs.packing import join
 from mjx_reinforce.runs.state import RunState
 from mjx_reinforce.sweeps.chunks import Runs
 from mjx_reinforce.sweeps.results import SweepFiles
@@ -35,7 +35,7 @@ def last_states(
         if found is None:
             raise ValueError(f"the last states in {folder} are damaged; start another sweep")
         states.append(jax.device_get(found.state))
-    return join(states, sum(len(runs.seed) for runs in chunks))
+    return jax.tree.map(lambda *xs: np.concatenate(xs), *states)
 
 
 def choose(states: RunState, of: Sequence[Runs], runs: Runs) -> RunState:

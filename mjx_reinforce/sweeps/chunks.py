@@ -5,19 +5,22 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from mjx_reinforce.runs import checkpoint
 from mjx_reinforce.runs.checkpoint import Checkpoint
 from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.record import Record
 from mjx_reinforce.runs.state import RunState
 from mjx_reinforce.sweeps.groups import Group
+from mjx_reinforce.sweeps.history import History
+from mjx_reinforce.sweeps.layout import Layout
 from mjx_reinforce.sweeps.programs import Programs
 
 #: Between checkpoints, where the user has not said how many updates.
 _CHECKPOINT_SECONDS = 60.0
+#: The host need not look at a sweep more often than this. Between short blocks the devices would
+#: wait for it.
+_SECONDS = 0.25
 
 
 class Runs(NamedTuple):
@@ -56,8 +59,8 @@ def split(group: Group, name: str, num_chunks: int) -> list[Runs]:
     ]
 
 
-def begin(programs: Programs, group: Group, runs: Runs) -> RunState:
-    """Returns the states of the runs of a chunk before their first update."""
+def begin(programs: Programs, group: Group, runs: Runs) -> np.ndarray:
+    """Returns the states [R, B] of the runs of a chunk before their first update."""
     settings = {name: values[runs.place] for name, values in group.settings.items()}
     return programs.begin(programs.keys[runs.seed], settings)
 
@@ -65,43 +68,44 @@ def begin(programs: Programs, group: Group, runs: Runs) -> RunState:
 class Saver:
     """Keeps a chunk in progress in checkpoints, and finds it again."""
 
-    def __init__(self, folder: Path, config: Config):
-        """Takes the folder of the chunk's checkpoints, and the settings of its group."""
-        self._folder, self._config = folder, config
+    def __init__(self, folder: Path, config: Config, layout: Layout):
+        """Takes the folder of the chunk's checkpoints, and the settings and states of its group."""
+        self._folder, self._config, self._layout = folder, config, layout
         self._saved_at, self._saved_updates = time.perf_counter(), 0
 
-    def save_if_due(self, states: RunState, record: Record) -> None:
+    def save_if_due(self, states: np.ndarray, history: History) -> None:
         """Saves once there were enough updates, or about a minute, since the last time."""
-        every, updates = self._config.checkpoint_every, int(record.updates.max())
+        every, updates = self._config.checkpoint_every, int(history.now["updates"].max())
         if every is None:
             due = time.perf_counter() - self._saved_at >= _CHECKPOINT_SECONDS
         else:
             due = updates - self._saved_updates >= every
         if due:
-            self.save(states, record)
+            self.save(states, history)
 
-    def save(self, states: RunState, record: Record) -> None:
+    def save(self, states: np.ndarray, history: History) -> None:
         """Writes a checkpoint, or raises OSError."""
         content = Checkpoint(
-            state=states,
-            record=record.arrays(),
-            seconds=record.seconds,
+            state=self._layout.states(states),
+            record=history.arrays(),
+            seconds=history.seconds,
             metrics_bytes=0,
             env_steps=self._config.env_steps,
             max_updates=self._config.max_updates,
         )
         checkpoint.save(self._folder, content, even=False)
-        self._saved_at, self._saved_updates = time.perf_counter(), int(record.updates.max())
+        self._saved_at = time.perf_counter()
+        self._saved_updates = int(history.now["updates"].max())
 
     def find(
-        self, like: Callable[[], RunState], record: Record, say: Callable[[str], None]
-    ) -> RunState | None:
-        """Returns the newest state that was saved, with its record restored, or None."""
+        self, like: Callable[[], RunState], history: History, say: Callable[[str], None]
+    ) -> np.ndarray | None:
+        """Returns the newest states that were saved, with their history restored, or None."""
         if not self._folder.exists():
             return None
         for found in checkpoint.load(self._folder, like(), say):
-            record.restore(found.record)
-            return jax.device_get(found.state)
+            history.restore(found.record)
+            return self._layout.rows(found.state)
         return None
 
     def remove(self) -> None:
@@ -111,31 +115,34 @@ class Saver:
 
 def train(
     programs: Programs,
-    states: RunState,
-    record: Record,
-    after: Callable[[RunState, Record], bool],
-) -> RunState | None:
+    states: np.ndarray,
+    history: History,
+    after: Callable[[], bool],
+    most: int,
+) -> bool:
     """Trains a chunk to its budget.
 
     Args:
       programs: of its group.
-      states: of its runs, before the first update or from a checkpoint.
-      record: of its runs.
-      after: is called after every evaluation; where it returns False the chunk is left.
+      states: [R, B] of its runs, before the first update or from a checkpoint; changed.
+      history: of its runs; changed.
+      after: is called after every evaluation, or where these take milliseconds after several;
+        where it returns False the chunk is left.
+      most: evaluations between two calls at most.
 
     Returns:
-      The last states, or None where the chunk was left.
+      Whether it ended, or was left.
     """
-    began = time.perf_counter() - record.seconds
-    if not record.evaluated():
-        record.keep_evaluation(programs.evaluate(states), time.perf_counter() - began)
-    while not record.finished():
-        last = record.last_evaluation()
-        states, metrics, evaluation, moved = programs.advance(states, last["eval_steps"])
-        record.keep_updates(metrics)
-        # A run that stood still was not played again.
-        evaluation = {name: np.where(moved, x, last[name]) for name, x in evaluation.items()}
-        record.keep_evaluation(evaluation, time.perf_counter() - began)
-        if not after(states, record):
-            return None
-    return states
+    began = time.perf_counter() - history.seconds
+    if not history.begun():
+        history.keep([programs.evaluate(states)], time.perf_counter() - began)
+    blocks = 1
+    while (training := history.training()).any():
+        measured = programs.advance(states, training, history.now["eval_steps"], blocks)
+        last = history.seconds
+        history.keep(measured, time.perf_counter() - began)
+        if not after():
+            return False
+        enough = len(measured) * _SECONDS / (history.seconds - last)
+        blocks = max(1, min(int(enough), 2 * len(measured), most))
+    return True

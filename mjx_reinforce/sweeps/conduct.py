@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.runs.config import MAX_COUNT
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.progress import Progress
-from mjx_reinforce.runs.record import Record
-from mjx_reinforce.runs.state import RunState
 from mjx_reinforce.sweeps import carry, chunks, rungs
 from mjx_reinforce.sweeps.ahead import one_ahead
 from mjx_reinforce.sweeps.chunks import Runs, Saver
 from mjx_reinforce.sweeps.design import Design
 from mjx_reinforce.sweeps.groups import Group, learner_builder
+from mjx_reinforce.sweeps.history import History
 from mjx_reinforce.sweeps.plan import Part, divide
 from mjx_reinforce.sweeps.prepare import Prepared
 from mjx_reinforce.sweeps.processes import Processes
@@ -173,35 +173,35 @@ class Conductor:
     def _train(self, rung: Rung, stage: Stage, programs: Programs, runs: Runs) -> bool:
         """Trains a chunk, from its last checkpoint if there is one; returns whether it ended."""
         config = dataclasses.replace(stage.group.config, num_seeds=len(runs.seed))
-        record = Record(config, getattr(self._prepared.env, "reward_threshold", None))
-        saver = Saver(self._files.checkpoints(runs.name), stage.group.config)
+        history, layout = History(config), programs.layout
+        saver = Saver(self._files.checkpoints(runs.name), config, layout)
         like = functools.partial(programs.shape_of, len(runs.seed))
-        states = saver.find(like, record, self._display.say)
+        states = saver.find(like, history, self._display.say)
         if states is None:
-            states = self._begin(rung, stage, programs, runs, record)
+            states = self._begin(rung, stage, programs, runs, history)
 
-        def after(states: RunState, record: Record) -> bool:
-            self._display.show_progress(self._progress(record, len(runs.seed)))
+        def after() -> bool:
+            self._display.show_progress(self._progress(history))
             if self._interrupt is not None and self._interrupt.number is not None:
-                saver.save(states, record)
+                saver.save(states, history)
                 return False
-            saver.save_if_due(states, record)
+            saver.save_if_due(states, history)
             return True
 
-        ended = chunks.train(programs, states, record, after)
-        if ended is None:
+        most = (config.checkpoint_every or MAX_COUNT) // config.eval_every
+        if not chunks.train(programs, states, history, after, most):
             return False
         keep = self._design.search == "halving"
         if keep:  # for the next rung
-            saver.save(ended, record)
-        self._files.add(runs, record)
+            saver.save(states, history)
+        self._files.add(runs, history)
         if not keep:
             saver.remove()
         return True
 
     def _begin(
-        self, rung: Rung, stage: Stage, programs: Programs, runs: Runs, record: Record
-    ) -> RunState:
+        self, rung: Rung, stage: Stage, programs: Programs, runs: Runs, history: History
+    ) -> np.ndarray:
         """Returns the first states of a chunk: new ones, or those at the end of a rung before."""
         if rung.before is None:
             return chunks.begin(programs, stage.group, runs)
@@ -210,18 +210,18 @@ class Conductor:
         shape_of = functools.partial(shape_of_states, build, tuple(before.group.settings))
         states = carry.last_states(self._files, before.chunks, shape_of, self._display.say)
         states = carry.choose(states, before.chunks, runs)
-        record.updates = states.train_states.num_updates.astype(np.int64)
-        record.env_steps = states.env_steps.astype(np.int64)
-        return states
+        history.now["updates"] = np.asarray(states.train_states.num_updates, np.int64)
+        history.now["env_steps"] = np.asarray(states.env_steps, np.int64)
+        return programs.layout.rows(states)
 
-    def _progress(self, record: Record, num_runs: int) -> Progress:
+    def _progress(self, history: History) -> Progress:
         """Returns how far the chunk is, but for the whole sweep where that differs.
 
         That counts the budgets of all runs: those that lie aside cost nothing.
         """
-        now = record.progress(1)
-        rung = (self._done + num_runs * record.used()) / self._total
+        now = history.progress()
+        rung = (self._done + now.num_seeds * now.fraction) / self._total
         done = (self._rungs_done + rung) / self._num_rungs
-        passed = self.clock.running + record.seconds
+        passed = self.clock.running + history.seconds
         left = passed * (1 - done) / done if done > 0 else float("nan")
         return now._replace(fraction=done, seconds_left=left)

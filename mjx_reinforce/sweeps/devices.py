@@ -11,8 +11,8 @@ import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 _AXIS = "runs"
-#: The first axis is that of the runs; the second one is; none is.
-RUNS, SECOND, NONE = PartitionSpec(_AXIS), PartitionSpec(None, _AXIS), PartitionSpec()
+#: The first axis is that of the runs; none is.
+RUNS, NONE = PartitionSpec(_AXIS), PartitionSpec()
 
 
 class Devices:

@@ -1,5 +1,6 @@
 """The compiled programs of a group: those of a run, for slots of runs on all devices."""
 
+import dataclasses
 import functools
 import threading
 from collections.abc import Callable, Collection, Sequence
@@ -11,11 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.runs.blocks import block_length
-from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.config import MAX_COUNT, Config
 from mjx_reinforce.runs.keys import plain, with_keys
 from mjx_reinforce.runs.memory import num_cores
-from mjx_reinforce.runs.packing import join, pack, put_back, spread, take, training
-from mjx_reinforce.runs.record import COUNTED
 from mjx_reinforce.runs.state import (
     Arrays,
     Budget,
@@ -29,87 +28,88 @@ from mjx_reinforce.runs.state import (
     seed_keys,
 )
 from mjx_reinforce.sweeps.ahead import started
-from mjx_reinforce.sweeps.devices import NONE, RUNS, SECOND, Devices
+from mjx_reinforce.sweeps.devices import NONE, RUNS, Devices
+from mjx_reinforce.sweeps.history import Measured
+from mjx_reinforce.sweeps.layout import Layout
+from mjx_reinforce.sweeps.packing import pack
 
 
 class Movers(NamedTuple):
-    """What moves the runs of one slot on. States have the data of keys in their place.
+    """What moves the runs of one slot on. States are rows of bytes, see ``layout.Layout``.
 
-    block: (states [W], budget) -> (states [W], ``record.COUNTED`` metrics [K, W], whether each run
-      made an update [W]), as ``state.block_of_updates``
-    look: (states [W], which [W]) -> evaluation [W] of the present policies of these runs
+    block: (states [W, B], which lanes have a run [W], budget) -> (states [W, B], which runs made an
+      update [W], and what ``history.Measured`` has of updates [W]), as ``state.block_of_updates``
+    look: (states [W, B], which [W]) -> what ``history.Measured`` has of evaluations [W]
     """
 
-    block: Callable[[RunState, Budget], tuple[RunState, dict[str, jax.Array], jax.Array]]
-    look: Callable[[RunState, jax.Array], dict[str, jax.Array]]
+    block: Callable[..., tuple[jax.Array, jax.Array, dict[str, jax.Array]]]
+    look: Callable[[jax.Array, jax.Array], dict[str, jax.Array]]
 
 
 class Programs(NamedTuple):
-    """The compiled programs of a group. States of runs [R] are on the host between them.
+    """The compiled programs of a group. States of runs [R, B] are on the host between them.
 
     begin: (data of keys [R, 2], settings [R] each) -> the first states
-    movers: by the width of a slot; the narrower ones may still be compiling
+    movers: by the width of a slot, the widest first; the narrower ones may still be compiling
     keys: [S, 2], the data of those that the seeds begin with
-    budget: of each run
-    limits: the budget on all devices
+    limits: the budget of each run, on all devices
     devices: among which a slot is divided
     shape_of: the shapes of the states of so many runs
+    layout: of their bytes
     """
 
-    begin: Callable[..., RunState]
+    begin: Callable[..., np.ndarray]
     movers: dict[int, "Future[Movers]"]
     keys: np.ndarray
-    budget: Budget
     limits: Budget
     devices: Devices
     shape_of: Callable[[int], RunState]
+    layout: Layout
 
     def of(self, config: Config) -> "Programs":
         """Returns the same programs for settings with another budget or another seed."""
         return self._replace(**_inputs(config, self.devices))
 
     def advance(
-        self, states: RunState, lengths: np.ndarray
-    ) -> tuple[RunState, Arrays, Arrays, np.ndarray]:
-        """Makes a block of updates of the runs that still train, and evaluates them.
+        self, states: np.ndarray, training: np.ndarray, lengths: np.ndarray, blocks: int
+    ) -> list[Measured]:
+        """Makes blocks of updates of the runs that still train, and evaluates them after each.
 
         Args:
-          states: [R] of all runs, at least one of which still trains.
+          states: [R, B] of all runs; changed.
+          training: [R] which of them still train; at least one does.
           lengths: [R] about how long their episodes are, see ``packing.pack``.
+          blocks: how many, where one of the narrowest slots holds these runs. Else they are packed
+            anew after one.
 
         Returns:
-          The states, the ``record.COUNTED`` metrics [K, R] as ``state.Programs.advance`` returns
-          them, the evaluation [R], and which runs were evaluated [R]: those that made an update.
+          What each block measured, of the runs that made an update; none without any.
         """
-        chosen = training(states, self.budget)
-        lanes, movers = self._pack(chosen, lengths)
+        lanes, movers = self._pack(training, lengths)
+        count = blocks if lanes.shape == (1, min(self.movers)) else 1
 
         def move(runs: np.ndarray) -> Any:
-            slot, metrics, moved = movers.block(self._put(take(states, runs)), self.limits)
-            looked = movers.look(slot, moved)  # begun before the host waits for the block
-            return jax.device_get((slot, metrics, looked))
+            measured = []
+            slot, which = self._put((states[runs], runs >= 0))
+            for _ in range(count):  # the host does not wait for any
+                slot, moved, counts = movers.block(slot, which, self.limits)
+                measured.append((moved, counts | movers.look(slot, moved)))
+            return jax.device_get((slot, measured))
 
-        slots, rows, looked = zip(*_side_by_side(move, lanes), strict=True)
-        metrics = spread(len(chosen), lanes, rows)
-        states = put_back(states, lanes, slots)
-        counts = {"updates_total": states.train_states.num_updates}
-        counts["env_steps_total"] = states.env_steps
-        for name, count in counts.items():  # of a run that stands still too
-            metrics[name] = np.where(metrics["active"], metrics[name], count)
-        made = int(metrics["active"].any(axis=1).sum())
-        metrics = {name: x[:made] for name, x in metrics.items()}
-        return states, metrics, spread(len(chosen), lanes, looked), chosen
+        rows, measured = zip(*_side_by_side(move, lanes), strict=True)
+        states[lanes[lanes >= 0]] = np.stack(rows)[lanes >= 0]
+        measured = [_joined(lanes, block) for block in zip(*measured, strict=True)]
+        return [block for block in measured if len(block.runs)]
 
-    def evaluate(self, states: RunState) -> Arrays:
-        """Evaluates the present policies of all runs [R]."""
-        every = np.ones(len(states.env_steps), bool)
-        lanes, movers = self._pack(every, np.zeros(len(every)))
+    def evaluate(self, states: np.ndarray) -> Measured:
+        """Evaluates the present policies of all runs [R, B]."""
+        lanes, movers = self._pack(np.ones(len(states), bool), np.zeros(len(states)))
 
         def look(runs: np.ndarray) -> Any:
-            slot = self._put(take(states, runs))
-            return jax.device_get(movers.look(slot, self._put(runs >= 0)))
+            slot, which = self._put((states[runs], runs >= 0))
+            return runs >= 0, jax.device_get(movers.look(slot, which))
 
-        return spread(len(every), lanes, _side_by_side(look, lanes))
+        return _joined(lanes, _side_by_side(look, lanes))
 
     def _pack(self, chosen: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, Movers]:
         """Returns the runs of each slot, and what moves them."""
@@ -126,8 +126,21 @@ def _side_by_side(move: Callable[[np.ndarray], Any], lanes: np.ndarray) -> list[
     A slot alone leaves a part of the cores waiting for each other, and its results are fetched
     while the next one is moved.
     """
-    with ThreadPoolExecutor(num_cores()) as pool:
-        return list(pool.map(move, lanes))
+    return [move(lanes[0])] if len(lanes) == 1 else list(_threads().map(move, lanes))
+
+
+@functools.cache
+def _threads() -> ThreadPoolExecutor:
+    """Returns one thread a core; to start them takes milliseconds."""
+    return ThreadPoolExecutor(num_cores())
+
+
+def _joined(lanes: np.ndarray, slots: Sequence[Any]) -> Measured:
+    """Returns what was measured in slots, each of which has (which lanes count [W], values [W])."""
+    counts, values = zip(*slots, strict=True)
+    kept = np.concatenate(counts)
+    joined = {name: np.concatenate([slot[name] for slot in values])[kept] for name in values[0]}
+    return Measured(lanes.reshape(-1)[kept], joined)
 
 
 def compile_programs(
@@ -152,10 +165,11 @@ def compile_programs(
       widths: how many runs a slot may have, the most first; multiples of the number of devices.
       devices: where.
     """
+    layout = Layout(shape_of_states(build_learner, traced, 1))
     compile_for = functools.partial(_movers, env, build_learner, horizon, config, traced, devices)
-    compile_for = functools.partial(compile_for, threading.Lock())
+    compile_for = functools.partial(compile_for, layout, threading.Lock())
     movers = {width: started(functools.partial(compile_for, width)) for width in widths}
-    begin = started(functools.partial(_begin, build_learner, traced, widths[0], devices))
+    begin = started(functools.partial(_begin, build_learner, traced, widths[0], devices, layout))
     inputs = started(functools.partial(_inputs, config, devices))
     movers[widths[0]].result()
     return Programs(
@@ -163,15 +177,15 @@ def compile_programs(
         movers=movers,
         devices=devices,
         shape_of=functools.partial(shape_of_states, build_learner, traced),
+        layout=layout,
         **inputs.result(),
     )
 
 
 def _inputs(config: Config, devices: Devices) -> dict[str, Any]:
     """Returns what is no part of a program, as ``Programs`` has it."""
-    keys, budget = jax.random.key_data(seed_keys(config)), budget_of(config)
-    keys, limits = jax.device_get(keys), devices.put(budget, NONE)
-    return {"keys": keys, "budget": jax.device_get(budget), "limits": limits}
+    keys = jax.device_get(jax.random.key_data(seed_keys(config)))
+    return {"keys": keys, "limits": devices.put(budget_of(config), NONE)}
 
 
 def shape_of_states(
@@ -191,17 +205,22 @@ def _arguments(traced: Collection[str], width: int) -> tuple[Any, dict[str, jax.
 
 
 def _begin(
-    build_learner: BuildLearner, traced: Collection[str], width: int, devices: Devices
-) -> Callable[..., RunState]:
+    build_learner: BuildLearner,
+    traced: Collection[str],
+    width: int,
+    devices: Devices,
+    layout: Layout,
+) -> Callable[..., np.ndarray]:
     """Compiles ``Programs.begin``, which begins ``width`` runs at once."""
 
-    def first(keys: jax.Array, settings: Any) -> RunState:
-        return plain(beginning(build_learner)(jax.random.wrap_key_data(keys), settings))
+    def first(keys: jax.Array, settings: Any) -> jax.Array:
+        states = beginning(build_learner)(jax.random.wrap_key_data(keys), settings)
+        return layout.traced_rows(plain(states))
 
     shapes = devices.shapes(jax.eval_shape(plain, _arguments(traced, width)), RUNS)
     compiled = devices.jit(first, (RUNS, RUNS), RUNS).lower(*shapes).compile()
 
-    def begin(keys: np.ndarray, settings: Arrays) -> RunState:
+    def begin(keys: np.ndarray, settings: Arrays) -> np.ndarray:
         count = len(keys)
         slots = []
         for start in range(0, count, width):
@@ -210,7 +229,7 @@ def _begin(
                 name: np.asarray(x[index], shapes[1][name].dtype) for name, x in settings.items()
             }
             slots.append(compiled(*devices.put((keys[index], values), RUNS)))
-        return join(jax.device_get(slots), count)
+        return np.concatenate(jax.device_get(slots))[:count]
 
     return begin
 
@@ -222,6 +241,7 @@ def _movers(
     config: Config,
     traced: Collection[str],
     devices: Devices,
+    layout: Layout,
     tracing: threading.Lock,
     width: int,
 ) -> Movers:
@@ -233,20 +253,40 @@ def _movers(
         like = jax.eval_shape(beginning(build_learner), *_arguments(traced, width))
         updates = block_of_updates(build_learner, block_length(config))
 
-        def block(states: RunState, budget: Budget) -> Any:
-            before = states.train_states.num_updates
-            after, (_, metrics) = updates(with_keys(states, like), budget)
-            counted = {name: metrics[name] for name in COUNTED}
-            return plain(after), counted, after.train_states.num_updates > before
+        def block(rows: jax.Array, which: jax.Array, budget: Budget) -> Any:
+            before = with_keys(layout.traced_states(rows), like)
+            # A lane without a run has no budget.
+            env_steps = jnp.where(which, before.env_steps, MAX_COUNT)
+            before = dataclasses.replace(before, env_steps=env_steps)
+            after, (_, metrics) = updates(before, budget)
+            moved = after.train_states.num_updates > before.train_states.num_updates
+            return layout.traced_rows(plain(after)), moved, _counts(after, metrics)
 
         # Policies and engines are those of any of its learners.
-        look = evaluation(env, build_learner({}), horizon, config, sampled=False)
+        evaluate = evaluation(env, build_learner({}), horizon, config, sampled=False)
+
+        def look(rows: jax.Array, key: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
+            actor = with_keys(layout.traced_states(rows), like).train_states.actor
+            measured = evaluate(actor, key, which)
+            return {name: measured[name] for name in ("eval_return", "eval_steps")}
+
         key, budget = devices.put((evaluation_key(config), budget_of(config)), NONE)
-        shapes = devices.shapes(jax.eval_shape(plain, like), RUNS)
-        which = devices.shapes(jax.ShapeDtypeStruct((width,), bool), RUNS)
-        advance = devices.jit(block, (RUNS, NONE), (RUNS, SECOND, RUNS))
+        rows = jax.eval_shape(layout.traced_rows, jax.eval_shape(plain, like))
+        which = jax.ShapeDtypeStruct((width,), bool)
+        rows, which = devices.shapes((rows, which), RUNS)
+        advance = devices.jit(block, (RUNS, RUNS, NONE), (RUNS, RUNS, RUNS))
         look = devices.jit(look, (RUNS, NONE, RUNS), RUNS)
-        looking = pool.submit(look.lower(shapes.train_states.actor, key, which).compile)
-        advancing = pool.submit(advance.lower(shapes, budget).compile)
+        looking = pool.submit(look.lower(rows, key, which).compile)
+        advancing = pool.submit(advance.lower(rows, which, budget).compile)
     looked, advanced = looking.result(), advancing.result()
-    return Movers(advanced, lambda states, which: looked(states.train_states.actor, key, which))
+    return Movers(advanced, lambda rows, which: looked(rows, key, which))
+
+
+def _counts(after: RunState, metrics: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Returns what a block of updates counted, as ``history.Measured`` has it."""
+    broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
+    return {
+        "updates": after.train_states.num_updates,
+        "env_steps": after.env_steps,
+        "nonfinite": jnp.sum(broken & metrics["active"], axis=0, dtype=jnp.int32),
+    }

@@ -13,8 +13,8 @@ import numpy as np
 from mjx_reinforce.export.files import read_arrays, write_arrays, write_bytes, write_json
 from mjx_reinforce.reports.statistics import steps_to_solve
 from mjx_reinforce.runs import checkpoint, files
-from mjx_reinforce.runs.record import Record
 from mjx_reinforce.sweeps.chunks import Runs
+from mjx_reinforce.sweeps.history import History
 
 Arrays = dict[str, np.ndarray]
 
@@ -49,7 +49,8 @@ class SweepFiles:
         self._first = first
         self._going_on = going_on
         self.directory, self.parts = directory, directory / "parts"
-        self._configurations, self._threshold = configurations, threshold
+        self._configurations = [_spelled(values) for values in configurations]
+        self._threshold = threshold
         self._columns = ("configuration", *configurations[0], *_MEASURED)
 
     def open(self) -> None:
@@ -88,15 +89,15 @@ class SweepFiles:
         """Returns the folder of a chunk's checkpoints."""
         return self.parts / chunk
 
-    def add(self, runs: Runs, record: Record) -> None:
+    def add(self, runs: Runs, history: History) -> None:
         """Writes the part of a chunk, and appends its rows to results.csv."""
-        history = record.history()
+        curves = history.curves()
         part = {
             "configuration": runs.configuration.astype(np.int32),
             "seed": runs.seed.astype(np.int32),
-            "eval_return": history["eval_return"].astype(np.float32),
-            "env_steps": history["env_steps"].astype(np.int32),
-            "nonfinite": record.nonfinite_updates().astype(np.int32),
+            "eval_return": curves["eval_return"].astype(np.float32),
+            "env_steps": curves["env_steps"].astype(np.int32),
+            "nonfinite": history.now["nonfinite"].astype(np.int32),
         }
         write_arrays(self._path(runs.name), part)
         if self._first and runs.name.startswith("0-"):  # other rungs continue rows that are there
@@ -146,7 +147,7 @@ class SweepFiles:
         }
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         return [
-            {"configuration": number, **_spelled(self._configurations[number]), **row}
+            {"configuration": number, **self._configurations[number], **row}
             for number, row in zip(part["configuration"].tolist(), rows, strict=True)
         ]
 

@@ -1,0 +1,115 @@
+"""What the runs of a chunk have measured so far: evaluations, and what was used until then.
+
+Nothing here prints, writes a file, or reads a clock.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.progress import Progress, measure
+from mjx_reinforce.runs.table import Table
+
+Arrays = dict[str, np.ndarray]
+
+#: What is kept of every evaluation.
+_CURVES = ("eval_return", "env_steps")
+
+
+class Measured(NamedTuple):
+    """One evaluation of some runs, and the block of updates before it.
+
+    runs: [n] their numbers
+    values: [n] each: ``eval_return``, and ``eval_steps``, those of all its episodes; of runs that
+      made updates also ``updates`` and ``env_steps`` since the start, and ``nonfinite``, how many
+      updates of the block met numbers that are not finite
+    """
+
+    runs: np.ndarray
+    values: Arrays
+
+
+class History:
+    """What each of R runs has measured.
+
+    now: [R] each, the latest of what ``Measured`` has; ``nonfinite`` since the start
+    seconds: wall time from the beginning to the last evaluation
+    """
+
+    def __init__(self, config: Config):
+        """Begins before the first update; R is ``config.num_seeds``."""
+        self._config = config
+        counts = ("updates", "env_steps", "nonfinite", "eval_steps")
+        self.now: Arrays = {name: np.zeros(config.num_seeds, np.int64) for name in counts}
+        self.now["eval_return"] = np.zeros(config.num_seeds, np.float32)
+        self.seconds = 0.0
+        self._curves = Table({})
+        self._before = self.now["env_steps"], self.seconds
+
+    def keep(self, blocks: Sequence[Measured], seconds: float) -> None:
+        """Takes in blocks of updates and their evaluations.
+
+        Args:
+          blocks: one after the other; runs that are not in them stay as they are.
+          seconds: wall time since the beginning.
+        """
+        now = self.now
+        self._before, self.seconds = (now["env_steps"].copy(), self.seconds), seconds
+        for runs, values in blocks:
+            for name, measured in values.items():
+                now[name][runs] = measured + (now[name][runs] if name == "nonfinite" else 0)
+            self._curves.append({name: now[name][None].copy() for name in _CURVES})
+
+    def arrays(self) -> Arrays:
+        """Returns all that was measured, by name, for ``restore``."""
+        curves = {f"curves.{name}": x for name, x in self._curves.columns().items()}
+        return {"seconds": np.asarray(self.seconds, np.float64), **self.now, **curves}
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Goes back to what a history of the same runs had measured.
+
+        Args:
+          arrays: from its ``arrays``.
+        """
+        self.now = {name: arrays[name] for name in self.now}
+        self.seconds = float(arrays["seconds"])
+        self._before = self.now["env_steps"], self.seconds
+        self._curves = Table({name: arrays[f"curves.{name}"] for name in _CURVES})
+
+    def begun(self) -> bool:
+        """Returns whether there is an evaluation."""
+        return bool(self._curves.latest(1))
+
+    def curves(self) -> Arrays:
+        """Returns ``eval_return``, and ``env_steps`` until then, [E, R] each."""
+        return self._curves.columns()
+
+    def training(self) -> np.ndarray:
+        """Returns which runs [R] have not used their budget."""
+        return self._used() < 1.0
+
+    def used(self) -> float:
+        """Returns the part of the budgets of all runs that is used."""
+        return float(np.minimum(self._used(), 1.0).mean())
+
+    def _used(self) -> np.ndarray:
+        """Returns the fraction of its budget that each run has used."""
+        used = np.zeros(self._config.num_seeds)
+        if self._config.env_steps is not None:
+            used = self.now["env_steps"] / self._config.env_steps
+        if self._config.max_updates is not None:
+            used = np.maximum(used, self.now["updates"] / self._config.max_updates)
+        return used
+
+    def progress(self) -> Progress:
+        """Returns how far the runs are; its fraction is that of all budgets, as ``used``."""
+        steps, seconds = self._before
+        past = {
+            "eval_return": self.now["eval_return"][None],
+            "env_steps": np.stack([steps, self.now["env_steps"]]),
+            "updates": self.now["updates"][None],
+            "seconds": np.array([seconds, self.seconds]),
+        }
+        return measure(past, np.array([self.used()] * 2))

@@ -1,0 +1,74 @@
+"""States of runs as rows of bytes: what goes between the host and its devices, as one array.
+
+A state has dozens of leaves, and each costs as much to choose, to send and to fetch as all of them
+in one array.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+
+class Layout:
+    """Writes the states of runs as rows [R, B] of bytes, and reads them; no bit changes."""
+
+    def __init__(self, like: Any):
+        """Takes the states of any number of runs, or their shapes, with the data of keys."""
+        leaves, self._structure = jax.tree.flatten(like)
+        self._shapes = [leaf.shape[1:] for leaf in leaves]
+        self._types = [np.dtype(leaf.dtype) for leaf in leaves]
+        sizes = [
+            int(np.prod(shape)) * kind.itemsize
+            for shape, kind in zip(self._shapes, self._types, strict=True)
+        ]
+        self._ends = np.cumsum(sizes)[:-1].tolist()
+
+    def rows(self, states: Any) -> np.ndarray:
+        """Returns the rows of states on the host."""
+        leaves = [np.ascontiguousarray(leaf) for leaf in jax.tree.leaves(states)]
+        return np.concatenate([_flat(leaf).view(np.uint8) for leaf in leaves], axis=1)
+
+    def states(self, rows: np.ndarray) -> Any:
+        """Returns the states of rows on the host."""
+        parts = map(np.ascontiguousarray, np.split(rows, self._ends, axis=1))
+        return self._unflatten(
+            part.view(kind) for part, kind in zip(parts, self._types, strict=True)
+        )
+
+    def traced_rows(self, states: Any) -> jax.Array:
+        """Returns what ``rows`` does, in a program."""
+
+        def as_bytes(leaf: jax.Array) -> jax.Array:
+            if leaf.dtype.itemsize == 1:
+                return _flat(leaf.astype(jnp.uint8))
+            return _flat(lax.bitcast_convert_type(leaf, jnp.uint8))
+
+        return jnp.concatenate([as_bytes(leaf) for leaf in jax.tree.leaves(states)], axis=1)
+
+    def traced_states(self, rows: jax.Array) -> Any:
+        """Returns what ``states`` does, in a program."""
+
+        def read(part: jax.Array, kind: np.dtype) -> jax.Array:
+            if kind.itemsize == 1:
+                return part.astype(kind)
+            numbers = part.reshape(len(part), part.shape[1] // kind.itemsize, kind.itemsize)
+            return lax.bitcast_convert_type(numbers, kind)
+
+        parts = jnp.split(rows, self._ends, axis=1)
+        return self._unflatten(read(*each) for each in zip(parts, self._types, strict=True))
+
+    def _unflatten(self, leaves: Any) -> Any:
+        """Returns states of leaves [R, numbers]."""
+        shaped = [
+            leaf.reshape(len(leaf), *shape)
+            for leaf, shape in zip(leaves, self._shapes, strict=True)
+        ]
+        return jax.tree.unflatten(self._structure, shaped)
+
+
+def _flat(leaf: Any) -> Any:
+    """Returns a leaf as [R, numbers]."""
+    return leaf.reshape(len(leaf), int(np.prod(leaf.shape[1:])))
