@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from mjx_reinforce.learners.learner import TrainState
@@ -24,12 +25,11 @@ class Best:
     num_updates: jax.Array
 
 
-@jax.jit
 def first_best(train_states: TrainState) -> Best:
-    """Returns the state before the first evaluation, in memory of its own."""
-    actor, num_updates = jax.tree.map(jnp.copy, (train_states.actor, train_states.num_updates))
-    worst = jnp.full(num_updates.shape, -jnp.inf, jnp.zeros(()).dtype)
-    return Best(actor=actor, eval_return=worst, num_updates=num_updates)
+    """Returns the state before the first evaluation, in memory of its own; it compiles nothing."""
+    actor, num_updates = jax.tree.map(np.array, (train_states.actor, train_states.num_updates))
+    worst = np.full(num_updates.shape, -np.inf, jnp.result_type(float))
+    return jax.device_put(Best(actor=actor, eval_return=worst, num_updates=num_updates))
 
 
 @jax.jit
