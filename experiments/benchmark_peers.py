@@ -96,7 +96,9 @@ def mujoco_warp(env_id: str, batch: int, steps: int = 20) -> Candidate:
         warp.capture_launch(capture.graph)
     warp.synchronize()
 
-    def run():
+    kept = on_gpu, worlds  # the graph has their addresses alone
+
+    def run(kept=kept):
         for _ in range(steps):
             warp.capture_launch(capture.graph)
         warp.synchronize()
