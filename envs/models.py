@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import jax
 from mujoco import MjModel, MjSpec  # pyright: ignore[reportAttributeAccessIssue] - a C extension
 
 from mjx_reinforce.checks import explain
@@ -82,7 +83,8 @@ def to_mjx(model: Any, xml_file: str) -> mjx.Model:
     """
     try:
         converted = mjx.put_model(model, impl="jax")
-        mjx.make_data(model, impl="jax")  # notices what the model alone does not show
+        # Notices what the model alone does not show; its arrays are not made.
+        jax.eval_shape(lambda: mjx.make_data(model, impl="jax"))
     except NotImplementedError as error:
         feature = str(error)
         remedy = next((change for part, change in _REMEDIES.items() if part in feature), _ELSE)

@@ -141,7 +141,6 @@ def train(
       The exit status, see ``main``.
     """
     with _collection_paused():
-        from mjx_reinforce.reports.curves import load_libraries
         from mjx_reinforce.runs.display import Display, print_summary
 
     with Display() as display:
@@ -153,7 +152,6 @@ def train(
         interrupt.defer(display.say)
         _begin(session, found)
         display.start(compile_seconds)
-        threading.Thread(target=load_libraries, daemon=True).start()
         _loop(session, interrupt)
     if not session.saved:
         session.save()
@@ -173,6 +171,7 @@ def _compile(
 ) -> tuple[Any, float]:
     """Returns a run before its first update, and how long it took to compile, in seconds."""
     with _collection_paused():
+        from mjx_reinforce.reports.curves import load_libraries
         from mjx_reinforce.runs.best import first_best
         from mjx_reinforce.runs.build import policy_settings
         from mjx_reinforce.runs.log import RunLog
@@ -180,9 +179,10 @@ def _compile(
         from mjx_reinforce.runs.session import Session
         from mjx_reinforce.runs.state import compile_programs
 
+    loading = threading.Thread(target=load_libraries, daemon=True)
     started = time.perf_counter()
     with _collection_paused():
-        state, programs = compile_programs(env, learner, horizon, config)
+        state, programs = compile_programs(env, learner, horizon, config, loading.start)
     seconds = learner.engine.seconds + time.perf_counter() - started
     record = Record(config, getattr(env, "reward_threshold", None))
     best, policy = first_best(state.train_states), policy_settings(env, config)

@@ -13,8 +13,8 @@ _SMOOTHED_EPISODES = 50
 
 def load_libraries() -> None:
     """Imports what drawing needs, a second of work, so that it can run beside other work."""
+    import matplotlib.backends.backend_agg
     import matplotlib.figure  # noqa: F401
-    import scipy.stats  # noqa: F401
 
 
 def draw_learning_curve(

@@ -45,8 +45,8 @@ class Budget(NamedTuple):
     updates: [] int32, how many it makes at most
     """
 
-    env_steps: jax.Array
-    updates: jax.Array
+    env_steps: jax.Array | np.int32
+    updates: jax.Array | np.int32
 
 
 class Programs(NamedTuple):
@@ -73,7 +73,11 @@ def first_state(learner: Learner, config: Config) -> RunState:
 
 def seed_keys(config: Config) -> jax.Array:
     """Returns the keys [S] that the seeds of a run begin with."""
-    return jax.random.split(_key(config.seed, domain=0), config.num_seeds)
+    return _seed_keys(config.seed, config.num_seeds)
+
+
+def _seed_keys(seed: Any, num_seeds: int) -> jax.Array:
+    return jax.random.split(_key(seed, domain=0), num_seeds)
 
 
 def beginning(build_learner: BuildLearner) -> Callable[..., RunState]:
@@ -97,7 +101,11 @@ def beginning(build_learner: BuildLearner) -> Callable[..., RunState]:
 
 
 def compile_programs(
-    env: Environment, learner: Learner, horizon: int, config: Config
+    env: Environment,
+    learner: Learner,
+    horizon: int,
+    config: Config,
+    meanwhile: Callable[[], object] = lambda: None,
 ) -> tuple[RunState, Programs]:
     """Returns the state before the first update, and the compiled programs of a run.
 
@@ -106,18 +114,27 @@ def compile_programs(
       learner: how.
       horizon: T, the time limit of an episode in steps.
       config: the settings of the run.
+      meanwhile: begins other work in Python; called once the rest of the time is XLA's.
     """
-    key = evaluation_key(config)
     budget = budget_of(config)
     block = block_of_updates(lambda _: learner, block_length(config))
     advance = jax.jit(block, donate_argnums=0)
     look = jax.jit(evaluation(env, learner, horizon, config))
-    shapes = jax.eval_shape(functools.partial(first_state, learner, config))
+
+    # One program, whatever the seeds are: a program for each operation on keys takes longer.
+    def start(seed: Any, eval_seed: Any) -> tuple[RunState, jax.Array, jax.Array]:
+        state = beginning(lambda _: learner)(_seed_keys(seed, config.num_seeds), {})
+        return state, _key(eval_seed, domain=1), _key(eval_seed, domain=2)
+
+    seeds = np.uint32(config.seed), np.uint32(config.eval_seed)
+    shapes, key, _ = jax.eval_shape(start, *seeds)
     with ThreadPoolExecutor() as pool:  # one compiles while the next is traced
-        beginning = pool.submit(first_state, learner, config)
+        starting = pool.submit(jax.jit(start), *seeds)
         looking = pool.submit(look.lower(shapes.train_states.actor, key).compile)
-        advancing = advance.lower(shapes, budget).compile()
-        compiled, first = looking.result(), beginning.result()
+        traced = advance.lower(shapes, budget)
+        meanwhile()
+        advancing = traced.compile()
+        compiled, (first, key, test_key) = looking.result(), starting.result()
 
     def advanced(state: RunState) -> tuple[RunState, Arrays]:
         state, (made, metrics) = advancing(state, budget)
@@ -127,12 +144,12 @@ def compile_programs(
         return to_numpy(compiled(state.train_states.actor, key))
 
     def tested(actor: Actor) -> Arrays:
-        return to_numpy(compiled(actor, _key(config.eval_seed, domain=2)))
+        return to_numpy(compiled(actor, test_key))
 
     return first, Programs(advanced, evaluated, tested)
 
 
-def _key(seed: int, domain: int) -> jax.Array:
+def _key(seed: Any, domain: int) -> jax.Array:
     """Returns the root of the keys of training (domain 0), evaluation (1), or the last test (2).
 
     The domains share no key, whatever seeds the user chooses.
@@ -148,7 +165,7 @@ def evaluation_key(config: Config) -> jax.Array:
 def budget_of(config: Config) -> Budget:
     """Returns the budget; what has no limit has the greatest count."""
     limits = (config.env_steps, config.max_updates)
-    return Budget(*(jnp.int32(MAX_COUNT if limit is None else limit) for limit in limits))
+    return Budget(*(np.int32(MAX_COUNT if limit is None else limit) for limit in limits))
 
 
 def block_of_updates(build_learner: BuildLearner, length: int) -> Callable[..., Any]:
