@@ -302,14 +302,21 @@ def test_short_episodes_are_learned_from_in_short(length, update, monkeypatch):
             done = (count >= length).astype(jnp.float32)
             return state.replace(reward=jnp.cos(action[0] + count), done=done, info=count)
 
-    learned = []
-    for few in (8, 10**6):
-        monkeypatch.setattr("mjx_reinforce.learners.reinforce._FEW", few)
+    learned, branches = [], []
+    for many in (2 * 3 * 400, 2 * 3 * 400 + 1):
+        monkeypatch.setattr("mjx_reinforce.learners.reinforce._MANY", many)
         learner = reinforce(
-            Ends(), num_episodes=3, update=update, optimizer=optax.sgd(1.0), engine="vmap"
+            Ends(),
+            num_episodes=3,
+            update=update,
+            optimizer=optax.sgd(1.0),
+            num_seeds=2,
+            engine="vmap",
         )
         seeds = jax.vmap(learner.init)(jax.random.split(jax.random.key(0), 2))
-        program = jax.jit(jax.vmap(learner.step))
-        learned.append(jax.tree.map(np.asarray, program(seeds)[0].actor.params))
+        program = jax.jit(jax.vmap(learner.step)).lower(seeds)
+        branches.append("stablehlo.case" in program.as_text())
+        learned.append(jax.tree.map(np.asarray, program.compile()(seeds)[0].actor.params))
+    assert branches == [True, False]
     assert np.abs(learned[0]["constants"]).max() > 0
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6), *learned)

@@ -50,6 +50,9 @@ from mjx_reinforce.types import (
 #: Episodes are short if none is longer than the horizon divided by this. An update passes over all
 #: steps that there may be, so it takes its time from the horizon, not from the episodes.
 _FEW = 8
+#: Updates of so many steps, of all seeds, are compiled for short episodes too. Measured on two CPU
+#: cores: that saves 70 ns for each of these steps in such an update, and takes 4 s to compile.
+_MANY = 2**19
 
 
 def default_distribution(space: Box | Discrete) -> Distribution:
@@ -70,6 +73,7 @@ def reinforce(
     loss_per: str = "episode",
     normalize_steps: float = 1000,
     one_start: bool = False,
+    num_seeds: int = 1,
     engine: str = "auto",
 ) -> Learner:
     """Builds REINFORCE for an environment; the formula is at the top of this file.
@@ -94,6 +98,9 @@ def reinforce(
         the state near the middle, statistics that never stop shrink, and magnify the
         observations until the policy fails.)
       one_start: reset every episode of a seed with the same key, drawn once at ``init``.
+      num_seeds: how many will learn at once, vmapped. It decides nothing but speed: of many,
+        updates whose episodes are all short pass over their first steps alone, the same up to
+        rounding.
       engine: how episodes are played: "auto", "vmap", "fused" or "native", see
         ``engines.choice``.
 
@@ -115,6 +122,7 @@ def reinforce(
         loss_per=loss_per,
         normalize_steps=normalize_steps,
         one_start=one_start,
+        num_seeds=num_seeds,
         observation_size=size,
     ).learner(engine)
 
@@ -134,6 +142,7 @@ class _Reinforce:
     loss_per: str
     normalize_steps: float
     one_start: bool
+    num_seeds: int
     observation_size: int
 
     def __post_init__(self):
@@ -192,9 +201,9 @@ class _Reinforce:
     def _learn(
         self, state: TrainState, trajectory: Trajectory, key: jax.Array
     ) -> tuple[TrainState, Metrics]:
-        """Learns; where all episodes, of all seeds, were short, from their first steps alone."""
+        """Learns; where all episodes, of many seeds, were short, from their first steps alone."""
         few = len(trajectory.mask) // _FEW
-        if few < CHUNK_STEPS:
+        if few < CHUNK_STEPS or self.num_seeds * trajectory.mask.size < _MANY:
             return self._learn_from(state, trajectory, key)
         return jax.lax.cond(
             any_lane(jnp.any(trajectory.mask[few])),

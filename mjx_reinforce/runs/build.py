@@ -77,6 +77,7 @@ def _build_reinforce(env: Any, config: Config, shared: dict[str, Any]) -> Any:
         entropy_cost=config.entropy_cost,
         loss_per=config.loss_per,
         one_start=config.one_start,
+        num_seeds=config.num_seeds,
         **shared,
     )
 
