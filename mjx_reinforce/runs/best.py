@@ -1,4 +1,4 @@
-"""The best policy of each seed, by its evaluations so far."""
+"""The best policy of each seed, by its evaluations so far; on the host, where nothing compiles."""
 
 from typing import Any
 
@@ -21,19 +21,26 @@ class Best:
     """
 
     actor: Actor
-    eval_return: jax.Array
-    num_updates: jax.Array
+    eval_return: Any
+    num_updates: Any
+
+
+def shape_of_best(train_states: TrainState) -> Best:
+    """Returns the shapes of the best policies of states, or of their shapes."""
+    counts = train_states.num_updates
+    returns = jax.ShapeDtypeStruct(counts.shape, jnp.result_type(float))
+    return Best(actor=train_states.actor, eval_return=returns, num_updates=counts)
 
 
 def first_best(train_states: TrainState) -> Best:
-    """Returns the state before the first evaluation, in memory of its own; it compiles nothing."""
+    """Returns the state before the first evaluation, in memory of its own."""
+    returns = shape_of_best(train_states).eval_return
     actor, num_updates = jax.tree.map(np.array, (train_states.actor, train_states.num_updates))
-    worst = np.full(num_updates.shape, -np.inf, jnp.result_type(float))
-    return jax.device_put(Best(actor=actor, eval_return=worst, num_updates=num_updates))
+    worst = np.full(returns.shape, -np.inf, returns.dtype)
+    return Best(actor=actor, eval_return=worst, num_updates=num_updates)
 
 
-@jax.jit
-def keep_best(best: Best, train_states: TrainState, eval_return: Any) -> Best:
+def keep_best(best: Best, train_states: TrainState, eval_return: np.ndarray) -> Best:
     """Takes in an evaluation; of two that are equal, the later is the better.
 
     Args:
@@ -41,12 +48,11 @@ def keep_best(best: Best, train_states: TrainState, eval_return: Any) -> Best:
       train_states: [S, ...] whose actors were evaluated; they are copied.
       eval_return: [S]; one that is not a number is never the best.
     """
-    present = Best(
-        actor=train_states.actor, eval_return=eval_return, num_updates=train_states.num_updates
-    )
-    better = eval_return >= best.eval_return
+    actor, num_updates = jax.device_get((train_states.actor, train_states.num_updates))
+    present = Best(actor=actor, eval_return=eval_return, num_updates=num_updates)
+    better = eval_return >= np.asarray(best.eval_return)
 
-    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
-        return jnp.where(better.reshape(-1, *[1] * (old.ndim - 1)), new, old)
+    def choose(new: np.ndarray, old: Any) -> np.ndarray:
+        return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
     return jax.tree.map(choose, present, best)

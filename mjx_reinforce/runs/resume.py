@@ -1,6 +1,7 @@
 """Going on with a run: its own settings, the same program, and the checkpoint that serves."""
 
 import dataclasses
+import functools
 import json
 import types
 import typing
@@ -173,16 +174,13 @@ def find(learner: Any, config: Config, say: Callable[[str], None]) -> Any:
     import jax
 
     from mjx_reinforce.runs import checkpoint
-    from mjx_reinforce.runs.best import first_best
+    from mjx_reinforce.runs.best import shape_of_best
     from mjx_reinforce.runs.state import first_state
-
-    def fresh() -> Any:
-        state = first_state(learner, config)
-        return state, first_best(state.train_states)
 
     assert config.resume is not None
     _check_unchanged(config, checkpoint.settings_of(config.resume / "checkpoint"))
-    like = jax.eval_shape(fresh)
+    state = jax.eval_shape(functools.partial(first_state, learner, config))
+    like = state, shape_of_best(state.train_states)
     length = _size(config.resume / "metrics.csv")
     for found in checkpoint.load(config.resume / "checkpoint", like, say):
         if found.metrics_bytes > length:
