@@ -49,10 +49,11 @@ def train(width: int, output: Path) -> None:
     build, traced = learner_builder(env, group.config), tuple(group.settings)
     programs = compile_programs(env, build, 1000, group.config, traced, (width,), devices)
     kept = {}
-    states = begin(programs, group, split(group, "0", 1)[0])
+    rows = begin(programs, group, split(group, "0", 1)[0])
     for count in range(1, max(UPDATES) + 1):
-        states = programs.advance(states, np.zeros(24))[0]
+        programs.advance(rows, np.ones(24, bool), np.zeros(24), blocks=1)
         if count in UPDATES:
+            states = programs.layout.states(rows)
             leaves = jax.tree.leaves(states.train_states.actor.params)
             kept[str(count)] = np.concatenate([x.reshape(24, -1) for x in leaves], axis=1)
     np.savez(output, allow_pickle=False, **kept)
