@@ -5,7 +5,7 @@ from typing import Any
 
 from jax import lax
 
-#: The `unroll` of a scan over contacts: machine code may write its iterations out.
+#: The `unroll` of scans over contacts. It asks `fused` to write the iterations out, if there are few.
 UNROLL = 2
 
 

@@ -3,14 +3,12 @@
 Runs of ``train`` with four seeds of 16 episodes an update and a 32-32 policy, training and
 evaluating, on 2026-11-22; all figures are good to a factor of two.
 
-- Two CPU cores: two hardware threads of the host of an H200, while seven such programs ran on
-  others. Two quiet cores of another machine were up to twice as fast. Those of ``native`` are of
-  two cores of a shared machine; with contacts, the rates of rollouts, halved.
+- Two CPU cores: two cores of a shared machine on which nothing else ran, twenty updates of each task;
+  the Humanoids' rates are those of rollouts, halved.
 - GPU: an H200. Compiling depends on the host: two of its threads took twice as long as stands here,
   16 quiet ones half as long. The rates of many episodes are those of ``docs/engine.md``, halved
-  where there are no contacts, since training takes as long as playing there. Training with
-  ``native`` was not measured there: for tasks with contacts the latency is the time that one env
-  step of 67,584 episodes took, and compiling is that of a rollout and 10 s.
+  where there are no contacts, since training takes as long as playing there. For tasks with
+  contacts the latency is the time that one env step of as many episodes took as were measured.
 """
 
 from typing import NamedTuple
@@ -72,23 +70,23 @@ TASKS = {
 
 _PENDULUM_CPU = Speed("native", 12, 2e-5, 8e6)
 _PENDULUM_GPU = Speed("native", 12, 2.2e-5, 1.2e9)
-_CART_CPU = Speed("fused", 10, 4.5e-5, 4e6)
+_CART_CPU = Speed("native", 9, 2e-5, 4e6)
 _CART_GPU = Speed("native", 12, 2.1e-5, 1e9)
 
 #: On two CPU cores.
 CPU = {
     "InvertedPendulum-v5": _PENDULUM_CPU,
     "InvertedPendulum-v4": _PENDULUM_CPU,
-    "InvertedDoublePendulum-v5": Speed("fused", 22, 1e-4, 4e5),
-    "Reacher-v5": Speed("fused", 22, 4.6e-5, 4e5),
-    "Pusher-v5": Speed("vmap", 65, 0, 2.5e3),
-    "Swimmer-v5": Speed("fused", 41, 3e-4, 5e4),
-    "HalfCheetah-v5": Speed("native", 20, 0, 1.4e5),
-    "Hopper-v5": Speed("native", 20, 0, 1.7e5),
-    "Walker2d-v5": Speed("native", 25, 0, 8.5e4),
-    "Ant-v5": Speed("vmap", 43, 0, 7.6e2),
-    "Humanoid-v5": Speed("vmap", 78, 0, 4.5e2),
-    "HumanoidStandup-v5": Speed("vmap", 70, 0, 2.3e2),
+    "InvertedDoublePendulum-v5": Speed("native", 18, 5e-5, 1e6),
+    "Reacher-v5": Speed("native", 14, 0, 8e5),
+    "Pusher-v5": Speed("native", 19, 0, 2e5),
+    "Swimmer-v5": Speed("native", 10, 0, 1e6),
+    "HalfCheetah-v5": Speed("native", 14, 0, 2.4e5),
+    "Hopper-v5": Speed("native", 13, 0, 1.7e5),
+    "Walker2d-v5": Speed("native", 15, 0, 1.2e5),
+    "Ant-v5": Speed("native", 21, 0, 2.5e4),
+    "Humanoid-v5": Speed("native", 48, 0, 1.1e4),
+    "HumanoidStandup-v5": Speed("native", 48, 0, 5.6e3),
     "CartPole-v1": _CART_CPU,
     "CartPole-v0": _CART_CPU,
     "ContinuousCartPole-v0": _CART_CPU,
@@ -100,14 +98,14 @@ GPU = {
     "InvertedPendulum-v4": _PENDULUM_GPU,
     "InvertedDoublePendulum-v5": Speed("native", 14, 3.4e-5, 1e9),
     "Reacher-v5": Speed("native", 14, 5.6e-5, 1.3e9),
-    "Pusher-v5": Speed("native", 46, 1.6e-2, 4.1e6),
+    "Pusher-v5": Speed("native", 20, 1.2e-3, 5.8e7),
     "Swimmer-v5": Speed("native", 13, 5e-5, 6e8),
-    "HalfCheetah-v5": Speed("native", 17, 2.6e-3, 2.6e7),
-    "Hopper-v5": Speed("native", 15, 1.2e-3, 5.8e7),
-    "Walker2d-v5": Speed("native", 16, 1.1e-2, 6.2e6),
-    "Ant-v5": Speed("native", 36, 4.1e-2, 1.6e6),
-    "Humanoid-v5": Speed("vmap", 62, 2.6e-2, 7.3e4),
-    "HumanoidStandup-v5": Speed("vmap", 63, 2.8e-2, 5.5e4),
+    "HalfCheetah-v5": Speed("native", 17, 2.9e-3, 2.3e7),
+    "Hopper-v5": Speed("native", 15, 1.7e-3, 3.9e7),
+    "Walker2d-v5": Speed("native", 16, 8.5e-3, 7.9e6),
+    "Ant-v5": Speed("native", 40, 1.4e-2, 2.4e6),
+    "Humanoid-v5": Speed("native", 75, 3.9e-2, 8.6e5),
+    "HumanoidStandup-v5": Speed("native", 75, 1e-1, 3.3e5),
     "CartPole-v1": _CART_GPU,
     "CartPole-v0": _CART_GPU,
     "ContinuousCartPole-v0": _CART_GPU,

@@ -22,7 +22,7 @@ from mjx_reinforce.types import Environment
 
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
 _LOOPS = {"unrolled": 1, "unrolled_arrays": 1, "unrolled_on_request": 1}
-#: On GPUs all but those over many contacts are written out, whose arrays would be in memory.
+#: On GPUs a loop over few contacts is written out: an array that a loop reads is in memory there.
 _GPU_LOOPS = {**_LOOPS, "unrolled_on_request": 25}
 #: The folders whose files decide what is written for a step.
 _WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
