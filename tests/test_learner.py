@@ -284,6 +284,7 @@ def test_nonsense_is_refused():
         mlp_policy(1, normal(Toy.action_space), (32, 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("length", "update"),
     [(50, updates.full_batch()), (51, updates.full_batch()), (30, updates.each_step())],

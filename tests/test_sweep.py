@@ -61,6 +61,7 @@ def close(one, other):
     return all(np.allclose(one[n], other[n], rtol=1e-4, equal_nan=True) for n in one | other)
 
 
+@pytest.mark.slow
 def test_a_run_is_that_of_train(run):
     """Of whichever configuration and group, and with a std of its own."""
     over = "--over learning-rate 1e-2 3e-2 --over estimator leave-one-out total-return "
@@ -142,6 +143,7 @@ def in_place(chosen, lengths, widths, num_devices):
     return lanes.reshape(-1, widths[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("exact", [False, True])
 def test_packing_changes_nothing(run, monkeypatch, exact):
     """Neither which runs share a slot, nor how wide it is, nor that those that ended lie aside."""

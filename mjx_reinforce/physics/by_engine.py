@@ -5,7 +5,7 @@ from typing import Any
 
 from jax import lax
 
-#: The `unroll` of scans over contacts. It asks `fused` to write the iterations out, if there are few.
+#: The `unroll` of scans over contacts. It asks `fused` to write few iterations out.
 UNROLL = 2
 
 

@@ -3,8 +3,8 @@
 Runs of ``train`` with four seeds of 16 episodes an update and a 32-32 policy, training and
 evaluating, on 2026-11-22; all figures are good to a factor of two.
 
-- Two CPU cores: two cores of a shared machine on which nothing else ran, twenty updates of each task;
-  the Humanoids' rates are those of rollouts, halved.
+- CPU: two cores of a shared machine on which nothing else ran, twenty updates of each task; the
+  Humanoids' rates are those of rollouts, halved.
 - GPU: an H200. Compiling depends on the host: two of its threads took twice as long as stands here,
   16 quiet ones half as long. The rates of many episodes are those of ``docs/engine.md``, halved
   where there are no contacts, since training takes as long as playing there. For tasks with
