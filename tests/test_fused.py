@@ -1,5 +1,6 @@
 """The fused evaluator against `jax.vmap`, primitive by primitive and loop by loop."""
 
+import functools
 from typing import Any
 
 import jax
@@ -378,6 +379,26 @@ def test_short_loops_can_stay_loops():
         for unrolled in (4, 1)
     ]
     assert counts == [3, 1]
+
+
+def test_a_scan_that_asks_to_be_unrolled_is_written_out_up_to_a_length():
+    def total(x, unroll):
+        step = lambda carry, row: (carry + jnp.sin(row), None)  # noqa: E731
+        return lax.scan(step, 0.0, x, unroll=unroll)[0]
+
+    def sines(unroll, on_request):
+        written = scalarized.build(
+            functools.partial(total, unroll=unroll),
+            (jnp.ones(7),),
+            [True],
+            400,
+            unrolled=1,
+            unrolled_arrays=1,
+            unrolled_on_request=on_request,
+        )
+        return written.operations["sin"]
+
+    assert [sines(1, 7), sines(2, 6), sines(2, 7), sines(7, 1)] == [1, 1, 7, 7]
 
 
 def test_pruned_functions_keep_only_what_they_return():

@@ -1,5 +1,6 @@
 """The native engine's kernels for GPUs: what they play, run on this CPU, and what they are."""
 
+import re
 import shutil
 import subprocess
 
@@ -122,6 +123,9 @@ def test_ptx(name, threads, capability, tmp_path):
     assert made.text.count(".entry play(") == 1
     assert f".target sm_{capability.replace('.', '')}" in made.text
     assert "call" not in made.text
+    meetings = re.findall(r"(bar.warp.sync 0xffffffff; )?bar(?:rier)?\.(?:sync|red)", made.text)
+    assert meetings
+    assert all(meetings)  # a warp comes together before each: an H200 waited forever without
     ptx._LOADED.clear()
     again = ptx.load(text, lambda: pytest.fail("it is on disk"), capability, tmp_path)
     assert again == made._replace(compiled=False)

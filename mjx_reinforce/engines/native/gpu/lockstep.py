@@ -16,8 +16,8 @@ from mjx_reinforce.fused.nodes import Node
 
 #: Gates and loops of more operations are entered by all threads of a block at once.
 LONG = 3_000
-#: The threads of a warp come together before they meet the others of their block: an H200 was seen
-#: to wait forever where they came to a barrier one by one.
+#: The threads of a warp come together before they meet the others of their block: where they came
+#: to a barrier one by one, an H200 waited forever.
 _TOGETHER = "bar.warp.sync 0xffffffff;"
 _MEET = f"{_TOGETHER} bar.sync 0;"
 _SOME = (
