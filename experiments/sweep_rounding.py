@@ -33,6 +33,7 @@ def train(width: int, output: Path) -> None:
     from mjx_reinforce import envs
     from mjx_reinforce.runs.defaults import of_task
     from mjx_reinforce.runs.jax_setup import configure_jax
+    from mjx_reinforce.sweeps.ahead import Clock
     from mjx_reinforce.sweeps.chunks import begin, split
     from mjx_reinforce.sweeps.devices import Devices
     from mjx_reinforce.sweeps.grid import configure, grid
@@ -47,7 +48,7 @@ def train(width: int, output: Path) -> None:
     group = make_groups(configs, ["learning_rate"], exact=False)[0]
     env, devices = envs.make(base.env), Devices()
     build, traced = learner_builder(env, group.config), tuple(group.settings)
-    programs = compile_programs(env, build, 1000, group.config, traced, (width,), devices)
+    programs = compile_programs(env, build, 1000, group.config, traced, (width,), devices, Clock())
     kept = {}
     rows = begin(programs, group, split(group, "0", 1)[0])
     for count in range(1, max(UPDATES) + 1):

@@ -2,6 +2,7 @@
 
 import ast
 import itertools
+import re
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -10,9 +11,10 @@ import pytest
 from jax import lax
 
 from mjx_reinforce import fused
-from mjx_reinforce.fused import folding, ops
+from mjx_reinforce.fused import folding, ops, scalarized
 from mjx_reinforce.fused.backends import BACKENDS
 from mjx_reinforce.fused.backends.backend import Backend
+from mjx_reinforce.fused.backends.llvm import LLVM, Input
 from mjx_reinforce.fused.backends.llvm_text import Text
 from mjx_reinforce.fused.backends.xla import XLA
 from mjx_reinforce.fused.graph import Graph
@@ -40,7 +42,7 @@ SETTINGS = {
         "read": lambda place: jnp.linspace(1.0, 2.0, 4),
         "batch_shape": (4,),
     },
-    "llvm": {"text": Text(4), "inputs": lambda number: ("%input", np.dtype(np.float32))},
+    "llvm": {"text": Text(4), "inputs": lambda number: Input("%input", np.dtype(np.float32))},
 }
 PARAMS = {
     "convert_element_type": {"new_dtype": np.dtype(np.int32)},
@@ -88,6 +90,25 @@ def test_a_backend_walks_loops_and_gates(name):
     """With settings as in `SETTINGS`, if the backend takes any."""
     written = fused.scalarize(branches_and_repeats, jnp.ones(()), branch_cost=1)
     assert written.compile(name, **SETTINGS.get(name, {}))
+
+
+@pytest.mark.parametrize("align", [1, 8, 16])
+def test_a_load_says_how_its_place_is_aligned(align):
+    """Of arguments read one by one, and in a loop that takes every second."""
+
+    def total(x):
+        pairs = x[:4].reshape(2, 2)
+        return lax.scan(lambda sums, row: (sums * row[0], None), x[5], pairs)[0]
+
+    counts = {"unrolled": 1, "unrolled_arrays": 1, "unrolled_on_request": 1}
+    written = scalarized.build(total, (jnp.ones(6),), [True], 400, **counts)
+    text = Text(1)
+    backend = LLVM(text, lambda number: Input("%input", np.dtype(np.float32), align))
+    backend.compile(written.schedule, written.outputs)
+    body = text.function("void @total(ptr %input)")
+    loads = re.findall(r"load float, ptr %\w+(?:, align (\d+))?", body)
+    known = str(min(align, 8)) if align > 4 else ""  # every second float, from the first
+    assert sorted(loads) == sorted(["", known])
 
 
 @pytest.mark.parametrize("name", ops.FACTS)

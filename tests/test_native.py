@@ -86,7 +86,7 @@ def test_every_distribution_draws_the_same_noise(name):
     assert np.all(got.action[~got.mask] == 0)
 
 
-@pytest.mark.parametrize("hidden_sizes", [(), (7, 5, 6)])
+@pytest.mark.parametrize("hidden_sizes", [(), (7, 5, 6), (8, 6, 5)])
 def test_the_pendulum(hidden_sizes):
     env = envs.make("InvertedPendulum-v5")
     fused, options = choice.choose("fused", env).rollout, {"horizon": 50, "num_episodes": 20}

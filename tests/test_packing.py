@@ -18,7 +18,7 @@ def test_each_run_has_one_lane_and_each_device_its_share(num_devices, active):
     chosen = random.permutation(100) < active
     lengths = random.integers(1, 21, 100)
     lanes = pack(chosen, lengths, [32, 8], num_devices)
-    assert lanes.shape == ((-(-active // 32), 32) if active > 16 else (-(-active // 8), 8))
+    assert lanes.shape == ((-(-active // 32), 32) if active > 8 else (-(-active // 8), 8))
     assert sorted(lanes[lanes >= 0]) == np.flatnonzero(chosen).tolist()
     shares = (lanes.reshape(len(lanes), num_devices, -1) >= 0).sum(axis=-1)
     assert np.all(shares.max(axis=1) - shares.min(axis=1) <= 1)

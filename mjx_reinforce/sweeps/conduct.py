@@ -12,7 +12,7 @@ from mjx_reinforce.runs.config import MAX_COUNT
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.progress import Progress
 from mjx_reinforce.sweeps import carry, chunks, rungs
-from mjx_reinforce.sweeps.ahead import one_ahead
+from mjx_reinforce.sweeps.ahead import Clock, one_ahead
 from mjx_reinforce.sweeps.chunks import Runs, Saver
 from mjx_reinforce.sweeps.design import Design
 from mjx_reinforce.sweeps.groups import Group, learner_builder
@@ -40,18 +40,6 @@ class Stage(NamedTuple):
     def of(self, runs: Sequence[Runs]) -> "Stage":
         """Returns the stage with some of its chunks."""
         return self._replace(chunks=list(runs))
-
-
-@dataclasses.dataclass
-class Clock:
-    """Where the time of a sweep goes (s).
-
-    compiling: with nothing trained beside it
-    running: training and evaluating
-    """
-
-    compiling: float = 0.0
-    running: float = 0.0
 
 
 class Conductor:
@@ -119,9 +107,10 @@ class Conductor:
             self.clock.compiling += seconds
             self._begin_files(seconds)
             for runs in stage.chunks:
-                began = time.perf_counter()
+                began, waited = time.perf_counter(), self.clock.compiling
                 ended = self._train(rung, stage, compiled, runs)
-                self.clock.running += time.perf_counter() - began
+                waited = self.clock.compiling - waited
+                self.clock.running += time.perf_counter() - began - waited
                 if not ended:
                     return False
                 self._done += len(runs.seed)
@@ -164,6 +153,7 @@ class Conductor:
                 tuple(whole.settings),
                 self._divide(stage.number, whole).widths,
                 self._prepared.devices,
+                self.clock,
             )
             if self._num_rungs == 1:
                 return programs

@@ -27,7 +27,7 @@ from mjx_reinforce.runs.state import (
     evaluation_key,
     seed_keys,
 )
-from mjx_reinforce.sweeps.ahead import started
+from mjx_reinforce.sweeps.ahead import Clock, started
 from mjx_reinforce.sweeps.devices import NONE, RUNS, Devices
 from mjx_reinforce.sweeps.history import Measured
 from mjx_reinforce.sweeps.layout import Layout
@@ -56,6 +56,7 @@ class Programs(NamedTuple):
     devices: among which a slot is divided
     shape_of: the shapes of the states of so many runs
     layout: of their bytes
+    clock: which counts the time that passes until a narrower slot's are there
     """
 
     begin: Callable[..., np.ndarray]
@@ -65,6 +66,7 @@ class Programs(NamedTuple):
     devices: Devices
     shape_of: Callable[[int], RunState]
     layout: Layout
+    clock: Clock
 
     def of(self, config: Config) -> "Programs":
         """Returns the same programs for settings with another budget or another seed."""
@@ -114,7 +116,7 @@ class Programs(NamedTuple):
     def _pack(self, chosen: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, Movers]:
         """Returns the runs of each slot, and what moves them."""
         lanes = pack(chosen, lengths, list(self.movers), self.devices.count)
-        return lanes, self.movers[lanes.shape[1]].result()
+        return lanes, self.clock.wait(self.movers[lanes.shape[1]])
 
     def _put(self, slot: Any) -> Any:
         return self.devices.put(slot, RUNS)
@@ -151,6 +153,7 @@ def compile_programs(
     traced: Collection[str],
     widths: Sequence[int],
     devices: Devices,
+    clock: Clock,
 ) -> Programs:
     """Compiles the programs of a group for the widest slot, and begins with the narrower ones.
 
@@ -164,6 +167,7 @@ def compile_programs(
       traced: the names of those that are.
       widths: how many runs a slot may have, the most first; multiples of the number of devices.
       devices: where.
+      clock: of the sweep.
     """
     layout = Layout(shape_of_states(build_learner, traced, 1))
     compile_for = functools.partial(_movers, env, build_learner, horizon, config, traced, devices)
@@ -178,6 +182,7 @@ def compile_programs(
         devices=devices,
         shape_of=functools.partial(shape_of_states, build_learner, traced),
         layout=layout,
+        clock=clock,
         **inputs.result(),
     )
 

@@ -1,8 +1,9 @@
 """Turns the scalar graph into LLVM IR: one instruction on a lane vector for each node."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -16,6 +17,20 @@ from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
 from mjx_reinforce.fused.ops import Op
 
 
+class Input(NamedTuple):
+    """An argument: lane vectors, one after the other, that stay as they are until the end.
+
+    Attributes:
+        pointer: where the first lies.
+        dtype: of their entries.
+        align: bytes of which the pointer is known to be a multiple; 1 leaves it to the dtype.
+    """
+
+    pointer: str
+    dtype: np.dtype
+    align: int = 1
+
+
 @dataclasses.dataclass(frozen=True)
 class Memory:
     """A value that stays in memory and is loaded wherever it is used: registers are few.
@@ -23,10 +38,12 @@ class Memory:
     Attributes:
         pointer: where its lane vector lies.
         dtype: of its entries.
+        align: as of ``Input``. Neighbours that are known to be aligned are loaded together.
     """
 
     pointer: str
     dtype: np.dtype
+    align: int = 1
 
 
 #: An operand, or where it lies.
@@ -38,13 +55,12 @@ class LLVM(Backend[Value]):
 
     OPERATIONS = OPERATIONS
 
-    def __init__(self, text: Text, inputs: Callable[[int], tuple[str, np.dtype]]):
+    def __init__(self, text: Text, inputs: Callable[[int], Input]):
         """Says what is written into, and where the inputs are.
 
         Args:
             text: the body of a function.
-            inputs: the pointer to an argument's lane vectors, one after the other, and its dtype,
-                by the argument's number. What it points to must stay as it is until the end.
+            inputs: an argument by its number.
         """
         self._text = text
         self._inputs = inputs
@@ -60,14 +76,15 @@ class LLVM(Backend[Value]):
         if isinstance(node.owner, Captured):
             raise UnsupportedPrimitive("an array of an outer transformation", "machine code")
         number, position = node.position
-        pointer, dtype = self._inputs(number)
-        return Memory(self._text.at(pointer, dtype, position), dtype)
+        pointer, dtype, align = self._inputs(number)
+        align = math.gcd(align, dtype.itemsize * position)
+        return Memory(self._text.at(pointer, dtype, position), dtype, align)
 
     def value(self, scalar: Scalar, values: dict[Node, Value]) -> str:
         """Returns a scalar's operand, loading it where it is in memory."""
         value = super().value(scalar, values)
         if isinstance(value, Memory):
-            return self._text.load(value.pointer, value.dtype)
+            return self._text.load(value.pointer, value.dtype, value.align)
         return value
 
     def node(self, node: Node, operands: list[Value]) -> Value:
@@ -199,11 +216,11 @@ class LLVM(Backend[Value]):
         return array if in_order else None
 
     def _place(self, place: Places, dtype: np.dtype, count: str) -> Value:
-        pointer, _ = self._inputs(place.leaf)
+        pointer, _, align = self._inputs(place.leaf)
         step = self._text.let(f"mul i64 {count}, {place.stride}")
-        return Memory(
-            self._text.at(pointer, dtype, self._text.let(f"add i64 {step}, {place.start}")), dtype
-        )
+        index = self._text.let(f"add i64 {step}, {place.start}")
+        align = math.gcd(align, dtype.itemsize * place.stride, dtype.itemsize * place.start)
+        return Memory(self._text.at(pointer, dtype, index), dtype, align)
 
 
 def _dtype(scalar: Any) -> np.dtype:

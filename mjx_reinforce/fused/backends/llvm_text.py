@@ -211,9 +211,10 @@ class Text:
         """Returns the pointer to a lane vector of an array of them."""
         return self.let(f"getelementptr inbounds {self.type(dtype)}, ptr {pointer}, i64 {index}")
 
-    def load(self, pointer: str, dtype: Any) -> str:
-        """Loads a lane vector."""
-        return self.let(f"load {self.type(dtype)}, ptr {pointer}")
+    def load(self, pointer: str, dtype: Any, align: int = 1) -> str:
+        """Loads a lane vector; ``align`` as of ``llvm.Input``."""
+        suffix = f", align {align}" if align > np.dtype(dtype).itemsize else ""
+        return self.let(f"load {self.type(dtype)}, ptr {pointer}{suffix}")
 
     def store(self, value: str, pointer: str, dtype: Any) -> None:
         """Stores a lane vector."""

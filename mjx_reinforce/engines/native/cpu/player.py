@@ -14,7 +14,7 @@ from mjx_reinforce.engines.native.cpu.denormals import Flush
 from mjx_reinforce.engines.native.cpu.lanes import ALIGNMENT, Field, Layout, layout
 from mjx_reinforce.engines.native.cpu.queue import NUM_CONTROLS, NUM_RECORDS, queue_text
 from mjx_reinforce.fused import scalarized
-from mjx_reinforce.fused.backends.llvm import LLVM
+from mjx_reinforce.fused.backends.llvm import LLVM, Input
 from mjx_reinforce.fused.backends.llvm_text import Text
 
 _INT, _LONG = np.dtype(np.int32), np.dtype(np.int64)
@@ -82,7 +82,7 @@ class _Work:
     def _play(self, step: scalarized.Scalarized, alive: str) -> str:
         """Writes a step of all lanes; returns which of them have ended their episode by it."""
         text, fields = self.text, self.places.inputs
-        emit = LLVM(text, lambda number: (self.inputs[number], fields[number].dtype))
+        emit = LLVM(text, lambda number: Input(self.inputs[number], fields[number].dtype))
         values = emit.compile(step.schedule, step.outputs)
         self._record(values[:NUM_RECORDS], step.out_avals, alive)
         (goes_on,), (broken,), *carried = values[NUM_RECORDS:]

@@ -7,9 +7,7 @@ at different places wait for instructions most of the time; in step, one reads t
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 
-import numpy as np
-
-from mjx_reinforce.fused.backends.llvm import LLVM, Value
+from mjx_reinforce.fused.backends.llvm import LLVM, Input, Value
 from mjx_reinforce.fused.backends.llvm_text import Text
 from mjx_reinforce.fused.liveness import LiveGate, LiveLoop, Schedule
 from mjx_reinforce.fused.nodes import Node
@@ -41,7 +39,7 @@ def operations(body: Schedule) -> int:
 class Lockstep(LLVM):
     """Writes LLVM IR for one of the threads of a block, all of which run what it writes."""
 
-    def __init__(self, text: Text, inputs: Callable[[int], tuple[str, np.dtype]]):
+    def __init__(self, text: Text, inputs: Callable[[int], Input]):
         """Arguments are those of `LLVM`."""
         super().__init__(text, inputs)
         self._together = True

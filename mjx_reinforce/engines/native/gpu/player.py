@@ -5,12 +5,14 @@ episodes beside theirs. What a thread computes depends on its episode alone: res
 for any number of threads.
 """
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from mjx_reinforce.engines.native.gpu.lockstep import LONG, Lockstep, operations, some_of_block
 from mjx_reinforce.fused import scalarized
+from mjx_reinforce.fused.backends.llvm import Input
 from mjx_reinforce.fused.backends.llvm_text import Text
 
 _INT = np.dtype(np.int32)
@@ -25,6 +27,8 @@ _NUM_OTHERS = 3
 #: A block's threads, and how many blocks a multiprocessor holds at once, for programs that fit into
 #: its instruction caches and for longer ones. A thread has 128 registers, in a longer program 255.
 _SHORT_BLOCKS, _LONG_BLOCKS = (32, 16), (128, 2)
+#: XLA's buffers begin at multiples of more bytes. A thread loads as many at once.
+_BUFFER_ALIGN = 16
 #: Denormals are zero, as in machine code for CPUs.
 _ATTRIBUTES = """attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
   "nvvm.maxntid"="{}" "nvvm.minctasm"="{}" }}
@@ -177,8 +181,8 @@ class _Kernel:
         text = self.text
         seed = text.let(f"udiv i32 {text.load(self.row, _INT)}, {self.episodes}")
         actor = [self._row(leaf, seed) for leaf in self.shared]
-        leaves = [*actor, *self.own]
-        emit = Lockstep(text, lambda number: (leaves[number].pointer, leaves[number].dtype))
+        leaves = [*actor, *(Input(leaf.pointer, leaf.dtype) for leaf in self.own)]
+        emit = Lockstep(text, leaves.__getitem__)
         values = emit.compile(self.step.schedule, self.step.outputs)
         *records, (goes_on,), (broken,) = values[:5]
         with text.when(running):
@@ -207,10 +211,11 @@ class _Kernel:
             text.store("0", self.running, _INT)
             self._count_steps()
 
-    def _row(self, leaf: _Leaf, seed: str) -> _Leaf:
+    def _row(self, leaf: _Leaf, seed: str) -> Input:
         """Returns a seed's row of a leaf of the actor."""
         first = self.text.let(f"mul i64 {self._wide(seed)}, {leaf.count}")
-        return leaf._replace(pointer=self.text.at(leaf.pointer, leaf.dtype, first))
+        align = math.gcd(_BUFFER_ALIGN, leaf.dtype.itemsize * leaf.count)
+        return Input(self.text.at(leaf.pointer, leaf.dtype, first), leaf.dtype, align)
 
     def _record(self, records: list[list[Any]], seed: str) -> None:
         """Writes observation, action and reward."""
