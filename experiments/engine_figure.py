@@ -20,7 +20,11 @@ STYLES = {
     "C MuJoCo": ("#D55E00", "D"),
 }
 #: Task -> where its name stands, in points from its own, and the side that is there.
-PLACES = {"InvertedDoublePendulum": ((-6, -3), "right"), "HumanoidStandup": ((7, -9), "left")}
+PLACES = {
+    "InvertedDoublePendulum": ((-6, -3), "right"),
+    "HalfCheetah": ((7, -9), "left"),
+    "HumanoidStandup": ((7, -9), "left"),
+}
 
 
 def main() -> None:
