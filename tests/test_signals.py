@@ -31,6 +31,14 @@ FOREVER = ["--env", "Survive-v0", "--env-steps", "1000000000", "--output", "out"
 HEAVY = ["--env", "Hopper-v5", "--engine", "vmap", "--output", "out"]
 
 
+@pytest.fixture(autouse=True)
+def ctrl_c_is_heard():
+    """What a script's shell starts in the background ignores Ctrl-C, and so would its child."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def start(directory, *arguments, real=False, cache=None):
     command = ["-m", "mjx_reinforce.train"] if real else ["-c", TRAIN.format(here=str(HERE))]
     environment = dict(os.environ) | ({"JAX_COMPILATION_CACHE_DIR": str(cache)} if cache else {})
