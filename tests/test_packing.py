@@ -1,12 +1,14 @@
 """Packing: every run that trains is in one lane, beside its like, and each device has its share."""
 
 import itertools
+import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mjx_reinforce.sweeps.ahead import Clock, started
 from mjx_reinforce.sweeps.layout import Layout
 from mjx_reinforce.sweeps.packing import pack
 
@@ -54,3 +56,10 @@ def test_no_bit_of_a_state_changes_on_its_way():
     assert np.array_equal(inside["number"], states["number"])
     assert np.array_equal(inside["which"], states["which"])
     assert np.array_equal(inside["matrix"].view(jnp.uint32), states["matrix"].view(np.uint32))
+
+
+def test_waiting_for_a_program_is_compiling():
+    clock = Clock()
+    assert clock.wait(started(lambda: time.sleep(0.2) or "program")) == "program"
+    assert clock.compiling >= 0.2
+    assert clock.running == 0
