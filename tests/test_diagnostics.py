@@ -1,5 +1,6 @@
 """Diagnostics against closed forms, enumerated episodes, and updates made to be so."""
 
+import dataclasses
 import itertools
 
 import jax
@@ -220,6 +221,44 @@ def test_what_does_not_clip_has_no_share():
 
 
 NAMES = {"kl", "policy_std", "explained_variance", "gradient_snr", "clipped_gradients"}
+
+
+def test_an_update_goes_no_further_than_it_may():
+    """From the second update on: the first also scales the observations, which counts, too."""
+
+    def moved(max_kl):
+        learner = reinforce(Survive(), num_episodes=4, max_kl=max_kl)
+        state = learner.init(jax.random.key(0))
+        state = dataclasses.replace(state, actor=scaled(state.actor))
+        after, metrics = train_step(learner, state)
+        change = jax.tree.map(jnp.subtract, after.actor.params, state.actor.params)
+        flat = np.concatenate([np.ravel(x) for x in jax.tree.leaves(change)])
+        return flat, float(metrics["kl"])
+
+    def scaled(actor):  # counted enough already
+        counted = actor.normalizer.replace(count=jnp.float32(2000), m2=jnp.full(1, 2000.0))
+        return actor.replace(normalizer=counted)
+
+    free, free_kl = moved(None)
+    for share in (0.5, 0.1, 0.01):
+        short, kl = moved(share * free_kl)
+        assert kl == pytest.approx(share * free_kl, rel=0.1)
+        cosine = free @ short / np.linalg.norm(free) / np.linalg.norm(short)
+        assert cosine == pytest.approx(1, abs=1e-4)
+    same, same_kl = moved(2 * free_kl)
+    assert np.array_equal(same, free)
+    assert same_kl == free_kl
+
+
+def test_a_change_without_a_kl_is_kept_as_it_is():
+    policy = mlp_policy(1, normal(BOX), ())
+    actor = reinforce(Survive(), policy=policy).init(jax.random.key(0)).actor
+    visited = diagnostics.visited_steps(make_trajectory([4, 9], 20))
+    same = diagnostics.within_kl(policy, actor, actor.params, visited, 0.01)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, actor.params))
+    broken = jax.tree.map(lambda x: x * jnp.nan, actor.params)
+    kept = diagnostics.within_kl(policy, actor, broken, visited, 0.01)
+    assert all(np.isnan(x).all() for x in jax.tree.leaves(kept))  # for ``keep_finite`` to see
 
 
 def test_an_update_has_all_of_them():

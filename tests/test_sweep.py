@@ -355,7 +355,7 @@ def test_a_flag_that_one_configuration_reads_is_accepted():
     configurations = grid({"estimator": ["leave-one-out", "value-baseline"]})
     configure(Config(value_fits=3), configurations, given=["value_fits"])
     with pytest.raises(ValueError, match="would do nothing"):
-        configure(Config(decay_updates=None), grid({"final_learning_rate": [1e-3, 1e-2]}))
+        configure(Config(decay_steps=None), grid({"final_learning_rate": [1e-3, 1e-2]}))
 
 
 @pytest.mark.slow

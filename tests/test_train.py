@@ -170,7 +170,6 @@ def test_the_saved_policy_plays_like_the_trained_one(run, tmp_path):
             "--value-learning-rate must be positive",
         ),
         (["--policy", "deterministic"], "no log-probability"),
-        (["--update", "each-step"], "pass --decay-updates None"),
         (["--algorithm", "ars", "--one-start"], "--shared-starts"),
         (["--algorithm", "ars", "--top-directions", "9"], "at most --num-directions 8, got 9"),
         (

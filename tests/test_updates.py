@@ -277,6 +277,30 @@ def test_the_learning_rate_may_be_a_schedule(name):
     assert float(second / first) == pytest.approx(10, rel=1e-4)
 
 
+UPDATES = {
+    "full-batch": updates.full_batch(),
+    "minibatches": updates.minibatches(3, 4),
+    "each-step": updates.each_step(),
+}
+
+
+@pytest.mark.parametrize("name", UPDATES)
+def test_the_rate_falls_with_the_env_steps_of_the_rollouts(name):
+    """Of each update the env steps are counted, however many optimiser steps it makes."""
+    played = float(np.sum(MASK))
+    plain = updates.make_optimizer("sgd", 0.1, max_grad_norm=None)
+    decaying = optax.chain(plain, updates.decay_by_env_steps(0.2, 2 * played))
+    state = decaying.init(PARAMS)
+    for number, factor in enumerate((1.0, 0.6, 0.2, 0.2)):
+        counted = state[-1].env_steps
+        assert float(counted) == pytest.approx(number * played)
+        change, _ = decaying.update(PARAMS, state, PARAMS, env_steps=jnp.zeros(()))
+        expected = jax.tree.map(lambda x, factor=factor: -0.1 * factor * x, PARAMS)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), change, expected)
+        problem = make_problem(decaying)
+        _, state, _ = UPDATES[name](problem, jax.random.key(number), PARAMS, state)
+
+
 def test_nonsense_is_refused():
     with pytest.raises(ValueError, match="num_updates must be at least 1, got 0"):
         updates.minibatches(0, 8)

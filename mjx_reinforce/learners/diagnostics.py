@@ -1,9 +1,11 @@
 """Diagnostics: how an update changed the policy, and how noisy the gradient was that it followed.
 
-Nothing that is learned depends on them, and they cost a few percent of an update at most: the
-policies are compared at a few of the visited steps, and the noise is that of a few episodes.
+Nothing that is learned depends on them, but for ``within_kl``. They cost a few percent of an update
+at most: the policies are compared at a few of the visited steps, and the noise is that of a few
+episodes.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -81,6 +83,29 @@ def policy_metrics(policy: Policy, before: Actor, after: Actor, visited: Visited
         std = jnp.mean(policy.distribution.std(old), axis=-1)
         metrics["policy_std"] = visited.mean(std)
     return metrics
+
+
+def within_kl(
+    policy: Policy, actor: Actor, params: Any, visited: Visited, max_kl: float | jax.Array
+) -> Any:
+    """Returns the parameters on the straight way to ``params`` at which KL is about ``max_kl``.
+
+    Where KL(before || after), the mean over visited steps, is greater than that, the change is
+    multiplied by sqrt(max_kl / KL): KL grows as the square of a small change (as in the natural
+    gradient's step, Schulman et al. 2015, arXiv:1502.05477, appendix C, without its line search).
+    Its direction stays.
+
+    Args:
+      policy: whose parameters change.
+      actor: the policy before the change.
+      params: the parameters after it.
+      visited: where the two are compared.
+      max_kl: in nats.
+    """
+    changed = dataclasses.replace(actor, params=params)
+    kl = policy_metrics(policy, actor, changed, visited)["kl"]
+    share = jnp.where(kl > max_kl, jnp.sqrt(max_kl / kl), 1.0)
+    return jax.tree.map(lambda old, new: old + share * (new - old), actor.params, params)
 
 
 def kl_divergence(

@@ -21,7 +21,12 @@ from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.fused import any_lane
-from mjx_reinforce.learners.diagnostics import nan_unless, policy_metrics, visited_steps
+from mjx_reinforce.learners.diagnostics import (
+    nan_unless,
+    policy_metrics,
+    visited_steps,
+    within_kl,
+)
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.learners.learner import (
     Learner,
@@ -71,6 +76,7 @@ def reinforce(
     horizon: int | None = None,
     entropy_cost: float | jax.Array = 0.0,
     loss_per: str = "episode",
+    max_kl: float | jax.Array | None = None,
     normalize_steps: float = 1000,
     one_start: bool = False,
     num_seeds: int = 1,
@@ -93,6 +99,9 @@ def reinforce(
       entropy_cost: weight of the policy's entropy H, in return per nat.
       loss_per: "episode" divides the sum by N; "step" by the number of steps played, so that the
         gradient does not grow with the episodes.
+      max_kl: the most, in nats, by which an update may move the policy: the mean over the steps
+        that it visited of KL(before || after). A change that goes further is shortened, see
+        ``diagnostics.within_kl``; None shortens none.
       normalize_steps: scale observations by the mean and std of about the first so many steps,
         then keep that scale; 0 does not scale, inf never stops. (Where a policy learns to keep
         the state near the middle, statistics that never stop shrink, and magnify the
@@ -120,6 +129,7 @@ def reinforce(
         horizon=check_horizon(env, horizon),
         entropy_cost=entropy_cost,
         loss_per=loss_per,
+        max_kl=max_kl,
         normalize_steps=normalize_steps,
         one_start=one_start,
         num_seeds=num_seeds,
@@ -140,6 +150,7 @@ class _Reinforce:
     horizon: int
     entropy_cost: float | jax.Array
     loss_per: str
+    max_kl: float | jax.Array | None
     normalize_steps: float
     one_start: bool
     num_seeds: int
@@ -225,6 +236,9 @@ class _Reinforce:
             divisor=jnp.maximum(jnp.sum(mask), 1) if self.loss_per == "step" else self.num_episodes,
         )
         params, opt_state, update_metrics = self.update(problem, key, actor.params, state.opt_state)
+        visited = visited_steps(trajectory)
+        if self.max_kl is not None:
+            params = within_kl(self.policy, actor, params, visited, self.max_kl)
         normalizer = normalize.update(
             actor.normalizer, trajectory.observation, mask, self.normalize_steps
         )
@@ -234,7 +248,7 @@ class _Reinforce:
         state = dataclasses.replace(
             state, actor=actor, opt_state=opt_state, estimator_state=estimator_state
         )
-        change = policy_metrics(self.policy, before[0], actor, visited_steps(trajectory))
+        change = policy_metrics(self.policy, before[0], actor, visited)
         sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
         diagnostics = nan_unless(sound, metrics | update_metrics | change)
         return state, episode_metrics(trajectory) | diagnostics | {"skipped_update": skipped}

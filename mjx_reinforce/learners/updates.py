@@ -38,6 +38,10 @@ class Problem(NamedTuple):
     samples: tuple[jax.Array, ...]
     divisor: int | jax.Array
 
+    def env_steps(self) -> jax.Array:
+        """Returns how many env steps [] the rollout had."""
+        return jnp.sum(self.samples[-1])
+
 
 #: The gradient's noise is measured on one of so many episodes, and on so many at most.
 _NOISE_SHARE, _NOISE_EPISODES = 32, 64
@@ -64,7 +68,9 @@ def full_batch() -> Update:
         metrics = {"entropy": sums["entropy"] / jnp.maximum(jnp.sum(mask), 1)}
         if mask.shape[1] > 1:
             metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
-        params, opt_state, step = _descend(problem, grads, problem.divisor, params, opt_state)
+        params, opt_state, step = _descend(
+            problem, grads, problem.divisor, params, opt_state, problem.env_steps()
+        )
         return params, opt_state, metrics | step
 
     return update
@@ -108,12 +114,13 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
         drawn = jax.random.randint(key, (num_updates, batch_size), 1, 1 + jnp.maximum(ranks[-1], 1))
         # Where the first, second, ... step inside the mask is; ``drawn`` counts from 1.
         indices = jnp.searchsorted(ranks, drawn)
+        share = ranks[-1] / num_updates
 
         def one(carry, index):
             params, opt_state = carry
             batch = jax.tree.map(lambda x: x[index], flat)
             grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, batch)
-            params, opt_state, step = _descend(problem, grads, batch_size, params, opt_state)
+            params, opt_state, step = _descend(problem, grads, batch_size, params, opt_state, share)
             return (params, opt_state), step | {"entropy": sums["entropy"] / batch_size}
 
         (params, opt_state), steps = lax.scan(one, (params, opt_state), indices)
@@ -141,7 +148,9 @@ def each_step() -> Update:
                 lambda x: lax.dynamic_index_in_dim(x, t, keepdims=False), problem.samples
             )
             grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, now)
-            params, opt_state, step = _descend(problem, grads, problem.divisor, params, opt_state)
+            params, opt_state, step = _descend(
+                problem, grads, problem.divisor, params, opt_state, jnp.sum(now[-1])
+            )
             return params, opt_state, step | sums
 
         def more(carry):
@@ -167,11 +176,20 @@ def each_step() -> Update:
 
 
 def _descend(
-    problem: Problem, grads: Any, divisor: int | jax.Array, params: Any, opt_state: Any
+    problem: Problem,
+    grads: Any,
+    divisor: int | jax.Array,
+    params: Any,
+    opt_state: Any,
+    env_steps: jax.Array,
 ) -> tuple[Any, Any, dict[str, jax.Array]]:
-    """Makes one optimiser step on summed gradients; also returns the metrics of that step."""
+    """Makes one optimiser step on summed gradients; also returns the metrics of that step.
+
+    ``env_steps`` [] were played for it; the optimiser is told so, for ``decay_by_env_steps``.
+    """
     grads = jax.tree.map(lambda g: g / divisor, grads)
-    changes, opt_state = problem.optimizer.update(grads, opt_state, params)
+    optimizer = optax.with_extra_args_support(problem.optimizer)
+    changes, opt_state = optimizer.update(grads, opt_state, params, env_steps=env_steps)
     metrics = {"gradient_norm": optax.tree.norm(grads)}
     parts = jax.tree.leaves(opt_state, is_leaf=lambda x: isinstance(x, ClipState))
     for part in parts:
@@ -200,6 +218,40 @@ def clip_by_norm(max_norm: float | jax.Array) -> optax.GradientTransformation:
         return clip.update(updates, optax.EmptyState())[0], clipped
 
     return optax.GradientTransformation(init, update)
+
+
+class DecayState(NamedTuple):
+    """State of ``decay_by_env_steps``: how many env steps were played so far, float []."""
+
+    env_steps: jax.Array
+
+
+def decay_by_env_steps(
+    least: float | jax.Array, env_steps: float | jax.Array
+) -> optax.GradientTransformationExtraArgs:
+    """Multiplies changes by a factor that falls linearly with the env steps played, then stays.
+
+    It follows another optimiser in ``optax.chain``. Counted in env steps, a policy whose episodes
+    are short keeps its rate, and one that has learned to play long ones settles soon.
+
+    Args:
+      least: the factor at the end; 1 is that at the start.
+      env_steps: over which it falls.
+    """
+
+    def init(params):
+        del params
+        return DecayState(jnp.zeros(()))
+
+    def update(updates, state, params=None, *, env_steps: jax.Array, **extra):
+        del params, extra
+        left = jnp.maximum(1 - state.env_steps / horizon, 0)
+        factor = least + (1 - least) * left
+        played = DecayState(state.env_steps + env_steps)
+        return jax.tree.map(lambda change: factor * change, updates), played
+
+    horizon = env_steps
+    return optax.GradientTransformationExtraArgs(init, update)
 
 
 def make_optimizer(

@@ -76,6 +76,7 @@ def _build_reinforce(env: Any, config: Config, shared: dict[str, Any]) -> Any:
         num_episodes=config.num_episodes,
         entropy_cost=config.entropy_cost,
         loss_per=config.loss_per,
+        max_kl=config.max_kl,
         one_start=config.one_start,
         num_seeds=config.num_seeds,
         **shared,
@@ -122,21 +123,19 @@ def _build_estimator(config: Config) -> Any:
 def _build_optimizer(config: Config) -> Any:
     import optax
 
-    from mjx_reinforce.learners.updates import make_optimizer
+    from mjx_reinforce.learners.updates import decay_by_env_steps, make_optimizer
 
-    rate: Any = config.learning_rate
-    if config.decay_updates is not None:
-        final = config.final_learning_rate
-        final = config.learning_rate / 10 if final is None else final
-        # The schedule counts optimiser steps.
-        each = config.minibatch_updates if config.update == "minibatches" else 1
-        rate = optax.linear_schedule(rate, final, config.decay_updates * each)
-    return make_optimizer(
+    optimizer = make_optimizer(
         config.optimizer,
-        rate,
+        config.learning_rate,
         weight_decay=config.weight_decay,
         max_grad_norm=config.max_grad_norm,
     )
+    if config.decay_steps is None:
+        return optimizer
+    final = config.final_learning_rate
+    least = 0.1 if final is None else final / config.learning_rate
+    return optax.chain(optimizer, decay_by_env_steps(least, config.decay_steps))
 
 
 def _build_update(config: Config) -> Any:

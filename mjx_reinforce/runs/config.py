@@ -102,7 +102,7 @@ _OPTIONAL = {field.name for field in dataclasses.fields(Config) if "None" in str
 #: Names of settings, what must hold of a value that is given, and how to say it.
 _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     (
-        "num_seeds num_episodes env_steps max_updates horizon decay_updates eval_every "
+        "num_seeds num_episodes env_steps max_updates horizon decay_steps eval_every "
         "checkpoint_every eval_episodes value_fits minibatch_updates minibatch_size "
         "num_directions top_directions",
         lambda x: x >= 1,
@@ -111,7 +111,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("normalize_steps", lambda x: x >= 0, "at least 0"),
     ("env_steps", lambda x: x < 2**30, "less than 2^30, for each seed"),
     (
-        "max_updates num_episodes horizon decay_updates eval_every eval_episodes normalize_steps "
+        "max_updates num_episodes horizon decay_steps eval_every eval_episodes normalize_steps "
         "minibatch_size num_directions checkpoint_every",
         lambda x: x <= MAX_COUNT,
         "less than 2^31",
@@ -139,7 +139,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         f"at most {_MAX_LAYERS} layers",
     ),
     (
-        "initial_std learning_rate final_learning_rate max_grad_norm value_learning_rate "
+        "initial_std learning_rate final_learning_rate max_grad_norm max_kl value_learning_rate "
         "step_size noise_std",
         lambda x: math.isfinite(x) and x > 0,
         "positive and finite",
@@ -156,7 +156,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         f"in [{1 / _MAX_SIZE:g}, {_MAX_RATE}], for a step moves a weight by about that",
     ),
     (
-        "initial_std noise_std max_grad_norm standardize_floor entropy_cost weight_decay",
+        "initial_std noise_std max_grad_norm max_kl standardize_floor entropy_cost weight_decay",
         lambda x: x == 0 or 1 / _MAX_SIZE <= x <= _MAX_SIZE,
         f"in [{1 / _MAX_SIZE:g}, {_MAX_SIZE:g}], for runs compute in float32",
     ),
@@ -174,17 +174,6 @@ def _check_reinforce(config: Config) -> None:
         raise ValueError(
             "--policy deterministic has no log-probability for --algorithm reinforce to follow; "
             "choose --policy auto or --algorithm ars"
-        )
-    if config.update == "each-step" and config.decay_updates is not None:
-        raise ValueError(
-            "--update each-step makes as many optimiser steps as an episode has, so a decay over "
-            f"--decay-updates {config.decay_updates} has no length; pass --decay-updates None"
-        )
-    steps = (config.decay_updates or 0) * config.minibatch_updates
-    if config.update == "minibatches" and steps > MAX_COUNT:
-        raise ValueError(
-            f"the learning rate would decay over {steps:,} optimiser steps, more than the 2^31 - 1 "
-            "that can be counted; lower --decay-updates or --minibatch-updates"
         )
 
 

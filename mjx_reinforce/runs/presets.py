@@ -20,7 +20,7 @@ _PLAIN = Config(
     normalize_steps=0,
     estimator="reward-to-go",
     standardize=False,
-    decay_updates=None,
+    decay_steps=None,
     max_grad_norm=None,
 )
 

@@ -113,13 +113,16 @@ class UpdateSettings:
     """Its learning rate at the start."""
     final_learning_rate: float | None = None
     """Learning rate after the decay, which is linear; a tenth of the first if not given."""
-    decay_updates: int | None = 100
-    """Updates over which the learning rate decays; None keeps it constant."""
+    decay_steps: int | None = 280_000
+    """Env steps of a seed over which the learning rate decays; None keeps it constant."""
     weight_decay: float = 0.0
     """adamw: the parameters shrink by learning rate times this; adam, sgd: this times the
     parameters is added to the gradient (L2, as in PyTorch)."""
     max_grad_norm: float | None = 1.0
     """The gradient is scaled down to at most this Euclidean norm; None leaves it."""
+    max_kl: float | None = None
+    """An update moves the policy by at most about this mean KL divergence, in nats, over the steps
+    that it visited: a change that goes further is shortened. None shortens none."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -9,8 +9,8 @@ import numpy as np
 from mjx_reinforce.runs.config import Config
 
 _REINFORCE = (
-    *("learning_rate", "final_learning_rate", "discount", "entropy_cost"),
-    *("standardize_floor", "max_grad_norm", "value_learning_rate", "initial_std"),
+    *("learning_rate", "final_learning_rate", "decay_steps", "discount", "entropy_cost"),
+    *("standardize_floor", "max_grad_norm", "max_kl", "value_learning_rate", "initial_std"),
 )
 _ARS = ("step_size", "noise_std")
 #: Families whose standard deviation is a parameter: what it begins with is in the first state
@@ -60,7 +60,7 @@ def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, fl
     if config.policy not in _FREE_STD:
         names = tuple(name for name in names if name != "initial_std")
     settings = {name: getattr(config, name) for name in names if exact or name in swept}
-    if config.decay_updates is None:
+    if config.decay_steps is None:
         settings.pop("final_learning_rate", None)
     elif "learning_rate" in settings and config.final_learning_rate is None:
         settings["final_learning_rate"] = config.learning_rate / 10
