@@ -117,6 +117,11 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ("--hidden-sizes 32 -1", "positive in every layer"),
         ("--hidden-sizes 99999999999", "less than 2^31 in every layer"),
         ("--decay-steps 0", "--decay-steps must be at least 1"),
+        (
+            "--update minibatches --minibatch-updates 50000 --decay-updates 50000 "
+            "--decay-steps None",
+            "decay over 2,500,000,000 optimiser steps",
+        ),
         ("--num-seeds abc", "--num-seeds: invalid literal for int() with base 10: 'abc'"),
         ("--num-seeds 1e3", "'1e3'"),
         ("--num-seeds", "Missing value for argument '--num-seeds'"),
@@ -506,6 +511,7 @@ RIGHT = {
     "num_seeds": st.integers(1, 9),
     "normalize_steps": st.none() | st.integers(0, 9),
     "decay_steps": st.none() | st.integers(1, 9),
+    "decay_updates": st.none() | st.integers(1, 9),
     "top_directions": st.none() | st.integers(1, 9),
     "algorithm": st.sampled_from(["reinforce", "ars"]),
     "policy": st.sampled_from(["auto", *DISTRIBUTIONS]),

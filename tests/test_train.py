@@ -170,6 +170,11 @@ def test_the_saved_policy_plays_like_the_trained_one(run, tmp_path):
             "--value-learning-rate must be positive",
         ),
         (["--policy", "deterministic"], "no log-probability"),
+        (["--decay-updates", "9"], "not both: pass --decay-steps None"),
+        (
+            ["--update", "each-step", "--decay-updates", "9", "--decay-steps", "None"],
+            "choose --decay-steps",
+        ),
         (["--algorithm", "ars", "--one-start"], "--shared-starts"),
         (["--algorithm", "ars", "--top-directions", "9"], "at most --num-directions 8, got 9"),
         (

@@ -125,17 +125,22 @@ def _build_optimizer(config: Config) -> Any:
 
     from mjx_reinforce.learners.updates import decay_by_env_steps, make_optimizer
 
+    rate: Any = config.learning_rate
+    final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
+    if config.decay_updates is not None:
+        # The schedule counts optimiser steps.
+        each = config.minibatch_updates if config.update == "minibatches" else 1
+        rate = optax.linear_schedule(rate, final, config.decay_updates * each)
     optimizer = make_optimizer(
         config.optimizer,
-        config.learning_rate,
+        rate,
         weight_decay=config.weight_decay,
         max_grad_norm=config.max_grad_norm,
     )
     if config.decay_steps is None:
         return optimizer
-    final = config.final_learning_rate
-    least = 0.1 if final is None else final / config.learning_rate
-    return optax.chain(optimizer, decay_by_env_steps(least, config.decay_steps))
+    decay = decay_by_env_steps(final / config.learning_rate, config.decay_steps)
+    return optax.chain(optimizer, decay)
 
 
 def _build_update(config: Config) -> Any:

@@ -102,7 +102,7 @@ _OPTIONAL = {field.name for field in dataclasses.fields(Config) if "None" in str
 #: Names of settings, what must hold of a value that is given, and how to say it.
 _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     (
-        "num_seeds num_episodes env_steps max_updates horizon decay_steps eval_every "
+        "num_seeds num_episodes env_steps max_updates horizon decay_steps decay_updates eval_every "
         "checkpoint_every eval_episodes value_fits minibatch_updates minibatch_size "
         "num_directions top_directions",
         lambda x: x >= 1,
@@ -111,8 +111,8 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("normalize_steps", lambda x: x >= 0, "at least 0"),
     ("env_steps", lambda x: x < 2**30, "less than 2^30, for each seed"),
     (
-        "max_updates num_episodes horizon decay_steps eval_every eval_episodes normalize_steps "
-        "minibatch_size num_directions checkpoint_every",
+        "max_updates num_episodes horizon decay_steps decay_updates eval_every eval_episodes "
+        "normalize_steps minibatch_size num_directions checkpoint_every",
         lambda x: x <= MAX_COUNT,
         "less than 2^31",
     ),
@@ -174,6 +174,22 @@ def _check_reinforce(config: Config) -> None:
         raise ValueError(
             "--policy deterministic has no log-probability for --algorithm reinforce to follow; "
             "choose --policy auto or --algorithm ars"
+        )
+    if config.decay_steps is not None and config.decay_updates is not None:
+        raise ValueError(
+            f"the learning rate decays over --decay-steps {config.decay_steps} or over "
+            f"--decay-updates {config.decay_updates}, not both: pass --decay-steps None"
+        )
+    if config.update == "each-step" and config.decay_updates is not None:
+        raise ValueError(
+            "--update each-step makes as many optimiser steps as an episode has, so a decay over "
+            f"--decay-updates {config.decay_updates} has no length; choose --decay-steps"
+        )
+    steps = (config.decay_updates or 0) * config.minibatch_updates
+    if config.update == "minibatches" and steps > MAX_COUNT:
+        raise ValueError(
+            f"the learning rate would decay over {steps:,} optimiser steps, more than the 2^31 - 1 "
+            "that can be counted; lower --decay-updates or --minibatch-updates"
         )
 
 

@@ -13,7 +13,7 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
         "num_episodes estimator discount discount_weights standardize standardize_floor "
         "value_learning_rate value_fits value_hidden_sizes update minibatch_updates "
         "minibatch_size loss_per entropy_cost optimizer learning_rate final_learning_rate "
-        "decay_steps weight_decay max_grad_norm max_kl",
+        "decay_steps decay_updates weight_decay max_grad_norm max_kl",
         lambda c: c.algorithm == "reinforce",
         "--algorithm reinforce",
     ),
@@ -40,7 +40,11 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
         lambda c: c.update != "minibatches",
         "--update full-batch or --update each-step",
     ),
-    ("final_learning_rate", lambda c: c.decay_steps is not None, "--decay-steps N"),
+    (
+        "final_learning_rate",
+        lambda c: c.decay_steps is not None or c.decay_updates is not None,
+        "--decay-steps N",
+    ),
     (
         "initial_std",
         lambda c: (

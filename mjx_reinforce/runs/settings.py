@@ -114,7 +114,10 @@ class UpdateSettings:
     final_learning_rate: float | None = None
     """Learning rate after the decay, which is linear; a tenth of the first if not given."""
     decay_steps: int | None = 280_000
-    """Env steps of a seed over which the learning rate decays; None keeps it constant."""
+    """Env steps of a seed over which the learning rate decays; None keeps it constant, or leaves it
+    to --decay-updates."""
+    decay_updates: int | None = None
+    """Updates over which it decays instead."""
     weight_decay: float = 0.0
     """adamw: the parameters shrink by learning rate times this; adam, sgd: this times the
     parameters is added to the gradient (L2, as in PyTorch)."""

@@ -60,7 +60,7 @@ def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, fl
     if config.policy not in _FREE_STD:
         names = tuple(name for name in names if name != "initial_std")
     settings = {name: getattr(config, name) for name in names if exact or name in swept}
-    if config.decay_steps is None:
+    if config.decay_steps is None and config.decay_updates is None:
         settings.pop("final_learning_rate", None)
     elif "learning_rate" in settings and config.final_learning_rate is None:
         settings["final_learning_rate"] = config.learning_rate / 10
