@@ -9,9 +9,10 @@ import optax
 import pytest
 from toys import Survive, Target
 
-from mjx_reinforce import reinforce, train_step
-from mjx_reinforce.learners import estimators, updates
+from mjx_reinforce import mlp_policy, normal, reinforce, train_step
+from mjx_reinforce.learners import estimators, schedules, updates
 from mjx_reinforce.learners.updates import Problem
+from mjx_reinforce.types import action_space
 
 LENGTHS = np.array([4, 1, 3])
 MASK = np.arange(5)[:, None] < LENGTHS
@@ -289,7 +290,7 @@ def test_the_rate_falls_with_the_env_steps_of_the_rollouts(name):
     """Of each update the env steps are counted, however many optimiser steps it makes."""
     played = float(np.sum(MASK))
     plain = updates.make_optimizer("sgd", 0.1, max_grad_norm=None)
-    decaying = optax.chain(plain, updates.decay_by_env_steps(0.2, 2 * played))
+    decaying = optax.chain(plain, schedules.decay_rate(0.2, 2 * played))
     state = decaying.init(PARAMS)
     for number, factor in enumerate((1.0, 0.6, 0.2, 0.2)):
         counted = state[-1].env_steps
@@ -299,6 +300,33 @@ def test_the_rate_falls_with_the_env_steps_of_the_rollouts(name):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), change, expected)
         problem = make_problem(decaying)
         _, state, _ = UPDATES[name](problem, jax.random.key(number), PARAMS, state)
+
+
+def test_the_std_shrinks_with_the_env_steps_besides_what_is_learned():
+    """Two rollouts of 8 steps, then one that passes the end of 20 by 4."""
+    params = {"network": jnp.ones(2), "constants": jnp.log(jnp.array([0.5, 0.3]))}
+    learned = jax.tree.map(lambda x: 0.1 * jnp.ones_like(x), params)
+    optimizer = optax.chain(optax.sgd(1.0), schedules.shrink_std(0.1, 20))
+    state = optimizer.init(params)
+    total = jnp.zeros(2)
+    for share in (0.4, 0.4, 0.2, 0.0):
+        change, state = optimizer.update(learned, state, params, env_steps=jnp.asarray(8))
+        np.testing.assert_allclose(change["network"], [-0.1, -0.1], rtol=1e-6)
+        expected = np.full(2, -0.1 + share * np.log(0.1))
+        np.testing.assert_allclose(change["constants"], expected, rtol=1e-5)
+        total += change["constants"] + 0.1
+    np.testing.assert_allclose(jnp.exp(total), [0.1, 0.1], rtol=1e-5)
+
+
+def test_a_policy_without_an_std_of_its_own_has_nothing_to_shrink():
+    learner = reinforce(
+        Target(),
+        optimizer=optax.chain(optax.adam(1e-2), schedules.shrink_std(0.1, 20)),
+        policy=mlp_policy(1, normal(action_space(Target()), std="softplus"), (4,)),
+    )
+    after, metrics = train_step(learner, learner.init(jax.random.key(0)))
+    assert metrics["skipped_update"] == 0
+    assert after.actor.params["constants"].shape == (0,)
 
 
 def test_nonsense_is_refused():

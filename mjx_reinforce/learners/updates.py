@@ -185,7 +185,7 @@ def _descend(
 ) -> tuple[Any, Any, dict[str, jax.Array]]:
     """Makes one optimiser step on summed gradients; also returns the metrics of that step.
 
-    ``env_steps`` [] were played for it; the optimiser is told so, for ``decay_by_env_steps``.
+    ``env_steps`` [] were played for it; the optimiser is told so, for ``schedules``.
     """
     grads = jax.tree.map(lambda g: g / divisor, grads)
     optimizer = optax.with_extra_args_support(problem.optimizer)
@@ -218,40 +218,6 @@ def clip_by_norm(max_norm: float | jax.Array) -> optax.GradientTransformation:
         return clip.update(updates, optax.EmptyState())[0], clipped
 
     return optax.GradientTransformation(init, update)
-
-
-class DecayState(NamedTuple):
-    """State of ``decay_by_env_steps``: how many env steps were played so far, float []."""
-
-    env_steps: jax.Array
-
-
-def decay_by_env_steps(
-    least: float | jax.Array, env_steps: float | jax.Array
-) -> optax.GradientTransformationExtraArgs:
-    """Multiplies changes by a factor that falls linearly with the env steps played, then stays.
-
-    It follows another optimiser in ``optax.chain``. Counted in env steps, a policy whose episodes
-    are short keeps its rate, and one that has learned to play long ones settles soon.
-
-    Args:
-      least: the factor at the end; 1 is that at the start.
-      env_steps: over which it falls.
-    """
-
-    def init(params):
-        del params
-        return DecayState(jnp.zeros(()))
-
-    def update(updates, state, params=None, *, env_steps: jax.Array, **extra):
-        del params, extra
-        left = jnp.maximum(1 - state.env_steps / horizon, 0)
-        factor = least + (1 - least) * left
-        played = DecayState(state.env_steps + env_steps)
-        return jax.tree.map(lambda change: factor * change, updates), played
-
-    horizon = env_steps
-    return optax.GradientTransformationExtraArgs(init, update)
 
 
 def make_optimizer(

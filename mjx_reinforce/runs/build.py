@@ -123,7 +123,8 @@ def _build_estimator(config: Config) -> Any:
 def _build_optimizer(config: Config) -> Any:
     import optax
 
-    from mjx_reinforce.learners.updates import decay_by_env_steps, make_optimizer
+    from mjx_reinforce.learners import schedules
+    from mjx_reinforce.learners.updates import make_optimizer
 
     rate: Any = config.learning_rate
     final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
@@ -139,8 +140,14 @@ def _build_optimizer(config: Config) -> Any:
     )
     if config.decay_steps is None:
         return optimizer
-    decay = decay_by_env_steps(final / config.learning_rate, config.decay_steps)
-    return optax.chain(optimizer, decay)
+    optimizer = optax.chain(
+        optimizer, schedules.decay_rate(final / config.learning_rate, config.decay_steps)
+    )
+    if config.final_std is None:
+        return optimizer
+    return optax.chain(
+        optimizer, schedules.shrink_std(config.final_std / config.initial_std, config.decay_steps)
+    )
 
 
 def _build_update(config: Config) -> Any:

@@ -139,7 +139,8 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         f"at most {_MAX_LAYERS} layers",
     ),
     (
-        "initial_std learning_rate final_learning_rate max_grad_norm max_kl value_learning_rate "
+        "initial_std final_std learning_rate final_learning_rate max_grad_norm max_kl "
+        "value_learning_rate "
         "step_size noise_std",
         lambda x: math.isfinite(x) and x > 0,
         "positive and finite",
@@ -156,7 +157,8 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         f"in [{1 / _MAX_SIZE:g}, {_MAX_RATE}], for a step moves a weight by about that",
     ),
     (
-        "initial_std noise_std max_grad_norm max_kl standardize_floor entropy_cost weight_decay",
+        "initial_std final_std noise_std max_grad_norm max_kl standardize_floor entropy_cost "
+        "weight_decay",
         lambda x: x == 0 or 1 / _MAX_SIZE <= x <= _MAX_SIZE,
         f"in [{1 / _MAX_SIZE:g}, {_MAX_SIZE:g}], for runs compute in float32",
     ),

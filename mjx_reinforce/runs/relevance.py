@@ -6,6 +6,8 @@ from typing import Any
 
 from mjx_reinforce.runs.config import Config, flag
 
+#: Families whose standard deviation is a parameter, the same in all states.
+FREE_STD = ("normal", "truncated-normal", "clipped-normal", "tanh-normal")
 #: Names of settings, when they are read, and how to say it. A setting may stand in several rows,
 #: the most general first. What stands in none is always read.
 READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
@@ -13,7 +15,7 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
         "num_episodes estimator discount discount_weights standardize standardize_floor "
         "value_learning_rate value_fits value_hidden_sizes update minibatch_updates "
         "minibatch_size loss_per entropy_cost optimizer learning_rate final_learning_rate "
-        "decay_steps decay_updates weight_decay max_grad_norm max_kl",
+        "decay_steps decay_updates weight_decay max_grad_norm max_kl final_std",
         lambda c: c.algorithm == "reinforce",
         "--algorithm reinforce",
     ),
@@ -44,6 +46,12 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
         "final_learning_rate",
         lambda c: c.decay_steps is not None or c.decay_updates is not None,
         "--decay-steps N",
+    ),
+    ("final_std", lambda c: c.decay_steps is not None, "--decay-steps N"),
+    (
+        "final_std",
+        lambda c: c.policy == "auto" or c.policy in FREE_STD,
+        "a --policy with one standard deviation for all states, such as normal,",
     ),
     (
         "initial_std",
@@ -87,7 +95,7 @@ def check_read_by_policy(config: Config, policy: str) -> None:
       policy: the distribution that stands for ``auto``, which depends on the environment.
     """
     chosen, default = dataclasses.replace(config, policy=policy), Config()
-    ours = {name: getattr(default, name) for name in ("initial_std", "rescale")}
+    ours = {name: getattr(default, name) for name in ("initial_std", "final_std", "rescale")}
     check_read(chosen, dataclasses.replace(chosen, **ours))
 
 

@@ -60,6 +60,9 @@ class PolicySettings:
     alike everywhere; or torch.nn.Linear's uniform ones."""
     initial_std: float = 0.5
     """Standard deviation of the actions before training, in the action's unit."""
+    final_std: float | None = None
+    """To this it shrinks over --decay-steps, besides what learning makes of it: some policies play
+    well with their noise alone. None leaves it to learning."""
     rescale: bool = True
     """Scale the mean so that the network's output 1 is the end of the action's range; else the
     output is the mean."""

@@ -7,15 +7,20 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.relevance import FREE_STD
 
 _REINFORCE = (
     *("learning_rate", "final_learning_rate", "decay_steps", "discount", "entropy_cost"),
-    *("standardize_floor", "max_grad_norm", "max_kl", "value_learning_rate", "initial_std"),
+    *(
+        "standardize_floor",
+        "max_grad_norm",
+        "max_kl",
+        "value_learning_rate",
+        "initial_std",
+        "final_std",
+    ),
 )
 _ARS = ("step_size", "noise_std")
-#: Families whose standard deviation is a parameter: what it begins with is in the first state
-#: alone. Others have ``initial_std`` in their actions, which an engine may compile.
-_FREE_STD = ("auto", "normal", "truncated-normal", "clipped-normal", "tanh-normal")
 
 
 class Group(NamedTuple):
@@ -57,7 +62,8 @@ def make_groups(configs: Sequence[Config], swept: Collection[str], *, exact: boo
 def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, float]:
     """Returns the numbers of a configuration that its programs take as arguments."""
     names = _REINFORCE if config.algorithm == "reinforce" else _ARS
-    if config.policy not in _FREE_STD:
+    if config.policy not in ("auto", *FREE_STD):
+        # Others have ``initial_std`` in their actions, which an engine may compile.
         names = tuple(name for name in names if name != "initial_std")
     settings = {name: getattr(config, name) for name in names if exact or name in swept}
     if config.decay_steps is None and config.decay_updates is None:

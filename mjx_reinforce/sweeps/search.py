@@ -9,7 +9,7 @@ import numpy as np
 #: Drawn evenly in their logarithm.
 _LOGARITHMIC = (
     *("learning_rate", "final_learning_rate", "value_learning_rate", "step_size"),
-    *("noise_std", "initial_std", "standardize_floor", "max_grad_norm", "max_kl"),
+    *("noise_std", "initial_std", "final_std", "standardize_floor", "max_grad_norm", "max_kl"),
 )
 #: Digits that are kept of what is drawn.
 _DIGITS = 4
