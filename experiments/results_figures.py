@@ -46,6 +46,8 @@ def _panels(count: int) -> tuple[Any, list[Any]]:
 
 def _curves(results: Sequence[Result]) -> Any:
     """Draws a panel a task; the pendulum's begins late, on a logarithmic axis."""
+    from matplotlib.ticker import EngFormatter
+
     figure, axes = _panels(len(results))
     for ax, result in zip(axes, results, strict=True):
         curve = result.curve
@@ -61,13 +63,14 @@ def _curves(results: Sequence[Result]) -> Any:
         seeds = len(result.seeds["seed"])
         ax.set_title(f"{result.task.name}, {seeds:,} seeds", fontsize="small")
         ax.tick_params(labelsize="x-small")
+        ax.xaxis.set_major_formatter(EngFormatter(sep=""))
         ax.grid(alpha=0.3)
     handles = [
         _line(color=_COLOURS[0], label="IQM over seeds, 95 % interval"),
         _line(color=_COLOURS[4], linewidth=6, alpha=0.4, label="5 to 95 % of seeds"),
         _line("black", f"published mean after {PUBLISHED_STEPS:,} env steps", linestyle="--"),
     ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False)
+    _legend(figure, handles, len(axes))
     figure.supxlabel("env steps of a seed", fontsize="small")
     figure.supylabel("return", fontsize="small")
     return figure
@@ -84,7 +87,7 @@ def _sensitivity(results: Sequence[Result]) -> Any:
         _moved_panel(ax, result, styles)
     handles = [_line(c, spoken(name), marker=m) for name, (c, m) in styles.items()]
     handles.append(_line("black", "defaults, 95 % interval", linewidth=6, alpha=0.2))
-    figure.legend(handles=handles, loc="outside upper center", ncols=5, frameon=False)
+    _legend(figure, handles, len(axes))
     figure.supxlabel("factor by which one setting is moved", fontsize="small")
     return figure
 
@@ -111,6 +114,13 @@ def _moved_panel(ax: Any, result: Result, styles: Mapping[str, tuple[str, str]])
     ax.set_title(result.task.name, fontsize="small")
     ax.tick_params(labelsize="x-small")
     ax.grid(alpha=0.3)
+
+
+def _legend(figure: Any, handles: Sequence[Any], panels: int) -> None:
+    """Writes a legend above the panels, as wide as they are."""
+    columns = 1 + min(panels, _COLUMNS)
+    where = {"loc": "outside upper center", "ncols": columns, "frameon": False}
+    figure.legend(handles=handles, fontsize="x-small", **where)
 
 
 def _line(color: str, label: str, **style: Any) -> Any:

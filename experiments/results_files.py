@@ -15,7 +15,7 @@ from mjx_reinforce.reports.statistics.aggregates import wilson
 from mjx_reinforce.runs.files import csv_bytes
 from mjx_reinforce.sweeps.reading import read_results
 from results_measures import QUANTILES, curves, least_share_solved
-from results_runs import FACTOR, status
+from results_runs import FACTOR, ended, swept
 from results_tasks import Task
 
 #: The policies that are played, by rank in the final evaluation.
@@ -64,12 +64,10 @@ def gather(tasks: Iterable[Task], directory: Path, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for task in tasks:
         run = directory / task.name
-        if status(run) in ("finished", "stopped"):
+        if ended(run):
             _gather_run(run, task.name, folder)
         sweep = directory / "sensitivity" / task.name
-        if (sweep / "sweep.json").exists() and (
-            read_json(sweep / "sweep.json")["status"] == "finished"
-        ):
+        if swept(sweep):
             _write(folder / f"{task.name}-sensitivity.csv", _gather_sweep(sweep))
         played = directory / "play" / f"{task.name}.csv"
         if played.exists():

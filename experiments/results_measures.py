@@ -103,14 +103,14 @@ def curves(
 
     Returns:
       ``env_steps``; the interquartile mean ``iqm`` with its 95 % interval ``low`` and ``high``;
-      quantiles ``q0``, ``q5``, ...; and the share ``solved``, NaN without a threshold.
+      quantiles ``q0``, ``q5``, ..., each the return of a seed; and the share ``solved``, NaN
+      without a threshold.
     """
     grid = steps[-1].min() * np.linspace(0, 1, _POINTS) ** 2
     on = on_grid(grid, steps, returns)
     low, high = iqm_interval(on)
     worst = np.where(np.isfinite(on), on, -np.inf)
-    with np.errstate(invalid="ignore"):
-        values = np.quantile(worst, QUANTILES, axis=1)
+    values = np.quantile(worst, QUANTILES, axis=1, method="inverted_cdf")
     solved = np.full(len(grid), math.nan)
     if threshold is not None:
         at, share = _share_over_steps(returns, steps, threshold)

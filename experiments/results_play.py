@@ -15,7 +15,7 @@ from mjx_reinforce.export.run_files import Run, read_run
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.watch import scene
 from results_files import POLICIES, write_played
-from results_runs import status
+from results_runs import ended
 from results_tasks import ROOT, Task
 
 #: Films: their length (simulated s), frames a second, and size (pixels).
@@ -36,7 +36,7 @@ def play(tasks: Iterable[Task], directory: Path, films: Path, num_episodes: int)
     films.mkdir(parents=True, exist_ok=True)
     for task in tasks:
         path = directory / "play" / f"{task.name}.csv"
-        if status(directory / task.name) is None or path.exists():
+        if path.exists() or not ended(directory / task.name):
             print(f"{task.name} is {'played' if path.exists() else 'not trained'}", flush=True)
             continue
         print(f"== {task.name}", flush=True)

@@ -33,7 +33,7 @@ _MOVED = {
 def train(tasks: Sequence[Task], directory: Path) -> int:
     """Trains tasks, one after the other, each as a program of its own; returns the exit status."""
     for task in tasks:
-        if status(directory / task.name) in ("finished", "stopped"):
+        if ended(directory / task.name):
             print(f"{task.name} is trained", flush=True)
             continue
         print(f"== {task.name}", flush=True)
@@ -55,10 +55,10 @@ def command(task: Task, directory: Path) -> list[str]:
     return [*words, "--output", str(directory)]
 
 
-def status(directory: Path) -> str | None:
-    """Returns what the summary.json of a run says of its end, None where there is none."""
+def ended(directory: Path) -> bool:
+    """Returns whether a run was trained to its end: its budget, or that of finite numbers."""
     path = directory / "summary.json"
-    return read_json(path).get("status") if path.exists() else None
+    return path.exists() and read_json(path)["status"] in ("finished", "stopped")
 
 
 def _wait(words: Sequence[str]) -> int:
@@ -86,7 +86,7 @@ def sensitivity(tasks: Sequence[Task], directory: Path) -> int:
     for task in tasks:
         place = directory / "sensitivity" / task.name
         begun = (place / "sweep.json").exists()
-        if begun and read_json(place / "sweep.json")["status"] == "finished":
+        if swept(place):
             print(f"the settings of {task.name} are swept", flush=True)
             continue
         print(f"== {task.name}", flush=True)
@@ -103,6 +103,12 @@ def sensitivity(tasks: Sequence[Task], directory: Path) -> int:
             if interrupt.number is not None:
                 return 128 + interrupt.number
     return 0
+
+
+def swept(directory: Path) -> bool:
+    """Returns whether a sweep has ended."""
+    path = directory / "sweep.json"
+    return path.exists() and read_json(path)["status"] == "finished"
 
 
 def moves(base: Config) -> Mapping[str, list[Any]]:
