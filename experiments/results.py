@@ -1,0 +1,96 @@
+"""The results of every task with its default settings; docs/results.md is what it writes.
+
+Four stages, each of which can be run alone, by task (``--tasks``), and again: what is there is
+kept, and what was stopped (Ctrl-C, or ``timeout -s INT 570 python ...``) goes on.
+
+    python experiments/results.py train DIR         # DIR/TASK: a run of mjx_reinforce.train
+    python experiments/results.py sensitivity DIR   # DIR/sensitivity/TASK: a sweep
+    python experiments/results.py play DIR          # DIR/play/TASK.csv, docs/films
+    python experiments/results.py page DIR          # experiments/results, docs/results.md
+
+``page`` without DIR writes the page anew from the small files in experiments/results. The tasks,
+their budgets, their seeds and the published figures are the table in results_tasks.py.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from results_tasks import TASKS, Task
+
+ROOT = Path(__file__).parents[1]
+
+
+def main() -> None:
+    """Reads the command line and does what it says."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    commands = parser.add_subparsers(dest="command", required=True)
+    train = commands.add_parser("train", help="train every task")
+    sensitivity = commands.add_parser("sensitivity", help="move every setting by a factor of 3")
+    play = commands.add_parser("play", help="play the best and median seeds in Gymnasium; films")
+    page = commands.add_parser("page", help="gather what the stages left, and write the page")
+    for command in (train, sensitivity, play, page):
+        needed = None if command is not page else "?"
+        command.add_argument("directory", type=Path, nargs=needed, help="of all stages")
+    for command in (train, sensitivity, play):
+        command.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
+    for command in (train, sensitivity):
+        command.add_argument("--num-seeds", type=int, help="in place of the table's")
+        command.add_argument("--env-steps", type=int, help="of a seed, in place of the table's")
+    play.add_argument("--episodes", type=int, default=100, help="of each policy, in both")
+    for command in (play, page):
+        command.add_argument("--docs", type=Path, default=ROOT / "docs", help="of page and films")
+    kept = ROOT / "experiments" / "results"
+    page.add_argument("--results", type=Path, default=kept, help="of the small files")
+    arguments = parser.parse_args()
+    try:
+        sys.exit(_COMMANDS[arguments.command](arguments))
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _tasks(arguments: argparse.Namespace) -> Sequence[Task]:
+    changes = {"seeds": arguments.num_seeds, "sweep_seeds": arguments.num_seeds}
+    changes |= {"env_steps": arguments.env_steps, "sweep_steps": arguments.env_steps}
+    given = {name: value for name, value in changes.items() if value is not None}
+    return [TASKS[name]._replace(**given) for name in arguments.tasks]
+
+
+def _train(arguments: argparse.Namespace) -> int:
+    import results_runs
+
+    return results_runs.train(_tasks(arguments), arguments.directory)
+
+
+def _sensitivity(arguments: argparse.Namespace) -> int:
+    import results_runs
+
+    return results_runs.sensitivity(_tasks(arguments), arguments.directory)
+
+
+def _play(arguments: argparse.Namespace) -> int:
+    import results_play
+
+    tasks, films = [TASKS[name] for name in arguments.tasks], arguments.docs / "films"
+    results_play.play(tasks, arguments.directory, films, arguments.episodes)
+    return 0
+
+
+def _page(arguments: argparse.Namespace) -> int:
+    import results_files
+    import results_page
+
+    if arguments.directory is not None:
+        results_files.gather(TASKS.values(), arguments.directory, arguments.results)
+    results_page.write(results_files.load(TASKS.values(), arguments.results), arguments.docs)
+    return 0
+
+
+_COMMANDS = {"train": _train, "sensitivity": _sensitivity, "play": _play, "page": _page}
+
+if __name__ == "__main__":
+    main()

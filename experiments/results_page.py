@@ -1,0 +1,206 @@
+"""docs/results.md, with its pictures: every number and word of it follows from the small files."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import results_figures
+import results_tables as tables
+from results_files import POLICIES, STAY_SOLVED, Result
+from results_runs import FACTOR
+from results_tasks import PUBLISHED_SEEDS, PUBLISHED_STEPS, Task, horizon
+from seeds_markdown import listed
+
+_VERDICTS = {
+    "above": "above the published figure",
+    "not apart": "not apart from the published figure",
+    "below": "below the published figure",
+    "none published": "without a published figure",
+    "none: a seed failed": "no mean, since a seed left the finite numbers",
+}
+
+
+def write(parts: Sequence[Result | Task], docs: Path) -> None:
+    """Writes results.md, and its pictures into the folder results.
+
+    Args:
+      parts: what is kept of each task, or the task where nothing is.
+      docs: the folder.
+
+    Raises:
+      ValueError: nothing is kept of any task.
+    """
+    results = [part for part in parts if isinstance(part, Result)]
+    if not results:
+        raise ValueError("there is no result yet: run the stage train, then page DIR")
+    results_figures.draw(results, docs / "results")
+    (docs / "results.md").write_text(page(parts, docs), encoding="utf-8")
+
+
+def page(parts: Sequence[Result | Task], docs: Path) -> str:
+    """Returns the page's text; films and pictures are linked where they are in ``docs``."""
+    results = [part for part in parts if isinstance(part, Result)]
+    sections = [
+        "# Results",
+        _introduction(results),
+        _missing(parts),
+        tables.results_table(results),
+        _verdicts(results),
+        _notes(results),
+        _explanation(results),
+        *_pendulum(results),
+        "## Learning curves",
+        "![Learning curves of every task](results/curves.png)",
+        *_played(results, docs),
+        *_moved(results),
+        "## How to do it again",
+        _commands(results),
+    ]
+    return "\n\n".join(section for section in sections if section) + "\n"
+
+
+def _introduction(results: Sequence[Result]) -> str:
+    roots = dict.fromkeys(f"{result.facts['settings']['seed']:,}" for result in results)
+    return (
+        "REINFORCE with the default settings of every task, as `python -m mjx_reinforce.train`\n"
+        f"has them, on seeds that no tuning used (root {listed(roots)}). This page, words\n"
+        "included, is written by `experiments/results.py` from the measured runs; last are the\n"
+        "commands."
+    )
+
+
+def _missing(parts: Sequence[Result | Task]) -> str:
+    missing = [part.name for part in parts if isinstance(part, Task)]
+    unfinished = [
+        part.task.name
+        for part in parts
+        if isinstance(part, Result) and part.facts["status"] != "finished"
+    ]
+    said = []
+    if missing:
+        said.append(f"Not run yet: {listed(missing)}.")
+    if unfinished:
+        said.append(f"Stopped, since nothing was finite any more: {listed(unfinished)}.")
+    return " ".join(said)
+
+
+def _verdicts(results: Sequence[Result]) -> str:
+    said = []
+    for verdict, words in _VERDICTS.items():
+        tasks = [result.task.name for result in results if tables.verdict_of(result) == verdict]
+        if tasks:
+            said.append(f"* {words}: {listed(tasks)}")
+    return "\n".join(["Means over seeds:", "", *said])
+
+
+def _notes(results: Sequence[Result]) -> str:
+    notes = [(result.task.name, result.task.note) for result in results if result.task.note]
+    return "\n".join(f"* {name}: {note}" for name, note in notes)
+
+
+def _explanation(results: Sequence[Result]) -> str:
+    episodes = sorted({result.facts["settings"]["eval_episodes"] for result in results})
+    shorter = [
+        f"{result.task.name} ({result.facts['settings']['horizon']} of {horizon(result.task.env)})"
+        for result in results
+        if result.facts["settings"]["horizon"] != horizon(result.task.env)
+    ]
+    said = [
+        "* A return is that of the policy at the end of training, without noise: the mean of\n"
+        f"  {listed(map(str, episodes))} episodes on starts that no training uses. It is not\n"
+        "  the best evaluation on the way.",
+        "* IQM: the mean of the middle half of the seeds. Intervals are 95 % bootstrap\n"
+        "  intervals over seeds ([statistics.md](statistics.md)).",
+        f"* Published: Tianshou's REINFORCE after {PUBLISHED_STEPS:,} env steps,\n"
+        f"  {PUBLISHED_SEEDS} seeds (examples/mujoco/README.md in its repository). What stands\n"
+        "  there after ± is read as the standard deviation over seeds; the interval is Student's,\n"
+        "  of the mean. Their figure is that of the best evaluation on the way, and their tasks\n"
+        "  are Gym 0.17's -v2 and -v3, which are not in everything those of -v5.",
+        "* Above: our interval of the mean lies above theirs; below: it lies below; not apart:\n"
+        "  they overlap.",
+        "* Training: wall time of all seeds together, evaluations included. Compiling: before\n"
+        "  it, with whatever the machine's compilation cache held.",
+    ]
+    if shorter:
+        said.append(f"* Episodes shorter than the task's limit, in steps: {listed(shorter)}.")
+    return "\n".join(said)
+
+
+def _pendulum(results: Sequence[Result]) -> list[str]:
+    solved = [result for result in results if result.task.env.startswith("InvertedPendulum-")]
+    if not solved:
+        return []
+    threshold = solved[0].facts["threshold"]
+    start, stop = STAY_SOLVED
+    return [
+        "## InvertedPendulum-v5, seed by seed",
+        f"Solved is a return of {threshold:g} in an evaluation. The least share solved is of\n"
+        f"the seeds that are solved at once, at any time from {start:,} to {stop:,} env steps,\n"
+        "each as its last evaluation until then showed it: a seed that falls again is not solved.",
+        tables.pendulum_table(solved),
+    ]
+
+
+def _played(results: Sequence[Result], docs: Path) -> list[str]:
+    played = [result for result in results if result.played is not None]
+    if not played:
+        return []
+    pairs = [tables.comparison(result, policy) for result in played for policy in POLICIES]
+    found = [pair for pair in pairs if pair is not None]
+    first = played[0].played
+    assert first is not None
+    episodes = int(first["episode"].max()) + 1
+    version = next(str(x) for x in first["simulation"] if x != "ours")
+    within = sum(pair.within for pair in found)
+    apart = sum(not pair.difference.low <= 0 <= pair.difference.high for pair in found)
+    words = (
+        "The best and the median seed of every task by the final evaluation, without noise, in\n"
+        f"{episodes:,} episodes here and {episodes:,} in plain {version.capitalize()}, each from\n"
+        f"starts that were used nowhere else. Of {len(found)} policies, {within} have\n"
+        "Gymnasium's mean within our 95 % interval. If both simulations were the same, that\n"
+        "would be so for five in six: our interval knows nothing of the chance in Gymnasium's\n"
+        "starts. The interval of the difference does, and would leave out zero for one in\n"
+        f"twenty: it does for {apart} of {len(found)}."
+    )
+    missing = [result.task.name for result in results if result.played is None]
+    words += f" Not played yet: {listed(missing)}." if missing else ""
+    return ["## In Gymnasium, and films", words, tables.play_table(played, docs)]
+
+
+def _moved(results: Sequence[Result]) -> list[str]:
+    swept = [result for result in results if result.moved is not None]
+    if not swept:
+        return []
+    missing = [result.task.name for result in results if result.moved is None]
+    words = (
+        f"Each setting alone, at a third and at {FACTOR} times its default (the discount by its\n"
+        f"distance from 1: a third of that distance is the factor {FACTOR}), with the env steps\n"
+        "that the table says. Drawn is the share of seeds solved at the end where the defaults\n"
+        "solve half of them, else the IQM of the final return, both with 95 % intervals. What\n"
+        "is *surely* worse or better has an interval apart from that of the defaults; nothing is\n"
+        "corrected for how many are compared."
+    )
+    words += f" Not swept yet: {listed(missing)}." if missing else ""
+    return [
+        "## How much each setting matters",
+        words,
+        "![Solve rate or return against the factor of each setting](results/sensitivity.png)",
+        tables.moved_table(swept),
+    ]
+
+
+def _commands(results: Sequence[Result]) -> str:
+    facts = [result.facts for result in results]
+    engines = listed(dict.fromkeys(str(one["engine"]) for one in facts))
+    commits = listed(dict.fromkeys(str(one["git_commit"] or "unknown")[:12] for one in facts))
+    jax = listed(dict.fromkeys(str(one["packages"]["jax"]) for one in facts))
+    return f"""```sh
+python experiments/results.py train DIR         # every task, one after the other
+python experiments/results.py sensitivity DIR   # moves every setting
+python experiments/results.py play DIR          # Gymnasium and films
+python experiments/results.py page DIR          # this page
+```
+
+`--tasks` chooses tasks; what is in DIR is kept, and what was stopped goes on. `page` without
+DIR writes this page from the small files in `experiments/results`: a row for each seed, the
+curves as quantiles, the sweeps, and the return of every episode that was played. Trained at
+commit {commits}, with the engine {engines} and JAX {jax}."""

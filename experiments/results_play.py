@@ -1,0 +1,128 @@
+"""The best and the median policy of every task in Gymnasium and in our simulation, and films."""
+
+import dataclasses
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce import envs
+from mjx_reinforce.export.files import read_json
+from mjx_reinforce.export.films import Renderer, import_mujoco, write_film
+from mjx_reinforce.export.run_files import Run, read_run
+from mjx_reinforce.runs.jax_setup import configure_jax
+from mjx_reinforce.watch import scene
+from results_files import POLICIES, write_played
+from results_runs import ended
+from results_tasks import ROOT, Task
+
+#: Films: their length (simulated s), frames a second, and size (pixels).
+_SECONDS, _RATE, _SIZE = 8.0, 15, (320, 240)
+
+
+def play(tasks: Iterable[Task], directory: Path, films: Path, num_episodes: int) -> None:
+    """Plays the policies of those tasks whose runs have ended, and films them in Gymnasium.
+
+    Args:
+      tasks: of the results.
+      directory: of the stages; the returns go to DIR/play/TASK.csv.
+      films: the folder of films, TASK-best.gif and TASK-median.gif.
+      num_episodes: of each policy in each simulation.
+    """
+    import_mujoco()
+    configure_jax()
+    films.mkdir(parents=True, exist_ok=True)
+    for task in tasks:
+        path = directory / "play" / f"{task.name}.csv"
+        if path.exists() or not ended(directory / task.name):
+            print(f"{task.name} is {'played' if path.exists() else 'not trained'}", flush=True)
+            continue
+        print(f"== {task.name}", flush=True)
+        run = read_run(directory / task.name)
+        ours = _own_simulation(run, num_episodes)
+        rows: list[dict[str, Any]] = []
+        for policy in POLICIES:
+            rows += _play(run, policy, num_episodes, ours, films / f"{task.name}-{policy}.gif")
+        write_played(path, rows)
+
+
+def _own_simulation(run: Run, num_episodes: int) -> Any:
+    """Returns a function from an actor to the returns [N] of episodes from fresh starts."""
+    import jax
+
+    from mjx_reinforce.engines.rollouts import episode_returns
+    from mjx_reinforce.runs.build import build
+    from mjx_reinforce.runs.resume import as_config
+
+    path = run.directory / "config.json"
+    config = dataclasses.replace(as_config(read_json(path), path), num_seeds=1, engine="auto")
+    env = envs.make(run.env)
+    learner, horizon = build(env, config)
+
+    @jax.jit
+    def returns(actor):
+        return episode_returns(
+            learner.engine.rollout(
+                env,
+                learner.act,
+                actor,
+                learner.policy.distribution,
+                # Training and its evaluations split the keys of their roots; this is not split.
+                jax.random.key(ROOT + 1),
+                num_episodes=num_episodes,
+                horizon=horizon,
+                num_deterministic=num_episodes,
+            )
+        )
+
+    return returns
+
+
+def _play(run: Run, policy: Any, num_episodes: int, ours: Any, film: Path) -> list[dict[str, Any]]:
+    """Plays one policy, films it, and returns a row for each episode."""
+    from mjx_reinforce.export.player import load_seed
+    from mjx_reinforce.runs.playing import gymnasium_simulator
+
+    player, _ = load_seed(run, policy)
+    version, simulate = gymnasium_simulator(player, run.horizon)
+    episodes = [simulate(number, False) for number in range(num_episodes)]
+    returns = {
+        "ours": np.asarray(ours(player.actor), float).tolist(),
+        f"gymnasium {version}": [episode.total for episode in episodes],
+    }
+    for name, values in returns.items():
+        print(f"{policy}, seed {player.seed}: mean return {np.mean(values):.1f} in {name}")
+    _film(film, run.env, [episode.qpos for episode in episodes])
+    return [
+        {
+            "policy": policy,
+            "seed": player.seed,
+            "simulation": name,
+            "episode": number,
+            "return": f"{value:.9g}",
+        }
+        for name, values in returns.items()
+        for number, value in enumerate(values)
+    ]
+
+
+def _film(path: Path, env_id: str, episodes: Sequence[np.ndarray]) -> None:
+    """Writes a film of episodes [T, nq] one after the other, until it is long enough."""
+    env = envs.make(env_id)
+    renderer = Renderer(scene(env), *_SIZE)
+    skip = max(1, math.ceil(1 / (env.dt * _RATE) - 1e-9))
+    shown = np.concatenate([qpos[::skip] for qpos in episodes])
+    shown = shown[: max(1, round(_SECONDS / (env.dt * skip)))]
+    samples = [_plain(renderer.draw(qpos)) for qpos in shown[:: -(-len(shown) // 4)]]
+    write_film(path, _frames(renderer, shown), 1 / (env.dt * skip), samples)
+
+
+def _frames(renderer: Renderer, shown: np.ndarray) -> Iterator[np.ndarray]:
+    return (_plain(renderer.draw(qpos)) for qpos in shown)
+
+
+def _plain(frame: np.ndarray) -> np.ndarray:
+    """Returns a picture with 16 levels of each colour, which takes a fraction of the space."""
+    return frame // 16 * 16 + 8

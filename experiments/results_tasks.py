@@ -1,0 +1,89 @@
+"""What the results are of: every task, its seeds and budget, and the figure to hold against it."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.runs.measured import TASKS as MEASURED
+
+#: Root of all randomness of the results. No tuning used it, nor is it named anywhere else.
+ROOT = 0
+#: The seeds of a published figure, and the env steps of each.
+PUBLISHED_SEEDS, PUBLISHED_STEPS = 10, 10_000_000
+#: A run is evaluated about so often, more where episodes end before their limit.
+_EVALUATIONS = 40
+
+
+class Task(NamedTuple):
+    """One row of the results.
+
+    name: of its files: the environment's id, and what else is not the default
+    env: the environment's id
+    seeds: how many are trained
+    env_steps: budget of each
+    published: mean and standard deviation over ``PUBLISHED_SEEDS`` seeds, if there is a figure
+    sweep_steps: budget of each seed where settings are moved
+    sweep_seeds: how many of each configuration
+    settings: what differs from the task's default settings
+    note: what the page says besides, such as what was tried where a return is below the published
+    """
+
+    name: str
+    env: str
+    seeds: int
+    env_steps: int
+    published: tuple[float, float] | None
+    sweep_steps: int
+    sweep_seeds: int = 16
+    settings: dict[str, Any] = {}  # noqa: RUF012 - nobody changes it
+    note: str = ""
+
+
+#: Published: REINFORCE of Tianshou, examples/mujoco/README.md there.
+TASKS: dict[str, Task] = {
+    task.name: task
+    for task in (
+        Task(
+            *("InvertedPendulum-v5", "InvertedPendulum-v5"),
+            *(4096, 1_000_000, (1000.0, 0.0), 280_000, 256),
+        ),
+        Task(
+            *("InvertedPendulum-v5-32-32", "InvertedPendulum-v5"),
+            *(4096, 1_000_000, (1000.0, 0.0), 280_000, 256),
+            settings={"hidden_sizes": (32, 32)},
+        ),
+        Task(
+            *("InvertedDoublePendulum-v5", "InvertedDoublePendulum-v5"),
+            *(64, 3_000_000, (7726.2, 1287.3), 1_000_000),
+        ),
+        Task("Reacher-v5", "Reacher-v5", 64, 3_000_000, (-5.5, 0.2), 1_000_000),
+        Task("Pusher-v5", "Pusher-v5", 16, 2_000_000, None, 500_000),
+        Task("Swimmer-v5", "Swimmer-v5", 64, 2_000_000, (35.6, 2.6), 500_000),
+        Task("HalfCheetah-v5", "HalfCheetah-v5", 64, 2_000_000, (1138.8, 104.7), 500_000),
+        Task("Hopper-v5", "Hopper-v5", 64, 2_000_000, (416.0, 104.7), 500_000),
+        Task("Walker2d-v5", "Walker2d-v5", 64, 1_000_000, (440.9, 148.2), 300_000),
+        Task("Ant-v5", "Ant-v5", 16, 2_000_000, (1108.1, 323.1), 300_000),
+        Task("Humanoid-v5", "Humanoid-v5", 16, 1_000_000, (464.3, 58.4), 200_000),
+        Task("HumanoidStandup-v5", "HumanoidStandup-v5", 16, 1_000_000, None, 200_000),
+    )
+}
+
+
+def settings_of(task: Task, num_seeds: int, env_steps: int) -> Config:
+    """Returns the settings of a task's runs: its defaults, but for these and ``eval_every``."""
+    config = dataclasses.replace(
+        of_task(task.env), num_seeds=num_seeds, seed=ROOT, env_steps=env_steps, **task.settings
+    )
+    return dataclasses.replace(config, eval_every=_eval_every(config, env_steps))
+
+
+def horizon(env: str) -> int:
+    """Returns the time limit of a task in env steps."""
+    return MEASURED[env].horizon
+
+
+def _eval_every(config: Config, env_steps: int) -> int:
+    """Returns the updates between evaluations."""
+    update = config.episodes_per_update * (config.horizon or horizon(config.env))
+    return max(1, env_steps // update // _EVALUATIONS)
