@@ -87,6 +87,6 @@ def horizon(env: str) -> int:
 
 
 def _eval_every(config: Config, env_steps: int) -> int:
-    """Returns the updates between evaluations: the default, or more of them where those are many."""
+    """Returns the updates between evaluations: the default, or more where those are many."""
     update = config.episodes_per_update * (config.horizon or horizon(config.env))
     return max(config.eval_every, env_steps // update // _EVALUATIONS)
