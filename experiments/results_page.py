@@ -113,8 +113,8 @@ def _explanation(results: Sequence[Result]) -> str:
         f"* Published: Tianshou's REINFORCE after {PUBLISHED_STEPS:,} env steps,\n"
         f"  {PUBLISHED_SEEDS} seeds (examples/mujoco/README.md in its repository). What stands\n"
         "  there after ± is read as the standard deviation over seeds; the interval is Student's,\n"
-        "  of the mean. Their figure is that of the best evaluation on the way, and their tasks\n"
-        "  are Gym 0.17's -v2 and -v3, which are not in everything those of -v5.",
+        "  of the mean. Their mean is that of the evaluation where it was greatest, ours that at\n"
+        "  the end; their tasks are Gym 0.17's -v2 and -v3, not in everything those of -v5.",
         "* Above: our interval of the mean lies above theirs; below: it lies below; not apart:\n"
         "  they overlap.",
         "* Training: wall time of all seeds together, evaluations included. Compiling: before\n"
@@ -122,7 +122,7 @@ def _explanation(results: Sequence[Result]) -> str:
     ]
     if shorter:
         said.append(f"* Episodes shorter than the task's limit, in steps: {listed(shorter)}.")
-    return "\n".join(said)
+    return "\n".join(["How to read this:", "", *said])
 
 
 def _pendulum(results: Sequence[Result]) -> list[str]:
