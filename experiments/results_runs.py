@@ -49,7 +49,7 @@ def command(task: Task, directory: Path) -> list[str]:
         return [*start, "--resume", str(directory)]
     config = settings_of(task, task.seeds, task.env_steps)
     words = [*start, "--env", task.env]
-    for name in (*task.settings, "num_seeds", "seed", "env_steps", "eval_every"):
+    for name in (*task.settings, "num_seeds", "seed", "env_steps", "max_updates", "eval_every"):
         value = getattr(config, name)
         words += [flag(name), *map(str, value if isinstance(value, tuple) else [value])]
     return [*words, "--output", str(directory)]

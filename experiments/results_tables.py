@@ -73,7 +73,12 @@ def results_table(results: Sequence[Result]) -> str:
     """Returns the table of all tasks."""
     header = [
         *("task", "seeds", "env steps a seed", "IQM (95 %)", "mean (95 %)", "worst seed"),
-        *("solved at the end (at)", "published (95 %)", "our mean is", "training, compiling"),
+        *(
+            "solved at the end (threshold)",
+            "published (95 %)",
+            "our mean is",
+            "training, compiling",
+        ),
         *("machine", "Gymnasium: best, median seed"),
     ]
     return table(header, map(_result_row, results))

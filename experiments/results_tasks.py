@@ -26,6 +26,8 @@ class Task(NamedTuple):
     sweep_steps: budget of each seed where settings are moved
     sweep_seeds: how many of each configuration
     settings: what differs from the task's default settings
+    patience: a seed ends after so many times the updates that episodes up to the time limit would
+      need: else one whose episodes stay a few steps long would be waited for, for ever
     note: what the page says besides, such as what was tried where a return is below the published
     """
 
@@ -37,6 +39,7 @@ class Task(NamedTuple):
     sweep_steps: int
     sweep_seeds: int = 16
     settings: dict[str, Any] = {}  # noqa: RUF012 - nobody changes it
+    patience: int = 50
     note: str = ""
 
 
@@ -47,11 +50,13 @@ TASKS: dict[str, Task] = {
         Task(
             *("InvertedPendulum-v5", "InvertedPendulum-v5"),
             *(4096, 1_000_000, (1000.0, 0.0), 280_000, 256),
+            patience=12,
         ),
         Task(
             *("InvertedPendulum-v5-32-32", "InvertedPendulum-v5"),
             *(4096, 1_000_000, (1000.0, 0.0), 280_000, 256),
             settings={"hidden_sizes": (32, 32)},
+            patience=12,
         ),
         Task(
             *("InvertedDoublePendulum-v5", "InvertedDoublePendulum-v5"),
@@ -71,19 +76,21 @@ TASKS: dict[str, Task] = {
 
 
 def settings_of(task: Task, num_seeds: int, env_steps: int) -> Config:
-    """Returns the settings of a task's runs: its defaults, but for these and ``eval_every``."""
+    """Returns the settings of a task's runs: its defaults, but for these and two more.
+
+    They are how often it is evaluated, and after how many updates a seed ends at the latest.
+    """
     config = dataclasses.replace(
         of_task(task.env), num_seeds=num_seeds, seed=ROOT, env_steps=env_steps, **task.settings
     )
-    return dataclasses.replace(config, eval_every=_eval_every(config, env_steps))
+    updates = -(-env_steps // (config.episodes_per_update * (config.horizon or horizon(task.env))))
+    return dataclasses.replace(
+        config,
+        eval_every=max(1, updates // _EVALUATIONS),
+        max_updates=task.patience * updates,
+    )
 
 
 def horizon(env: str) -> int:
     """Returns the time limit of a task in env steps."""
     return MEASURED[env].horizon
-
-
-def _eval_every(config: Config, env_steps: int) -> int:
-    """Returns the updates between evaluations."""
-    update = config.episodes_per_update * (config.horizon or horizon(config.env))
-    return max(1, env_steps // update // _EVALUATIONS)
