@@ -28,7 +28,14 @@ _CURVE_COLUMNS = (
     *(f"q{100 * q:g}" for q in QUANTILES),
     "solved",
 )
-_MOVED = {"setting": str, "value": str, "factor": float, "seeds": int, "env_steps": int}
+_MOVED = {
+    "setting": str,
+    "value": str,
+    "factor": float,
+    "seeds": int,
+    "env_steps": int,
+    "cut_short": int,
+}
 _MOVED_RETURNS = ("iqm", "low", "high", "solved", "solved_low", "solved_high")
 _PLAYED = {"policy": str, "seed": int, "simulation": str, "episode": int, "return": float}
 
@@ -103,12 +110,13 @@ def _gather_run(run: Path, name: str, folder: Path) -> None:
     facts |= {
         "nonfinite_updates": len(summary["nonfinite"]),
         "least_share_solved": least,
+        "cut_short": int(np.sum(steps[-1] < config["env_steps"])),
         "evaluations": len(returns),
         "settings": {k: v for k, v in config.items() if k not in (*PROVENANCE, "output")},
     }
     write_json(folder / f"{name}.json", facts)
     _write(folder / f"{name}-seeds.csv", columns)
-    _write(folder / f"{name}-curve.csv", curves(returns, steps, threshold))
+    _write(folder / f"{name}-curve.csv", curves(returns, steps, threshold, config["env_steps"]))
 
 
 def _gather_sweep(directory: Path) -> Columns:
@@ -126,7 +134,8 @@ def _gather_sweep(directory: Path) -> Columns:
         less = name is not None and values[name] < base[name]
         factor = 1 if name is None else 1 / FACTOR if less else FACTOR
         value = "" if name is None else f"{values[name]:.9g}"
-        moved = name or "default", value, factor, len(final), budget
+        cut = int(np.sum(results.env_steps[-1, results.configuration == number] < budget))
+        moved = name or "default", value, factor, len(final), budget, cut
         rows.append((*moved, iqm(final), low, high, *found))
     names = (*_MOVED, *_MOVED_RETURNS)
     return {name: np.array(x) for name, x in zip(names, zip(*rows, strict=True), strict=True)}

@@ -70,9 +70,10 @@ def least_share_solved(
       steps: [E, S] the seed's env steps until then; the first evaluation's are 0.
       threshold: the return that counts as solved.
       start: env steps.
-      stop: env steps; NaN is returned where a seed was trained for less.
+      stop: env steps; NaN is returned where all seeds were trained for less. One that was trained
+        for less than others keeps its last return.
     """
-    if steps[-1].min() < stop:
+    if steps[-1].max() < stop:
         return math.nan
     at, share = _share_over_steps(returns, steps, threshold)
     first = np.searchsorted(at, start, side="right") - 1
@@ -92,7 +93,7 @@ def _share_over_steps(
 
 
 def curves(
-    returns: np.ndarray, steps: np.ndarray, threshold: float | None
+    returns: np.ndarray, steps: np.ndarray, threshold: float | None, budget: float
 ) -> dict[str, np.ndarray]:
     """Returns the learning curve over seeds by column, on a grid of env steps [K].
 
@@ -100,13 +101,14 @@ def curves(
       returns: [E, S] at each evaluation.
       steps: [E, S] env steps until then.
       threshold: the return that counts as solved, if any.
+      budget: the env steps at which the curve ends; a seed that ended before keeps its return.
 
     Returns:
       ``env_steps``; the interquartile mean ``iqm`` with its 95 % interval ``low`` and ``high``;
       quantiles ``q0``, ``q5``, ..., each the return of a seed; and the share ``solved``, NaN
       without a threshold.
     """
-    grid = steps[-1].min() * np.linspace(0, 1, _POINTS) ** 2
+    grid = min(budget, steps[-1].max()) * np.linspace(0, 1, _POINTS) ** 2
     on = on_grid(grid, steps, returns)
     low, high = iqm_interval(on)
     worst = np.where(np.isfinite(on), on, -np.inf)

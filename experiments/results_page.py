@@ -113,16 +113,27 @@ def _explanation(results: Sequence[Result]) -> str:
         f"* Published: Tianshou's REINFORCE after {PUBLISHED_STEPS:,} env steps,\n"
         f"  {PUBLISHED_SEEDS} seeds (examples/mujoco/README.md in its repository). What stands\n"
         "  there after ± is read as the standard deviation over seeds; the interval is Student's,\n"
-        "  of the mean. Their figure is that of the best evaluation on the way, and their tasks\n"
-        "  are Gym 0.17's -v2 and -v3, which are not in everything those of -v5.",
+        "  of the mean. Their mean is that of the evaluation where it was greatest, ours that at\n"
+        "  the end; their tasks are Gym 0.17's -v2 and -v3, not in everything those of -v5.",
         "* Above: our interval of the mean lies above theirs; below: it lies below; not apart:\n"
         "  they overlap.",
         "* Training: wall time of all seeds together, evaluations included. Compiling: before\n"
         "  it, with whatever the machine's compilation cache held.",
     ]
+    cut = [
+        f"{result.task.name} {result.facts['cut_short']:,} of {len(result.seeds['seed']):,} (after "
+        f"{result.facts['settings']['max_updates']:,} updates)"
+        for result in results
+        if result.facts["cut_short"]
+    ]
+    if cut:
+        said.append(
+            "* Seeds whose episodes stayed so short that their updates did not use up their env\n"
+            f"  steps ended there, and keep their last return: {listed(cut)}."
+        )
     if shorter:
         said.append(f"* Episodes shorter than the task's limit, in steps: {listed(shorter)}.")
-    return "\n".join(said)
+    return "\n".join(["How to read this:", "", *said])
 
 
 def _pendulum(results: Sequence[Result]) -> list[str]:
@@ -179,6 +190,9 @@ def _moved(results: Sequence[Result]) -> list[str]:
         "is *surely* worse or better has an interval apart from that of the defaults; nothing is\n"
         "corrected for how many are compared."
     )
+    cut = [name for name, short in map(_cut_short, swept) if short]
+    if cut:
+        words += f" Runs that ended before, since their episodes stayed short: {listed(cut)}."
     words += f" Not swept yet: {listed(missing)}." if missing else ""
     return [
         "## How much each setting matters",
@@ -186,6 +200,13 @@ def _moved(results: Sequence[Result]) -> list[str]:
         "![Solve rate or return against the factor of each setting](results/sensitivity.png)",
         tables.moved_table(swept),
     ]
+
+
+def _cut_short(result: Result) -> tuple[str, int]:
+    """Returns a task with how many runs of its sweep ended before their env steps, and that."""
+    assert result.moved is not None
+    short, runs = (int(result.moved[name].sum()) for name in ("cut_short", "seeds"))
+    return f"{result.task.name} {short:,} of {runs:,}", short
 
 
 def _commands(results: Sequence[Result]) -> str:

@@ -19,7 +19,7 @@ from results_runs import ended
 from results_tasks import ROOT, Task
 
 #: Films: their length (simulated s), frames a second, and size (pixels).
-_SECONDS, _RATE, _SIZE = 8.0, 15, (320, 240)
+_SECONDS, _RATE, _SIZE = 6.0, 12, (320, 240)
 
 
 def play(tasks: Iterable[Task], directory: Path, films: Path, num_episodes: int) -> None:
@@ -124,5 +124,5 @@ def _frames(renderer: Renderer, shown: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _plain(frame: np.ndarray) -> np.ndarray:
-    """Returns a picture with 16 levels of each colour, which takes a fraction of the space."""
-    return frame // 16 * 16 + 8
+    """Returns a picture with 8 levels of each colour, which takes half the space in a film."""
+    return frame // 32 * 32 + 16

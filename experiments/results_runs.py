@@ -13,7 +13,7 @@ from mjx_reinforce.runs.config import Config, flag
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.sweeps.design import Design, read_design
 from mjx_reinforce.sweeps.perform import perform
-from results_tasks import Task, settings_of
+from results_tasks import Task, settings_of, sweep_settings_of
 
 #: Each setting is moved by this factor either way.
 FACTOR = 3
@@ -90,7 +90,7 @@ def sensitivity(tasks: Sequence[Task], directory: Path) -> int:
             print(f"the settings of {task.name} are swept", flush=True)
             continue
         print(f"== {task.name}", flush=True)
-        base = settings_of(task, task.sweep_seeds, task.sweep_steps)
+        base = sweep_settings_of(task, task.sweep_seeds, task.sweep_steps)
         if begun:
             base = read_design(place).base
         design = OneAtATime(

@@ -73,7 +73,12 @@ def results_table(results: Sequence[Result]) -> str:
     """Returns the table of all tasks."""
     header = [
         *("task", "seeds", "env steps a seed", "IQM (95 %)", "mean (95 %)", "worst seed"),
-        *("solved at the end", "published (95 %)", "our mean is", "training, compiling"),
+        *(
+            "solved at the end (threshold)",
+            "published (95 %)",
+            "our mean is",
+            "training, compiling",
+        ),
         *("machine", "Gymnasium: best, median seed"),
     ]
     return table(header, map(_result_row, results))
@@ -84,7 +89,7 @@ def _result_row(result: Result) -> list[str]:
     threshold, published = facts["threshold"], result.task.published
     solved = "no threshold"
     if threshold is not None:
-        solved = f"{int(np.sum(final >= threshold)):,} of {len(final):,} ({threshold:g})"
+        solved = f"{int(np.sum(final >= threshold)):,} of {len(final):,} ({threshold:,g})"
     theirs = "none" if published is None else estimate(published_interval(*published))
     played = [comparison(result, policy) for policy in POLICIES]
     return [

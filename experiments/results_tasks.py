@@ -27,6 +27,8 @@ class Task(NamedTuple):
     sweep_steps: budget of each seed where settings are moved
     sweep_seeds: how many of each configuration
     settings: what differs from the task's default settings
+    patience: in the sweep a seed ends after so many times the updates that episodes up to the time
+      limit would need: else one whose episodes stay a few steps long would be waited for
     note: what the page says besides, such as what was tried where a return is below the published
     root: of its seeds
     """
@@ -39,6 +41,7 @@ class Task(NamedTuple):
     sweep_steps: int
     sweep_seeds: int = 16
     settings: dict[str, Any] = {}  # noqa: RUF012 - nobody changes it
+    patience: int = 50
     note: str = ""
     root: int = ROOT
 
@@ -51,11 +54,13 @@ TASKS: dict[str, Task] = {
             *("InvertedPendulum-v5", "InvertedPendulum-v5"),
             *(4096, 1_000_000, (1000.0, 0.0), 280_000, 256),
             settings={"eval_every": 2},
+            patience=12,
         ),
         Task(
             *("InvertedPendulum-v5-32-32", "InvertedPendulum-v5"),
             *(4096, 1_000_000, (1000.0, 0.0), 280_000, 256),
             settings={**PENDULUM_NETWORK, "eval_every": 2},
+            patience=12,
         ),
         Task(
             *("InvertedDoublePendulum-v5", "InvertedDoublePendulum-v5"),
@@ -90,7 +95,15 @@ def settings_of(task: Task, num_seeds: int, env_steps: int) -> Config:
     )
     if "eval_every" in task.settings:
         return config
-    return dataclasses.replace(config, eval_every=_eval_every(config, env_steps))
+    every = max(config.eval_every, _updates(task, config, env_steps) // _EVALUATIONS)
+    return dataclasses.replace(config, eval_every=every)
+
+
+def sweep_settings_of(task: Task, num_seeds: int, env_steps: int) -> Config:
+    """Returns the settings from which a task's sweep moves."""
+    config = settings_of(task, num_seeds, env_steps)
+    most = task.patience * _updates(task, config, env_steps)
+    return dataclasses.replace(config, max_updates=most)
 
 
 def horizon(env: str) -> int:
@@ -98,7 +111,6 @@ def horizon(env: str) -> int:
     return MEASURED[env].horizon
 
 
-def _eval_every(config: Config, env_steps: int) -> int:
-    """Returns the updates between evaluations: the default, or more where those are many."""
-    update = config.episodes_per_update * (config.horizon or horizon(config.env))
-    return max(config.eval_every, env_steps // update // _EVALUATIONS)
+def _updates(task: Task, config: Config, env_steps: int) -> int:
+    """Returns how many updates a budget lasts if no episode ends before its limit."""
+    return -(-env_steps // (config.episodes_per_update * (config.horizon or horizon(task.env))))

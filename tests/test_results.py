@@ -67,14 +67,15 @@ def test_least_share_solved_is_of_the_last_evaluations(start, stop, expected):
     assert least_share_solved(RETURNS, STEPS, 5.0, start, stop) == expected
 
 
-def test_least_share_solved_needs_runs_as_long():
-    assert math.isnan(least_share_solved(RETURNS, STEPS, 5.0, 0, 101))
+def test_least_share_solved_needs_a_run_as_long():
+    assert math.isnan(least_share_solved(RETURNS, STEPS, 5.0, 0, 111))
+    assert least_share_solved(RETURNS, STEPS, 5.0, 105, 110) == 0.5
 
 
 def test_curves_are_over_seeds_at_the_same_steps():
     seeds, last = np.arange(8.0), 100
     steps = np.array([[0] * 8, [50] * 8, [last] * 8])
-    found = curves(seeds * steps, steps, threshold=last * 5.5)
+    found = curves(seeds * steps, steps, threshold=last * 5.5, budget=last)
     np.testing.assert_allclose(found["q50"], 3 * found["env_steps"])
     np.testing.assert_allclose(found["q75"], 5 * found["env_steps"])
     np.testing.assert_allclose(found["iqm"], iqm(seeds) * found["env_steps"])
@@ -85,9 +86,16 @@ def test_curves_are_over_seeds_at_the_same_steps():
 
 def test_a_failed_seed_is_the_worst_of_a_curve():
     returns = np.array([[1, 2, 3, 4], [1, 2, 3, np.nan]])
-    found = curves(returns, np.array([[0] * 4, [10] * 4]), None)
+    found = curves(returns, np.array([[0] * 4, [10] * 4]), None, 10)
     assert (found["q0"][-1], found["q100"][-1], found["q75"][-1]) == (-math.inf, 3.0, 2.0)
     assert np.isnan(found["solved"]).all()
+
+
+def test_a_seed_that_ended_before_keeps_its_return():
+    returns, steps = np.array([[0, 0], [6, 1]]), np.array([[0, 0], [60, 10]])
+    found = curves(returns, steps, None, 50)
+    assert found["env_steps"][-1] == 50
+    np.testing.assert_allclose([found["q0"][-1], found["q100"][-1]], [1, 5])
 
 
 def test_compare_tells_simulations_apart():
