@@ -132,4 +132,4 @@ def _moved(name: str, value: Any, factor: float, counts: bool) -> Any:
         return value
     if name == "discount":
         return max(0.0, round(1 - (1 - value) / factor, 12))
-    return max(1, round(value * factor)) if counts else float(f"{value * factor:.6g}")
+    return max(2, round(value * factor)) if counts else float(f"{value * factor:.6g}")
