@@ -6,8 +6,6 @@ docs/failures.md and its pictures from experiments/failures, without training.
 """
 
 import argparse
-import dataclasses
-import math
 import sys
 import time
 from collections.abc import Sequence
@@ -16,42 +14,16 @@ from pathlib import Path
 import numpy as np
 
 import failures_measures as measures
-from failures_runs import Measured, Setting, train
+from failures_arms import ARMS
+from failures_runs import Measured, train
 
 _HERE = Path(__file__).parent
 DATA, DOCS = _HERE / "failures", _HERE.parent / "docs"
 #: Seeds that are trained together; an arm has one or more such parts.
 PART = 256
 
-#: The settings that do not fail.
-MENDED = Setting(
-    num_episodes=8,
-    max_kl=0.02,
-    discount=0.988,
-    standardize_floor=5.0,
-    decay_updates=math.inf,
-    decay_steps=200_000,
-    final_learning_rate=1e-5,
-    env_steps=240_000,
-    max_updates=240,
-)
-#: The first is the base; the others, but for the last two, change one thing of it alone.
-ARMS = {
-    "base": Setting(),
-    "position-scale": Setting(least_position_scale=0.2),
-    "clip": Setting(clip=1e6),
-    "normalize-3000": Setting(normalize_steps=3000),
-    "normalize-10000": Setting(normalize_steps=10_000),
-    "max-kl": Setting(max_kl=0.02),
-    "momentum": Setting(momentum=0.0),
-    "rate": Setting(learning_rate=3e-3, final_learning_rate=3e-4),
-    "decay-steps": Setting(decay_updates=math.inf, decay_steps=120_000),
-    "both": Setting(max_kl=0.02, least_position_scale=0.2),
-    "mended": MENDED,
-    "mended-scale": dataclasses.replace(MENDED, least_position_scale=0.2),
-}
 #: Parts of each arm; 1 if not here.
-PARTS = {"base": 2, "mended": 2}
+PARTS = {"base": 2}
 
 
 def main() -> None:

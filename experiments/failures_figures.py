@@ -76,7 +76,7 @@ def _differences(kept: Kept) -> Any:
     """Draws quartiles of failing and of other seeds over the first updates."""
     figure, axes = _figure(2, 3, 9, 4.6, sharex=True)
     for ax, (measure, title) in zip(axes.flat, _TITLES.items(), strict=True):
-        for group, colour in (("failing", _FAILING), ("others", _OTHERS)):
+        for group, colour in (("failing", _FAILING), ("other", _OTHERS)):
             rows = [r for r in kept.updates if r["measure"] == measure and r["group"] == group]
             x = [int(row["update"]) for row in rows]
             low, middle, high = (

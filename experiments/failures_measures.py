@@ -16,15 +16,14 @@ Arrays = dict[str, np.ndarray]
 COMPARED = {
     "scale_position": "std by which the cart's position is divided (m)",
     "clipped_position": "share of steps whose scaled position is clipped",
-    "saturated_units": "share of hidden units with |tanh| > 0.99",
+    "saturated_units": "share of hidden units that are saturated (tanh beyond 0.99)",
     "force_out_of_range": "share of steps whose mean force is out of range",
     "kl": "KL of the update (nats)",
     "policy_std": "std of the actions",
 }
-#: Updates at which they are compared, counted from 1; later, many seeds have used their budget.
-LOOKS = (1, 2, 4, 6, 8, 10)
-#: The first updates are drawn.
-SHOWN = 24
+#: Updates at which they are compared, counted from 1, with which nothing is scaled yet; after the
+#: last of those that are drawn, many seeds have used their budget.
+LOOKS, SHOWN = (2, 3, 4, 6, 8), 14
 #: A gradient below this norm has no direction to learn from: no episode did better than another.
 NO_GRADIENT = 1e-2
 
@@ -117,8 +116,8 @@ def quartiles(run: Measured) -> list[dict[str, Any]]:
     fails = run.final_return < SOLVED
     rows = []
     for name in COMPARED:
-        for group, chosen in (("failing", fails), ("others", ~fails)):
-            for update, x in enumerate(run.updates[name][:SHOWN, chosen], start=1):
+        for group, chosen in (("failing", fails), ("other", ~fails)):
+            for update, x in enumerate(run.updates[name][1:SHOWN, chosen], start=2):
                 low, middle, high = np.nanquantile(x, (0.25, 0.5, 0.75))
                 rows.append(
                     {"measure": name, "group": group, "update": update}

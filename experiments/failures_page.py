@@ -7,8 +7,10 @@ import numpy as np
 
 import failures_figures
 from failures_answers import Arm, Contrast, arms, contrasts, fails, quarters
-from failures_measures import COMPARED, LOOKS, Kept
+from failures_arms import MENDED, MENDED_FLAGS, WORDS
+from failures_measures import COMPARED, Kept
 from failures_runs import ENV_STEPS, MAX_UPDATES
+from mjx_reinforce.policies.normalize import CLIP
 from mjx_reinforce.reports.statistics import Estimate
 from seeds_markdown import percent, table
 
@@ -16,22 +18,6 @@ from seeds_markdown import percent, table
 _TEMPLATE = Path(__file__).with_suffix(".md")
 #: Updates of the table of differences.
 _TABLE_LOOKS = (2, 4, 8)
-#: The arms in words.
-WORDS = {
-    "base": "nothing changed",
-    "position-scale": "position divided by 0.2 m at least",
-    "clip": "observations not clipped",
-    "normalize-3000": "scale of the first 3,000 steps",
-    "normalize-10000": "scale of the first 10,000 steps",
-    "max-kl": "KL of an update at most 0.02",
-    "momentum": "Adam without momentum (b1 = 0)",
-    "rate": "rate 3e-3",
-    "decay-steps": "rate falls with env steps",
-    "grad-norm": "gradient not clipped",
-    "std": "initial std 1",
-    "both": "KL at most 0.02 and position by 0.2 m",
-    "mended": "the mended default",
-}
 
 
 def write(kept: Kept, docs: Path) -> None:
@@ -54,7 +40,12 @@ def page(kept: Kept, found: list[Arm]) -> str:
         "max_updates": f"{MAX_UPDATES}",
         "differences_table": _differences(contrasts(kept, _TABLE_LOOKS)),
         "arms_table": _arms(found),
-        "fast_scale": f"{100 * quarters(kept)[-1].low:.0f}",
+        "low_scale": f"{100 * quarters(kept)[0].low:.0f} to {100 * quarters(kept)[0].high:.0f} cm",
+        "high_scale": f"{100 * quarters(kept)[-1].low:.0f} cm",
+        "clipped_beyond": f"{CLIP * quarters(kept)[0].high:.1f} m",
+        "early_kl": f"{np.nanmedian(kept.base['kl_2']):.2f}",
+        "mended_env_steps": f"{MENDED.env_steps:,}",
+        "mended_flags": MENDED_FLAGS,
         "never": f"{base.never}",
         "fell": f"{base.failures - base.never}",
         "scale_failing": _centimetres(kept, failing=True),
@@ -72,7 +63,14 @@ def page(kept: Kept, found: list[Arm]) -> str:
         "high_fallen": percent(quarters(kept)[-1].fallen.value, 0),
     }
     for arm in found:
+        moved = kept.falls[arm.name]
         texts |= {
+            f"{arm.name}_never": f"{arm.never}",
+            f"{arm.name}_kl": f"{moved['kl_after'] / moved['updates_after']:.2g}",
+            f"{arm.name}_quiet": f"{moved['began_without_gradient']}",
+            f"{arm.name}_began": f"{moved['began']}",
+            f"{arm.name}_p_failing": _p_value(arm.p_failing),
+            f"{arm.name}_p_fallen": _p_value(arm.p_fallen),
             f"{arm.name}_count": f"{arm.count}",
             f"{arm.name}_failures": f"{arm.failures}",
             f"{arm.name}_failing": _share(arm.failing),
@@ -87,7 +85,7 @@ def page(kept: Kept, found: list[Arm]) -> str:
 def _centimetres(kept: Kept, *, failing: bool) -> str:
     """Returns the median scale of the cart's position after the fifth update."""
     chosen = fails(kept.seeds["base"]) == failing
-    return f"{100 * np.nanmedian(kept.base[f'scale_position_{LOOKS[3]}'][chosen]):.1f}"
+    return f"{100 * np.nanmedian(kept.base['scale_position_6'][chosen]):.1f}"
 
 
 def _share(x: Estimate) -> str:

@@ -70,21 +70,26 @@ def test_arms_are_compared_on_the_same_seeds():
     kept = measures.Kept({"base": seeds(8, 100), "max-kl": seeds(0, 50)}, {}, [], [], {})
     base, other = answers.arms(kept)
     assert (base.failures, base.never, base.failing.value) == (8, 8, 0.08)
-    assert np.isinf(base.slowest) and other.slowest == 100
+    assert (base.slowest, other.slowest) == (np.inf, 100)
     assert other.p_failing == pytest.approx(2 * 0.5**8)  # eight seeds apart, all the same way
     assert other.p_fallen == 1
 
 
+@pytest.mark.slow
 def test_bounded_scale_and_budget_hold_in_a_training():
-    setting = Setting(num_episodes=2, hidden_sizes=(4,), env_steps=60, max_updates=3)
+    setting = Setting(
+        num_episodes=2,
+        hidden_sizes=(4,),
+        env_steps=60,
+        max_updates=3,
+        least_position_scale=0.2,
+    )
     found = train(setting, range(2))
-    bounded = train(Setting(**(vars(setting) | {"least_position_scale": 0.2})), range(2))
     made = np.isfinite(found.updates["kl"])
     before = np.nancumsum(found.updates["env_steps"], axis=0) - found.updates["env_steps"]
-    assert (before[made] < 60).all() and made[0].all()
-    assert (found.updates["scale_position"][1] < 0.1).all()
-    np.testing.assert_allclose(bounded.updates["scale_position"][1], 0.2, rtol=1e-6)
-    np.testing.assert_array_equal(found.updates["kl"][0], bounded.updates["kl"][0])
+    assert made[0].all()
+    assert (before[made] < 60).all()
+    np.testing.assert_allclose(found.updates["scale_position"][1], 0.2, rtol=1e-6)
     assert found.final_return.shape == (2,)
 
 
