@@ -19,7 +19,7 @@ class Arm(NamedTuple):
     name: the arm
     count: S
     failing: the share whose last policy is below the threshold without noise
-    failures, never: how many, and how many of these never were above
+    failures, never, stand: how many, how many of them never were above, how many are with noise
     fallen: the share that fell below it again in one evaluation at least
     fallen_evaluations: the share of such evaluations, of all after the first solved one
     median, slowest: env steps to solve, the median and the 99 % quantile (inf: never)
@@ -32,6 +32,7 @@ class Arm(NamedTuple):
     failing: Estimate
     failures: int
     never: int
+    stand: int
     fallen: Estimate
     fallen_evaluations: float
     median: float
@@ -97,6 +98,7 @@ def _arm(name: str, seeds: Arrays, p_failing: float, p_fallen: float) -> Arm:
         failing=wilson(bad.sum(), count),
         failures=int(bad.sum()),
         never=int((bad & np.isinf(steps)).sum()),
+        stand=int((bad & (seeds["final_sampled"] >= SOLVED)).sum()),
         fallen=wilson(falls_again(seeds).sum(), count),
         fallen_evaluations=float(seeds["fallen"].sum() / seeds["evaluations"].sum()),
         median=float(median),

@@ -85,8 +85,7 @@ def _differences(kept: Kept) -> Any:
             ax.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
             ax.plot(x, middle, color=colour, label=f"{group} seeds")
         ax.set_title(title, fontsize="medium")
-        if measure in ("scale_position", "kl"):
-            ax.set_yscale("log")
+        ax.set_ylim(bottom=0 if measure != "policy_std" else None)
     axes[0, 0].legend(fontsize="small", frameon=False)
     for ax in axes[1]:
         ax.set_xlabel("update")
@@ -120,7 +119,7 @@ def _arms(arms: Sequence[Arm], words: dict[str, str]) -> Any:
     y = -np.arange(len(arms))
     for ax, title, name in (
         (axes[0, 0], "failing seeds, %", "failing"),
-        (axes[0, 1], "seeds that fell again at least once, %", "fallen"),
+        (axes[0, 1], "fell again at least once, %", "fallen"),
     ):
         found = [getattr(arm, name) for arm in arms]
         ax.axvspan(100 * found[0].low, 100 * found[0].high, color="grey", alpha=0.15, linewidth=0)

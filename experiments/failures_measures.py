@@ -76,17 +76,13 @@ def falls(run: Measured) -> dict[str, float]:
     return {
         "began": int(began.sum()),
         "began_without_gradient": int((began & quiet).sum()),
-        "began_without_gradient_stand_with_noise": int((began & quiet & (all_falls == 0)).sum()),
-        "began_without_gradient_then_played": int((began & quiet & np.isfinite(all_falls)).sum()),
         "quiet_updates": int((after & quiet).sum()),
         "updates_after": int(after.sum()),
         "kl_after": float(x["kl"][after].sum()),
         "kl_without_gradient": float(x["kl"][after & quiet].sum()),
-        "kl_median_without_gradient": float(np.median(x["kl"][after & quiet])),
         "falls_next": float(all_falls[some].sum()),
         "falls_next_at_rail_end": float(following[some].sum()),
-        "clipped_fallen": float(np.median(x["clipped_position"][after & (returns < SOLVED)])),
-        "clipped_standing": float(np.median(x["clipped_position"][after & (returns >= SOLVED)])),
+        "saturated": float(np.nanmean(x["saturated_units"])),
     }
 
 

@@ -50,9 +50,6 @@ def page(kept: Kept, found: list[Arm]) -> str:
         "fell": f"{base.failures - base.never}",
         "scale_failing": _centimetres(kept, failing=True),
         "scale_others": _centimetres(kept, failing=False),
-        "clipped_fallen": percent(falls["clipped_fallen"], 0),
-        "clipped_standing": percent(falls["clipped_standing"], 0),
-        "rail": percent(falls["falls_next_at_rail_end"] / falls["falls_next"], 0),
         "quiet_kl": percent(falls["kl_without_gradient"] / falls["kl_after"], 0),
         "quiet_updates": percent(falls["quiet_updates"] / falls["updates_after"], 0),
         "quiet_began": percent(falls["began_without_gradient"] / falls["began"], 0),
@@ -66,7 +63,10 @@ def page(kept: Kept, found: list[Arm]) -> str:
         moved = kept.falls[arm.name]
         texts |= {
             f"{arm.name}_never": f"{arm.never}",
+            f"{arm.name}_stand": f"{arm.stand}",
             f"{arm.name}_kl": f"{moved['kl_after'] / moved['updates_after']:.2g}",
+            f"{arm.name}_rail": percent(moved["falls_next_at_rail_end"] / moved["falls_next"], 0),
+            f"{arm.name}_saturated": percent(moved["saturated"], 0),
             f"{arm.name}_quiet": f"{moved['began_without_gradient']}",
             f"{arm.name}_began": f"{moved['began']}",
             f"{arm.name}_p_failing": _p_value(arm.p_failing),
@@ -97,7 +97,7 @@ def _thousands(steps: float) -> str:
 
 
 def _p_value(p: float) -> str:
-    return "" if np.isnan(p) else "< 0.001" if p < 0.001 else f"{p:.2g}"
+    return "" if np.isnan(p) else "below 0.001" if p < 0.001 else f"{p:.2g}"
 
 
 def _arms(found: Iterable[Arm]) -> str:

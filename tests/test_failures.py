@@ -22,7 +22,7 @@ UPDATES = {
     "kl": [[1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 2, 3], [1, np.nan, 4, 5]],
     "falls": [[4] * 4, [4] * 4, [0, 4, 1, 2], [0, np.nan, 2, 4]],
     "falls_at_rail_end": [[0] * 4, [0] * 4, [0, 0, 1, 0], [0, np.nan, 2, 1]],
-    "clipped_position": np.zeros((4, 4)),
+    "saturated_units": np.full((4, 4), 0.25),
 }
 
 
@@ -45,6 +45,7 @@ def test_falls_are_told_apart_by_their_gradient(run):
     assert (found["updates_after"], found["quiet_updates"]) == (6, 3)
     assert found["kl_after"] == 1 + 1 + 2 + 4 + 3 + 5
     assert found["kl_without_gradient"] == 1 + 1 + 2
+    assert found["saturated"] == 0.25
     assert (found["falls_next"], found["falls_next_at_rail_end"]) == (2 + 4, 2 + 1)
 
 
@@ -62,7 +63,10 @@ def test_arms_are_compared_on_the_same_seeds():
         steps = np.where(bad, np.nan, 100.0)
         returns = np.where(bad, 40.0, 1000.0)
         ones = np.ones(count)
-        return {"final_return": returns, "steps_to_solve": steps} | {
+        return {
+            "final_return": returns,
+            "final_sampled": np.where(np.arange(count) < 3, 1000.0, 40.0),
+            "steps_to_solve": steps,
             "evaluations": ones,
             "fallen": 0 * ones,
         }
@@ -70,6 +74,7 @@ def test_arms_are_compared_on_the_same_seeds():
     kept = measures.Kept({"base": seeds(8, 100), "max-kl": seeds(0, 50)}, {}, [], [], {})
     base, other = answers.arms(kept)
     assert (base.failures, base.never, base.failing.value) == (8, 8, 0.08)
+    assert (base.stand, other.stand) == (3, 0)
     assert (base.slowest, other.slowest) == (np.inf, 100)
     assert other.p_failing == pytest.approx(2 * 0.5**8)  # eight seeds apart, all the same way
     assert other.p_fallen == 1
