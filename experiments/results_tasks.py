@@ -72,11 +72,11 @@ TASKS: dict[str, Task] = {
         Task("HalfCheetah-v5", "HalfCheetah-v5", 64, 2_000_000, (1138.8, 104.7), 500_000),
         Task("Hopper-v5", "Hopper-v5", 64, 1_500_000, (416.0, 104.7), 500_000),
         Task(
-            *("Walker2d-v5", "Walker2d-v5", 64, 1_000_000, (440.9, 148.2), 300_000),
+            *("Walker2d-v5", "Walker2d-v5", 64, 800_000, (440.9, 148.2), 300_000),
             root=SECOND_ROOT,
         ),
         Task(
-            *("Ant-v5", "Ant-v5", 16, 1_000_000, (1108.1, 323.1), 300_000),
+            *("Ant-v5", "Ant-v5", 16, 700_000, (1108.1, 323.1), 300_000),
             root=SECOND_ROOT,
         ),
         Task(

@@ -27,7 +27,7 @@ TINY += ["--eval-every", "1", "--eval-episodes", "1"]
 
 @pytest.fixture(autouse=True)
 def toys(monkeypatch, tmp_path):
-    for name in ("InvertedPendulum-v4", "InvertedDoublePendulum-v5"):
+    for name in ("InvertedPendulum-v4", "InvertedPendulum-v5", "InvertedDoublePendulum-v5"):
         monkeypatch.setitem(envs._TABLE, name, (Survive, {}))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.chdir(tmp_path)
@@ -100,7 +100,7 @@ def test_network_outputs_mean_what_they_do_in_the_program(name, std):
         assert float(moved[0]) == pytest.approx(0.3 + 2 * std(-0.7), rel=1e-5)
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.parametrize("name", sorted(PRESETS.keys() - {"pendulum-network"}))  # ours
 def test_first_weights_are_pytorchs(name):
     """Uniform within 1 / sqrt(fan-in), biases too; the critic's as well."""
     config = PRESETS[name][1]
