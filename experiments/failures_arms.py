@@ -5,7 +5,7 @@ import math
 
 from failures_runs import Setting
 
-#: The settings of the mended default that differ from the base's.
+#: The mended settings: those that differ from the base's.
 _MENDED = {
     "num_episodes": 8,
     "max_kl": 0.02,
@@ -44,6 +44,6 @@ WORDS = {
     "linear": "a linear policy",
     "both": "KL at most 0.02, position by 0.2 m",
     "all": "these two, and no momentum",
-    "mended": "the mended default",
-    "mended-scale": "the mended default, position by 0.2 m",
+    "mended": "the mended settings",
+    "mended-scale": "the mended settings, position by 0.2 m",
 }

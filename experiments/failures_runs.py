@@ -15,7 +15,8 @@ from mjx_reinforce.learners.diagnostics import Visited, visited_steps
 from mjx_reinforce.learners.estimators import leave_one_out, standardize
 from mjx_reinforce.learners.learner import Learner, TrainState
 from mjx_reinforce.learners.reinforce import reinforce
-from mjx_reinforce.learners.updates import clip_by_norm, decay_by_env_steps
+from mjx_reinforce.learners.schedules import decay_rate
+from mjx_reinforce.learners.updates import clip_by_norm
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.normal import normal
 from mjx_reinforce.policies.policy import mlp_policy
@@ -178,7 +179,7 @@ def _learner(env: Any, setting: Setting, num_seeds: int, engine: str = "auto") -
         optimizer=optax.chain(
             clip_by_norm(setting.max_grad_norm),
             optax.adam(schedule, b1=setting.momentum),
-            decay_by_env_steps(final / rate, setting.decay_steps),
+            decay_rate(final / rate, setting.decay_steps),
         ),
         num_episodes=setting.num_episodes,
         max_kl=setting.max_kl,

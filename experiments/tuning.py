@@ -1,0 +1,115 @@
+"""The searches behind the default settings; experiments/tuning is what is kept of them.
+
+    python experiments/tuning.py list            # the searches
+    python experiments/tuning.py run NAME DIR    # trains one anew, and writes DIR/NAME.csv
+    python experiments/tuning.py keep NAME DIR   # DIR/NAME.csv of the sweep in DIR/NAME
+
+searches.json has their configurations, drawn at random or chosen after earlier ones, and the
+settings that all share, where they differ from the plain ones. Their names begin with the number of
+the round. A CSV has a row for each configuration, best first. Those that were stopped for time ("stopped") have as many env steps as they reached. No seed
+of a search is among those of docs/results.md.
+"""
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.export.files import read_json, write_bytes
+from mjx_reinforce.reports.statistics import steps_to_solve
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.files import csv_bytes
+from mjx_reinforce.sweeps.design import Design
+from mjx_reinforce.sweeps.perform import perform
+from mjx_reinforce.sweeps.reading import Results, read_results
+from results_measures import least_share_solved, solved_within
+
+KEPT = Path(__file__).parent / "tuning"
+#: The env steps within which a pendulum should be solved, and from which on it should stay so.
+_SOLVED, _STAYS = 100_000, 200_000
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Listed(Design):
+    """A sweep of configurations that are listed."""
+
+    listed: tuple[dict[str, Any], ...]
+
+    def configurations(self) -> list[dict[str, Any]]:
+        """Returns them."""
+        return list(self.listed)
+
+
+def main() -> None:
+    """Reads the command line and does what it says."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    searches = read_json(KEPT / "searches.json")
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("list", help="name the searches")
+    for name in ("run", "keep"):
+        command = commands.add_parser(name)
+        command.add_argument("name", choices=searches)
+        command.add_argument("directory", type=Path)
+    arguments = parser.parse_args()
+    if arguments.command == "list":
+        for name, search in searches.items():
+            print(f"{name}: {len(search['configurations'])} configurations, {search['settings']}")
+        return
+    search, place = searches[arguments.name], arguments.directory / arguments.name
+    try:
+        if arguments.command == "run":
+            perform(_design(search, place), None, [], report=False)
+        keep(read_results(place), arguments.directory / f"{arguments.name}.csv")
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+def _design(search: dict[str, Any], place: Path) -> Design:
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in search["settings"].items()}
+    listed = tuple(search["configurations"])
+    over = {name: sorted({one[name] for one in listed}) for name in listed[0]}
+    return Listed(base=Config(**settings, output=place), over=over, listed=listed)
+
+
+def keep(results: Results, path: Path) -> None:
+    """Writes a row for each configuration, by the mean over its seeds of the last return.
+
+    Of a task with a threshold also the share of seeds solved within ``_SOLVED`` env steps, the
+    least share solved at once from ``_STAYS`` on, and the median env steps to solve.
+    """
+    threshold = read_json(results.directory / "sweep.json")["threshold"]
+    rows = [
+        values | _measure(results, results.configuration == number, threshold)
+        for number, values in enumerate(results.configurations)
+    ]
+    rows.sort(key=lambda row: -float(row["mean"]))
+    write_bytes(path, csv_bytes(tuple(rows[0]), rows))
+
+
+def _measure(results: Results, mine: np.ndarray, threshold: float | None) -> dict[str, str]:
+    returns, steps = results.eval_return[:, mine], results.env_steps[:, mine]
+    last = returns[-1]
+    found = {
+        "seeds": len(last),
+        "env_steps": steps[-1].mean(),
+        **{name: getattr(np, name)(last) for name in ("mean", "std", "min", "median", "max")},
+    }
+    if threshold is not None:
+        solved = [np.inf if x is None else x for x in steps_to_solve(returns, steps, threshold)]
+        stop = float(steps[-1].min())
+        found["solved_within_100k"] = solved_within(solved, _SOLVED) / len(last)
+        found["least_share_solved"] = (
+            least_share_solved(returns, steps, threshold, _STAYS, stop) if stop > _STAYS else np.nan
+        )
+        found["median_steps_to_solve"] = np.median(solved)
+    return {name: f"{float(x):.6g}" for name, x in found.items()}
+
+
+if __name__ == "__main__":
+    main()
