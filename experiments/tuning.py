@@ -5,9 +5,10 @@
     python experiments/tuning.py keep NAME DIR   # DIR/NAME.csv of the sweep in DIR/NAME
 
 searches.json has their configurations, drawn at random or chosen after earlier ones, and the
-settings that all share, where they differ from the plain ones. Their names begin with the number of
-the round. A CSV has a row for each configuration, best first. Those that were stopped for time ("stopped") have as many env steps as they reached. No seed
-of a search is among those of docs/results.md.
+settings that all share, where they differ from the plain ones. Names begin with the number of the
+round. A CSV has a row for each configuration, best first; searches that were stopped for time
+("stopped") have as many env steps as they reached. No seed of a search is among those of
+docs/results.md.
 """
 
 import argparse
@@ -71,7 +72,9 @@ def main() -> None:
 
 
 def _design(search: dict[str, Any], place: Path) -> Design:
-    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in search["settings"].items()}
+    settings: dict[str, Any] = {
+        k: tuple(v) if isinstance(v, list) else v for k, v in search["settings"].items()
+    }
     listed = tuple(search["configurations"])
     over = {name: sorted({one[name] for one in listed}) for name in listed[0]}
     return Listed(base=Config(**settings, output=place), over=over, listed=listed)

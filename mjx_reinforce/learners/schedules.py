@@ -63,9 +63,9 @@ def _schedule(change: Callable[..., Any]) -> optax.GradientTransformationExtraAr
         del params
         return Played(jnp.zeros(()))
 
-    def update(updates, state, params=None, *, env_steps: jax.Array, **extra):
-        del params, extra
-        after = state.env_steps + env_steps
+    def update(updates, state, params=None, **rollout: Any):
+        del params
+        after = state.env_steps + rollout["env_steps"]
         return change(updates, state.env_steps, after), Played(after)
 
     return optax.GradientTransformationExtraArgs(init, update)
