@@ -22,7 +22,10 @@ from results_tasks import Task
 POLICIES = ("best", "median")
 #: The env steps between which a solved seed should stay solved.
 STAY_SOLVED = (200_000, 1_000_000)
-_SEED_COLUMNS = ("seed", "env_steps", "final_return", "best_return", "env_steps_to_solve")
+_SEED_COLUMNS = (
+    *("seed", "env_steps", "test_return", "final_return", "best_return"),
+    "env_steps_to_solve",
+)
 _CURVE_COLUMNS = (
     *("env_steps", "iqm", "low", "high"),
     *(f"q{100 * q:g}" for q in QUANTILES),
@@ -46,7 +49,8 @@ class Result(NamedTuple):
     """What is kept of a task.
 
     facts: of its run: settings, machine, times
-    seeds: by column, [S] of each seed; ``env_steps_to_solve`` is inf where it never was
+    seeds: by column, [S] of each seed; ``env_steps_to_solve`` is inf where it never was;
+      ``test_return`` is the last policy's on starts that nothing else used
     curve: by column, see ``results_measures.curves``
     moved: by column, a row for each configuration of its sweep; None if it was not swept
     played: by column, a row for each episode of the best and median policy; None if not played
@@ -97,6 +101,7 @@ def _gather_run(run: Path, name: str, folder: Path) -> None:
     columns = {
         "seed": np.arange(returns.shape[1]),
         "env_steps": steps[-1],
+        "test_return": summary["final_test_returns"],
         "final_return": returns[-1],
         "best_return": np.fmax.reduce(returns),
         "env_steps_to_solve": [math.inf if x is None else x for x in solved],
@@ -175,6 +180,6 @@ def _text(x: Any) -> str:
     return f"{x:.9g}" if isinstance(x, float) else str(x)
 
 
-def final_returns(result: Result) -> np.ndarray:
-    """Returns each seed's return [S] in the final evaluation, NaN of one that failed."""
-    return finite_or_nan(result.seeds["final_return"])
+def tested_returns(result: Result) -> np.ndarray:
+    """Returns each seed's return [S] on starts that nothing else used, NaN of one that failed."""
+    return finite_or_nan(result.seeds["test_return"])

@@ -105,9 +105,10 @@ def _explanation(results: Sequence[Result]) -> str:
         if result.facts["settings"]["horizon"] != horizon(result.task.env)
     ]
     said = [
-        "* A return is that of the policy at the end of training, without noise: the mean of\n"
-        f"  {listed(map(str, episodes))} episodes on starts that no training uses. It is not\n"
-        "  the best evaluation on the way.",
+        "* A return in the table is that of the policy at the end of training, without noise: the\n"
+        f"  mean of {listed(map(str, episodes))} episodes on starts that were used nowhere else.\n"
+        "  The evaluations on the way, and so the curves and what counts as solved, have as many\n"
+        "  other starts, the same for all seeds.",
         "* IQM: the mean of the middle half of the seeds. Intervals are 95 % bootstrap\n"
         "  intervals over seeds ([statistics.md](statistics.md)).",
         f"* Published: Tianshou's REINFORCE after {PUBLISHED_STEPS:,} env steps,\n"

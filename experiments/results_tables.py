@@ -10,7 +10,7 @@ import numpy as np
 from mjx_reinforce.reports.experiment import spoken
 from mjx_reinforce.reports.statistics import Estimate
 from mjx_reinforce.reports.statistics.aggregates import interval
-from results_files import POLICIES, STAY_SOLVED, Result, final_returns
+from results_files import POLICIES, STAY_SOLVED, Result, tested_returns
 from results_measures import (
     Comparison,
     compare,
@@ -50,8 +50,8 @@ def machine(facts: dict[str, Any]) -> str:
 
 
 def mean_of(result: Result) -> Estimate:
-    """Returns the mean over seeds of the final return, with its interval."""
-    return interval("mean", final_returns(result))
+    """Returns the mean over seeds of the last policies' returns, with its interval."""
+    return interval("mean", tested_returns(result))
 
 
 def verdict_of(result: Result) -> str:
@@ -85,7 +85,8 @@ def results_table(results: Sequence[Result]) -> str:
 
 
 def _result_row(result: Result) -> list[str]:
-    final, facts = final_returns(result), result.facts
+    tested, facts = tested_returns(result), result.facts
+    final = result.seeds["final_return"]
     threshold, published = facts["threshold"], result.task.published
     solved = "no threshold"
     if threshold is not None:
@@ -96,9 +97,9 @@ def _result_row(result: Result) -> list[str]:
         result.task.name,
         f"{len(final):,}",
         f"{facts['settings']['env_steps']:,}",
-        estimate(interval("iqm", final)),
+        estimate(interval("iqm", tested)),
         estimate(mean_of(result)),
-        number(float(np.min(np.where(np.isfinite(final), final, -np.inf)))),
+        number(float(np.min(np.where(np.isfinite(tested), tested, -np.inf)))),
         solved,
         theirs,
         verdict_of(result),

@@ -24,7 +24,7 @@ from results_measures import (
     steps_quantile,
     verdict,
 )
-from results_tasks import TASKS, settings_of
+from results_tasks import TASKS, settings_of, sweep_settings_of
 
 PENDULUM, REACHER = TASKS["InvertedPendulum-v5"], TASKS["Reacher-v5"]
 
@@ -140,7 +140,7 @@ def test_the_stages_have_settings_that_hold(task, tmp_path):
     wanted = settings_of(task, task.seeds, task.env_steps)
     assert config == dataclasses.replace(wanted, output=tmp_path / task.name)
     check(config)
-    base = settings_of(task, task.sweep_seeds, task.sweep_steps)
+    base = sweep_settings_of(task, task.sweep_seeds, task.sweep_steps)
     check_design(results_runs.OneAtATime(base=base, over=results_runs.moves(base)))
 
 
@@ -158,6 +158,7 @@ def write_run(directory, task, returns, threshold):
     (directory / "config.json").write_text(json.dumps(config))
     summary = {"status": "finished", "threshold": threshold, "engine": "native"}
     summary |= {"num_seeds": len(returns), "compile_seconds": 9.0, "run_seconds": 600.0}
+    summary["final_test_returns"] = [490.0 if x == 500.0 else x for x in returns]
     (directory / "summary.json").write_text(json.dumps(summary | {"nonfinite": []}))
     with (directory / "metrics.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -213,7 +214,7 @@ def test_the_page_says_what_was_measured_and_what_is_missing(kept, tmp_path):
     lines = page.splitlines()
     row = next(line for line in lines if line.startswith(f"| {PENDULUM.name} | 10 |"))
     assert "| 1,000,000 | 1,000.0 (" in row
-    assert "| 500.0 | 9 of 10 (950) | 1,000.0 (1,000.0 to 1,000.0) |" in row
+    assert "| 490.0 | 9 of 10 (950) | 1,000.0 (1,000.0 to 1,000.0) |" in row
     assert "| 10.0 min, 9.0 s | 2 CPU cores | 998.5, 900.5 |" in row
     assert f"above the published figure: {REACHER.name}\n" in page
     (missing,) = [line for line in lines if line.startswith("Not run yet: ")]
