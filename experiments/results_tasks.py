@@ -61,6 +61,13 @@ TASKS: dict[str, Task] = {
             *(4096, 1_000_000, (1000.0, 0.0), 280_000, 256),
             settings={**PENDULUM_NETWORK, "eval_every": 2},
             patience=12,
+            note=(
+                "to be solved as surely as with the linear policy was the aim. 350 settings\n"
+                "  were tried (`experiments/tuning`): episodes an update, rate, KL bound,\n"
+                "  discount, noise, how rate and noise fall, floor, and how long the scale is\n"
+                "  measured. Of the 30 that were tried with 768 seeds none had 99.9 % of them\n"
+                "  solved within 100,000 env steps. [failures.md](failures.md): why seeds fall."
+            ),
         ),
         Task(
             *("InvertedDoublePendulum-v5", "InvertedDoublePendulum-v5"),
@@ -76,7 +83,7 @@ TASKS: dict[str, Task] = {
             root=SECOND_ROOT,
         ),
         Task(
-            *("Ant-v5", "Ant-v5", 16, 700_000, (1108.1, 323.1), 300_000),
+            *("Ant-v5", "Ant-v5", 16, 1_100_000, (1108.1, 323.1), 300_000),
             root=SECOND_ROOT,
         ),
         Task(
