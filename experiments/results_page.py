@@ -61,10 +61,11 @@ def page(parts: Sequence[Result | Task], docs: Path) -> str:
 def _introduction(results: Sequence[Result]) -> str:
     roots = dict.fromkeys(f"{result.facts['settings']['seed']:,}" for result in results)
     return (
-        "REINFORCE with the default settings of every task, as `python -m mjx_reinforce.train`\n"
-        f"has them, on seeds that no tuning used (root {listed(roots)}). This page, words\n"
-        "included, is written by `experiments/results.py` from the measured runs; last are the\n"
-        "commands."
+        "REINFORCE with the default settings of every task, but for the budgets (env steps a\n"
+        "seed, in the table) and how often it is evaluated; 32-32 is the preset\n"
+        f"`pendulum-network`. No search used these seeds (root {listed(roots)}). This page,\n"
+        "words included, is written by `experiments/results.py` from the measured runs; last are\n"
+        "the commands."
     )
 
 
@@ -94,7 +95,9 @@ def _verdicts(results: Sequence[Result]) -> str:
 
 def _notes(results: Sequence[Result]) -> str:
     notes = [(result.task.name, result.task.note) for result in results if result.task.note]
-    return "\n".join(f"* {name}: {note}" for name, note in notes)
+    if not notes:
+        return ""
+    return "\n".join(["Of single tasks:", "", *(f"* {name}: {note}" for name, note in notes)])
 
 
 def _explanation(results: Sequence[Result]) -> str:
@@ -107,8 +110,9 @@ def _explanation(results: Sequence[Result]) -> str:
     said = [
         "* A return in the table is that of the policy at the end of training, without noise: the\n"
         f"  mean of {listed(map(str, episodes))} episodes on starts that were used nowhere else.\n"
-        "  The evaluations on the way, and so the curves and what counts as solved, have as many\n"
-        "  other starts, the same for all seeds.",
+        "  They are the same for all seeds of a task: intervals are over seeds, and leave the\n"
+        "  choice of the starts out. The evaluations on the way, and so the curves and the table\n"
+        "  of the pendulum, have as many other starts, which the searches had, too.",
         "* IQM: the mean of the middle half of the seeds. Intervals are 95 % bootstrap\n"
         "  intervals over seeds ([statistics.md](statistics.md)).",
         f"* Published: Tianshou's REINFORCE after {PUBLISHED_STEPS:,} env steps,\n"

@@ -74,6 +74,10 @@ def _wait(words: Sequence[str]) -> int:
 class OneAtATime(Design):
     """A sweep of the base's settings, and of each value of ``over`` alone beside them."""
 
+    def count(self) -> int:
+        """Returns how many configurations there are."""
+        return len(self.configurations())
+
     def configurations(self) -> list[dict[str, Any]]:
         """Returns the base's values first, then those with one of them changed."""
         base = {name: getattr(self.base, name) for name in self.over}

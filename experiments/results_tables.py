@@ -86,16 +86,15 @@ def results_table(results: Sequence[Result]) -> str:
 
 def _result_row(result: Result) -> list[str]:
     tested, facts = tested_returns(result), result.facts
-    final = result.seeds["final_return"]
     threshold, published = facts["threshold"], result.task.published
     solved = "no threshold"
     if threshold is not None:
-        solved = f"{int(np.sum(final >= threshold)):,} of {len(final):,} ({threshold:,g})"
+        solved = f"{int(np.sum(tested >= threshold)):,} of {len(tested):,} ({threshold:,g})"
     theirs = "none" if published is None else estimate(published_interval(*published))
     played = [comparison(result, policy) for policy in POLICIES]
     return [
         result.task.name,
-        f"{len(final):,}",
+        f"{len(tested):,}",
         f"{facts['settings']['env_steps']:,}",
         estimate(interval("iqm", tested)),
         estimate(mean_of(result)),

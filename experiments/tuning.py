@@ -39,6 +39,10 @@ class Listed(Design):
 
     listed: tuple[dict[str, Any], ...]
 
+    def count(self) -> int:
+        """Returns how many there are."""
+        return len(self.listed)
+
     def configurations(self) -> list[dict[str, Any]]:
         """Returns them."""
         return list(self.listed)
@@ -75,9 +79,16 @@ def _design(search: dict[str, Any], place: Path) -> Design:
     settings: dict[str, Any] = {
         k: tuple(v) if isinstance(v, list) else v for k, v in search["settings"].items()
     }
-    listed = tuple(search["configurations"])
-    over = {name: sorted({one[name] for one in listed}) for name in listed[0]}
-    return Listed(base=Config(**settings, output=place), over=over, listed=listed)
+    values = {name: [one[name] for one in search["configurations"]] for name in _names(search)}
+    same = {name: found[0] for name, found in values.items() if len(set(found)) == 1}
+    over = {name: sorted(set(found)) for name, found in values.items() if name not in same}
+    listed = tuple({name: one[name] for name in over} for one in search["configurations"])
+    base = Config(**settings, **same, output=place)
+    return Listed(base=base, over=over, listed=listed)
+
+
+def _names(search: dict[str, Any]) -> list[str]:
+    return list(search["configurations"][0])
 
 
 def keep(results: Results, path: Path) -> None:

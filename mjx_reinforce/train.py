@@ -21,6 +21,7 @@ from mjx_reinforce.runs import resume
 from mjx_reinforce.runs.alarms import silence_alarms
 from mjx_reinforce.runs.command_line import parse, refuse
 from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.files import check_writable, choose_directory, prepare, remove_empty
 from mjx_reinforce.runs.flags import accept_all_characters
 from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
@@ -28,6 +29,7 @@ from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.memory import check_size
 from mjx_reinforce.runs.plan import Plan, make_plan
+from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.relevance import check_read_by_policy
 from mjx_reinforce.runs.sinks.sink import check_installed, open_sinks
 
@@ -109,7 +111,9 @@ def _start(env: Any, config: Config) -> tuple[Any, int, Any]:
     learner, horizon = build(env, config)
     if config.resume is None:
         if config.policy == "auto":
-            check_read_by_policy(config, policy_settings(env, config)["policy"])
+            policy = policy_settings(env, config)["policy"]
+            presets = [preset for _, preset in PRESETS.values()]
+            check_read_by_policy(config, policy, [of_task(config.env), *presets])
         return learner, horizon, None
     resume.check_program(config.resume, provenance())
     return learner, horizon, resume.find(learner, config, print)

@@ -106,7 +106,7 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ("--max-grad-norm nan", "positive and finite, got nan"),
         ("--max-kl 0", "--max-kl must be positive and finite, got 0.0"),
         ("--final-std 0.1 --decay-steps None", "only --decay-steps N reads that"),
-        ("--final-std 0.1 --policy normal-softplus", "one standard deviation for all states"),
+        ("--final-std 0.1 --policy normal-softplus", "the same in all states"),
         ("--final-std 0", "--final-std must be positive and finite, got 0.0"),
         ("--algorithm ars --max-kl 0.01", "--max-kl 0.01 would do nothing"),
         ("--discount -0.1", "in [0, 1], got -0.1"),

@@ -3,6 +3,7 @@
 The physics is that of a toy where it would be MuJoCo's, which takes long to compile.
 """
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from mjx_reinforce.runs.build import build, policy_settings
 from mjx_reinforce.runs.config import check
 from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.presets import PRESETS
+from mjx_reinforce.runs.relevance import check_read_by_policy
 
 TINY = ["--num-seeds", "2", "--max-updates", "2", "--horizon", "8"]
 TINY += ["--eval-every", "1", "--eval-episodes", "1"]
@@ -137,3 +139,21 @@ def test_help_lists_presets_and_groups_without_jax():
     assert done.stdout.endswith("False\n")
     for text in (*PRESETS, "policy options", "updates options", "--ars-update"):
         assert text in done.stdout
+
+
+@pytest.mark.parametrize("id", ["InvertedPendulum-v5", "Hopper-v5", "CartPole-v1"])
+@pytest.mark.parametrize("words", [["--algorithm", "ars"], []])
+@pytest.mark.parametrize("preset", [[], ["pendulum-network"]])
+def test_defaults_that_a_policy_does_not_read_are_not_the_users(id, words, preset):
+    """Only what the command line itself says may be refused for doing nothing."""
+    config = train_module.parse([*preset, "--env", id, *words])
+    if preset and words:
+        config = dataclasses.replace(config, hidden_sizes=())
+    defaults = [of_task(id), *(config for _, config in PRESETS.values())]
+    families = {"ars": "deterministic", "reinforce": "normal"}
+    family = "categorical" if id.startswith("CartPole") else families[config.algorithm]
+    check_read_by_policy(config, family, defaults)
+    if family != "normal":
+        changed = dataclasses.replace(config, initial_std=0.123)
+        with pytest.raises(ValueError, match=r"--initial-std 0\.123 would do nothing"):
+            check_read_by_policy(changed, family, defaults)

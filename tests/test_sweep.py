@@ -65,23 +65,26 @@ def close(one, other):
 def test_a_run_is_that_of_train(run):
     """Of whichever configuration and group, and with a std of its own."""
     over = "--over learning-rate 1e-2 3e-2 --over estimator leave-one-out total-return "
-    over += "--over initial-std 0.4 0.6"
-    assert run(f"{SMALL} --num-seeds 2 --max-updates 12 {over} --output swept") == 0
+    over += "--over initial-std 0.4 0.6 --over decay-steps 40 4000"
+    shared = f"{SMALL} --num-seeds 2 --max-updates 12 --max-kl 0.01 --final-std 0.1"
+    assert run(f"{shared} {over} --output swept") == 0
     results = read_results(Path("swept"))
-    assert len(results.configurations) == 8
-    assert results.configurations[5] == {
+    assert len(results.configurations) == 16
+    assert results.configurations[10] == {
         "learning_rate": 3e-2,
         "estimator": "leave-one-out",
         "initial_std": 0.6,
+        "decay_steps": 40,
     }
-    alone = "--learning-rate 3e-2 --initial-std 0.6 --output alone"
-    assert run(f"{SMALL} --num-seeds 2 --max-updates 12 {alone}", train_module) == 0
+    alone = "--learning-rate 3e-2 --initial-std 0.6 --decay-steps 40 --output alone"
+    assert run(f"{shared} {alone}", train_module) == 0
     rows = list(csv.DictReader(Path("alone/metrics.csv").read_text().splitlines()))
     for name in ("eval_return", "env_steps"):
         expected = np.array([float(row[name]) for row in rows]).reshape(-1, 2)
-        measured = getattr(results, name)[:, results.configuration == 5]
+        measured = getattr(results, name)[:, results.configuration == 10]
         assert np.allclose(measured, expected, rtol=1e-4, equal_nan=True)
-    assert not same({"": results.eval_return[:, :2]}, {"": results.eval_return[:, 10:12]})
+    assert not same({"": results.eval_return[:, :2]}, {"": results.eval_return[:, 20:22]})
+    assert not same({"": results.eval_return[:, 20:22]}, {"": results.eval_return[:, 22:24]})
 
 
 def test_the_files_say_what_was_measured(run):

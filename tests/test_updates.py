@@ -12,6 +12,8 @@ from toys import Survive, Target
 from mjx_reinforce import mlp_policy, normal, reinforce, train_step
 from mjx_reinforce.learners import estimators, schedules, updates
 from mjx_reinforce.learners.updates import Problem
+from mjx_reinforce.runs.build import _build_optimizer
+from mjx_reinforce.runs.config import Config
 from mjx_reinforce.types import action_space
 
 LENGTHS = np.array([4, 1, 3])
@@ -316,6 +318,30 @@ def test_the_std_shrinks_with_the_env_steps_besides_what_is_learned():
         np.testing.assert_allclose(change["constants"], expected, rtol=1e-5)
         total += change["constants"] + 0.1
     np.testing.assert_allclose(jnp.exp(total), [0.1, 0.1], rtol=1e-5)
+
+
+def test_settings_become_the_schedules_they_name():
+    """The rate falls to a tenth if nothing is said; the noise by the ratio of its two settings."""
+    params = {"network": jnp.ones(2), "constants": jnp.zeros(1)}
+
+    def changes(**settings):
+        config = Config(optimizer="sgd", learning_rate=0.1, max_grad_norm=None, **settings)
+        optimizer = _build_optimizer(config)
+        state, found = optimizer.init(params), []
+        for _ in range(3):
+            change, state = optimizer.update(params, state, params, env_steps=jnp.asarray(50))
+            found.append((float(change["network"][0]), float(change["constants"][0])))
+        return np.array(found)
+
+    rates = changes(decay_steps=100)
+    np.testing.assert_allclose(rates[:, 0], [-0.1, -0.055, -0.01], rtol=1e-5)
+    rates = changes(decay_steps=100, final_learning_rate=0.05)
+    np.testing.assert_allclose(rates[:, 0], [-0.1, -0.075, -0.05], rtol=1e-5)
+    np.testing.assert_allclose(changes(decay_steps=None)[:, 0], [-0.1] * 3, rtol=1e-5)
+    rates = changes(decay_steps=None, decay_updates=2)
+    np.testing.assert_allclose(rates[:, 0], [-0.1, -0.055, -0.01], rtol=1e-5)
+    shrunk = changes(decay_steps=100, initial_std=0.6, final_std=0.03)
+    np.testing.assert_allclose(shrunk[:, 1], np.log(0.05) * np.array([0.5, 0.5, 0]), rtol=1e-5)
 
 
 def test_a_policy_without_an_std_of_its_own_has_nothing_to_shrink():

@@ -101,7 +101,7 @@ def reinforce(
         gradient does not grow with the episodes.
       max_kl: the most, in nats, by which an update may move the policy: the mean over the steps
         that it visited of KL(before || after). A change that goes further is shortened, see
-        ``diagnostics.within_kl``; None shortens none.
+        ``diagnostics.within_kl``; None shortens none. A new scale of the observations comes on top.
       normalize_steps: scale observations by the mean and std of about the first so many steps,
         then keep that scale; 0 does not scale, inf never stops. (Where a policy learns to keep
         the state near the middle, statistics that never stop shrink, and magnify the

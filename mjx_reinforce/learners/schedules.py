@@ -41,8 +41,9 @@ def shrink_std(
 ) -> optax.GradientTransformationExtraArgs:
     """Multiplies standard deviations that are parameters by ``ratio`` in all, evenly in the log.
 
-    Learning changes them besides. They are the entry ``constants`` of ``mlp_policy``'s parameters,
-    log standard deviations of the families that keep one for all states; others have no entries.
+    Learning changes them besides, and an update that ``max_kl`` shortens shrinks them less. They
+    are the entry ``constants`` of ``mlp_policy``'s parameters, log standard deviations of the
+    families that keep one for all states; others have no entries.
 
     Args:
       ratio: of the standard deviation at the end to that at the start.

@@ -109,6 +109,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         "at least 1",
     ),
     ("normalize_steps", lambda x: x >= 0, "at least 0"),
+    ("decay_steps", lambda x: x <= 2**24, "at most 2^24, for float32 counts no further"),
     ("env_steps", lambda x: x < 2**30, "less than 2^30, for each seed"),
     (
         "max_updates num_episodes horizon decay_steps decay_updates eval_every eval_episodes "

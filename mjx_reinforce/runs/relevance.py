@@ -1,7 +1,7 @@
 """Which setting is read under which condition; what would do nothing is refused."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from mjx_reinforce.runs.config import Config, flag
@@ -45,13 +45,13 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
     (
         "final_learning_rate",
         lambda c: c.decay_steps is not None or c.decay_updates is not None,
-        "--decay-steps N",
+        "--decay-steps N (or --decay-updates N)",
     ),
     ("final_std", lambda c: c.decay_steps is not None, "--decay-steps N"),
     (
         "final_std",
         lambda c: c.policy == "auto" or c.policy in FREE_STD,
-        "a --policy with one standard deviation for all states, such as normal,",
+        "a --policy whose standard deviation is the same in all states",
     ),
     (
         "initial_std",
@@ -87,16 +87,21 @@ def check_read(config: Config, default: Config) -> None:
             )
 
 
-def check_read_by_policy(config: Config, policy: str) -> None:
-    """Raises ValueError for settings that differ from ours and that the policy does not read.
+def check_read_by_policy(config: Config, policy: str, defaults: Sequence[Config]) -> None:
+    """Raises ValueError for settings that a user changed and that the policy does not read.
 
     Args:
       config: the settings.
       policy: the distribution that stands for ``auto``, which depends on the environment.
+      defaults: what holds where the user gave none: those of the task, and presets.
     """
-    chosen, default = dataclasses.replace(config, policy=policy), Config()
-    ours = {name: getattr(default, name) for name in ("initial_std", "final_std", "rescale")}
-    check_read(chosen, dataclasses.replace(chosen, **ours))
+    chosen = dataclasses.replace(config, policy=policy)
+    given = [
+        name
+        for name in ("initial_std", "final_std", "rescale")
+        if all(getattr(config, name) != getattr(default, name) for default in defaults)
+    ]
+    check_read(chosen, dataclasses.replace(chosen, **dict.fromkeys(given, object())))
 
 
 def changed(config: Config, default: Config) -> tuple[str, ...]:

@@ -61,8 +61,9 @@ class PolicySettings:
     initial_std: float = 0.5
     """Standard deviation of the actions before training, in the action's unit."""
     final_std: float | None = None
-    """To this it shrinks over --decay-steps, besides what learning makes of it: some policies play
-    well with their noise alone. None leaves it to learning."""
+    """Towards this it shrinks over --decay-steps, besides what learning makes of it: some policies
+    play well with their noise alone. Where --max-kl shortens updates it stays larger. None leaves
+    it to learning."""
     rescale: bool = True
     """Scale the mean so that the network's output 1 is the end of the action's range; else the
     output is the mean."""
@@ -117,10 +118,10 @@ class UpdateSettings:
     final_learning_rate: float | None = None
     """Learning rate after the decay, which is linear; a tenth of the first if not given."""
     decay_steps: int | None = 280_000
-    """Env steps of a seed over which the learning rate decays; None keeps it constant, or leaves it
-    to --decay-updates."""
+    """Env steps of a seed over which the learning rate decays, and the noise with --final-std.
+    None: it stays, or see --decay-updates."""
     decay_updates: int | None = None
-    """Updates over which it decays instead."""
+    """Updates over which the learning rate decays; needs --decay-steps None."""
     weight_decay: float = 0.0
     """adamw: the parameters shrink by learning rate times this; adam, sgd: this times the
     parameters is added to the gradient (L2, as in PyTorch)."""
@@ -128,7 +129,8 @@ class UpdateSettings:
     """The gradient is scaled down to at most this Euclidean norm; None leaves it."""
     max_kl: float | None = None
     """An update moves the policy by at most about this mean KL divergence, in nats, over the steps
-    that it visited: a change that goes further is shortened. None shortens none."""
+    that it visited: a change that goes further is shortened. (A new scale of the observations
+    comes on top.) None shortens none."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -68,6 +68,10 @@ class Design:
     processes: ProcessSettings = dataclasses.field(default_factory=ProcessSettings)
     resume: Path | None = None
 
+    def count(self) -> int:
+        """Returns how many configurations it begins with."""
+        return self.budget or math.prod(map(len, self.over.values()))
+
     def configurations(self) -> list[dict[str, Any]]:
         """Returns the values of what is swept, in each configuration."""
         if self.budget is None:
@@ -123,8 +127,7 @@ def check_design(design: Design) -> None:
 
 def _check_results(design: Design) -> None:
     """Raises ValueError where memory does not hold what results.csv is made of."""
-    configurations = design.budget or math.prod(map(len, design.over.values()))
-    runs = configurations * design.base.num_seeds
+    runs = design.count() * design.base.num_seeds
     if runs * _RESULT > host_memory():
         raise ValueError(
             f"the results of {runs:,} runs do not fit into memory: they need about "

@@ -10,15 +10,17 @@ from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.relevance import FREE_STD
 
 _REINFORCE = (
-    *("learning_rate", "final_learning_rate", "decay_steps", "discount", "entropy_cost"),
-    *(
-        "standardize_floor",
-        "max_grad_norm",
-        "max_kl",
-        "value_learning_rate",
-        "initial_std",
-        "final_std",
-    ),
+    "learning_rate",
+    "final_learning_rate",
+    "decay_steps",
+    "discount",
+    "entropy_cost",
+    "standardize_floor",
+    "max_grad_norm",
+    "max_kl",
+    "value_learning_rate",
+    "initial_std",
+    "final_std",
 )
 _ARS = ("step_size", "noise_std")
 
