@@ -156,7 +156,10 @@ def test_the_saved_policy_plays_like_the_trained_one(run, tmp_path):
         (["--max-updates", "0"], "--max-updates must be at least 1, got 0"),
         (["--max-updates", str(2**31)], "--max-updates must be less than 2^31, got 2147483648"),
         (
-            ["--env-steps", "None", "--max-updates", "134218", "--output", "out"],
+            [
+                *("--num-episodes", "16", "--env-steps", "None", "--max-updates", "134218"),
+                *("--output", "out"),
+            ],
             "give --env-steps, or lower",
         ),
         (["--max-grad-norm", "0"], "--max-grad-norm must be positive and finite, got 0.0"),
