@@ -156,6 +156,18 @@ def _pendulum(results: Sequence[Result]) -> list[str]:
     ]
 
 
+def _episodes(played: Sequence[Result]) -> str:
+    """Returns how many episodes were played: "100 episodes (Ant-v5: 30)"."""
+    counts = {
+        result.task.name: int(result.played["episode"].max()) + 1
+        for result in played
+        if result.played is not None
+    }
+    most = max(counts.values())
+    fewer = [f"{name}: {count:,}" for name, count in counts.items() if count < most]
+    return f"{most:,} episodes" + (f" ({', '.join(fewer)})" if fewer else "")
+
+
 def _played(results: Sequence[Result], docs: Path) -> list[str]:
     played = [result for result in results if result.played is not None]
     if not played:
@@ -164,13 +176,13 @@ def _played(results: Sequence[Result], docs: Path) -> list[str]:
     found = [pair for pair in pairs if pair is not None]
     first = played[0].played
     assert first is not None
-    episodes = int(first["episode"].max()) + 1
+    episodes = _episodes(played)
     version = next(str(x) for x in first["simulation"] if x != "ours")
     within = sum(pair.within for pair in found)
     apart = sum(not pair.difference.low <= 0 <= pair.difference.high for pair in found)
     words = (
         "The best and the median seed of every task by the final evaluation, without noise, in\n"
-        f"{episodes:,} episodes here and {episodes:,} in plain {version.capitalize()}, each from\n"
+        f"{episodes} here and as many in plain {version.capitalize()}, each from\n"
         f"starts that were used nowhere else. Of {len(found)} policies, {within} have\n"
         "Gymnasium's mean within our 95 % interval. If both simulations were the same, that\n"
         "would be so for five in six: our interval knows nothing of the chance in Gymnasium's\n"
