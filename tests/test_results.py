@@ -11,6 +11,8 @@ import pytest
 import results_files
 import results_page
 import results_runs
+import tuning
+from mjx_reinforce.export.files import read_json
 from mjx_reinforce.reports.statistics import Estimate, iqm
 from mjx_reinforce.runs import command_line
 from mjx_reinforce.runs.config import Config, check
@@ -142,6 +144,21 @@ def test_the_stages_have_settings_that_hold(task, tmp_path):
     check(config)
     base = sweep_settings_of(task, task.sweep_seeds, task.sweep_steps)
     check_design(results_runs.OneAtATime(base=base, over=results_runs.moves(base)))
+
+
+SEARCHES = read_json(tuning.KEPT / "searches.json")
+
+
+@pytest.mark.parametrize("name", SEARCHES)
+def test_a_search_can_be_made_again(name, tmp_path):
+    """With the configurations that were kept, and no more memory than they need."""
+    design = tuning._design(SEARCHES[name], tmp_path)
+    check_design(design)
+    base = dataclasses.asdict(design.base)
+    kept = SEARCHES[name]["configurations"]
+    pairs = zip(design.configurations(), kept, strict=True)
+    assert [{k: (base | one)[k] for k in values} for one, values in pairs] == kept
+    assert (tuning.KEPT / f"{name}.csv").exists()
 
 
 def test_a_run_that_was_begun_goes_on(tmp_path):
