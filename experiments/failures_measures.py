@@ -169,8 +169,9 @@ def load(folder: Path) -> Kept:
     """Reads the files."""
     seeds: dict[str, Arrays] = {}
     table = _read(folder / "seeds.csv")
-    for arm in dict.fromkeys(table.pop("arm")):
-        chosen = _read(folder / "seeds.csv")["arm"] == arm
+    names = table.pop("arm")
+    for arm in dict.fromkeys(names):
+        chosen = names == arm
         seeds[arm] = {name: x[chosen].astype(float) for name, x in table.items() if name != "seed"}
     return Kept(
         seeds,

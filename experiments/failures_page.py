@@ -54,10 +54,6 @@ def page(kept: Kept, found: list[Arm]) -> str:
         "quiet_updates": percent(falls["quiet_updates"] / falls["updates_after"], 0),
         "quiet_began": percent(falls["began_without_gradient"] / falls["began"], 0),
         "began": f"{falls['began']}",
-        "low_quarter": _share(quarters(kept)[0].failing),
-        "high_quarter": _share(quarters(kept)[-1].failing),
-        "low_fallen": percent(quarters(kept)[0].fallen.value, 0),
-        "high_fallen": percent(quarters(kept)[-1].fallen.value, 0),
     }
     for arm in found:
         moved = kept.falls[arm.name]
@@ -76,7 +72,6 @@ def page(kept: Kept, found: list[Arm]) -> str:
             f"{arm.name}_failing": _share(arm.failing),
             f"{arm.name}_fallen": percent(arm.fallen.value, 0),
             f"{arm.name}_median": _thousands(arm.median),
-            f"{arm.name}_slowest": _thousands(arm.slowest),
         }
     texts = {name.replace("-", "_"): text for name, text in texts.items()}
     return _TEMPLATE.read_text("utf-8").format(**texts)

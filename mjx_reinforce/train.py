@@ -19,9 +19,8 @@ from typing import Any
 from mjx_reinforce import envs
 from mjx_reinforce.runs import resume
 from mjx_reinforce.runs.alarms import silence_alarms
-from mjx_reinforce.runs.command_line import parse, refuse
+from mjx_reinforce.runs.command_line import parse, refuse, start
 from mjx_reinforce.runs.config import Config, check
-from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.files import check_writable, choose_directory, prepare, remove_empty
 from mjx_reinforce.runs.flags import accept_all_characters
 from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
@@ -29,7 +28,6 @@ from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.memory import check_size
 from mjx_reinforce.runs.plan import Plan, make_plan
-from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.relevance import check_read_by_policy
 from mjx_reinforce.runs.sinks.sink import check_installed, open_sinks
 
@@ -73,7 +71,8 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             env = envs.make(config.env)
             configure_jax()
             with heartbeat(to_screen, None, "writing the simulation out"):
-                learner, horizon, found = _start(env, config)
+                default = start(arguments, "train")[0]
+                learner, horizon, found = _start(env, config, default)
             plan = make_plan(env, learner, horizon, config)
     except ValueError as error:
         refuse(str(error), made)
@@ -99,8 +98,10 @@ def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
     return directory, prepare(directory, config.overwrite)
 
 
-def _start(env: Any, config: Config) -> tuple[Any, int, Any]:
+def _start(env: Any, config: Config, default: Config) -> tuple[Any, int, Any]:
     """Returns the learner, the horizon, and the checkpoint from which the run goes on, if any.
+
+    The default settings are those that hold where the user gave none.
 
     Raises:
       ValueError: the settings do not fit the environment, or the run cannot go on here.
@@ -111,9 +112,7 @@ def _start(env: Any, config: Config) -> tuple[Any, int, Any]:
     learner, horizon = build(env, config)
     if config.resume is None:
         if config.policy == "auto":
-            policy = policy_settings(env, config)["policy"]
-            presets = [preset for _, preset in PRESETS.values()]
-            check_read_by_policy(config, policy, [of_task(config.env), *presets])
+            check_read_by_policy(config, default, policy_settings(env, config)["policy"])
         return learner, horizon, None
     resume.check_program(config.resume, provenance())
     return learner, horizon, resume.find(learner, config, print)

@@ -59,7 +59,7 @@ def refused(monkeypatch, tmp_path, capsys):
     [
         ("--algorithm ars --learning-rate 0.1", "only --algorithm reinforce reads that"),
         ("--algorithm ars --discount 0.5 --no-standardize", "leave them out"),
-        ("--algorithm ars --num-episodes 4", "--num-episodes 4 would do nothing"),
+        ("--algorithm ars --num-episodes 5", "--num-episodes 5 would do nothing"),
         ("--algorithm ars --estimator value-baseline --value-fits 3", "would do nothing"),
         ("--algorithm ars --max-grad-norm None", "--max-grad-norm None would do nothing"),
         ("--num-directions 4", "--num-directions 4 would do nothing: only --algorithm ars"),

@@ -146,14 +146,12 @@ def test_help_lists_presets_and_groups_without_jax():
 @pytest.mark.parametrize("preset", [[], ["pendulum-network"]])
 def test_defaults_that_a_policy_does_not_read_are_not_the_users(id, words, preset):
     """Only what the command line itself says may be refused for doing nothing."""
-    config = train_module.parse([*preset, "--env", id, *words])
-    if preset and words:
-        config = dataclasses.replace(config, hidden_sizes=())
-    defaults = [of_task(id), *(config for _, config in PRESETS.values())]
+    arguments = [*preset, "--env", id, *words]
+    config, default = train_module.parse(arguments), train_module.start(arguments, "train")[0]
     families = {"ars": "deterministic", "reinforce": "normal"}
     family = "categorical" if id.startswith("CartPole") else families[config.algorithm]
-    check_read_by_policy(config, family, defaults)
+    check_read_by_policy(config, default, family)
     if family != "normal":
-        changed = dataclasses.replace(config, initial_std=0.123)
-        with pytest.raises(ValueError, match=r"--initial-std 0\.123 would do nothing"):
-            check_read_by_policy(changed, family, defaults)
+        changed = dataclasses.replace(config, initial_std=1.0)  # a preset's, but not this one's
+        with pytest.raises(ValueError, match=r"--initial-std 1\.0 would do nothing"):
+            check_read_by_policy(changed, default, family)

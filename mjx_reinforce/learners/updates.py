@@ -38,10 +38,6 @@ class Problem(NamedTuple):
     samples: tuple[jax.Array, ...]
     divisor: int | jax.Array
 
-    def env_steps(self) -> jax.Array:
-        """Returns how many env steps [] the rollout had."""
-        return jnp.sum(self.samples[-1])
-
 
 #: The gradient's noise is measured on one of so many episodes, and on so many at most.
 _NOISE_SHARE, _NOISE_EPISODES = 32, 64
@@ -65,11 +61,12 @@ def full_batch() -> Update:
         del key
         mask = problem.samples[-1]
         _, grads, sums = accumulate_gradient(problem.surrogate, params, problem.samples)
-        metrics = {"entropy": sums["entropy"] / jnp.maximum(jnp.sum(mask), 1)}
+        env_steps = jnp.sum(mask)
+        metrics = {"entropy": sums["entropy"] / jnp.maximum(env_steps, 1)}
         if mask.shape[1] > 1:
             metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
         params, opt_state, step = _descend(
-            problem, grads, problem.divisor, params, opt_state, problem.env_steps()
+            problem, grads, problem.divisor, params, opt_state, env_steps
         )
         return params, opt_state, metrics | step
 

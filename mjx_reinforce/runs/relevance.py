@@ -1,7 +1,7 @@
 """Which setting is read under which condition; what would do nothing is refused."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from mjx_reinforce.runs.config import Config, flag
@@ -87,20 +87,16 @@ def check_read(config: Config, default: Config) -> None:
             )
 
 
-def check_read_by_policy(config: Config, policy: str, defaults: Sequence[Config]) -> None:
+def check_read_by_policy(config: Config, default: Config, policy: str) -> None:
     """Raises ValueError for settings that a user changed and that the policy does not read.
 
     Args:
       config: the settings.
+      default: those that hold where the user gave none.
       policy: the distribution that stands for ``auto``, which depends on the environment.
-      defaults: what holds where the user gave none: those of the task, and presets.
     """
     chosen = dataclasses.replace(config, policy=policy)
-    given = [
-        name
-        for name in ("initial_std", "final_std", "rescale")
-        if all(getattr(config, name) != getattr(default, name) for default in defaults)
-    ]
+    given = {"initial_std", "final_std", "rescale"}.intersection(changed(config, default))
     check_read(chosen, dataclasses.replace(chosen, **dict.fromkeys(given, object())))
 
 
