@@ -106,6 +106,11 @@ def check_id(id: str) -> None:
         )
 
 
+def is_ours(id: str) -> bool:
+    """Returns whether an environment's code is this package's; imports nothing."""
+    return id in _TABLE and isinstance(_TABLE[id][0], str)
+
+
 def register(id: str, entry: Callable[..., Any], /, **kwargs: Any) -> None:
     """Adds an environment to ``make`` and ``names``.
 

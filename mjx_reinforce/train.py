@@ -28,7 +28,6 @@ from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.memory import check_size
 from mjx_reinforce.runs.plan import Plan, make_plan
-from mjx_reinforce.runs.relevance import check_read_by_policy
 from mjx_reinforce.runs.sinks.sink import check_installed, open_sinks
 
 
@@ -68,16 +67,16 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             directory, made = _directory(config)
             interrupt.on_exit(lambda: remove_empty(made))
             held.enter_context(locked(directory))
-            env = envs.make(config.env)
+            # A module of the user's is imported before JAX starts, which it may set up.
+            env = None if envs.is_ours(config.env) else envs.make(config.env)
             configure_jax()
             with heartbeat(to_screen, None, "writing the simulation out"):
-                default = start(arguments, "train")[0]
-                learner, horizon, found = _start(env, config, default)
-            plan = make_plan(env, learner, horizon, config)
+                ready, found = _start(env, config, start(arguments, "train")[0])
+            plan = make_plan(ready, config)
     except ValueError as error:
         refuse(str(error), made)
     try:
-        return train(env, learner, horizon, found, config, plan, directory, interrupt)
+        return train(ready, found, config, plan, directory, interrupt)
     except RuntimeError as error:  # XLA's
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
@@ -98,30 +97,29 @@ def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
     return directory, prepare(directory, config.overwrite)
 
 
-def _start(env: Any, config: Config, default: Config) -> tuple[Any, int, Any]:
-    """Returns the learner, the horizon, and the checkpoint from which the run goes on, if any.
+def _start(env: Any, config: Config, default: Config) -> tuple[Any, Any]:
+    """Returns a run that is ready, and the checkpoint from which it goes on, if any.
 
-    The default settings are those that hold where the user gave none.
+    Args:
+      env: the environment, if it is the user's own.
+      config: the settings.
+      default: those that hold where the user gave none.
 
     Raises:
       ValueError: the settings do not fit the environment, or the run cannot go on here.
     """
-    from mjx_reinforce.runs.build import build, policy_settings
     from mjx_reinforce.runs.files import provenance
+    from mjx_reinforce.runs.ready import prepare
 
-    learner, horizon = build(env, config)
+    ready = prepare(config, default, env)
     if config.resume is None:
-        if config.policy == "auto":
-            check_read_by_policy(config, default, policy_settings(env, config)["policy"])
-        return learner, horizon, None
+        return ready, None
     resume.check_program(config.resume, provenance())
-    return learner, horizon, resume.find(learner, config, print)
+    return ready, resume.find(ready.parts.like, config, print)
 
 
 def train(
-    env: Any,
-    learner: Any,
-    horizon: int,
+    ready: Any,
     found: Any,
     config: Config,
     plan: Plan,
@@ -131,9 +129,7 @@ def train(
     """Trains to the budget, a signal, or until nothing is finite, and writes the run's files.
 
     Args:
-      env: what is trained on.
-      learner: how.
-      horizon: the time limit of an episode in steps.
+      ready: the run, a ``ready.Ready``.
       found: the checkpoint from which the run goes on, if any.
       config: the settings of the run.
       plan: what is said of it beforehand.
@@ -150,7 +146,7 @@ def train(
         interrupt.on_exit(display.console.show_cursor)
         display.say(plan.text)
         with display.compiling(plan.compiling):
-            session, compile_seconds = _compile(env, learner, horizon, config, directory, display)
+            session, compile_seconds = _compile(ready, config, directory, display)
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
         interrupt.defer(display.say)
         _begin(session, found)
@@ -160,7 +156,7 @@ def train(
         session.save()
     # A signal after that changes nothing: what is left takes a second or two.
     test = session.test(lambda: interrupt.number is not None)
-    summary = _finish(session, learner.engine.name, compile_seconds, test)
+    summary = _finish(session, ready.engine, compile_seconds, test)
     with contextlib.suppress(OSError):  # as ``Display.say``
         print_summary(display.console, summary, directory)
     if summary["status"] == "stopped":
@@ -169,28 +165,24 @@ def train(
     return 0 if interrupt.number is None or test else 128 + interrupt.number
 
 
-def _compile(
-    env: Any, learner: Any, horizon: int, config: Config, directory: Path, display: Any
-) -> tuple[Any, float]:
+def _compile(ready: Any, config: Config, directory: Path, display: Any) -> tuple[Any, float]:
     """Returns a run before its first update, and how long it took to compile, in seconds."""
     with _collection_paused():
         from mjx_reinforce.reports.curves import load_libraries
         from mjx_reinforce.runs.best import first_best
-        from mjx_reinforce.runs.build import policy_settings
         from mjx_reinforce.runs.log import RunLog
         from mjx_reinforce.runs.record import Record
         from mjx_reinforce.runs.session import Session
-        from mjx_reinforce.runs.state import compile_programs
+        from mjx_reinforce.runs.state import compile_parts
 
     loading = threading.Thread(target=load_libraries, daemon=True)
     started = time.perf_counter()
     with _collection_paused():
-        state, programs = compile_programs(env, learner, horizon, config, loading.start)
-    seconds = learner.engine.seconds + time.perf_counter() - started
-    record = Record(config, getattr(env, "reward_threshold", None))
-    best, policy = first_best(state.train_states), policy_settings(env, config)
-    known = dataclasses.replace(config, horizon=horizon)
-    session = Session(known, policy, programs, record, RunLog(directory), display, state, best)
+        state, programs = compile_parts(ready.parts, config, loading.start)
+    seconds = ready.engine_seconds + time.perf_counter() - started
+    record, best = Record(config, ready.threshold), first_best(state.train_states)
+    known, log = dataclasses.replace(config, horizon=ready.horizon), RunLog(directory)
+    session = Session(known, ready.policy, programs, record, log, display, state, best)
     return session, seconds
 
 

@@ -5,13 +5,16 @@ import os
 import shutil
 import sys
 import tempfile
+from importlib.metadata import version
 from pathlib import Path
 
 # Before JAX is imported, which reads them once. The workers of pytest-xdist and the command lines
 # that tests run inherit them.
 os.environ.setdefault(
     "XLA_FLAGS",
-    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true",
+    "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    # JAX 0.10's older emitters of fusions compile twice as fast; its users have the newer ones.
+    + " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10."),
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
@@ -23,9 +26,16 @@ import jax
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+SLOW = Path(__file__).with_name("slow.txt")
+
 jax.config.update("jax_default_matmul_precision", "highest")
 
 
 def pytest_collection_modifyitems(items):
-    """What takes longest comes first, so that no worker is left alone with it at the end."""
+    """Marks what slow.txt lists, and puts it first: no worker is left alone with it at the end."""
+    slow = {line for line in SLOW.read_text().splitlines() if not line.startswith("#")}
+    for item in items:
+        case = f"{item.path.name}::{item.name}"
+        if not slow.isdisjoint({case, case.partition("[")[0]}):
+            item.add_marker("slow")
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)

@@ -31,7 +31,7 @@ def test_one_update_by_hand(top):
     learner = ars(
         env, policy=policy, num_directions=5, top_directions=top, step_size=0.3, noise_std=0.2
     )
-    state = learner.init(jax.random.key(0))
+    state = jax.jit(learner.init)(jax.random.key(0))
     state, _ = train_step(learner, state)  # Observations are normalised from here on.
     flat, unflatten = jax.flatten_util.ravel_pytree(state.actor.params)
     _, play_key, _ = jax.random.split(state.key, 3)
@@ -71,7 +71,7 @@ def test_the_documents_update_by_hand():
     for leaf in jax.tree.leaves(increment):
         np.testing.assert_allclose(leaf, expected, rtol=1e-6)
     learner = ars(Target(), num_directions=4, update="document", step_size=1.0, noise_std=0.5)
-    state, _ = train_step(learner, learner.init(jax.random.key(0)))
+    state, _ = train_step(learner, jax.jit(learner.init)(jax.random.key(0)))
     layer = state.actor.params["network"]["params"]["Dense_0"]
     assert float(layer["kernel"][0, 0]) == float(layer["bias"][0]) != 0.0
 
@@ -83,7 +83,7 @@ def test_equal_returns_change_nothing(update):
             return jnp.full((), 0.1)
 
     learner = ars(Constant(), update=update)
-    state = learner.init(jax.random.key(0))
+    state = jax.jit(learner.init)(jax.random.key(0))
     after, metrics = train_step(learner, state)
     jax.tree.map(np.testing.assert_array_equal, after.actor.params, state.actor.params)
     assert int(metrics["skipped_update"]) == 0
@@ -92,7 +92,7 @@ def test_equal_returns_change_nothing(update):
 
 def train(env, num_updates, **settings):
     learner = ars(env, **settings)
-    state = learner.init(jax.random.key(0))
+    state = jax.jit(learner.init)(jax.random.key(0))
     state, metrics = jax.jit(
         lambda s: jax.lax.scan(lambda s, _: learner.step(s), s, length=num_updates)
     )(state)
@@ -125,7 +125,8 @@ def test_shared_starts():
     seen = {}
     for shared in (False, True):
         learner = ars(SignedTarget(), num_directions=16, noise_std=1e-9, shared_starts=shared)
-        seen[shared] = train_step(learner, learner.init(jax.random.key(0)))[0].actor.normalizer
+        state, _ = train_step(learner, jax.jit(learner.init)(jax.random.key(0)))
+        seen[shared] = state.actor.normalizer
     assert int(seen[True].count) == int(seen[False].count) == 32
     # With 16 starts twice, the mean observation is a multiple of 1/8.
     assert float(seen[True].mean[0]) * 8 == pytest.approx(round(float(seen[True].mean[0]) * 8))
@@ -134,9 +135,9 @@ def test_shared_starts():
 def test_seeds_together_and_standing_still():
     learner = ars(Survive(), num_directions=4, noise_std=0.5)
     keys = jax.random.split(jax.random.key(0), 3)
-    states = jax.vmap(learner.init)(keys)
+    states = jax.jit(jax.vmap(learner.init))(keys)
     together, metrics = jax.jit(jax.vmap(learner.step))(states, jnp.array([True, True, False]))
-    alone, _ = train_step(learner, learner.init(keys[1]))
+    alone, _ = train_step(learner, jax.jit(learner.init)(keys[1]))
     jax.tree.map(
         lambda x, y: np.testing.assert_allclose(x[1], y, rtol=1e-4, atol=1e-6),
         together.actor,
@@ -155,7 +156,7 @@ def test_hyperparameters_vmap_and_keys_are_used_once():
         after, _ = learner.step(state)
         return jax.flatten_util.ravel_pytree(after.actor.params)[0]
 
-    moves = jax.vmap(step)(jnp.array([0.1, 0.2]))
+    moves = jax.jit(jax.vmap(step))(jnp.array([0.1, 0.2]))
     np.testing.assert_allclose(2 * moves[0], moves[1], rtol=1e-4)
     with jax.debug_key_reuse(True):
         learner = ars(Survive(), num_directions=4)

@@ -89,7 +89,6 @@ def exact():
     return reference, error(one_step("InvertedPendulum-v5", "vmap", solver="mjx"), reference)
 
 
-@pytest.mark.slow
 def test_fused_is_plain_mjx_in_double_precision(exact):
     with jax.enable_x64(True):
         assert error(one_step("InvertedPendulum-v5", "fused"), exact[0]) < 1e-12

@@ -64,6 +64,23 @@ def test_reward_to_go_and_total_return_by_hand():
     np.testing.assert_allclose(got, np.where(MASK, expected[0], 0.0), rtol=1e-6)
 
 
+@pytest.mark.parametrize(("dtype", "within"), [(np.float64, 1e-12), (np.float32, 1e-5)])
+@pytest.mark.parametrize("horizon", [1, 2, 3, 36, 37, 1000])
+def test_returns_to_go_are_those_of_the_recurrence(horizon, dtype, within):
+    reward = np.random.default_rng(horizon).normal(1.0, 1.0, (horizon, 2)).astype(dtype)
+    discounts = [0, 0.5, 0.995, 1]
+    expected = np.zeros((horizon + 1, len(discounts), 2))
+    for t in reversed(range(horizon)):
+        expected[t] = reward[t] + np.array(discounts)[:, None] * expected[t + 1]
+    with jax.enable_x64(dtype == np.float64):
+        traced = jnp.asarray(discounts, dtype)
+        together = jax.vmap(est.discounted_returns, (None, 0), 1)(jnp.asarray(reward), traced)
+        alone = [est.discounted_returns(jnp.asarray(reward), discount) for discount in discounts]
+    for got in (together, np.stack(alone, 1)):
+        assert got.dtype == dtype
+        np.testing.assert_allclose(got, expected[:-1], rtol=within, atol=within)
+
+
 @pytest.mark.parametrize("ended", ["zero", "skip"])
 def test_leave_one_out_by_hand(ended):
     returns = returns_by_hand(0.9)
@@ -354,7 +371,7 @@ def assert_unbiased(estimator, objective):
     start = policy.init(jax.random.key(0))
 
     def gradient(key):
-        state, _ = train_step(learner, learner.init(key))
+        state, _ = train_step(learner, jax.jit(learner.init)(key))
         return state.actor.params - start
 
     samples = jax.jit(jax.vmap(gradient))(jax.random.split(jax.random.key(1), 30_000))

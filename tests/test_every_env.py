@@ -1,8 +1,8 @@
 """Every environment trains: from the command line, or up to what XLA would compile.
 
 What compiles in seconds runs, two updates of two short episodes. Of the tasks that compile for
-half a minute and more one runs, with contacts; the training step of the others is traced, and
-their compiled physics is compared with Gymnasium's in ``test_parity.py``.
+half a minute and more one runs, with contacts; the training step of the others and of older
+versions is traced. ``test_parity.py`` compares the compiled physics with Gymnasium's.
 """
 
 import subprocess
@@ -20,10 +20,12 @@ HEAVY = {
 SETTINGS = (
     "--num-seeds 1 --num-episodes 2 --horizon 3 --max-updates 2 --eval-every 2 --eval-episodes 1"
 )
-RUN = [id for id in envs.names() if id not in HEAVY]
+#: Tasks of the same classes as others, with other numbers.
+OLDER = {"InvertedPendulum-v4", "CartPole-v0"}
+RUN = [id for id in envs.names() if id not in HEAVY | OLDER]
 
 
-@pytest.mark.parametrize("id", [*RUN, pytest.param("Hopper-v5", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("id", [*RUN, "Hopper-v5"])
 def test_trains(id, tmp_path):
     command = [sys.executable, "-W", "ignore", "-m", "mjx_reinforce.train", "--env", id]
     command += [*SETTINGS.split(), "--output", str(tmp_path / "run")]
@@ -36,7 +38,7 @@ def shapes(tree):
     return jax.tree.map(lambda x: (x.shape, x.dtype), tree)
 
 
-@pytest.mark.parametrize("id", sorted(HEAVY - {"Hopper-v5"}))
+@pytest.mark.parametrize("id", sorted((HEAVY | OLDER) - {"Hopper-v5"}))
 def test_a_training_step_is_traced(id):
     """The state comes back as it was: it can be trained on, and scanned over."""
     learner = reinforce(envs.make(id), num_episodes=2, horizon=3, engine="vmap")

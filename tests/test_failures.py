@@ -80,7 +80,6 @@ def test_arms_are_compared_on_the_same_seeds():
     assert other.p_fallen == 1
 
 
-@pytest.mark.slow
 def test_bounded_scale_and_budget_hold_in_a_training():
     setting = Setting(
         num_episodes=2,

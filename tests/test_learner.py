@@ -16,7 +16,7 @@ from mjx_reinforce.learners import estimators, gradients, updates
 
 def train(env, num_updates, **settings):
     learner = reinforce(env, num_episodes=32, **settings)
-    state = learner.init(jax.random.key(0))
+    state = jax.jit(learner.init)(jax.random.key(0))
 
     def body(state, _):
         return learner.step(state)
@@ -80,8 +80,8 @@ def test_update_is_the_finite_difference_of_the_surrogate():
             entropy_cost=cost,
             normalize_steps=0,
         )
-        state = learner.init(jax.random.key(3))
-        after, _ = learner.step(state)
+        state = jax.jit(learner.init)(jax.random.key(3))
+        after, _ = jax.jit(learner.step)(state)
         trajectory = rollout(
             env,
             policy.apply,
@@ -129,7 +129,7 @@ def test_chunks_do_not_change_the_gradient(samples, monkeypatch):
 def test_one_trace_and_nothing_donated():
     learner = reinforce(Survive(), num_episodes=4)
     before = train_step._cache_size()
-    state = learner.init(jax.random.key(0))
+    state = jax.jit(learner.init)(jax.random.key(0))
     first = train_step(learner, state)
     again = train_step(learner, state)
     train_step(learner, first[0])
@@ -158,11 +158,11 @@ def test_seeds_together_are_the_seeds_alone():
     """Up to the last bits: the width of a batch changes XLA's reductions."""
     learner = reinforce(Survive(), num_episodes=8)
     keys = jax.random.split(jax.random.key(0), 3)
-    states = jax.vmap(learner.init)(keys)
+    states = jax.jit(jax.vmap(learner.init))(keys)
     together, metrics = jax.vmap(functools.partial(train_step, learner))(states)
     assert metrics["episode_return"].shape == (3,)
     for s in range(3):
-        alone, _ = train_step(learner, learner.init(keys[s]))
+        alone, _ = train_step(learner, jax.jit(learner.init)(keys[s]))
         jax.tree.map(
             lambda x, y, s=s: np.testing.assert_allclose(x[s], y, rtol=1e-4, atol=1e-6),
             together.actor,
@@ -198,7 +198,7 @@ def test_hyperparameters_vmap():
         after, _ = learner.step(state)
         return after.actor.params["constants"] - state.actor.params["constants"]
 
-    moves = jax.vmap(step)(jnp.array([0.1, 0.2]))
+    moves = jax.jit(jax.vmap(step))(jnp.array([0.1, 0.2]))
     np.testing.assert_allclose(2 * moves[0], moves[1], rtol=1e-4)
 
 
@@ -224,7 +224,7 @@ def test_one_start_is_a_seeds_own_and_stays(one_start):
         normalize_steps=0,
         one_start=one_start,
     )
-    states = jax.vmap(learner.init)(jax.random.split(jax.random.key(0), 3))
+    states = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 3))
     starts = []
     for _ in range(2):
         states, metrics = jax.vmap(functools.partial(train_step, learner))(states)
@@ -247,14 +247,16 @@ class Breaks(Survive):
 
 
 def test_a_broken_simulation_is_counted_and_stays_in_its_seed():
+    @jax.jit
+    @jax.vmap
     def step(broken, key):
         learner = reinforce(Breaks(broken), num_episodes=4)
         return learner.step(learner.init(key))
 
     keys = jax.random.split(jax.random.key(0), 2)
-    healthy, metrics = jax.vmap(step)(jnp.array([False, False]), keys)
+    healthy, metrics = step(jnp.array([False, False]), keys)
     assert np.all(metrics["nonfinite_episodes"] == 0)
-    mixed, metrics = jax.vmap(step)(jnp.array([True, False]), keys)
+    mixed, metrics = step(jnp.array([True, False]), keys)
     np.testing.assert_array_equal(metrics["nonfinite_episodes"], [4, 0])
     for name in ("entropy", "gradient_norm", "kl", "policy_std", "gradient_snr", "weight_std"):
         np.testing.assert_array_equal(np.isfinite(metrics[name]), [False, True], err_msg=name)
@@ -266,7 +268,7 @@ def test_a_gradient_that_is_not_finite_is_skipped():
     estimator = estimators.reward_to_go()
     bad = estimator._replace(update=lambda s, t: (jnp.full_like(t.reward, jnp.nan), s, {}))
     learner = reinforce(Survive(), num_episodes=4, estimator=bad)
-    state = learner.init(jax.random.key(0))
+    state = jax.jit(learner.init)(jax.random.key(0))
     after, metrics = train_step(learner, state)
     assert int(metrics["skipped_update"]) == 1
     for name in ("entropy", "gradient_norm", "kl", "clipped_gradients"):
@@ -284,7 +286,6 @@ def test_nonsense_is_refused():
         mlp_policy(1, normal(Toy.action_space), (32, 0))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("length", "update"),
     [(50, updates.full_batch()), (51, updates.full_batch()), (30, updates.each_step())],
@@ -314,7 +315,7 @@ def test_short_episodes_are_learned_from_in_short(length, update, monkeypatch):
             num_seeds=2,
             engine="vmap",
         )
-        seeds = jax.vmap(learner.init)(jax.random.split(jax.random.key(0), 2))
+        seeds = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 2))
         program = jax.jit(jax.vmap(learner.step)).lower(seeds)
         branches.append("stablehlo.case" in program.as_text())
         learned.append(jax.tree.map(np.asarray, program.compile()(seeds)[0].actor.params))

@@ -242,7 +242,6 @@ def test_mjx_is_left_as_it_is():
     assert table[capsules] is collision_primitive.capsule_capsule
 
 
-@pytest.mark.slow
 def test_descent_to_a_cylinder_is_written_out():
     """A loop there stalls jaxlib 0.10.2."""
     model = mujoco.MjModel.from_xml_path(str(PUSHER))  # pyright: ignore

@@ -61,7 +61,6 @@ class Scene(Survive):
         return jnp.concatenate([data.qacc, data.qfrc_constraint, touching])
 
 
-@pytest.mark.slow
 def test_contacts_of_all_kinds():
     with jax.enable_x64(True):
         env = Scene()

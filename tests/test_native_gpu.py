@@ -73,7 +73,6 @@ def test_seeds_that_are_not_active_are_not_played(pendulum, monkeypatch):
         np.testing.assert_array_equal(got[[1, 3]], want[[1, 3]])
 
 
-@pytest.mark.slow
 def test_in_step_or_apart_an_episode_is_the_same(monkeypatch):
     """Hopper's loops and branches, entered by all threads together or by each alone.
 

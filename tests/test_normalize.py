@@ -91,3 +91,22 @@ def test_deviations_stay_accurate_far_from_zero():
     got = np.asarray(merged(far, far).m2)
     exact = 2 * np.sum((far[MASK] - far[MASK].mean(axis=0)) ** 2, axis=0)
     np.testing.assert_allclose(got, exact, rtol=0.01)
+
+
+@pytest.mark.parametrize("min_std", [0.0, 0.3, 5.0])
+def test_a_small_deviation_is_raised_to_the_least(min_std):
+    """After every batch, of each entry by itself; the mean stays."""
+    normalizer, mean, count, m2 = normalize.init(2), np.zeros(2), 0, np.zeros(2)
+    for observation in (FIRST, SECOND):
+        normalizer = normalize.update(
+            normalizer, jnp.asarray(observation), jnp.asarray(MASK), 1e9, min_std
+        )
+        new = observation[MASK]
+        merged = (count * mean + new.sum(axis=0)) / (count + len(new))
+        m2 = m2 + count * (mean - merged) ** 2 + ((new - merged) ** 2).sum(axis=0)
+        mean, count = merged, count + len(new)
+        m2 = np.maximum(m2, count * min_std**2)
+        std = normalize.standard_deviation(normalizer)
+        assert np.all(std >= min_std * (1 - 1e-6))
+        np.testing.assert_allclose(std, np.sqrt(m2 / count), rtol=1e-4)
+        np.testing.assert_allclose(normalizer.mean, mean, rtol=1e-5)

@@ -98,3 +98,9 @@ def test_readme_python_runs(tmp_path):
     assert blocks
     code = "\n".join(blocks)
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, cwd=tmp_path)
+
+
+def test_slow_tests_are_tests():
+    lines = Path(__file__).with_name("slow.txt").read_text().splitlines()
+    for file, _, case in (line.partition("::") for line in lines if not line.startswith("#")):
+        assert f"def {case.partition('[')[0]}(" in (ROOT / "tests" / file).read_text(), case

@@ -51,13 +51,7 @@ def test_model_equals_gymnasium_field_by_field(id):
     assert compared > 300
 
 
-#: They compile for minutes; CI steps them on the oldest JAX alone.
-SLOW = {"Ant-v5", "Humanoid-v5", "HumanoidStandup-v5", "Pusher-v5", "Hopper-v5", "Walker2d-v5"}
-
-
-@pytest.mark.parametrize(
-    "id", [pytest.param(id, marks=pytest.mark.slow) if id in SLOW else id for id in IDS]
-)
+@pytest.mark.parametrize("id", IDS)
 def test_equals_gymnasium(id):
     """One step from many states, the starts, and the observation at a start."""
     theirs = parity.Theirs.play(id, states=NUM_STATES, resets=1000, seed=0, tolerance=0)

@@ -13,9 +13,8 @@ from toys import Survive
 
 from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
-from mjx_reinforce.runs import measured, memory, plan
+from mjx_reinforce.runs import measured, memory, plan, ready
 from mjx_reinforce.runs.blocks import block_length
-from mjx_reinforce.runs.build import build
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.heartbeat import heartbeat
@@ -177,9 +176,9 @@ def test_an_accelerators_memory_counts_where_there_is_one(monkeypatch):
     machine = plan.Machine("a GPU", {}, 1.0, 1e8, shared=False)
     monkeypatch.setattr(plan, "this_machine", lambda: machine)
     env = Survive()
-    learner, horizon = build(env, config)
+    made = ready.made(env, config)
     with pytest.raises(ValueError, match=r"memory.*0\.1 GB are here"):
-        plan.make_plan(env, learner, horizon, config)
+        plan.make_plan(made, config)
 
 
 # Time.
@@ -220,8 +219,7 @@ def test_a_plan_says_what_is_known(monkeypatch, engine):
     monkeypatch.setitem(measured.TASKS, "Survive-v0", Task(1, 1, 20, 0.5, 5e8))
     config = Config(env="Survive-v0", env_steps=1600, engine=engine)
     env = Survive()
-    learner, horizon = build(env, config)
-    text, compiling = plan.make_plan(env, learner, horizon, config)
+    text, compiling = plan.make_plan(ready.made(env, config), config)
     assert text.startswith("Training 4 seeds of Survive-v0 by reinforce, 1,600 env steps each, on")
     assert "on 3 mills, with the engine" in text
     assert "0.5 GB of memory" in text

@@ -102,7 +102,7 @@ def test_network_outputs_mean_what_they_do_in_the_program(name, std):
         assert float(moved[0]) == pytest.approx(0.3 + 2 * std(-0.7), rel=1e-5)
 
 
-@pytest.mark.parametrize("name", sorted(PRESETS.keys() - {"pendulum-network"}))  # ours
+@pytest.mark.parametrize("name", sorted(PRESETS))
 def test_first_weights_are_pytorchs(name):
     """Uniform within 1 / sqrt(fan-in), biases too; the critic's as well."""
     config = PRESETS[name][1]
@@ -143,15 +143,14 @@ def test_help_lists_presets_and_groups_without_jax():
 
 @pytest.mark.parametrize("id", ["InvertedPendulum-v5", "Hopper-v5", "CartPole-v1"])
 @pytest.mark.parametrize("words", [["--algorithm", "ars"], []])
-@pytest.mark.parametrize("preset", [[], ["pendulum-network"]])
-def test_defaults_that_a_policy_does_not_read_are_not_the_users(id, words, preset):
+def test_defaults_that_a_policy_does_not_read_are_not_the_users(id, words):
     """Only what the command line itself says may be refused for doing nothing."""
-    arguments = [*preset, "--env", id, *words]
+    arguments = ["--env", id, *words]
     config, default = train_module.parse(arguments), train_module.start(arguments, "train")[0]
     families = {"ars": "deterministic", "reinforce": "normal"}
     family = "categorical" if id.startswith("CartPole") else families[config.algorithm]
     check_read_by_policy(config, default, family)
     if family != "normal":
-        changed = dataclasses.replace(config, initial_std=1.0)  # a preset's, but not this one's
+        changed = dataclasses.replace(config, initial_std=1.0)
         with pytest.raises(ValueError, match=r"--initial-std 1\.0 would do nothing"):
             check_read_by_policy(changed, default, family)

@@ -86,7 +86,7 @@ def test_a_record_of_nothing_is_restored():
     record, copy = (Record(Config(num_seeds=2), None) for _ in range(2))
     copy.restore(record.arrays())
     same(record.arrays(), copy.arrays())
-    assert copy.add_evaluation(evaluation(1, 2), 0.5)[0]["train_return"] == ""
+    assert copy.add_evaluation(evaluation(1, 2), 0.5)["train_return"] == ["", ""]
 
 
 def test_a_block_waits_for_its_evaluation():

@@ -121,15 +121,17 @@ def test_each_setting_moves_alone():
         standardize=False,
         decay_steps=None,
         max_kl=None,
+        momentum=0.7,
     )
     moves = results_runs.moves(base)
-    assert set(moves) == {"learning_rate", "discount", "num_episodes", "initial_std"}
+    assert set(moves) == {"learning_rate", "discount", "num_episodes", "initial_std", "momentum"}
     assert moves["learning_rate"] == pytest.approx([0.1, 0.3, 0.9])
     assert moves["discount"] == pytest.approx([0.97, 0.99, 1 - 0.01 / 3])
+    assert moves["momentum"] == pytest.approx([0.1, 0.7, 0.9])
     assert moves["num_episodes"] == [5, 16, 48]
     configurations = results_runs.OneAtATime(base=base, over=moves).configurations()
     changed = [sum(one[k] != configurations[0][k] for k in one) for one in configurations]
-    assert changed == [0] + [1] * 8
+    assert changed == [0] + [1] * 10
     assert configurations[0] == {name: getattr(base, name) for name in moves}
     undiscounted = results_runs.moves(dataclasses.replace(base, discount=1.0))
     assert "discount" not in undiscounted

@@ -23,7 +23,7 @@ from mjx_reinforce.export import files as export_files
 from mjx_reinforce.learners.learner import TrainState
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.runs import checkpoint
+from mjx_reinforce.runs import checkpoint, files
 from mjx_reinforce.runs.best import first_best, keep_best
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.files import locked
@@ -151,6 +151,7 @@ def test_rows_after_the_checkpoint_are_played_again(run, trained, parts):
 def test_a_full_disk_costs_no_training(run, trained, tmp_path, monkeypatch, capsys):
     """Neither checkpoints nor policies nor rows can be written, then all of them again."""
     written, real = [], export_files.write_bytes
+    appended, real_append = [], files.append
 
     def full(path, content):
         written.append(path.name)
@@ -158,13 +159,21 @@ def test_a_full_disk_costs_no_training(run, trained, tmp_path, monkeypatch, caps
             raise OSError(errno.ENOSPC, "No space left on device")
         real(path, content)
 
+    def full_for_rows(path, content):
+        appended.append(content)
+        if 1 < len(appended) < 4:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real_append(path, content)
+
+    monkeypatch.setattr(files, "append", full_for_rows)
     for module in (checkpoint, export_files):
         monkeypatch.setattr(module, "write_bytes", full)
     arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "full"]
     assert run(*COMMON, *arguments) == 0
     assert_same(trained, tmp_path / "full")
     output = capsys.readouterr().out
-    assert "warning: cannot write a checkpoint (No space left on device)" in output
+    for what in ("a checkpoint", "metrics.csv"):
+        assert f"warning: cannot write {what} (No space left on device)" in output
 
 
 def test_a_run_that_cannot_end_is_resumed(run, trained, tmp_path, monkeypatch, capsys):

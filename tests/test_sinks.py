@@ -9,6 +9,8 @@ import sys
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from toys import Survive
 
 from mjx_reinforce import envs
@@ -114,12 +116,24 @@ def test_before_the_first_update_its_columns_are_not_shown():
     }
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@given(data=st.data())
+@settings(derandomize=True, deadline=None, database=None)
+def test_cells_come_back_to_the_last_bit(dtype, data):
+    floats = st.floats(width=np.finfo(dtype).bits)
+    values = np.array(data.draw(st.lists(floats, min_size=1)), dtype)
+    back = [rows.number(cell) for cell in rows._cells(values)]
+    assert all(isinstance(x, float) for x in back)
+    back = np.array(back, dtype)
+    np.testing.assert_array_equal(back, values)
+    np.testing.assert_array_equal(np.signbit(back), np.signbit(values))
+
+
 def test_json_lines_are_the_rows_of_the_table(directory):
     [lines] = sink.open_sinks(Config(jsonl=True), directory, None)
     for update in (0, 5, 10):
-        files.append_csv(
-            directory / "metrics.csv", rows.COLUMNS, evaluation(update, first=not update)
-        )
+        new = rows.lines(evaluation(update, first=not update))
+        files.append(directory / "metrics.csv", new)
         lines.write(evaluation(update, first=not update))
     table = as_csv(directory / "metrics.csv")
     assert len(table) == 60
@@ -149,7 +163,7 @@ def test_tensorboard_has_the_numbers_and_the_histograms(directory):
 @pytest.mark.parametrize("level", [0.0, 1000.0, -3e38])
 def test_a_histogram_of_equal_values_is_one_bin(directory, level):
     [charted] = sink.open_sinks(Config(tensorboard=True), directory, None)
-    charted.write([row | {"eval_return": level} for row in evaluation(0)])
+    charted.write(evaluation(0) | {"eval_return": 20 * [str(level)]})
     histogram = charts(directory / "tensorboard")[0]["eval_return/seeds"]
     assert [count for count in histogram.bucket if count] == [20]
 

@@ -61,7 +61,6 @@ def close(one, other):
     return all(np.allclose(one[n], other[n], rtol=1e-4, equal_nan=True) for n in one | other)
 
 
-@pytest.mark.slow
 def test_a_run_is_that_of_train(run):
     """Of whichever configuration and group, and with a std of its own."""
     over = "--over learning-rate 1e-2 3e-2 --over estimator leave-one-out total-return "
@@ -146,7 +145,6 @@ def in_place(chosen, lengths, widths, num_devices):
     return lanes.reshape(-1, widths[0])
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("exact", [False, True])
 def test_packing_changes_nothing(run, monkeypatch, exact):
     """Neither which runs share a slot, nor how wide it is, nor that those that ended lie aside."""
@@ -226,7 +224,6 @@ def start(count, command, folder):
     return subprocess.Popen(line, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("exact", [False, True])
 def test_devices_change_nothing_but_rounding(run, tmp_path, exact):
     command = f"{STEPS} --num-seeds 3 {'--exact' * exact}"
@@ -361,7 +358,6 @@ def test_a_flag_that_one_configuration_reads_is_accepted():
         configure(Config(decay_steps=None), grid({"final_learning_rate": [1e-3, 1e-2]}))
 
 
-@pytest.mark.slow
 def test_halving_goes_on_with_the_better_half(run, monkeypatch):
     """The winner's training is that of a run alone, and its last figure is of other seeds.
 
@@ -463,7 +459,6 @@ def test_from_python_a_report_can_be_left_out(monkeypatch, tmp_path, capsys, rep
     assert ("statistics and report" in capsys.readouterr().out) == report
 
 
-@pytest.mark.slow
 def test_two_processes_share_a_sweep(run, tmp_path):
     command = f"{SMALL} --num-seeds 3 --max-updates 6 {RATES}"
     assert run(f"{command} --output alone") == 0

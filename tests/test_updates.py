@@ -191,7 +191,7 @@ def test_a_seed_that_stands_still_stays_as_it_is(update):
 def test_each_step_of_episodes_of_one_step_is_the_full_batch():
     def after(update):
         learner = reinforce(Target(), num_episodes=4, update=update)
-        return train_step(learner, learner.init(jax.random.key(0)))[0].actor
+        return train_step(learner, jax.jit(learner.init)(jax.random.key(0)))[0].actor
 
     assert_close(after(updates.each_step()), after(None))
 
@@ -204,7 +204,7 @@ def test_minibatches_find_the_best_action():
         optimizer=optax.adam(1e-3),
         update=updates.minibatches(4, 16),
     )
-    state = learner.init(jax.random.key(0))
+    state = jax.jit(learner.init)(jax.random.key(0))
     state = jax.jit(lambda s: jax.lax.scan(lambda s, _: learner.step(s), s, length=200)[0])(state)
     mode = learner.policy.distribution.mode(learner.act(state.actor, jnp.zeros(1)))
     assert float(mode[0]) == pytest.approx(0.5, abs=0.1)
@@ -238,6 +238,14 @@ def test_optimizers_by_hand(name):
     if name != "sgd":
         expected = adam_by_hand(grads, decay, decoupled=name == "adamw")
     assert float(x) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["adam", "adamw"])
+def test_without_momentum_adam_follows_the_last_gradient_alone(name):
+    optimizer = updates.make_optimizer(name, 0.1, max_grad_norm=None, momentum=0.0)
+    got = changes(optimizer, jnp.array(2.0), *map(jnp.array, (0.5, -3.0)))
+    second = (0.999 * 0.001 * 0.5**2 + 0.001 * 3.0**2) / (1 - 0.999**2)
+    np.testing.assert_allclose(got, [-0.1, 0.1 * 3.0 / np.sqrt(second)], rtol=1e-5)
 
 
 def test_the_norm_is_clipped_before_the_weight_decay():
@@ -350,7 +358,7 @@ def test_a_policy_without_an_std_of_its_own_has_nothing_to_shrink():
         optimizer=optax.chain(optax.adam(1e-2), schedules.shrink_std(0.1, 20)),
         policy=mlp_policy(1, normal(action_space(Target()), std="softplus"), (4,)),
     )
-    after, metrics = train_step(learner, learner.init(jax.random.key(0)))
+    after, metrics = train_step(learner, jax.jit(learner.init)(jax.random.key(0)))
     assert metrics["skipped_update"] == 0
     assert after.actor.params["constants"].shape == (0,)
 

@@ -61,6 +61,7 @@ def ars(
     noise_std: float | jax.Array = 0.03,
     horizon: int | None = None,
     normalize_steps: float = math.inf,
+    normalize_min_std: float | jax.Array = 0.0,
     shared_starts: bool = False,
     update: str = "paper",
     engine: str = "auto",
@@ -79,6 +80,7 @@ def ars(
       horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
       normalize_steps: scale observations by the mean and std of about the first so many steps;
         inf is V2, 0 is V1.
+      normalize_min_std: the least that an observation is divided by, in its own unit.
       shared_starts: the two episodes of a direction start alike; each has its own start in the
         paper.
       update: "paper", or "document" for that of a published notebook: ``document_increment``.
@@ -105,6 +107,7 @@ def ars(
         noise_std=noise_std,
         horizon=horizon,
         normalize_steps=normalize_steps,
+        normalize_min_std=normalize_min_std,
         shared_starts=shared_starts,
         update=update,
         observation_size=size,
@@ -136,6 +139,7 @@ class _Search:
     noise_std: float | jax.Array
     horizon: int
     normalize_steps: float
+    normalize_min_std: float | jax.Array
     shared_starts: bool
     update: str
     observation_size: int
@@ -187,7 +191,11 @@ class _Search:
             increment = document_increment(trial.directions, returns, self.noise_std)
         moved = jax.tree.map(lambda p, d: p + self.step_size * d, actor.params, increment)
         normalizer = normalize.update(
-            actor.normalizer, trajectory.observation, trajectory.mask, self.normalize_steps
+            actor.normalizer,
+            trajectory.observation,
+            trajectory.mask,
+            self.normalize_steps,
+            self.normalize_min_std,
         )
         learned = Actor(params=self._tie(moved), normalizer=normalizer)
         actor, skipped = keep_finite(learned, actor)

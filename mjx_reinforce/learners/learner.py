@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.flatten_util import ravel_pytree
 
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
@@ -120,10 +121,25 @@ def keep_finite(learned: Any, before: Any) -> tuple[Any, jax.Array]:
 
     So an update that breaks costs its seed that one update.
     """
-    leaves = [x for x in jax.tree.leaves(learned) if jnp.issubdtype(x.dtype, jnp.floating)]
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in leaves]))
-    kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), learned, before)
+    # Floats are joined into one vector for the choice. With a choice for each leaf XLA's CPU
+    # backend makes a program for each, and each of them computes again what they share.
+    vector, unravel = ravel_pytree(_floats(learned))
+    finite = jnp.all(jnp.isfinite(vector))
+    floats = iter(unravel(jnp.where(finite, vector, ravel_pytree(_floats(before))[0])))
+
+    def choose(new, old):
+        return next(floats) if _is_float(new) else jnp.where(finite, new, old)
+
+    kept = jax.tree.map(choose, learned, before)
     return kept, jnp.where(finite, 0, 1)
+
+
+def _floats(tree: Any) -> list[jax.Array]:
+    return [x for x in jax.tree.leaves(tree) if _is_float(x)]
+
+
+def _is_float(x: jax.Array) -> bool:
+    return jnp.issubdtype(x.dtype, jnp.floating)
 
 
 def episode_metrics(trajectory: Trajectory) -> Metrics:

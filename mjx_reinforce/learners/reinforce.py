@@ -78,6 +78,7 @@ def reinforce(
     loss_per: str = "episode",
     max_kl: float | jax.Array | None = None,
     normalize_steps: float = 1000,
+    normalize_min_std: float | jax.Array = 0.0,
     one_start: bool = False,
     num_seeds: int = 1,
     engine: str = "auto",
@@ -106,6 +107,8 @@ def reinforce(
         then keep that scale; 0 does not scale, inf never stops. (Where a policy learns to keep
         the state near the middle, statistics that never stop shrink, and magnify the
         observations until the policy fails.)
+      normalize_min_std: the least that an observation is divided by, in its own unit. (What hardly
+        changes in the first steps would be magnified for ever.)
       one_start: reset every episode of a seed with the same key, drawn once at ``init``.
       num_seeds: how many will learn at once, vmapped. It decides nothing but speed: of many,
         updates whose episodes are all short pass over their first steps alone, the same up to
@@ -131,6 +134,7 @@ def reinforce(
         loss_per=loss_per,
         max_kl=max_kl,
         normalize_steps=normalize_steps,
+        normalize_min_std=normalize_min_std,
         one_start=one_start,
         num_seeds=num_seeds,
         observation_size=size,
@@ -152,6 +156,7 @@ class _Reinforce:
     loss_per: str
     max_kl: float | jax.Array | None
     normalize_steps: float
+    normalize_min_std: float | jax.Array
     one_start: bool
     num_seeds: int
     observation_size: int
@@ -240,7 +245,11 @@ class _Reinforce:
         if self.max_kl is not None:
             params = within_kl(self.policy, actor, params, visited, self.max_kl)
         normalizer = normalize.update(
-            actor.normalizer, trajectory.observation, mask, self.normalize_steps
+            actor.normalizer,
+            trajectory.observation,
+            mask,
+            self.normalize_steps,
+            self.normalize_min_std,
         )
         learned = Actor(params=params, normalizer=normalizer), opt_state, estimator_state
         before = actor, state.opt_state, state.estimator_state

@@ -223,6 +223,7 @@ def make_optimizer(
     *,
     weight_decay: float = 0.0,
     max_grad_norm: float | jax.Array | None = 1.0,
+    momentum: float | jax.Array = 0.9,
 ) -> optax.GradientTransformation:
     """Builds an optimiser with the constants that PyTorch and optax share.
 
@@ -234,6 +235,7 @@ def make_optimizer(
         which Adam then rescales with the rest, as ``torch.optim.Adam(weight_decay=...)`` does.
       max_grad_norm: the gradient, before the weight decay, is scaled down to at most this
         Euclidean norm; None leaves it as it is.
+      momentum: b1 of Adam; sgd has none.
 
     Raises:
       ValueError: the name is unknown.
@@ -243,7 +245,8 @@ def make_optimizer(
     if max_grad_norm is not None:
         parts.append(clip_by_norm(max_grad_norm))
     if name == "adamw":
-        return optax.chain(*parts, optax.adamw(learning_rate, weight_decay=weight_decay))
+        return optax.chain(*parts, optax.adamw(learning_rate, momentum, weight_decay=weight_decay))
     if weight_decay:
         parts.append(optax.add_decayed_weights(weight_decay))
-    return optax.chain(*parts, (optax.adam if name == "adam" else optax.sgd)(learning_rate))
+    last = optax.adam(learning_rate, momentum) if name == "adam" else optax.sgd(learning_rate)
+    return optax.chain(*parts, last)

@@ -33,6 +33,7 @@ from importlib import metadata
 from typing import Any, cast
 
 import jax
+import jax.numpy as jnp
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver, collision_sdf, scan
 from mujoco.mjx._src.collision_primitive import collider
@@ -162,10 +163,15 @@ def _fenced_level(*inputs: Any) -> Any:
 def _descend(objective: Callable[..., Any], x: jax.Array, niter: int) -> tuple[Any, jax.Array]:
     """Returns the least distance found [] and where [3], as MJX's `_gradient_descent`."""
 
+    @jax.jit  # not inlined: JAX vmaps it once for all iterations
+    def step(state: collision_sdf.GradientState) -> collision_sdf.GradientState:
+        return collision_sdf._gradient_step(objective, state)
+
     def written_out(x: jax.Array) -> tuple[Any, jax.Array]:
-        state = collision_sdf.GradientState(dist=1e10, x=x)  # type: ignore
+        far = jnp.asarray(1e10, x.dtype)
+        state = collision_sdf.GradientState(dist=far, x=x)  # type: ignore
         for _ in range(niter):
-            state = collision_sdf._gradient_step(objective, state)
+            state = step(state)
         return state.dist, state.x
 
     return by_engine(lambda x: _descent(objective, x, niter), written_out, x)

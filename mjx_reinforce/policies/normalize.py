@@ -30,7 +30,11 @@ def init(observation_size: int) -> Normalizer:
 
 
 def update(
-    normalizer: Normalizer, observation: jax.Array, mask: jax.Array, at_most: float
+    normalizer: Normalizer,
+    observation: jax.Array,
+    mask: jax.Array,
+    at_most: float,
+    min_std: float | jax.Array = 0.0,
 ) -> Normalizer:
     """Merges a batch into the statistics, unless enough observations are counted already.
 
@@ -42,6 +46,8 @@ def update(
       observation: [T, N, O]; entries outside the mask have no effect.
       mask: [T, N] True where the observation counts.
       at_most: a batch is merged only if fewer observations than this are counted so far.
+      min_std: a smaller standard deviation of the two together is raised to this, in the
+        observation's unit, and has that size when the next batch is merged.
 
     Returns:
       The statistics of both together, or those so far.
@@ -54,10 +60,11 @@ def update(
     m2 = jnp.sum(jnp.where(kept, (observation - mean) ** 2, 0.0), axis=(0, 1))
     total = jnp.maximum(normalizer.count + count, 1.0)
     delta = mean - normalizer.mean
+    m2 = normalizer.m2 + m2 + delta**2 * normalizer.count * count / total
     return Normalizer(
         count=normalizer.count + count,
         mean=normalizer.mean + delta * count / total,
-        m2=normalizer.m2 + m2 + delta**2 * normalizer.count * count / total,
+        m2=jnp.maximum(m2, min_std**2 * (normalizer.count + count)),
     )
 
 

@@ -36,6 +36,7 @@ def build(env: Any, config: Config, policy: Any = None) -> tuple[Any, int]:
         "policy": build_policy(policy_settings(env, config)) if policy is None else policy,
         "horizon": horizon,
         "normalize_steps": math.inf if forever else config.normalize_steps,
+        "normalize_min_std": config.normalize_min_std,
         "engine": config.engine,
     }
     build_learner = _build_ars if config.algorithm == "ars" else _build_reinforce
@@ -55,7 +56,7 @@ def policy_settings(env: Any, config: Config) -> dict[str, Any]:
     return {
         "env": config.env,
         "policy": family if config.policy == "auto" else config.policy,
-        "hidden_sizes": config.hidden_sizes,
+        "hidden_sizes": list(config.hidden_sizes),
         "shared_trunk": config.shared_trunk,
         "initializer": config.initializer,
         "initial_std": config.initial_std,
@@ -137,6 +138,7 @@ def _build_optimizer(config: Config) -> Any:
         rate,
         weight_decay=config.weight_decay,
         max_grad_norm=config.max_grad_norm,
+        momentum=config.momentum,
     )
     if config.decay_steps is None:
         return optimizer

@@ -130,8 +130,7 @@ def _description() -> str:
         f"Leaves {', '.join(_FILES)} in the run directory.\n\n"
         "Defaults depend on the task: --help shows those of InvertedPendulum-v5, --help --env ID "
         "those of another.\n\n"
-        "Presets, whose settings replace the defaults; all but pendulum-network are published "
-        f"programs:\n{presets()}\n\n"
+        f"Presets, published programs whose settings replace the defaults:\n{presets()}\n\n"
         f"Environments: {', '.join(envs.names())}."
     )
 

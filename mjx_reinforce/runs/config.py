@@ -124,6 +124,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ),
     ("seed eval_seed", lambda x: 0 <= x < 2**32, "in [0, 2^32)"),
     ("discount", lambda x: 0 <= x <= 1, "in [0, 1]"),
+    ("momentum", lambda x: 0 <= x <= 1 - 2**-24, "in [0, 1 - 2^-24], the last float32 below 1"),
     (
         "hidden_sizes value_hidden_sizes",
         lambda x: all(n >= 1 for n in x),
@@ -147,7 +148,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         "positive and finite",
     ),
     (
-        "standardize_floor entropy_cost weight_decay",
+        "standardize_floor entropy_cost weight_decay normalize_min_std",
         lambda x: math.isfinite(x) and x >= 0,
         "finite and not negative",
     ),
@@ -159,7 +160,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ),
     (
         "initial_std final_std noise_std max_grad_norm max_kl standardize_floor entropy_cost "
-        "weight_decay",
+        "weight_decay normalize_min_std",
         lambda x: x == 0 or 1 / _MAX_SIZE <= x <= _MAX_SIZE,
         f"in [{1 / _MAX_SIZE:g}, {_MAX_SIZE:g}], for runs compute in float32",
     ),

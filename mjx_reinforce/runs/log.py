@@ -1,7 +1,7 @@
 """The files of a run: config.json first, metrics.csv as it goes on, the rest at its end."""
 
 import datetime
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ class RunLog:
         self.directory = directory
         self._metrics = directory / "metrics.csv"
         #: Rows that could not be written yet.
-        self._waiting: list[Mapping[str, Any]] = []
+        self._waiting = b""
 
     def begin(self, settings: Mapping[str, Any]) -> None:
         """Writes config.json, and a metrics.csv that has no rows yet; removes an older run.
@@ -83,15 +83,18 @@ class RunLog:
         """Writes a summary.json that says how far the run is, for whoever finds it killed."""
         write_json(self.directory / "summary.json", {"status": "running", **reached})
 
-    def add_rows(self, new: Sequence[Mapping[str, Any]]) -> None:
+    def add_rows(self, new: rows.Cells) -> None:
         """Appends rows to metrics.csv, after those that could not be written before."""
-        self._waiting += new
-        files.append_csv(self._metrics, rows.COLUMNS, self._waiting)
-        self._waiting = []
+        self._waiting += rows.lines(new)
+        self._write_waiting()
+
+    def _write_waiting(self) -> None:
+        files.append(self._metrics, self._waiting)
+        self._waiting = b""
 
     def metrics_bytes(self) -> int:
         """Returns the length of metrics.csv with all rows in it."""
-        self.add_rows(())
+        self._write_waiting()
         return self._metrics.stat().st_size
 
     def save_policies(self, last: Actor, best: Actor, settings: dict[str, Any]) -> None:
@@ -113,7 +116,7 @@ class RunLog:
           picture: the contents of learning_curve.png.
           summary: the contents of summary.json.
         """
-        self.add_rows(())
+        self._write_waiting()
         write_arrays(self.directory / "returns.npz", training, compressed=True)
         write_bytes(self.directory / "learning_curve.png", picture)
         write_json(self.directory / "summary.json", summary)

@@ -1,5 +1,6 @@
 """What a run will do, how long that takes about, and how much memory it needs."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from mjx_reinforce.runs import measured
@@ -52,24 +53,22 @@ class Plan(NamedTuple):
     compiling: float | None
 
 
-def make_plan(env: Any, learner: Any, horizon: int, config: Config) -> Plan:
+def make_plan(ready: Any, config: Config) -> Plan:
     """Returns the plan of a run on this machine.
 
     Args:
-      env: what is trained on.
-      learner: how.
-      horizon: the time limit of an episode in steps.
-      config: the settings.
+      ready: the run, a ``ready.Ready``.
+      config: its settings.
 
     Raises:
       ValueError: the run does not fit into the memory that is here.
     """
-    task, machine = task_of(env, horizon, config), this_machine()
+    task, machine = task_of(ready.policy, ready.horizon, config), this_machine()
     base = task.base_memory if machine.shared else 0.0
     check_fits(config, task, machine.memory, base)
     speed = machine.speeds.get(config.env)
     known = num_parameters(config, task) <= _MEASURED_PARAMETERS
-    if speed is None or speed.engine != learner.engine.name or not known:
+    if speed is None or speed.engine != ready.engine or not known:
         time, compiling = "How long this takes here is not known", None
     else:
         seconds, bounded = training_seconds(config, task, speed)
@@ -81,8 +80,8 @@ def make_plan(env: Any, learner: Any, horizon: int, config: Config) -> Plan:
             time += ", more if some seeds' episodes stay short, since all wait for the last"
     memory = gigabytes(base + needed(config, task))
     text = (
-        f"Training {_what(config)} on {machine.name}, with the engine {learner.engine.name}: "
-        f"{learner.engine.why}. {time}. It needs about {memory} of memory."
+        f"Training {_what(config)} on {machine.name}, with the engine {ready.engine}: "
+        f"{ready.why}. {time}. It needs about {memory} of memory."
     )
     return Plan(text, compiling)
 
@@ -148,12 +147,15 @@ def _what(config: Config) -> str:
     return f"{seeds} of {config.env} by {config.algorithm}, {' or '.join(budgets)} each,"
 
 
-def task_of(env: Any, horizon: int, config: Config) -> Task:
-    """Returns the sizes of a task, also of the user's own."""
-    from mjx_reinforce.types import Discrete, action_space, observation_size
+def task_of(policy: Mapping[str, Any], horizon: int, config: Config) -> Task:
+    """Returns the sizes of a task, also of the user's own.
 
+    Args:
+      policy: what ``build.policy_settings`` returns.
+      horizon: the time limit of an episode in steps.
+      config: the settings.
+    """
     if config.env in measured.TASKS:
         return measured.TASKS[config.env]
-    discrete = isinstance(action_space(env), Discrete)
-    entries = 1 if discrete else env.action_size
-    return Task(observation_size(env), entries, horizon, 1.0, _BASE_MEMORY)
+    entries = 1 if "num_actions" in policy else len(policy["action_low"])
+    return Task(policy["observation_size"], entries, horizon, 1.0, _BASE_MEMORY)

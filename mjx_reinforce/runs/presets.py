@@ -1,4 +1,4 @@
-"""Published programs, setting by setting, under names for the command line, and one of ours.
+"""Published programs, setting by setting, under names for the command line.
 
 Their network weights, optimisers and constants are those of the programs. Two things are ours:
 five seeds train together, so that there is an interval, and each is evaluated as in every other
@@ -9,7 +9,6 @@ import dataclasses
 import math
 
 from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.defaults import PENDULUM_NETWORK
 
 # What they share: PyTorch's weights, one episode an update, and none of our own additions.
 _PLAIN = Config(
@@ -100,10 +99,6 @@ _CATEGORICAL = dataclasses.replace(
 
 #: name -> (a line for --help, the settings).
 PRESETS: dict[str, tuple[str, Config]] = {
-    "pendulum-network": (
-        "InvertedPendulum-v5 with 32 and 32 tanh units, and the settings found for them",
-        Config(env="InvertedPendulum-v5", **PENDULUM_NETWORK),
-    ),
     "gymnasium-tutorial": (
         "Gymnasium's REINFORCE tutorial: reward to go, AdamW, one start state a seed",
         _TUTORIAL,

@@ -122,7 +122,7 @@ class Record:
             newest = np.take_along_axis(values, last[None], axis=0)[0]
             self._last[name] = np.asarray(np.where(made > 0, newest, self._last.get(name, newest)))
 
-    def add_evaluation(self, result: Arrays, seconds: float) -> list[dict[str, Any]]:
+    def add_evaluation(self, result: Arrays, seconds: float) -> rows.Cells:
         """Takes in an evaluation [S] of the present policies.
 
         Args:
@@ -130,7 +130,7 @@ class Record:
           seconds: wall time since compilation ended.
 
         Returns:
-          The rows of metrics.csv, see ``rows``.
+          The cells of its rows in metrics.csv, see ``rows``.
         """
         episodes = self.updates * self._config.episodes_per_update
         counts = {"env_steps": self.env_steps, "episodes": episodes, "updates": self.updates}

@@ -15,7 +15,8 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
         "num_episodes estimator discount discount_weights standardize standardize_floor "
         "value_learning_rate value_fits value_hidden_sizes update minibatch_updates "
         "minibatch_size loss_per entropy_cost optimizer learning_rate final_learning_rate "
-        "decay_steps decay_updates weight_decay max_grad_norm max_kl final_std",
+        "decay_steps decay_updates weight_decay max_grad_norm max_kl final_std "
+        "momentum",
         lambda c: c.algorithm == "reinforce",
         "--algorithm reinforce",
     ),
@@ -46,6 +47,12 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
         "final_learning_rate",
         lambda c: c.decay_steps is not None or c.decay_updates is not None,
         "--decay-steps N (or --decay-updates N)",
+    ),
+    ("normalize_min_std", lambda c: c.normalize_steps != 0, "--normalize-steps N"),
+    (
+        "momentum",
+        lambda c: c.optimizer in ("adam", "adamw"),
+        "--optimizer adam or --optimizer adamw",
     ),
     ("final_std", lambda c: c.decay_steps is not None, "--decay-steps N"),
     (

@@ -1,7 +1,6 @@
 """Going on with a run: its own settings, the same program, and the checkpoint that serves."""
 
 import dataclasses
-import functools
 import json
 import types
 import typing
@@ -159,11 +158,11 @@ def check_same_program(
             )
 
 
-def find(learner: Any, config: Config, say: Callable[[str], None]) -> Any:
+def find(like: Any, config: Config, say: Callable[[str], None]) -> Any:
     """Returns the newest checkpoint that serves, or None: then the run starts again.
 
     Args:
-      learner: how it learns.
+      like: the shapes of its ``RunState``.
       config: its settings, with the budget that it is to have.
       say: shows a line about each file that does not serve.
 
@@ -171,18 +170,14 @@ def find(learner: Any, config: Config, say: Callable[[str], None]) -> Any:
       ValueError: the budget is smaller than what the run did, config.json was changed by hand, or
         a checkpoint is of another version.
     """
-    import jax
-
     from mjx_reinforce.runs import checkpoint
     from mjx_reinforce.runs.best import shape_of_best
-    from mjx_reinforce.runs.state import first_state
 
     assert config.resume is not None
     _check_unchanged(config, checkpoint.settings_of(config.resume / "checkpoint"))
-    state = jax.eval_shape(functools.partial(first_state, learner, config))
-    like = state, shape_of_best(state.train_states)
+    states = like, shape_of_best(like.train_states)
     length = _size(config.resume / "metrics.csv")
-    for found in checkpoint.load(config.resume / "checkpoint", like, say):
+    for found in checkpoint.load(config.resume / "checkpoint", states, say):
         if found.metrics_bytes > length:
             say(f"metrics.csv is shorter than at checkpoint {found.number}; trying the one before")
         elif _serves(found, config):

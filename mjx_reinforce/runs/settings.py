@@ -70,6 +70,9 @@ class PolicySettings:
     normalize_steps: int | None = 1000
     """Scale observations by the statistics of about the first so many steps; 0 does not, None
     goes on for ever."""
+    normalize_min_std: float = 0.0
+    """They are divided by at least this, in the observation's unit: what hardly changes in those
+    steps would be magnified for ever."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -115,6 +118,8 @@ class UpdateSettings:
     """The rule that turns a gradient into a step."""
     learning_rate: float = 1e-2
     """Its learning rate at the start."""
+    momentum: float = 0.9
+    """Adam's b1: how much of the last mean gradient the next one keeps."""
     final_learning_rate: float | None = None
     """Learning rate after the decay, which is linear; a tenth of the first if not given."""
     decay_steps: int | None = 280_000

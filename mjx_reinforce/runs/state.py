@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -17,6 +17,7 @@ from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.runs.blocks import block_length
 from mjx_reinforce.runs.config import MAX_COUNT, Config
 from mjx_reinforce.runs.evaluation import evaluate
+from mjx_reinforce.runs.keys import plain, with_keys
 from mjx_reinforce.types import Environment
 
 Arrays = dict[str, np.ndarray]
@@ -49,6 +50,26 @@ class Budget(NamedTuple):
     updates: jax.Array | np.int32
 
 
+class Parts(NamedTuple):
+    """The programs of a run before they are compiled, on lists of the leaves of states.
+
+    Keys are data in them, so that they may be kept on disk, see ``kept``. Each part is a function
+    without arguments that returns its program: tracing takes time, and is done when it is needed.
+
+    like: the shapes of a ``RunState``
+    start: (seed, eval_seed) -> the first state's leaves, and the data of the keys of evaluation and
+      of the last test
+    advance: (leaves, (env_steps, updates) as in ``Budget``) -> leaves, how many updates were made,
+      metrics; as ``block_of_updates``
+    look: (leaves of the actors, data of a key) -> as ``evaluation``
+    """
+
+    like: RunState
+    start: Callable[[], Callable[..., Any]]
+    advance: Callable[[], Callable[..., Any]]
+    look: Callable[[], Callable[..., Any]]
+
+
 class Programs(NamedTuple):
     """The compiled programs of a run, over all seeds at once.
 
@@ -64,11 +85,6 @@ class Programs(NamedTuple):
     advance: Callable[[RunState], tuple[RunState, Arrays]]
     evaluate: Callable[[RunState], Arrays]
     test: Callable[[Actor], Arrays]
-
-
-def first_state(learner: Learner, config: Config) -> RunState:
-    """Returns the state before the first update."""
-    return jax.jit(beginning(lambda _: learner))(seed_keys(config), {})
 
 
 def seed_keys(config: Config) -> jax.Array:
@@ -100,44 +116,74 @@ def beginning(build_learner: BuildLearner) -> Callable[..., RunState]:
     return begin
 
 
-def compile_programs(
-    env: Environment,
-    learner: Learner,
-    horizon: int,
-    config: Config,
-    meanwhile: Callable[[], object] = lambda: None,
-) -> tuple[RunState, Programs]:
-    """Returns the state before the first update, and the compiled programs of a run.
+def parts_of(env: Environment, learner: Learner, horizon: int, config: Config) -> Parts:
+    """Returns the programs of a run.
 
     Args:
       env: what is trained on.
       learner: how.
       horizon: T, the time limit of an episode in steps.
       config: the settings of the run.
-      meanwhile: begins other work in Python; called once the rest of the time is XLA's.
     """
-    budget = budget_of(config)
-    block = block_of_updates(lambda _: learner, block_length(config))
-    advance = jax.jit(block, donate_argnums=0)
-    look = jax.jit(evaluation(env, learner, horizon, config))
 
     # One program, whatever the seeds are: a program for each operation on keys takes longer.
-    def start(seed: Any, eval_seed: Any) -> tuple[RunState, jax.Array, jax.Array]:
+    def first(seed: Any, eval_seed: Any) -> tuple[RunState, jax.Array, jax.Array]:
         state = beginning(lambda _: learner)(_seed_keys(seed, config.num_seeds), {})
         return state, _key(eval_seed, domain=1), _key(eval_seed, domain=2)
 
-    seeds = np.uint32(config.seed), np.uint32(config.eval_seed)
-    shapes, key, _ = jax.eval_shape(start, *seeds)
+    updates = block_of_updates(lambda _: learner, block_length(config))
+    evaluate = evaluation(env, learner, horizon, config)
+    like = jax.eval_shape(first, np.uint32(0), np.uint32(0))[0]
+
+    def start(seed: Any, eval_seed: Any) -> Any:
+        state, *keys = plain(first(seed, eval_seed))
+        return jax.tree.leaves(state), *keys
+
+    def advance(leaves: list[jax.Array], budget: tuple[jax.Array, jax.Array]) -> Any:
+        state, measured = updates(_joined(leaves, like), Budget(*budget))
+        return jax.tree.leaves(plain(state)), *measured
+
+    def look(leaves: list[jax.Array], key: jax.Array) -> dict[str, jax.Array]:
+        actor = _joined(leaves, like.train_states.actor)
+        return evaluate(actor, jax.random.wrap_key_data(key))
+
+    return Parts(like, lambda: start, lambda: advance, lambda: look)
+
+
+def compile_parts(
+    parts: Parts, config: Config, meanwhile: Callable[[], object] = lambda: None
+) -> tuple[RunState, Programs]:
+    """Returns the state before the first update, and the compiled programs of a run.
+
+    Args:
+      parts: of the run.
+      config: its settings.
+      meanwhile: begins other work in Python; called once the rest of the time is XLA's.
+    """
+    like, budget = parts.like, tuple(budget_of(config))
+
+    def start(*seeds: Any) -> tuple[RunState, jax.Array, jax.Array]:
+        leaves, *keys = parts.start()(*seeds)
+        return _joined(leaves, like), *keys
+
+    def advance(state: RunState, budget: tuple[Any, Any]) -> Any:
+        leaves, made, metrics = parts.advance()(jax.tree.leaves(plain(state)), budget)
+        return _joined(leaves, like), made, metrics
+
+    def look(actor: Actor, key: jax.Array) -> dict[str, jax.Array]:
+        return parts.look()(jax.tree.leaves(actor), key)
+
+    seeds, key = (np.uint32(config.seed), np.uint32(config.eval_seed)), key_shape()
     with ThreadPoolExecutor() as pool:  # one compiles while the next is traced
         starting = pool.submit(jax.jit(start), *seeds)
-        looking = pool.submit(look.lower(shapes.train_states.actor, key).compile)
-        traced = advance.lower(shapes, budget)
+        looking = pool.submit(jax.jit(look).lower(like.train_states.actor, key).compile)
+        traced = jax.jit(advance, donate_argnums=0).lower(like, budget)
         meanwhile()
         advancing = traced.compile()
         compiled, (first, key, test_key) = looking.result(), starting.result()
 
     def advanced(state: RunState) -> tuple[RunState, Arrays]:
-        state, (made, metrics) = advancing(state, budget)
+        state, made, metrics = advancing(state, budget)
         return state, {name: x[: int(made)] for name, x in to_numpy(metrics).items()}
 
     def evaluated(state: RunState) -> Arrays:
@@ -149,12 +195,22 @@ def compile_programs(
     return first, Programs(advanced, evaluated, tested)
 
 
+def _joined(leaves: Sequence[jax.Array], like: Any) -> Any:
+    """Returns a pytree like another of plain leaves; its keys are keys again."""
+    return with_keys(jax.tree.unflatten(jax.tree.structure(like), leaves), like)
+
+
 def _key(seed: Any, domain: int) -> jax.Array:
     """Returns the root of the keys of training (domain 0), evaluation (1), or the last test (2).
 
     The domains share no key, whatever seeds the user chooses.
     """
     return jax.random.fold_in(jax.random.key(seed), domain)
+
+
+def key_shape() -> jax.ShapeDtypeStruct:
+    """Returns the shape of the data of a key."""
+    return jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0)))
 
 
 def evaluation_key(config: Config) -> jax.Array:

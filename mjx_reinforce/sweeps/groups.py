@@ -18,11 +18,13 @@ _REINFORCE = (
     "standardize_floor",
     "max_grad_norm",
     "max_kl",
+    "normalize_min_std",
+    "momentum",
     "value_learning_rate",
     "initial_std",
     "final_std",
 )
-_ARS = ("step_size", "noise_std")
+_ARS = ("step_size", "noise_std", "normalize_min_std")
 
 
 class Group(NamedTuple):

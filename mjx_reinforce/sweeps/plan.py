@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from mjx_reinforce.runs.build import policy_settings
 from mjx_reinforce.runs.memory import gigabytes, needed, num_cores
 from mjx_reinforce.runs.plan import Machine, duration, task_of, this_machine, training_seconds
 from mjx_reinforce.sweeps.groups import Group
@@ -71,7 +72,7 @@ def chunk_limit(
 def _capacity(env: Any, horizon: int, group: Group, num_devices: int) -> int:
     """Returns how many runs memory holds side by side."""
     one = dataclasses.replace(group.config, num_seeds=1)
-    task, machine = task_of(env, horizon, one), this_machine()
+    task, machine = task_of(policy_settings(env, one), horizon, one), this_machine()
     memory = machine.memory - task.base_memory if machine.shared else machine.memory * num_devices
     capacity = int(_MEMORY * memory / needed(one, task))
     if capacity < num_devices:
@@ -111,7 +112,7 @@ def describe(
     memory = max(
         needed(dataclasses.replace(group.config, num_seeds=at_once * part.widths[0]), task)
         for group, part in zip(groups, parts, strict=True)
-        for task in (task_of(env, horizon, group.config),)
+        for task in (task_of(policy_settings(env, group.config), horizon, group.config),)
     )
     where = machine.name
     if num_devices > 1:
@@ -141,7 +142,8 @@ def _time(
     for group in groups:
         num_seeds = len(group.members) * group.config.num_seeds
         config = dataclasses.replace(group.config, num_seeds=num_seeds)
-        total += training_seconds(config, task_of(env, horizon, config), speed)[0]
+        task = task_of(policy_settings(env, config), horizon, config)
+        total += training_seconds(config, task, speed)[0]
     faster = machine.faster * (1 if machine.shared else num_devices)
     compiling = duration(speed.compiling)
     return f"Compiling takes about {compiling} each, training about {duration(total / faster)}"

@@ -10,6 +10,7 @@ import numpy as np
 _LOGARITHMIC = (
     *("learning_rate", "final_learning_rate", "value_learning_rate", "step_size"),
     *("noise_std", "initial_std", "final_std", "standardize_floor", "max_grad_norm", "max_kl"),
+    "normalize_min_std",
 )
 #: Digits that are kept of what is drawn.
 _DIGITS = 4

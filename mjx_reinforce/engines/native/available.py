@@ -4,6 +4,7 @@ import sys
 
 import jax
 
+from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.gpu import seam as gpu
 
 #: LLVM 20, which llvmlite 0.45 has, is the first that reads the IR as it is written here.
@@ -13,6 +14,16 @@ _OLDEST = (20,)
 def platform() -> str:
     """Returns what JAX computes on: "cpu", "gpu" or another name."""
     return jax.default_backend()
+
+
+def made_for() -> str:
+    """Returns what machine code is made by, and for which CPU; or why there is none here."""
+    reason = unavailable()
+    if reason:
+        return reason
+    import llvmlite
+
+    return f"{llvmlite.__version__} {machine.this_machine()}"
 
 
 def unavailable() -> str | None:

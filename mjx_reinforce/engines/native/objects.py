@@ -1,10 +1,13 @@
 """Compiled objects on disk: written whole or not at all, checked when read, bounded in size."""
 
 import contextlib
+import functools
 import hashlib
 import os
 import tempfile
+from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -18,9 +21,10 @@ def read(folder: Path, key: str) -> bytes | None:
     path = folder / f"{key}.o"
     try:
         data = path.read_bytes()
-        os.utime(path)
     except OSError:
         return None
+    with contextlib.suppress(OSError):  # it can only be read
+        os.utime(path)
     whole = hashlib.sha256(data[_DIGEST:]).digest() == data[:_DIGEST]
     return data[_DIGEST:] if whole else None
 
@@ -53,6 +57,27 @@ def _forget(folder: Path, limit: int) -> None:
         with contextlib.suppress(OSError):
             path.unlink()
         total -= size
+
+
+@functools.cache
+def source_digest(*packages: str) -> str:
+    """Returns a hash of the files of packages that decide what is compiled."""
+    digest = hashlib.sha256()
+    for name in packages:
+        for file in _files(resources.files(name)):
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _files(folder: Any) -> list[Any]:
+    """Returns the files of a package that are part of the program, in order of their names."""
+    found = []
+    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
+        if entry.is_dir():
+            found += _files(entry)
+        elif entry.name.endswith((".py", ".ll", ".xml")):
+            found.append(entry)
+    return found
 
 
 def folder() -> Path | None:

@@ -1,8 +1,6 @@
 """From an environment and a policy to machine code, made once and kept on disk."""
 
 import functools
-import hashlib
-from importlib import resources
 from typing import Any, NamedTuple
 
 import jax
@@ -60,7 +58,8 @@ def build(
     if not on_cpu:  # a thread without an episode does not play
         function, examples = _while_running(function), examples[:-1]
     traced, shapes = jaxprs.trace(function, *examples)
-    source, folder = f"{jaxprs.fingerprint(traced)} {_writers()}", objects.folder()
+    source = f"{jaxprs.fingerprint(traced)} {objects.source_digest(*_WRITERS)}"
+    folder = objects.folder()
     if on_cpu:
         target = machine.this_machine()
         write = functools.partial(_write_cpu, function, examples, target)
@@ -95,24 +94,3 @@ def _write_cpu(function: Any, examples: tuple[Any, ...], target: machine.Machine
     num_args, lanes = queue.NUM_CONTROLS + len(buffers), target.lanes
     entry = handler.handler_text(num_args, [*records, 4, 4, 4], lanes)
     return entry + player.player_text(written, num_actor, lanes, flush(target.triple))
-
-
-@functools.cache
-def _writers() -> str:
-    """Returns a hash of the files that decide what is written."""
-    digest = hashlib.sha256()
-    for name in _WRITERS:
-        for file in _files(resources.files(name)):
-            digest.update(file.read_bytes())
-    return digest.hexdigest()
-
-
-def _files(folder: Any) -> list[Any]:
-    """Returns the files of a package that are part of the program, in order of their names."""
-    found = []
-    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
-        if entry.is_dir():
-            found += _files(entry)
-        elif entry.name.endswith((".py", ".ll")):
-            found.append(entry)
-    return found

@@ -2,12 +2,11 @@
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from mjx_reinforce.export.files import finite, write_bytes
 from mjx_reinforce.runs.files import append
+from mjx_reinforce.runs.rows import Cells, number
 
 NAME = "metrics.jsonl"
 
@@ -19,10 +18,12 @@ class JsonLines:
         """Writes the rows that metrics.csv has already, in place of what was there."""
         self._path = directory / NAME
         with (directory / "metrics.csv").open(encoding="utf-8", newline="") as file:
-            rows = [{name: _number(x) for name, x in row.items()} for row in csv.DictReader(file)]
-        write_bytes(self._path, _lines(rows))
+            written = [*csv.reader(file)]
+        names = written[0]
+        columns = zip(*written[1:], strict=True) if written[1:] else ([] for _ in names)
+        write_bytes(self._path, _lines(dict(zip(names, columns, strict=True))))
 
-    def write(self, rows: Sequence[Mapping[str, Any]]) -> None:
+    def write(self, rows: Cells) -> None:
         """Adds rows, or raises OSError and adds none."""
         append(self._path, _lines(rows))
 
@@ -30,13 +31,7 @@ class JsonLines:
         """Does nothing: every line is written."""
 
 
-def _lines(rows: Sequence[Mapping[str, Any]]) -> bytes:
-    cells = ({name: None if x == "" else x for name, x in row.items()} for row in rows)
-    return "".join(json.dumps(finite(row), allow_nan=False) + "\n" for row in cells).encode()
-
-
-def _number(text: str) -> int | float | None:
-    """Returns what a cell of metrics.csv says; None if it is empty."""
-    if text.lstrip("-").isdigit():
-        return int(text)
-    return float(text) if text else None
+def _lines(rows: Cells) -> bytes:
+    numbers = zip(*(map(number, cells) for cells in rows.values()), strict=True)
+    objects = (finite(dict(zip(rows, row, strict=True))) for row in numbers)
+    return "".join(json.dumps(each, allow_nan=False) + "\n" for each in objects).encode()

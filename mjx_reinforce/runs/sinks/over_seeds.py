@@ -1,11 +1,9 @@
 """What charts show of an evaluation of many seeds: statistics, and a few seeds one by one."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 import numpy as np
 
 from mjx_reinforce.reports.statistics import iqm, iqm_interval
+from mjx_reinforce.runs.rows import Cells
 
 #: Seeds that are shown one by one, the first ones: each is a curve for every column.
 MAX_SINGLE_SEEDS = 16
@@ -15,22 +13,20 @@ _QUANTILES = (5, 25, 50, 75, 95)
 #: The interval is drawn from thousands of resamples, so the returns that matter alone have it.
 _WITH_INTERVAL = ("eval_return",)
 
-Rows = Sequence[Mapping[str, Any]]
 
-
-def step(rows: Rows) -> int:
+def step(rows: Cells) -> int:
     """Returns the place of an evaluation on the axis of charts: the most updates of a seed."""
-    return max(row["update"] for row in rows)
+    return max(map(int, rows["update"]))
 
 
-def measured(rows: Rows) -> dict[str, np.ndarray]:
+def measured(rows: Cells) -> dict[str, np.ndarray]:
     """Returns the columns [S] of one evaluation that were measured."""
     apart = ("seed", "update", *_PROGRESS)
-    names = [name for name, value in rows[0].items() if name not in apart and value != ""]
-    return {name: np.array([row[name] for row in rows], float) for name in names}
+    names = [name for name, cells in rows.items() if name not in apart and cells[0]]
+    return {name: np.array(rows[name], float) for name in names}
 
 
-def scalars(rows: Rows) -> dict[str, float]:
+def scalars(rows: Cells) -> dict[str, float]:
     """Returns the numbers that are shown, by name, such as ``eval_return/iqm``.
 
     For each column: ``iqm``, ``lowest`` (of returns, the worst seed), ``highest`` and quantiles;
@@ -41,7 +37,7 @@ def scalars(rows: Rows) -> dict[str, float]:
     Args:
       rows: of one evaluation.
     """
-    shown = {f"progress/{name}": float(np.mean([row[name] for row in rows])) for name in _PROGRESS}
+    shown = {f"progress/{name}": float(np.array(rows[name], float).mean()) for name in _PROGRESS}
     for name, values in measured(rows).items():
         numbers = _summary(values)
         if name in _WITH_INTERVAL:

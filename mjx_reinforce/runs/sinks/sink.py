@@ -1,14 +1,11 @@
 """What a sink is, and which ones a run has."""
 
 import importlib.util
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from mjx_reinforce.runs.config import Config
-
-#: The rows of one evaluation, one for each seed, as ``runs.rows`` makes them.
-Rows = Sequence[Mapping[str, Any]]
+from mjx_reinforce.runs.rows import Cells
 
 #: Settings that need a package, and the package.
 _PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
@@ -17,7 +14,7 @@ _PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 class Sink(Protocol):
     """Takes the rows of evaluations, in order."""
 
-    def write(self, rows: Rows) -> None:
+    def write(self, rows: Cells) -> None:
         """Adds the rows of one evaluation; raises OSError, and adds nothing, if that fails."""
         ...
 
@@ -34,9 +31,9 @@ class Queue:
 
     def __init__(self, name: str, sink: Sink):
         self.name, self._sink = name, sink
-        self._waiting: list[Rows] = []
+        self._waiting: list[Cells] = []
 
-    def write(self, rows: Rows) -> None:
+    def write(self, rows: Cells) -> None:
         """Adds the rows of one evaluation after those that wait, or raises OSError."""
         self._waiting.append(rows)
         self._write_waiting()

@@ -8,13 +8,13 @@ import importlib
 import socket
 import struct
 import time
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjx_reinforce.runs.files import append
+from mjx_reinforce.runs.rows import Cells
 from mjx_reinforce.runs.sinks import over_seeds
 
 NAME = "tensorboard"
@@ -46,7 +46,7 @@ class TensorBoard:
         purge = event(wall_time=now, step=first, session_log=start)
         append(self._path, _record(header) + _record(purge))
 
-    def write(self, rows: Sequence[Mapping[str, Any]]) -> None:
+    def write(self, rows: Cells) -> None:
         """Adds an event, or raises OSError and adds none."""
         from tensorboardX.summary import make_histogram
 

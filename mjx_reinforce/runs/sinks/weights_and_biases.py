@@ -2,11 +2,12 @@
 
 import contextlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from mjx_reinforce.export.files import read_json, write_json
+from mjx_reinforce.runs.rows import Cells
 from mjx_reinforce.runs.sinks import over_seeds
 
 #: Which run it is, and up to which update it has rows.
@@ -49,7 +50,7 @@ class WeightsAndBiases:
             )
         self._save()
 
-    def write(self, rows: Sequence[Mapping[str, Any]]) -> None:
+    def write(self, rows: Cells) -> None:
         """Logs the rows of one evaluation, or raises OSError."""
         step = over_seeds.step(rows)
         if step <= self._logged:

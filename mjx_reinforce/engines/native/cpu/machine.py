@@ -135,6 +135,22 @@ def load(
         return _LOADED[key]
 
 
+def in_memory() -> list[str]:
+    """Returns the keys of all code in memory."""
+    return list(_LOADED)
+
+
+def loaded(key: str, names: tuple[str, ...], folder: Path) -> Code | None:
+    """Returns the functions of a module by the key of their ``Code``; None if it is not on disk."""
+    with _LOCK:
+        if key not in _LOADED:
+            data = objects.read(folder, key)
+            if data is None:
+                return None
+            _LOADED[key] = Code(key, _link(key, names, data), compiled=False)
+        return _LOADED[key]
+
+
 def _key(source: str, names: tuple[str, ...], machine: Machine) -> str:
     """Returns a hash of all that an object depends on."""
     import llvmlite

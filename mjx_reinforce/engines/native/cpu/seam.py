@@ -8,6 +8,7 @@ instead of 1 µs, and XLA's programs are not cached then.
 import ctypes
 import functools
 import os
+import re
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -15,7 +16,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_reinforce.engines.native.cpu import handler
+from mjx_reinforce.engines.native import objects
+from mjx_reinforce.engines.native.cpu import handler, machine
 from mjx_reinforce.engines.native.cpu.machine import Code
 
 #: key of the code -> how JAX calls it
@@ -33,7 +35,7 @@ def call(code: Code, results: Sequence[jax.ShapeDtypeStruct], *args: Any) -> Seq
     if way(code) == "callback":
         play = functools.partial(_play, code, results)
         return jax.pure_callback(play, results, *args, vmap_method="broadcast_all")
-    return jax.ffi.ffi_call(_target(code), results, vmap_method="broadcast_all")(*args)
+    return jax.ffi.ffi_call(_target(code.key), results, vmap_method="broadcast_all")(*args)
 
 
 def way(code: Code) -> str:
@@ -43,9 +45,28 @@ def way(code: Code) -> str:
     return _WAYS[code.key]
 
 
-def _target(code: Code) -> str:
+def targets() -> list[str]:
+    """Returns XLA's names of all handlers that there are in memory."""
+    return [_target(key) for key in machine.in_memory()]
+
+
+def restore(program: bytes) -> bool:
+    """Makes ready the machine code that a program calls, from disk; returns whether all is there.
+
+    Args:
+      program: as JAX exports it, or anything else that has the names of handlers in it.
+    """
+    folder = objects.folder()
+    for name in set(re.findall(rb"mjx_reinforce_([0-9a-f]{64})", program)):
+        code = machine.loaded(name.decode(), handler.NAMES, folder) if folder else None
+        if code is None or way(code) != "ffi":
+            return False
+    return True
+
+
+def _target(key: str) -> str:
     """Returns XLA's name of the handler; programs in JAX's cache find it again by it."""
-    return f"mjx_reinforce_{code.key}"
+    return f"mjx_reinforce_{key}"
 
 
 def _register(code: Code) -> bool:
@@ -53,7 +74,7 @@ def _register(code: Code) -> bool:
     jax.devices()  # a handler refused before XLA has started would keep it from starting
     address = ctypes.c_void_p(code.addresses["handler"])
     try:
-        jax.ffi.register_ffi_target(_target(code), jax.ffi.pycapsule(address), platform="cpu")
+        jax.ffi.register_ffi_target(_target(code.key), jax.ffi.pycapsule(address), platform="cpu")
     except (AttributeError, RuntimeError):  # jax.ffi has changed; XLA speaks another version
         return False
     return True
