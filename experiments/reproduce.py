@@ -27,7 +27,7 @@ from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.runs.build import build, policy_settings
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.presets import PRESETS
-from mjx_reinforce.runs.state import compile_programs
+from mjx_reinforce.runs.state import compile_parts, parts_of
 from reproduce_cases import CASES, Case, limit, load_reference
 from reproduce_figures import draw
 from reproduce_mistakes import STALE, clamped, stale_starts
@@ -160,7 +160,7 @@ def train(
     learner, horizon = build(env, config, policy)
     if stale:
         learner = stale_starts(lambda env: build(env, config, policy)[0], env)
-    state, programs = compile_programs(env, learner, horizon, config)
+    state, programs = compile_parts(parts_of(env, learner, horizon, config), config)
     compiled = time.perf_counter()
     scores, env_steps, columns = [], 0, Progress.get_default_columns()
     with Progress(*columns, MofNCompleteColumn(), TimeElapsedColumn()) as progress:

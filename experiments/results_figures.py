@@ -13,8 +13,11 @@ from results_tables import moved_measure
 from results_tasks import PUBLISHED_STEPS
 
 #: Colours that differ for colour-blind readers too (Okabe and Ito 2008), and shapes.
-_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000", "#999999")
-_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
+_COLOURS = (
+    *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000", "#999999"),
+    *("#882255", "#117733"),
+)
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">")
 _COLUMNS = 4
 
 

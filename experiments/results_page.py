@@ -62,10 +62,10 @@ def _introduction(results: Sequence[Result]) -> str:
     roots = dict.fromkeys(f"{result.facts['settings']['seed']:,}" for result in results)
     return (
         "REINFORCE with the default settings of every task, but for the budgets (env steps a\n"
-        "seed, in the table) and how often it is evaluated; 32-32 is the preset\n"
-        f"`pendulum-network`. No search used these seeds (root {listed(roots)}). This page,\n"
-        "words included, is written by `experiments/results.py` from the measured runs; last are\n"
-        "the commands."
+        "seed, in the table) and how often it is evaluated; 32-32 has `--hidden-sizes 32 32`\n"
+        f"besides. No search used these seeds (roots {listed(roots)}).\n"
+        "This page, words included, is written by `experiments/results.py` from measured runs;\n"
+        "last are the commands."
     )
 
 
@@ -200,8 +200,8 @@ def _moved(results: Sequence[Result]) -> list[str]:
         return []
     missing = [result.task.name for result in results if result.moved is None]
     words = (
-        f"Each setting alone, at a third and at {FACTOR} times its default (the discount by its\n"
-        f"distance from 1: a third of that distance is the factor {FACTOR}), with the env steps\n"
+        f"Each setting alone, at a third and at {FACTOR} times its default (discount, momentum\n"
+        f"by their distance from 1: a third of that is the factor {FACTOR}), with the env steps\n"
         "that the table says. Drawn is the share of seeds solved at the end where the defaults\n"
         "solve half of them, else the IQM of the final return, both with 95 % intervals. What\n"
         "is *surely* worse or better has an interval apart from that of the defaults; nothing is\n"

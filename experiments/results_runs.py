@@ -24,6 +24,8 @@ _MOVED = {
     "discount": False,
     "initial_std": False,
     "standardize_floor": False,
+    "momentum": False,
+    "normalize_min_std": False,
     "num_episodes": True,
     "decay_steps": True,
     "decay_updates": True,
@@ -118,7 +120,7 @@ def swept(directory: Path) -> bool:
 def moves(base: Config) -> Mapping[str, list[Any]]:
     """Returns the values of every setting that a base has: less, its own, and more.
 
-    A discount moves by its distance from 1.
+    A discount and a momentum move by their distance from 1.
     """
     found: dict[str, list[Any]] = {}
     for name, counts in _MOVED.items():
@@ -131,9 +133,9 @@ def moves(base: Config) -> Mapping[str, list[Any]]:
 
 
 def _moved(name: str, value: Any, factor: float, counts: bool) -> Any:
-    """Returns a value times a factor; a discount nearer to 1 by as much is the "more" of it."""
+    """Returns a value times a factor; of the discount and the momentum, nearer to 1 is "more"."""
     if factor == 1:
         return value
-    if name == "discount":
+    if name in ("discount", "momentum"):
         return max(0.0, round(1 - (1 - value) / factor, 12))
     return max(2, round(value * factor)) if counts else float(f"{value * factor:.6g}")

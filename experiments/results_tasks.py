@@ -4,12 +4,12 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.defaults import PENDULUM_NETWORK, of_task
+from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.measured import TASKS as MEASURED
 
-#: Roots of all randomness of the results. No tuning used them. The second is of tasks whose
-#: settings were chosen anew after a run with the first.
-ROOT, SECOND_ROOT = 923917982, 456536658
+#: Roots of all randomness of the results. No tuning used them. The second and the third are of
+#: tasks whose settings were chosen anew after a run with the first.
+ROOT, SECOND_ROOT, THIRD_ROOT = 923917982, 456536658, 612381924
 #: The seeds of a published figure, and the env steps of each.
 PUBLISHED_SEEDS, PUBLISHED_STEPS = 10, 10_000_000
 #: A run is evaluated about so often, more where episodes end before their limit.
@@ -57,23 +57,32 @@ TASKS: dict[str, Task] = {
             *(4096, 1_000_000, (1000.0, 0.0), 280_000, 256),
             settings={"eval_every": 2},
             patience=12,
+            note=(
+                "the second attempt, with the settings of a later search. With those before (root\n"
+                "  923,917,982) the median was 13,166 env steps."
+            ),
+            root=THIRD_ROOT,
         ),
         Task(
             *("InvertedPendulum-v5-32-32", "InvertedPendulum-v5"),
             *(4096, 1_000_000, (1000.0, 0.0), 280_000, 256),
-            settings={**PENDULUM_NETWORK, "eval_every": 2},
+            settings={"hidden_sizes": (32, 32), "eval_every": 2},
             patience=12,
             note=(
-                "the aim, 99.9 % solved within 100,000 env steps and at every evaluation from\n"
-                "  200,000 on, was missed. 350 settings were tried (`experiments/tuning`):\n"
-                "  episodes an update, rate, KL bound, discount, noise, how rate and noise fall,\n"
-                "  floor, and how long the scale is measured. None of the 30 that were tried with\n"
-                "  768 seeds reached it. [failures.md](failures.md) says why seeds fall."
+                "the second attempt, with the settings of a later search. With those before (root\n"
+                "  923,917,982) the median was 14,313 env steps, and 99.41 % were solved at the\n"
+                "  worst evaluation after 200,000."
             ),
+            root=THIRD_ROOT,
         ),
         Task(
             *("InvertedDoublePendulum-v5", "InvertedDoublePendulum-v5"),
             *(64, 3_000_000, (7726.2, 1287.3), 1_000_000),
+            note=(
+                "the second attempt, with the settings of a later search. With those before (root\n"
+                "  923,917,982) the mean was 9,307 after as many env steps."
+            ),
+            root=THIRD_ROOT,
         ),
         Task("Reacher-v5", "Reacher-v5", 64, 3_000_000, (-5.5, 0.2), 1_000_000),
         Task("Pusher-v5", "Pusher-v5", 16, 1_000_000, None, 500_000),
@@ -89,18 +98,20 @@ TASKS: dict[str, Task] = {
             root=SECOND_ROOT,
         ),
         Task(
-            *("Ant-v5", "Ant-v5", 16, 700_000, (1108.1, 323.1), 300_000),
+            *("Ant-v5", "Ant-v5", 16, 2_000_000, (1108.1, 323.1), 300_000),
             note=(
                 "the second attempt. With the settings that a search read wrongly (root\n"
-                "  923,917,982) the mean was 975 after 1,500,000 env steps."
+                "  923,917,982) the mean was 975 after 1,500,000 env steps. After 700,000 these\n"
+                "  seeds had 1,377, not apart from the published figure, and went on."
             ),
             root=SECOND_ROOT,
         ),
         Task(
-            *("Humanoid-v5", "Humanoid-v5", 16, 200_000, (464.3, 58.4), 100_000),
+            *("Humanoid-v5", "Humanoid-v5", 16, 1_000_000, (464.3, 58.4), 100_000),
             note=(
                 "the second attempt. With the settings that a search read wrongly (root\n"
-                "  923,917,982) the mean was 498 after 300,000 env steps."
+                "  923,917,982) the mean was 498 after 300,000 env steps. After 200,000 these\n"
+                "  seeds had 510, not apart from the published figure, and went on."
             ),
             root=SECOND_ROOT,
         ),
