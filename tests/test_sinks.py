@@ -126,7 +126,8 @@ def test_cells_come_back_to_the_last_bit(dtype, data):
     assert all(isinstance(x, float) for x in back)
     back = np.array(back, dtype)
     np.testing.assert_array_equal(back, values)
-    np.testing.assert_array_equal(np.signbit(back), np.signbit(values))
+    number = ~np.isnan(values)  # of NaN, text keeps no sign
+    np.testing.assert_array_equal(np.signbit(back[number]), np.signbit(values[number]))
 
 
 def test_json_lines_are_the_rows_of_the_table(directory):

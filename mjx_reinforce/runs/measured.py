@@ -6,7 +6,7 @@ evaluating, on 2026-11-22; all figures are good to a factor of two.
 - CPU: two cores of a shared machine on which nothing else ran, twenty updates of each task; the
   Humanoids' rates are those of rollouts, halved.
 - GPU: an H200. Compiling depends on the host: two of its threads took twice as long as stands here,
-  16 quiet ones half as long. The rates of many episodes are those of ``docs/engine.md``, halved
+  16 quiet ones half as long. The rates of many episodes are those of ``docs/benchmarks.md``, halved
   where there are no contacts, since training takes as long as playing there. For tasks with
   contacts the latency is the time that one env step of as many episodes took as were measured, and
   compiling is that of a rollout, while 16 other programs compiled, and 10 s.
