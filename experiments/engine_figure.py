@@ -1,7 +1,7 @@
 """Draws docs/engine.png: env steps a second against the size of the task, engine by engine.
 
 ``python experiments/engine_figure.py`` reads docs/engine.csv: for each task, device and engine the
-scalar operations of a step, and the env steps a second that docs/benchmarks.md says when were measured.
+scalar operations of a step, and env steps a second; docs/benchmarks.md says of which day.
 """
 
 import csv

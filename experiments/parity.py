@@ -18,7 +18,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -30,6 +30,7 @@ from scipy import stats
 
 from mjx_reinforce import envs
 from mjx_reinforce.types import Discrete
+from parity_native import Native
 from parity_sides import Ours, Outcome, Peer, make_peer, stack
 from parity_states import draw_states
 
@@ -66,6 +67,8 @@ class Settings:
     """Starts drawn on each side."""
     horizon: int = 100
     """Env steps of an episode whose return is compared, at most."""
+    engine: Literal["vmap", "native"] = "vmap"
+    """What plays our side: ``jax.vmap`` of the environment, or machine code."""
     seed: int = 0
     """Of states, actions, starts and policies."""
     tolerance: float | None = None
@@ -86,7 +89,7 @@ def peer_steps(peer: Peer, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarra
 
 
 def step_errors(
-    ours: Ours, peer: Peer, states: tuple[np.ndarray, ...], expected: Outcome, eps: float
+    ours: Ours | Native, peer: Peer, states: tuple[np.ndarray, ...], expected: Outcome, eps: float
 ) -> dict[str, Any]:
     """Compares one env step from each state.
 
@@ -186,11 +189,12 @@ def fixed_policy(env: Any, observation_size: int, seed: int) -> Callable[..., np
     weights = random.standard_normal((observation_size, env.action_size))
     weights /= math.sqrt(observation_size)
 
-    def act(observation: np.ndarray) -> np.ndarray:
+    def act(observation: Any) -> Any:  # of NumPy or of JAX
+        numpy: Any = observation.__array_namespace__()
         output = observation @ weights
         if isinstance(space, Discrete):
-            return np.argmax(output, axis=-1)
-        return (space.high + space.low) / 2 + (space.high - space.low) / 2 * np.tanh(output)
+            return numpy.argmax(output, axis=-1)
+        return (space.high + space.low) / 2 + (space.high - space.low) / 2 * numpy.tanh(output)
 
     return act
 
@@ -241,7 +245,7 @@ def compare(
 ) -> dict[str, Any]:
     """Returns the row of one environment in one precision; ``say`` hears what comes next."""
     with jax.enable_x64(dtype == "float64"):
-        ours = Ours(env_id, settings.batch)
+        ours = (Native if settings.engine == "native" else Ours)(env_id, settings.batch)
         say("starts")
         starts = ours.starts(settings.seed, settings.resets)
         row = {"env": env_id, "dtype": dtype, "states": settings.states}
