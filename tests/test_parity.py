@@ -13,6 +13,8 @@ import pytest
 
 import parity
 from mjx_reinforce import envs
+from mjx_reinforce.engines.native import available
+from parity_native import Native
 from parity_sides import Ours, make_peer
 from parity_states import draw_states
 
@@ -51,22 +53,34 @@ def test_model_equals_gymnasium_field_by_field(id):
     assert compared > 300
 
 
-@pytest.mark.parametrize("id", IDS)
-def test_equals_gymnasium(id):
-    """One step from many states, the starts, and the observation at a start."""
+def check(ours, id):
+    """Compares one step from many states, the starts, and the observation at a start."""
     theirs = parity.Theirs.play(id, states=NUM_STATES, resets=1000, seed=0, tolerance=0)
-    with jax.enable_x64(True):
-        ours = Ours(id, NUM_STATES)
-        starts = ours.starts(0, 1000)
-        row = parity.reset_errors(starts, theirs.peer, theirs.starts, "float64")
-        row |= parity.step_errors(ours, theirs.peer, theirs.states, theirs.expected, 2e-16)
-        again = ours.starts(0, 1)
+    starts = ours.starts(0, 1000)
+    row = parity.reset_errors(starts, theirs.peer, theirs.starts, "float64")
+    row |= parity.step_errors(ours, theirs.peer, theirs.states, theirs.expected, 2e-16)
     assert row["reset_p_value"] > 1e-4
     assert row["reset_observation"] < 1e-9
     assert row["terminated_mismatches"] == 0
     for name in ("qpos", "qvel", "observation", "reward"):
         assert row[name] < TOLERANCE, name
+    return starts
+
+
+@pytest.mark.parametrize("id", IDS)
+def test_equals_gymnasium(id):
+    with jax.enable_x64(True):
+        ours = Ours(id, NUM_STATES)
+        starts, again = check(ours, id), ours.starts(0, 1)
     np.testing.assert_array_equal(again.qpos, starts.qpos[:NUM_STATES])
+
+
+@pytest.mark.skipif(available.unavailable() is not None, reason="there is no machine code here")
+@pytest.mark.parametrize("id", ["InvertedPendulum-v5", "CartPole-v1", "ContinuousCartPole-v0"])
+def test_machine_code_equals_gymnasium(id):
+    """Tasks with contacts are held to the same physics in ``test_native_contacts.py``."""
+    with jax.enable_x64(True):
+        check(Native(id, NUM_STATES), id)
 
 
 @pytest.mark.parametrize("id", ["InvertedPendulum-v5", "CartPole-v1", "ContinuousCartPole-v0"])
