@@ -64,9 +64,10 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             check(config)
             check_size(config)
             check_installed(config)
-            directory, made = _directory(config)
+            directory, new = _directory(config)
+            held.enter_context(locked(directory))  # a folder in which another trains stays
+            made = new
             interrupt.on_exit(lambda: remove_empty(made))
-            held.enter_context(locked(directory))
             # A module of the user's is imported before JAX starts, which it may set up.
             env = None if envs.is_ours(config.env) else envs.make(config.env)
             configure_jax()

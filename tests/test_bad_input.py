@@ -129,6 +129,7 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ("--num-seeds 1e3", "'1e3'"),
         ("--num-seeds", "Missing value for argument '--num-seeds'"),
         ("--num-seeds 3 4", "no flag takes '4'"),
+        ("--num-seeds 3 gymnasium-tutorial", "a preset comes before all flags"),
         ("--num-sedes 3", "unknown flag '--num-sedes'. Did you mean '--num-seeds'?"),
         ("--num-sedes=3", "unknown flag '--num-sedes'. Did you mean '--num-seeds'?"),
         ("--no-such-thing", "unknown flag '--no-such-thing'."),
@@ -581,3 +582,14 @@ def test_a_machine_without_the_chosen_device_is_named(monkeypatch):
     monkeypatch.setattr(jax, "devices", none)
     with pytest.raises(ValueError, match="JAX cannot compute here: Unable to initialize"):
         jax_setup.configure_jax()
+
+
+@pytest.mark.parametrize("name", jax_setup._REFUSED)
+def test_what_the_commands_cannot_work_with_is_named(name):
+    before = jax.config.values[name.lower()]
+    jax.config.update(name.lower(), True)
+    try:
+        with pytest.raises(ValueError, match=f"{name} is set, but .*; unset it"):
+            jax_setup.configure_jax()
+    finally:
+        jax.config.update(name.lower(), before)

@@ -164,6 +164,15 @@ def test_nothing_is_kept_of_an_environment_of_the_users(monkeypatch):
         assert kept.key_of(Config(env=name)) is None
 
 
+@pytest.mark.parametrize("looks", ["jax_debug_nans", "jax_debug_infs"])
+def test_nothing_is_kept_where_jax_is_to_look_for_nans(looks):
+    jax.config.update(looks, True)
+    try:
+        assert kept.key_of(CONFIG) is None
+    finally:
+        jax.config.update(looks, False)
+
+
 def test_nothing_is_kept_where_jax_keeps_nothing(monkeypatch):
     monkeypatch.setattr(objects, "folder", lambda: None)
     assert kept.key_of(CONFIG) is None

@@ -1,5 +1,6 @@
 """Checkpoints: a run that goes on ends as one that never stopped, whatever happens to its files."""
 
+import contextlib
 import csv
 import errno
 import functools
@@ -10,6 +11,7 @@ import shutil
 import signal
 import sys
 import time
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -348,6 +350,33 @@ def test_two_processes_do_not_train_in_one_directory(run, parts, capsys):
     with locked(parts):
         assert run("--resume", "parts") == 2
     assert "another process trains in parts" in capsys.readouterr().err
+
+
+def test_the_folder_of_a_run_that_begins_elsewhere_stays(run, tmp_path, monkeypatch, capsys):
+    """Of two processes one makes the folder, and the other is quicker to train in it."""
+    with contextlib.ExitStack() as other:
+
+        def quicker(directory):
+            other.enter_context(locked(directory))
+            return locked(directory)
+
+        monkeypatch.setattr(files, "locked", quicker)
+        assert run("--output", "out/in") == 2
+    assert "another process trains in out/in" in capsys.readouterr().err
+    assert (tmp_path / "out" / "in").is_dir()
+
+
+def test_a_folder_that_another_process_makes_is_not_ours(tmp_path, monkeypatch):
+    mkdir = Path.mkdir
+
+    def late(folder, *arguments):
+        mkdir(folder, *arguments)
+        return mkdir(folder, *arguments)
+
+    monkeypatch.setattr(Path, "mkdir", late)
+    assert files.prepare(tmp_path / "a" / "b", False) == []
+    monkeypatch.undo()
+    assert files.prepare(tmp_path / "c" / "d", False) == [tmp_path / "c" / "d", tmp_path / "c"]
 
 
 def test_a_finished_run_has_nothing_to_do(run, tmp_path, capsys):

@@ -48,8 +48,9 @@ def prepare(directory: Path, overwrite: bool) -> list[Path]:
         )
     made: list[Path] = []
     try:
-        made = [path for path in (directory, *directory.parents) if not path.exists()]
-        directory.mkdir(parents=True, exist_ok=True)
+        for folder in (*reversed(directory.parents), directory):
+            if _make(folder):
+                made.insert(0, folder)
         # Where a run was killed as it wrote its first file, nothing was begun.
         names = [path.name for path in directory.iterdir()]
         if any(not name.startswith(".config.json.") for name in names) and not overwrite:
@@ -65,6 +66,19 @@ def prepare(directory: Path, overwrite: bool) -> list[Path]:
             "make room there, or choose another --output"
         ) from error
     return made
+
+
+def _make(folder: Path) -> bool:
+    """Makes a folder if it is not there; returns whether it was made, and by no other process."""
+    if folder.is_dir():
+        return False
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        if not folder.is_dir():
+            raise
+        return False
+    return True
 
 
 def _run_around(directory: Path) -> Path | None:

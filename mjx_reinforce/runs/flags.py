@@ -53,7 +53,8 @@ def read(form: Any, arguments: Sequence[str], prog: str, description: str) -> An
             raise
         raise ValueError(f"{_first_section(box.getvalue())} (see --help)") from stop
     if unknown:
-        raise ValueError(_about_unknown(unknown, list(_flags(parsed))))
+        first = "a preset comes before all flags; " if prog.endswith("[PRESET]") else ""
+        raise ValueError(_about_unknown(unknown, list(_flags(parsed)), first))
     return parsed
 
 
@@ -82,11 +83,11 @@ def _flags(parsed: Any) -> Iterator[str]:
             yield f"--{field.name.replace('_', '-')}"
 
 
-def _about_unknown(unknown: Sequence[str], flags: Sequence[str]) -> str:
-    """Returns the message about what tyro could not place."""
+def _about_unknown(unknown: Sequence[str], flags: Sequence[str], first: str) -> str:
+    """Returns the message about what tyro could not place; ``first`` says what may come first."""
     flag = next((text.partition("=")[0] for text in unknown if text.startswith("-")), None)
     if flag is None:
-        return f"no flag takes {' '.join(map(repr, unknown))} (see --help)"
+        return f"no flag takes {' '.join(map(repr, unknown))} ({first}see --help)"
     if flag in flags:
         return f"{flag} stands after --, which ends the flags: leave -- out"
     near = difflib.get_close_matches(flag, flags, n=1)

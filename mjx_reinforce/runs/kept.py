@@ -41,9 +41,11 @@ _NAMES = ("start", "advance", "look")
 def key_of(config: Config) -> str | None:
     """Returns a name for all that the programs of a run depend on.
 
-    None where nothing is kept: on a GPU, where JAX keeps nothing, of an environment of the user's.
+    None where nothing is kept: on a GPU, where JAX keeps nothing, of an environment of the user's,
+    and where JAX is to look for NaNs, which it cannot in a program that is not traced.
     """
-    if platform() != "cpu" or objects.folder() is None or not envs.is_ours(config.env):
+    looks = any(jax.config.values[name] for name in ("jax_debug_nans", "jax_debug_infs"))
+    if platform() != "cpu" or looks or objects.folder() is None or not envs.is_ours(config.env):
         return None
     made_by = provenance()
     del made_by["git_commit"]  # the sources say it better

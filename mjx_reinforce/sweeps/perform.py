@@ -44,9 +44,9 @@ def perform(
     processes = join_processes(design.processes)
     with contextlib.ExitStack() as held:
         if processes.index == 0:
-            if design.resume is None:
-                made += prepare(directory, design.base.overwrite)
-            held.enter_context(locked(directory))
+            new = prepare(directory, design.base.overwrite) if design.resume is None else []
+            held.enter_context(locked(directory))  # a folder in which another trains stays
+            made += new
         configure_jax()
         return directory, _perform(design, directory, known, processes, interrupt, report)
 
