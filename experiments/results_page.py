@@ -241,4 +241,5 @@ python experiments/results.py page DIR          # this page
 `--tasks` chooses tasks; what is in DIR is kept, and what was stopped goes on. `page` without
 DIR writes this page from the small files in `experiments/results`: a row for each seed, the
 curves as quantiles, the sweeps, and the return of every episode that was played. Trained at
-commit {commits}, with the engine {engines} and JAX {jax}."""
+commit {commits}, with the engine {engines} and JAX {jax}. A commit that the repository does not
+have was joined with others as it landed."""
