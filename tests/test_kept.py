@@ -4,12 +4,15 @@ import dataclasses
 import os
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 from toys import Survive
 
 from mjx_reinforce import envs
@@ -18,6 +21,7 @@ from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.runs import kept, ready, trees
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.state import compile_parts
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
@@ -171,6 +175,37 @@ def test_nothing_is_kept_where_jax_is_to_look_for_nans(looks):
         assert kept.key_of(CONFIG) is None
     finally:
         jax.config.update(looks, False)
+
+
+def test_a_damaged_program_in_the_cache_of_jax_is_replaced(tmp_path, capsys):
+    """JAX itself would leave it there, and compile at every start."""
+
+    def start():
+        def shifted_sine(x):
+            return jnp.sin(x) + 2
+
+        return float(jax.jit(shifted_sine)(1.0))
+
+    before = jax.config.values["jax_compilation_cache_dir"]
+    show = warnings.showwarning
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+            compilation_cache.reset_cache()
+            configure_jax()
+            value = start()
+            [program] = tmp_path.glob("jit_shifted_sine-*-cache")
+            os.truncate(program, 100)
+            assert start() == value
+            assert "jit_shifted_sine in" in capsys.readouterr().err
+            assert program.stat().st_size > 100
+            assert start() == value
+            assert capsys.readouterr().err == ""
+    finally:
+        warnings.showwarning = show
+        jax.config.update("jax_compilation_cache_dir", before)
+        compilation_cache.reset_cache()
 
 
 def test_nothing_is_kept_where_jax_keeps_nothing(monkeypatch):

@@ -1,7 +1,15 @@
 """How this program's commands set up JAX."""
 
+import contextlib
+import functools
+import glob
 import os
+import re
+import sys
+import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 #: Settings of JAX's that the commands cannot work with, and why.
 _REFUSED = {
@@ -12,6 +20,9 @@ _REFUSED = {
 
 def configure_jax() -> None:
     """Turns on exact float32 products and the compilation cache, unless the user chose.
+
+    A program in the cache that cannot be read is removed, so that JAX, which replaces none, writes
+    it anew.
 
     Raises:
       ValueError: JAX finds no device, such as where JAX_PLATFORMS names one that is not here, or is
@@ -27,9 +38,28 @@ def configure_jax() -> None:
     if settings["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "mjx_reinforce"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    if not isinstance(warnings.showwarning, functools.partial):
+        warnings.showwarning = functools.partial(_forget_unreadable, warnings.showwarning)
     if settings["jax_default_matmul_precision"] is None:
         jax.config.update("jax_default_matmul_precision", "highest")
     try:
         jax.devices()
     except RuntimeError as error:
         raise ValueError(f"JAX cannot compute here: {error}") from error
+
+
+def _forget_unreadable(
+    show: Callable[..., None], message: Any, *where: Any, **options: Any
+) -> None:
+    """Shows a warning; one of a program in the cache that cannot be read also removes it."""
+    import jax
+
+    found = re.search(r"reading persistent compilation cache entry for '([^']+)'", str(message))
+    if found is None:
+        show(message, *where, **options)
+        return
+    name, folder = found[1], jax.config.values["jax_compilation_cache_dir"]
+    for path in Path(folder).glob(f"{glob.escape(name)}-*"):  # the other programs of that name too
+        with contextlib.suppress(OSError):
+            path.unlink()
+    print(f"warning: {name} in {folder} could not be read; it is compiled anew", file=sys.stderr)
