@@ -23,6 +23,7 @@ STYLES = {
 PLACES = {
     "InvertedDoublePendulum": ((-6, -3), "right"),
     "HalfCheetah": ((7, -9), "left"),
+    "Walker2d": ((-7, -4), "right"),
     "HumanoidStandup": ((7, -9), "left"),
 }
 
