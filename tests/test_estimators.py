@@ -12,6 +12,7 @@ from toys import Chain, categorical, expected_return
 
 from mjx_reinforce import Policy, Trajectory, reinforce, train_step
 from mjx_reinforce.learners import estimators as est
+from mjx_reinforce.learners.returns import discounted_returns
 from mjx_reinforce.policies.networks import MLP
 from mjx_reinforce.registry import ESTIMATORS, load
 
@@ -74,8 +75,8 @@ def test_returns_to_go_are_those_of_the_recurrence(horizon, dtype, within):
         expected[t] = reward[t] + np.array(discounts)[:, None] * expected[t + 1]
     with jax.enable_x64(dtype == np.float64):
         traced = jnp.asarray(discounts, dtype)
-        together = jax.vmap(est.discounted_returns, (None, 0), 1)(jnp.asarray(reward), traced)
-        alone = [est.discounted_returns(jnp.asarray(reward), discount) for discount in discounts]
+        together = jax.vmap(discounted_returns, (None, 0), 1)(jnp.asarray(reward), traced)
+        alone = [discounted_returns(jnp.asarray(reward), discount) for discount in discounts]
     for got in (together, np.stack(alone, 1)):
         assert got.dtype == dtype
         np.testing.assert_allclose(got, expected[:-1], rtol=within, atol=within)

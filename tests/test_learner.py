@@ -12,6 +12,7 @@ from toys import Late, Signed, SignedTarget, Survive, Target, Toy
 
 from mjx_reinforce import mlp_policy, normal, reinforce, rollout, train_step
 from mjx_reinforce.learners import estimators, gradients, updates
+from mjx_reinforce.learners.returns import discounted_returns
 
 
 def train(env, num_updates, **settings):
@@ -91,7 +92,7 @@ def test_update_is_the_finite_difference_of_the_surrogate():
             num_episodes=4,
             horizon=20,
         )
-        weight = estimators.discounted_returns(trajectory.reward, 0.9)
+        weight = discounted_returns(trajectory.reward, 0.9)
 
         def surrogate(params):
             outputs = policy.apply(params, trajectory.observation)

@@ -12,7 +12,6 @@ its gradient has another length, and is no longer exactly unbiased. ``mean_log_p
 ``normalized_returns`` come from published programs, and say what they follow instead.
 """
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -23,6 +22,7 @@ import optax
 from jax import lax
 
 from mjx_reinforce.learners.gradients import accumulate_gradient
+from mjx_reinforce.learners.returns import discounted_returns
 from mjx_reinforce.policies.networks import MLP
 from mjx_reinforce.types import Trajectory
 
@@ -39,37 +39,6 @@ class Estimator(NamedTuple):
     init: Callable[[jax.Array, int], Any]
     update: Callable[[Any, Trajectory], tuple[jax.Array, Any, dict[str, jax.Array]]]
     min_episodes: int = 1
-
-
-def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Array:
-    """Returns G [T, N] with ``G[t] = reward[t] + discount * G[t + 1]`` and ``G[T] = 0``.
-
-    Args:
-      reward: [T, N], zero where the episode is over.
-      discount: in [0, 1].
-    """
-    # Products of matrices, in blocks of about sqrt(T) steps: within each block, then over the
-    # blocks. A scan takes T steps one after the other, and an associative scan compiles for long.
-    discount = jnp.asarray(discount, reward.dtype)
-    horizon, num_episodes = reward.shape
-    length = math.isqrt(horizon - 1) + 1
-    count = -(-horizon // length)
-    blocks = jnp.pad(reward, ((0, count * length - horizon), (0, 0)))
-    blocks = blocks.reshape(count, length, num_episodes)
-    own = _discounted_sums(blocks, discount)
-    total = _discounted_sums(own[:, 0], jnp.power(discount, length))
-    later = jnp.pad(total[1:], ((0, 1), (0, 0)))
-    steps_left = jnp.arange(length, 0, -1, dtype=reward.dtype)
-    returns = own + jnp.power(discount, steps_left)[:, None] * later[:, None]
-    return returns.reshape(-1, num_episodes)[:horizon]
-
-
-def _discounted_sums(x: jax.Array, discount: jax.Array) -> jax.Array:
-    """Returns y [..., T, N] with ``y[t] = x[t] + discount * y[t + 1]`` and ``y[T] = 0``."""
-    time = jnp.arange(x.shape[-2], dtype=x.dtype)
-    ahead = time - time[:, None]
-    factors = jnp.where(ahead < 0, 0, jnp.power(discount, jnp.maximum(ahead, 0)))
-    return jnp.matmul(factors, x, precision="highest")
 
 
 def total_return(discount: float | jax.Array = 0.99) -> Estimator:

@@ -38,7 +38,7 @@ def configure_jax() -> None:
     if settings["jax_compilation_cache_dir"] is None:
         jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "mjx_reinforce"))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    if not isinstance(warnings.showwarning, functools.partial):
+    if getattr(warnings.showwarning, "func", None) is not _forget_unreadable:
         warnings.showwarning = functools.partial(_forget_unreadable, warnings.showwarning)
     if settings["jax_default_matmul_precision"] is None:
         jax.config.update("jax_default_matmul_precision", "highest")
@@ -51,7 +51,10 @@ def configure_jax() -> None:
 def _forget_unreadable(
     show: Callable[..., None], message: Any, *where: Any, **options: Any
 ) -> None:
-    """Shows a warning; one of a program in the cache that cannot be read also removes it."""
+    """Shows a warning; where it says that a program in the cache cannot be read, removes that.
+
+    JAX names the function that was compiled, not the file: all programs of that function go.
+    """
     import jax
 
     found = re.search(r"reading persistent compilation cache entry for '([^']+)'", str(message))
@@ -59,7 +62,7 @@ def _forget_unreadable(
         show(message, *where, **options)
         return
     name, folder = found[1], jax.config.values["jax_compilation_cache_dir"]
-    for path in Path(folder).glob(f"{glob.escape(name)}-*"):  # the other programs of that name too
+    for path in Path(folder).glob(f"{glob.escape(name)}-*"):
         with contextlib.suppress(OSError):
             path.unlink()
     print(f"warning: {name} in {folder} could not be read; it is compiled anew", file=sys.stderr)
