@@ -22,7 +22,6 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from mjx_reinforce.physics import contact_rows
-from mjx_reinforce.physics.by_engine import UNROLL
 from mjx_reinforce.physics.mjx_internals import jax_fields
 
 # mjMINVAL: what C takes for zero.
@@ -100,9 +99,7 @@ def supports(model: mjx.Model, data: mjx.Data) -> bool:
     )
 
 
-def solve(
-    model: mjx.Model, data: mjx.Data, unroll: int = UNROLL
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds the acceleration under constraints, from the start that costs less.
 
     The starts are the unconstrained acceleration and, unless the model disables it, the warm start.
@@ -110,7 +107,6 @@ def solve(
     Args:
         model: a model that `supports` accepts; `iterations` and `ls_iterations` bound the loops.
         data: with its constraint rows made.
-        unroll: of loops over contacts, see `by_engine`.
 
     Returns:
         The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
@@ -118,8 +114,7 @@ def solve(
     fields = jax_fields(data)
     equality = jnp.arange(fields.efc_D.shape[0]) < fields.ne
     rows = _Rows(fields.efc_J, fields.efc_aref, fields.efc_D, equality)
-    num_others = fields.ne + fields.nf + fields.nl
-    division = contact_rows.blocks(num_others, fields.contact.dim, unroll)
+    division = contact_rows.blocks(fields.ne + fields.nf + fields.nl, fields.contact.dim)
     # A NaN counts as touching, so that it gets to the acceleration.
     touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
     inertia = mjx.full_m(model, data)
