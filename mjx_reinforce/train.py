@@ -144,7 +144,7 @@ def train(
         from mjx_reinforce.runs.display import Display, print_summary
 
     with Display() as display:
-        interrupt.on_exit(display.console.show_cursor)
+        interrupt.restore_screen(display.console.show_cursor)
         display.say(plan.text)
         with display.compiling(plan.compiling):
             session, compile_seconds = _compile(ready, config, directory, display)

@@ -28,7 +28,17 @@ train.main()
 """
 FOREVER = ["--env", "Survive-v0", "--env-steps", "1000000000", "--output", "out"]
 #: It takes minutes to compile.
-HEAVY = ["--env", "Hopper-v5", "--engine", "vmap", "--output", "out"]
+HEAVY = ["--env", "Humanoid-v5", "--engine", "vmap", "--output", "out"]
+#: What it does before it ends takes longer than the screen is waited for.
+SLOW_EXIT = """
+import pathlib, time
+from mjx_reinforce.runs.interrupt import Interrupt
+with Interrupt() as interrupt:
+    interrupt.on_exit(lambda: (time.sleep(2), pathlib.Path("cleaned").touch()))
+    interrupt.restore_screen(lambda: time.sleep(60))
+    print("listening", flush=True)
+    time.sleep(60)
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -111,6 +121,15 @@ def test_a_signal_while_compiling_leaves_nothing(tmp_path, number, status):
     assert finish(process) == status
     assert time.monotonic() - begun < 5
     assert not (tmp_path / "out").exists()
+
+
+def test_files_are_cleaned_up_however_long_it_takes_but_the_screen_is_not_waited_for(tmp_path):
+    command = [sys.executable, "-c", SLOW_EXIT]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "listening\n"
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=30) == 143
+    assert (tmp_path / "cleaned").exists()
 
 
 @pytest.mark.parametrize("delay", [0.5, 1.5])

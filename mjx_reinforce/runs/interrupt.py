@@ -7,7 +7,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -27,6 +27,7 @@ class Interrupt:
         self.number: int | None = None
         self._say: Callable[[str], None] | None = None
         self._actions: list[Callable[[], Any]] = []
+        self._screen_actions: list[Callable[[], Any]] = [sys.stdout.flush, sys.stderr.flush]
 
     def __enter__(self) -> "Interrupt":
         self._heard, self._told = socket.socketpair()
@@ -43,8 +44,15 @@ class Interrupt:
         self._told.close()  # which ends the thread
 
     def on_exit(self, action: Callable[[], Any]) -> None:
-        """Adds what is done before a signal ends the process; its errors are not shown."""
+        """Adds what is done before a signal ends the process, however long that takes.
+
+        Its errors are not shown.
+        """
         self._actions.append(action)
+
+    def restore_screen(self, action: Callable[[], Any]) -> None:
+        """Adds what is tried before a signal ends the process: the screen may never take it."""
+        self._screen_actions.insert(0, action)
 
     def defer(self, say: Callable[[str], None]) -> None:
         """From now on the first signal only sets ``number``; the second ends the process.
@@ -62,17 +70,19 @@ class Interrupt:
 
     def _act(self, number: int) -> None:
         if self._say is None or self.number is not None:
+            _try(self._actions)
             # Not for long: the screen may be a pipe that nobody reads.
-            _start(self._clean_up).join(timeout=1)
+            _start(functools.partial(_try, self._screen_actions)).join(timeout=1)
             os._exit(128 + number)
         self.number = number
         said = "stopping after the present block of updates or test; Ctrl-C again stops at once"
         _start(functools.partial(self._say, said))
 
-    def _clean_up(self) -> None:
-        for action in (*self._actions, sys.stdout.flush, sys.stderr.flush):
-            with contextlib.suppress(Exception):
-                action()
+
+def _try(actions: Iterable[Callable[[], Any]]) -> None:
+    for action in actions:
+        with contextlib.suppress(Exception):
+            action()
 
 
 def _start(action: Callable[[], Any]) -> threading.Thread:

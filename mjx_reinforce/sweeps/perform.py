@@ -99,7 +99,7 @@ def _perform(
             processes.meet("ready")
 
         if interrupt is not None:
-            interrupt.on_exit(display.console.show_cursor)
+            interrupt.restore_screen(display.console.show_cursor)
         conductor = Conductor(prepared, design, processes, files, display, interrupt, ready)
         conductor.clock.compiling += prepared.engine_seconds
         ended = conductor.conduct()
