@@ -22,7 +22,8 @@ STYLES = {
 #: Task -> where its name stands, in points from its own, and the side that is there.
 PLACES = {
     "InvertedDoublePendulum": ((-6, -3), "right"),
-    "HalfCheetah": ((7, -9), "left"),
+    "Hopper": ((-7, 1), "right"),
+    "HalfCheetah": ((-7, -2), "right"),
     "Walker2d": ((-7, -4), "right"),
     "HumanoidStandup": ((7, -9), "left"),
 }

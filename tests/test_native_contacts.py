@@ -31,15 +31,29 @@ SCENE = """
 </worldbody></mujoco>"""
 
 
+#: Of its 16 contacts three of each kind have room in `touching`.
+MANY_FEET = """
+<mujoco><worldbody><geom type="plane" size="5 5 1"/>
+  <body pos="0 0 0.1"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="0.1 0.2 0.3"/>
+    {}</body>
+</worldbody></mujoco>""".format(
+    "".join(
+        f'<geom type="sphere" size="0.1" pos="{x} {y} 0" condim="{dim}" priority="1"/>'
+        for x, y, dim in [(x, y, 1 if x == y else 3) for x in range(4) for y in range(4)]
+    )
+)
+
+
 class Scene(Survive):
     """Its second observation is what the physics makes of the random state that it starts from."""
 
     action_size = 1
 
-    def __init__(self):
-        model = mujoco.MjModel.from_xml_string(SCENE)  # pyright: ignore
+    def __init__(self, xml=SCENE):
+        model = mujoco.MjModel.from_xml_string(xml)  # pyright: ignore
         self.model, self.data = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
-        self.size = 2 * model.nv + len(jax_fields(self.data).contact.dim)
+        fields = jax_fields(self.data)
+        self.size = 2 * model.nv + len(fields.efc_force) + len(fields.contact.dim)
 
     def reset(self, rng):
         nq, nv = self.model.nq, self.model.nv
@@ -58,12 +72,16 @@ class Scene(Survive):
         data = physics.forward(self.model, data)
         contact = jax_fields(data).contact
         touching = (contact.dist < contact.includemargin).astype(qpos.dtype)
-        return jnp.concatenate([data.qacc, data.qfrc_constraint, touching])
+        force = jax_fields(data).efc_force
+        return jnp.concatenate([data.qacc, data.qfrc_constraint, force, touching])
 
 
-def test_contacts_of_all_kinds():
+@pytest.mark.parametrize(
+    "xml", [SCENE, MANY_FEET], ids=["all kinds", "more than there is room for"]
+)
+def test_contacts(xml):
     with jax.enable_x64(True):
-        env = Scene()
+        env = Scene(xml)
         actor, act, distribution = actor_and_act(env, ())
 
         def play(engine):
@@ -85,8 +103,12 @@ def test_contacts_of_all_kinds():
     steady = np.all(steady, axis=0)
     assert steady.sum() > 48
     ours, theirs = ours[steady], theirs[steady]
-    nv, dims = env.model.nv, jax_fields(env.data).contact.dim
-    for dim in (1, 3, 4, 6):
-        assert 0 < theirs[:, 2 * nv :][:, dims == dim].mean() < 1, dim
-    np.testing.assert_array_equal(ours[:, 2 * nv :], theirs[:, 2 * nv :])
+    dims = jax_fields(env.data).contact.dim
+    touching = theirs[:, -len(dims) :]
+    for dim in np.unique(dims):
+        assert 0 < touching[:, dims == dim].mean() < 1, dim
+    if xml is MANY_FEET:
+        most = np.maximum(*(touching[:, dims == dim].sum(axis=1) for dim in (1, 3)))
+        assert {1, 2, 3, 4, 5} <= {*most.astype(int)}
+    np.testing.assert_array_equal(ours[:, -len(dims) :], touching)
     assert np.max(np.abs(ours - theirs).max(axis=1) / scale[steady]) < 1e-11

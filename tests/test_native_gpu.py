@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from players import actor_and_act, assert_same_episodes
 from test_native import Drifting, both, played
+from test_native_contacts import MANY_FEET, Scene
 from toys import Chain, categorical
 
 from mjx_reinforce import envs
@@ -93,6 +94,21 @@ def test_in_step_or_apart_an_episode_is_the_same(monkeypatch):
         for name in ("observation", "action", "reward", "mask", "nonfinite"):
             np.testing.assert_array_equal(getattr(got, name), getattr(want, name))
     assert 0 < meetings[0] < meetings[1] < meetings[2]
+
+
+def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
+    env = Scene(MANY_FEET)
+    who = actor_and_act(env, ())
+    size = {"num_episodes": 12, "horizon": 2}
+    gpu_on_cpu.emulate(monkeypatch)
+    want = played(rollout.rollout, env, who, **size)
+    block = gpu_on_cpu.Block(3)
+    gpu_on_cpu.emulate(monkeypatch, block=block)
+    monkeypatch.setattr(lockstep, "LONG", 0)
+    got = played(rollout.rollout, env, who, **size)
+    assert block.apart is None
+    for name in ("observation", "action", "reward", "mask"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(want, name))
 
 
 def kernel_text(env, sizes):

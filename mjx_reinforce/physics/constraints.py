@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 
-from mjx_reinforce.physics import limits, newton
+from mjx_reinforce.physics import limits, newton, touching
 from mjx_reinforce.physics.mjx_internals import jax_fields, with_solution
 
 
@@ -70,6 +70,6 @@ def _iterate(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, ja
         The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
     if newton.supports(model, data):
-        return newton.solve(model, data)
+        return touching.solve(newton.solve, model, data)
     data = mjx.solve(model, data)
     return data.qacc, data.qfrc_constraint, jax_fields(data).efc_force

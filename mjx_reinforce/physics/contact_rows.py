@@ -19,17 +19,20 @@ class Blocks(NamedTuple):
 
     others: the leading rows, which belong to no contact
     groups: contacts with equally many rows: how many contacts, and how many rows each
+    unroll: of loops over contacts, see `by_engine`
     """
 
     others: int
     groups: tuple[tuple[int, int], ...]
+    unroll: int
 
 
-def blocks(others: int, dims: Any) -> Blocks:
+def blocks(others: int, dims: Any, unroll: int = UNROLL) -> Blocks:
     """Returns the division for contacts [C] of these dimensions under pyramidal cones."""
     kinds = [dim for dim in (1, 3, 4, 6) if (dims == dim).any()]
     rows = {dim: 1 if dim == 1 else 2 * (dim - 1) for dim in kinds}
-    return Blocks(others, tuple((int((dims == dim).sum()), rows[dim]) for dim in kinds))
+    groups = tuple((int((dims == dim).sum()), rows[dim]) for dim in kinds)
+    return Blocks(others, groups, unroll)
 
 
 def weighted(
@@ -59,7 +62,7 @@ def weighted(
         zero = jnp.zeros_like(start)
         sums = whole(start, *(x[: division.others] for x in rows))
         for group in _by_group(division, rows):
-            sums, _ = lax.scan(add, sums, group, unroll=UNROLL)
+            sums, _ = lax.scan(add, sums, group, unroll=division.unroll)
         return sums
 
     return by_engine(by_contact, whole, start, jacobian, mass, force)
@@ -91,7 +94,7 @@ def along(
             division.groups, _by_group(division, (jacobian,)), strict=True
         ):
             block = rows, touching[first : first + count]
-            parts.append(lax.scan(product, None, block, unroll=UNROLL)[1].reshape(-1))
+            parts.append(lax.scan(product, None, block, unroll=division.unroll)[1].reshape(-1))
             first += count
         return jnp.concatenate(parts)
 

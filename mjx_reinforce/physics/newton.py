@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from mjx_reinforce.physics import contact_rows
+from mjx_reinforce.physics.by_engine import UNROLL
 from mjx_reinforce.physics.mjx_internals import jax_fields
 
 # mjMINVAL: what C takes for zero.
@@ -99,7 +100,9 @@ def supports(model: mjx.Model, data: mjx.Data) -> bool:
     )
 
 
-def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
+def solve(
+    model: mjx.Model, data: mjx.Data, unroll: int = UNROLL
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds the acceleration under constraints, from the start that costs less.
 
     The starts are the unconstrained acceleration and, unless the model disables it, the warm start.
@@ -107,6 +110,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
     Args:
         model: a model that `supports` accepts; `iterations` and `ls_iterations` bound the loops.
         data: with its constraint rows made.
+        unroll: of loops over contacts, see `by_engine`.
 
     Returns:
         The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
@@ -114,7 +118,8 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
     fields = jax_fields(data)
     equality = jnp.arange(fields.efc_D.shape[0]) < fields.ne
     rows = _Rows(fields.efc_J, fields.efc_aref, fields.efc_D, equality)
-    division = contact_rows.blocks(fields.ne + fields.nf + fields.nl, fields.contact.dim)
+    num_others = fields.ne + fields.nf + fields.nl
+    division = contact_rows.blocks(num_others, fields.contact.dim, unroll)
     # A NaN counts as touching, so that it gets to the acceleration.
     touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
     inertia = mjx.full_m(model, data)
