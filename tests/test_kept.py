@@ -18,6 +18,7 @@ from toys import Survive
 from mjx_reinforce import envs
 from mjx_reinforce.engines.native import objects
 from mjx_reinforce.engines.native.cpu import machine
+from mjx_reinforce.engines.native.gpu import seam as gpu
 from mjx_reinforce.runs import kept, ready, trees
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import of_task
@@ -101,10 +102,19 @@ def test_programs_depend_on_what_jax_is_told(monkeypatch):
         keys.add(kept.key_of(CONFIG))
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
     keys.add(kept.key_of(CONFIG))
-    monkeypatch.setattr(kept, "platform", lambda: "gpu")
+    monkeypatch.setattr(kept, "platform", lambda: "tpu")
     keys.add(kept.key_of(CONFIG))
     assert len(keys) == 4
     assert None in keys
+
+
+def test_a_program_that_launches_a_gpus_kernel_is_kept():
+    def add(x):
+        result = jax.ShapeDtypeStruct((1,), jnp.int32)
+        return gpu._call(gpu._PROBE, "probe", [result], (1, 1), [jnp.ones(1, jnp.int32), x])
+
+    kept._export("key", "look", lambda: add, (jax.ShapeDtypeStruct((1,), np.int32),))
+    assert gpu.PTX.encode() in kept._read("key", "look")
 
 
 def test_a_commit_that_changes_no_source_changes_nothing(monkeypatch):

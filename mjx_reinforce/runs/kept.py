@@ -2,8 +2,7 @@
 
 They lie beside XLA's compiled programs in JAX's cache, under a hash of all that they depend on:
 every source file of this package, the versions of others, the settings, the device. What a run
-begins with (its seeds) and when it ends are inputs of its programs. On CPUs only: on a GPU it was
-never tried.
+begins with (its seeds) and when it ends are inputs of its programs.
 """
 
 import dataclasses
@@ -22,6 +21,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.engines.native import objects
 from mjx_reinforce.engines.native.available import made_for, platform
 from mjx_reinforce.engines.native.cpu import seam
+from mjx_reinforce.engines.native.gpu.seam import PTX
 from mjx_reinforce.runs.blocks import block_length
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.files import provenance, version
@@ -41,11 +41,13 @@ _NAMES = ("start", "advance", "look")
 def key_of(config: Config) -> str | None:
     """Returns a name for all that the programs of a run depend on.
 
-    None where nothing is kept: on a GPU, where JAX keeps nothing, of an environment of the user's,
+    None where nothing is kept: on what is neither a CPU nor a GPU, of an environment of the user's,
     and where JAX is to look for NaNs, which it cannot in a program that is not traced.
     """
     looks = any(jax.config.values[name] for name in ("jax_debug_nans", "jax_debug_infs"))
-    if platform() != "cpu" or looks or objects.folder() is None or not envs.is_ours(config.env):
+    if looks or objects.folder() is None or not envs.is_ours(config.env):
+        return None
+    if platform() not in ("cpu", "gpu"):
         return None
     made_by = provenance()
     del made_by["git_commit"]  # the sources say it better
@@ -112,7 +114,7 @@ def _export(
 ) -> Callable[..., Any]:
     """Returns a program as it is kept, or as it was where JAX cannot export it."""
     program = part()
-    unsafe = [export.DisabledSafetyCheck.custom_call(x) for x in seam.targets()]
+    unsafe = [export.DisabledSafetyCheck.custom_call(x) for x in (*seam.targets(), PTX)]
     try:
         exported = export.export(jax.jit(program), disabled_checks=unsafe)(*given)
         # That list names all code in memory, also of other tasks; ``seam.restore`` would load it.

@@ -17,13 +17,14 @@ def platform() -> str:
 
 
 def made_for() -> str:
-    """Returns what machine code is made by, and for which CPU; or why there is none here."""
+    """Returns what machine code is made by, and for which machine; or why there is none here."""
     reason = unavailable()
     if reason:
         return reason
     import llvmlite
 
-    return f"{llvmlite.__version__} {machine.this_machine()}"
+    made_for = gpu.this_machine() if platform() == "gpu" else machine.this_machine()
+    return f"{llvmlite.__version__} {made_for}"
 
 
 def unavailable() -> str | None:

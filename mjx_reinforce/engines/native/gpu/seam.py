@@ -17,7 +17,7 @@ from jax import lax
 from mjx_reinforce.engines.native.gpu import player, ptx
 
 #: XLA's name of what launches a kernel.
-_PTX = "__gpu$xla.gpu.ptx"
+PTX = "__gpu$xla.gpu.ptx"
 #: Threads of a block at least, a warp, and blocks on each multiprocessor at most.
 _LEAST_THREADS, _MOST_BLOCKS = 32, 16
 #: A kernel that adds 1 to the number that is its second argument and its result.
@@ -77,6 +77,12 @@ def _refused() -> str | None:
 def compute_capability() -> str:
     """Returns that of the GPU, such as "9.0"; what other devices say instead; "" if nothing."""
     return str(getattr(jax.devices()[0], "compute_capability", ""))
+
+
+def this_machine() -> str:
+    """Returns what a program with kernels depends on."""
+    processors = jax.devices()[0].core_count
+    return f"compute capability {compute_capability()}, {processors} multiprocessors"
 
 
 def launch(
@@ -139,7 +145,7 @@ def _call(
     aliases = {first + k: k for k in range(len(results))}
     blocks, threads = map(np.int32, grid)
     one = np.int32(1)
-    return jax.ffi.ffi_call(_PTX, results, input_output_aliases=aliases)(
+    return jax.ffi.ffi_call(PTX, results, input_output_aliases=aliases)(
         *args,
         name=entry,
         kernel_type="ptx",
