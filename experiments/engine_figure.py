@@ -23,7 +23,6 @@ STYLES = {
 PLACES = {
     "InvertedDoublePendulum": ((-6, -3), "right"),
     "Hopper": ((-7, 1), "right"),
-    "HalfCheetah": ((-7, -2), "right"),
     "Walker2d": ((-7, -4), "right"),
     "HumanoidStandup": ((7, -9), "left"),
 }

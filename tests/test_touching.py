@@ -49,10 +49,15 @@ def test_values_go_back_to_the_contacts_that_touch():
             np.testing.assert_array_equal(given, expected.reshape(-1))
 
 
-def test_where_all_have_room_the_solver_has_the_data_as_it_is():
-    env, asked = envs.make("Hopper-v5"), []
+@pytest.mark.parametrize(
+    ("env_id", "contacts"),
+    [("Hopper-v5", 3), ("Pusher-v5", None)],
+    ids=["all have room", "few rows would be saved"],
+)
+def test_where_it_is_not_worth_it_the_solver_has_the_data_as_it_is(env_id, contacts):
+    env, asked = envs.make(env_id), []
     data = mjx.make_data(env.mj_model, impl="jax")
-    few = jax.tree.map(lambda x: x[:3], jax_fields(data).contact)
+    few = jax.tree.map(lambda x: x[:contacts], jax_fields(data).contact)
     data = data.tree_replace({"_impl.contact": few})
     touching.solve(lambda *given: asked.extend(given), env.model, data)
     assert asked[0] is env.model
