@@ -23,7 +23,9 @@ STYLES = {
 PLACES = {
     "InvertedDoublePendulum": ((-6, -3), "right"),
     "Hopper": ((-7, 1), "right"),
+    "HalfCheetah": ((0, 10), "center"),
     "Walker2d": ((-7, -4), "right"),
+    "Pusher": ((7, -6), "left"),
     "HumanoidStandup": ((7, -9), "left"),
 }
 
