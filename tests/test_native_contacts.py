@@ -112,3 +112,33 @@ def test_contacts(xml, room, monkeypatch):
     assert {room - 1, room, room + 1} <= {*most.astype(int)}
     np.testing.assert_array_equal(ours[:, -len(dims) :], touches)
     assert np.max(np.abs(ours - theirs).max(axis=1) / scale[steady]) < 1e-11
+
+
+BALL = """
+<mujoco><worldbody><geom type="plane" size="5 5 1"/>
+  <body pos="0 0 0.1"><joint type="slide" axis="0 0 1"/><geom type="sphere" size="0.1"/></body>
+</worldbody></mujoco>"""
+
+
+class LostBall(Scene):
+    """Where the ball is NaN, only its acceleration and the force on it show that."""
+
+    def reset(self, rng):
+        state = super().reset(rng)
+        qpos, *others = state.info
+        return state.replace(info=(jnp.where(qpos > 0.1, jnp.nan, qpos), *others))
+
+
+def test_a_nan_gets_to_the_acceleration():
+    env = LostBall(BALL)
+    actor, act, distribution = actor_and_act(env, ())
+
+    def broken(engine):
+        roll = lambda key: engine(  # noqa: E731
+            env, act, actor, distribution, key, num_episodes=64, horizon=2
+        )
+        return np.asarray(jax.jit(roll)(jax.random.key(0)).nonfinite)
+
+    ours, theirs = broken(rollout.rollout), broken(rollouts.rollout)
+    assert 0 < theirs.sum() < 64
+    np.testing.assert_array_equal(ours, theirs)

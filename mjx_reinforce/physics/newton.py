@@ -165,8 +165,8 @@ def solve(
 
 
 def _point(rows: _Rows, qacc: jax.Array, imbalance: jax.Array, residual: jax.Array) -> _Point:
-    """Returns an acceleration [nv] with which rows push."""
-    return _Point(qacc, imbalance, residual, rows.equality | (residual < 0))
+    """Returns an acceleration [nv] with which rows push; a NaN pushes, so that it is not lost."""
+    return _Point(qacc, imbalance, residual, rows.equality | ~(residual >= 0))
 
 
 def _cost(rows: _Rows, data: mjx.Data, point: _Point) -> jax.Array:
