@@ -32,7 +32,7 @@ SCENE = """
 </worldbody></mujoco>"""
 
 
-#: It has 16 contacts.
+#: Of its 16 contacts three of each kind have room in `touching`.
 MANY_FEET = """
 <mujoco><worldbody><geom type="plane" size="5 5 1"/>
   <body pos="0 0 0.1"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="0.1 0.2 0.3"/>

@@ -51,7 +51,7 @@ class Interrupt:
         self._actions.append(action)
 
     def restore_screen(self, action: Callable[[], Any]) -> None:
-        """Adds what is tried before a signal ends the process: the screen may never take it."""
+        """Adds what is tried, for a second at most, before a signal ends the process."""
         self._screen_actions.insert(0, action)
 
     def defer(self, say: Callable[[str], None]) -> None:
