@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from toys import Drift
@@ -395,6 +396,27 @@ def test_halving_goes_on_with_the_better_half(run, monkeypatch):
     summary = json.loads(Path("fresh/summary.json").read_text())
     assert np.allclose(winner["final_returns"], summary["final_returns"], rtol=1e-4)
     assert winner["iqm"] == pytest.approx(summary["iqm"], rel=1e-4)
+
+
+def test_programs_have_run_once_for_no_run_before_they_train(run, monkeypatch):
+    """A GPU's driver translates kernels when they first run: that is compiling too."""
+    made, block_of_updates = [], programs.block_of_updates
+
+    def counting(*arguments):
+        advance = block_of_updates(*arguments)
+
+        def counted(*arguments):
+            state, (count, metrics) = advance(*arguments)
+            jax.debug.callback(lambda x: made.append(int(x)), count)
+            return state, (count, metrics)
+
+        return counted
+
+    monkeypatch.setattr(programs, "block_of_updates", counting)
+    assert run(f"{SMALL} --num-seeds 2 --max-updates 3 {RATES} --output swept") == 0
+    jax.effects_barrier()
+    assert made[0] == 0
+    assert sum(made) >= 3
 
 
 def test_half_the_configurations_stay_until_one_is_left():

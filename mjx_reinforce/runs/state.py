@@ -160,14 +160,14 @@ def compile_parts(
       config: its settings.
       meanwhile: begins other work in Python; called once the rest of the time is XLA's.
     """
-    like, budget = parts.like, tuple(budget_of(config))
+    like, budget = parts.like, budget_of(config)
 
     def start(*seeds: Any) -> tuple[RunState, jax.Array, jax.Array]:
         leaves, *keys = parts.start()(*seeds)
         return _joined(leaves, like), *keys
 
-    def advance(state: RunState, budget: tuple[Any, Any]) -> Any:
-        leaves, made, metrics = parts.advance()(jax.tree.leaves(plain(state)), budget)
+    def advance(state: RunState, budget: Budget) -> Any:
+        leaves, made, metrics = parts.advance()(jax.tree.leaves(plain(state)), tuple(budget))
         return _joined(leaves, like), made, metrics
 
     def look(actor: Actor, key: jax.Array) -> dict[str, jax.Array]:
@@ -181,6 +181,8 @@ def compile_parts(
         meanwhile()
         advancing = traced.compile()
         compiled, (first, key, test_key) = looking.result(), starting.result()
+    # No update: a GPU's driver translates the kernels of a program when it first runs.
+    first = jax.block_until_ready(advancing(first, Budget(np.int32(0), np.int32(0)))[0])
 
     def advanced(state: RunState) -> tuple[RunState, Arrays]:
         state, made, metrics = advancing(state, budget)

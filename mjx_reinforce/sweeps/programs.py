@@ -284,6 +284,9 @@ def _movers(
         looking = pool.submit(look.lower(rows, key, which).compile)
         advancing = pool.submit(advance.lower(rows, which, budget).compile)
     looked, advanced = looking.result(), advancing.result()
+    # No run: a GPU's driver translates the kernels of a program when it first runs.
+    none = devices.put((np.zeros(rows.shape, rows.dtype), np.zeros(width, bool)), RUNS)
+    jax.block_until_ready(advanced(*none, budget))
     return Movers(advanced, lambda rows, which: looked(rows, key, which))
 
 
