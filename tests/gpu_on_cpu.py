@@ -15,6 +15,9 @@ from mjx_reinforce.engines.native.gpu import player, ptx, seam
 
 _SOME = re.compile(r'call i32 asm sideeffect "[^"]*bar.red[^"]*", "=r,r"\(i32 (%\w+)\) convergent')
 _ALL = re.compile(r'call void asm sideeffect "[^"]*bar.sync[^\n]*')
+_BLOCK = re.compile(r"call i32 @llvm.nvvm.read.ptx.sreg.n?(?:cta|t)id.x\(\)")
+_THREAD = threading.local()
+_NUMBER = ctypes.CFUNCTYPE(ctypes.c_int)(lambda: _THREAD.number)
 
 
 class Block:
@@ -63,7 +66,29 @@ def as_for_a_cpu(text, block=None):
     """Returns a kernel's LLVM IR, with threads that meet in a block, or each in a block alone."""
     text = text.replace("define ptx_kernel void", "define void").replace(") #0 {", ") {")
     text = re.sub(r"attributes #0 = \{[^}]*\}", "", text)
+    number = f"call i32 inttoptr (i64 {ctypes.cast(_NUMBER, ctypes.c_void_p).value} to ptr)()"
+    text = text.replace("call i32 @llvm.nvvm.read.ptx.sreg.tid.x()", number)
+    text = _BLOCK.sub("add i32 0, 0", text)
     return block.text(text) if block else _ALL.sub("", _SOME.sub(r"or i32 \1, 0", text))
+
+
+def compiled(text, block=None):
+    """Returns a kernel's code for this CPU."""
+    text = as_for_a_cpu(text, block)
+    return machine.load(text, lambda: text, (player.ENTRY,), machine.this_machine(), None)
+
+
+def run_threads(address, threads, arrays):
+    """Runs a kernel's code in so many threads, on pointers to arrays."""
+    pointers = [ctypes.c_void_p(x.ctypes.data) for x in arrays]
+    kernel = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(pointers))(address)
+
+    def run(number):
+        _THREAD.number = number
+        kernel(*pointers)
+
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(run, range(threads)))
 
 
 def emulate(monkeypatch, threads=1, block=None):
@@ -73,29 +98,32 @@ def emulate(monkeypatch, threads=1, block=None):
     def load(source, write, capability, folder):
         assert capability == "9.0"
         assert folder is None or folder.name == "native"
-        text = as_for_a_cpu(write(), block)
-        code = machine.load(text, lambda: text, (player.ENTRY,), machine.this_machine(), None)
-        return ptx.Kernel(code.key, str(code.addresses[player.ENTRY]), 128, compiled=True)
+        text = write()
+        code = compiled(text, block)
+        words = int((re.findall(r"@scratch = constant i32 (\d+)", text) or [0])[0])
+        address = str(code.addresses[player.ENTRY])
+        return ptx.Kernel(code.key, address, 128, 2, words, compiled=True)
 
-    def call(text, entry, results, grid, args):
+    def call(text, entry, grid, given, written, scratch=()):
         assert entry == player.ENTRY
+        results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
+        size = 32 * -(-threads // 32)
 
         def run(*args):
-            given = [np.array(x, order="C") for x in args]
-            written = given[len(given) - len(results) :]
-            assert not any(x.any() for x in written)
-            pointers = [ctypes.c_void_p(x.ctypes.data) for x in [*given, *written]]
-            play = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(pointers))(int(text))
-            with ThreadPoolExecutor(threads) as pool:
-                list(pool.map(lambda _: play(*pointers), range(threads)))
-            return written
+            args = [np.array(x, order="C") for x in args]
+            left = args[len(given) :]
+            assert not any(x.any() for x in left)
 
-        return jax.pure_callback(run, list(results), *args)
+            nans = [np.full(x.size // grid[1] * size, np.nan, np.float32) for x in scratch]
+            run_threads(int(text), threads, [*args, *left, *nans])
+            return left
+
+        return jax.pure_callback(run, results, *given, *written)
 
     monkeypatch.setattr(available, "platform", lambda: "gpu")
     monkeypatch.setattr(seam, "unavailable", lambda: None)
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
-    monkeypatch.setattr(seam, "_grid", lambda items, most: (1, min(items, most)))
+    monkeypatch.setattr(seam, "_grid", lambda items, most, blocks: (1, min(items, most)))
     monkeypatch.setattr(ptx, "load", load)
     monkeypatch.setattr(seam, "_call", call)
 
@@ -104,6 +132,6 @@ def lowered(monkeypatch, function, *args):
     """Returns what XLA's compiler for NVIDIA GPUs gets, as text."""
     monkeypatch.setattr(available, "platform", lambda: "gpu")
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
-    monkeypatch.setattr(seam, "_grid", lambda items, most: (-(-items // 32), 32))
+    monkeypatch.setattr(seam, "_grid", lambda items, most, blocks: (-(-items // 32), 32))
     traced = jax.jit(function).trace(*jax.tree.map(jnp.asarray, args))
     return traced.lower(lowering_platforms=("cuda",)).as_text()

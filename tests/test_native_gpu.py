@@ -17,7 +17,7 @@ from toys import Chain, categorical
 from mjx_reinforce import envs
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.native import available, rollout, step
-from mjx_reinforce.engines.native.gpu import lockstep, player, ptx, seam
+from mjx_reinforce.engines.native.gpu import lockstep, player, ptx, scratch, seam
 from mjx_reinforce.fused import scalarized
 
 if reason := available.unavailable():
@@ -111,6 +111,38 @@ def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
         np.testing.assert_array_equal(getattr(got, name), getattr(want, name))
 
 
+def test_long_arrays_are_in_a_buffer(monkeypatch):
+    env = envs.make("Hopper-v5")
+    who = actor_and_act(env, (4,))
+    gpu_on_cpu.emulate(monkeypatch)
+    want = played(rollout.rollout, env, who, horizon=30)
+    monkeypatch.setattr(scratch, "_LONG", 5)
+    made, load = [], ptx.load
+    monkeypatch.setattr(ptx, "load", lambda *x: made.append(load(*x)) or made[-1])
+    got = played(rollout.rollout, env, who, horizon=30)
+    assert made[0].scratch > 100
+    for name in ("observation", "action", "reward", "mask"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(want, name))
+
+
+def test_each_thread_has_words_of_its_own():
+    """Those of the threads of a warp are side by side."""
+    text = scratch.ScratchText()
+    arrays = [text.reserve_long(np.int32, count) for count in (30, 40)]
+    thread = text.let("call i32 @llvm.nvvm.read.ptx.sreg.tid.x()")
+    for array, count in zip(arrays, (30, 40), strict=True):
+        for k in range(count):
+            value = text.let(f"add i32 {text.let(f'mul i32 {thread}, 100')}, {k + count}")
+            text.store(value, text.at(array, np.int32, text.let(f"add i64 {k}, 0")), np.int32)
+    text.line("ret void")
+    code = gpu_on_cpu.compiled(text.function("ptx_kernel void @play(ptr %scratch) #0"))
+    buffer = np.zeros((2, 70, 32), np.int32)
+    gpu_on_cpu.run_threads(code.addresses["play"], 64, [buffer])
+    entries = np.concatenate([np.arange(30) + 30, np.arange(40) + 40])
+    threads = np.arange(64).reshape(2, 1, 32)
+    np.testing.assert_array_equal(buffer, 100 * threads + entries[:, None])
+
+
 def kernel_text(env, sizes):
     actor, act, distribution = actor_and_act(env, sizes)
     examples = step.examples(env, actor)[:-1]
@@ -197,9 +229,9 @@ def test_another_engine_plays_where_kernels_are_not_launched(pendulum, monkeypat
 
 def test_few_episodes_are_spread_over_all_multiprocessors(monkeypatch):
     monkeypatch.setattr(jax, "devices", lambda: [type("GPU", (), {"core_count": 100})])
-    assert seam._grid(1, 512) == (1, 32)
-    assert seam._grid(1_600, 512) == (50, 32)
-    assert seam._grid(6_400, 512) == (100, 64)
-    assert seam._grid(51_200, 512) == (100, 512)
-    assert seam._grid(10**7, 512) == (1_600, 512)
-    assert seam._grid(10**7, 32) == (1_600, 32)
+    assert seam._grid(1, 512, 2) == (1, 32)
+    assert seam._grid(1_600, 512, 2) == (50, 32)
+    assert seam._grid(6_400, 512, 2) == (100, 64)
+    assert seam._grid(51_200, 512, 2) == (100, 512)
+    assert seam._grid(10**7, 512, 2) == (200, 512)
+    assert seam._grid(10**7, 32, 16) == (1_600, 32)

@@ -93,6 +93,10 @@ class LLVM(Backend[Value]):
         kinds = [np.dtype(arg.dtype) for arg in node.args]
         return OPERATIONS[op.name](self._text, op, node.dtype, kinds, cast(list[str], operands))
 
+    def reserve(self, dtype: np.dtype, count: int) -> str:
+        """Returns a pointer to room for an array that a loop reads or leaves."""
+        return self._text.reserve(dtype, count)
+
     def some(self, mask: str) -> str:
         """Returns an i1: whether some lane of a mask is set, for a gate or a loop."""
         return self._text.any(mask)
@@ -122,7 +126,7 @@ class LLVM(Backend[Value]):
         text = self._text
         inits = [self.value(carry.init, values) for carry in loop.carries]
         readers = [self._reader(e.leaf, e.values, values) for e in loop.elements]
-        kept = [text.reserve(_dtype(r.value), loop.length or 0) for r in loop.records]
+        kept = [self.reserve(_dtype(r.value), loop.length or 0) for r in loop.records]
         before, head, body, after = text.block, text.label(), text.label(), text.label()
         text.line(f"br label %{head}")
         text.start(head)
@@ -204,7 +208,7 @@ class LLVM(Backend[Value]):
         if all(map(is_constant, row)):
             table = text.table(dtype, [literal(x) for x in row])
             return lambda count: text.spread(dtype, table, count)
-        array = text.reserve(dtype, len(row))
+        array = self.reserve(dtype, len(row))
         for t, x in enumerate(row):
             text.store(self.value(x, values), self._text.at(array, dtype, t), dtype)
         return lambda count: Memory(self._text.at(array, dtype, count), dtype)

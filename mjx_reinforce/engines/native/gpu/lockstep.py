@@ -7,6 +7,9 @@ at different places wait for instructions most of the time; in step, one reads t
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 
+import numpy as np
+
+from mjx_reinforce.engines.native.gpu.scratch import ScratchText
 from mjx_reinforce.fused.backends.llvm import LLVM, Input, Value
 from mjx_reinforce.fused.backends.llvm_text import Text
 from mjx_reinforce.fused.liveness import LiveGate, LiveLoop, Schedule
@@ -39,10 +42,15 @@ def operations(body: Schedule) -> int:
 class Lockstep(LLVM):
     """Writes LLVM IR for one of the threads of a block, all of which run what it writes."""
 
-    def __init__(self, text: Text, inputs: Callable[[int], Input]):
+    def __init__(self, text: ScratchText, inputs: Callable[[int], Input]):
         """Arguments are those of `LLVM`."""
         super().__init__(text, inputs)
+        self._scratch = text
         self._together = True
+
+    def reserve(self, dtype: np.dtype, count: int) -> str:
+        """Returns a pointer to room for an array: a long one is in XLA's buffer."""
+        return self._scratch.reserve_long(dtype, count)
 
     def some(self, mask: str) -> str:
         """Returns an i1: whether a thread goes on, or where all do, whether one must."""

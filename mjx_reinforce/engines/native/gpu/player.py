@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.engines.native.gpu.lockstep import LONG, Lockstep, operations, some_of_block
+from mjx_reinforce.engines.native.gpu.scratch import ScratchText
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.fused.backends.llvm import Input
-from mjx_reinforce.fused.backends.llvm_text import Text
 
 _INT = np.dtype(np.int32)
 #: The kernel's name. Its attributes are #0.
@@ -51,8 +51,9 @@ def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
     of the actor [S, ...] and of the state [S, N, ...] that are not empty; as many again as there
     are results, which it does not read; and the results, which are zero when it starts:
     observation [S, T, O, N], action [S, T, A, N], reward [S, T, N], length [S, N] int32,
-    broken [S, N] int32, simulated [S] int32 and next [1] int32, the item to be fetched next. Item k
-    is episode k % N of seed k / N. A thread counts the steps that it waits for others in its block
+    broken [S, N] int32, simulated [S] int32 and next [1] int32, the item to be fetched next; and,
+    if there are long arrays, the buffer of ``scratch.ScratchText``. Item k is episode k % N of seed
+    k / N. A thread counts the steps that it waits for others in its block
     as simulated for the seed it played last.
 
     Args:
@@ -66,7 +67,7 @@ class _Kernel:
     """Writes ``@play``."""
 
     def __init__(self, step: scalarized.Scalarized, num_actor: int):
-        self.text, self.step = Text(1), step
+        self.text, self.step = ScratchText(), step
         avals = [(np.dtype(x.dtype), int(np.prod(x.shape, dtype=int))) for x in step.in_avals]
         actor, own = avals[:num_actor], avals[num_actor:]
         state = own[: len(own) - _NUM_OTHERS]
@@ -114,7 +115,8 @@ class _Kernel:
         unread = [f"%zero.{name}" for name in RESULTS]
         written = [f"%{name}" for name in RESULTS]
         parameters = [f"ptr noalias readonly {x}" for x in pointers]
-        parameters += [f"ptr {x}" for x in unread] + [f"ptr {x}" for x in written]
+        parameters += [f"ptr {x}" for x in [*unread, *written]]
+        parameters += ["ptr noalias %scratch"] if text.words else []
         blocks = _LONG_BLOCKS if operations(self.step.schedule) > LONG else _SHORT_BLOCKS
         kernel = text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
         return kernel + _ATTRIBUTES.format(*blocks)

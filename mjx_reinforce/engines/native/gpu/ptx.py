@@ -11,6 +11,8 @@ from mjx_reinforce.engines.native import objects
 
 #: LLVM's name of NVIDIA's GPUs.
 TRIPLE = "nvptx64-nvidia-cuda"
+#: What finds a kernel's threads, blocks and scratch, or 0.
+_FACTS = (r"\.maxntid (\d+)", r"\.minnctapersm (\d+)", r"\bscratch = (\d+)")
 _LOADED: dict[str, "Kernel"] = {}
 _LOCK = threading.Lock()
 
@@ -21,12 +23,16 @@ class Kernel(NamedTuple):
     key: a name for all that it depends on
     text: PTX; its entry is "play"
     threads: of a block, at most
+    blocks: on a multiprocessor, at most
+    scratch: 4-byte words of a buffer that each thread needs
     compiled: whether it was compiled now, and not read from disk
     """
 
     key: str
     text: str
     threads: int
+    blocks: int
+    scratch: int
     compiled: bool
 
 
@@ -47,8 +53,8 @@ def load(source: str, write: Callable[[], str], capability: str, folder: Path | 
         if key not in _LOADED:
             found = objects.read(folder, key) if folder else None
             text = found.decode() if found else _compile(write(), capability)
-            threads = int(re.findall(r"\.maxntid (\d+)", text)[0])
-            _LOADED[key] = Kernel(key, text, threads, compiled=not found)
+            facts = [int((re.findall(x, text) or [0])[0]) for x in _FACTS]
+            _LOADED[key] = Kernel(key, text, *facts, compiled=not found)
             if folder and not found:
                 objects.write(folder, key, text.encode())
         return _LOADED[key]

@@ -6,6 +6,7 @@ each process before it is relied on.
 """
 
 import functools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,8 +19,8 @@ from mjx_reinforce.engines.native.gpu import player, ptx
 
 #: XLA's name of what launches a kernel.
 PTX = "__gpu$xla.gpu.ptx"
-#: Threads of a block at least, a warp, and blocks on each multiprocessor at most.
-_LEAST_THREADS, _MOST_BLOCKS = 32, 16
+#: Threads of a block at least: a warp.
+_LEAST_THREADS = 32
 #: A kernel that adds 1 to the number that is its second argument and its result.
 _PROBE = """
 .version 7.0
@@ -61,8 +62,7 @@ def _refused() -> str | None:
     """Returns why XLA does not launch kernels, None if it does: in a loop, into its own results."""
 
     def add(_: Any, x: jax.Array) -> jax.Array:
-        result = [jax.ShapeDtypeStruct((1,), jnp.int32)]
-        return _call(_PROBE, "probe", result, (1, 1), [jnp.ones(1, jnp.int32), x])[0]
+        return _call(_PROBE, "probe", (1, 1), [jnp.ones(1, jnp.int32)], [x])[0]
 
     try:
         with jax.ensure_compile_time_eval():
@@ -126,27 +126,33 @@ def _launch(
         shape((seeds, horizon, int(np.prod(x.shape, dtype=int)), episodes), x.dtype) for x in record
     )
     counts = [shape(x, jnp.int32) for x in ((seeds, episodes), (seeds, episodes), (seeds,), (1,))]
-    results = [observation, action, reward, *counts]
     given = [jnp.array([seeds, episodes, horizon], jnp.int32), *args]
-    zeros = [jnp.zeros(x.shape, x.dtype) for x in results]
-    grid = _grid(seeds * episodes, kernel.threads)
-    return _call(kernel.text, player.ENTRY, results, grid, [*given, *zeros])[:-1]
+    zeros = [jnp.zeros(x.shape, x.dtype) for x in (observation, action, reward, *counts)]
+    grid = _grid(seeds * episodes, kernel.threads, kernel.blocks)
+    words = kernel.scratch * math.prod(grid)
+    scratch = [shape((words,), jnp.int32)] if words else []
+    return _call(kernel.text, player.ENTRY, grid, given, zeros, scratch)[: len(zeros) - 1]
 
 
 def _call(
     text: str,
     entry: str,
-    results: Sequence[jax.ShapeDtypeStruct],
     grid: tuple[int, int],
-    args: Sequence[jax.Array],
+    given: Sequence[jax.Array],
+    written: Sequence[jax.Array],
+    scratch: Sequence[jax.ShapeDtypeStruct] = (),
 ) -> Sequence[jax.Array]:
-    """Launches so many blocks of so many threads, which write over the last arguments."""
-    first = len(args) - len(results)
-    aliases = {first + k: k for k in range(len(results))}
+    """Launches so many blocks of so many threads.
+
+    Its results are what it leaves in ``written`` and then ``scratch``, which begins with any values.
+    """
+    results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
+    aliases = {len(given) + k: k for k in range(len(results))}
     blocks, threads = map(np.int32, grid)
     one = np.int32(1)
-    return jax.ffi.ffi_call(PTX, results, input_output_aliases=aliases)(
-        *args,
+    return jax.ffi.ffi_call(PTX, [*results, *scratch], input_output_aliases=aliases)(
+        *given,
+        *written,
         name=entry,
         kernel_type="ptx",
         kernel_data=text,
@@ -160,14 +166,13 @@ def _call(
     )
 
 
-def _grid(items: int, most: int) -> tuple[int, int]:
+def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
     """Returns how many blocks of how many threads, at most so many, play so many episodes.
 
-    Few episodes are spread over all multiprocessors. Blocks beyond those that run at once find no
-    episode left, and end.
+    Few episodes are spread over all multiprocessors, each of which has so many blocks at most.
     """
     processors = jax.devices()[0].core_count
     threads = _LEAST_THREADS
     while threads < most and threads * processors < items:
         threads *= 2
-    return min(-(-items // threads), _MOST_BLOCKS * processors), threads
+    return min(-(-items // threads), blocks * processors), threads
