@@ -1,14 +1,25 @@
 """Draws docs/engine.png: env steps a second against the size of the task, engine by engine.
 
 ``python experiments/engine_figure.py`` reads docs/engine.csv: for each task, device and engine the
-scalar operations of a step, and env steps a second; docs/benchmarks.md says of which day.
+scalar operations of a step, and env steps a second; docs/benchmarks.md says of which day. With
+``--count`` it counts the operations first, in some minutes: a step is what ``native`` plays, with a
+16-32 policy and its noise.
 """
 
 import csv
+import functools
 from collections import defaultdict
 from pathlib import Path
 
+import jax
+import tyro
 from matplotlib.figure import Figure
+
+from benchmark import the_policy
+from mjx_reinforce import act, envs
+from mjx_reinforce.engines.chunks import CHUNK_STEPS
+from mjx_reinforce.engines.native import program, step
+from mjx_reinforce.fused import scalarized
 
 DOCS = Path(__file__).parents[1] / "docs"
 #: engine -> colour (Okabe and Ito's, for all eyes) and marker
@@ -19,9 +30,11 @@ STYLES = {
     "MuJoCo Warp": ("#009E73", "^"),
     "C MuJoCo": ("#D55E00", "D"),
 }
-#: Task -> where its name stands, in points from its own, and the side that is there.
+#: Task, or task and device -> where its name stands, in points from its own, and on which side.
 PLACES = {
-    "InvertedDoublePendulum": ((-6, -3), "right"),
+    ("HalfCheetah", "two CPU cores"): ((7, -8), "left"),
+    ("Pusher", "two CPU cores"): ((7, 3), "left"),
+    "InvertedDoublePendulum": ((-6, -4), "right"),
     "Hopper": ((-7, 1), "right"),
     "HalfCheetah": ((0, 10), "center"),
     "Walker2d": ((-7, -4), "right"),
@@ -30,10 +43,22 @@ PLACES = {
 }
 
 
-def main() -> None:
-    """Reads and draws."""
-    with (DOCS / "engine.csv").open(encoding="utf-8") as file:
+def main(count: bool = False) -> None:
+    """Reads and draws.
+
+    Args:
+      count: write the operations anew first.
+    """
+    path = DOCS / "engine.csv"
+    with path.open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
+    if count:
+        for row in rows:
+            row["operations"] = operations(row["task"], "CPU" in row["device"])
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
     devices = list(dict.fromkeys(row["device"] for row in rows))
     figure = Figure(figsize=(5.5 * len(devices), 4.8), dpi=150, layout="constrained")
     for axes, device in zip(figure.subplots(1, len(devices), sharex=True), devices, strict=True):
@@ -44,7 +69,8 @@ def main() -> None:
                 lines[row["engine"]].append(point)
                 if row["engine"] == "native":
                     name = row["task"].removesuffix("-v5")
-                    place, side = PLACES.get(name, ((7, 4), "left"))
+                    usual = PLACES.get(name, ((7, 4), "left"))
+                    place, side = PLACES.get((name, device), usual)
                     axes.annotate(name, point, place, textcoords="offset points", size=7, ha=side)
         for engine, points in lines.items():
             colour, marker = STYLES[engine]
@@ -58,5 +84,23 @@ def main() -> None:
     figure.savefig(DOCS / "engine.png")
 
 
+@functools.cache
+def operations(task: str, on_cpu: bool) -> int:
+    """Counts the operations of the program for a CPU or a GPU."""
+    env = envs.make(task)
+    policy, actor = the_policy(env, None)
+    function = step.step_function(
+        env, functools.partial(act, policy), policy.distribution, CHUNK_STEPS
+    )
+    examples = step.examples(env, actor)
+    loops = program.LOOPS
+    if not on_cpu:
+        function, examples = program.while_running(function), examples[:-1]
+        loops = program.GPU_LOOPS
+    varying = [True] * len(jax.tree.leaves(examples))
+    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **loops)
+    return sum(written.operations.values())
+
+
 if __name__ == "__main__":
-    main()
+    tyro.cli(main)

@@ -19,9 +19,9 @@ from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Environment
 
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
-_LOOPS = {"unrolled": 1, "unrolled_arrays": 1, "unrolled_on_request": 1}
+LOOPS = {"unrolled": 1, "unrolled_arrays": 1, "unrolled_on_request": 1}
 #: On GPUs a loop over few contacts is written out: an array that a loop reads is in memory there.
-_GPU_LOOPS = {**_LOOPS, "unrolled_on_request": 25}
+GPU_LOOPS = {**LOOPS, "unrolled_on_request": 25}
 #: The folders whose files decide what is written for a step.
 _WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
 
@@ -56,7 +56,7 @@ def build(
     function = step.step_function(env, act, distribution, length)
     on_cpu = available.platform() == "cpu"
     if not on_cpu:  # a thread without an episode does not play
-        function, examples = _while_running(function), examples[:-1]
+        function, examples = while_running(function), examples[:-1]
     traced, shapes = jaxprs.trace(function, *examples)
     source = f"{jaxprs.fingerprint(traced)} {objects.source_digest(*_WRITERS)}"
     folder = objects.folder()
@@ -70,7 +70,7 @@ def build(
     return Program(code, shapes.record)
 
 
-def _while_running(function: Any) -> Any:
+def while_running(function: Any) -> Any:
     """Returns a step of episodes that are running."""
     return lambda *args: function(*args, jnp.int32(1))
 
@@ -79,7 +79,7 @@ def _write_gpu(function: Any, examples: tuple[Any, ...]) -> str:
     """Writes a step, and the kernel around it, as LLVM IR."""
     actor = examples[0]
     varying = [True] * len(jax.tree.leaves(examples))
-    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **_GPU_LOOPS)
+    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **GPU_LOOPS)
     return gpu_player.kernel_text(written, len(jax.tree.leaves(actor)))
 
 
@@ -88,7 +88,7 @@ def _write_cpu(function: Any, examples: tuple[Any, ...], target: machine.Machine
     actor, carried, *_ = examples
     num_actor = len(jax.tree.leaves(actor))
     varying = [True] * len(jax.tree.leaves(examples))
-    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **_LOOPS)
+    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **LOOPS)
     buffers = [x for x in jax.tree.leaves((actor, carried.state)) if np.prod(x.shape)]
     records = [np.dtype(x.dtype).itemsize for x in written.out_avals[: queue.NUM_RECORDS]]
     num_args, lanes = queue.NUM_CONTROLS + len(buffers), target.lanes

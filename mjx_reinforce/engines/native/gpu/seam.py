@@ -144,7 +144,7 @@ def _call(
 ) -> Sequence[jax.Array]:
     """Launches so many blocks of so many threads.
 
-    Its results are what it leaves in ``written`` and then ``scratch``, which begins with any values.
+    Returns what it leaves in ``written``, and ``scratch``, which begins with any values.
     """
     results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
     aliases = {len(given) + k: k for k in range(len(results))}
