@@ -53,8 +53,8 @@ def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
     observation [S, T, O, N], action [S, T, A, N], reward [S, T, N], length [S, N] int32,
     broken [S, N] int32, simulated [S] int32 and next [1] int32, the item to be fetched next; and,
     if there are long arrays, the buffer of ``scratch.ScratchText``. Item k is episode k % N of seed
-    k / N. A thread counts the steps that it waits for others in its block
-    as simulated for the seed it played last.
+    k / N. A thread counts the steps that it waits for others in its block as simulated for the seed
+    it played last.
 
     Args:
         step: of ``step.step_function`` where an episode is running, written out.

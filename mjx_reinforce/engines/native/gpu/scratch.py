@@ -1,8 +1,8 @@
 """Long arrays of a thread, in a buffer of XLA's.
 
 CUDA sets local memory aside for as many threads as a GPU can hold, whatever a kernel uses: the
-arrays of Humanoid's contacts, 43 kB a thread, would take 12 GB of an H200. A buffer for the threads
-that run takes 1.5 GB.
+arrays of Humanoid's contacts, 46 kB a thread, would take 12 GB of an H200. A buffer for the threads
+that run takes 1.6 GB.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ from mjx_reinforce.fused.backends.llvm_text import Text
 
 #: Bytes of a word, and threads of a warp. Those of a warp have their words side by side.
 _WORD, _WARP = 4, 32
-#: Shorter arrays are in local memory.
+#: Arrays of so many entries are long: loops over fewer contacts are written out on a GPU.
 _LONG = 26
 _NUMBER = "call i32 @llvm.nvvm.read.ptx.sreg.{}()"
 
