@@ -15,9 +15,13 @@ from mjx_reinforce.engines.native.gpu import player, ptx, seam
 
 _SOME = re.compile(r'call i32 asm sideeffect "[^"]*bar.red[^"]*", "=r,r"\(i32 (%\w+)\) convergent')
 _ALL = re.compile(r'call void asm sideeffect "[^"]*bar.sync[^\n]*')
-_BLOCK = re.compile(r"call i32 @llvm.nvvm.read.ptx.sreg.n?(?:cta|t)id.x\(\)")
 _THREAD = threading.local()
-_NUMBER = ctypes.CFUNCTYPE(ctypes.c_int)(lambda: _THREAD.number)
+#: What a thread asks, in blocks of 32.
+_NUMBERS = {
+    "tid": ctypes.CFUNCTYPE(ctypes.c_int)(lambda: _THREAD.number % 32),
+    "ctaid": ctypes.CFUNCTYPE(ctypes.c_int)(lambda: _THREAD.number // 32),
+    "ntid": ctypes.CFUNCTYPE(ctypes.c_int)(lambda: 32),
+}
 
 
 class Block:
@@ -66,9 +70,10 @@ def as_for_a_cpu(text, block=None):
     """Returns a kernel's LLVM IR, with threads that meet in a block, or each in a block alone."""
     text = text.replace("define ptx_kernel void", "define void").replace(") #0 {", ") {")
     text = re.sub(r"attributes #0 = \{[^}]*\}", "", text)
-    number = f"call i32 inttoptr (i64 {ctypes.cast(_NUMBER, ctypes.c_void_p).value} to ptr)()"
-    text = text.replace("call i32 @llvm.nvvm.read.ptx.sreg.tid.x()", number)
-    text = _BLOCK.sub("add i32 0, 0", text)
+    for name, function in _NUMBERS.items():
+        address = ctypes.cast(function, ctypes.c_void_p).value
+        asked = f"call i32 @llvm.nvvm.read.ptx.sreg.{name}.x()"
+        text = text.replace(asked, f"call i32 inttoptr (i64 {address} to ptr)()")
     return block.text(text) if block else _ALL.sub("", _SOME.sub(r"or i32 \1, 0", text))
 
 

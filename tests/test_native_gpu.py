@@ -16,7 +16,7 @@ from toys import Chain, categorical
 
 from mjx_reinforce import envs
 from mjx_reinforce.engines import choice
-from mjx_reinforce.engines.native import available, rollout, step
+from mjx_reinforce.engines.native import available, objects, program, rollout, step
 from mjx_reinforce.engines.native.gpu import lockstep, player, ptx, scratch, seam
 from mjx_reinforce.fused import scalarized
 
@@ -116,7 +116,7 @@ def test_long_arrays_are_in_a_buffer(monkeypatch):
     who = actor_and_act(env, (4,))
     gpu_on_cpu.emulate(monkeypatch)
     want = played(rollout.rollout, env, who, horizon=30)
-    monkeypatch.setattr(scratch, "_LONG", 5)
+    monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
     made, load = [], ptx.load
     monkeypatch.setattr(ptx, "load", lambda *x: made.append(load(*x)) or made[-1])
     got = played(rollout.rollout, env, who, horizon=30)
@@ -129,7 +129,10 @@ def test_each_thread_has_words_of_its_own():
     """Those of the threads of a warp are side by side."""
     text = scratch.ScratchText()
     arrays = [text.reserve_long(np.int32, count) for count in (30, 40)]
-    thread = text.let("call i32 @llvm.nvvm.read.ptx.sreg.tid.x()")
+    block, lane = (
+        text.let(f"call i32 @llvm.nvvm.read.ptx.sreg.{x}()") for x in ("ctaid.x", "tid.x")
+    )
+    thread = text.let(f"add i32 {text.let(f'mul i32 {block}, 32')}, {lane}")
     for array, count in zip(arrays, (30, 40), strict=True):
         for k in range(count):
             value = text.let(f"add i32 {text.let(f'mul i32 {thread}, 100')}, {k + count}")
@@ -154,19 +157,23 @@ def kernel_text(env, sizes):
         step.BRANCH_COST,
         unrolled=1,
         unrolled_arrays=1,
-        unrolled_on_request=25,
+        unrolled_on_request=program.GPU_LOOPS["unrolled_on_request"],
     )
     return player.kernel_text(written, len(jax.tree.leaves(actor)))
 
 
-@pytest.mark.parametrize(("name", "threads"), [("InvertedPendulum-v5", 32), ("Hopper-v5", 128)])
+@pytest.mark.parametrize(
+    ("name", "threads", "blocks"), [("InvertedPendulum-v5", 32, 16), ("Hopper-v5", 128, 2)]
+)
 @pytest.mark.parametrize("capability", ["7.5", "9.0"])
-def test_ptx(name, threads, capability, tmp_path):
+def test_ptx(name, threads, blocks, capability, tmp_path, monkeypatch):
     """It is one kernel that calls nothing; NVIDIA's assembler takes it, where there is one."""
+    monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
     text = kernel_text(envs.make(name), (4,))
     made = ptx.load(text, lambda: text, capability, tmp_path)
     assert made.compiled
-    assert made.threads == threads
+    assert (made.threads, made.blocks) == (threads, blocks)
+    assert (made.scratch > 0) == (name == "Hopper-v5")
     assert made.text.count(".entry play(") == 1
     assert f".target sm_{capability.replace('.', '')}" in made.text
     assert "call" not in made.text
@@ -181,6 +188,29 @@ def test_ptx(name, threads, capability, tmp_path):
         source.write_text(made.text)
         architecture = f"-arch=sm_{capability.replace('.', '')}"
         subprocess.run(["ptxas", "-O0", architecture, source, "-o", "/dev/null"], check=True)
+
+
+def test_the_buffer_has_room_for_the_threads_of_all_blocks(monkeypatch, tmp_path):
+    env = envs.make("Hopper-v5")
+    actor, act, distribution = actor_and_act(env, (4,))
+    monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
+    monkeypatch.setattr(objects, "folder", lambda: tmp_path)
+    monkeypatch.setattr(ptx, "_LOADED", {})
+
+    def one(key):
+        return rollout.rollout(env, act, actor, distribution, key, num_episodes=70, horizon=50)
+
+    text = gpu_on_cpu.lowered(monkeypatch, one, jax.random.key(0))
+    (kernel,) = ptx._LOADED.values()
+    assert kernel.scratch > 0
+    (call,) = (line for line in text.splitlines() if "@__gpu$xla.gpu.ptx" in line)
+    assert "grid_x = 3 : i32" in call
+    assert f"tensor<{kernel.scratch * 96}xi32>)" in call
+
+
+def test_a_kernel_without_bounds_is_refused():
+    with pytest.raises(RuntimeError, match="install llvmlite"):
+        ptx._facts(".maxntid 32")
 
 
 def test_one_launch_for_all_seeds_in_loops(pendulum, monkeypatch):

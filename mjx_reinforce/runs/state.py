@@ -181,7 +181,7 @@ def compile_parts(
         meanwhile()
         advancing = traced.compile()
         compiled, (first, key, test_key) = looking.result(), starting.result()
-    # No update: a GPU's driver translates the kernels of a program when it first runs.
+    # No update: a GPU's driver translates a program's kernel, also the evaluation's, at first use.
     first = jax.block_until_ready(advancing(first, Budget(np.int32(0), np.int32(0)))[0])
 
     def advanced(state: RunState) -> tuple[RunState, Arrays]:

@@ -12,7 +12,7 @@ from mjx_reinforce.engines.native import available, objects, step
 from mjx_reinforce.engines.native.cpu import handler, machine, player, queue
 from mjx_reinforce.engines.native.cpu.denormals import flush
 from mjx_reinforce.engines.native.gpu import player as gpu_player
-from mjx_reinforce.engines.native.gpu import ptx
+from mjx_reinforce.engines.native.gpu import ptx, scratch
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.policies.distribution import Distribution
@@ -21,7 +21,7 @@ from mjx_reinforce.types import Environment
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
 LOOPS = {"unrolled": 1, "unrolled_arrays": 1, "unrolled_on_request": 1}
 #: On GPUs a loop over few contacts is written out: an array that a loop reads is in memory there.
-GPU_LOOPS = {**LOOPS, "unrolled_on_request": 25}
+GPU_LOOPS = {**LOOPS, "unrolled_on_request": scratch.WRITTEN_OUT}
 #: The folders whose files decide what is written for a step.
 _WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
 

@@ -11,8 +11,8 @@ from mjx_reinforce.engines.native import objects
 
 #: LLVM's name of NVIDIA's GPUs.
 TRIPLE = "nvptx64-nvidia-cuda"
-#: What finds a kernel's threads, blocks and scratch, or 0.
-_FACTS = (r"\.maxntid (\d+)", r"\.minnctapersm (\d+)", r"\bscratch = (\d+)")
+#: What finds a kernel's threads and blocks, and, where it has any, its scratch.
+_BOUNDS, _SCRATCH = (r"\.maxntid (\d+)", r"\.minnctapersm (\d+)"), r"\bscratch = (\d+)"
 _LOADED: dict[str, "Kernel"] = {}
 _LOCK = threading.Lock()
 
@@ -23,7 +23,7 @@ class Kernel(NamedTuple):
     key: a name for all that it depends on
     text: PTX; its entry is "play"
     threads: of a block, at most
-    blocks: on a multiprocessor, at most
+    blocks: on a multiprocessor; its registers are as many as that leaves each thread
     scratch: 4-byte words of a buffer that each thread needs
     compiled: whether it was compiled now, and not read from disk
     """
@@ -46,18 +46,26 @@ def load(source: str, write: Callable[[], str], capability: str, folder: Path | 
       folder: where kernels are kept; None keeps none.
 
     Raises:
-      RuntimeError: the text is no LLVM IR, or LLVM has no code for such a GPU.
+      RuntimeError: the text is no LLVM IR, or this LLVM has no code for such a GPU, or none with
+        bounds of threads and blocks.
     """
     key = _key(source, capability)
     with _LOCK:
         if key not in _LOADED:
             found = objects.read(folder, key) if folder else None
             text = found.decode() if found else _compile(write(), capability)
-            facts = [int((re.findall(x, text) or [0])[0]) for x in _FACTS]
-            _LOADED[key] = Kernel(key, text, *facts, compiled=not found)
+            _LOADED[key] = Kernel(key, text, *_facts(text), compiled=not found)
             if folder and not found:
                 objects.write(folder, key, text.encode())
         return _LOADED[key]
+
+
+def _facts(text: str) -> tuple[int, int, int]:
+    """Returns a kernel's threads, blocks and scratch."""
+    threads, blocks = (re.findall(x, text) for x in _BOUNDS)
+    if not (threads and blocks):
+        raise RuntimeError("it bounds no threads and blocks; install llvmlite 0.48 or newer")
+    return int(threads[0]), int(blocks[0]), int((re.findall(_SCRATCH, text) or [0])[0])
 
 
 def _key(source: str, capability: str) -> str:

@@ -13,8 +13,8 @@ from mjx_reinforce.fused.backends.llvm_text import Text
 
 #: Bytes of a word, and threads of a warp. Those of a warp have their words side by side.
 _WORD, _WARP = 4, 32
-#: Arrays of so many entries are long: loops over fewer contacts are written out on a GPU.
-_LONG = 26
+#: On a GPU loops over so many contacts are written out. The arrays of longer loops are long.
+WRITTEN_OUT = 25
 _NUMBER = "call i32 @llvm.nvvm.read.ptx.sreg.{}()"
 
 
@@ -40,7 +40,7 @@ class ScratchText(Text):
 
     def reserve_long(self, dtype: Any, count: int) -> str:
         """Returns what `reserve` does, in the buffer if the array is long; `at` finds entries."""
-        if count < _LONG or np.dtype(dtype).itemsize > _WORD:
+        if count <= WRITTEN_OUT or np.dtype(dtype).itemsize > _WORD:
             return self.reserve(dtype, count)
         name = self.name()
         first = self.words * _WORD * _WARP

@@ -144,7 +144,8 @@ def _call(
 ) -> Sequence[jax.Array]:
     """Launches so many blocks of so many threads.
 
-    Returns what it leaves in ``written``, and ``scratch``, which begins with any values.
+    They also write into ``scratch``, a buffer that begins with any values. Returns ``written`` as
+    they leave it, and then that buffer.
     """
     results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
     aliases = {len(given) + k: k for k in range(len(results))}
