@@ -8,7 +8,6 @@ if __name__ == "__main__":  # Ctrl-C ends the imports below without a traceback
 import contextlib
 import dataclasses
 import gc
-import os
 import sys
 import threading
 import time
@@ -22,7 +21,7 @@ from mjx_reinforce.runs.alarms import silence_alarms
 from mjx_reinforce.runs.command_line import parse, refuse, start
 from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.files import check_writable, choose_directory, prepare, remove_empty
-from mjx_reinforce.runs.flags import accept_all_characters
+from mjx_reinforce.runs.flags import accept_all_characters, drop_unwritten
 from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
@@ -41,16 +40,8 @@ def main() -> None:
     silence_alarms()
     with Interrupt() as interrupt, contextlib.ExitStack() as held:
         status = _main(sys.argv[1:], interrupt, held)
-    _drop_unwritten()
+    drop_unwritten()
     sys.exit(status)
-
-
-def _drop_unwritten() -> None:
-    """Drops output that its full disk or closed pipe does not take: Python would report it."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitStack) -> int:

@@ -455,6 +455,18 @@ def test_an_ascii_terminal_shows_escapes(tmp_path, accent):
     assert done.stderr.decode("ascii").startswith("error: unknown environment")
 
 
+@pytest.mark.parametrize("command", ["train", "sweep"])
+def test_help_may_be_cut_off(command):
+    """As by ``--help | head``."""
+    command = [sys.executable, "-m", f"mjx_reinforce.{command}", "--help"]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 0
+
+
 @pytest.mark.parametrize("columns", ["1", "20", "0", "x", "200"])
 def test_help_is_of_some_hundred_lines_on_every_terminal(monkeypatch, capsys, columns):
     monkeypatch.setenv("COLUMNS", columns)

@@ -155,9 +155,7 @@ def kernel_text(env, sizes):
         examples,
         [True] * len(jax.tree.leaves(examples)),
         step.BRANCH_COST,
-        unrolled=1,
-        unrolled_arrays=1,
-        unrolled_on_request=program.GPU_LOOPS["unrolled_on_request"],
+        **program.GPU_LOOPS,
     )
     return player.kernel_text(written, len(jax.tree.leaves(actor)))
 

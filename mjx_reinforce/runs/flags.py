@@ -52,10 +52,21 @@ def read(form: Any, arguments: Sequence[str], prog: str, description: str) -> An
         if not stop.code:
             raise
         raise ValueError(f"{_first_section(box.getvalue())} (see --help)") from stop
+    except BrokenPipeError:  # --help | head
+        drop_unwritten()
+        sys.exit(0)
     if unknown:
         first = "a preset comes before all flags; " if prog.endswith("[PRESET]") else ""
         raise ValueError(_about_unknown(unknown, list(_flags(parsed)), first))
     return parsed
+
+
+def drop_unwritten() -> None:
+    """Drops output that its full disk or closed pipe does not take: Python would report it."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextlib.contextmanager
