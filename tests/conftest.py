@@ -1,4 +1,7 @@
-"""Shared settings of the tests: what they compile is kept, and nothing is optimised for speed."""
+"""Shared settings of the tests: what they compile is kept, and nothing is optimised for speed.
+
+They run on the CPU unless JAX_PLATFORMS names something else.
+"""
 
 import atexit
 import os
@@ -17,12 +20,14 @@ os.environ.setdefault(
     + " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10."),
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     cache = tempfile.mkdtemp(prefix="mjx-reinforce-tests-")
     atexit.register(shutil.rmtree, cache, ignore_errors=True)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
 
 import jax
+import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
 
@@ -38,4 +43,6 @@ def pytest_collection_modifyitems(items):
         case = f"{item.path.name}::{item.name}"
         if not slow.isdisjoint({case, case.partition("[")[0]}):
             item.add_marker("slow")
+        if item.get_closest_marker("cpu") and jax.default_backend() != "cpu":
+            item.add_marker(pytest.mark.skip(reason="it is for CPUs"))
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)

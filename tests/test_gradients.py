@@ -72,7 +72,8 @@ def chunk_length(horizon, num_episodes):
         (12, 2**19, 1),  # more episodes than samples: a step at a time
     ],
 )
-def test_a_chunk_is_as_long_as_memory_allows(horizon, num_episodes, expected):
+def test_a_chunk_is_as_long_as_memory_allows(monkeypatch, horizon, num_episodes, expected):
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     assert chunk_length(horizon, num_episodes) == expected
 
 

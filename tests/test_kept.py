@@ -139,7 +139,10 @@ def test_another_seed_finds_the_programs_and_differs(monkeypatch):
     assert not np.array_equal(numbers(ready.prepare(other, other), other)[2][0], first[2][0])
 
 
-@pytest.mark.parametrize("name", ["facts", "advance", ""], ids=["facts", "advance", "machine code"])
+@pytest.mark.parametrize(
+    "name",
+    ["facts", "advance", pytest.param("", id="machine code", marks=pytest.mark.cpu)],
+)
 def test_what_is_damaged_is_made_again(name, folder, monkeypatch):
     monkeypatch.setattr(machine, "_LOADED", {})  # as in a process that has loaded nothing
     expected = numbers(ready.prepare(CONFIG, CONFIG), CONFIG)

@@ -13,6 +13,7 @@ from mjx_reinforce import Box, envs
 from mjx_reinforce.engines import choice, rollouts
 from mjx_reinforce.engines.native import available, objects, program, rollout
 from mjx_reinforce.engines.native.cpu import machine
+from mjx_reinforce.engines.native.gpu import ptx
 from mjx_reinforce.registry import DISTRIBUTIONS, load
 from mjx_reinforce.types import Discrete
 
@@ -44,6 +45,21 @@ class Drifting(Survive):
         info = (count + 1, count % 7 == 3, limit)
         earned = jnp.mean(jnp.asarray(action, moved.dtype))
         return state.replace(obs=moved, reward=earned, done=done.astype(moved.dtype), info=info)
+
+
+class Bytes(Drifting):
+    """Its state has a number of 8 bits, which overflows."""
+
+    def reset(self, rng):
+        state = super().reset(rng)
+        return state.replace(info=(*state.info, jnp.int8(1)))
+
+    def step(self, state, action):
+        *info, number = state.info
+        after = super().step(state.replace(info=tuple(info)), action)
+        number = number + jnp.int8(50)
+        reward = after.reward + number.astype(after.reward.dtype)
+        return after.replace(info=(*after.info, number), reward=reward)
 
 
 def played(play, env, player, num_seeds=3, num_episodes=5, **options):
@@ -104,6 +120,7 @@ def test_tasks_without_contacts(id):
     assert_same_episodes(got, want, rounding=1e-4)
 
 
+@pytest.mark.cpu
 def test_no_lane_waits():
     """Lengths from 4 to 84, a lane's next episode of any seed: nearly all that is played counts."""
     env = Drifting()
@@ -150,6 +167,7 @@ def test_the_number_of_threads_changes_nothing(threads):
     assert_identical(played(rollout.rollout, env, player, **options), want)
 
 
+@pytest.mark.cpu
 @pytest.mark.parametrize("level", ["x86-64", "x86-64-v3"])
 def test_older_cpus(level, monkeypatch):
     """Fewer lanes, no fused products: the same episodes up to rounding."""
@@ -186,6 +204,7 @@ def test_a_nan_stays_in_its_lane():
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.cpu
 def test_double_precision():
     with jax.enable_x64(True):
         env = Drifting()
@@ -207,6 +226,7 @@ def test_no_code_is_made_twice(tmp_path, monkeypatch):
     assert program.build(env, act, actor, distribution, 17).code is first.code
     assert program.build(env, act, actor, distribution, 19).code is not first.code
     monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(ptx, "_LOADED", {})
     monkeypatch.setattr(program.scalarized, "build", None)
     assert not program.build(env, act, actor, distribution, 17).code.compiled
 
@@ -240,20 +260,6 @@ def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
             after = super().step(state, action)
             return after.replace(reward=jax.lax.lgamma(after.reward + 5.0))
 
-    class Bytes(Drifting):
-        def reset(self, rng):
-            state = super().reset(rng)
-            return state.replace(info=(*state.info, jnp.int8(1)))
-
-        def step(self, state, action):
-            after = super().step(state.replace(info=state.info[:3]), action)
-            return after.replace(info=(*after.info, state.info[3]))
-
-    small = Bytes()
-    actor, act, distribution = actor_and_act(small, ())
-    chosen = choice.choose("auto", small, choice.Player(act, actor, distribution), 500)
-    assert chosen.name == "fused"
-    assert "machine code cannot play this: its state has numbers of int8" in chosen.why
     gamma = Gamma()
     actor, act, distribution = actor_and_act(gamma, ())
     player = choice.Player(act, actor, distribution)
@@ -263,3 +269,12 @@ def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
     monkeypatch.setattr(available, "unavailable", lambda: "llvmlite is not installed")
     with pytest.raises(ValueError, match="llvmlite is not installed; choose auto"):
         choice.choose("native", env, player, 500)
+
+
+@pytest.mark.cpu
+def test_lanes_have_no_numbers_of_8_bits():
+    env = Bytes()
+    actor, act, distribution = actor_and_act(env, ())
+    chosen = choice.choose("auto", env, choice.Player(act, actor, distribution), 500)
+    assert chosen.name == "fused"
+    assert "machine code cannot play this: its state has numbers of int8" in chosen.why

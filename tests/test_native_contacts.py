@@ -77,6 +77,7 @@ class Scene(Survive):
         return jnp.concatenate([data.qacc, data.qfrc_constraint, force, touches])
 
 
+@pytest.mark.cpu
 @pytest.mark.parametrize(("xml", "room"), [(SCENE, 2), (MANY_FEET, 3)], ids=["all kinds", "feet"])
 def test_contacts(xml, room, monkeypatch):
     """Where there is room in `touching` for those that touch, and where there is not."""

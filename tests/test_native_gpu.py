@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from players import actor_and_act, assert_same_episodes
-from test_native import Drifting, both, played
+from test_native import Bytes, Drifting, both, played
 from test_native_contacts import MANY_FEET, Scene
 from toys import Chain, categorical
 
@@ -32,9 +32,10 @@ def pendulum():
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_the_same_episodes_as_everywhere(pendulum, monkeypatch, threads):
-    """Of a task, and of a toy whose state has a counter, a flag and a limit of its own."""
+    """Of a task, and of toys whose state has a counter, a flag, a limit and a number of 8 bits."""
     gpu_on_cpu.emulate(monkeypatch, threads)
-    for env, who in (pendulum, (toy := Drifting(), actor_and_act(toy, (4,)))):
+    toys = ((env, actor_and_act(env, (4,))) for env in (Drifting(), Bytes()))
+    for env, who in (pendulum, *toys):
         got, want = both(env, who, num_deterministic=2, horizon=100)
         assert got.mask[:, 0].all()
         assert not got.mask[:, -1].all()
@@ -234,15 +235,17 @@ def test_one_launch_for_all_seeds_in_loops(pendulum, monkeypatch):
     assert "block_x = 32 : i32" in calls[0]
 
 
+@pytest.mark.cpu
 def test_it_says_why_there_are_no_kernels(monkeypatch):
     monkeypatch.setattr(seam, "compute_capability", lambda: "gfx90a")
     assert "this is 'gfx90a'" in (seam.unavailable() or "")
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
     with jax.enable_x64(True):
         assert "float32 alone" in (seam.unavailable() or "")
-    assert "does not launch its kernels" in (seam.unavailable() or "")  # this is a CPU
+    assert "does not launch its kernels" in (seam.unavailable() or "")
 
 
+@pytest.mark.cpu
 def test_another_engine_plays_where_kernels_are_not_launched(pendulum, monkeypatch):
     monkeypatch.setattr(available, "platform", lambda: "gpu")
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")

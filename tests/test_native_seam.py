@@ -17,6 +17,7 @@ from jax import lax
 from mjx_reinforce.engines.native import available, objects
 from mjx_reinforce.engines.native.cpu import handler, machine, seam
 
+pytestmark = pytest.mark.cpu
 ACTIVE = [1, 0, 1, 1, 0, 7]
 HERE = Path(__file__).parent
 

@@ -75,11 +75,12 @@ def test_equals_gymnasium(id):
     np.testing.assert_array_equal(again.qpos, starts.qpos[:NUM_STATES])
 
 
-@pytest.mark.skipif(available.unavailable() is not None, reason="there is no machine code here")
 @pytest.mark.parametrize("id", ["InvertedPendulum-v5", "CartPole-v1", "ContinuousCartPole-v0"])
 def test_machine_code_equals_gymnasium(id):
     """Tasks with contacts are held to the same physics in ``test_native_contacts.py``."""
     with jax.enable_x64(True):
+        if reason := available.unavailable():
+            pytest.skip(reason)
         check(Native(id, NUM_STATES), id)
 
 

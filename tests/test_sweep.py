@@ -146,6 +146,7 @@ def in_place(chosen, lengths, widths, num_devices):
     return lanes.reshape(-1, widths[0])
 
 
+@pytest.mark.cpu
 @pytest.mark.parametrize("exact", [False, True])
 def test_packing_changes_nothing(run, monkeypatch, exact):
     """Neither which runs share a slot, nor how wide it is, nor that those that ended lie aside."""
@@ -225,6 +226,7 @@ def start(count, command, folder):
     return subprocess.Popen(line, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
 
 
+@pytest.mark.cpu
 @pytest.mark.parametrize("exact", [False, True])
 def test_devices_change_nothing_but_rounding(run, tmp_path, exact):
     command = f"{STEPS} --num-seeds 3 {'--exact' * exact}"
