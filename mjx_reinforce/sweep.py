@@ -16,7 +16,7 @@ from mjx_reinforce.runs.alarms import silence_alarms
 from mjx_reinforce.runs.command_line import refuse
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.files import remove_empty
-from mjx_reinforce.runs.flags import accept_all_characters
+from mjx_reinforce.runs.flags import accept_all_characters, drop_unwritten
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.sweeps.command_line import parse
 from mjx_reinforce.sweeps.design import Design
@@ -33,6 +33,7 @@ def main() -> None:
         if interrupt.number is not None:  # not at the end of a compiler's thread
             sys.stdout.flush()
             os._exit(status)
+    drop_unwritten()
     sys.exit(status)
 
 

@@ -4,6 +4,7 @@ First command lines and calls by hand, then settings drawn at random.
 """
 
 import dataclasses
+import json
 import math
 import os
 import subprocess
@@ -465,6 +466,22 @@ def test_help_may_be_cut_off(command):
         process.stdout.close()
         assert process.stderr.read() == ""
     assert process.returncode == 0
+
+
+def test_a_run_that_nobody_reads_goes_on(monkeypatch, tmp_path):
+    """As by ``| head -1``: what it says is lost, what it makes is not."""
+    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
+    monkeypatch.chdir(tmp_path)
+    arguments = "--env Survive-v0 --num-seeds 1 --max-updates 2 --hidden-sizes --output out"
+    monkeypatch.setattr(sys, "argv", ["train", *arguments.split()])
+    read, write = os.pipe()
+    os.close(read)
+    with open(write, "w") as nobody, monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", nobody)
+        with pytest.raises(SystemExit) as stop:
+            train_module.main()
+    assert stop.value.code == 0
+    assert json.loads((tmp_path / "out/summary.json").read_text())["status"] == "finished"
 
 
 @pytest.mark.parametrize("columns", ["1", "20", "0", "x", "200"])

@@ -1,5 +1,6 @@
 """Programs of runs on disk: a second start traces nothing, and gives the same numbers."""
 
+import contextlib
 import dataclasses
 import os
 import subprocess
@@ -189,35 +190,51 @@ def test_nothing_is_kept_where_jax_is_to_look_for_nans(looks):
         jax.config.update(looks, False)
 
 
-def test_a_damaged_program_in_the_cache_of_jax_is_replaced(tmp_path, capsys):
-    """JAX itself would leave it there, and compile at every start."""
-
-    def start():
-        def shifted_sine(x):
-            return jnp.sin(x) + 2
-
-        return float(jax.jit(shifted_sine)(1.0))
-
+@contextlib.contextmanager
+def cache_of_jax(folder):
+    """Lets JAX keep programs in a folder, and its warnings be shown as the commands show them."""
     before = jax.config.values["jax_compilation_cache_dir"]
     show = warnings.showwarning
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always")
-            jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+            jax.config.update("jax_compilation_cache_dir", str(folder))
             compilation_cache.reset_cache()
             configure_jax()
-            value = start()
-            [program] = tmp_path.glob("jit_shifted_sine-*-cache")
-            os.truncate(program, 100)
-            assert start() == value
-            assert "jit_shifted_sine in" in capsys.readouterr().err
-            assert program.stat().st_size > 100
-            assert start() == value
-            assert capsys.readouterr().err == ""
+            yield
     finally:
         warnings.showwarning = show
         jax.config.update("jax_compilation_cache_dir", before)
         compilation_cache.reset_cache()
+
+
+def compile_and_run():
+    def shifted_sine(x):
+        return jnp.sin(x) + 2
+
+    return float(jax.jit(shifted_sine)(1.0))
+
+
+def test_a_damaged_program_in_the_cache_of_jax_is_replaced(tmp_path, capsys):
+    """JAX itself would leave it there, and compile at every start."""
+    with cache_of_jax(tmp_path):
+        value = compile_and_run()
+        [program] = tmp_path.glob("jit_shifted_sine-*-cache")
+        os.truncate(program, 100)
+        assert compile_and_run() == value
+        assert "jit_shifted_sine in" in capsys.readouterr().err
+        assert program.stat().st_size > 100
+        assert compile_and_run() == value
+        assert capsys.readouterr().err == ""
+
+
+def test_a_cache_of_jax_that_does_not_work_is_named_once(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.touch()
+    with cache_of_jax(file):
+        assert compile_and_run() == compile_and_run()
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith(f"warning: the cache {file} does not work (FileExistsError")
 
 
 def test_nothing_is_kept_where_jax_keeps_nothing(monkeypatch):

@@ -9,7 +9,7 @@ import pytest
 from players import actor_and_act, assert_same_episodes
 from toys import Survive, ToyState, categorical
 
-from mjx_reinforce import Box, envs
+from mjx_reinforce import Box, envs, reinforce
 from mjx_reinforce.engines import choice, rollouts
 from mjx_reinforce.engines.native import available, objects, program, rollout
 from mjx_reinforce.engines.native.cpu import machine
@@ -204,6 +204,29 @@ def test_a_nan_stays_in_its_lane():
         np.testing.assert_array_equal(one, other)
 
 
+def test_integers_divide_as_everywhere():
+    """By zero, and the least one by -1, for both of which a processor stops the program."""
+    edges = jnp.int32([-(2**31), -7, -1, 0, 1, 5, 2**31 - 1])
+
+    class Divides(Drifting):
+        def reset(self, rng):
+            state = super().reset(rng)
+            numbers = jax.random.choice(rng, edges, (2,))
+            return state.replace(info=(*state.info, numbers))
+
+        def step(self, state, action):
+            *info, (x, y) = state.info
+            after = super().step(state.replace(info=tuple(info)), action)
+            parts = jnp.float32([jax.lax.div(x, y), jax.lax.rem(x, y)])
+            info = (*after.info, jnp.stack([x, y]))
+            return after.replace(info=info, reward=parts[0] + 3 * parts[1])
+
+    env = Divides()
+    got, want = both(env, actor_and_act(env, ()), num_episodes=100, horizon=1)
+    np.testing.assert_array_equal(got.reward, want.reward)
+    assert len(np.unique(want.reward)) > 20
+
+
 @pytest.mark.cpu
 def test_double_precision():
     with jax.enable_x64(True):
@@ -211,6 +234,24 @@ def test_double_precision():
         got, want = both(env, actor_and_act(env, (4, 3)), num_episodes=20)
         assert got.observation.dtype == np.float64
         assert_same_episodes(got, want, rounding=1e-12)
+    jax.clear_caches()
+
+
+@pytest.mark.cpu
+def test_a_policy_in_single_precision_plays_in_double_precision():
+    """Networks have float32 parameters, whatever jax_enable_x64 says."""
+    with jax.enable_x64(True):
+        learners = [
+            reinforce(Drifting(), num_episodes=4, horizon=20, engine=engine)
+            for engine in ("native", "vmap")
+        ]
+        returns = []
+        for learner in learners:
+            state = learner.init(jax.random.key(0))
+            trajectory = jax.jit(learner.play)(state, jax.random.key(1))
+            returns.append(np.asarray(trajectory.reward))
+    assert returns[0].dtype == np.float64
+    np.testing.assert_allclose(*returns, rtol=1e-6, atol=1e-6)
     jax.clear_caches()
 
 

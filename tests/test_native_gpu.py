@@ -207,9 +207,11 @@ def test_the_buffer_has_room_for_the_threads_of_all_blocks(monkeypatch, tmp_path
     assert f"tensor<{kernel.scratch * 96}xi32>)" in call
 
 
-def test_a_kernel_without_bounds_is_refused():
-    with pytest.raises(RuntimeError, match="install llvmlite"):
-        ptx._facts(".maxntid 32")
+def test_a_gpu_that_llvm_does_not_know_is_refused():
+    text = "define ptx_kernel void @play() { ret void }"
+    assert ".target sm_90" in ptx._compile(text, "9.0")
+    with pytest.raises(RuntimeError, match="does not know GPUs of compute capability 99"):
+        ptx._compile(text, "99.0")
 
 
 def test_one_launch_for_all_seeds_in_loops(pendulum, monkeypatch):
@@ -240,6 +242,9 @@ def test_it_says_why_there_are_no_kernels(monkeypatch):
     monkeypatch.setattr(seam, "compute_capability", lambda: "gfx90a")
     assert "this is 'gfx90a'" in (seam.unavailable() or "")
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
+    with monkeypatch.context() as patch:
+        patch.setattr("llvmlite.binding.llvm_version_info", (20, 1, 8))
+        assert "llvmlite>=0.48" in (seam.unavailable() or "")
     with jax.enable_x64(True):
         assert "float32 alone" in (seam.unavailable() or "")
     assert "does not launch its kernels" in (seam.unavailable() or "")

@@ -169,7 +169,7 @@ def screen(width):
 def test_a_progress_line_fits_in_80_columns(monkeypatch):
     """With the returns, both speeds, failed seeds, the time that passed and the time left."""
     console = screen(80)
-    monkeypatch.setattr(display, "Console", lambda **_: console)
+    monkeypatch.setattr(display, "_Screen", lambda **_: console)
     with display.Display() as shown:
         shown.start(1.0)
         shown.show_progress(
@@ -183,7 +183,7 @@ def test_a_progress_line_fits_in_80_columns(monkeypatch):
 
 
 def test_without_a_terminal_an_evaluation_is_one_line(monkeypatch, capsys):
-    monkeypatch.setattr(display, "Console", lambda **_: Console(width=80))
+    monkeypatch.setattr(display, "_Screen", lambda **_: Console(width=80))
     with display.Display() as shown:
         shown.show_progress(Progress(0.0, 0, 0, 8.0, 7.0, 0, 2, np.nan, np.nan, np.nan))
         shown.show_progress(Progress(0.25, 5, 4e4, 9.5, 7.0, 0, 2, 1000.0, 2000.0, 59.2))

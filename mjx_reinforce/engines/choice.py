@@ -135,7 +135,7 @@ def unsupported_by_fused(env: Environment, step: Any) -> str | None:
     try:
         written = step.write(*jax.eval_shape(one))
     except (fused.UnsupportedPrimitive, TypeError) as error:
-        return str(error)
+        return " ".join(str(error).split())
     count = sum(written.operations.values())
     if count > MAX_OPERATIONS:
         return f"one env step takes {count:,} scalar operations, more than {MAX_OPERATIONS:,}"

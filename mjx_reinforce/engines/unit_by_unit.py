@@ -42,6 +42,7 @@ def unit_by_unit(
         together = math.gcd(size, _TOGETHER)
         weights = first["kernel"].T, first["bias"], second["kernel"]
         rows = [w.reshape(size // together, together, *w.shape[1:]) for w in weights]
-        x, _ = lax.scan(add_units, second["bias"], rows)
+        bias = second["bias"].astype(jnp.result_type(x, *weights, second["bias"]))
+        x, _ = lax.scan(add_units, bias, rows)
         x = jnp.tanh(x) if layers else x
     return jnp.dot(x, layers[0]["kernel"]) + layers[0]["bias"] if layers else x

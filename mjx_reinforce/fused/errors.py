@@ -2,12 +2,17 @@
 
 
 class UnsupportedPrimitive(NotImplementedError):  # noqa: N818 (reads as what it is)
-    """A JAX primitive that the fused evaluator has no rule for."""
+    """A JAX primitive that cannot be written out, or not for a backend."""
 
-    def __init__(self, name: str, source: str, detail: str = ""):
-        """Names the primitive and the line of user code it came from."""
-        reason = f" ({detail})" if detail else ""
-        super().__init__(
-            f"fused.vmap has no rule for the primitive '{name}'{reason}, used at {source}. "
-            "Use jax.vmap for this function, or add a rule in mjx_reinforce/fused/rules."
-        )
+
+def no_rule(name: str, source: str) -> UnsupportedPrimitive:
+    """Returns the error for a primitive without a rule.
+
+    Args:
+      name: the primitive's.
+      source: the line of the user's code that it came from.
+    """
+    return UnsupportedPrimitive(
+        f"there is no rule for the primitive {name!r}, used at {source}; use jax.vmap for this "
+        "function, or add a rule in mjx_reinforce/fused/rules"
+    )

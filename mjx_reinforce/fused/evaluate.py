@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.fused import arrays, branches, jaxprs, loops
-from mjx_reinforce.fused.errors import UnsupportedPrimitive
+from mjx_reinforce.fused.errors import no_rule
 from mjx_reinforce.fused.graph import Graph
 from mjx_reinforce.fused.rules import elementwise, indexing, linear, reductions, structural
 
@@ -56,7 +56,7 @@ def _apply(graph: Graph, eqn: Any, used: list[bool], operands: list[np.ndarray])
             return run(graph, program, operands, used)
     if all(map(arrays.is_numeric, operands)):
         return jaxprs.evaluate(eqn.primitive.bind, eqn.params, operands)
-    raise UnsupportedPrimitive(name, jaxprs.source(eqn))
+    raise no_rule(name, jaxprs.source(eqn))
 
 
 def _settled(eqn: Any, results: list[np.ndarray]) -> list[np.ndarray]:

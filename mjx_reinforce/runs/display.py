@@ -18,6 +18,7 @@ from rich.text import Text
 
 from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.runs import nonfinite, progress
+from mjx_reinforce.runs.flags import drop_unwritten
 from mjx_reinforce.runs.heartbeat import heartbeat
 from mjx_reinforce.runs.plan import duration
 
@@ -34,12 +35,21 @@ class _Bar(Progress):
             yield Text(self.line)
 
 
+class _Screen(Console):
+    """Prints as the console of rich does, which would end the program where nobody reads."""
+
+    def on_broken_pipe(self) -> None:
+        """Drops what nobody reads, now and from now on."""
+        self.quiet = True
+        drop_unwritten()
+
+
 class Display:
     """A progress bar on a terminal, one line an evaluation elsewhere."""
 
     def __init__(self):
         # What users name is printed as it is: "[bold]" and ":smile:" are no commands.
-        self.console = Console(markup=False, emoji=False)
+        self.console = _Screen(markup=False, emoji=False)
         self._bar = _Bar(
             SpinnerColumn("line" if self.console.options.ascii_only else "dots"),
             TextColumn("{task.description}"),

@@ -16,6 +16,8 @@ _REFUSED = {
     "JAX_ENABLE_X64": "the commands compute in float32",
     "JAX_DISABLE_JIT": "the commands compile before they begin",
 }
+#: What JAX says of a program in its cache: what it was doing, the function's name, and the error.
+_CACHE_ERROR = r"Error (reading|writing) persistent compilation cache entry for '([^']+)': (.*)"
 
 
 def configure_jax() -> None:
@@ -57,12 +59,24 @@ def _forget_unreadable(
     """
     import jax
 
-    found = re.search(r"reading persistent compilation cache entry for '([^']+)'", str(message))
+    found = re.search(_CACHE_ERROR, str(message), re.DOTALL)
     if found is None:
         show(message, *where, **options)
         return
-    name, folder = found[1], jax.config.values["jax_compilation_cache_dir"]
-    for path in Path(folder).glob(f"{glob.escape(name)}-*"):
+    (doing, name, cause), folder = found.groups(), jax.config.values["jax_compilation_cache_dir"]
+    removed = []
+    for path in Path(folder).glob(f"{glob.escape(name)}-*") if doing == "reading" else ():
         with contextlib.suppress(OSError):
             path.unlink()
-    print(f"warning: {name} in {folder} could not be read; it is compiled anew", file=sys.stderr)
+            removed.append(path)
+    if removed:
+        _warn(f"{name} in {folder} could not be read; it is compiled anew")
+    else:
+        kind = cause.partition(": '")[0]  # without the file
+        _warn(f"the cache {folder} does not work ({kind}), so the next start compiles again")
+
+
+@functools.cache
+def _warn(text: str) -> None:
+    """Says something once."""
+    print(f"warning: {text}", file=sys.stderr)

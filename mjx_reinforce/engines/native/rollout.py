@@ -93,7 +93,7 @@ def unsupported(
     try:
         build(env, act, actor, distribution, chunk_length(horizon))
     except (UnsupportedPrimitive, TypeError) as error:
-        return str(error)
+        return " ".join(str(error).split())
     except RuntimeError as error:
         return f"LLVM refuses its program: {' '.join(str(error).split())}"
     return None

@@ -74,7 +74,7 @@ class LLVM(Backend[Value]):
     def leaf(self, node: Node) -> Value:
         """An input stays in memory."""
         if isinstance(node.owner, Captured):
-            raise UnsupportedPrimitive("an array of an outer transformation", "machine code")
+            raise UnsupportedPrimitive("it needs an array of an outer transformation")
         number, position = node.position
         pointer, dtype, align = self._inputs(number)
         align = math.gcd(align, dtype.itemsize * position)

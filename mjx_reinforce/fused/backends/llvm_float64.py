@@ -1,4 +1,4 @@
-"""Transcendental operations of float64 lanes, which only tests run on: right before fast."""
+"""Transcendental operations of float64 lanes, on CPUs: right before fast."""
 
 from collections.abc import Callable
 

@@ -74,18 +74,28 @@ def _select(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: li
 
 
 def _divide(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) -> str:
-    """Division or its rest; by an integer zero as XLA does it: -1, or the dividend."""
+    """Division or its rest; by an integer zero as XLA does it: -1, or the dividend.
+
+    A processor stops the program where it divides by an integer zero, or the least one by -1.
+    """
     kind = text.type(dtype)
     if dtype.kind == "f":
         instruction = "fdiv contract" if op.name == "div" else "frem"
         return text.let(f"{instruction} {kind} {args[0]}, {args[1]}")
     instruction = ("s" if dtype.kind == "i" else "u") + op.name
-    one, zero = text.constant(dtype.type(1)), text.constant(dtype.type(0))
-    by_zero = text.let(f"icmp eq {kind} {args[1]}, {zero}")
-    divisor = text.let(f"select {text.type(bool)} {by_zero}, {kind} {one}, {kind} {args[1]}")
+    zero, one, ones = (text.constant(x) for x in (dtype.type(0), dtype.type(1), ~dtype.type(0)))
+
+    def where(divisor: str, chosen: str, otherwise: str) -> str:
+        here = text.let(f"icmp eq {kind} {args[1]}, {divisor}")
+        return text.let(f"select {text.type(bool)} {here}, {kind} {chosen}, {kind} {otherwise}")
+
+    divisor = where(zero, one, args[1])
+    if dtype.kind == "i":
+        divisor = where(ones, one, divisor)
     result = text.let(f"{instruction} {kind} {args[0]}, {divisor}")
-    otherwise = text.constant(~dtype.type(0)) if op.name == "div" else args[0]
-    return text.let(f"select {text.type(bool)} {by_zero}, {kind} {otherwise}, {kind} {result}")
+    if dtype.kind == "i" and op.name == "div":
+        result = where(ones, text.let(f"sub {kind} {zero}, {args[0]}"), result)
+    return where(zero, ones if op.name == "div" else args[0], result)
 
 
 def _shift(instruction: str) -> Emit:
@@ -199,7 +209,7 @@ def _math(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[str
 
 
 def _absent(text: Text, op: Op, *_: Any) -> str:
-    raise UnsupportedPrimitive(op.name, "the step of an episode")
+    raise UnsupportedPrimitive(f"it has no instruction for {op.name!r}")
 
 
 OPERATIONS: dict[str, Emit] = {

@@ -15,7 +15,7 @@ _TURN = (0x0028BE60DB939105, 0x4A7F09D5F47D4D37, 0x7036D8A5664F10E4)
 
 
 def _large(x: Lanes) -> tuple[Lanes, Lanes]:
-    """Returns x - n pi / 2 within pi / 4 and the last bits of the integer n, for x > 65,536.
+    """Returns x - n pi / 2 within pi / 4 and the last bits of the integer n, for x > _LARGE.
 
     After Payne and Hanek: x is an integer of 24 bits times 2^e, and of its product with
     1 / (2 pi) what is not a whole turn is in the 64 digits that start at digit e.

@@ -63,8 +63,6 @@ done:
   store ptr %list, ptr %active.at
   %data.at = getelementptr %Job, ptr %job, $data
   store ptr %data, ptr %data.at
-  %seeds.at = getelementptr %Job, ptr %job, $seeds
-  store i64 %seeds, ptr %seeds.at
   %num.at = getelementptr %Job, ptr %job, $num_active
   store i64 %num, ptr %num.at
   %bytes.at = getelementptr %Job, ptr %job, $bytes

@@ -24,7 +24,6 @@ FIELDS = (
     "simulated",  # i64: lane steps
     "active",  # ptr to i64: the active seeds
     "data",  # ptr to ptr: the arguments' data, then the results'
-    "seeds",  # i64: seeds, active or not, S
     "num_active",  # i64: active seeds
     "bytes",  # ptr to i64: the size of each result
     "chunks",  # i64: parts in which the results are set to zero

@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused.backends.llvm_text import Text
-
 #: So that every lane vector can be loaded whole.
 ALIGNMENT = 64
 
@@ -106,8 +104,3 @@ def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> Layout:
     inputs = [field(x.dtype, int(np.prod(x.shape, dtype=int))) for x in leaves]
     others = [field(np.int32, 1), field(np.int64, 1), field(np.int64, 1)]
     return Layout(inputs, actor, state, *others, size=end)
-
-
-def pointer(text: Text, memory: str, field: Field) -> str:
-    """Returns the pointer to the first lane vector of a field."""
-    return text.let(f"getelementptr inbounds i8, ptr {memory}, i64 {field.offset}")

@@ -13,6 +13,8 @@ from mjx_reinforce.engines.native import objects
 TRIPLE = "nvptx64-nvidia-cuda"
 #: What finds a kernel's threads and blocks, and, where it has any, its scratch.
 _BOUNDS, _SCRATCH = (r"\.maxntid (\d+)", r"\.minnctapersm (\d+)"), r"\bscratch = (\d+)"
+#: What GPUs of compute capability 7.0 need. For one that it does not know, LLVM writes 3.2.
+_VERSION, _LEAST_VERSION = r"\.version (\d+\.\d+)", 6.0
 _LOADED: dict[str, "Kernel"] = {}
 _LOCK = threading.Lock()
 
@@ -46,8 +48,7 @@ def load(source: str, write: Callable[[], str], capability: str, folder: Path | 
       folder: where kernels are kept; None keeps none.
 
     Raises:
-      RuntimeError: the text is no LLVM IR, or this LLVM has no code for such a GPU, or none with
-        bounds of threads and blocks.
+      RuntimeError: the text is no LLVM IR, or this LLVM has no code for such a GPU.
     """
     key = _key(source, capability)
     with _LOCK:
@@ -62,10 +63,8 @@ def load(source: str, write: Callable[[], str], capability: str, folder: Path | 
 
 def _facts(text: str) -> tuple[int, int, int]:
     """Returns a kernel's threads, blocks and scratch."""
-    threads, blocks = (re.findall(x, text) for x in _BOUNDS)
-    if not (threads and blocks):
-        raise RuntimeError("it bounds no threads and blocks; install llvmlite 0.48 or newer")
-    return int(threads[0]), int(blocks[0]), int((re.findall(_SCRATCH, text) or [0])[0])
+    threads, blocks = (int(re.findall(x, text)[0]) for x in _BOUNDS)
+    return threads, blocks, int((re.findall(_SCRATCH, text) or [0])[0])
 
 
 def _key(source: str, capability: str) -> str:
@@ -78,6 +77,7 @@ def _key(source: str, capability: str) -> str:
 
 def _compile(text: str, capability: str) -> str:
     """Returns PTX."""
+    import llvmlite
     import llvmlite.binding as llvm
 
     llvm.initialize_all_targets()
@@ -86,6 +86,12 @@ def _compile(text: str, capability: str) -> str:
         cpu=f"sm_{capability.replace('.', '')}", opt=3
     )
     header = f'target datalayout = "{target.target_data}"\ntarget triple = "{TRIPLE}"\n'
-    module = llvm.parse_assembly(header + text)
+    written = target.emit_assembly(llvm.parse_assembly(header + text))
+    version = re.findall(_VERSION, written)[0]
+    if float(version) < _LEAST_VERSION:
+        raise RuntimeError(
+            f"llvmlite {llvmlite.__version__} does not know GPUs of compute capability "
+            f"{capability}; install a newer one"
+        )
     # Division as XLA's GPU programs have it, within 2 units in the last place.
-    return target.emit_assembly(module).replace("div.rn.ftz.f32", "div.full.ftz.f32")
+    return written.replace("div.rn.ftz.f32", "div.full.ftz.f32")

@@ -19,6 +19,8 @@ from mjx_reinforce.engines.native.gpu import player, ptx
 
 #: XLA's name of what launches a kernel.
 PTX = "__gpu$xla.gpu.ptx"
+#: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
+_OLDEST = (22,)
 #: Threads of a block at least: a warp.
 _LEAST_THREADS = 32
 #: A kernel that adds 1 to the number that is its second argument and its result.
@@ -49,6 +51,8 @@ def unavailable() -> str | None:
         return f"it runs on NVIDIA GPUs of compute capability 7.0 or more, this is {capability!r}"
     if jax.config.values["jax_enable_x64"]:
         return "on GPUs it plays in float32 alone, and jax_enable_x64 is set"
+    if llvm.llvm_version_info < _OLDEST:
+        return "its kernels need llvmlite 0.48 or newer; pip install 'llvmlite>=0.48'"
     llvm.initialize_all_targets()
     try:
         llvm.Target.from_triple(ptx.TRIPLE)
