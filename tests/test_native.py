@@ -1,6 +1,7 @@
 """The native engine plays the same episodes as `rollouts.rollout`, in machine code."""
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from toys import Survive, ToyState, categorical
 from mjx_reinforce import Box, envs, reinforce
 from mjx_reinforce.engines import choice, rollouts
 from mjx_reinforce.engines.native import available, objects, program, rollout
-from mjx_reinforce.engines.native.cpu import machine
+from mjx_reinforce.engines.native.cpu import lanes, machine
 from mjx_reinforce.engines.native.gpu import ptx
 from mjx_reinforce.registry import DISTRIBUTIONS, load
 from mjx_reinforce.types import Discrete
@@ -225,6 +226,19 @@ def test_integers_divide_as_everywhere():
     got, want = both(env, actor_and_act(env, ()), num_episodes=100, horizon=1)
     np.testing.assert_array_equal(got.reward, want.reward)
     assert len(np.unique(want.reward)) > 20
+
+
+@pytest.mark.parametrize("count", [1, 4, 8, 16])
+def test_vectors_begin_at_multiples_of_their_size(count):
+    """As LLVM takes for granted, also of 16 numbers of 8 bytes."""
+    leaves = [jax.ShapeDtypeStruct((3,), x) for x in (np.float32, np.float64, np.int32, np.int64)]
+    places = lanes.layout(leaves, 1, 1, count)
+    fields = [*places.inputs, places.broken, places.seed, places.episode]
+    for field, after in itertools.pairwise(fields):
+        assert after.offset >= field.offset + field.count * field.dtype.itemsize * count
+    for field in fields:
+        vector = field.dtype.itemsize * count
+        assert field.offset % vector == lanes.ALIGNMENT % vector == 0
 
 
 @pytest.mark.cpu

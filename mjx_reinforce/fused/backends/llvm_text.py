@@ -19,6 +19,8 @@ _SCALARS = {
     "float32": "float",
     "float64": "double",
 }
+#: Room for an array begins at a multiple of so many bytes at least: a line of the cache.
+_LEAST_ALIGN = 64
 
 
 Written = TypeVar("Written")
@@ -181,8 +183,8 @@ class Text:
 
     def reserve(self, dtype: Any, count: int) -> str:
         """Returns a pointer to room for lane vectors, which lasts until the function returns."""
-        name = self.name()
-        self._reserved.append(f"  {name} = alloca [{count} x {self.type(dtype)}], align 64")
+        name, align = self.name(), max(_LEAST_ALIGN, np.dtype(dtype).itemsize * self.lanes)
+        self._reserved.append(f"  {name} = alloca [{count} x {self.type(dtype)}], align {align}")
         return name
 
     def table(self, dtype: Any, literals: list[str]) -> str:

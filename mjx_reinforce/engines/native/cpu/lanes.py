@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
-#: So that every lane vector can be loaded whole.
-ALIGNMENT = 64
+#: The bytes of the widest lane vector, 16 numbers of 8 bytes: a vector begins at a multiple of its
+#: size, as LLVM takes for granted.
+ALIGNMENT = 128
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,8 +98,9 @@ def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> Layout:
 
     def field(dtype: Any, count: int) -> Field:
         nonlocal end
-        begin = end
-        end += -(-count * np.dtype(dtype).itemsize * lanes // ALIGNMENT) * ALIGNMENT
+        vector = np.dtype(dtype).itemsize * lanes
+        begin = -(-end // vector) * vector
+        end = begin + count * vector
         return Field(begin, np.dtype(dtype), count)
 
     inputs = [field(x.dtype, int(np.prod(x.shape, dtype=int))) for x in leaves]
