@@ -16,6 +16,8 @@ from pathlib import Path
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    # On a GPU a program compiled anew may else round otherwise.
+    + " --xla_gpu_deterministic_ops=true"
     # JAX 0.10's older emitters of fusions compile twice as fast; its users have the newer ones.
     + " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10."),
 )

@@ -483,6 +483,7 @@ def test_from_python_a_report_can_be_left_out(monkeypatch, tmp_path, capsys, rep
     assert ("statistics and report" in capsys.readouterr().out) == report
 
 
+@pytest.mark.cpu  # each process needs a GPU of its own
 def test_two_processes_share_a_sweep(run, tmp_path):
     command = f"{SMALL} --num-seeds 3 --max-updates 6 {RATES}"
     assert run(f"{command} --output alone") == 0
