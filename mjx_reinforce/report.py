@@ -21,7 +21,8 @@ from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.vega import ONE, draw
 from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.files import version
-from mjx_reinforce.runs.flags import accept_all_characters, read
+from mjx_reinforce.runs.flags import read
+from mjx_reinforce.runs.streams import accept_everything
 
 _PROGRAM = "python -m mjx_reinforce.report"
 _ABOUT = (
@@ -48,7 +49,7 @@ class Settings:
 
 def main() -> None:
     """Reads the command line, writes the report, and exits: 0 done, 2 bad input, 130 stopped."""
-    accept_all_characters()
+    accept_everything()
     try:
         settings = read(Settings, sys.argv[1:], _PROGRAM, _ABOUT)
         check_output(settings.output, settings.overwrite)

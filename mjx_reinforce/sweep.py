@@ -16,8 +16,8 @@ from mjx_reinforce.runs.alarms import silence_alarms
 from mjx_reinforce.runs.command_line import refuse
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.files import remove_empty
-from mjx_reinforce.runs.flags import accept_all_characters, drop_unwritten
 from mjx_reinforce.runs.interrupt import Interrupt
+from mjx_reinforce.runs.streams import accept_everything
 from mjx_reinforce.sweeps.command_line import parse
 from mjx_reinforce.sweeps.design import Design
 from mjx_reinforce.sweeps.perform import perform
@@ -26,14 +26,13 @@ from mjx_reinforce.sweeps.reading import Results, read_results
 
 def main() -> None:
     """Reads the command line, sweeps, and exits, with the statuses of ``train.main``."""
-    accept_all_characters()
+    accept_everything()
     silence_alarms()
     with Interrupt() as interrupt:
         status = _main(sys.argv[1:], interrupt)
         if interrupt.number is not None:  # not at the end of a compiler's thread
             sys.stdout.flush()
             os._exit(status)
-    drop_unwritten()
     sys.exit(status)
 
 

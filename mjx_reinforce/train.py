@@ -21,13 +21,13 @@ from mjx_reinforce.runs.alarms import silence_alarms
 from mjx_reinforce.runs.command_line import parse, refuse, start
 from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.files import check_writable, choose_directory, prepare, remove_empty
-from mjx_reinforce.runs.flags import accept_all_characters, drop_unwritten
 from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.memory import check_size
 from mjx_reinforce.runs.plan import Plan, make_plan
 from mjx_reinforce.runs.sinks.sink import check_installed, open_sinks
+from mjx_reinforce.runs.streams import accept_everything
 
 
 def main() -> None:
@@ -36,11 +36,10 @@ def main() -> None:
     The status is 0 when done, 1 if files cannot be written or nothing is finite any more, 2 for bad
     input, 130 after Ctrl-C and 143 after SIGTERM.
     """
-    accept_all_characters()
+    accept_everything()
     silence_alarms()
     with Interrupt() as interrupt, contextlib.ExitStack() as held:
         status = _main(sys.argv[1:], interrupt, held)
-    drop_unwritten()
     sys.exit(status)
 
 

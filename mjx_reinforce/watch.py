@@ -18,9 +18,10 @@ from mjx_reinforce import envs
 from mjx_reinforce.export.films import Renderer, import_mujoco, mediapy_with_ffmpeg, write_film
 from mjx_reinforce.export.run_files import Run, Seed, Which, choose_seed, read_run
 from mjx_reinforce.runs.alarms import silence_alarms
-from mjx_reinforce.runs.flags import accept_all_characters, read
+from mjx_reinforce.runs.flags import read
 from mjx_reinforce.runs.heartbeat import heartbeat
 from mjx_reinforce.runs.jax_setup import configure_jax
+from mjx_reinforce.runs.streams import accept_everything
 
 #: Frames a second at most: what a film shows, and what GIF viewers play.
 _MAX_RATE = 30
@@ -70,7 +71,7 @@ class Settings:
 
 def main() -> None:
     """Reads the command line, films, and exits: 0 done, 2 bad input, 130 interrupted."""
-    accept_all_characters()
+    accept_everything()
     silence_alarms()
     try:
         film(read(Settings, sys.argv[1:], "python -m mjx_reinforce.watch", Settings.__doc__ or ""))

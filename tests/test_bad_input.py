@@ -441,9 +441,9 @@ def test_a_run_in_a_folder_with_brackets_names_it(monkeypatch, tmp_path, capsys)
 def test_an_ascii_terminal_shows_escapes(tmp_path, accent):
     code = (
         "from pathlib import Path\n"
-        "from mjx_reinforce.runs.flags import accept_all_characters\n"
+        "from mjx_reinforce.runs.streams import accept_everything\n"
         "from mjx_reinforce.runs.display import Display\n"
-        "accept_all_characters()\n"
+        "accept_everything()\n"
         f"Display().say({accent!r})\n"
     )
     environ = {"PYTHONIOENCODING": "ascii", "LANG": "C", "PYTHONPATH": ":".join(sys.path)}
@@ -468,6 +468,14 @@ def test_help_may_be_cut_off(command):
     assert process.returncode == 0
 
 
+@pytest.mark.parametrize("module", ["train", "report"])
+@pytest.mark.parametrize("where", [">&-", "> /dev/full", "2>&- >&-"])
+def test_help_may_go_nowhere(module, where):
+    line = f"{sys.executable} -m mjx_reinforce.{module} --help {where}"
+    done = subprocess.run(line, shell=True, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 def test_a_run_that_nobody_reads_goes_on(monkeypatch, tmp_path):
     """As by ``| head -1``: what it says is lost, what it makes is not."""
     monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
@@ -478,6 +486,7 @@ def test_a_run_that_nobody_reads_goes_on(monkeypatch, tmp_path):
     os.close(read)
     with open(write, "w") as nobody, monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", nobody)
+        patch.setattr(sys, "stderr", nobody)
         with pytest.raises(SystemExit) as stop:
             train_module.main()
     assert stop.value.code == 0

@@ -10,7 +10,8 @@ from typing import Literal
 import tyro
 
 from mjx_reinforce.export.run_files import Seed, Which, read_run
-from mjx_reinforce.runs.flags import accept_all_characters, one_line_errors, read
+from mjx_reinforce.runs.flags import one_line_errors, read
+from mjx_reinforce.runs.streams import accept_everything
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -34,7 +35,7 @@ class Settings:
 
 def main() -> None:
     """Reads the command line, exports, and exits: 0 done, 2 bad input, 130 interrupted."""
-    accept_all_characters()
+    accept_everything()
     prog = "python -m mjx_reinforce.export"
     with one_line_errors():
         settings = read(Settings, sys.argv[1:], prog, Settings.__doc__ or "")

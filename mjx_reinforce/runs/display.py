@@ -18,7 +18,6 @@ from rich.text import Text
 
 from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.runs import nonfinite, progress
-from mjx_reinforce.runs.flags import drop_unwritten
 from mjx_reinforce.runs.heartbeat import heartbeat
 from mjx_reinforce.runs.plan import duration
 
@@ -39,9 +38,8 @@ class _Screen(Console):
     """Prints as the console of rich does, which would end the program where nobody reads."""
 
     def on_broken_pipe(self) -> None:
-        """Drops what nobody reads, now and from now on."""
+        """Says no more."""
         self.quiet = True
-        drop_unwritten()
 
 
 class Display:

@@ -1,4 +1,4 @@
-"""Reading a command line, refusing in one line, and terminals that lack some characters."""
+"""Reading a command line, and refusing in one line."""
 
 import contextlib
 import dataclasses
@@ -52,21 +52,10 @@ def read(form: Any, arguments: Sequence[str], prog: str, description: str) -> An
         if not stop.code:
             raise
         raise ValueError(f"{_first_section(box.getvalue())} (see --help)") from stop
-    except BrokenPipeError:  # --help | head
-        drop_unwritten()
-        sys.exit(0)
     if unknown:
         first = "a preset comes before all flags; " if prog.endswith("[PRESET]") else ""
         raise ValueError(_about_unknown(unknown, list(_flags(parsed)), first))
     return parsed
-
-
-def drop_unwritten() -> None:
-    """Drops output that its full disk or closed pipe does not take: Python would report it."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @contextlib.contextmanager
@@ -132,13 +121,3 @@ def one_line_errors() -> Iterator[None]:
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
-
-
-def accept_all_characters() -> None:
-    """Makes standard output and error write an escape for a character that they cannot encode.
-
-    A path with an accent would else end a run in a UnicodeEncodeError on a terminal of ASCII.
-    """
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
