@@ -3,6 +3,7 @@
 First command lines and calls by hand, then settings drawn at random.
 """
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -474,6 +475,19 @@ def test_help_may_go_nowhere(module, where):
     line = f"{sys.executable} -m mjx_reinforce.{module} --help {where}"
     done = subprocess.run(line, shell=True, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_words_that_nobody_reads_end_no_sweep_of_a_script(monkeypatch):
+    """Whose streams are its own: rich would end it."""
+    read, write = os.pipe()
+    os.close(read)
+    nobody = open(write, "w")  # noqa: SIM115 (closing it fails)
+    monkeypatch.setattr(sys, "stdout", nobody)
+    shown = display.Display()
+    shown.say("first")
+    shown.say("second")
+    with contextlib.suppress(BrokenPipeError):
+        nobody.close()
 
 
 def test_a_run_that_nobody_reads_goes_on(monkeypatch, tmp_path):

@@ -53,7 +53,7 @@ def configure_jax() -> None:
 def _forget_unreadable(
     show: Callable[..., None], message: Any, *where: Any, **options: Any
 ) -> None:
-    """Shows a warning; where it says that a program in the cache cannot be read, removes that.
+    """Shows a warning; one about the cache in a line, and removes a program that cannot be read.
 
     JAX names the function that was compiled, not the file: all programs of that function go.
     """

@@ -85,17 +85,17 @@ def _divide(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: li
     instruction = ("s" if dtype.kind == "i" else "u") + op.name
     zero, one, ones = (text.constant(x) for x in (dtype.type(0), dtype.type(1), ~dtype.type(0)))
 
-    def where(divisor: str, chosen: str, otherwise: str) -> str:
-        here = text.let(f"icmp eq {kind} {args[1]}, {divisor}")
+    def by(number: str, chosen: str, otherwise: str) -> str:
+        here = text.let(f"icmp eq {kind} {args[1]}, {number}")
         return text.let(f"select {text.type(bool)} {here}, {kind} {chosen}, {kind} {otherwise}")
 
-    divisor = where(zero, one, args[1])
+    divisor = by(zero, one, args[1])
     if dtype.kind == "i":
-        divisor = where(ones, one, divisor)
+        divisor = by(ones, one, divisor)
     result = text.let(f"{instruction} {kind} {args[0]}, {divisor}")
     if dtype.kind == "i" and op.name == "div":
-        result = where(ones, text.let(f"sub {kind} {zero}, {args[0]}"), result)
-    return where(zero, ones if op.name == "div" else args[0], result)
+        result = by(ones, text.let(f"sub {kind} {zero}, {args[0]}"), result)
+    return by(zero, ones if op.name == "div" else args[0], result)
 
 
 def _shift(instruction: str) -> Emit:
