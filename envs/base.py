@@ -34,18 +34,41 @@ SOLVERS = ("exact", "mjx", "fast")
 
 @struct.dataclass(kw_only=True)
 class Physics:
-    """What the next physics step needs; all other fields of mjx.Data are computed from it.
+    """What the next physics step needs (``models.CARRIED``); the rest of mjx.Data follows from it.
 
+    time: [] since the start of the episode (s)
     qpos: [nq] generalised positions (m, rad)
     qvel: [nv] generalised velocities (m/s, rad/s)
+    act: [na] activations of the actuators that have a state
     qacc_warmstart: [nv] where the constraint solver starts (m/s^2, rad/s^2)
     carried: fields of the last step's mjx.Data that the next outcome reads, by their names
     """
 
+    time: jax.Array
     qpos: jax.Array
     qvel: jax.Array
+    act: jax.Array
     qacc_warmstart: jax.Array
     carried: dict[str, jax.Array] = struct.field(default_factory=dict)
+
+
+class Before(Simulation):
+    """What is known of the start of an env step, under MuJoCo's own names."""
+
+    def __init__(self, known: dict[str, jax.Array]):
+        """Shows the given fields of mjData; any other raises AttributeError when it is read."""
+        vars(self).update(known)
+
+    def __getattr__(self, name: str) -> Any:
+        raise AttributeError(
+            f"before.{name} is not known, since nothing kept it from the env step before; "
+            f"write carried = ({name!r},) in the class of the task"
+        )
+
+
+def _carried(state: Any) -> dict[str, jax.Array]:
+    """Returns what MuJoCo carries from step to step, of a state or a simulation."""
+    return {name: getattr(state, name) for name in models.CARRIED}
 
 
 class MujocoEnv(Env):
@@ -83,8 +106,8 @@ class MujocoEnv(Env):
             check_positive("frame_skip", self.frame_skip)
 
     settings: Settings
-    #: Fields of mjData that ``outcome`` reads of ``before`` besides qpos and qvel. Their values are
-    #: up to one physics step older than qpos, as in Gymnasium.
+    #: Fields of mjData that ``outcome`` reads of ``before`` besides time, qpos, qvel and act. What
+    #: MuJoCo computes from these is up to one physics step older, as in Gymnasium.
     carried: tuple[str, ...] = ()
     #: Whether ``outcome`` or ``observe`` reads ``cfrc_ext``, which is zero at the start of an
     #: episode, as in Gymnasium.
@@ -125,13 +148,13 @@ class MujocoEnv(Env):
 
     @abc.abstractmethod
     def outcome(
-        self, before: Simulation, data: Simulation, action: jax.Array
+        self, before: Before, data: Simulation, action: jax.Array
     ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
         """Returns the reward [], whether the episode terminated [], and the reward's terms.
 
         Args:
-          before: the simulation at the start of the env step; of its fields only qpos, qvel and
-            those in ``carried`` are set.
+          before: the simulation at the start of the env step. It has time, qpos, qvel, act, and
+            the fields in ``carried``: "ctrl" there is what was applied in the env step before.
           data: the simulation after the env step; it has every field of mjData.
           action: [A] as the policy gave it.
         """
@@ -156,27 +179,29 @@ class MujocoEnv(Env):
 
     def _forward_state(self, qpos: jax.Array, qvel: jax.Array) -> State:
         """Returns the state at positions and velocities, from one forward pass."""
-        start = Physics(
-            qpos=qpos, qvel=qvel, qacc_warmstart=jnp.zeros(self.mj_model.nv, qpos.dtype)
-        )
+        start = mjx.make_data(self.mj_model, impl="jax").replace(qpos=qpos, qvel=qvel)
         # MJX normalises quaternions in qpos itself; MuJoCo does so when it steps.
-        data = self._forward(self._data(start)).replace(qpos=qpos)
-        start, view = self._physics(data), Simulation(data)
+        data = physics.like(self._forward(start).replace(qpos=qpos), start)
+        state, view = self._physics(data), Simulation(data)
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
-        terms = jax.tree.map(jnp.zeros_like, self._checked_outcome(view, view, action)[2])
-        return State(cast(Any, start), self.observe(view), zero, zero, terms)
+        terms = self._checked_outcome(self._before(state), view, action)[2]
+        return State(cast(Any, state), self.observe(view), zero, zero, dict.fromkeys(terms, zero))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Returns the state one env step later under ``action`` [A]."""
-        before = self._data(cast(Any, state.pipeline_state)).replace(ctrl=action)
+        start = cast(Any, state.pipeline_state)
+        data = self._data(start)
         data = jax.lax.fori_loop(
-            0, self.frame_skip, lambda _, data: physics.like(self._physics_step(data), data), before
+            0,
+            self.frame_skip,
+            lambda _, data: physics.like(self._physics_step(data), data),
+            data.replace(ctrl=jnp.asarray(action, data.ctrl.dtype)),
         )
         if self.contact_forces:
             data = mjx.rne_postconstraint(self.model, data)
         view = Simulation(data)
-        reward, terminated, terms = self._checked_outcome(Simulation(before), view, action)
+        reward, terminated, terms = self._checked_outcome(self._before(start), view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
@@ -187,28 +212,24 @@ class MujocoEnv(Env):
             metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
         )
 
-    def _checked_outcome(self, before: Simulation, data: Simulation, action: jax.Array) -> Any:
+    def _checked_outcome(self, before: Before, data: Simulation, action: jax.Array) -> Any:
         """Returns what ``outcome`` returns, or raises ValueError where it is no outcome."""
         return check_outcome(type(self).__name__, self.outcome(before, data, action))
 
-    def _data(self, physics: Physics) -> mjx.Data:
-        """Returns a fresh simulation at the given state."""
+    def _before(self, state: Physics) -> "Before":
+        """Returns the start of an env step as ``outcome`` may read it."""
         data = mjx.make_data(self.mj_model, impl="jax")
-        return data.replace(
-            qpos=physics.qpos,
-            qvel=physics.qvel,
-            qacc_warmstart=physics.qacc_warmstart,
-            **physics.carried,
-        )
+        constant = {name: getattr(data, name) for name in models.CONSTANT}
+        return Before(constant | state.carried | _carried(state))
+
+    def _data(self, state: Physics) -> mjx.Data:
+        """Returns a fresh simulation at the given state."""
+        return mjx.make_data(self.mj_model, impl="jax").replace(**_carried(state))
 
     def _physics(self, data: mjx.Data) -> Physics:
         """Returns what the next env step needs to know of a simulation."""
-        return Physics(
-            qpos=data.qpos,
-            qvel=data.qvel,
-            qacc_warmstart=data.qacc_warmstart,
-            carried={name: getattr(data, name) for name in self.carried},
-        )
+        kept = {name: getattr(Simulation(data), name) for name in self.carried}
+        return Physics(**_carried(data), carried=kept)
 
     @property
     def num_contacts(self) -> int:

@@ -4,12 +4,18 @@ import contextlib
 import importlib.resources
 import io
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
-from mujoco import MjModel, MjSpec  # pyright: ignore[reportAttributeAccessIssue] - a C extension
+import numpy as np
+from mujoco import (  # a C extension
+    MjModel,  # pyright: ignore[reportAttributeAccessIssue]
+    MjSpec,  # pyright: ignore[reportAttributeAccessIssue]
+    mjtEnableBit,  # pyright: ignore[reportAttributeAccessIssue]
+    mjtIntegrator,  # pyright: ignore[reportAttributeAccessIssue]
+)
 
 from mjx_reinforce.checks import explain
 
@@ -18,6 +24,34 @@ from mjx_reinforce.checks import explain
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
+#: Everything that MuJoCo carries from a step to the next, by its names in mjData; mjdata.h lists it
+#: as mjtState. Here is what an env step hands to the next.
+CARRIED = ("time", "qpos", "qvel", "act", "qacc_warmstart")
+#: What the action sets for all physics steps of an env step.
+GIVEN = ("ctrl",)
+#: What stays as the model has it, since no task changes it.
+CONSTANT = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
+#: What MJX does not carry: its size in the model, what it is, and how to do without.
+NOT_CARRIED = {
+    "history": ("nhistory", "delays", "remove delay and interval from actuators and sensors"),
+    "plugin": ("nplugin", "plugins", "remove them"),
+    "plastic": ("nplastic", "plastic springs", "remove springyield"),
+}
+#: What else MJX ignores in silence, likewise.
+_ON_JOINT = "give it to the joint, times the square of gear"
+_ONE_NUMBER = "give one number"
+_IGNORED = (
+    ("actuator_armature", "the armature of an actuator", _ON_JOINT),
+    ("actuator_damping", "the damping of an actuator", _ON_JOINT),
+    ("actuator_dampingpoly", "the polynomial damping of an actuator", _ON_JOINT),
+    ("jnt_stiffnesspoly", "the polynomial stiffness of a joint", _ONE_NUMBER),
+    ("dof_dampingpoly", "the polynomial damping of a joint", _ONE_NUMBER),
+    ("tendon_stiffnesspoly", "the polynomial stiffness of a tendon", _ONE_NUMBER),
+    ("tendon_dampingpoly", "the polynomial damping of a tendon", _ONE_NUMBER),
+    ("geom_adhesion", "adhesive geoms", "remove adhesion"),
+    ("pair_adhesion", "adhesive contact pairs", "remove adhesion"),
+    ("geom_surfacevel", "moving surfaces", "remove surfacevel"),
+)
 #: Part of MJX's message -> what to change in the MJCF.
 _REMEDIES = {
     "SOL_PGS": 'set <option solver="Newton"/>',
@@ -81,6 +115,8 @@ def to_mjx(model: Any, xml_file: str) -> mjx.Model:
     Raises:
       ValueError: MJX cannot run it; the message names the feature and what to change.
     """
+    for feature, remedy in _ignored(model):
+        raise ValueError(f"MJX cannot run {xml_file!r}: MJX would ignore {feature}; {remedy}")
     try:
         converted = mjx.put_model(model, impl="jax")
         # Notices what the model alone does not show; its arrays are not made.
@@ -90,3 +126,14 @@ def to_mjx(model: Any, xml_file: str) -> mjx.Model:
         remedy = next((change for part, change in _REMEDIES.items() if part in feature), _ELSE)
         raise ValueError(f"MJX cannot run {xml_file!r}: {feature}; {remedy}") from error
     return converted
+
+
+def _ignored(model: Any) -> Iterator[tuple[str, str]]:
+    """Yields what MJX would ignore in silence, and how to do without it."""
+    for field, feature, remedy in (*NOT_CARRIED.values(), *_IGNORED):
+        if np.any(getattr(model, field)):
+            yield feature, remedy
+    if model.opt.enableflags & mjtEnableBit.mjENBL_SLEEP:
+        yield "sleeping bodies", 'remove <flag sleep="enable"/>'
+    if model.opt.integrator == mjtIntegrator.mjINT_DISCRETE:
+        yield "the integrator INT_DISCRETE", _REMEDIES["INT_IMPLICIT"]

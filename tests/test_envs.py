@@ -38,7 +38,8 @@ def env(request):
 
 
 def shapes(tree):
-    return jax.tree.map(lambda x: (x.shape, x.dtype), tree)
+    """A program that was compiled for one state serves all that have these."""
+    return jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), tree)
 
 
 @pytest.mark.parametrize("x64", [False, True])
@@ -216,6 +217,14 @@ def test_the_same_key_is_the_same_episode(id):
 
 def equal(x, y):
     jax.tree.map(np.testing.assert_array_equal, x, y)
+
+
+def test_step_is_compiled_once():
+    env = envs.make("InvertedPendulum-v5")
+    step, state = jax.jit(env.step), env.reset(jax.random.key(0))
+    for _ in range(3):
+        state = step(state, jnp.zeros(1))
+    assert step._cache_size() == 1
 
 
 def test_unknown_names_are_explained():
