@@ -1,12 +1,15 @@
 """The results of every task with its default settings; docs/results.md is what it writes.
 
-Four stages, each of which can be run alone, by task (``--tasks``), and again: what is there is
-kept, and what was stopped (Ctrl-C, or ``timeout -s INT 570 python ...``) goes on.
+Stages, each of which can be run alone, by task (``--tasks``), and again: what is there is kept,
+and what was stopped (Ctrl-C, or ``timeout -s INT 570 python ...``) goes on. ``pack`` is for runs on
+another machine: what the stages after ``train`` need of them, to be unpacked in DIR here.
 
     python experiments/results.py train DIR         # DIR/TASK: a run of mjx_reinforce.train
+    python experiments/results.py pack DIR FILE     # FILE.tar.gz, of the runs that have ended
     python experiments/results.py sensitivity DIR   # DIR/sensitivity/TASK: a sweep
     python experiments/results.py play DIR          # DIR/play/TASK.csv, docs/films
     python experiments/results.py page DIR          # experiments/results, docs/results.md
+    python experiments/results.py readme            # prints the table of README.md
 
 ``page`` without DIR writes the page anew from the small files in experiments/results. The tasks,
 their budgets, their seeds and the published figures are the table in results_tasks.py.
@@ -30,12 +33,15 @@ def main() -> None:
     commands = parser.add_subparsers(dest="command", required=True)
     train = commands.add_parser("train", help="train every task")
     sensitivity = commands.add_parser("sensitivity", help="move every setting by a factor of 3")
+    pack = commands.add_parser("pack", help="one file of what the later stages need of runs")
     play = commands.add_parser("play", help="play the best and median seeds in Gymnasium; films")
     page = commands.add_parser("page", help="gather what the stages left, and write the page")
-    for command in (train, sensitivity, play, page):
+    readme = commands.add_parser("readme", help="print the table of README.md")
+    for command in (train, sensitivity, pack, play, page):
         needed = None if command is not page else "?"
         command.add_argument("directory", type=Path, nargs=needed, help="of all stages")
-    for command in (train, sensitivity, play):
+    pack.add_argument("file", type=Path, help="to be written, .tar.gz")
+    for command in (train, sensitivity, pack, play):
         command.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
     for command in (train, sensitivity):
         command.add_argument("--num-seeds", type=int, help="in place of the table's")
@@ -44,7 +50,8 @@ def main() -> None:
     for command in (play, page):
         command.add_argument("--docs", type=Path, default=ROOT / "docs", help="of page and films")
     kept = ROOT / "experiments" / "results"
-    page.add_argument("--results", type=Path, default=kept, help="of the small files")
+    for command in (page, readme):
+        command.add_argument("--results", type=Path, default=kept, help="of the small files")
     arguments = parser.parse_args()
     try:
         sys.exit(_COMMANDS[arguments.command](arguments))
@@ -72,6 +79,15 @@ def _sensitivity(arguments: argparse.Namespace) -> int:
     return results_runs.sensitivity(_tasks(arguments), arguments.directory)
 
 
+def _pack(arguments: argparse.Namespace) -> int:
+    import results_files
+
+    tasks = [TASKS[name] for name in arguments.tasks]
+    for name in results_files.pack(tasks, arguments.directory, arguments.file):
+        print(f"packed {name}")
+    return 0
+
+
 def _play(arguments: argparse.Namespace) -> int:
     import results_play
 
@@ -90,7 +106,23 @@ def _page(arguments: argparse.Namespace) -> int:
     return 0
 
 
-_COMMANDS = {"train": _train, "sensitivity": _sensitivity, "play": _play, "page": _page}
+def _readme(arguments: argparse.Namespace) -> int:
+    import results_files
+    import results_tables
+
+    results = results_files.load(TASKS.values(), arguments.results)
+    print(results_tables.readme_table([x for x in results if isinstance(x, results_files.Result)]))
+    return 0
+
+
+_COMMANDS = {
+    "train": _train,
+    "sensitivity": _sensitivity,
+    "pack": _pack,
+    "play": _play,
+    "page": _page,
+    "readme": _readme,
+}
 
 if __name__ == "__main__":
     main()

@@ -2,6 +2,8 @@
 
 import math
 import shutil
+import tarfile
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +22,10 @@ from results_tasks import Task
 
 #: The policies that are played, by rank in the final evaluation.
 POLICIES = ("best", "median")
+#: In a directory of stages, the small files of runs that stayed on another machine.
+_GATHERED = "gathered"
+#: What is packed of a run beside them: what playing its last policies needs.
+_PLAYABLE = ("config.json", "summary.json", "policy/policy.json", "policy/actor.npz")
 #: The env steps between which a solved seed should stay solved.
 STAY_SOLVED = (200_000, 1_000_000)
 _SEED_COLUMNS = (
@@ -74,9 +80,12 @@ def gather(tasks: Iterable[Task], directory: Path, folder: Path) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     for task in tasks:
-        run = directory / task.name
-        if ended(run):
+        run, packed = directory / task.name, directory / _GATHERED
+        if ended(run) and (run / "metrics.csv").exists():
             _gather_run(run, task.name, folder)
+        elif (packed / f"{task.name}.json").exists():
+            for name in _run_files(task.name):
+                shutil.copyfile(packed / name, folder / name)
         sweep = directory / "sensitivity" / task.name
         if swept(sweep):
             _write(folder / f"{task.name}-sensitivity.csv", _gather_sweep(sweep))
@@ -85,11 +94,37 @@ def gather(tasks: Iterable[Task], directory: Path, folder: Path) -> None:
             shutil.copyfile(played, folder / f"{task.name}-play.csv")
 
 
+def pack(tasks: Iterable[Task], directory: Path, path: Path) -> list[str]:
+    """Writes an archive of what ``play`` and ``page`` need of those tasks whose runs have ended.
+
+    Args:
+      tasks: of the results.
+      directory: of the stages.
+      path: of the archive, which is to be unpacked in a directory of stages elsewhere.
+
+    Returns:
+      The names of the tasks that are in it.
+    """
+    names = [task.name for task in tasks if ended(directory / task.name)]
+    with tarfile.open(path, "w:gz") as archive, tempfile.TemporaryDirectory() as folder:
+        for name in names:
+            _gather_run(directory / name, name, Path(folder))
+            for file in _run_files(name):
+                archive.add(Path(folder) / file, f"{_GATHERED}/{file}")
+            for file in _PLAYABLE:
+                archive.add(directory / name / file, f"{name}/{file}")
+    return names
+
+
 def load(tasks: Iterable[Task], folder: Path) -> list[Result | Task]:
     """Returns what is kept of each task, or the task itself where nothing is."""
     return [
         _load(task, folder) if (folder / f"{task.name}.json").exists() else task for task in tasks
     ]
+
+
+def _run_files(name: str) -> tuple[str, ...]:
+    return f"{name}.json", f"{name}-seeds.csv", f"{name}-curve.csv"
 
 
 def _gather_run(run: Path, name: str, folder: Path) -> None:
@@ -119,9 +154,10 @@ def _gather_run(run: Path, name: str, folder: Path) -> None:
         "evaluations": len(returns),
         "settings": {k: v for k, v in config.items() if k not in (*PROVENANCE, "output")},
     }
-    write_json(folder / f"{name}.json", facts)
-    _write(folder / f"{name}-seeds.csv", columns)
-    _write(folder / f"{name}-curve.csv", curves(returns, steps, threshold, config["env_steps"]))
+    facts_file, seeds_file, curve_file = (folder / file for file in _run_files(name))
+    write_json(facts_file, facts)
+    _write(seeds_file, columns)
+    _write(curve_file, curves(returns, steps, threshold, config["env_steps"]))
 
 
 def _gather_sweep(directory: Path) -> Columns:

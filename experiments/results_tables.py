@@ -98,7 +98,7 @@ def _result_row(result: Result) -> list[str]:
         f"{facts['settings']['env_steps']:,}",
         estimate(interval("iqm", tested)),
         estimate(mean_of(result)),
-        number(float(np.min(np.where(np.isfinite(tested), tested, -np.inf)))),
+        number(worst(tested)),
         solved,
         theirs,
         verdict_of(result),
@@ -106,6 +106,36 @@ def _result_row(result: Result) -> list[str]:
         machine(facts),
         ", ".join(number(one.gymnasium.value) for one in played if one) or "not played",
     ]
+
+
+def readme_table(results: Sequence[Result]) -> str:
+    """Returns the table of README.md, of the tasks with their default settings."""
+    header = [
+        "task",
+        "seeds",
+        "env steps a seed",
+        "ours",
+        "worst seed",
+        "Tianshou, 10 million steps",
+    ]
+    return table(header, [_readme_row(x) for x in results if x.task.name == x.task.env])
+
+
+def _readme_row(result: Result) -> list[str]:
+    tested, published = tested_returns(result), result.task.published
+    return [
+        result.task.name,
+        f"{len(tested):,}",
+        f"{result.facts['settings']['env_steps']:,}",
+        estimate(mean_of(result)),
+        number(worst(tested)),
+        "" if published is None else estimate(published_interval(*published)),
+    ]
+
+
+def worst(returns: np.ndarray) -> float:
+    """Returns the least of returns [S]; one that is not finite is the worst."""
+    return float(np.min(np.where(np.isfinite(returns), returns, -np.inf)))
 
 
 def pendulum_table(results: Sequence[Result]) -> str:

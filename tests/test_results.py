@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import math
+import tarfile
 
 import numpy as np
 import pytest
@@ -11,8 +12,10 @@ import pytest
 import results_files
 import results_page
 import results_runs
+import results_tables
 import tuning
 from mjx_reinforce.export.files import read_json
+from mjx_reinforce.export.run_files import read_run
 from mjx_reinforce.reports.statistics import Estimate, iqm
 from mjx_reinforce.runs import command_line
 from mjx_reinforce.runs.config import Config, check
@@ -249,6 +252,38 @@ def test_the_page_says_what_was_measured_and_what_is_missing(kept, tmp_path):
     assert f"| 16 | 1,000 | solved 100.0 % | learning rate {rate:.6g}: 0.0 % | none |" in page
     pictures = sorted(path.name for path in (docs / "results").iterdir())
     assert pictures == ["curves.png", "sensitivity.png"]
+
+
+def test_what_is_packed_elsewhere_gives_the_same_page(kept, tmp_path):
+    """And the policies can be played; what is not needed stays behind."""
+    runs, here = tmp_path / "runs", tmp_path / "here"
+    tasks = [PENDULUM, REACHER, TASKS["Ant-v5"]]
+    for task in tasks[:2]:
+        (runs / task.name / "policy").mkdir()
+        for name in ("policy.json", "actor.npz"):
+            (runs / task.name / "policy" / name).write_text(task.name)
+    path = tmp_path / "packed.tar.gz"
+    assert results_files.pack(tasks, runs, path) == [PENDULUM.name, REACHER.name]
+    with tarfile.open(path) as archive:
+        archive.extractall(here, filter="data")
+    assert not list(here.rglob("metrics.csv"))
+    assert results_runs.ended(here / REACHER.name)
+    assert read_run(here / REACHER.name).env == REACHER.env
+    results_files.gather(TASKS.values(), here, tmp_path / "again")
+    for path in (tmp_path / "again").iterdir():
+        assert path.read_bytes() == (kept / path.name).read_bytes()
+    assert len(list((tmp_path / "again").iterdir())) == 6
+
+
+def test_the_table_of_the_readme(kept):
+    loaded = results_files.load(TASKS.values(), kept)
+    results = [part for part in loaded if isinstance(part, results_files.Result)]
+    lines = results_tables.readme_table(results).splitlines()
+    assert lines[0].startswith("| task | seeds | env steps a seed | ours | worst seed | Tianshou")
+    ours = results_tables.estimate(results_tables.mean_of(results[0]))
+    row = f"| {PENDULUM.name} | 10 | 1,000,000 | {ours} | 490.0 | 1,000.0 (1,000.0 to 1,000.0) |"
+    assert lines[2] == row
+    assert lines[3].endswith("| -4.30 | -5.50 (-5.64 to -5.36) |")
 
 
 def test_the_page_without_sweeps_and_games(kept, tmp_path):

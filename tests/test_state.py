@@ -1,8 +1,15 @@
 """The compiled programs of a run."""
 
+import dataclasses
+
 import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import Toy
 
 from mjx_reinforce import envs
+from mjx_reinforce.reports.statistics.aggregates import interval
 from mjx_reinforce.runs import ready
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.state import compile_parts
@@ -32,3 +39,75 @@ def test_they_have_run_once_without_an_update():
     programs.advance(state)
     jax.effects_barrier()
     assert made[1] > 0
+
+
+class Luck(Toy):
+    """The return is the start, whatever is done: its mean is 0, and every policy is equal."""
+
+    def observe(self, key):
+        return jax.random.uniform(key, (1,), minval=-1.0)
+
+    def earn(self, obs, action):
+        return obs[0]
+
+
+LUCK = Config(env="Luck-v0", num_seeds=3, hidden_sizes=(), eval_episodes=2, test_episodes=5)
+
+
+@pytest.fixture
+def measure(monkeypatch):
+    """Returns what settings evaluate to before and after an update, and what they test to."""
+    monkeypatch.setitem(envs._TABLE, "Luck-v0", (Luck, {}))
+
+    def measure(**changes):
+        config = dataclasses.replace(LUCK, **changes)
+        state, programs = compile_parts(ready.made(envs.make(config.env), config).parts, config)
+        first = programs.evaluate(state)
+        state = programs.advance(state)[0]
+        return first, programs.evaluate(state), programs.test(state.train_states.actor)
+
+    return measure
+
+
+def test_each_seed_is_evaluated_and_tested_on_starts_of_its_own(measure):
+    first, second, test = (result["eval_return"] for result in measure())
+    assert len({*first.tolist(), *test.tolist()}) == 6
+    assert np.array_equal(first, second)  # the same at every evaluation
+
+
+@pytest.mark.parametrize(
+    "changes", [{"num_seeds": 5}, {"seed": 7, "learning_rate": 0.5, "hidden_sizes": (3,)}]
+)
+def test_a_seed_keeps_its_starts_whatever_is_trained(measure, changes):
+    for one, other in zip(measure(), measure(**changes), strict=True):
+        assert np.array_equal(one["eval_return"], other["eval_return"][:3])
+    other = measure(eval_seed=1)
+    assert not np.isin(one["eval_return"], other[2]["eval_return"]).any()
+
+
+def test_a_test_plays_whole_evaluations_from_starts_of_their_own(measure):
+    tests = [measure(test_episodes=episodes)[2] for episodes in (None, 2, 5, 6)]
+    assert [int(test["eval_steps"][0]) for test in tests] == [2 * n for n in (2, 2, 6, 6)]
+    for name in ("eval_return", "eval_return_stochastic", "eval_length"):
+        assert np.array_equal(tests[0][name], tests[1][name])
+        assert np.array_equal(tests[2][name], tests[3][name])
+    assert not np.isin(tests[0]["eval_return"], tests[2]["eval_return"]).any()
+
+
+def test_an_interval_over_seeds_covers_the_mean_over_starts():
+    """With starts shared by the seeds of a run it never would: all returns would be one number."""
+    config = dataclasses.replace(LUCK, num_seeds=20, test_episodes=4)
+    parts = ready.made(Luck(), config).parts
+
+    @jax.jit
+    def tested(eval_seed):
+        leaves, keys = parts.start()(0, eval_seed)
+        state = jax.tree.unflatten(jax.tree.structure(parts.like), leaves)
+        actor = jax.tree.leaves(state.train_states.actor)
+        return jnp.mean(jnp.stack([parts.look()(actor, key)["eval_return"] for key in keys]), 0)
+
+    covered = []
+    for eval_seed in range(100):
+        found = interval("mean", np.asarray(tested(np.uint32(eval_seed))))
+        covered.append(found.low <= 0 <= found.high)
+    assert 0.88 <= np.mean(covered) <= 1  # 95 %, with a standard error of 2.2

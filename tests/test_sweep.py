@@ -87,6 +87,20 @@ def test_a_run_is_that_of_train(run):
     assert not same({"": results.eval_return[:, 20:22]}, {"": results.eval_return[:, 22:24]})
 
 
+def test_a_seed_has_the_same_starts_in_every_configuration_and_as_in_train(run):
+    """And others than the seeds beside it: of policies that are alike, as all are at first."""
+    shared = f"{SMALL.replace('sizes 4', 'sizes')} --num-seeds 4 --max-updates 2"
+    over = "--over num-episodes 3 5 --over learning-rate 1e-2 1e-1 --chunk-runs 5"
+    assert run(f"{shared} {over} --output swept") == 0
+    results = read_results(Path("swept"))
+    first = [results.eval_return[0, results.configuration == number] for number in range(4)]
+    assert all(np.array_equal(first[0], other) for other in first)
+    assert len(set(first[0].tolist())) == 4
+    assert run(f"{shared.replace('seeds 4', 'seeds 2')} --output alone", train_module) == 0
+    rows = list(csv.DictReader(Path("alone/metrics.csv").read_text().splitlines()))
+    assert np.allclose([float(row["eval_return"]) for row in rows[:2]], first[0][:2])
+
+
 def test_the_files_say_what_was_measured(run):
     command = f"{SMALL} --num-seeds 2 --max-updates 7 --over hidden-sizes none 3,3 {RATES}"
     assert run(f"{command} --output swept") == 0

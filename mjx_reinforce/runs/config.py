@@ -103,8 +103,8 @@ _OPTIONAL = {field.name for field in dataclasses.fields(Config) if "None" in str
 _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     (
         "num_seeds num_episodes env_steps max_updates horizon decay_steps decay_updates eval_every "
-        "checkpoint_every eval_episodes value_fits minibatch_updates minibatch_size "
-        "num_directions top_directions",
+        "checkpoint_every eval_episodes test_episodes value_fits minibatch_updates "
+        "minibatch_size num_directions top_directions",
         lambda x: x >= 1,
         "at least 1",
     ),
@@ -113,6 +113,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ("env_steps", lambda x: x < 2**30, "less than 2^30, for each seed"),
     (
         "max_updates num_episodes horizon decay_steps decay_updates eval_every eval_episodes "
+        "test_episodes "
         "normalize_steps minibatch_size num_directions checkpoint_every",
         lambda x: x <= MAX_COUNT,
         "less than 2^31",

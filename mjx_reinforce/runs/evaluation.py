@@ -26,7 +26,8 @@ def evaluate(
       env: what is played.
       learner: whose policy and engine it is.
       actor: the parameters and observation statistics.
-      key: consumed; pass the same one each time to see the same start states.
+      key: consumed; pass the same one each time to see the same start states, and each seed one of
+        its own: else the choice of the starts is a chance that no interval over seeds covers.
       num_episodes: N, of each kind.
       horizon: T, the time limit in steps.
       active: [] where False nothing is played, and what is returned says nothing.

@@ -27,7 +27,7 @@ from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.files import provenance, version
 from mjx_reinforce.runs.keys import plain
 from mjx_reinforce.runs.resume import recordable
-from mjx_reinforce.runs.state import Parts, key_shape
+from mjx_reinforce.runs.state import Parts, eval_keys_shape
 from mjx_reinforce.runs.trees import describe, rebuild
 
 #: Settings that change no program. Of the budgets, ``block_length`` says what does.
@@ -84,7 +84,7 @@ def keep(key: str, facts: dict[str, Any], parts: Parts) -> Parts:
     given = {
         "start": (seed, seed),
         "advance": (shapes, (count, count)),
-        "look": (actor, key_shape()),
+        "look": (actor, eval_keys_shape(parts.like)),
     }
     return parts._replace(
         **{

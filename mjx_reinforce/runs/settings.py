@@ -163,7 +163,11 @@ class EvaluationSettings:
     eval_every: int = 5
     """Updates between evaluations."""
     eval_episodes: int = 16
-    """Episodes of an evaluation, with the mode and as many with samples; the starts are fixed."""
+    """Episodes of an evaluation, with the mode and as many with samples. Each seed has starts of
+    its own, the same at every evaluation."""
+    test_episodes: int | None = None
+    """Episodes of the test at the end, which plays --eval-episodes at a time, from other starts; as
+    many as an evaluation if not given."""
     eval_seed: int = 0
     """Root of the evaluation's keys, apart from all training keys whatever its value."""
 

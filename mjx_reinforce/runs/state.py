@@ -31,11 +31,13 @@ class RunState:
 
     train_states: [S, ...] the ``TrainState`` of every seed
     env_steps: [S] int32, how many each seed has played in training
+    eval_keys: [S] the key of each seed's evaluations, from which its start states are drawn
     settings: [S] each, settings that differ from seed to seed; none where all seeds have the same
     """
 
     train_states: TrainState
     env_steps: jax.Array
+    eval_keys: jax.Array
     settings: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
 
 
@@ -57,11 +59,11 @@ class Parts(NamedTuple):
     without arguments that returns its program: tracing takes time, and is done when it is needed.
 
     like: the shapes of a ``RunState``
-    start: (seed, eval_seed) -> the first state's leaves, and the data of the keys of evaluation and
-      of the last test
+    start: (seed, eval_seed) -> the first state's leaves, and the data of the keys [K, S] of the
+      last test, which plays the episodes of K evaluations
     advance: (leaves, (env_steps, updates) as in ``Budget``) -> leaves, how many updates were made,
       metrics; as ``block_of_updates``
-    look: (leaves of the actors, data of a key) -> as ``evaluation``
+    look: (leaves of the actors, data of the keys [S]) -> as ``evaluation``
     """
 
     like: RunState
@@ -79,7 +81,8 @@ class Programs(NamedTuple):
       seed that stood still), and ``updates_total`` and ``env_steps_total``, the seed's counts
       after the update
     evaluate: (RunState) -> [S] each, what ``evaluation.evaluate`` returns for every seed
-    test: (Actor [S, ...]) -> the same on start states that nothing else is played on
+    test: (Actor [S, ...]) -> the same on ``test_episodes`` start states (rounded up to whole
+      evaluations) that nothing else is played on
     """
 
     advance: Callable[[RunState], tuple[RunState, Arrays]]
@@ -99,7 +102,8 @@ def _seed_keys(seed: Any, num_seeds: int) -> jax.Array:
 def beginning(build_learner: BuildLearner) -> Callable[..., RunState]:
     """Returns a function to the state before the first update.
 
-    It takes the keys [S] of the seeds, and the settings [S] that differ between them.
+    It takes the keys [S] of the seeds, those of their evaluations [S], and the settings [S] that
+    differ between the seeds.
 
     Args:
       build_learner: called while the settings of one seed are traced.
@@ -108,10 +112,13 @@ def beginning(build_learner: BuildLearner) -> Callable[..., RunState]:
     def init(key: jax.Array, settings: dict[str, jax.Array]) -> TrainState:
         return build_learner(settings).init(key)
 
-    def begin(keys: jax.Array, settings: dict[str, jax.Array]) -> RunState:
-        states = jax.vmap(init)(keys, settings)
-        zeros = jnp.zeros(len(keys), jnp.int32)
-        return RunState(train_states=states, env_steps=zeros, settings=settings)
+    def begin(keys: jax.Array, eval_keys: jax.Array, settings: dict[str, jax.Array]) -> RunState:
+        return RunState(
+            train_states=jax.vmap(init)(keys, settings),
+            env_steps=jnp.zeros(len(keys), jnp.int32),
+            eval_keys=eval_keys,
+            settings=settings,
+        )
 
     return begin
 
@@ -127,25 +134,25 @@ def parts_of(env: Environment, learner: Learner, horizon: int, config: Config) -
     """
 
     # One program, whatever the seeds are: a program for each operation on keys takes longer.
-    def first(seed: Any, eval_seed: Any) -> tuple[RunState, jax.Array, jax.Array]:
-        state = beginning(lambda _: learner)(_seed_keys(seed, config.num_seeds), {})
-        return state, _key(eval_seed, domain=1), _key(eval_seed, domain=2)
+    def first(seed: Any, eval_seed: Any) -> tuple[RunState, jax.Array]:
+        roots = _seed_keys(seed, config.num_seeds), _eval_keys(eval_seed, config.num_seeds)
+        return beginning(lambda _: learner)(*roots, {}), _test_keys(eval_seed, config)
 
     updates = block_of_updates(lambda _: learner, block_length(config))
     evaluate = evaluation(env, learner, horizon, config)
     like = jax.eval_shape(first, np.uint32(0), np.uint32(0))[0]
 
     def start(seed: Any, eval_seed: Any) -> Any:
-        state, *keys = plain(first(seed, eval_seed))
-        return jax.tree.leaves(state), *keys
+        state, test_keys = plain(first(seed, eval_seed))
+        return jax.tree.leaves(state), test_keys
 
     def advance(leaves: list[jax.Array], budget: tuple[jax.Array, jax.Array]) -> Any:
         state, measured = updates(_joined(leaves, like), Budget(*budget))
         return jax.tree.leaves(plain(state)), *measured
 
-    def look(leaves: list[jax.Array], key: jax.Array) -> dict[str, jax.Array]:
+    def look(leaves: list[jax.Array], keys: jax.Array) -> dict[str, jax.Array]:
         actor = _joined(leaves, like.train_states.actor)
-        return evaluate(actor, jax.random.wrap_key_data(key))
+        return evaluate(actor, jax.random.wrap_key_data(keys))
 
     return Parts(like, lambda: start, lambda: advance, lambda: look)
 
@@ -162,25 +169,25 @@ def compile_parts(
     """
     like, budget = parts.like, budget_of(config)
 
-    def start(*seeds: Any) -> tuple[RunState, jax.Array, jax.Array]:
-        leaves, *keys = parts.start()(*seeds)
-        return _joined(leaves, like), *keys
+    def start(*seeds: Any) -> tuple[RunState, jax.Array]:
+        leaves, test_keys = parts.start()(*seeds)
+        return _joined(leaves, like), test_keys
 
     def advance(state: RunState, budget: Budget) -> Any:
         leaves, made, metrics = parts.advance()(jax.tree.leaves(plain(state)), tuple(budget))
         return _joined(leaves, like), made, metrics
 
-    def look(actor: Actor, key: jax.Array) -> dict[str, jax.Array]:
-        return parts.look()(jax.tree.leaves(actor), key)
+    def look(actor: Actor, keys: jax.Array) -> dict[str, jax.Array]:
+        return parts.look()(jax.tree.leaves(actor), keys)
 
-    seeds, key = (np.uint32(config.seed), np.uint32(config.eval_seed)), key_shape()
+    seeds, keys = (np.uint32(config.seed), np.uint32(config.eval_seed)), eval_keys_shape(like)
     with ThreadPoolExecutor() as pool:  # one compiles while the next is traced
         starting = pool.submit(jax.jit(start), *seeds)
-        looking = pool.submit(jax.jit(look).lower(like.train_states.actor, key).compile)
+        looking = pool.submit(jax.jit(look).lower(like.train_states.actor, keys).compile)
         traced = jax.jit(advance, donate_argnums=0).lower(like, budget)
         meanwhile()
         advancing = traced.compile()
-        compiled, (first, key, test_key) = looking.result(), starting.result()
+        compiled, (first, test_keys) = looking.result(), starting.result()
     # No update: a GPU's driver translates a program's kernel, also the evaluation's, at first use.
     first = jax.block_until_ready(advancing(first, Budget(np.int32(0), np.int32(0)))[0])
 
@@ -189,10 +196,10 @@ def compile_parts(
         return state, {name: x[: int(made)] for name, x in to_numpy(metrics).items()}
 
     def evaluated(state: RunState) -> Arrays:
-        return to_numpy(compiled(state.train_states.actor, key))
+        return to_numpy(compiled(state.train_states.actor, jax.random.key_data(state.eval_keys)))
 
     def tested(actor: Actor) -> Arrays:
-        return to_numpy(compiled(actor, test_key))
+        return joined([to_numpy(compiled(actor, keys)) for keys in np.asarray(test_keys)])
 
     return first, Programs(advanced, evaluated, tested)
 
@@ -210,14 +217,33 @@ def _key(seed: Any, domain: int) -> jax.Array:
     return jax.random.fold_in(jax.random.key(seed), domain)
 
 
-def key_shape() -> jax.ShapeDtypeStruct:
-    """Returns the shape of the data of a key."""
-    return jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0)))
+def eval_keys_shape(like: RunState) -> jax.ShapeDtypeStruct:
+    """Returns the shape of the data of the keys of evaluations."""
+    return jax.eval_shape(plain, like.eval_keys)
 
 
-def evaluation_key(config: Config) -> jax.Array:
-    """Returns the key of every evaluation but the last test."""
-    return _key(config.eval_seed, domain=1)
+def eval_keys(config: Config) -> jax.Array:
+    """Returns the keys [S] of every evaluation but the last test."""
+    return _eval_keys(config.eval_seed, config.num_seeds)
+
+
+def _eval_keys(eval_seed: Any, num_seeds: int) -> jax.Array:
+    return _for_each_seed(_key(eval_seed, domain=1), num_seeds)
+
+
+def _test_keys(eval_seed: Any, config: Config) -> jax.Array:
+    """Returns the keys [K, S] of the last test, which plays the episodes of K evaluations."""
+    rounds = -(-(config.test_episodes or config.eval_episodes) // config.eval_episodes)
+    keys = jax.random.split(_key(eval_seed, domain=2), rounds)
+    return jax.vmap(lambda key: _for_each_seed(key, config.num_seeds))(keys)
+
+
+def _for_each_seed(key: jax.Array, num_seeds: int) -> jax.Array:
+    """Returns keys [S], each by the seed's number alone, however many seeds there are.
+
+    Start states shared by all seeds would be a chance that no interval over seeds knows of.
+    """
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_seeds))
 
 
 def budget_of(config: Config) -> Budget:
@@ -275,7 +301,7 @@ def block_of_updates(build_learner: BuildLearner, length: int) -> Callable[..., 
 def evaluation(
     env: Environment, learner: Learner, horizon: int, config: Config, *, sampled: bool = True
 ) -> Any:
-    """Returns a function that evaluates actors [S, ...], all on the same start states.
+    """Returns a function that evaluates actors [S, ...] with keys [S].
 
     It also takes which of them are evaluated [S]; all by default. ``sampled`` is that of
     ``evaluation.evaluate``.
@@ -285,10 +311,17 @@ def evaluation(
         size = {"num_episodes": config.eval_episodes, "horizon": horizon}
         return evaluate(env, learner, actor, key, **size, active=active, sampled=sampled)
 
-    def every(actor: Actor, key: jax.Array, *active: jax.Array) -> dict[str, jax.Array]:
-        return jax.vmap(one, in_axes=(0, None, *[0] * len(active)))(actor, key, *active)
+    return jax.vmap(one)
 
-    return every
+
+def joined(evaluations: Sequence[Arrays]) -> Arrays:
+    """Returns what an evaluation of all episodes of several would have returned, [S] each."""
+    return {
+        name: (np.sum if name.endswith("steps") else np.mean)(
+            [x[name] for x in evaluations], axis=0
+        )
+        for name in evaluations[0]
+    }
 
 
 def to_numpy(tree: dict[str, jax.Array]) -> Arrays:

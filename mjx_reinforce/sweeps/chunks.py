@@ -62,7 +62,7 @@ def split(group: Group, name: str, num_chunks: int) -> list[Runs]:
 def begin(programs: Programs, group: Group, runs: Runs) -> np.ndarray:
     """Returns the states [R, B] of the runs of a chunk before their first update."""
     settings = {name: values[runs.place] for name, values in group.settings.items()}
-    return programs.begin(programs.keys[runs.seed], settings)
+    return programs.begin(programs.keys[runs.seed], programs.eval_keys[runs.seed], settings)
 
 
 class Saver:

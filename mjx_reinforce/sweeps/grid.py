@@ -22,6 +22,7 @@ _ONCE = {
     "overwrite": "it has one directory",
     "resume": "it goes on as a whole",
     "checkpoint_every": "it is saved as a whole",
+    "test_episodes": "it has no test",
     **dict.fromkeys(("tensorboard", "wandb", "jsonl"), "its rows are in results.csv"),
 }
 

@@ -23,8 +23,8 @@ from mjx_reinforce.runs.state import (
     beginning,
     block_of_updates,
     budget_of,
+    eval_keys,
     evaluation,
-    evaluation_key,
     seed_keys,
 )
 from mjx_reinforce.sweeps.ahead import Clock, started
@@ -49,9 +49,11 @@ class Movers(NamedTuple):
 class Programs(NamedTuple):
     """The compiled programs of a group. States of runs [R, B] are on the host between them.
 
-    begin: (data of keys [R, 2], settings [R] each) -> the first states
+    begin: (data of keys [R, 2] and of those of evaluations [R, 2], settings [R] each) -> the first
+      states
     movers: by the width of a slot, the widest first; the narrower ones may still be compiling
     keys: [S, 2], the data of those that the seeds begin with
+    eval_keys: [S, 2], the data of those of the seeds' evaluations, the same in all configurations
     limits: the budget of each run, on all devices
     devices: among which a slot is divided
     shape_of: the shapes of the states of so many runs
@@ -62,6 +64,7 @@ class Programs(NamedTuple):
     begin: Callable[..., np.ndarray]
     movers: dict[int, "Future[Movers]"]
     keys: np.ndarray
+    eval_keys: np.ndarray
     limits: Budget
     devices: Devices
     shape_of: Callable[[int], RunState]
@@ -189,8 +192,8 @@ def compile_programs(
 
 def _inputs(config: Config, devices: Devices) -> dict[str, Any]:
     """Returns what is no part of a program, as ``Programs`` has it."""
-    keys = jax.device_get(jax.random.key_data(seed_keys(config)))
-    return {"keys": keys, "limits": devices.put(budget_of(config), NONE)}
+    keys = jax.device_get(plain({"keys": seed_keys(config), "eval_keys": eval_keys(config)}))
+    return keys | {"limits": devices.put(budget_of(config), NONE)}
 
 
 def shape_of_states(
@@ -203,10 +206,11 @@ def shape_of_states(
     )
 
 
-def _arguments(traced: Collection[str], width: int) -> tuple[Any, dict[str, jax.Array]]:
+def _arguments(traced: Collection[str], width: int) -> tuple[Any, Any, dict[str, jax.Array]]:
     """Returns the shapes of the arguments of ``beginning``."""
     zeros = {name: jnp.zeros(width) for name in traced}
-    return jax.eval_shape(lambda: (jax.random.split(jax.random.key(0), width), zeros))
+    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), width))
+    return keys, keys, jax.eval_shape(lambda: zeros)
 
 
 def _begin(
@@ -218,22 +222,22 @@ def _begin(
 ) -> Callable[..., np.ndarray]:
     """Compiles ``Programs.begin``, which begins ``width`` runs at once."""
 
-    def first(keys: jax.Array, settings: Any) -> jax.Array:
-        states = beginning(build_learner)(jax.random.wrap_key_data(keys), settings)
-        return layout.traced_rows(plain(states))
+    def first(keys: jax.Array, eval_keys: jax.Array, settings: Any) -> jax.Array:
+        typed = map(jax.random.wrap_key_data, (keys, eval_keys))
+        return layout.traced_rows(plain(beginning(build_learner)(*typed, settings)))
 
     shapes = devices.shapes(jax.eval_shape(plain, _arguments(traced, width)), RUNS)
-    compiled = devices.jit(first, (RUNS, RUNS), RUNS).lower(*shapes).compile()
+    compiled = devices.jit(first, (RUNS, RUNS, RUNS), RUNS).lower(*shapes).compile()
 
-    def begin(keys: np.ndarray, settings: Arrays) -> np.ndarray:
+    def begin(keys: np.ndarray, eval_keys: np.ndarray, settings: Arrays) -> np.ndarray:
         count = len(keys)
         slots = []
         for start in range(0, count, width):
             index = np.minimum(np.arange(start, start + width), count - 1)
             values = {
-                name: np.asarray(x[index], shapes[1][name].dtype) for name, x in settings.items()
+                name: np.asarray(x[index], shapes[2][name].dtype) for name, x in settings.items()
             }
-            slots.append(compiled(*devices.put((keys[index], values), RUNS)))
+            slots.append(compiled(*devices.put((keys[index], eval_keys[index], values), RUNS)))
         return np.concatenate(jax.device_get(slots))[:count]
 
     return begin
@@ -270,24 +274,23 @@ def _movers(
         # Policies and engines are those of any of its learners.
         evaluate = evaluation(env, build_learner({}), horizon, config, sampled=False)
 
-        def look(rows: jax.Array, key: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
-            actor = with_keys(layout.traced_states(rows), like).train_states.actor
-            measured = evaluate(actor, key, which)
+        def look(rows: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
+            states = with_keys(layout.traced_states(rows), like)
+            measured = evaluate(states.train_states.actor, states.eval_keys, which)
             return {name: measured[name] for name in ("eval_return", "eval_steps")}
 
-        key, budget = devices.put((evaluation_key(config), budget_of(config)), NONE)
+        budget = devices.put(budget_of(config), NONE)
         rows = jax.eval_shape(layout.traced_rows, jax.eval_shape(plain, like))
         which = jax.ShapeDtypeStruct((width,), bool)
         rows, which = devices.shapes((rows, which), RUNS)
         advance = devices.jit(block, (RUNS, RUNS, NONE), (RUNS, RUNS, RUNS))
-        look = devices.jit(look, (RUNS, NONE, RUNS), RUNS)
-        looking = pool.submit(look.lower(rows, key, which).compile)
+        looking = pool.submit(devices.jit(look, (RUNS, RUNS), RUNS).lower(rows, which).compile)
         advancing = pool.submit(advance.lower(rows, which, budget).compile)
     looked, advanced = looking.result(), advancing.result()
     # No run: a GPU's driver translates the kernels of a program when it first runs.
     none = devices.put((np.zeros(rows.shape, rows.dtype), np.zeros(width, bool)), RUNS)
     jax.block_until_ready(advanced(*none, budget))
-    return Movers(advanced, lambda rows, which: looked(rows, key, which))
+    return Movers(advanced, looked)
 
 
 def _counts(after: RunState, metrics: dict[str, jax.Array]) -> dict[str, jax.Array]:

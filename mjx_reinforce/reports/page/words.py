@@ -247,8 +247,8 @@ def _of_measure(findings: Findings) -> Iterator[str]:
     episodes = findings.experiment.settings.get("eval_episodes")
     if episodes is not None:
         yield (
-            f"A return is the mean of {count(int(episodes), 'episode')} from the same starts at "
-            "every evaluation, and without exploration."
+            f"A return is the mean of {count(int(episodes), 'episode')} without exploration, from "
+            "starts of the seed's own, the same at every evaluation."
         )
     yield "One task: nothing here says how these settings do on another."
 
