@@ -1,17 +1,17 @@
 """How fast every engine is, beside what a user would otherwise pick, in one table from one run.
 
     python experiments/benchmark.py --quick          # two minutes on a CPU
-    python experiments/benchmark.py --json rows.json # everything
+    python experiments/benchmark.py --csv rows.csv   # everything
 
 All engines play the same looping task: an episode that ends starts again from its own start state,
-so that every simulated step is a real one. Runs are interleaved and the median is reported; compare
-rows of one run with each other, not with another machine's.
+so that every simulated step is a real one. A rollout has a policy, its noise, and all that is
+recorded for an update. Runs are interleaved and the median is shown; compare rows of one run with
+each other, not with another machine's. `benchmark_all.py` makes the rows of docs/benchmarks.csv.
 """
 
 import dataclasses
+import datetime
 import functools
-import json
-import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +24,8 @@ from flax import struct
 from rich.console import Console
 from rich.table import Table
 
-from benchmark_peers import Candidate, peers
+from benchmark_peers import peers
+from benchmark_rows import Candidate, append, facts, measure, speed
 from mjx_reinforce import Actor, act, envs, load_policy, mlp_policy, reinforce
 from mjx_reinforce.engines.choice import Player, choose
 from mjx_reinforce.learners.reinforce import default_distribution
@@ -33,24 +34,13 @@ from mjx_reinforce.types import action_space, observation_size
 
 #: Name in the table -> engine, and the solver of the environment's physics.
 ENGINES = {
-    "mjx": ("vmap", "mjx"),
-    "mjx, 1 iteration": ("vmap", "fast"),
+    "plain MJX": ("vmap", "mjx"),
+    "plain MJX, 1 iteration": ("vmap", "fast"),
     "vmap": ("vmap", "exact"),
     "fused": ("fused", "exact"),
     "native": ("native", "exact"),
 }
-KEYS = (
-    "what",
-    "engine",
-    "env",
-    "batch",
-    "device",
-    "env_steps_per_second",
-    "physics_steps_per_second",
-    "compile_seconds",
-    "peak_memory_bytes",
-    "ratio_to_mjx",
-)
+SHOWN = ("task", "what", "engine", "precision", "batch", "steps", "compile_seconds")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,9 +49,10 @@ class Settings:
 
     env: tuple[str, ...] = ("InvertedPendulum-v5",)
     """Environments."""
-    engine: tuple[str, ...] = ()
-    """Rows of the table: mjx, "mjx, 1 iteration", vmap, fused and native; all but vmap if not
-    given."""
+    engine: tuple[str, ...] = ("plain MJX", "fused", "native")
+    """Rows of the table: "plain MJX", "plain MJX, 1 iteration", vmap, fused and native."""
+    precision: tuple[str, ...] = ("float32", "float64")
+    """Of the native engine on a CPU; all else of ours plays in float32."""
     batch: tuple[int, ...] = (128, 512, 2048, 8192)
     """Episodes played at once."""
     max_mjx_batch: int = 2048
@@ -69,17 +60,15 @@ class Settings:
     steps: int = 100
     """Env steps of each episode."""
     repeats: int = 5
-    """Timed runs of each row; the median counts."""
+    """Timed runs of each row; the median is shown."""
     train: bool = True
     """Also measure training updates (16-32 and 64-64 networks) at the greatest batch."""
     policy: Path | None = None
     """The policy folder of a run, instead of an untrained 16-32 network."""
-    json: Path | None = None
-    """Where to write the rows."""
-    png: Path = Path("benchmark.png")
-    """Where to draw steps per second against batch."""
+    csv: Path | None = None
+    """Where to append the rows, with every repetition's speed."""
     quick: bool = False
-    """InvertedPendulum on mjx, fused, native and C MuJoCo only, in under two minutes."""
+    """InvertedPendulum with few episodes and no training, in under two minutes."""
 
 
 @struct.dataclass
@@ -114,99 +103,94 @@ class Loop:
 
 
 def main() -> None:
-    """Measures, prints, draws and writes."""
+    """Measures, prints and writes."""
     settings = tyro.cli(Settings, description=__doc__)
     if settings.quick:
-        settings = dataclasses.replace(
-            settings,
-            engine=("mjx", "fused", "native"),
-            batch=(128, 1024, 4096),
-            max_mjx_batch=128,
-            repeats=3,
-            train=False,
-        )
+        few: dict[str, Any] = {
+            "batch": (128, 1024, 4096),
+            "max_mjx_batch": 128,
+            "repeats": 3,
+            "train": False,
+        }
+        settings = dataclasses.replace(settings, **few)
     jax.config.update("jax_default_matmul_precision", "highest")
-    if not settings.engine:
-        engine = ("mjx", "mjx, 1 iteration", "fused", "native")
-        settings = dataclasses.replace(settings, engine=engine)
+    said = facts(datetime.datetime.now().isoformat(timespec="seconds"), "")
     rows = []
     for env in settings.env:
-        candidates = [
-            *rollouts(env, settings),
-            *trainings(env, settings),
-            *peers(env, settings.quick),
-        ]
-        rows += measure(candidates, settings.repeats)
+        ours = list(engines(env, settings))
+        rows += [said | row for row in measure(ours + peers(env), settings.repeats)]
     show(rows)
-    draw(rows, settings.png)
-    if settings.json:
-        settings.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    if settings.csv:
+        append(settings.csv, rows)
 
 
-def rollouts(env_id: str, settings: Settings) -> list[Candidate]:
-    """Whole rollouts, policy included, for every engine and batch."""
-    candidates = []
+def engines(env_id: str, settings: Settings):
+    """Generates what is to be timed of every engine, batch and precision."""
+    precisions = settings.precision if jax.default_backend() == "cpu" else ("float32",)
     for name in settings.engine:
-        engine_name, solver = ENGINES[name]
-        env = Loop(make(env_id, solver), settings.steps)
-        policy, actor = the_policy(env, settings.policy)
+        plain = ENGINES[name][0] == "vmap"
+        batches = [b for b in settings.batch if not plain or b <= settings.max_mjx_batch]
+        for precision in precisions if name == "native" else ("float32",):
+            yield from rollouts(
+                env_id, name, batches, settings.steps, precision, policy=settings.policy
+            )
+        if settings.train:
+            for sizes in ((16, 32), (64, 64)):
+                yield training(env_id, name, max(batches), settings.steps, sizes)
 
-        play_act = functools.partial(act, policy)
+
+def rollouts(
+    env_id: str,
+    name: str,
+    batches: list[int],
+    steps: int,
+    precision: str = "float32",
+    *,
+    policy: Path | None = None,
+) -> list[Candidate]:
+    """Whole rollouts with a policy, its noise and all that an update needs, for every batch."""
+    candidates = []
+    with jax.enable_x64(precision == "float64"):
+        engine_name, solver = ENGINES[name]
+        env = Loop(make(env_id, solver), steps)
+        network, actor = the_policy(env, policy)
+        play_act = functools.partial(act, network)
         began = time.perf_counter()
-        player = Player(play_act, actor, policy.distribution)
-        engine = choose(engine_name, env, player, settings.steps)
-        choosing = time.perf_counter() - began
-        for batch in settings.batch:
-            if engine_name == "vmap" and batch > settings.max_mjx_batch:
-                continue
+        player = Player(play_act, actor, network.distribution)
+        engine = choose(engine_name, env, player, steps)
+        choosing = time.perf_counter() - began  # machine code is made here
+        for batch in batches:
 
-            def play(actor, key, env=env, act=play_act, engine=engine, policy=policy, batch=batch):
-                return engine.rollout(
-                    env,
-                    act,
-                    actor,
-                    policy.distribution,
-                    key,
-                    num_episodes=batch,
-                    horizon=settings.steps,
-                )
+            def play(actor, key, batch=batch):
+                sizes = {"num_episodes": batch, "horizon": steps}
+                return engine.rollout(env, play_act, actor, network.distribution, key, **sizes)
 
-            row = {"what": "rollout", "engine": name, "env": env_id, "batch": batch}
-            candidate = compiled(row, play, actor, settings.steps * batch, env.env)
-            row["compile_seconds"] += choosing  # machine code is made when its engine is chosen
-            candidates.append(candidate)
+            what = "rollout, untrained 16-32 policy" if policy is None else f"rollout, {policy}"
+            row = {"what": what, "engine": name, "task": env_id, "precision": precision}
+            row |= {"batch": batch, "steps": steps}
+            candidates.append(compiled(row, play, actor, batch * steps, choosing))
     return candidates
 
 
-def trainings(env_id: str, settings: Settings) -> list[Candidate]:
-    """Whole updates: rollout, estimator, gradient and optimiser."""
-    candidates = []
-    if not settings.train:
-        return candidates
-    batch = max(settings.batch)
-    for name in settings.engine:
-        engine_name, solver = ENGINES[name]
-        if engine_name == "vmap":
-            batch = min(batch, settings.max_mjx_batch)
-        for sizes in ((16, 32), (64, 64)):
-            env = Loop(make(env_id, solver), settings.steps)
-            distribution = default_distribution(action_space(env))
-            policy = mlp_policy(observation_size(env), distribution, sizes)
-            began = time.perf_counter()
-            learner = reinforce(env, policy=policy, num_episodes=batch, engine=engine_name)
-            choosing = time.perf_counter() - began
-            state = learner.init(jax.random.key(0))
+def training(
+    env_id: str, name: str, batch: int, steps: int, sizes: tuple[int, ...] = (64, 64)
+) -> Candidate:
+    """Whole updates in float32: rollout, estimator, gradient and optimiser."""
+    engine_name, solver = ENGINES[name]
+    env = Loop(make(env_id, solver), steps)
+    policy = mlp_policy(observation_size(env), default_distribution(action_space(env)), sizes)
+    began = time.perf_counter()
+    learner = reinforce(env, policy=policy, num_episodes=batch, engine=engine_name)
+    choosing = time.perf_counter() - began
+    state = learner.init(jax.random.key(0))
 
-            def update(state, key, learner=learner):
-                return learner.step(dataclasses.replace(state, key=key))
+    def update(state, key):
+        return learner.step(dataclasses.replace(state, key=key))
 
-            label = f"{name}, {sizes[0]}-{sizes[1]}"
-            row = {"what": "train", "engine": label, "env": env_id, "batch": batch}
-            candidate = compiled(row, update, state, settings.steps * batch, env.env)
-            row["compile_seconds"] += choosing
-            candidates.append(candidate)
-        batch = max(settings.batch)
-    return candidates
+    what = f"training, untrained {sizes[0]}-{sizes[1]} policy"
+    row = {"what": what, "engine": name, "task": env_id, "precision": "float32"}
+    row |= {"batch": batch, "steps": steps}
+    return compiled(row, update, state, batch * steps, choosing)
 
 
 def make(env_id: str, solver: str) -> Any:
@@ -225,80 +209,28 @@ def the_policy(env: Any, directory: Path | None) -> tuple[Any, Actor]:
 
 
 def compiled(
-    row: dict[str, Any], fn: Callable[..., Any], argument: Any, env_steps: int, env: Any
+    row: dict[str, Any], fn: Callable[..., Any], argument: Any, env_steps: int, before: float
 ) -> Candidate:
-    """Compiles ``fn(argument, key)`` and notes how long that took and what memory it needs."""
+    """Compiles ``fn(argument, key)``, and notes how long that and what came before took (s)."""
     started = time.perf_counter()
     program = jax.jit(fn).lower(argument, jax.random.key(0)).compile()
-    row["compile_seconds"] = time.perf_counter() - started
-    memory = program.memory_analysis()
-    row["peak_memory_bytes"] = (
-        memory.temp_size_in_bytes + memory.output_size_in_bytes + memory.argument_size_in_bytes
-        if memory
-        else None
-    )
+    row["compile_seconds"] = before + time.perf_counter() - started
     row["device"] = jax.devices()[0].device_kind
-    row["frame_skip"] = getattr(env, "frame_skip", 1)
     keys = iter(jax.random.split(jax.random.key(1), 1000))
     return Candidate(row, lambda: jax.block_until_ready(program(argument, next(keys))), env_steps)
 
 
-def measure(candidates: list[Candidate], repeats: int) -> list[dict[str, Any]]:
-    """Times all candidates in turn, several times, and completes their rows."""
-    times: list[list[float]] = [[] for _ in candidates]
-    for repeat in range(repeats + 1):
-        for candidate, taken in zip(candidates, times, strict=True):
-            started = time.perf_counter()
-            candidate.run()
-            if repeat:  # the first warms up
-                taken.append(time.perf_counter() - started)
-    rows = []
-    for candidate, taken in zip(candidates, times, strict=True):
-        speed = candidate.env_steps / statistics.median(taken)
-        row: dict[str, Any] = {"compile_seconds": None, "peak_memory_bytes": None}
-        row |= candidate.row
-        row["env_steps_per_second"] = speed
-        row["physics_steps_per_second"] = speed * row.pop("frame_skip")
-        rows.append(row)
-    for what in ("rollout", "train"):
-        same = [row for row in rows if row["what"] == what]
-        plain = [r["env_steps_per_second"] for r in same if r["engine"] in ("mjx", "mjx, 16-32")]
-        best = max(plain or [float("nan")])
-        for row in same:
-            row["ratio_to_mjx"] = row["env_steps_per_second"] / best
-    return [{key: row[key] for key in KEYS} for row in rows]
-
-
 def show(rows: list[dict[str, Any]]) -> None:
     """Prints the table."""
-    table = Table(*(key.replace("_", " ") for key in KEYS))
+    table = Table(*(key.replace("_", " ") for key in SHOWN), "env steps/s")
     for row in rows:
-        table.add_row(*(_format(row[key]) for key in KEYS))
-    Console(width=180).print(table)
-    print("ratio to mjx: to plain MJX at its best batch in this run")
+        cells = (row.get(key) for key in SHOWN)
+        table.add_row(*(_format(cell) for cell in cells), f"{speed(row):,.0f}")
+    Console(width=160).print(table)
 
 
 def _format(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:,.0f}" if value >= 100 else f"{value:.2f}"
-    return "" if value is None else f"{value:,}" if isinstance(value, int) else str(value)
-
-
-def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draws env steps per second against batch, both on logarithmic axes."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 5), dpi=150, layout="constrained")
-    axes = figure.subplots()
-    lines = {(row["env"], row["engine"]) for row in rows if row["what"] == "rollout"}
-    for env, engine in sorted(lines):
-        chosen = [r for r in rows if (r["env"], r["engine"], r["what"]) == (env, engine, "rollout")]
-        x, y = zip(*((r["batch"], r["env_steps_per_second"]) for r in chosen), strict=True)
-        axes.loglog(x, y, marker="o", label=f"{engine}, {env}")
-    axes.set(xlabel="episodes at once", ylabel="env steps per second", title=rows[0]["device"])
-    axes.grid(alpha=0.3, which="both")
-    axes.legend(fontsize="small")
-    figure.savefig(path)
+    return "" if value is None else f"{value:.1f}" if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":

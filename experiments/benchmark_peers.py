@@ -1,116 +1,173 @@
 """What a user would otherwise pick, as far as it is installed here, for `benchmark.py` to time."""
 
+import functools
 import importlib.util
-import os
+import math
 import time
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
+from benchmark_rows import Candidate, threads
 from mjx_reinforce import envs
 
 #: Worlds that MuJoCo Warp simulates at once.
 WARP_WORLDS = (8192, 32768)
+#: Env steps that MuJoCo Warp's worlds have gone through before they are timed.
+WARP_BEFORE = 50
+#: What MuJoCo Warp may have too little room for: `OverflowType`, without the limits of iterations.
+WARP_ROOM = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")
 
 
-class Candidate(NamedTuple):
-    """Something to time.
-
-    row: what the table says of it so far
-    run: plays once and waits for the end
-    env_steps: how many env steps that is
-    """
-
-    row: dict[str, Any]
-    run: Callable[[], Any]
-    env_steps: int
-
-
-def peers(env_id: str, quick: bool) -> list[Candidate]:
+def peers(env_id: str) -> list[Candidate]:
     """C MuJoCo on all threads; where it can run, MuJoCo Warp and Gymnasium's vector env."""
     candidates = []
     if hasattr(envs.make(env_id), "mj_model"):
         candidates.append(c_mujoco(env_id))
         if importlib.util.find_spec("warp") and jax.default_backend() == "gpu":
             candidates += [mujoco_warp(env_id, batch) for batch in WARP_WORLDS]
-    if quick:
-        return candidates
-    if importlib.util.find_spec("gymnasium") and _in_gymnasium(env_id):
+    if _in_gymnasium(env_id):
         candidates.append(gymnasium_vector(env_id))
     return candidates
 
 
-def c_mujoco(env_id: str, batch: int = 1024, steps: int = 20) -> Candidate:
-    """``mujoco.rollout`` under random actions, for as long as a pendulum takes to fall."""
+def c_mujoco(env_id: str, batch: int = 512, steps: int = 20) -> Candidate:
+    """``mujoco.rollout`` under random actions, on all threads, in double precision.
+
+    No policy; the states of all physics steps are recorded, which ``mujoco.rollout`` always does.
+    """
     from mujoco import MjData, mj_getState, mj_stateSize, mjtState, rollout  # type: ignore
 
     env = envs.make(env_id)
-    model, threads = env.mj_model, os.cpu_count() or 1
+    model = env.mj_model
     full = mjtState.mjSTATE_FULLPHYSICS
     start = np.empty(mj_stateSize(model, full))
     mj_getState(model, MjData(model), start, full)
-    data = [MjData(model) for _ in range(threads)]
-    low, high = env.action_space
-    control = np.random.default_rng(0).uniform(low, high, (batch, steps, model.nu))
-    control = np.repeat(control, env.frame_skip, axis=1)
-    pool = rollout.Rollout(nthread=threads)
+    data = [MjData(model) for _ in range(threads())]
+    control = np.repeat(_actions(env, batch, steps), env.frame_skip, axis=1)
+    pool = rollout.Rollout(nthread=threads())
 
     def run():
         pool.rollout(model, data, np.tile(start, (batch, 1)), control)
 
-    row = {"what": "rollout", "engine": f"C MuJoCo, {threads} threads", "env": env_id}
-    row |= {"batch": batch, "device": "cpu", "frame_skip": env.frame_skip}
+    row = {"what": "rollout, no policy", "engine": "C MuJoCo", "task": env_id}
+    row |= {"precision": "float64", "batch": batch, "steps": steps, "device": "cpu"}
+    row["settings"] = f"{threads()} threads; {options(model)}"
     return Candidate(row, run, batch * steps)
 
 
 def mujoco_warp(env_id: str, batch: int, steps: int = 20) -> Candidate:
     """MuJoCo Warp under constant random actions: no policy, no noise, nothing recorded.
 
-    Its worlds have gone through fifty steps before, so that what falls has come to contacts.
+    Each run begins where the worlds have gone through ``WARP_BEFORE`` steps, so that what falls has
+    come to contacts. One CUDA graph plays an env step. There is room for what `warp_room` finds,
+    doubled until those steps need no more.
+
+    Raises (when run):
+      RuntimeError: a world came to need more.
     """
     import warp  # pyright: ignore
     from mujoco import MjData, mj_forward  # type: ignore
     from mujoco.mjx.third_party import mujoco_warp  # pyright: ignore
+    from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType  # pyright: ignore
 
+    warp.config.quiet = True
     env = envs.make(env_id)
     model = env.mj_model
     data = MjData(model)
     mj_forward(model, data)
     started = time.perf_counter()
     on_gpu = mujoco_warp.put_model(model)
-    worlds = mujoco_warp.put_data(model, data, nworld=batch, nconmax=64, njmax=256)
-    low, high = env.action_space
-    control = np.random.default_rng(0).uniform(low, high, (batch, model.nu))
-    worlds.ctrl.assign(control.astype(np.float32))
+    on_gpu.opt.warn_overflow = 0  # said once, below
+    actions = _actions(env, batch, 1)[:, 0].astype(np.float32)
+    too_small = sum(OverflowType[name] for name in WARP_ROOM)
 
-    def play(count):
-        for _ in range(count * env.frame_skip):
-            mujoco_warp.step(on_gpu, worlds)
+    def begin(room):
+        worlds = mujoco_warp.put_data(model, data, nworld=batch, **room)
+        worlds.ctrl.assign(actions)
 
-    play(1)  # compiles
-    with warp.ScopedCapture() as capture:
-        play(1)
-    for _ in range(50):
-        warp.capture_launch(capture.graph)
-    warp.synchronize()
+        def play():
+            for _ in range(env.frame_skip):
+                mujoco_warp.step(on_gpu, worlds)
 
-    kept = on_gpu, worlds  # the graph has their addresses alone
+        play()  # compiles
+        with warp.ScopedCapture() as capture:
+            play()
+        return worlds, capture.graph  # the graph has the addresses of the worlds alone
 
-    def run(kept=kept):
-        for _ in range(steps):
-            warp.capture_launch(capture.graph)
+    def go(worlds, graph, count):
+        for _ in range(count):
+            warp.capture_launch(graph)
         warp.synchronize()
+        return OverflowType(int(np.bitwise_or.reduce(worlds.overflow.numpy())) & too_small)
 
-    row = {"what": "rollout", "engine": "MuJoCo Warp", "env": env_id, "batch": batch}
-    row |= {"device": warp.get_device().name, "frame_skip": env.frame_skip}
+    room = warp_room(env_id)
+    kept = begin(room)
+    while go(*kept, WARP_BEFORE):
+        room = {name: 2 * size for name, size in room.items()}
+        kept = begin(room)
+    state = [getattr(kept[0], name) for name in ("qpos", "qvel", "qacc_warmstart")]
+    start = [warp.clone(array) for array in state]
+
+    def run():
+        for array, old in zip(state, start, strict=True):
+            warp.copy(array, old)
+        if lacking := go(*kept, steps):
+            raise RuntimeError(f"{env_id}: MuJoCo Warp had too little room: {lacking!r} in {room}")
+
+    row: dict[str, Any] = {"what": "rollout, no policy", "engine": "MuJoCo Warp", "task": env_id}
+    row |= {"precision": "float32", "batch": batch, "steps": steps}
+    row["device"] = warp.get_device().name
+    sizes = ", ".join(f"{name} {size}" for name, size in room.items())
+    own = f"graph_conditional {on_gpu.opt.graph_conditional}, tolerance at least 1e-6"
+    row["settings"] = f"{sizes}; {options(model)}; {own}; warp {warp.__version__}"
     row["compile_seconds"] = time.perf_counter() - started
     return Candidate(row, run, batch * steps)
 
 
-def gymnasium_vector(env_id: str, batch: int = 8, steps: int = 200) -> Candidate:
-    """Gymnasium's synchronous vector environment under random actions."""
+@functools.cache
+def warp_room(env_id: str, worlds: int = 64, steps: int = 130) -> dict[str, int]:
+    """Returns how many contacts (nconmax) and rows (njmax) a world of MuJoCo Warp needs.
+
+    Half as many again as C MuJoCo has at most, in as many worlds under constant random actions, and
+    the next multiple of eight.
+    """
+    from mujoco import MjData, mj_resetData, mj_step  # type: ignore
+
+    env = envs.make(env_id)
+    model = env.mj_model
+    data = MjData(model)
+    contacts = rows = 0
+    for action in _actions(env, worlds, 1)[:, 0]:
+        mj_resetData(model, data)
+        data.ctrl[:] = action
+        for _ in range(steps * env.frame_skip):
+            mj_step(model, data)
+            contacts, rows = max(contacts, data.ncon), max(rows, data.nefc)
+    return {"nconmax": _above(1.5 * contacts), "njmax": _above(1.5 * rows)}
+
+
+def _above(x: float) -> int:
+    return max(8, 8 * math.ceil(x / 8))
+
+
+def options(model) -> str:
+    """Returns a model's solver settings in words."""
+    from mujoco import mjtCone, mjtIntegrator, mjtJacobian, mjtSolver  # type: ignore
+
+    opt = model.opt
+    kinds = (mjtSolver(opt.solver), mjtIntegrator(opt.integrator), mjtCone(opt.cone))
+    names = [kind.name.partition("_")[2] for kind in (*kinds, mjtJacobian(opt.jacobian))]
+    solver, integrator, cone, jacobian = names
+    return (
+        f"{solver}, {opt.iterations} iterations of {opt.ls_iterations} line-search steps, "
+        f"tolerance {opt.tolerance:g}, {integrator}, {cone} cones, {jacobian} Jacobian"
+    )
+
+
+def gymnasium_vector(env_id: str, batch: int = 8, steps: int = 50) -> Candidate:
+    """Gymnasium's synchronous vector environment under random actions; no policy."""
     import gymnasium
 
     env = gymnasium.make_vec(env_id, num_envs=batch, vectorization_mode="sync")
@@ -121,13 +178,21 @@ def gymnasium_vector(env_id: str, batch: int = 8, steps: int = 200) -> Candidate
         for action in actions:
             env.step(action)
 
-    row = {"what": "rollout", "engine": "Gymnasium vector", "env": env_id, "batch": batch}
-    frame_skip = getattr(envs.make(env_id), "frame_skip", 1)
-    row |= {"device": "cpu", "frame_skip": frame_skip}
+    row = {"what": "rollout, no policy", "engine": "Gymnasium", "task": env_id}
+    row |= {"precision": "float64", "batch": batch, "steps": steps, "device": "cpu"}
+    row["settings"] = f"gymnasium {gymnasium.__version__}, vectorization_mode sync"
     return Candidate(row, run, batch * steps)
 
 
+def _actions(env, batch: int, steps: int) -> np.ndarray:
+    """Draws actions [batch, steps, A] evenly between the bounds."""
+    low, high = env.action_space
+    return np.random.default_rng(0).uniform(low, high, (batch, steps, env.mj_model.nu))
+
+
 def _in_gymnasium(env_id: str) -> bool:
+    if not importlib.util.find_spec("gymnasium"):
+        return False
     import gymnasium
 
     return env_id in gymnasium.registry
