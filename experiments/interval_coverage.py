@@ -158,6 +158,21 @@ def two_samples(draws: int) -> Iterator[tuple[str, str, list[str]]]:
             yield kind, name, row
 
 
+def paired_rates(draws: int) -> Iterator[tuple[str, str, list[str]]]:
+    """Yields the same for the difference of two rates on the same seeds."""
+    for first, second, alike in ((0.9, 0.7, 0.5), (0.99, 0.97, 0.5), (1.0, 0.995, 0.0)):
+        name = f"{100 * first:g} % and {100 * second:g} %" + (", same luck" if alike else "")
+        cells = []
+        for num_seeds in SEEDS:
+            random = np.random.default_rng(num_seeds)
+            luck = random.random((2, draws, num_seeds))
+            shared = random.random((draws, num_seeds)) < alike
+            luck[1] = np.where(shared, luck[0], luck[1])
+            found = comparisons.paired_rates(luck[0] < first, luck[1] < second)
+            cells.append(share(found.low, found.high, first - second))
+        yield "difference of paired rates (Newcombe)", name, cells
+
+
 def times(draws: int) -> Iterator[tuple[str, str, list[str]]]:
     """Yields the same for env steps to a threshold, which are lognormal with the median 1."""
     for name, solved_share, earliest in (
@@ -203,7 +218,7 @@ def main() -> None:
     print(f"Share of {draws:,} draws whose 95 % interval covers the truth, in percent\n")
     print("| interval | distribution |", *(f"{n} seeds |" for n in SEEDS))
     print("|---|---|" + "---|" * len(SEEDS))
-    parts = one_sample(draws), rates(draws), two_samples(draws), times(draws)
+    parts = one_sample(draws), rates(draws), two_samples(draws), paired_rates(draws), times(draws)
     for part in (*parts, stratified(max(draws // 20, 10))):
         for interval, distribution, cells in part:
             print(f"| {interval} | {distribution} |", *(f"{c} |" for c in cells), flush=True)

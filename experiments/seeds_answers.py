@@ -13,14 +13,15 @@ from mjx_reinforce.reports.statistics.comparisons import (
     Difference,
     holm,
     paired_difference,
+    paired_rates,
     probability_of_improvement,
 )
 from seeds_runs import Task
 
 #: Where a setting is not compared: the program's defaults.
 DEFAULTS = {"estimator": "leave-one-out", "discount_weights": False, "standardize": True}
-#: Half of the seeds choose the learning rates, the other half says what these give.
-CHOOSING, REPORTING = slice(0, None, 2), slice(1, None, 2)
+#: Each half of the seeds chooses the learning rates at which the other half is reported.
+HALVES = slice(0, None, 2), slice(1, None, 2)
 LEVEL = 0.05
 
 
@@ -58,7 +59,7 @@ class Measure(NamedTuple):
     """What a run is judged by.
 
     values: of a task, [..., S]
-    statistic: over seeds, "iqm" or "mean"
+    statistic: over seeds, "iqm", "mean" or "rate"
     sign: 1 where more is better, else -1
     """
 
@@ -70,11 +71,15 @@ class Measure(NamedTuple):
 MEASURES = {
     "final return": Measure(lambda task: task.final_return, "iqm", 1),
     "solved at the end": Measure(
-        lambda task: (task.final_return >= task.threshold).astype(float), "mean", 1
+        lambda task: (task.final_return >= task.threshold).astype(float), "rate", 1
     ),
     "average return": Measure(lambda task: task.average_return, "mean", 1),
     "env steps to solve": Measure(lambda task: task.steps_to_solve, "mean", -1),
 }
+
+
+#: The learning rates of two arms.
+Rates = tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class Effect(NamedTuple):
@@ -82,7 +87,8 @@ class Effect(NamedTuple):
 
     task, contrast, measure: names
     where: "best" learning rate of each arm, "all" other settings averaged, or a learning rate
-    rates: the learning rates of the two arms, None where all are averaged
+    rates: the learning rates of each of the two arms, two where the halves of the seeds chose two;
+      None where all are averaged
     first, second: the statistic of each arm
     difference: first minus second, with its interval
     adjusted: its p value after Holm's correction for all effects of the page
@@ -93,7 +99,7 @@ class Effect(NamedTuple):
     contrast: str
     measure: str
     where: str
-    rates: tuple[float, float] | None
+    rates: Rates | None
     first: float
     second: float
     difference: Difference
@@ -120,30 +126,39 @@ def effects(tasks: Sequence[Task]) -> list[Effect]:
 
 def _effects_of(task: Task, contrast: Contrast) -> list[Effect]:
     """Returns the effects of one contrast, their p values not yet corrected."""
-    rates = task.factors["learning_rate"]
-    best = best_rates(task, contrast)
-    each = [(f"{rate:g}", (rate, rate), slice(None), ["average return"]) for rate in rates]
-    found = []
-    for where, chosen, seeds, measures in [("best", best, REPORTING, MEASURES), *each]:
-        for measure in measures:
-            arms = [
-                arm(task, measure, contrast, level, rate)[seeds]
-                for level, rate in zip(contrast.levels, chosen, strict=True)
-            ]
-            found.append(_effect(task, contrast, measure, where, chosen, arms))
+    chosen = zip(*(best_rates(task, contrast, half) for half in HALVES), strict=True)
+    one, other = (tuple(sorted(set(rates))) for rates in chosen)
+    found = [
+        _effect(task, contrast, measure, "best", (one, other), at_best(task, measure, contrast))
+        for measure in MEASURES
+    ]
+    for rate in task.factors["learning_rate"]:
+        arms = [arm(task, "average return", contrast, level, rate) for level in contrast.levels]
+        same = (rate,), (rate,)
+        found.append(_effect(task, contrast, "average return", f"{rate:g}", same, arms))
     for measure in MEASURES:
         arms = [_averaged(task, measure, contrast, level) for level in contrast.levels]
         found.append(_effect(task, contrast, measure, "all", None, arms))
     return found
 
 
-def best_rates(task: Task, contrast: Contrast) -> tuple[float, float]:
-    """Returns each arm's learning rate of the greatest average return on the choosing seeds."""
+def at_best(task: Task, measure: str, contrast: Contrast) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a measure [S] of both arms, each at its best rate by the half a seed is not in."""
+    first, second = np.empty((2, task.final_return.shape[-1]))
+    for choosing, reported in (HALVES, HALVES[::-1]):
+        rates = best_rates(task, contrast, choosing)
+        for values, level, rate in zip((first, second), contrast.levels, rates, strict=True):
+            values[reported] = arm(task, measure, contrast, level, rate)[reported]
+    return first, second
+
+
+def best_rates(task: Task, contrast: Contrast, seeds: slice) -> tuple[float, float]:
+    """Returns each arm's learning rate of the greatest average return on some seeds."""
     rates = task.factors["learning_rate"]
     first, second = (
         max(
             rates,
-            key=lambda rate: arm(task, "average return", contrast, level, rate)[CHOOSING].mean(),
+            key=lambda rate: arm(task, "average return", contrast, level, rate)[seeds].mean(),
         )
         for level in contrast.levels
     )
@@ -176,14 +191,16 @@ def _effect(
     contrast: Contrast,
     measure: str,
     where: str,
-    rates: tuple[float, float] | None,
+    rates: Rates | None,
     arms: Sequence[np.ndarray],
 ) -> Effect:
     _, statistic, sign = MEASURES[measure]
     first, second = arms
-    robust = statistic == "iqm"
-    difference = (paired_iqm_difference if robust else paired_difference)(first, second)
-    middle = iqm if robust else np.mean
+    compare = {"iqm": paired_iqm_difference, "mean": paired_difference, "rate": paired_rates}
+    # Rates that were averaged over settings are numbers like any other.
+    averaged = statistic == "rate" and where == "all"
+    difference = compare["mean" if averaged else statistic](first, second)
+    middle = iqm if statistic == "iqm" else np.mean
     improvement = probability_of_improvement(sign * first, sign * second).value
     values = float(middle(first)), float(middle(second))
     return Effect(

@@ -9,7 +9,7 @@ from scipy import stats
 
 from mjx_reinforce.reports.statistics.comparisons import holm, paired_difference
 from mjx_reinforce.reports.statistics.power import seeds_needed, wrong_winner
-from seeds_answers import CONTRASTS, LEVEL, MEASURES, REPORTING, Contrast, arm, best_rates
+from seeds_answers import CONTRASTS, LEVEL, MEASURES, Contrast, at_best
 from seeds_runs import Task
 
 #: Numbers of seeds of the picture.
@@ -63,10 +63,7 @@ def few_seeds(
 def _few_seeds(task: Task, contrast: Contrast, measure: str, counts: Sequence[int]) -> FewSeeds:
     """Returns the same of one comparison, its p value not yet corrected."""
     sign = MEASURES[measure].sign
-    first, second = (
-        sign * arm(task, measure, contrast, level, rate)[REPORTING]
-        for level, rate in zip(contrast.levels, best_rates(task, contrast), strict=True)
-    )
+    first, second = (sign * values for values in at_best(task, measure, contrast))
     return FewSeeds(
         task=task.name,
         contrast=contrast.name,

@@ -79,11 +79,13 @@ def _curves(tasks: Sequence[Task]) -> Any:
 
 
 def _best_of_each(task: Task) -> dict[str, float]:
-    """Returns the learning rate that was chosen for each estimator."""
+    """Returns the learning rate of each estimator that is best on all seeds."""
     rates: dict[str, float] = {}
     for contrast in CONTRASTS:
         if contrast.factor == "estimator":
-            rates |= dict(zip(contrast.levels, best_rates(task, contrast), strict=True))
+            rates |= dict(
+                zip(contrast.levels, best_rates(task, contrast, slice(None)), strict=True)
+            )
     return rates
 
 

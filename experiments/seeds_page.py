@@ -35,7 +35,6 @@ def page(found: Findings) -> str:
     tasks, settings = found.tasks, found.tasks[0].record["settings"]
     texts = {
         "seeds": f"{tasks[0].record['num_seeds']:,}",
-        "half": f"{tasks[0].final_return[..., 1::2].shape[-1]:,}",
         "runs": f"{sum(task.final_return.size for task in tasks):,}",
         "configurations": f"{tasks[0].final_return[..., 0].size}",
         "tasks": listed([task.name for task in tasks]),

@@ -25,13 +25,18 @@ def effects_table(found: Findings, contrasts: Sequence[Contrast]) -> str:
             for where in ("best", "all"):
                 group = found.of(contrast, task, where)
                 rates = group[0].rates
-                spoken = " / ".join(f"{x:g}" for x in rates) if rates else "all settings"
+                spoken = " / ".join(map(_rates, rates)) if rates else "all settings"
                 average = next(e for e in group if e.measure == "average return")
                 cells = [_cell(task, effect) for effect in group]
                 better = percent(average.improvement, 0) if rates else ""
                 rows.append([contrast.name, task.name, spoken, *cells, better])
     header = ["", "task", "learning rates", *MEASURES, "better seed"]
     return table(header, rows)
+
+
+def _rates(rates: Sequence[float]) -> str:
+    """Returns the learning rates of an arm: "0.01", or "0.003 or 0.01"."""
+    return " or ".join(f"{rate:g}" for rate in rates)
 
 
 def _cell(task: Task, effect: Effect) -> str:
@@ -102,8 +107,8 @@ def task_table(tasks: Sequence[Task]) -> str:
 def effect_row(effect: Effect) -> dict[str, Any]:
     """Returns an effect as a row of effects.csv."""
     row = effect._asdict()
-    difference, rates = row.pop("difference"), row.pop("rates") or ("", "")
-    row |= {"first_learning_rate": rates[0], "second_learning_rate": rates[1]}
+    difference, rates = row.pop("difference"), row.pop("rates") or ((), ())
+    row |= {"first_learning_rate": _rates(rates[0]), "second_learning_rate": _rates(rates[1])}
     return row | {f"difference_{name}": x for name, x in difference._asdict().items()}
 
 

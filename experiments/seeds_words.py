@@ -31,7 +31,11 @@ def _verdict(contrast: Contrast, found: Sequence[Effect]) -> str:
     """Returns which arm is better, by the measures that surely differ, and how much better."""
     direction = _direction(found)
     if direction is None:
-        return "better in one measure, worse in another"
+        better, worse = (
+            listed(effect.measure for effect in found if effect.direction == sign)
+            for sign in (1, -1)
+        )
+        return f"{contrast.names[0]}: better in {better}, worse in {worse}"
     if direction == 0:
         return "no difference found"
     share, measure = _share(found, direction)
@@ -143,7 +147,7 @@ def caveats(found: Findings) -> str:
             for effect in found.effects
             for task in found.tasks
             if effect.where == "best" and effect.task == task.name and effect.rates is not None
-            if end(task.factors["learning_rate"]) in effect.rates
+            if end(task.factors["learning_rate"]) in (*effect.rates[0], *effect.rates[1])
         }
         if at_edge:
             places = listed(sorted(f"{contrast} ({task})" for contrast, task in at_edge))

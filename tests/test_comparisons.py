@@ -12,6 +12,7 @@ from mjx_reinforce.reports.statistics.comparisons import (
     failures_as_worst,
     holm,
     paired_difference,
+    paired_rates,
     probability_of_improvement,
 )
 
@@ -49,6 +50,37 @@ def test_improvement_interval_by_hand():
     value, low, high = probability_of_improvement(x, y)
     np.testing.assert_allclose([low, high], np.sort(ends))
     assert value == pytest.approx(rate)
+
+
+@pytest.mark.parametrize(
+    ("counts", "low", "high"),
+    [
+        ((36, 12, 2, 0), 0.0569, 0.3404),  # Newcombe 1998, table II
+        ((14, 5, 0, 22), 0.011, 0.226),  # Altman et al. 2000, Statistics with Confidence, chapter 6
+        ((1, 1, 7, 12), -0.507, -0.026),  # Fagerland et al. 2014, of Bentur et al.
+    ],
+)
+def test_paired_rates_as_published(counts, low, high):
+    x, y = np.repeat([1, 1, 0, 0], counts), np.repeat([1, 0, 1, 0], counts)
+    found = paired_rates(x, y)
+    assert [found.low, found.high] == pytest.approx([low, high], abs=10.0 ** -len(f"{low}"[3:]) / 2)
+    assert found.value == pytest.approx(np.mean(x) - np.mean(y))
+    expected = stats.binomtest(counts[1], counts[1] + counts[2]).pvalue
+    assert found.p_value == pytest.approx(expected)
+    mirrored = paired_rates(y, x)
+    assert (mirrored.low, mirrored.high) == pytest.approx((-found.high, -found.low))
+
+
+def test_paired_rates_have_width_where_all_seeds_agree():
+    """As far as Wilson's interval of one rate, for either may be the lower one."""
+    solved = np.ones((2, 512), bool)
+    found = paired_rates(solved, solved)
+    wilson = stats.binomtest(512, 512).proportion_ci(method="wilson")
+    np.testing.assert_allclose(found.high, 1 - wilson.low)
+    np.testing.assert_array_equal(found.low, -found.high)
+    np.testing.assert_array_equal((found.value, found.p_value), ([0, 0], [1, 1]))
+    with pytest.raises(ValueError, match="as many"):
+        paired_rates([1, 0], [1])
 
 
 def test_paired_interval_by_hand():

@@ -10,7 +10,7 @@ import seeds_page
 import seeds_runs
 import seeds_words
 from mjx_reinforce.reports.statistics import iqm
-from seeds_answers import CONTRASTS, best_rates, effects, paired_iqm_difference
+from seeds_answers import CONTRASTS, HALVES, at_best, best_rates, effects, paired_iqm_difference
 from seeds_few import any_pair, few_seeds
 from seeds_runs import Task, load, measure, save
 
@@ -105,15 +105,44 @@ def test_what_does_nothing_is_not_found(found):
 
 
 def test_each_arm_has_its_own_best_rate(tasks):
-    assert best_rates(tasks[0], NORMALISE) == (1e-2, 3e-2)
-    assert best_rates(tasks[1], NORMALISE) == (3e-2, 3e-2)
+    for half in HALVES:
+        assert best_rates(tasks[0], NORMALISE, half) == (1e-2, 3e-2)
+        assert best_rates(tasks[1], NORMALISE, half) == (3e-2, 3e-2)
 
 
 def test_the_rates_are_not_chosen_on_the_seeds_that_are_reported(tasks):
     task = tasks[1]
     returns = task.average_return.copy()
     returns[..., 0, 1::2] += 1000  # the worst rate, on the other half
-    assert best_rates(task._replace(average_return=returns), GAMMA) == (3e-2, 3e-2)
+    changed = task._replace(average_return=returns)
+    assert [best_rates(changed, GAMMA, half)[0] for half in HALVES] == [3e-2, 3e-3]
+    for values in at_best(changed, "average return", GAMMA):
+        assert values.max() < 60
+        assert values[HALVES[1]].mean() == pytest.approx(40, abs=0.5)  # less what the rate takes
+        assert values[HALVES[0]].mean() == pytest.approx(30, abs=0.5)
+    (effect, *_) = (e for e in effects([changed]) if e.contrast == GAMMA.name)
+    assert effect.rates == ((3e-3, 3e-2), (3e-3, 3e-2))
+
+
+def test_every_seed_is_reported(tasks):
+    """Failures of one half are not lost because the other half has none."""
+    returns = np.full_like(tasks[0].final_return, 60.0)
+    one = FACTORS["estimator"].index("value-baseline")
+    returns[one, ..., : 2 * 13 : 2] = 0.0
+    found = effects([tasks[0]._replace(final_return=returns)])
+    effect = only(found, "Up-v0", LEARNED, "solved at the end", "best")
+    assert effect.difference.value == pytest.approx(-13 / SEEDS)
+    assert effect.difference.p_value == pytest.approx(2**-12)
+    assert effect.direction == -1
+
+
+def test_rates_without_a_failure_have_an_interval(tasks):
+    found = effects([tasks[0]._replace(final_return=np.full((*SHAPE, SEEDS), 60.0))])
+    difference = only(found, "Up-v0", LEARNED, "solved at the end", "best").difference
+    assert (difference.value, difference.p_value) == (0, 1)
+    # Wilson's interval of 200 successes in 200.
+    half = 1.96**2 / (SEEDS + 1.96**2)
+    assert [difference.low, difference.high] == pytest.approx([-half, half], rel=1e-4)
 
 
 def test_the_page_says_what_the_numbers_are(tasks, tmp_path, monkeypatch):
@@ -139,8 +168,7 @@ def test_few_seeds_against_the_normal_distribution(tasks):
     task = tasks[1]
     returns = task.final_return.copy()
     one, other = (FACTORS["discount_weights"].index(x) for x in (True, False))
-    noise = np.random.default_rng(1).normal(size=SEEDS)
-    noise[1::2] = stats.norm.ppf((np.arange(SEEDS / 2) + 0.5) / (SEEDS / 2))
+    noise = stats.norm.ppf((np.arange(SEEDS) + 0.5) / SEEDS)
     returns[:, one], returns[:, other] = 1 + noise, noise
     found = few_seeds([task._replace(final_return=returns)], ["final return"], COUNTS)
     (few,) = [few for few in found if few.contrast == GAMMA.name]
@@ -237,3 +265,10 @@ def test_what_is_better_by_another_measure_says_by_which(monkeypatch):
     (row,) = [line for line in answers.splitlines() if line.startswith(f"| {LEARNED.name} |")]
     assert "a learned baseline: much better (9" in row
     assert row.endswith("% in env steps to solve) |")
+    failed = np.full_like(task.final_return, 60.0)
+    failed[FACTORS["estimator"].index("value-baseline"), ..., :80:2] = 0.0  # of one half alone
+    found = seeds_findings.find([task._replace(final_return=failed)], COUNTS)
+    (row,) = [
+        line for line in seeds_words.short_answers(found).splitlines() if LEARNED.name in line
+    ]
+    assert row.endswith("better in env steps to solve, worse in solved at the end |")
