@@ -9,7 +9,7 @@ another machine: what the stages after ``train`` need of them, to be unpacked in
     python experiments/results.py sensitivity DIR   # DIR/sensitivity/TASK: a sweep
     python experiments/results.py play DIR          # DIR/play/TASK.csv, docs/films
     python experiments/results.py page DIR          # experiments/results, docs/results.md
-    python experiments/results.py readme            # prints the table of README.md
+    python experiments/results.py readme            # README.md, its part on results
 
 ``page`` without DIR writes the page anew from the small files in experiments/results. The tasks,
 their budgets, their seeds and the published figures are the table in results_tasks.py.
@@ -36,7 +36,7 @@ def main() -> None:
     pack = commands.add_parser("pack", help="one file of what the later stages need of runs")
     play = commands.add_parser("play", help="play the best and median seeds in Gymnasium; films")
     page = commands.add_parser("page", help="gather what the stages left, and write the page")
-    readme = commands.add_parser("readme", help="print the table of README.md")
+    readme = commands.add_parser("readme", help="write the part of README.md on results")
     for command in (train, sensitivity, pack, play, page):
         needed = None if command is not page else "?"
         command.add_argument("directory", type=Path, nargs=needed, help="of all stages")
@@ -52,6 +52,7 @@ def main() -> None:
     kept = ROOT / "experiments" / "results"
     for command in (page, readme):
         command.add_argument("--results", type=Path, default=kept, help="of the small files")
+    readme.add_argument("--readme", type=Path, default=ROOT / "README.md", help="to be changed")
     arguments = parser.parse_args()
     try:
         sys.exit(_COMMANDS[arguments.command](arguments))
@@ -108,10 +109,11 @@ def _page(arguments: argparse.Namespace) -> int:
 
 def _readme(arguments: argparse.Namespace) -> int:
     import results_files
-    import results_tables
+    import results_readme
 
-    results = results_files.load(TASKS.values(), arguments.results)
-    print(results_tables.readme_table([x for x in results if isinstance(x, results_files.Result)]))
+    parts = results_files.load(TASKS.values(), arguments.results)
+    results = [part for part in parts if isinstance(part, results_files.Result)]
+    results_readme.write(results, arguments.readme)
     return 0
 
 

@@ -44,6 +44,7 @@ _MOVED = {
     "seeds": int,
     "env_steps": int,
     "cut_short": int,
+    "own_starts": int,
 }
 _MOVED_RETURNS = ("iqm", "low", "high", "solved", "solved_low", "solved_high")
 _PLAYED = {"policy": str, "seed": int, "simulation": str, "episode": int, "return": float}
@@ -164,7 +165,8 @@ def _gather_sweep(directory: Path) -> Columns:
     """Returns a row for each configuration of a sweep of ``OneAtATime``; the first is its base."""
     results, record = read_results(directory), read_json(directory / "sweep.json")
     threshold, budget = record["threshold"], record["settings"]["env_steps"]
-    base, rows = results.configurations[0], []
+    # Of sweeps from before there was that setting, all seeds have the same starts.
+    base, rows, own = results.configurations[0], [], int("test_episodes" in record["settings"])
     for number, values in enumerate(results.configurations):
         name = next((name for name in base if values[name] != base[name]), None)
         final = results.eval_return[-1, results.configuration == number]
@@ -176,7 +178,7 @@ def _gather_sweep(directory: Path) -> Columns:
         factor = 1 if name is None else 1 / FACTOR if less else FACTOR
         value = "" if name is None else f"{values[name]:.9g}"
         cut = int(np.sum(results.env_steps[-1, results.configuration == number] < budget))
-        moved = name or "default", value, factor, len(final), budget, cut
+        moved = name or "default", value, factor, len(final), budget, cut, own
         rows.append((*moved, iqm(final), low, high, *found))
     names = (*_MOVED, *_MOVED_RETURNS)
     return {name: np.array(x) for name, x in zip(names, zip(*rows, strict=True), strict=True)}
@@ -214,6 +216,18 @@ def _write(path: Path, columns: Mapping[str, Any]) -> None:
 
 def _text(x: Any) -> str:
     return f"{x:.9g}" if isinstance(x, float) else str(x)
+
+
+def own_starts(result: Result) -> bool:
+    """Returns whether each seed was tested on starts of its own; once all had the same."""
+    return "test_episodes" in result.facts["settings"]
+
+
+def tested_episodes(result: Result) -> int:
+    """Returns of how many episodes a seed's test was: whole evaluations."""
+    settings = result.facts["settings"]
+    a_round = settings["eval_episodes"]
+    return -(-(settings.get("test_episodes") or a_round) // a_round) * a_round
 
 
 def tested_returns(result: Result) -> np.ndarray:

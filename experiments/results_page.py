@@ -5,7 +5,7 @@ from pathlib import Path
 
 import results_figures
 import results_tables as tables
-from results_files import POLICIES, STAY_SOLVED, Result
+from results_files import POLICIES, STAY_SOLVED, Result, own_starts, tested_episodes
 from results_runs import FACTOR
 from results_tasks import PUBLISHED_SEEDS, PUBLISHED_STEPS, Task, horizon
 from seeds_markdown import listed
@@ -101,30 +101,44 @@ def _notes(results: Sequence[Result]) -> str:
 
 
 def _explanation(results: Sequence[Result]) -> str:
-    episodes = sorted({result.facts["settings"]["eval_episodes"] for result in results})
+    played: dict[int, list[str]] = {}
+    for result in results:
+        played.setdefault(tested_episodes(result), []).append(result.task.name)
+    counts = [f"{count} ({listed(names)})" for count, names in sorted(played.items())]
+    shared = [result.task.name for result in results if not own_starts(result)]
+    evaluated = listed(
+        str(x) for x in sorted({result.facts["settings"]["eval_episodes"] for result in results})
+    )
     shorter = [
         f"{result.task.name} ({result.facts['settings']['horizon']} of {horizon(result.task.env)})"
         for result in results
         if result.facts["settings"]["horizon"] != horizon(result.task.env)
     ]
     said = [
-        "* A return in the table is that of the policy at the end of training, without noise: the\n"
-        f"  mean of {listed(map(str, episodes))} episodes on starts that were used nowhere else.\n"
-        "  They are the same for all seeds of a task: intervals are over seeds, and leave the\n"
-        "  choice of the starts out. The evaluations on the way, and so the curves and the table\n"
-        "  of the pendulum, have as many other starts, which the searches had, too.",
+        "* A return in the table is that of the policy at the end of training, without noise: a\n"
+        "  seed's is the mean of episodes from starts that were used nowhere else. So many are\n"
+        f"  they: {listed(counts)}.\n"
+        "  Each seed has starts of its own, so intervals over seeds cover the choice of starts.\n"
+        "  The evaluations on the way, and so the curves and the table of the pendulum, have\n"
+        f"  others ({evaluated} episodes), the same at every evaluation of a seed.",
         "* IQM: the mean of the middle half of the seeds. Intervals are 95 % bootstrap\n"
         "  intervals over seeds ([statistics.md](statistics.md)).",
         f"* Published: Tianshou's REINFORCE after {PUBLISHED_STEPS:,} env steps,\n"
         f"  {PUBLISHED_SEEDS} seeds (examples/mujoco/README.md in its repository). What stands\n"
         "  there after ± is read as the standard deviation over seeds; the interval is Student's,\n"
         "  of the mean. Their mean is that of the evaluation where it was greatest, ours that at\n"
-        "  the end; their tasks are Gym 0.17's -v2 and -v3, not in everything those of -v5.",
+        "  the end; their tasks are Gym 0.17's -v2 and -v3, not in everything those of -v5. They\n"
+        "  have one setting for all tasks, ours were searched for each (`experiments/tuning`).",
         "* Above: our interval of the mean lies above theirs; below: it lies below; not apart:\n"
         "  they overlap.",
         "* Training: wall time of all seeds together, evaluations included. Compiling: before\n"
         "  it, with whatever the machine's compilation cache held.",
     ]
+    if shared:
+        said.append(
+            "* Trained before that, with the same starts for all seeds, so that intervals leave\n"
+            f"  the choice of the starts out: {listed(shared)}."
+        )
     cut = [
         f"{result.task.name} {result.facts['cut_short']:,} of {len(result.seeds['seed']):,} (after "
         f"{result.facts['settings']['max_updates']:,} updates)"
@@ -210,6 +224,12 @@ def _moved(results: Sequence[Result]) -> list[str]:
     cut = [name for name, short in map(_cut_short, swept) if short]
     if cut:
         words += f" Runs that ended before, since their episodes stayed short: {listed(cut)}."
+    shared = [x.task.name for x in swept if x.moved is not None and not x.moved["own_starts"].all()]
+    if shared:
+        words += (
+            " With the same starts for all runs of a sweep, so that intervals leave the choice of\n"
+            f"starts out: {listed(shared)}."
+        )
     words += f" Not swept yet: {listed(missing)}." if missing else ""
     return [
         "## How much each setting matters",
@@ -236,6 +256,7 @@ python experiments/results.py train DIR         # every task, one after the othe
 python experiments/results.py sensitivity DIR   # moves every setting
 python experiments/results.py play DIR          # Gymnasium and films
 python experiments/results.py page DIR          # this page
+python experiments/results.py readme            # the tables of README.md
 ```
 
 `--tasks` chooses tasks; what is in DIR is kept, and what was stopped goes on. `page` without

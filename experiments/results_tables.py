@@ -109,16 +109,9 @@ def _result_row(result: Result) -> list[str]:
 
 
 def readme_table(results: Sequence[Result]) -> str:
-    """Returns the table of README.md, of the tasks with their default settings."""
-    header = [
-        "task",
-        "seeds",
-        "env steps a seed",
-        "ours",
-        "worst seed",
-        "Tianshou, 10 million steps",
-    ]
-    return table(header, [_readme_row(x) for x in results if x.task.name == x.task.env])
+    """Returns the table of README.md."""
+    header = ["task", "seeds", "env steps a seed", "ours", "worst seed"]
+    return table([*header, "Tianshou, 10 million steps"], map(_readme_row, results))
 
 
 def _readme_row(result: Result) -> list[str]:
@@ -131,6 +124,34 @@ def _readme_row(result: Result) -> list[str]:
         number(worst(tested)),
         "" if published is None else estimate(published_interval(*published)),
     ]
+
+
+def readme_pendulum_table(results: Sequence[Result]) -> str:
+    """Returns the same as ``pendulum_table`` in fewer columns."""
+    limits, (start, stop) = " / ".join(f"{limit:,}" for limit in WITHIN), STAY_SOLVED
+    header = ["policy", f"solved within {limits} steps"]
+    header += [f"least share solved at once, {start:,} to {stop / 1e6:g} million"]
+    return table([*header, "median steps to solve", "training"], map(_readme_pendulum_row, results))
+
+
+def _readme_pendulum_row(result: Result) -> list[str]:
+    steps, sizes = result.seeds["env_steps_to_solve"], result.facts["settings"]["hidden_sizes"]
+    flags = " ".join(map(str, sizes))
+    shares = [percent(solved_within(steps, limit) / len(steps), 2) for limit in WITHIN]
+    return [
+        f"{' and '.join(map(str, sizes))} units (`--hidden-sizes {flags}`)"
+        if sizes
+        else "linear (the default)",
+        " / ".join(shares),
+        _least_share(result),
+        _steps(steps_quantile(steps, 0.5)),
+        seconds(result.facts["run_seconds"]),
+    ]
+
+
+def _least_share(result: Result) -> str:
+    least = result.facts["least_share_solved"]
+    return "not trained for as long" if least is None else percent(least, 2)
 
 
 def worst(returns: np.ndarray) -> float:
@@ -151,12 +172,11 @@ def _pendulum_row(result: Result) -> list[str]:
     steps = result.seeds["env_steps_to_solve"]
     sizes = result.facts["settings"]["hidden_sizes"]
     within = [solved_within(steps, limit) for limit in WITHIN]
-    least = result.facts["least_share_solved"]
     return [
         f"{' and '.join(map(str, sizes))} units" if sizes else "linear",
         f"{len(steps):,}",
         *(f"{percent(count / len(steps), 2)} ({count:,})" for count in within),
-        "not trained for as long" if least is None else percent(least, 2),
+        _least_share(result),
         *(_steps(steps_quantile(steps, share)) for share in (0.5, 0.99)),
     ]
 

@@ -11,6 +11,7 @@ import pytest
 
 import results_files
 import results_page
+import results_readme
 import results_runs
 import results_tables
 import tuning
@@ -243,6 +244,8 @@ def test_the_page_says_what_was_measured_and_what_is_missing(kept, tmp_path):
     assert all(name in missing for name in TASKS if name not in (PENDULUM.name, REACHER.name))
     assert f"{REACHER.name}," not in missing
     assert "| linear | 10 | 0.00 % (0) | 90.00 % (9) | 90.00 % | 100,000 | never |" in lines
+    assert f"  they: 16 ({PENDULUM.name}) and 256 ({REACHER.name}).\n" in page
+    assert f"starts out: {PENDULUM.name}." in page  # of its sweep, made up without a test
     assert f"Not played yet: {REACHER.name}." in page
     assert "Of 2 policies, 1 have" in page
     assert f"[film](films/{PENDULUM.name}-best.gif)" in page
@@ -275,15 +278,44 @@ def test_what_is_packed_elsewhere_gives_the_same_page(kept, tmp_path):
     assert len(list((tmp_path / "again").iterdir())) == 6
 
 
-def test_the_table_of_the_readme(kept):
+def test_the_part_of_the_readme_on_results(kept, tmp_path):
     loaded = results_files.load(TASKS.values(), kept)
     results = [part for part in loaded if isinstance(part, results_files.Result)]
-    lines = results_tables.readme_table(results).splitlines()
-    assert lines[0].startswith("| task | seeds | env steps a seed | ours | worst seed | Tianshou")
+    readme = tmp_path / "README.md"
+    readme.write_text("Before.\n\n## Results\n\nold\n\nSolved is a return of 950 in an evaluation.")
+    results_readme.write(results, readme)
+    text = readme.read_text("utf-8")
+    assert text.startswith("Before.\n\n## Results\n\nWith the default")
+    assert text.endswith("\n\nSolved is a return of 950 in an evaluation.")
+    assert "old" not in text
+    words = " ".join(text.split())
+    assert "each of 16 to 256 episodes from starts of the seed's own, used nowhere else" in words
+    assert (
+        "Ours lie above theirs, intervals apart, in Reacher; not apart in InvertedPendulum;"
+        in words
+    )
+    assert "with 10 to 10 % of the env steps" in words
+    assert "(among 2,029 configurations for InvertedPendulum-v5, 9 to 42 for each of 8 " in words
     ours = results_tables.estimate(results_tables.mean_of(results[0]))
-    row = f"| {PENDULUM.name} | 10 | 1,000,000 | {ours} | 490.0 | 1,000.0 (1,000.0 to 1,000.0) |"
-    assert lines[2] == row
-    assert lines[3].endswith("| -4.30 | -5.50 (-5.64 to -5.36) |")
+    row = f"| {PENDULUM.name} | 10 | 1,000,000 | {ours} | 490.0 | 1,000.0 (1,000.0 to 1,000.0) |\n"
+    assert row in text
+    assert " | -4.30 | -5.50 (-5.64 to -5.36) |\n" in text
+    assert "| linear (the default) | 0.00 % / 90.00 % | 90.00 % | 100,000 | 10.0 min |\n" in text
+    with pytest.raises(ValueError, match="has no part"):
+        results_readme.write(results, kept / f"{PENDULUM.name}.json")
+
+
+def test_results_from_before_seeds_had_starts_of_their_own_say_so(kept, tmp_path):
+    path = kept / f"{REACHER.name}.json"
+    facts = json.loads(path.read_text())
+    del facts["settings"]["test_episodes"]
+    path.write_text(json.dumps(facts))
+    results = results_files.load((PENDULUM, REACHER), kept)
+    said = "the choice of the starts out: "
+    assert f"{said}{REACHER.name}.\n" in results_page.page(results, tmp_path)
+    assert "own (but for Reacher, whose seeds share theirs)" in " ".join(
+        results_readme.part(results).split()
+    )
 
 
 def test_the_page_without_sweeps_and_games(kept, tmp_path):

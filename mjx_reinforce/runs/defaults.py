@@ -30,8 +30,8 @@ _PENDULUM: dict[str, Any] = {
 
 #: Environment id -> the settings that differ. Tasks with contacts are slow on CPUs: they play 8
 #: or 4 episodes an evaluation, not 32. Pusher and HumanoidStandup were not searched.
-#: Tests are of so many episodes that the variance of a mean of them is a quarter of that over
-#: seeds or less.
+#: Tests are of so many episodes that, of most policies, the variance of their mean is a quarter of
+#: that over seeds or less.
 _OF_TASKS: dict[str, dict[str, Any]] = {
     "InvertedPendulum-v5": _PENDULUM,
     "InvertedPendulum-v4": _PENDULUM,
