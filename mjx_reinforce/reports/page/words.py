@@ -248,7 +248,7 @@ def _of_measure(findings: Findings) -> Iterator[str]:
     if episodes is not None:
         yield (
             f"A return is the mean of {count(int(episodes), 'episode')} without exploration, from "
-            "starts of the seed's own, the same at every evaluation."
+            "starts that are the same at every evaluation of a seed."
         )
     yield "One task: nothing here says how these settings do on another."
 
