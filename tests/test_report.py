@@ -1,7 +1,9 @@
 """The report: what is on the page, that it needs nothing else, and that it loses no file."""
 
+import csv
 import html
 import json
+import math
 import re
 import subprocess
 import sys
@@ -117,6 +119,46 @@ def test_numbers_and_pictures_lie_beside(written):
     assert content(page)["files"]["results.csv"].splitlines() == lines
     for name in ("final", "curves", "solved", "distribution", "profile", "sensitivity-0", "worst"):
         assert (beside / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def cells(path):
+    """All cells of a CSV file but the header's."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return [cell for row in list(csv.reader(file))[1:] for cell in row]
+
+
+def is_number(text):
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+FORMULAS = ("=HYPERLINK(1)", "@SUM(1+1)", "+A1", "-A1", "\tA1")
+
+
+def test_names_are_no_formulas_in_spreadsheets(tmp_path):
+    """A spreadsheet computes what begins like a formula: numbers may, names may not."""
+    runs = [make_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
+    report.write(runs, tmp_path / "page.html")
+    files = sorted((tmp_path / "page").glob("*.csv"))
+    texts = [cell for path in files for cell in cells(path)]
+    assert {"'=HYPERLINK(1)", "'@SUM(1+1)", "-120.5"} <= set(texts)
+    begun = [text for text in texts if text.startswith(("=", "+", "-", "@", "\t", "\r"))]
+    assert [text for text in begun if not is_number(text)] == []
+    for name, text in content(tmp_path / "page.html")["files"].items():
+        assert (tmp_path / "page" / name).read_text(encoding="utf-8") == text
+
+
+def test_every_table_names_its_configurations(written):
+    files = sorted((written[0] / "report").glob("*.csv"))
+    assert {path.name for path in files} >= {"band.csv", "worst.csv", "curves.csv"}
+    assert [p.name for p in files if "configuration" not in p.read_text().splitlines()[0]] == []
+
+
+def test_every_picture_can_be_downloaded(written):
+    buttons = set(re.findall(r'data-png="([^"]+)"', written[1].read_text(encoding="utf-8")))
+    assert buttons == {path.stem for path in (written[0] / "report").glob("*.png")}
 
 
 def test_a_thousand_seeds_make_no_larger_charts(tmp_path):

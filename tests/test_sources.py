@@ -15,8 +15,8 @@ from mjx_reinforce.runs.rows import COLUMNS
 ONE = {"learning_rate": [1e-3, 3e-3]}
 
 
-def make_run(directory, *, num_seeds=3, evaluations=4, summary=None, **settings):
-    """Writes what a run leaves that a report reads: seed s returns 100 s + 10 e."""
+def make_run(directory, *, num_seeds=3, evaluations=4, offset=0.0, summary=None, **settings):
+    """Writes what a run leaves that a report reads: seed s returns 100 s + 10 e + offset."""
     directory.mkdir(parents=True)
     config = {"env": "CartPole-v1", "learning_rate": 0.01, "hidden_sizes": [32, 32]} | settings
     provenance = {"python": "3.11.9", "device": "cpu", "packages": {"jax": "0.10.2"}}
@@ -28,8 +28,8 @@ def make_run(directory, *, num_seeds=3, evaluations=4, summary=None, **settings)
         writer.writeheader()
         for e in range(evaluations):
             for s in range(num_seeds):
-                row = {"seed": s, "env_steps": 50 * e, "eval_return": 100.0 * s + 10 * e}
-                writer.writerow(row)
+                value = 100.0 * s + 10 * e + offset
+                writer.writerow({"seed": s, "env_steps": 50 * e, "eval_return": value})
     return directory
 
 

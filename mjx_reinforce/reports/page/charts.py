@@ -240,7 +240,8 @@ def sensitivity(
 def worst(threshold: float | None) -> Chart:
     """The worst seeds of the best configuration, over its band.
 
-    Data: ``worst`` (seed, env_steps, value), ``band`` (env_steps, value, low, high).
+    Data: ``worst`` (configuration, seed, env_steps, value), ``band`` (configuration, env_steps,
+    value).
     """
     x = alt.X("env_steps:Q", title=_STEPS, axis=_THOUSANDS, scale=alt.Scale(nice=False))
     y = alt.Y("value:Q", title="return of the deterministic policy", scale=alt.Scale(zero=False))

@@ -14,6 +14,9 @@ from mjx_reinforce.reports.findings import Findings, swept
 #: Columns by name, all of one length. ``configuration`` holds places among the results.
 Table = dict[str, list[Any]]
 
+#: With these a spreadsheet's formula begins. page.js has them, too.
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
+
 
 def rows(table: Table, labels: Sequence[str]) -> list[dict[str, Any]]:
     """Returns a table row by row, with the labels of its configurations."""
@@ -94,5 +97,18 @@ def table_csv(table: Table, labels: Sequence[str]) -> str:
 
 def _csv(lines: Sequence[Sequence[Any]]) -> str:
     text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows(lines)
+    csv.writer(text, lineterminator="\n").writerows([map(_no_formula, line) for line in lines])
     return text.getvalue()
+
+
+def _no_formula(cell: Any) -> Any:
+    """Returns a cell with an apostrophe before a name that a spreadsheet would compute.
+
+    Run directories may be called "=HYPERLINK(1)". Numbers stay, also those that are texts.
+    """
+    if not isinstance(cell, str) or not cell.startswith(_FORMULA):
+        return cell
+    try:
+        return cell if math.isfinite(float(cell)) else f"'{cell}"
+    except ValueError:
+        return f"'{cell}"

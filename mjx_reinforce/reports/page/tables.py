@@ -143,13 +143,18 @@ def worst_curves(findings: Findings) -> dict[str, Table]:
         at = keep.astype(int)[np.isfinite(returns[keep.astype(int)])]
         parts.append(
             {
+                "configuration": [0] * len(at),
                 "seed": [int(part.seed[s])] * len(at),
                 "env_steps": short(part.env_steps[at, s], 7),
                 "value": short(returns[at], 4),
             }
         )
     known = np.isfinite(result.band.value)
-    band = {"env_steps": short(findings.grid[known], 7), "value": short(result.band.value[known])}
+    band = {
+        "configuration": [0] * int(known.sum()),
+        "env_steps": short(findings.grid[known], 7),
+        "value": short(result.band.value[known]),
+    }
     return {"worst": join(parts), "band": band}
 
 

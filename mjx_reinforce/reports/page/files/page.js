@@ -101,9 +101,12 @@
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   };
+  // A name that a spreadsheet would take for a formula gets an apostrophe, as in columns.py.
+  const noFormula = (text) =>
+    /^[=+\-@\t\r\n]/.test(text) && !Number.isFinite(Number(text)) ? `'${text}` : text;
   const quoted = (value) => {
-    const text = value === null ? "" : String(value);
-    return /[",\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
+    const text = value === null ? "" : noFormula(String(value));
+    return /[",\r\n]/.test(text) ? `"${text.replaceAll('"', '""')}"` : text;
   };
   const csv = (listed) => listed.length
     ? [Object.keys(listed[0]), ...listed.map(Object.values)].map((row) => row.map(quoted).join(","))
@@ -125,10 +128,11 @@
     made.finalize();
   };
 
+  const ALWAYS = "worst";  // seeds of the best configuration, whichever are shown
   const fill = (place) => {
     const table = document.createElement("table");
     const listed = rows(place.dataset.table).filter((row) =>
-      !("configuration" in row) || shown().includes(row.configuration));
+      place.dataset.table === ALWAYS || shown().includes(row.configuration));
     if (!listed.length) return;
     const line = (parent, cells, kind) => {
       const row = parent.insertRow();
