@@ -16,7 +16,7 @@ from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
 from mjx_reinforce.reports.findings import Findings, find
 from mjx_reinforce.reports.page import columns, document, tables
-from mjx_reinforce.reports.page.document import GENERATOR, Watch, encoded
+from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.vega import ONE, draw
 from mjx_reinforce.runs.defaults import of_task
@@ -41,10 +41,11 @@ class Settings:
 
     sources: tyro.conf.Positional[tuple[Path, ...]]
     """Run or sweep directories, all of one task. Several are compared."""
-    output: Path = Path("report.html")
-    """The page. Its pictures and tables go into a folder of the same name without .html."""
+    output: Path | None = None
+    """The page. By default report.html in the run or sweep that it is of, or, of several, in the
+    current folder. Its pictures and tables go into a folder of the same name without .html."""
     overwrite: bool = False
-    """Replace files that are no report of this program."""
+    """Replace a page that exists, and the pictures and tables of the same names beside it."""
 
 
 def main() -> None:
@@ -52,19 +53,27 @@ def main() -> None:
     accept_everything()
     try:
         settings = read(Settings, sys.argv[1:], _PROGRAM, _ABOUT)
-        check_output(settings.output, settings.overwrite)
-        seconds = write(settings.sources, settings.output)
+        experiment = sources.read(settings.sources)
+        output = settings.output or _default_output(settings.sources)
+        check_output(output, settings.overwrite)
+        seconds = _write(experiment, output)
     except (ValueError, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
-    size = settings.output.stat().st_size / 1e6
-    print(f"{settings.output} ({size:.1f} MB, {seconds:.1f} s), pictures and tables beside it")
+    size = output.stat().st_size / 1e6
+    print(f"{output} ({size:.1f} MB, {seconds:.1f} s), pictures and tables in {_beside(output)}")
+
+
+def _default_output(chosen: Sequence[Path]) -> Path:
+    """Returns where a page goes: into what it is of, or, if that is several, the current folder."""
+    alone = len(dict.fromkeys(chosen)) == 1
+    return (chosen[0] if alone else Path()) / "report.html"
 
 
 def check_output(output: Path, overwrite: bool) -> None:
-    """Raises ValueError if the report cannot be written there, or would replace other files."""
+    """Raises ValueError if the report cannot be written there, or would replace files unasked."""
     if output.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"{output} is no page; end --output in .html")
     if not os.access(output.parent, os.W_OK):
@@ -74,28 +83,16 @@ def check_output(output: Path, overwrite: bool) -> None:
     beside = _beside(output)
     if beside.exists() and not beside.is_dir():
         raise ValueError(f"{beside} is in the way of the pictures; choose another --output")
-    if overwrite or is_ours(output):
-        return
     for path in (output, beside):
-        if path.is_file() or (path.is_dir() and any(path.iterdir())):
-            raise ValueError(
-                f"{path} exists and is no report of this program; choose another --output, or "
-                "pass --overwrite to replace it"
-            )
-
-
-def is_ours(output: Path) -> bool:
-    """Returns whether a file is a page of this program."""
-    if not output.is_file():
-        return False
-    with output.open("rb") as file:
-        return f'<meta name="generator" content="{GENERATOR}">'.encode() in file.read(2000)
+        there = path.is_file() or (path.is_dir() and any(path.iterdir()))
+        if there and not overwrite:
+            raise ValueError(f"{path} exists; pass --overwrite or another --output")
 
 
 def write(chosen: Sequence[Path], output: Path) -> float:
     """Writes the page, and its pictures and tables beside it; returns how long it took (s).
 
-    Replaces what an earlier report left there; ``check_output`` refuses to replace anything else.
+    Replaces what is there; ``check_output`` refuses that.
 
     Args:
       chosen: run and sweep directories, see ``sources.read``.
@@ -105,8 +102,12 @@ def write(chosen: Sequence[Path], output: Path) -> float:
       ValueError: a source is damaged, or they are of different tasks.
       OSError: a file cannot be read or written.
     """
+    return _write(sources.read(chosen), output)
+
+
+def _write(experiment: Experiment, output: Path) -> float:
+    """Does what ``write`` says, of what was read."""
     started = time.perf_counter()
-    experiment = sources.read(chosen)
     findings = find(experiment)
     drawn, data = figures(findings), tables.chart_tables(findings)
     files = {

@@ -108,18 +108,21 @@ class Browser:
 
     def open(self, path, width=1280, height=900, dark=False):
         """Opens a file at a width in CSS pixels, and waits until the page says that it is ready."""
-        phone = width < 600
+        self.resize(width, height)
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.call("Emulation.setEmulatedMedia", features=[scheme])
+        self.call("Page.navigate", url=path.resolve().as_uri())
+        self.wait_for("document.documentElement?.dataset.ready === 'yes'")
+
+    def resize(self, width, height=900):
+        """Gives the page a width in CSS pixels; below 600 it is on a phone."""
         self.call(
             "Emulation.setDeviceMetricsOverride",
             width=width,
             height=height,
             deviceScaleFactor=1,
-            mobile=phone,
+            mobile=width < 600,
         )
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self.call("Emulation.setEmulatedMedia", features=[scheme])
-        self.call("Page.navigate", url=path.resolve().as_uri())
-        self.wait_for("document.documentElement?.dataset.ready === 'yes'")
 
     def wait_for(self, condition):
         """Waits until JavaScript is true."""

@@ -11,7 +11,7 @@ import sys
 import numpy as np
 import pytest
 from browser import CHROMIUM, opened_browser
-from fake_sweeps import make_sweep
+from fake_sweeps import GRID, make_sweep
 from test_sources import ONE, make_run
 
 from mjx_reinforce import report
@@ -107,7 +107,42 @@ def test_solved_share_rises_to_those_who_ever_did(found):
             s for c, s in zip(data["configuration"], data["share"], strict=True) if c == place
         ]
         assert shares == sorted(shares)
-        assert shares[-1] <= result.solving.ever / 40 + 1e-4
+        assert shares[-1] == pytest.approx(result.solving.ever / 40, abs=1e-4)
+
+
+def solve_at_the_end(directory, runs, threshold):
+    """Lets some runs of a sweep reach the threshold at their last evaluation, not before."""
+    with np.load(directory / "curves.npz") as archive:
+        arrays = dict(archive)
+    arrays["eval_return"][:-1, runs] = np.minimum(arrays["eval_return"][:-1, runs], threshold / 2)
+    arrays["eval_return"][-1, runs] = threshold + 10
+    np.savez(directory / "curves.npz", **arrays)
+
+
+def test_tables_and_figures_agree_on_who_solved(tmp_path):
+    """Seeds end at different env steps; the figures' last place is the end of each, as table 1."""
+    directory = make_sweep(tmp_path / "sweep", num_seeds=40, over=ONE)
+    solve_at_the_end(directory, [1, 5, 9, 42, 77], 950)
+    report.write([directory], directory / "report.html")
+    shown = findings.find(sources.read([directory]))
+    data, said = tables.chart_tables(shown), visible(directory / "report.html")
+    with (directory / "report" / "summary.csv").open(encoding="utf-8", newline="") as file:
+        summary = list(csv.DictReader(file))
+    for place, result in enumerate(shown.results):
+        at_end = int((result.configuration.eval_return[-1] >= 950).sum())
+        ever = int((result.configuration.eval_return >= 950).any(axis=0).sum())
+        assert f"{at_end} of 40 " in said  # table 1
+        assert (summary[place]["solved_at_end"], summary[place]["ever_solved"]) == (
+            str(at_end),
+            str(ever),
+        )
+        rows = zip(data["moments"]["configuration"], data["moments"]["said"], strict=True)
+        assert f", {at_end} of 40 solved" in [text for c, text in rows if c == place][-1]
+        rows = zip(data["solved"]["configuration"], data["solved"]["share"], strict=True)
+        assert [share for c, share in rows if c == place][-1] == pytest.approx(ever / 40, abs=1e-4)
+    assert "the last evaluation of each seed, as in table 1" in (
+        directory / "report.html"
+    ).read_text(encoding="utf-8")
 
 
 def test_numbers_and_pictures_lie_beside(written):
@@ -207,19 +242,54 @@ def run_report(*arguments):
 
 
 def test_command_line(tmp_path):
-    """It writes, replaces its own page, and refuses what it did not write, in one line."""
-    run, page = make_run(tmp_path / "run"), tmp_path / "page.html"
-    done = run_report(run, "--output", page)
+    """It writes into the run, and replaces what exists when it is asked to, or says one line."""
+    run = make_run(tmp_path / "run")
+    page = run / "report.html"
+    done = run_report(run)
     assert done.returncode == 0, done.stderr
     assert str(page) in done.stdout
-    report.check_output(page, overwrite=False)
+    assert (run / "report" / "results.csv").is_file()
     page.write_text("mine")
-    refused = run_report(run, "--output", page)
+    refused = run_report(run)
     assert refused.returncode == 2
-    assert refused.stderr.startswith("error: ")
-    assert refused.stderr.count("\n") == 1
+    assert refused.stderr == f"error: {page} exists; pass --overwrite or another --output\n"
     assert page.read_text() == "mine"
-    report.check_output(page, overwrite=True)
+    assert run_report(run, "--overwrite").returncode == 0
+    assert "<!doctype html>" in page.read_text()
+
+
+def said_by_main(monkeypatch, capsys, *arguments):
+    """What the command says, or how it refuses; nothing is drawn."""
+    monkeypatch.setattr(report, "figures", lambda findings: [])
+    monkeypatch.setattr(report.document, "render", lambda *arguments: "a page")
+    monkeypatch.setattr(sys, "argv", ["report", *map(str, arguments)])
+    status = 0
+    try:
+        report.main()
+    except SystemExit as stop:
+        status = stop.code
+    return status, "".join(capsys.readouterr())
+
+
+def test_pages_go_where_they_belong(tmp_path, monkeypatch, capsys):
+    """Of A into A, of B into B, of both here: none replaces another, nor the pictures alone."""
+    monkeypatch.chdir(tmp_path)
+    first, second = make_run(tmp_path / "a"), make_run(tmp_path / "b")
+    for chosen, page in (
+        ([first], first / "report.html"),
+        ([second, second], second / "report.html"),
+        ([first, second], tmp_path / "report.html"),
+    ):
+        assert said_by_main(monkeypatch, capsys, *chosen)[0] == 0
+        assert page.read_text() == "a page"
+        status, said = said_by_main(monkeypatch, capsys, *chosen)
+        assert (status, "exists; pass --overwrite" in said) == (2, True)
+        page.unlink()
+        status, said = said_by_main(monkeypatch, capsys, *chosen)
+        assert (status, "report exists; pass --overwrite" in said) == (2, True)
+        assert said_by_main(monkeypatch, capsys, *chosen, "--overwrite")[0] == 0
+    status, said = said_by_main(monkeypatch, capsys, tmp_path / "none")
+    assert (status, said) == (2, f"error: there is no directory {tmp_path / 'none'}\n")
 
 
 @pytest.mark.parametrize("name", ["page.txt", "none/page.html", "folder.html", "page.html"])
@@ -300,6 +370,64 @@ def test_charts_are_whole_at_any_width_and_on_paper(tmp_path):
             whole = browser.run("document.querySelector('figure').clientWidth")
             assert browser.run(drawn) == str(whole)
         assert browser.errors == []
+
+
+#: Tables that are wider than their place, which cuts columns or hides them behind a scroll bar.
+CUT = """[...document.querySelectorAll('.scroll, .numbers')].filter((place) =>
+  !place.clientWidth || place.scrollWidth > place.clientWidth || place.innerText.length < 20
+).map((place) => place.getAttribute('aria-label'))"""
+#: Cells of table 1 whose words are not seen.
+HIDDEN = """[...document.querySelectorAll('.results td, .results tbody th')].filter((cell) => {
+  const box = cell.getBoundingClientRect();
+  return !box.width || box.left < 0 || box.right > innerWidth;
+}).map((cell) => cell.textContent)"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+@pytest.mark.parametrize("over", [ONE, GRID], ids=["two", "sixteen"])
+def test_no_column_is_cut_at_any_width(tmp_path, over):
+    """From a phone to a wide screen, also where returns have seven digits."""
+    directory = make_sweep(tmp_path / "sweep", num_seeds=8, over=over)
+    with np.load(directory / "curves.npz") as archive:
+        arrays = dict(archive)
+    arrays["eval_return"] = -1234.5678 * arrays["eval_return"]
+    np.savez(directory / "curves.npz", **arrays)
+    page = directory / "report.html"
+    report.write([directory], page)
+    with opened_browser() as browser:
+        browser.open(page, width=360)
+        browser.run("document.querySelectorAll('details.data').forEach((x) => { x.open = true })")
+        filled = "[...document.querySelectorAll('.numbers')].every((x) => x.innerText)"
+        browser.wait_for(filled)
+        for width in (360, 390, 480, 640, 768, 831, 832, 833, 900, 1024, 1280, 1920):
+            browser.resize(width)
+            assert browser.run(CUT) == [], width
+            assert browser.run(HIDDEN) == [], width
+            assert browser.run("document.documentElement.scrollWidth") <= width
+        assert browser.errors == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+def test_tables_of_a_figure_are_no_formulas_either(tmp_path):
+    """What the page itself writes when a button is pressed."""
+    runs = [make_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
+    report.write(runs, tmp_path / "page.html")
+    with opened_browser() as browser:
+        browser.open(tmp_path / "page.html")
+        browser.run(
+            "window.saved = []; URL.createObjectURL = (blob) => {"
+            "blob.text().then((text) => saved.push(text)); return '#'; }"
+        )
+        browser.run("document.querySelectorAll('[data-csv]').forEach((x) => x.click())")
+        buttons = browser.run("document.querySelectorAll('[data-csv]').length")
+        browser.wait_for(f"saved.length === {buttons}")
+        texts = browser.run("saved")
+    listed = [
+        cell for text in texts for row in list(csv.reader(text.splitlines()))[1:] for cell in row
+    ]
+    assert {"'=HYPERLINK(1)", "'@SUM(1+1)", "-120.5"} <= set(listed)
+    begun = [text for text in listed if text.startswith(("=", "+", "-", "@", "\t", "\r"))]
+    assert [text for text in begun if not is_number(text)] == []
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")

@@ -14,9 +14,7 @@ from mjx_reinforce.reports.statistics.aggregates import interval, wilson
 from mjx_reinforce.reports.statistics.comparisons import Comparison, compare_all
 from mjx_reinforce.reports.statistics.power import seeds_needed, wrong_winner
 from mjx_reinforce.reports.statistics.survival import (
-    Survival,
     collapses,
-    kaplan_meier,
     median_steps,
     restricted_mean,
     time_to_threshold,
@@ -40,7 +38,6 @@ class Solving(NamedTuple):
     fell: [S] who reached it and was below it at the end
     steps: [S] env steps until the first time, or all of them
     solved: [S] who ever did
-    survival: the share that has not, over env steps
     median, mean: env steps until half of the seeds have; on average, each counted up to the
       shortest training of any seed of the experiment
     """
@@ -51,7 +48,6 @@ class Solving(NamedTuple):
     fell: np.ndarray
     steps: np.ndarray
     solved: np.ndarray
-    survival: Survival
     median: Estimate
     mean: Estimate
 
@@ -182,7 +178,6 @@ def _solving(part: Configuration, experiment: Experiment, until: int) -> Solving
         fell=collapses(returns, threshold),
         steps=steps,
         solved=solved,
-        survival=kaplan_meier(steps, solved),
         median=median_steps(steps, solved),
         mean=restricted_mean(steps, solved, until),
     )

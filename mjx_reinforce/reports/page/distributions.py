@@ -1,4 +1,8 @@
-"""The report's histograms: where all seeds are, at the moments that its slider stops at."""
+"""The report's histograms: where all seeds are, at the moments that its slider stops at.
+
+The last of them is the end: each seed's last evaluation, which tables are of. The grid ends where
+the first seed did, when some may not have solved the task that do.
+"""
 
 import numpy as np
 
@@ -28,15 +32,15 @@ def edges(findings: Findings) -> np.ndarray:
 
 def distributions(findings: Findings) -> dict[str, Table]:
     """Returns the histograms of all configurations at all moments, and what is said of each."""
-    borders = edges(findings)
+    borders, stops = edges(findings), moments(findings)
     bars: Table = {n: [] for n in ("configuration", "moment", "low", "high", "share", "height")}
     said: Table = {n: [] for n in ("configuration", "moment", "said")}
     starts, ends = short(borders[:-1]), short(borders[1:])
     for place, result in enumerate(findings.results):
         end = result.configuration.env_steps[-1].min()
-        for moment, k in enumerate(moments(findings)):
+        for moment, k in enumerate(stops):
             ended = bool(findings.grid[k] > end)
-            values = result.final if ended else result.seeds[k]
+            values = result.final if ended or k == stops[-1] else result.seeds[k]
             finite = np.clip(values[np.isfinite(values)], borders[0], borders[-1])
             counts, _ = np.histogram(finite, borders)
             share, tallest = counts / len(values), max(counts.max(), 1)

@@ -18,8 +18,6 @@ from mjx_reinforce.reports.page.distributions import moments
 from mjx_reinforce.reports.page.figures import SHOWN, Figure
 from mjx_reinforce.reports.page.words import interval, number, percent, steps
 
-#: What tells a page of ours from another file.
-GENERATOR = "mjx_reinforce.report"
 _FILES = resources.files("mjx_reinforce.reports.page") / "files"
 _METHODS = (
     "Configurations are ordered by the mean of their seeds' final returns; where means are equal, "
@@ -91,7 +89,6 @@ def render(
         moments=content["moments"],
         version=version,
         seconds=f"{seconds:.1f} s",
-        generator=GENERATOR,
         light=palette.LIGHT,
         dark=palette.DARK,
         colour=palette.colour,

@@ -117,7 +117,8 @@ def _solved(findings: Findings, place: int) -> list[Figure]:
             caption=(
                 f"The share of seeds that have reached {number(findings.experiment.threshold)} at "
                 "least once, after Kaplan and Meier, with its pointwise 95 % interval. A seed that "
-                "fell back later still counts here; table 1 says how many did."
+                "fell back later still counts here; table 1 says how many did. The curve's last "
+                "point is the end of each seed's training."
             ),
             alt="Share of seeds over env steps, a rising line for each configuration shown.",
             tables=["solved"],
@@ -136,9 +137,10 @@ def _distribution(findings: Findings, place: int) -> list[Figure]:
             number=place,
             title="Where the seeds are",
             caption=(
-                "Histograms of all seeds' returns, read off at the slider's time, or where the "
-                "training had ended before it; the tallest bar of each row has its height, and "
-                "the outermost bars hold what lies beyond them."
+                "Histograms of all seeds' returns, read off at the slider's time; its last place, "
+                "and what had ended before, is each seed's last evaluation, as in table 1. The "
+                "tallest bar of each row has its height, and the outermost bars hold what lies "
+                "beyond them."
             ),
             alt="A histogram of returns for each configuration shown, with its median and worst.",
             tables=["histogram", "moments"],

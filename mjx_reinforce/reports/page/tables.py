@@ -10,6 +10,7 @@ from mjx_reinforce.reports.findings import Findings, Result, swept, values_of
 from mjx_reinforce.reports.page.columns import Table, join, short
 from mjx_reinforce.reports.page.distributions import distributions
 from mjx_reinforce.reports.statistics.profiles import performance_profile
+from mjx_reinforce.reports.statistics.survival import kaplan_meier
 
 #: Points of a curve, at most.
 _POINTS = 80
@@ -87,13 +88,18 @@ def _final(findings: Findings) -> Table:
 
 
 def _solved(findings: Findings) -> Table:
-    """Returns the share of seeds that have solved the task, until the end of the grid."""
+    """Returns the share of seeds that have solved the task, until the first seed's end.
+
+    There all that came until a seed's own end counts, so that the last share is that of the seeds
+    who ever did.
+    """
     table: Table = {n: [] for n in ("configuration", "env_steps", "share", "low", "high")}
     for place, result in enumerate(findings.results):
         if result.solving is None:
             continue
-        curve = result.solving.survival
-        steps = findings.grid[findings.grid <= result.configuration.env_steps[-1].max()]
+        steps = findings.grid[findings.grid <= result.configuration.env_steps[-1].min()]
+        solving = result.solving
+        curve = kaplan_meier(np.minimum(solving.steps, steps[-1]), solving.solved)
         at = np.searchsorted(curve.steps, steps, side="right")
         table["configuration"] += [place] * len(steps)
         table["env_steps"] += short(steps, 7)

@@ -183,7 +183,10 @@
   if (slider) {
     const output = document.getElementById("moment-said");
     const tell = () => {
-      const text = `${moments[Number(slider.value)].toLocaleString("en")} env steps of a seed`;
+      const moment = Number(slider.value);
+      const text = moment === moments.length - 1
+        ? "the end: the last evaluation of each seed, as in table 1"
+        : `${moments[moment].toLocaleString("en")} env steps of a seed`;
       output.textContent = text;
       slider.setAttribute("aria-valuetext", text);
     };
