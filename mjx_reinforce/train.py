@@ -141,6 +141,7 @@ def train(
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
         interrupt.defer(display.say)
         _begin(session, found)
+        session.correction = plan.correction
         display.start(compile_seconds)
         _loop(session, interrupt)
     if not session.saved:

@@ -13,7 +13,7 @@ from toys import Survive
 
 from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
-from mjx_reinforce.runs import measured, memory, plan, ready
+from mjx_reinforce.runs import measured, memory, operations, plan, ready
 from mjx_reinforce.runs.blocks import block_length
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import of_task
@@ -197,6 +197,82 @@ def test_the_time_of_a_run_by_hand():
     assert plan.training_seconds(config, task, speed) == (pytest.approx(4000 / 10 * 0.02), True)
 
 
+def test_the_operations_of_networks_by_hand():
+    """A policy of 1,282 parameters, a value network of 97: 5 to 16, 16 to 1, with biases."""
+    task, plain = Task(4, 1, 50, 1.0, 0.0), Config(estimator="reward-to-go")
+    assert operations.per_step(plain, task) == 10 * 1282
+    value = dataclasses.replace(
+        plain, estimator="value-baseline", value_hidden_sizes=(16,), value_fits=3
+    )
+    assert operations.per_step(value, task) == 10 * 1282 + (2 + 6 * 3) * 97
+    # 50 minibatches of 128 are 8 times the 16 * 50 steps of a rollout.
+    drawn = dataclasses.replace(plain, update="minibatches")
+    assert operations.per_step(drawn, task) == (4 + 6 * 8) * 1282
+    assert operations.per_step(dataclasses.replace(value, algorithm="ars"), task) == 2 * 1282
+
+
+#: Env steps of all seeds, and the processor's time that training and evaluating them took (s), on
+#: 2026-11-24, beside other programs.
+TRAINED = [
+    ("ContinuousCartPole-v0", 32, {}, 383_715, 0.21),
+    ("ContinuousCartPole-v0", 32, {"value_hidden_sizes": (16,)}, 372_424, 0.48),
+    ("ContinuousCartPole-v0", 32, {"value_fits": 10}, 377_492, 2.99),
+    ("ContinuousCartPole-v0", 32, {"value_fits": 40}, 126_694, 4.71),
+    ("ContinuousCartPole-v0", 16, {"value_hidden_sizes": (256, 256)}, 62_554, 4.56),
+    ("ContinuousCartPole-v0", 32, {"hidden_sizes": (128, 128)}, 379_775, 2.10),
+    ("ContinuousCartPole-v0", 32, {"update": "minibatches"}, 241_520, 0.93),
+    ("ContinuousCartPole-v0", 32, {"update": "each-step"}, 156_543, 0.24),
+    ("InvertedPendulum-v5", 16, {"hidden_sizes": (32, 32)}, 467_649, 0.82),
+    ("InvertedPendulum-v5", 16, {"value_fits": 10}, 603_998, 9.32),
+    ("Swimmer-v5", 4, {"value_fits": 10}, 160_000, 1.23),
+]
+
+
+@pytest.mark.parametrize(("env", "seeds", "settings", "steps", "seconds"), TRAINED)
+def test_estimates_are_good_to_a_factor_of_three(env, seeds, settings, steps, seconds):
+    if any(name.startswith("value") for name in settings):
+        settings = settings | {"estimator": "value-baseline"}
+    config = dataclasses.replace(of_task(env), num_seeds=seeds, **settings)
+    config = dataclasses.replace(config, env_steps=steps // seeds)
+    machine = plan.Machine("two cores", measured.CPU, 1.0, 1e10, shared=True)
+    task, speed = measured.TASKS[env], measured.CPU[env]
+    said, bounded = plan.run_seconds(config, task, machine, speed)
+    assert not bounded
+    assert seconds / 2 / 3 < said < seconds / 2 * 3
+
+
+def test_a_wrong_estimate_is_corrected_once_it_shows():
+    made = plan.Plan("", 8.0, 10.0, bounded=False)
+    said = "training takes about 2 min in all, not about 10 s as was said"
+    assert made.correction(120.0) == said
+    assert made.correction(29.0) is None  # less than three times as long
+    assert made.correction(float("nan")) is None
+    assert plan.Plan("", 8.0, 1.0).correction(9.0) is None  # nobody waits for 8 s
+    slow = plan.Plan("", 8.0, 600.0)
+    assert slow.correction(60.0) == "training takes about 60 s in all, not about 10 min as was said"
+    assert slow._replace(bounded=True).correction(60.0) is None  # it said "at most"
+    assert slow._replace(bounded=True).correction(6000.0) is not None
+    assert plan.Plan("", None).correction(1e9) is None
+
+
+def test_a_run_says_once_that_it_takes_another_time(run, monkeypatch, capsys):
+    plans = lambda ready, config: plan.Plan("a plan", 8.0, 1e5)  # noqa: E731
+    monkeypatch.setattr(train_module, "make_plan", plans)
+    assert run("--max-updates", "30", "--output", "out", "--hidden-sizes") == 0
+    lines = capsys.readouterr().out.splitlines()
+    corrected = [n for n, line in enumerate(lines) if "in all, not about 28 h as was said" in line]
+    assert len(corrected) == 1
+    assert lines[corrected[0] - 1].startswith("update    15")  # after three blocks of five
+
+
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [(2e5, "1 MB"), (2.64e7, "26 MB"), (1e8, "0.1 GB"), (5e8, "0.5 GB"), (1.23e10, "12 GB")],
+)
+def test_memory_is_never_nothing(size, said):
+    assert memory.gigabytes(size) == said
+
+
 @pytest.mark.parametrize(
     ("seconds", "said"),
     [
@@ -219,7 +295,7 @@ def test_a_plan_says_what_is_known(monkeypatch, engine):
     monkeypatch.setitem(measured.TASKS, "Survive-v0", Task(1, 1, 20, 0.5, 5e8))
     config = Config(env="Survive-v0", env_steps=1600, engine=engine)
     env = Survive()
-    text, compiling = plan.make_plan(ready.made(env, config), config)
+    text, compiling, *_ = plan.make_plan(ready.made(env, config), config)
     assert text.startswith("Training 4 seeds of Survive-v0 by reinforce, 1,600 env steps each, on")
     assert "on 3 mills, with the engine" in text
     assert "0.5 GB of memory" in text

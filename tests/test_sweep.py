@@ -1,6 +1,7 @@
 """Sweeps: the runs of ``train``, whatever is beside them, wherever they are, however they stop."""
 
 import csv
+import dataclasses
 import json
 import os
 import socket
@@ -16,7 +17,9 @@ from toys import Drift
 from mjx_reinforce import envs
 from mjx_reinforce import sweep as sweep_module
 from mjx_reinforce import train as train_module
+from mjx_reinforce.runs import plan as runs_plan
 from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.sweeps import chunks, conduct, perform, plan, programs, rungs, search
 from mjx_reinforce.sweeps.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.groups import make_groups
@@ -125,6 +128,45 @@ def test_the_files_say_what_was_measured(run):
         "learning_rate": 3e-2,
     }
     assert len(said["chunk_runs"]) == 2  # two networks, two programs
+
+
+def test_a_sweep_whose_estimate_is_wrong_says_so_after_a_group(run, monkeypatch, capsys):
+    """Once: after the last group nothing is left to be estimated."""
+    monkeypatch.setattr(conduct, "group_seconds", lambda *arguments: 1e5)
+    command = f"{SMALL} --num-seeds 2 --max-updates 7 --over hidden-sizes none 3,3"
+    assert run(f"{command} --output swept") == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "as was said" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("2 runs took ")
+    assert ", not about 28 h as was said: the rest takes about " in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "configurations", "part"),
+    [
+        ("grid", 8, 1.0),
+        ("random", 8, 9 / 8),
+        # An eighth of the budget for 8, half of 1/4, 1/2 and 1 for 4, 2 and 1, and all for fresh.
+        ("halving", 8, (8 / 8 + 4 / 8 + 2 / 4 + 1 / 2 + 1) / 8),
+        ("halving", 5, (5 / 8 + 3 / 8 + 2 / 4 + 1 / 2 + 1) / 5),
+    ],
+)
+def test_the_time_of_a_search_is_that_of_what_it_trains(kind, configurations, part):
+    assert rungs.part_trained(kind, configurations) == pytest.approx(part)
+
+
+def test_a_sweeps_plan_counts_value_networks(monkeypatch):
+    """Six configurations of 128 seeds: announced with 27 s, it was not done in 11 minutes."""
+    monkeypatch.setattr(runs_plan, "num_cores", lambda: 2)
+    env, base = envs.make("CartPole-v1"), of_task("CartPole-v1")
+    base = dataclasses.replace(base, num_seeds=128)
+    said = {}
+    for estimator in ("leave-one-out", "value-baseline"):
+        group = make_groups([dataclasses.replace(base, estimator=estimator)] * 2, (), exact=False)
+        said[estimator] = plan.group_seconds(env, 500, "native", group[0], 1)
+    assert 10 < said["leave-one-out"] < 60
+    assert 200 < said["value-baseline"] < 1800
+    assert plan.group_seconds(env, 500, "vmap", group[0], 1) is None
 
 
 def test_chunks_change_nothing_but_rounding(run):

@@ -5,12 +5,15 @@ evaluating, on 2026-11-22, and of InvertedPendulum on a CPU with its default set
 and a linear policy, on 2026-11-23; all figures are good to a factor of two.
 
 - CPU: two cores of a shared machine on which nothing else ran, twenty updates of each task; the
-  Humanoids' rates are those of rollouts, halved.
+  Humanoids' rates are those of rollouts, halved. The operations of larger networks and of value
+  networks are from ContinuousCartPole, InvertedPendulum and Swimmer on 2026-11-24, by the time of
+  the processor: 3e10 to 6e10 a second and core.
 - GPU: an H200. Compiling depends on the host: two of its threads took twice as long as stands here,
   16 quiet ones half as long. The rates of many episodes are those of ``docs/benchmarks.md``, halved
   where there are no contacts, since training takes as long as playing there. For tasks with
   contacts the latency is the time that one env step of as many episodes took as were measured, and
-  compiling is that of a rollout, while 16 other programs compiled, and 10 s.
+  compiling is that of a rollout, while 16 other programs compiled, and 10 s. The operations of
+  networks were not measured: they are taken to be a tenth of what the card can do.
 """
 
 from typing import NamedTuple
@@ -74,6 +77,9 @@ _PENDULUM_CPU = Speed("native", 8, 1.5e-6, 8e6)
 _PENDULUM_GPU = Speed("native", 12, 2.2e-5, 1.2e9)
 _CART_CPU = Speed("native", 9, 2e-5, 4e6)
 _CART_GPU = Speed("native", 12, 2.1e-5, 1e9)
+
+#: Floating-point operations a second of networks that learn: on two CPU cores, and on one H200.
+CPU_OPERATIONS, GPU_OPERATIONS = 6e10, 5e12
 
 #: On two CPU cores.
 CPU = {

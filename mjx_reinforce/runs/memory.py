@@ -63,7 +63,7 @@ def parts(config: Config, task: Task) -> list[Part]:
     policies = seeds if follows else seeds * 2 * config.num_directions
     network = _ACTIVATIONS * held + _PARAMETERS * policies * num_parameters(config, task)
     critic = config.value_hidden_sizes if config.estimator == "value-baseline" else ()
-    critics = _CRITIC_PARAMETERS * seeds * _weights([task.observation, *critic, 1]) if critic else 0
+    critics = _CRITIC_PARAMETERS * seeds * critic_parameters(config, task)
     widest = max([values, *config.hidden_sizes])
     drawn = seeds * config.minibatch_size if config.update == "minibatches" else 0
     return [
@@ -82,6 +82,13 @@ def parts(config: Config, task: Task) -> list[Part]:
 def num_parameters(config: Config, task: Task) -> int:
     """Returns how many parameters the policy has, about: mean and std have outputs of their own."""
     return _weights([task.observation, *config.hidden_sizes, 2 * task.action])
+
+
+def critic_parameters(config: Config, task: Task) -> int:
+    """Returns how many parameters the value network has, 0 where there is none."""
+    if config.algorithm != "reinforce" or config.estimator != "value-baseline":
+        return 0
+    return _weights([task.observation, *config.value_hidden_sizes, 1])
 
 
 def _weights(widths: Sequence[int]) -> int:
@@ -146,7 +153,9 @@ def num_cores() -> int:
 
 
 def gigabytes(size: float) -> str:
-    """Returns a number of bytes for people."""
+    """Returns a number of bytes for people: in GB, or where that is nearly none, in MB."""
+    if size < 5e7:
+        return f"{max(1, round(size / 1e6))} MB"
     return f"{size / 1e9:,.1f} GB" if size < 1e10 else f"{size / 1e9:,.0f} GB"
 
 

@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from mjx_reinforce.runs import measured
+from mjx_reinforce.runs import measured, operations
 from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.measured import Speed, Task
 from mjx_reinforce.runs.memory import (
     check_fits,
@@ -17,6 +18,9 @@ from mjx_reinforce.runs.memory import (
 
 #: The figures are good to this factor.
 _ACCURACY = 2.0
+#: Once it is seen how long training takes, an estimate is corrected that is wrong by more than this
+#: factor, and by so many seconds.
+_WRONG, _NOTICED = 3.0, 10.0
 #: Networks up to this many parameters are as fast as those that were measured.
 _MEASURED_PARAMETERS = 20_000
 #: CPU cores that make a run faster; it was not tried with more.
@@ -47,10 +51,29 @@ class Plan(NamedTuple):
 
     text: a paragraph for people
     compiling: how long it takes to compile (s), None if that is not known
+    training: how long it trains and evaluates (s), None if that is not known
+    bounded: whether that is at most so long
     """
 
     text: str
     compiling: float | None
+    training: float | None = None
+    bounded: bool = False
+
+    def correction(self, seconds: float) -> str | None:
+        """Returns what is said of a training that takes so long in all (s), if the plan is wrong.
+
+        Args:
+          seconds: in all, as the first blocks of updates show; NaN if nobody knows.
+        """
+        if self.training is None or not is_wrong(self.training, seconds):
+            return None
+        if self.bounded and seconds < self.training:
+            return None
+        return (
+            f"training takes about {duration(seconds)} in all, not about "
+            f"{duration(self.training)} as was said"
+        )
 
 
 def make_plan(ready: Any, config: Config) -> Plan:
@@ -70,9 +93,9 @@ def make_plan(ready: Any, config: Config) -> Plan:
     known = num_parameters(config, task) <= _MEASURED_PARAMETERS
     if speed is None or speed.engine != ready.engine or not known:
         time, compiling = "How long this takes here is not known", None
+        seconds, bounded = None, False
     else:
-        seconds, bounded = training_seconds(config, task, speed)
-        seconds /= machine.faster
+        seconds, bounded = run_seconds(config, task, machine, speed)
         compiling = speed.compiling
         time = f"Compiling takes {_range(compiling)}, or much less if this was compiled before; "
         time += f"training {'at most ' + duration(seconds) if bounded else _range(seconds)}"
@@ -83,25 +106,51 @@ def make_plan(ready: Any, config: Config) -> Plan:
         f"Training {_what(config)} on {machine.name}, with the engine {ready.engine}: "
         f"{ready.why}. {time}. It needs about {memory} of memory."
     )
-    return Plan(text, compiling)
+    return Plan(text, compiling, seconds, bounded)
+
+
+def is_wrong(said: float, taken: float) -> bool:
+    """Returns whether an estimate (s) is so wrong that it is corrected; a NaN corrects nothing."""
+    least, most = min(said, taken), max(said, taken)
+    return most > _WRONG * least and most - least > _NOTICED
+
+
+def run_seconds(config: Config, task: Task, machine: Machine, speed: Speed) -> tuple[float, bool]:
+    """Returns how long a run trains and evaluates on a machine (s), and whether at most so long.
+
+    What was measured is the task with its own settings; what other networks do besides is counted.
+    They learn from whole updates, in which short episodes wait for the longest.
+    """
+    seconds, bounded = training_seconds(config, task, speed)
+    own = operations.per_step(of_task(config.env), task)
+    beyond = max(0.0, operations.per_step(config, task) - own)
+    steps = config.num_seeds * _steps(config, task, task.useful)[0]
+    rate = measured.CPU_OPERATIONS if machine.shared else measured.GPU_OPERATIONS
+    return (seconds + steps * beyond / rate) / machine.faster, bounded
 
 
 def training_seconds(config: Config, task: Task, speed: Speed) -> tuple[float, bool]:
-    """Returns how long a run trains and evaluates (s), and whether that is at most so long.
+    """Returns how long the networks that were measured take (s), and whether at most so long."""
+    steps, bounded = _steps(config, task, useful_part(task, speed))
+    episodes = config.episodes_per_update
+    evaluated = 2 * config.eval_episodes / (config.eval_every * episodes)
+    total = config.num_seeds * steps * (1 + evaluated)
+    return speed.seconds(total, config.num_seeds * episodes), bounded
+
+
+def _steps(config: Config, task: Task, useful: float) -> tuple[float, bool]:
+    """Returns the env steps that a seed simulates for training, and whether at most so many.
 
     It is where the number of updates ends the run: nobody knows how long their episodes are.
     """
     horizon = config.horizon or task.horizon
-    episodes = config.episodes_per_update
     bounds = []
     if config.env_steps is not None:
-        bounds.append((config.env_steps / useful_part(task, speed), False))
+        bounds.append((config.env_steps / useful, False))
     if config.max_updates is not None:
-        bounds.append((float(config.max_updates) * episodes * horizon, True))
-    steps, bounded = min(bounds)
-    evaluated = 2 * config.eval_episodes / (config.eval_every * episodes)
-    total = config.num_seeds * steps * (1 + evaluated)
-    return speed.seconds(total, config.num_seeds * episodes), bounded
+        updates = float(config.max_updates)
+        bounds.append((updates * config.episodes_per_update * horizon, True))
+    return min(bounds)
 
 
 def useful_part(task: Task, speed: Speed) -> float:

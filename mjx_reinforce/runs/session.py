@@ -17,6 +17,8 @@ from mjx_reinforce.runs.state import Programs, RunState
 
 #: Between checkpoints, where the user has not said how many updates.
 _CHECKPOINT_SECONDS = 60.0
+#: After so many blocks of updates the time that is left can be trusted.
+_FIRST_BLOCKS = 3
 
 
 class Session:
@@ -56,6 +58,8 @@ class Session:
         #: Whether the newest checkpoint is of the present state.
         self.saved = False
         self._failing: set[str] = set()
+        #: What is said of the time that training takes in all (s), if anything is; see ``plan``.
+        self.correction: Callable[[float], str | None] = lambda seconds: None
         #: Where rows go besides metrics.csv.
         self.sinks: list[Queue] = []
 
@@ -86,7 +90,16 @@ class Session:
         self._attempt("metrics.csv", lambda: self.log.add_rows(rows))
         for sink in self.sinks:
             self._attempt(sink.name, functools.partial(sink.write, rows))
-        self.display.show_progress(self.record.progress())
+        progress = self.record.progress()
+        self.display.show_progress(progress)
+        if progress.updates >= _FIRST_BLOCKS * self.config.eval_every:
+            self._look_at_time(progress.seconds_left)
+
+    def _look_at_time(self, left: float) -> None:
+        """Says, once, if training takes quite another time than was said."""
+        if said := self.correction(self.record.seconds + left):
+            self.display.say(said, "yellow")
+            self.correction = lambda seconds: None
 
     def save_if_due(self) -> None:
         """Saves a checkpoint once there were enough updates, or about a minute, since the last."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from mjx_reinforce.runs.config import MAX_COUNT
 from mjx_reinforce.runs.interrupt import Interrupt
+from mjx_reinforce.runs.plan import duration, is_wrong
 from mjx_reinforce.runs.progress import Progress
 from mjx_reinforce.sweeps import carry, chunks, rungs
 from mjx_reinforce.sweeps.ahead import Clock, one_ahead
@@ -17,12 +18,15 @@ from mjx_reinforce.sweeps.chunks import Runs, Saver
 from mjx_reinforce.sweeps.design import Design
 from mjx_reinforce.sweeps.groups import Group, learner_builder
 from mjx_reinforce.sweeps.history import History
-from mjx_reinforce.sweeps.plan import Part, divide
+from mjx_reinforce.sweeps.plan import Part, divide, group_seconds
 from mjx_reinforce.sweeps.prepare import Prepared
 from mjx_reinforce.sweeps.processes import Processes
 from mjx_reinforce.sweeps.programs import Programs, compile_programs, shape_of_states
 from mjx_reinforce.sweeps.results import SweepFiles
 from mjx_reinforce.sweeps.rungs import Rung
+
+#: More than this of a sweep is all of it, but for rounding.
+_ALL = 1 - 1e-6
 
 
 class Stage(NamedTuple):
@@ -36,6 +40,11 @@ class Stage(NamedTuple):
     number: int
     group: Group
     chunks: list[Runs]
+
+    @property
+    def num_runs(self) -> int:
+        """How many runs there are in its chunks."""
+        return sum(len(runs.seed) for runs in self.chunks)
 
     def of(self, runs: Sequence[Runs]) -> "Stage":
         """Returns the stage with some of its chunks."""
@@ -72,7 +81,7 @@ class Conductor:
         self._interrupt = interrupt
         self._ready: Callable[[float], None] | None = ready
         self._num_rungs = rungs.count(design.search, len(prepared.configurations))
-        self._rungs_done = self._total = self._done = 0
+        self._rungs_done, self._total, self._done = 0, 0.0, 0.0
         self._before: list[Stage] = []
         self._compiled: dict[int, Programs] = {}
         self.clock = Clock()
@@ -97,8 +106,10 @@ class Conductor:
         """Trains the chunks of a rung that are this process's; returns whether they ended."""
         every = self._stages(rung)
         stages = self._left(every)
-        self._total = sum(len(runs.seed) for stage in stages for runs in stage.chunks)
-        self._done = 0
+        said = {stage.number: self._seconds(rung, stage) for stage in stages}
+        each = {number: 1.0 if seconds is None else seconds for number, seconds in said.items()}
+        self._total = sum(each[stage.number] * stage.num_runs for stage in stages)
+        self._done = 0.0
         programs = one_ahead([functools.partial(self._compile, stage) for stage in stages])
         for stage in stages:
             began = time.perf_counter()
@@ -106,17 +117,43 @@ class Conductor:
             seconds = time.perf_counter() - began
             self.clock.compiling += seconds
             self._begin_files(seconds)
+            before = self.clock.running
             for runs in stage.chunks:
                 began, waited = time.perf_counter(), self.clock.compiling
-                ended = self._train(rung, stage, compiled, runs)
+                ended = self._train(rung, stage, compiled, runs, each[stage.number])
                 waited = self.clock.compiling - waited
                 self.clock.running += time.perf_counter() - began - waited
                 if not ended:
                     return False
-                self._done += len(runs.seed)
+                self._done += each[stage.number] * len(runs.seed)
+            self._correct(said[stage.number], stage.num_runs, self.clock.running - before)
         self._begin_files(0.0)  # where this process had nothing to do
         self._before = every
         return True
+
+    def _seconds(self, rung: Rung, stage: Stage) -> float | None:
+        """Returns about how long a run of a stage takes (s), None where that is not known."""
+        prepared, group = self._prepared, stage.group
+        seconds = group_seconds(
+            prepared.env, prepared.horizon, prepared.engine, group, prepared.devices.count
+        )
+        runs = len(group.members) * group.config.num_seeds
+        return None if seconds is None else rung.added * seconds / runs
+
+    def _correct(self, said: float | None, num_runs: int, took: float) -> None:
+        """Says what the rest takes, if the runs that ended took quite another time than was said.
+
+        A sweep that goes on may have trained a part of them before.
+        """
+        done, resumed = self._part_done(), self._design.resume is not None
+        if said is None or resumed or done > _ALL or not is_wrong(said * num_runs, took):
+            return
+        left = duration(self.clock.running * (1 - done) / done)
+        self._display.say(
+            f"{num_runs:,} runs took {duration(took)}, not about {duration(said * num_runs)} as "
+            f"was said: the rest takes about {left}",
+            "yellow",
+        )
 
     def _stages(self, rung: Rung) -> list[Stage]:
         """Returns all runs of a rung."""
@@ -160,8 +197,11 @@ class Conductor:
             self._compiled[stage.number] = programs
         return self._compiled[stage.number].of(stage.group.config)
 
-    def _train(self, rung: Rung, stage: Stage, programs: Programs, runs: Runs) -> bool:
-        """Trains a chunk, from its last checkpoint if there is one; returns whether it ended."""
+    def _train(self, rung: Rung, stage: Stage, programs: Programs, runs: Runs, each: float) -> bool:
+        """Trains a chunk, from its last checkpoint if there is one; returns whether it ended.
+
+        ``each`` is what a run of it takes, as ``_part_done`` counts.
+        """
         config = dataclasses.replace(stage.group.config, num_seeds=len(runs.seed))
         history, layout = History(config), programs.layout
         saver = Saver(self._files.checkpoints(runs.name), config, layout)
@@ -171,7 +211,7 @@ class Conductor:
             states = self._begin(rung, stage, programs, runs, history)
 
         def after() -> bool:
-            self._display.show_progress(self._progress(history))
+            self._display.show_progress(self._progress(history, each))
             if self._interrupt is not None and self._interrupt.number is not None:
                 saver.save(states, history)
                 return False
@@ -204,14 +244,22 @@ class Conductor:
         history.now["env_steps"] = np.asarray(states.env_steps, np.int64)
         return programs.layout.rows(states)
 
-    def _progress(self, history: History) -> Progress:
-        """Returns how far the chunk is, but for the whole sweep where that differs.
+    def _part_done(self, more: float = 0.0) -> float:
+        """Returns the part of the whole sweep that is done.
 
-        That counts the budgets of all runs: those that lie aside cost nothing.
+        It counts the budgets of all runs by the time that they were said to take, or alike where
+        that is not known: those that lie aside cost nothing.
+
+        Args:
+          more: what of the present chunk is done.
         """
+        rung = (self._done + more) / self._total if self._total else 0.0
+        return (self._rungs_done + rung) / self._num_rungs
+
+    def _progress(self, history: History, each: float) -> Progress:
+        """Returns how far the chunk is, but for the whole sweep where that differs."""
         now = history.progress()
-        rung = (self._done + now.num_seeds * now.fraction) / self._total
-        done = (self._rungs_done + rung) / self._num_rungs
+        done = self._part_done(each * now.num_seeds * now.fraction)
         passed = self.clock.running + history.seconds
         left = passed * (1 - done) / done if done > 0 else float("nan")
         return now._replace(fraction=done, seconds_left=left)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from mjx_reinforce.runs.build import policy_settings
 from mjx_reinforce.runs.memory import gigabytes, needed, num_cores
-from mjx_reinforce.runs.plan import Machine, duration, task_of, this_machine, training_seconds
+from mjx_reinforce.runs.plan import duration, run_seconds, task_of, this_machine
 from mjx_reinforce.sweeps.groups import Group
 
 #: Chunks take up to this part of the memory that is there.
@@ -90,6 +90,7 @@ def describe(
     groups: Sequence[Group],
     parts: Sequence[Part],
     num_devices: int,
+    part_trained: float,
 ) -> str:
     """Returns a paragraph on what a sweep will do.
 
@@ -100,6 +101,7 @@ def describe(
       groups: of configurations.
       parts: how the runs of each are divided.
       num_devices: on which they are.
+      part_trained: of the budgets of all runs, see ``rungs.part_trained``.
     """
     first, machine = groups[0].config, this_machine()
     configurations = sum(len(group.members) for group in groups)
@@ -121,7 +123,7 @@ def describe(
         f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
         f"of {first.env}, on {where}, with the engine {learners[0].engine.name}: "
         f"{_count(len(groups), 'compiled program')}, {_count(chunks, 'chunk')} of up to {side:,} "
-        f"runs. {_time(env, horizon, learners, groups, machine, num_devices)}. "
+        f"runs. {_time(env, horizon, learners, groups, num_devices, part_trained)}. "
         f"It needs about {gigabytes(memory)} of memory beside the programs."
     )
 
@@ -131,22 +133,40 @@ def _time(
     horizon: int,
     learners: Sequence[Any],
     groups: Sequence[Group],
-    machine: Machine,
     num_devices: int,
+    part_trained: float,
 ) -> str:
     """Returns about how long the training takes, where that is known."""
-    speed = machine.speeds.get(groups[0].config.env)
-    if speed is None or any(learner.engine.name != speed.engine for learner in learners):
-        return "How long this takes here is not known"
     total = 0.0
-    for group in groups:
-        num_seeds = len(group.members) * group.config.num_seeds
-        config = dataclasses.replace(group.config, num_seeds=num_seeds)
-        task = task_of(policy_settings(env, config), horizon, config)
-        total += training_seconds(config, task, speed)[0]
-    faster = machine.faster * (1 if machine.shared else num_devices)
-    compiling = duration(speed.compiling)
-    return f"Compiling takes about {compiling} each, training about {duration(total / faster)}"
+    for learner, group in zip(learners, groups, strict=True):
+        seconds = group_seconds(env, horizon, learner.engine.name, group, num_devices)
+        if seconds is None:
+            return "How long this takes here is not known"
+        total += part_trained * seconds
+    compiling = duration(this_machine().speeds[groups[0].config.env].compiling)
+    return f"Compiling takes about {compiling} each, training about {duration(total)}"
+
+
+def group_seconds(
+    env: Any, horizon: int, engine: str, group: Group, num_devices: int
+) -> float | None:
+    """Returns about how long all runs of a group train (s), None where that is not known.
+
+    Args:
+      env: what is trained on.
+      horizon: the time limit of an episode in steps.
+      engine: the name of what plays.
+      group: of configurations, with their budget.
+      num_devices: on which they are.
+    """
+    machine, num_seeds = this_machine(), len(group.members) * group.config.num_seeds
+    config = dataclasses.replace(group.config, num_seeds=num_seeds)
+    speed = machine.speeds.get(config.env)
+    if speed is None or engine != speed.engine:
+        return None
+    task = task_of(policy_settings(env, config), horizon, config)
+    seconds, _ = run_seconds(config, task, machine, speed)
+    return seconds / (1 if machine.shared else num_devices)
 
 
 def _count(number: int, noun: str) -> str:

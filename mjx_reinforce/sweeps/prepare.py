@@ -10,6 +10,7 @@ from mjx_reinforce.sweeps.devices import Devices
 from mjx_reinforce.sweeps.grid import configure
 from mjx_reinforce.sweeps.groups import Group, make_groups
 from mjx_reinforce.sweeps.plan import chunk_limit, describe, divide
+from mjx_reinforce.sweeps.rungs import part_trained
 
 
 class Prepared(NamedTuple):
@@ -64,6 +65,7 @@ def prepare(design: Design, limits: Sequence[int] | None, num_processes: int) ->
         for group, limit in zip(groups, limits, strict=True)
     ]
     learners = [learner for learner, _ in built]
-    plan = describe(env, horizon, learners, groups, parts, devices.count)
+    trained = part_trained(design.search, len(configurations))
+    plan = describe(env, horizon, learners, groups, parts, devices.count, trained)
     engine = learners[0].engine.name, sum(learner.engine.seconds for learner in learners)
     return Prepared(env, horizon, devices, configurations, groups, list(limits), *engine, plan)

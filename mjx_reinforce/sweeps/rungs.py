@@ -18,6 +18,8 @@ from mjx_reinforce.sweeps.groups import Group
 
 Arrays = dict[str, np.ndarray]
 
+#: The part of a rung's budget that runs which go on have not used before.
+_ADDED = 0.5
 #: The name of the rung of fresh seeds.
 FRESH = "fresh"
 
@@ -37,6 +39,11 @@ class Rung(NamedTuple):
         """The rung at whose end the runs go on, or None where they begin."""
         return str(int(self.name) - 1) if self.name not in ("0", FRESH) else None
 
+    @property
+    def added(self) -> float:
+        """The part of its budget for which the runs are trained."""
+        return 1.0 if self.before is None else _ADDED
+
 
 def _num_halvings(search: str, configurations: int) -> int:
     """Returns how often the configurations are halved: until one is left, or never."""
@@ -46,6 +53,16 @@ def _num_halvings(search: str, configurations: int) -> int:
 def count(search: str, configurations: int) -> int:
     """Returns how many rungs a sweep has."""
     return 1 + _num_halvings(search, configurations) + (search != "grid")
+
+
+def part_trained(search: str, configurations: int) -> float:
+    """Returns how many env steps a search trains, as a part of what training all of them takes."""
+    halvings = _num_halvings(search, configurations)
+    kept, steps = configurations, configurations / 2**halvings
+    for number in range(1, halvings + 1):
+        kept = -(-kept // 2)
+        steps += kept * _ADDED * 2 ** (number - halvings)
+    return (steps + (search != "grid")) / configurations
 
 
 def schedule(

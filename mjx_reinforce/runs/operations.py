@@ -1,0 +1,33 @@
+"""The floating-point operations of a run's networks, for an estimate of its time.
+
+A layer takes two for each of its weights forwards, and four backwards.
+"""
+
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.measured import Task
+from mjx_reinforce.runs.memory import critic_parameters, num_parameters
+
+_FORWARDS, _BACKWARDS = 2, 4
+
+
+def per_step(config: Config, task: Task) -> float:
+    """Returns the operations for each env step that a run plays and trains on.
+
+    The policy plays and measures how far it moved, and learns from each step once, or from what
+    minibatches draw. The value network gives each step its value, and is fitted ``value_fits``
+    times.
+
+    Args:
+      config: the settings.
+      task: the sizes of the task; ``config.horizon`` goes over its time limit.
+    """
+    policy = num_parameters(config, task)
+    if config.algorithm == "ars":
+        return _FORWARDS * policy
+    learned = 1.0
+    if config.update == "minibatches":
+        steps = config.num_episodes * (config.horizon or task.horizon)
+        learned = config.minibatch_updates * config.minibatch_size / steps
+    once = _FORWARDS + _BACKWARDS
+    value = critic_parameters(config, task) * (_FORWARDS + once * config.value_fits)
+    return (2 * _FORWARDS + once * learned) * policy + value
