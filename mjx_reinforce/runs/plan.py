@@ -70,10 +70,8 @@ class Plan(NamedTuple):
             return None
         if self.bounded and seconds < self.training:
             return None
-        return (
-            f"training takes about {duration(seconds)} in all, not about "
-            f"{duration(self.training)} as was said"
-        )
+        said = _training(self.training, self.bounded)
+        return f"training takes about {duration(seconds)} in all, not {said} as was said"
 
 
 def make_plan(ready: Any, config: Config) -> Plan:
@@ -98,7 +96,7 @@ def make_plan(ready: Any, config: Config) -> Plan:
         seconds, bounded = run_seconds(config, task, machine, speed)
         compiling = speed.compiling
         time = f"Compiling takes {_range(compiling)}, or much less if this was compiled before; "
-        time += f"training {'at most ' + duration(seconds) if bounded else _range(seconds)}"
+        time += f"training {_training(seconds, bounded)}"
         if not bounded and useful_part(task, speed) < 1:
             time += ", more if some seeds' episodes stay short, since all wait for the last"
     memory = gigabytes(base + needed(config, task))
@@ -178,6 +176,10 @@ def duration(seconds: float) -> str:
         if number < 100 or unit == "h":
             break
     return f"{float(f'{max(number, 1):.2g}'):g} {unit}"
+
+
+def _training(seconds: float, bounded: bool) -> str:
+    return f"at most {duration(seconds)}" if bounded else _range(seconds)
 
 
 def _range(seconds: float) -> str:
