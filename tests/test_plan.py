@@ -259,13 +259,13 @@ def test_a_wrong_estimate_is_corrected_once_it_shows():
 def test_a_run_says_once_that_it_takes_another_time(run, monkeypatch, capsys):
     plans = lambda ready, config: plan.Plan("a plan", 8.0, 1e5)  # noqa: E731
     monkeypatch.setattr(train_module, "make_plan", plans)
-    assert run("--max-updates", "30", "--output", "out", "--hidden-sizes") == 0
+    assert run("--max-updates", "120", "--output", "out", "--hidden-sizes") == 0
     lines = capsys.readouterr().out.splitlines()
     corrected = [
         n for n, line in enumerate(lines) if "in all, not about 14 h to 56 h as was said" in line
     ]
     assert len(corrected) == 1
-    assert lines[corrected[0] - 1].startswith("update    15")  # after three blocks of five
+    assert lines[corrected[0] - 1].startswith("update    15")  # the first with a tenth of 120
 
 
 @pytest.mark.parametrize(

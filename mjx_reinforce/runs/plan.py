@@ -64,7 +64,7 @@ class Plan(NamedTuple):
         """Returns what is said of a training that takes so long in all (s), if the plan is wrong.
 
         Args:
-          seconds: in all, as the first blocks of updates show; NaN if nobody knows.
+          seconds: in all, as its first part shows; NaN if nobody knows.
         """
         if self.training is None or not is_wrong(self.training, seconds):
             return None

@@ -17,8 +17,9 @@ from mjx_reinforce.runs.state import Programs, RunState
 
 #: Between checkpoints, where the user has not said how many updates.
 _CHECKPOINT_SECONDS = 60.0
-#: After so many blocks of updates the time that is left can be trusted.
-_FIRST_BLOCKS = 3
+#: Once so much of the budget is used, the time that is left can be trusted: before, episodes may be
+#: much shorter than later, so that each takes longer for its steps.
+_TRUSTED = 0.1
 
 
 class Session:
@@ -92,7 +93,7 @@ class Session:
             self._attempt(sink.name, functools.partial(sink.write, rows))
         progress = self.record.progress()
         self.display.show_progress(progress)
-        if progress.updates >= _FIRST_BLOCKS * self.config.eval_every:
+        if progress.fraction >= _TRUSTED:
             self._look_at_time(progress.seconds_left)
 
     def _look_at_time(self, left: float) -> None:
