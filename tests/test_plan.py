@@ -265,7 +265,7 @@ def test_a_run_says_once_that_it_takes_another_time(run, monkeypatch, capsys):
         n for n, line in enumerate(lines) if "in all, not about 14 h to 56 h as was said" in line
     ]
     assert len(corrected) == 1
-    assert lines[corrected[0] - 1].startswith("update    15")  # the first with a tenth of 120
+    assert lines[corrected[0] - 1].startswith("update    30")  # a quarter of 120
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from mjx_reinforce.runs.state import Programs, RunState
 _CHECKPOINT_SECONDS = 60.0
 #: Once so much of the budget is used, the time that is left can be trusted: before, episodes may be
 #: much shorter than later, so that each takes longer for its steps.
-_TRUSTED = 0.1
+_TRUSTED = 0.25
 
 
 class Session:
