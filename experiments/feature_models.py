@@ -245,20 +245,20 @@ MODELS = {
     ),
     # Contacts
     "sphere on a plane": _scene('type="sphere"'),
-    "capsule on a plane": _scene('type="capsule" euler="0 80 0"'),
-    "box on a plane": _scene('type="box" euler="3 5 0"'),
-    "cylinder on a plane": _scene('type="cylinder" euler="80 3 0"'),
-    "ellipsoid on a plane": _scene('type="ellipsoid" euler="0 10 0"'),
+    "capsule on a plane": _scene('type="capsule" euler="0 80 0"', pos="0 0 .12"),
+    "box on a plane": _scene('type="box" euler="3 5 0"', pos="0 0 .154"),
+    "cylinder on a plane": _scene('type="cylinder" euler="80 3 0"', pos="0 0 .119"),
+    "ellipsoid on a plane": _scene('type="ellipsoid" euler="0 10 0"', pos="0 0 .138"),
     "mesh on a plane": _scene('type="mesh" mesh="m"', top=_TETRAHEDRON),
     "mesh on a box": _scene(
         'type="mesh" mesh="m"', top=_TETRAHEDRON, floor='type="box" size="2 2 .1" pos="0 0 -.1"'
     ),
     "sphere on a heightfield": _scene(
-        'type="sphere"', top=_HILLS, floor='type="hfield" hfield="h"', pos="0 0 .29"
+        'type="sphere"', top=_HILLS, floor='type="hfield" hfield="h"', pos="0 0 .299"
     ),
     "sphere on a box": _scene('type="sphere"', floor='type="box" size="2 2 .1" pos="0 0 -.1"'),
     "box on a box": _scene(
-        'type="box" euler="3 5 0"', floor='type="box" size="2 2 .1" pos="0 0 -.1"'
+        'type="box" euler="3 5 0"', floor='type="box" size="2 2 .1" pos="0 0 -.1"', pos="0 0 .154"
     ),
     "capsule on a capsule": _scene(
         'type="capsule" euler="0 90 0"',

@@ -1,11 +1,12 @@
 """C MuJoCo's step in MJX, with constraint solvers that do less work for the same answer.
 
-The stages are MJX's own, in MJX's order, but for three:
+The stages are MJX's own, in MJX's order, but for four:
 
 - `constraints` solves for the constraint forces in closed form, or not at all where no constraint
   is active, or with a line search that ends when it is exact.
 - `contacts` finds the contacts of capsules as C MuJoCo 4.0 does; MJX 3.17 departs from it.
 - `runge_kutta` turns free and ball joints as C MuJoCo 4.0 does; MJX 3.17 departs from it.
+- `forward` computes the sensors of accelerations where there are no constraints too; MJX skips them.
 
 Gymnasium runs C MuJoCo, so its answer is the one we want. For a model without such contacts and
 joints, such as InvertedPendulum's, a step equals `mjx.step`.
@@ -57,13 +58,13 @@ def step(
 
 
 def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Computes accelerations; equal to `mjx.forward(model, data)` but for contacts of capsules."""
+    """Computes accelerations as `mjx.forward(model, data)` does, but for what this file lists."""
     data = contacts.fwd_position(model, data)
     data = mjx.sensor_pos(model, data)
     data = mjx.fwd_velocity(model, data)
     data = mjx.sensor_vel(model, data)
     data = mjx.fwd_actuation(model, data)
     data = mjx.fwd_acceleration(model, data)
-    if jax_fields(data).efc_J.size == 0:  # MJX skips the acceleration sensors here too
-        return data.replace(qacc=data.qacc_smooth)
+    if jax_fields(data).efc_J.size == 0:
+        return mjx.sensor_acc(model, data.replace(qacc=data.qacc_smooth))
     return mjx.sensor_acc(model, constraints.solve(model, data))
