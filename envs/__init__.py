@@ -5,14 +5,15 @@ An environment is a ``brax.envs.base.Env`` whose ``reset`` and ``step`` call MJX
 directly. Nothing heavy is imported before ``make``.
 """
 
-import contextlib
-import io
 import re
 from collections.abc import Callable
 from typing import Any
 
 from mjx_reinforce.checks import BadEnvironmentError, check_parts, explain
+from mjx_reinforce.physics.quiet import silence_mjx
 from mjx_reinforce.registry import check_name, load
+
+silence_mjx()  # before any environment imports it
 
 _CART_POLE = "mjx_reinforce.envs.cart_pole:CartPole"
 _PENDULUM = "mjx_reinforce.envs.inverted_pendulum:InvertedPendulum"
@@ -74,9 +75,7 @@ def make(id: str, /, **kwargs: Any) -> Any:
 def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
     """Returns the class or function of an entry of the table, or of "module:Class"."""
     try:
-        # MJX prints two lines when its optional Warp backend is not installed.
-        with contextlib.redirect_stdout(io.StringIO()):
-            build = load(entry)
+        build = load(entry)
     except (Exception, SystemExit) as error:  # an import runs the user's code
         raise ValueError(
             f"cannot import the environment {id!r}: {explain(error)}; write module:Class of a "

@@ -1,33 +1,26 @@
 """What every MuJoCo task shares: the model, the physics of one env step, the state."""
 
 import abc
-import contextlib
 import dataclasses
 import functools
-import io
 from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from brax.envs.base import Env, State
 from flax import struct
+from mujoco import mjx
 
+from mjx_reinforce.envs import models
+from mjx_reinforce.envs.outcomes import check_outcome, check_start
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings, check_positive
 from mjx_reinforce.fused import prune
+from mjx_reinforce.physics import mjx_internals
+from mjx_reinforce.physics import step as physics
+from mjx_reinforce.physics.mjx_internals import Simulation
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Box
-
-# MJX prints two lines when its optional Warp backend is not installed; this
-# package asks for the JAX implementation by name, so they only worry people.
-with contextlib.redirect_stdout(io.StringIO()):
-    from brax.envs.base import Env, State
-    from mujoco import mjx
-
-    from mjx_reinforce.envs import models
-    from mjx_reinforce.envs.outcomes import check_outcome, check_start
-    from mjx_reinforce.physics import mjx_internals
-    from mjx_reinforce.physics import step as physics
-    from mjx_reinforce.physics.mjx_internals import Simulation
 
 SOLVERS = ("exact", "mjx", "fast")
 

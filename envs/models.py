@@ -1,8 +1,6 @@
 """From MJCF to a model that MJX runs, or a clear error."""
 
-import contextlib
 import importlib.resources
-import io
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,14 +13,10 @@ from mujoco import (  # a C extension
     MjSpec,  # pyright: ignore[reportAttributeAccessIssue]
     mjtEnableBit,  # pyright: ignore[reportAttributeAccessIssue]
     mjtIntegrator,  # pyright: ignore[reportAttributeAccessIssue]
+    mjx,
 )
 
 from mjx_reinforce.checks import explain
-
-# MJX prints two lines when its optional Warp backend is not installed; this
-# package asks for the JAX implementation by name, so they only worry people.
-with contextlib.redirect_stdout(io.StringIO()):
-    from mujoco import mjx
 
 #: Everything that MuJoCo carries from a step to the next, by its names in mjData; mjdata.h lists it
 #: as mjtState. Here is what an env step hands to the next.

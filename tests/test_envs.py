@@ -4,6 +4,8 @@ import dataclasses
 import functools
 import importlib.resources
 import inspect
+import subprocess
+import sys
 
 import gymnasium
 import jax
@@ -247,3 +249,32 @@ def test_own_model_by_path(tmp_path):
     (tmp_path / "mine.xml").write_text(asset.read_text())
     mine = envs.make("InvertedPendulum-v5", xml_file=str(tmp_path / "mine.xml"), frame_skip=1)
     assert mine.dt == pytest.approx(0.02)
+
+
+_THREADS = """
+import sys, threading
+from mjx_reinforce import envs
+stdout, seen, ended = sys.stdout, set(), threading.Event()
+def look():
+    while not ended.is_set():
+        seen.add(sys.stdout)
+watcher = threading.Thread(target=look)
+watcher.start()
+names = ["InvertedPendulum-v5", "CartPole-v1", "Reacher-v5"] * 2
+makers = [threading.Thread(target=envs.make, args=(name,)) for name in names]
+for thread in makers:
+    thread.start()
+for thread in makers:
+    thread.join()
+ended.set()
+watcher.join()
+print(seen == {stdout}, sys.stdout is stdout)
+"""
+
+
+def test_threads_that_make_environments_leave_standard_output_alone():
+    """Nor do they print: what MJX says of its Warp backend is not heard."""
+    done = subprocess.run(
+        [sys.executable, "-c", _THREADS], check=True, capture_output=True, text=True, timeout=100
+    )
+    assert done.stdout == "True True\n"
