@@ -636,10 +636,19 @@ def test_a_machine_without_the_chosen_device_is_named(monkeypatch):
         jax_setup.configure_jax()
 
 
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="it needs a JAX without CUDA")
+def test_a_platform_without_its_plugin_is_named():
+    code = "from mjx_reinforce.runs.jax_setup import configure_jax as f\ntry: f()\n"
+    code += "except ValueError as error: print(error)"
+    where = os.environ | {"JAX_PLATFORMS": "cuda"}
+    said = subprocess.run([sys.executable, "-c", code], env=where, capture_output=True, text=True)
+    assert "JAX_PLATFORMS is 'cuda', for which no plugin is installed" in said.stdout
+
+
 @pytest.mark.parametrize("name", jax_setup._REFUSED)
 def test_what_the_commands_cannot_work_with_is_named(name):
     before = jax.config.values[name.lower()]
-    jax.config.update(name.lower(), True)
+    jax.config.update(name.lower(), "disallow" if name == "JAX_TRANSFER_GUARD" else True)
     try:
         with pytest.raises(ValueError, match=f"{name} is set, but .*; unset it"):
             jax_setup.configure_jax()

@@ -228,13 +228,29 @@ def test_a_damaged_program_in_the_cache_of_jax_is_replaced(tmp_path, capsys):
         assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize("where", ["", "native/key.o"])
+def test_a_cache_of_jax_in_which_others_may_write_is_not_used(where, tmp_path, capsys):
+    """What is in it is run."""
+    cache = tmp_path / "cache"
+    (cache / "native").mkdir(parents=True)
+    (cache / "native" / "key.o").touch()
+    (cache / where).chmod(0o777)
+    with cache_of_jax(cache):
+        compile_and_run()
+        assert jax.config.values["jax_compilation_cache_dir"] is None
+    (said,) = capsys.readouterr().err.splitlines()
+    assert f"the cache {cache} is not used (others may write to {cache / where})" in said
+    assert said.endswith("set JAX_COMPILATION_CACHE_DIR to a folder of your own")
+    assert [path.name for path in cache.iterdir()] == ["native"]
+
+
 def test_a_cache_of_jax_that_does_not_work_is_named_once(tmp_path, capsys):
     file = tmp_path / "file"
     file.touch()
     with cache_of_jax(file):
         assert compile_and_run() == compile_and_run()
     (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith(f"warning: the cache {file} does not work (FileExistsError")
+    assert said.startswith(f"warning: the cache {file} is not used (FileExistsError")
 
 
 def test_nothing_is_kept_where_jax_keeps_nothing(monkeypatch):

@@ -203,6 +203,17 @@ def test_a_second_process_compiles_nothing(tmp_path):
     assert stored.read_bytes() == whole
 
 
+@pytest.mark.parametrize("place", ["", "native", "native/OBJECT"])
+def test_code_that_others_may_have_written_is_not_loaded(tmp_path, place):
+    where = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
+    assert run(LOAD, **where) == ["True"]
+    (stored,) = (tmp_path / "native").iterdir()
+    (tmp_path / place.replace("OBJECT", stored.name)).chmod(0o777)
+    assert run(LOAD, **where) == ["True"]
+    stored.chmod(0o600)
+    assert run(LOAD, **where) == ["True" if place in ("", "native") else "False"]
+
+
 @pytest.mark.parametrize("damage", [b"", b"short", bytes(2000)])
 def test_a_damaged_object_is_none(tmp_path, damage):
     objects.write(tmp_path, "key", b"data")

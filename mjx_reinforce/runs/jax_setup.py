@@ -11,11 +11,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from mjx_reinforce.engines.native.ownership import distrust, distrust_contents, make_folder
+
 #: Settings of JAX's that the commands cannot work with, and why.
 _REFUSED = {
     "JAX_ENABLE_X64": "the commands compute in float32",
     "JAX_DISABLE_JIT": "the commands compile before they begin",
+    "JAX_TRANSFER_GUARD": "the commands move numbers between Python and the device",
 }
+#: Values of these with which the commands can work.
+_HARMLESS = (False, None, "allow", "log", "log_explicit")
 #: What JAX says of a program in its cache: what it was doing, the function's name, and the error.
 _CACHE_ERROR = r"Error (reading|writing) persistent compilation cache entry for '([^']+)': (.*)"
 
@@ -32,14 +37,12 @@ def configure_jax() -> None:
     """
     import jax
 
-    for name, what in _REFUSED.items():
-        if jax.config.values[name.lower()]:
-            raise ValueError(f"{name} is set, but {what}; unset it")
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     settings = jax.config.values
-    if settings["jax_compilation_cache_dir"] is None:
-        jax.config.update("jax_compilation_cache_dir", str(Path(cache) / "mjx_reinforce"))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    for name, what in _REFUSED.items():
+        if settings[name.lower()] not in _HARMLESS:
+            raise ValueError(f"{name} is set, but {what}; unset it")
+    if settings["jax_enable_compilation_cache"]:
+        _choose_cache()
     if getattr(warnings.showwarning, "func", None) is not _forget_unreadable:
         warnings.showwarning = functools.partial(_forget_unreadable, warnings.showwarning)
     if settings["jax_default_matmul_precision"] is None:
@@ -48,6 +51,47 @@ def configure_jax() -> None:
         jax.devices()
     except RuntimeError as error:
         raise ValueError(f"JAX cannot compute here: {error}") from error
+    except AssertionError as error:  # JAX knows the platform, but has no plugin for it
+        platforms = settings["jax_platforms"]
+        raise ValueError(
+            f"JAX cannot compute here: JAX_PLATFORMS is {platforms!r}, for which no plugin is "
+            "installed; install JAX for it, such as by pip install 'jax[cuda12]', or unset it"
+        ) from error
+
+
+def _choose_cache() -> None:
+    """Chooses where programs are kept, unless the user did.
+
+    A folder that cannot be used, or in which others may write, keeps none: what is in it is run.
+    """
+    import jax
+    from jax.experimental.compilation_cache import compilation_cache
+
+    variable, chosen = "JAX_COMPILATION_CACHE_DIR", jax.config.values["jax_compilation_cache_dir"]
+    if chosen is None:
+        variable = "XDG_CACHE_HOME"
+        cache = os.environ.get(variable) or os.path.expanduser("~/.cache")
+        chosen = os.path.join(cache, "mjx_reinforce")
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    if chosen and "://" not in chosen and (why := _unusable(Path(chosen))):
+        _warn(
+            f"the cache {chosen} is not used ({why}), so the next start compiles again; set "
+            f"{variable} to a folder of your own"
+        )
+        chosen = None
+        compilation_cache.reset_cache()  # a module of the user's may have used it
+    jax.config.update("jax_compilation_cache_dir", chosen)
+
+
+def _unusable(folder: Path) -> str | None:
+    """Returns why programs cannot be kept in a folder, which is made, None if they can."""
+    if folder.parts[0] == "~":
+        return "there is no home"
+    try:
+        make_folder(folder)
+    except OSError as error:
+        return f"{type(error).__name__}: {error.strerror}"
+    return distrust(folder) or distrust_contents(folder)
 
 
 def _forget_unreadable(

@@ -1,15 +1,21 @@
-"""Compiled objects on disk: written whole or not at all, checked when read, bounded in size."""
+"""Compiled objects on disk: written whole or not at all, checked when read, bounded in size.
+
+They are code: only what nobody but this user and root may have written is read.
+"""
 
 import contextlib
 import functools
 import hashlib
 import os
 import tempfile
+import warnings
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import jax
+
+from mjx_reinforce.engines.native.ownership import distrust, is_trusted, make_folder
 
 #: Where a folder holds more bytes than this, what was used longest ago goes.
 LIMIT = 256 * 2**20
@@ -17,10 +23,13 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 def read(folder: Path, key: str) -> bytes | None:
-    """Returns the object of a key; None if there is none, or it is damaged."""
+    """Returns the object of a key; None if there is none, or it is damaged, or may be another's."""
     path = folder / f"{key}.o"
     try:
-        data = path.read_bytes()
+        with open(path, "rb", opener=_open_no_link) as file:
+            if not is_trusted(os.fstat(file.fileno())):
+                return None
+            data = file.read()
     except OSError:
         return None
     with contextlib.suppress(OSError):  # it can only be read
@@ -32,7 +41,7 @@ def read(folder: Path, key: str) -> bytes | None:
 def write(folder: Path, key: str, data: bytes, limit: int = LIMIT) -> None:
     """Keeps an object and forgets the oldest; a folder that cannot be written keeps nothing."""
     with contextlib.suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
         handle, name = tempfile.mkstemp(dir=folder, suffix=".o")
         try:
             with open(handle, "wb") as file:
@@ -42,6 +51,11 @@ def write(folder: Path, key: str, data: bytes, limit: int = LIMIT) -> None:
             os.unlink(name)
             raise
         _forget(folder, limit)
+
+
+def _open_no_link(path: str, flags: int) -> int:
+    """Opens a file, no link to one."""
+    return os.open(path, flags | getattr(os, "O_NOFOLLOW", 0))
 
 
 def _forget(folder: Path, limit: int) -> None:
@@ -81,8 +95,15 @@ def _files(folder: Any) -> list[Any]:
 
 
 def folder() -> Path | None:
-    """Returns where compiled objects are kept: beside JAX's programs; None if JAX keeps none."""
-    folder = jax.config.values["jax_compilation_cache_dir"]
-    if not folder or "://" in folder or not jax.config.values["jax_enable_compilation_cache"]:
+    """Returns where compiled objects are kept: beside JAX's programs.
+
+    None if JAX keeps none, and where others may write, of which it warns.
+    """
+    chosen = jax.config.values["jax_compilation_cache_dir"]
+    if not chosen or "://" in chosen or not jax.config.values["jax_enable_compilation_cache"]:
         return None
-    return Path(folder) / "native"
+    folder = Path(chosen) / "native"
+    if why := distrust(folder):
+        warnings.warn(f"{why}, so no machine code is kept in {folder}", stacklevel=2)
+        return None
+    return folder
