@@ -8,6 +8,7 @@ import dataclasses
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import typing
@@ -19,6 +20,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rich.table import Table
+from saved_runs import make_run
 from toys import Survive
 
 from mjx_reinforce import ars, envs, reinforce
@@ -54,6 +56,43 @@ def refused(monkeypatch, tmp_path, capsys):
         return printed.err
 
     return run
+
+
+#: Begins a command without root's right to enter every folder.
+AS_A_USER = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] * (os.geteuid() == 0)
+
+
+@pytest.mark.skipif(
+    bool(AS_A_USER) and shutil.which("setpriv") is None, reason="root may enter every folder"
+)
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        ("train --output closed/run", "cannot write to the run directory closed/run (Permission"),
+        ("train --output circle", "directory circle (Too many levels of symbolic links)"),
+        ("train --output circle/run", "directory circle/run (Too many levels of symbolic links)"),
+        ("sweep --over discount 1 0.9 --output closed/run", "closed/run (Permission denied)"),
+        ("train --resume closed/run", "closed/run/config.json (Permission denied)"),
+        ("sweep --resume closed/run", "closed/run/sweep.json (Permission denied)"),
+        ("watch closed/run", "Permission denied"),
+        ("report closed/run", "Permission denied"),
+        ("export closed/run --to numpy", "Permission denied"),
+        ("export run --to numpy --output closed/run.npz", "closed"),
+        ("watch run --output closed/run.gif", "closed"),
+        ("report run --output closed/run.html", "closed"),
+        ("report run --output circle/run.html", "circle"),
+    ],
+)
+def test_folders_that_may_not_be_entered_are_named(tmp_path, command, message):
+    make_run(tmp_path / "run")
+    (tmp_path / "closed").mkdir(0)
+    (tmp_path / "circle").symlink_to("circle")
+    module, *arguments = command.split()
+    python = [*AS_A_USER, sys.executable, "-m", f"mjx_reinforce.{module}"]
+    done = subprocess.run([*python, *arguments], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2, done
+    (said,) = done.stderr.splitlines()
+    assert message in said
 
 
 @pytest.mark.parametrize(

@@ -41,13 +41,13 @@ def prepare(directory: Path, overwrite: bool) -> list[Path]:
       ValueError: it exists and is not empty, is no directory, is in that of another run, or
         cannot be written.
     """
-    if (outer := _run_around(directory)) is not None:
-        raise ValueError(
-            f"the run directory {directory} would be inside the run {outer}; choose another "
-            "--output"
-        )
     made: list[Path] = []
     try:
+        if (outer := _run_around(directory)) is not None:
+            raise ValueError(
+                f"the run directory {directory} would be inside the run {outer}; choose another "
+                "--output"
+            )
         for folder in (*reversed(directory.parents), directory):
             if _make(folder):
                 made.insert(0, folder)
@@ -76,6 +76,7 @@ def _make(folder: Path) -> bool:
         folder.mkdir()
     except FileExistsError:
         if not folder.is_dir():
+            folder.stat()  # says what is wrong with a link
             raise
         return False
     return True
@@ -83,7 +84,7 @@ def _make(folder: Path) -> bool:
 
 def _run_around(directory: Path) -> Path | None:
     """Returns the run or sweep that a directory is in, if any."""
-    for parent in directory.resolve().parents:
+    for parent in Path(os.path.realpath(directory)).parents:
         run = (parent / "config.json").exists() and (parent / "metrics.csv").exists()
         if run or (parent / "sweep.json").exists():
             return parent
