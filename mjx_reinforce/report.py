@@ -22,6 +22,7 @@ from mjx_reinforce.reports.page.vega import ONE, draw
 from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.files import version
 from mjx_reinforce.runs.flags import read
+from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.streams import accept_everything
 
 _PROGRAM = "python -m mjx_reinforce.report"
@@ -155,13 +156,14 @@ def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
     if (directory / "config.json").is_file():
         return Watch(
             f"To watch the worst, seed {seed}:",
-            f"python -m mjx_reinforce.watch {shlex.quote(str(directory))} --seed {seed}",
+            f"python -m mjx_reinforce.watch {shlex.quote(str(directory))} --seed {seed}"
+            + env_flag(experiment.env),
         )
     flags = _flags(experiment.settings | best.configuration.settings)
     return Watch(
         f"A sweep keeps no policies. To watch the worst, seed {seed}, train it again:",
         f"python -m mjx_reinforce.train {flags} --num-seeds {seed + 1} --output again\n"
-        f"python -m mjx_reinforce.watch again --seed {seed}",
+        f"python -m mjx_reinforce.watch again --seed {seed}{env_flag(experiment.env)}",
     )
 
 

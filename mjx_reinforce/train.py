@@ -25,6 +25,7 @@ from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.memory import check_size
+from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.plan import Plan, make_plan
 from mjx_reinforce.runs.sinks.sink import check_installed, open_sinks
 from mjx_reinforce.runs.streams import accept_everything
@@ -75,7 +76,8 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
         refuse(f"this run does not fit into memory ({error}); {remedy}", made)
     except OSError as error:
         begun = (directory / "config.json").exists()
-        remedy = "make room, then " + (f"go on with --resume {directory}" if begun else "try again")
+        again = f"--resume {directory}{env_flag(config.env)}"
+        remedy = "make room, then " + (f"go on with {again}" if begun else "try again")
         refuse(f"cannot write the files of this run ({error}); {remedy}", made, status=1)
 
 

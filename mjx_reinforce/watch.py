@@ -3,6 +3,7 @@
 import dataclasses
 import math
 import os
+import shlex
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -21,6 +22,7 @@ from mjx_reinforce.runs.alarms import silence_alarms
 from mjx_reinforce.runs.flags import read
 from mjx_reinforce.runs.heartbeat import heartbeat
 from mjx_reinforce.runs.jax_setup import configure_jax
+from mjx_reinforce.runs.own_code import check_named
 from mjx_reinforce.runs.streams import accept_everything
 
 #: Frames a second at most: what a film shows, and what GIF viewers play.
@@ -42,6 +44,9 @@ class Settings:
 
     run: tyro.conf.Positional[Path]
     """The run directory that training left."""
+    env: str | None = None
+    """Needed where a run was trained on module:Class, code of your own or of another: that name
+    again, for then it is run."""
     seed: Seed = "best"
     """Which of the run's seeds plays: best, worst or median by its final evaluation, or a number.
     """
@@ -90,6 +95,7 @@ def film(settings: Settings) -> None:
       OSError: a file cannot be read or written.
     """
     run = read_run(settings.run)
+    _check_env(settings, run)
     output = check(settings, choose_seed(run, settings.seed, settings.which))
     import_mujoco()
     configure_jax()
@@ -112,6 +118,14 @@ def film(settings: Settings) -> None:
     frames = track(map(renderer.draw, shown), "drawing", len(shown), transient=True)
     write_film(output, frames, 1 / (env.dt * skip), samples)
     print(f"{len(shown)} frames in {output}")
+
+
+def _check_env(settings: Settings, run: Run) -> None:
+    """Raises ValueError for another environment than the run's, or where one must be named."""
+    if settings.env not in (None, run.env):
+        raise ValueError(f"--env is {settings.env}, but {run.directory} was trained on {run.env}")
+    command = f"python -m mjx_reinforce.watch {shlex.quote(str(run.directory))}"
+    check_named(run.env, settings.env, run.directory, command)
 
 
 def _waiting(what: str) -> AbstractContextManager[Any]:

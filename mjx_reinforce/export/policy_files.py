@@ -95,7 +95,8 @@ def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
         raise ValueError(f"seed {seed} is not among the {num_seeds} of {directory}")
     with _damage_in(actor_path):
         check_finite(arrays, seed)
-    # Files from before there was a checksum have none.
+    # Files from before there was a checksum have none. It finds damage, not ill will: who changes
+    # the files can compute it anew.
     if checksum is not None and checksum != _checksum(settings, arrays):
         raise ValueError(
             f"{settings_path} is damaged, or actor.npz beside it: they do not belong together "

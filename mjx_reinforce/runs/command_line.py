@@ -1,6 +1,7 @@
 """The command line of ``python -m mjx_reinforce.train``: presets, flags, and runs that go on."""
 
 import dataclasses
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -16,6 +17,7 @@ from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import named_task, of_task
 from mjx_reinforce.runs.files import remove_empty
 from mjx_reinforce.runs.flags import read
+from mjx_reinforce.runs.own_code import check_named
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.relevance import check_read
 from mjx_reinforce.runs.settings import GROUPS
@@ -40,8 +42,8 @@ def parse(arguments: Sequence[str]) -> Config:
 
     Raises:
       ValueError: there is no such preset or flag, a value is not of its type, a setting that is
-        given would do nothing, or the run to resume is not there, has other settings, or was
-        stopped.
+        given would do nothing, or the run to resume is not there, has other settings, was stopped,
+        or is of the user's own environment, which is to be named again.
     """
     default, preset, flags, prog = start(arguments, "python -m mjx_reinforce.train")
     config = _read(flags, default, prog)
@@ -55,7 +57,19 @@ def parse(arguments: Sequence[str]) -> Config:
     if resume.is_done(known, asked):
         print(f"{known.resume} is finished; to go on, give a larger --env-steps or --max-updates")
         sys.exit(0)
+    check_resumed(known.env, arguments, config.resume)
     return asked
+
+
+def check_resumed(env: str, arguments: Sequence[str], directory: Path) -> None:
+    """Raises ValueError if going on would run code that the command line does not name.
+
+    Args:
+      env: the environment of what goes on.
+      arguments: the command line.
+      directory: of what goes on.
+    """
+    check_named(env, named_task(arguments), directory, f"--resume {shlex.quote(str(directory))}")
 
 
 def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequence[str], str]:

@@ -19,6 +19,7 @@ from rich.text import Text
 from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.runs import nonfinite, progress
 from mjx_reinforce.runs.heartbeat import heartbeat
+from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.plan import duration
 
 
@@ -170,5 +171,5 @@ def print_summary(console: Console, summary: dict[str, Any], directory: Path) ->
     said = f"Files in {directory}; python -m mjx_reinforce.report {shlex.quote(str(directory))}"
     said += " makes a page of them"
     if summary["status"] == "interrupted":
-        said = f"Interrupted: go on with --resume {directory}"
+        said = f"Interrupted: go on with --resume {directory}{env_flag(summary['env'])}"
     console.print(said, markup=False, highlight=False, soft_wrap=True)

@@ -181,7 +181,8 @@ class CheckpointSettings:
     given. They are written after evaluations."""
     resume: Path | None = None
     """Go on with the run in this directory, with its own settings. Only its budget may change:
-    --env-steps, --max-updates, --stop-when-solved, --checkpoint-every."""
+    --env-steps, --max-updates, --stop-when-solved, --checkpoint-every. A run of your own
+    module:Class needs its --env again."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-from mjx_reinforce.runs.command_line import join_groups, read_groups, start
+from mjx_reinforce.runs.command_line import check_resumed, join_groups, read_groups, start
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.relevance import changed
 from mjx_reinforce.runs.settings import GROUPS
@@ -64,4 +64,5 @@ def _resumed(flags: Sequence[str], directory: Path, prog: str) -> Design:
     base, settings, processes = _read(flags, design.base, prog)
     if dataclasses.replace(base, resume=None) != design.base or settings != SweepSettings():
         raise ValueError(f"the sweep in {directory} goes on as it is: give --resume alone")
+    check_resumed(base.env, flags, directory)
     return dataclasses.replace(design, processes=processes, resume=directory)

@@ -12,6 +12,7 @@ from mjx_reinforce.runs.files import choose_directory, locked, prepare
 from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
+from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.resume import check_same_program
 from mjx_reinforce.sweeps.design import Design, as_record, check_design
 from mjx_reinforce.sweeps.processes import Processes, join_processes
@@ -175,7 +176,7 @@ def _check_same(directory: Path, known: Mapping[str, Any], present: Mapping[str,
 def _ending(directory: Path, contents: Mapping[str, Any]) -> str:
     """Returns the line that ends a sweep."""
     if contents["status"] == "interrupted":
-        return f"interrupted; go on with --resume {directory}"
+        return f"interrupted; go on with --resume {directory}{env_flag(contents['env'])}"
     took = (
         f"compiling took {contents['compile_seconds']:.1f} s, training and evaluating "
         f"{contents['run_seconds']:.1f} s"

@@ -1,0 +1,111 @@
+"""Code that only the files of a run name is not run: the command line names it too, or it stays."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from fake_sweeps import make_sweep
+from saved_runs import change, change_arrays, make_run, write
+
+from mjx_reinforce import load, report, watch
+from mjx_reinforce import sweep as sweep_module
+from mjx_reinforce import train as train_module
+from mjx_reinforce.export import __main__ as export
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.resume import recordable
+from mjx_reinforce.sweeps.design import Design, as_record
+
+ENV = "evil_module:Task"
+MAINS = {
+    "train": train_module.main,
+    "sweep": sweep_module.main,
+    "watch": watch.main,
+    "report": report.main,
+    "export": export.main,
+}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A run and a sweep that name a module, which leaves a file if it is imported."""
+    (tmp_path / "evil_module.py").write_text("open('ran', 'w').close()\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "evil_module", raising=False)
+    make_run(tmp_path / "run")
+    write(tmp_path / "run" / "config.json", recordable(Config(env=ENV, horizon=60)))
+    change(tmp_path / "run" / "summary.json", status="interrupted")
+    change(tmp_path / "run" / "policy" / "policy.json", env=ENV)
+    change_arrays(tmp_path / "run" / "policy" / "actor.npz", checksum=None)
+    rates = {"learning_rate": [1e-3, 3e-3]}
+    make_sweep(tmp_path / "rates", num_seeds=2, over=rates, env=ENV)
+    record = json.loads(json.dumps(as_record(Design(base=Config(env=ENV), over=rates))))
+    change(tmp_path / "rates" / "sweep.json", **record, status="interrupted")
+    return tmp_path
+
+
+@pytest.fixture
+def said(monkeypatch, capsys):
+    """Runs a command line and returns what it said on standard error, and its exit status."""
+
+    def run(command):
+        monkeypatch.setattr(sys, "argv", command.split())
+        status = 0
+        try:
+            MAINS[command.split()[0]]()
+        except SystemExit as stop:
+            status = stop.code
+        return capsys.readouterr().err, status
+
+    return run
+
+
+GOING_ON = {
+    "train --resume run": "--resume run",
+    "train --resume run --max-updates 9": "--resume run",
+    "sweep --resume rates": "--resume rates",
+    "watch run": "python -m mjx_reinforce.watch run",
+}
+
+
+@pytest.mark.parametrize("command", GOING_ON)
+def test_code_that_only_a_file_names_is_not_run(folder, said, command):
+    error, status = said(command)
+    assert status == 2
+    assert not (folder / "ran").exists()
+    assert error.endswith(f"if you trust it, name it: {GOING_ON[command]} --env {ENV}\n")
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("command", GOING_ON)
+def test_code_that_is_named_again_is_run(folder, said, command):
+    error, _ = said(f"{command} --env {ENV}")
+    assert (folder / "ran").exists()
+    assert f"cannot import the environment '{ENV}'" in error
+
+
+@pytest.mark.parametrize("env", ["os:abort", "CartPole-v1"])
+def test_another_environment_than_the_runs_is_refused(folder, said, env):
+    for command in ("train --resume run", "watch run"):
+        error, status = said(f"{command} --env {env}")
+        assert status == 2
+        assert ENV in error
+    assert not (folder / "ran").exists()
+
+
+def test_what_is_no_name_is_not_proposed(folder, said):
+    change(folder / "run" / "config.json", env="x:y; touch ran; echo ")
+    for command in ("train --resume run", "watch run"):
+        assert "is not of the form module:Class" in said(command)[0]
+
+
+@pytest.mark.parametrize("command", ["report rates", "export run --to numpy"])
+def test_reports_and_exports_run_no_code(folder, said, command):
+    assert said(command)[1] == 0
+    assert not (folder / "ran").exists()
+
+
+def test_to_load_a_policy_runs_no_code(folder):
+    assert load(folder / "run").act(np.zeros(4, np.float32)) in (0, 1)
+    assert not (folder / "ran").exists()
