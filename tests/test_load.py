@@ -1,8 +1,10 @@
 """A trained policy in three lines: which seed, which action, and every damage named."""
 
+import io
 import re
 import shutil
 import sys
+import zipfile
 
 import gymnasium
 import jax
@@ -130,6 +132,20 @@ def cut(run):
     path.write_bytes(path.read_bytes()[:1000])
 
 
+def add_array(name, shape, count):
+    """Adds an array of bytes that says its shape, with so many zeros; many are compressed."""
+
+    def add(run):
+        content, said = io.BytesIO(), {"descr": "|i1", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(content, said)
+        content.write(bytes(count))
+        kind = zipfile.ZIP_DEFLATED if count > 1000 else zipfile.ZIP_STORED
+        with zipfile.ZipFile(run / NPZ, "a", kind, compresslevel=1) as archive:
+            archive.writestr(f"{name}.npy", content.getvalue())
+
+    return add
+
+
 JSON, NPZ = "policy/policy.json", "policy/actor.npz"
 #: What is done to a run, the file that the message names, and what it says besides.
 DAMAGE = {
@@ -174,7 +190,7 @@ DAMAGE = {
     "another scaling": (entries(JSON, rescale=False), "policy.json", "checksum"),
     "no arrays": (remove(NPZ), NPZ, "cannot read"),
     "no archive": (content(NPZ, b"PK"), NPZ, "no whole NumPy archive"),
-    "text for arrays": (content(NPZ, b"hello"), NPZ, "contains pickled (object) data)"),
+    "text for arrays": (content(NPZ, b"hello"), NPZ, "no whole NumPy archive"),
     "an empty archive": (content(NPZ, b""), NPZ, "no whole NumPy archive"),
     "half an archive": (cut, NPZ, "no whole NumPy archive"),
     "an array is missing": (arrays(normalizer__m2=None), NPZ, "normalizer/m2 is missing"),
@@ -188,6 +204,9 @@ DAMAGE = {
     "nan": (arrays(**{KERNEL: lambda x: x * np.nan}), NPZ, "of seed 1 has numbers that are not"),
     "other numbers": (arrays(normalizer__mean=lambda x: x + 1), "policy.json", "checksum"),
     "a bit": (flip_a_bit, NPZ, "damaged"),
+    "compressed": (add_array("x", (10**8,), 10**8), NPZ, "'x' is compressed"),
+    "less than it says": (add_array("x", (3 * 10**9,), 1), NPZ, "not as long as it says"),
+    "shapes below zero": (add_array("x", (-1, -100), 100), NPZ, "not as long as it says"),
 }
 
 
@@ -206,6 +225,23 @@ def test_damage_is_named_in_one_line(tmp_path, monkeypatch, capsys, name):
         with pytest.raises(SystemExit, match="2"):
             main()
         assert capsys.readouterr().err == f"error: {said}\n"
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        arrays(x=lambda _: np.ones(3)),
+        arrays(**{KERNEL: lambda x: x[:, :3]}),
+        add_array("x", (10**6,), 10**6),
+    ],
+)
+def test_names_shapes_and_sizes_are_looked_at_before_anything_is_read(
+    tmp_path, monkeypatch, damage
+):
+    damage(make_run(tmp_path))
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("it was read"))
+    with pytest.raises(ValueError, match=r"actor\.npz is damaged"):
+        load(tmp_path)
 
 
 def test_the_damage_of_one_seed_leaves_the_others(tmp_path):

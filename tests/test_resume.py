@@ -134,6 +134,19 @@ def test_a_damaged_checkpoint_costs_an_interval(run, trained, parts, capsys, dam
     assert f"going on after {0 if damage == 'all' else 15} updates" in output
 
 
+def test_a_checkpoint_that_is_compressed_is_none(trained, tmp_path):
+    """A few bytes can ask for gigabytes; whoever writes such a file can name it by its digest."""
+    [*_, newest] = checkpoints(trained)
+    with np.load(newest) as archive:
+        np.savez_compressed(tmp_path / "small.npz", **archive)
+    number, digest = newest.name.split("-")[0], checkpoint._digest
+    packed = (tmp_path / "small.npz").read_bytes()
+    named = (tmp_path / "small.npz").rename(tmp_path / f"{number}-{digest(packed)}.npz")
+    assert checkpoint._read(named) is None
+    assert checkpoint._read(newest) == newest.read_bytes()
+    assert checkpoint.settings_of(tmp_path) == {}
+
+
 def test_a_shortened_table_is_played_again(run, trained, parts, capsys):
     metrics = parts / "metrics.csv"
     metrics.write_bytes(metrics.read_bytes()[:-7])

@@ -156,6 +156,10 @@ def change_arrays(directory, **arrays):
             "curves.npz is damaged: it has no array env_st",
         ),
         (lambda d: change_arrays(d, seed=np.zeros(3)), r"seed has the shape \(3,\), not \(10,\)"),
+        (
+            lambda d: change_arrays(d, more=np.zeros(3)),
+            "curves.npz is damaged: 'more' is not an array of a sweep",
+        ),
         (lambda d: (d / "curves.npz").write_bytes(b"x"), "curves.npz is damaged: it is no whole"),
         (lambda d: change_arrays(d, configuration=np.full(10, 7)), "no row of configuration 7"),
         (damage_json("sweep.json", configurations=[]), "does not name configuration 0"),

@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from mjx_reinforce.export.files import Header
+
 #: No layer, observation or action of a policy has more entries.
 _MAX_SIZE = 2**20
 
@@ -30,11 +32,13 @@ def check_settings(settings: Mapping[str, Any]) -> None:
             raise ValueError(f"action_low has {low} entries, action_high has {high}")
 
 
-def check_arrays(arrays: Mapping[str, np.ndarray], expected: Mapping[str, tuple[int, ...]]) -> int:
+def check_arrays(
+    arrays: Mapping[str, Header | np.ndarray], expected: Mapping[str, tuple[int, ...]]
+) -> int:
     """Checks the names and shapes of ``actor.npz``.
 
     Args:
-      arrays: what the archive holds.
+      arrays: what the archive holds, or says that it does.
       expected: names and shapes of what the policy needs, without the seed axis.
 
     Returns:

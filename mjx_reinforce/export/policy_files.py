@@ -3,7 +3,7 @@
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ import numpy as np
 from flax import serialization, traverse_util
 
 from mjx_reinforce.export.files import (
+    Header,
     finite,
     read_arrays,
     read_json,
@@ -87,10 +88,14 @@ def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
     with _damage_in(settings_path):
         check_settings(settings)
         policy = build_policy(settings)
-    arrays = read_arrays(actor_path)
-    checksum = arrays.pop(_CHECKSUM, None)
-    with _damage_in(actor_path):
-        num_seeds = check_arrays(arrays, _shapes(policy, settings["observation_size"]))
+    shapes = _shapes(policy, settings["observation_size"])
+
+    def check(found: Mapping[str, Header | np.ndarray]) -> int:
+        with _damage_in(actor_path):
+            return check_arrays({k: x for k, x in found.items() if k != _CHECKSUM}, shapes)
+
+    arrays = read_arrays(actor_path, check, stored=True)
+    num_seeds, checksum = check(arrays), arrays.pop(_CHECKSUM, None)
     if seed is not None and not 0 <= seed < num_seeds:
         raise ValueError(f"seed {seed} is not among the {num_seeds} of {directory}")
     with _damage_in(actor_path):

@@ -1,11 +1,12 @@
 """Reading the directory of a sweep."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.export.files import read_arrays, read_json
+from mjx_reinforce.export.files import Header, read_arrays, read_json
 from mjx_reinforce.reports.experiment import Configuration, Source, describe
 from mjx_reinforce.reports.run_source import number, read_columns, timings
 
@@ -66,7 +67,14 @@ def _swept(content: dict[str, Any], path: Path) -> dict[int, dict[str, Any]]:
 
 def _read_curves(path: Path) -> dict[str, np.ndarray]:
     """Returns the arrays of curves.npz."""
-    arrays = read_arrays(path)
+    arrays = read_arrays(path, lambda headers: _check_curves(headers, path))
+    return {name: arrays[name] for name in _ARRAYS}
+
+
+def _check_curves(arrays: Mapping[str, Header], path: Path) -> None:
+    """Raises ValueError for what is not in a curves.npz, or is missing there."""
+    for name in sorted(arrays.keys() - set(_ARRAYS)):
+        raise ValueError(f"{path} is damaged: {name!a} is not an array of a sweep")
     for name in _ARRAYS:
         if name not in arrays:
             raise ValueError(f"{path} is damaged: it has no array {name}")
@@ -81,7 +89,6 @@ def _read_curves(path: Path) -> dict[str, np.ndarray]:
             raise ValueError(
                 f"{path} is damaged: {name} has the shape {arrays[name].shape}, not {wanted}"
             )
-    return {name: arrays[name] for name in _ARRAYS}
 
 
 def _nonfinite(path: Path, curves: dict[str, np.ndarray]) -> np.ndarray:

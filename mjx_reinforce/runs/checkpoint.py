@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mjx_reinforce.export.files import write_bytes
+from mjx_reinforce.export.files import members, write_bytes
 from mjx_reinforce.runs.keys import is_key, plain
 
 Arrays = dict[str, np.ndarray]
@@ -135,7 +135,8 @@ def _read(path: Path) -> bytes | None:
     """Returns the contents of a checkpoint, or None if they are not those that were written."""
     try:
         content = path.read_bytes()
-    except OSError:
+        members(content, stored=True)
+    except Exception:  # OSError, and what ``members`` raises, which has no common class
         return None
     return content if _digest(content) == path.stem.rpartition("-")[2] else None
 

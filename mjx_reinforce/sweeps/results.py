@@ -118,7 +118,7 @@ class SweepFiles:
     def measured(self, rung: str) -> Arrays:
         """Returns what the chunks of a rung measured so far, sorted; empty if nothing."""
         paths = sorted(self.parts.glob(f"{rung}-*.npz"))
-        return join([read_arrays(path) for path in paths]) if paths else {}
+        return join([read_arrays(path, stored=True) for path in paths]) if paths else {}
 
     def _path(self, chunk: str) -> Path:
         return self.parts / f"{chunk}.npz"
