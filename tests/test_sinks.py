@@ -18,6 +18,7 @@ from mjx_reinforce import train as train_module
 from mjx_reinforce.reports.statistics import iqm, iqm_interval
 from mjx_reinforce.runs import files, rows
 from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.sinks import over_seeds, sink, tensorboard
 from mjx_reinforce.runs.sinks.sink import Queue
 
@@ -144,6 +145,19 @@ def test_json_lines_are_the_rows_of_the_table(directory):
     (directory / "metrics.jsonl").write_bytes(written[:100] + b"\n{half a ro")
     sink.open_sinks(Config(jsonl=True), directory, 10)
     assert (directory / "metrics.jsonl").read_bytes() == written
+
+
+@pytest.mark.parametrize("name", ["metrics.jsonl", "wandb/mjx_reinforce.json", "config.json"])
+def test_what_a_kill_left_of_writing_a_file_is_removed(directory, name):
+    """At the next start of the run, or when it goes on."""
+    (directory / "wandb").mkdir()
+    log, part = RunLog(directory), (directory / name).with_name(f".{(directory / name).name}.0a1b")
+    part.touch()
+    log.begin({})
+    assert not part.exists()
+    part.touch()
+    log.resume({}, {}, None)
+    assert not part.exists()
 
 
 def test_tensorboard_has_the_numbers_and_the_histograms(directory):

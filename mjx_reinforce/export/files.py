@@ -5,7 +5,7 @@ import io
 import json
 import math
 import os
-import tempfile
+import secrets
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -28,19 +28,29 @@ class Header(NamedTuple):
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Replaces a file at once: a reader, or a crash, sees the old one or the new one."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    """Replaces a file at once: a reader, a crash or a power cut sees the old one or the new one."""
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:
-        with os.fdopen(handle, "wb") as file:
+        with temporary.open("xb") as file:
             file.write(content)
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
+            file.flush()
+            os.fsync(file.fileno())
         os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(FileNotFoundError):
-            os.unlink(temporary)
+            temporary.unlink()
         raise
+    with contextlib.suppress(OSError):  # not every file system can; the file is whole without it
+        _sync(path.parent)
+
+
+def _sync(folder: Path) -> None:
+    """Waits until the names in a folder are on the disk."""
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def write_json(path: Path, value: Mapping[str, Any]) -> None:
@@ -105,7 +115,7 @@ def read_arrays(
 
 @contextlib.contextmanager
 def _damage_in(path: Path) -> Iterator[None]:
-    """Raises as ValueError what zip and NumPy raise for damaged bytes, which has no common class."""
+    """Raises what zip and NumPy raise, which has no common class, as a ValueError with the name."""
     try:
         yield
     except Exception as error:

@@ -74,8 +74,7 @@ class RunLog:
 
     def _remove_parts(self) -> None:
         """Removes what a crash left of writing files."""
-        for name in _FILES:
-            path = self.directory / name
+        for path in (*(self.directory / name for name in _FILES), *sink.files(self.directory)):
             for part in path.parent.glob(f".{path.name}.*"):
                 part.unlink()
 

@@ -84,13 +84,17 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Que
     return sinks
 
 
+def files(directory: Path) -> list[Path]:
+    """Returns the files that sinks replace at once."""
+    from mjx_reinforce.runs.sinks import json_lines, weights_and_biases
+
+    return [directory / json_lines.NAME, directory / weights_and_biases.NAME]
+
+
 def remove(directory: Path) -> None:
     """Removes what the sinks of an older run left; W&B keeps its runs apart itself."""
-    from mjx_reinforce.runs.sinks import json_lines, tensorboard, weights_and_biases
+    from mjx_reinforce.runs.sinks import tensorboard
 
-    for path in (
-        directory / json_lines.NAME,
-        directory / weights_and_biases.NAME,
-        *(directory / tensorboard.NAME).glob(tensorboard.PATTERN),
-    ):
+    events = (directory / tensorboard.NAME).glob(tensorboard.PATTERN)
+    for path in (*files(directory), *events):
         path.unlink(missing_ok=True)
