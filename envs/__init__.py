@@ -15,6 +15,8 @@ from mjx_reinforce.registry import check_name, load
 
 silence_mjx()  # before any environment imports it
 
+#: What the system's loader says of a library for which there is no memory.
+_NO_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory")
 _CART_POLE = "mjx_reinforce.envs.cart_pole:CartPole"
 _PENDULUM = "mjx_reinforce.envs.inverted_pendulum:InvertedPendulum"
 
@@ -77,9 +79,13 @@ def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
     try:
         build = load(entry)
     except (Exception, SystemExit) as error:  # an import runs the user's code
+        remedy = "write module:Class of a module that is in this folder or installed"
+        if isinstance(error, MemoryError) or any(text in str(error) for text in _NO_MEMORY):
+            remedy = "there is not enough memory for the libraries: see ulimit -v"
+        elif ":" not in id:
+            remedy = "see whether what this package needs is installed: pip check"
         raise ValueError(
-            f"cannot import the environment {id!r}: {explain(error)}; write module:Class of a "
-            "module that is in this folder or installed"
+            f"cannot import the environment {id!r}: {explain(error)}; {remedy}"
         ) from error
     if not callable(build):
         raise ValueError(

@@ -77,7 +77,8 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
     except OSError as error:
         begun = (directory / "config.json").exists()
         again = f"--resume {directory}{env_flag(config.env)}"
-        remedy = "make room, then " + (f"go on with {again}" if begun else "try again")
+        room = "make room, then " if error.errno else "then "  # W&B's have no number
+        remedy = room + (f"go on with {again}" if begun else "try again")
         refuse(f"cannot write the files of this run ({error}); {remedy}", made, status=1)
 
 

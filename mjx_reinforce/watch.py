@@ -16,7 +16,13 @@ from rich.console import Console
 from rich.progress import track
 
 from mjx_reinforce import envs
-from mjx_reinforce.export.films import Renderer, import_mujoco, mediapy_with_ffmpeg, write_film
+from mjx_reinforce.export.films import (
+    Renderer,
+    import_gymnasium,
+    import_mujoco,
+    mediapy_with_ffmpeg,
+    write_film,
+)
 from mjx_reinforce.export.run_files import Run, Seed, Which, choose_seed, read_run
 from mjx_reinforce.runs.alarms import silence_alarms
 from mjx_reinforce.runs.flags import read
@@ -97,6 +103,8 @@ def film(settings: Settings) -> None:
     run = read_run(settings.run)
     _check_env(settings, run)
     output = check(settings, choose_seed(run, settings.seed, settings.which))
+    if settings.backend == "gymnasium":
+        import_gymnasium()
     import_mujoco()
     configure_jax()
     from mjx_reinforce.export.player import load_seed

@@ -72,3 +72,22 @@ def test_a_class_that_is_not_there_is_explained(monkeypatch, id):
     monkeypatch.syspath_prepend(SCRIPT.parent)
     with pytest.raises(ValueError, match="cannot import the environment"):
         envs.make(id)
+
+
+@pytest.mark.parametrize(
+    ("id", "error", "remedy"),
+    [
+        ("InvertedPendulum-v5", MemoryError(), "not enough memory"),
+        ("own_model:Crane", MemoryError(), "not enough memory"),
+        ("CartPole-v1", ImportError("x.so: failed to map segment from shared ob"), "not enough m"),
+        ("CartPole-v1", ImportError("No module named 'brax'"), "pip check"),
+        ("own_model:Crane", ImportError("No module named 'own_model'"), "write module:Class"),
+    ],
+)
+def test_the_remedy_is_that_of_what_is_wrong(monkeypatch, id, error, remedy):
+    def fail(entry):
+        raise error
+
+    monkeypatch.setattr(envs, "load", fail)
+    with pytest.raises(ValueError, match=f"cannot import the environment '{id}'.*{remedy}"):
+        envs.make(id)

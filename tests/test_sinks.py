@@ -321,6 +321,33 @@ def test_wandb_is_offline_and_goes_on(directory, monkeypatch):
     assert {path.name for path in directory.iterdir()} == {"metrics.csv", "config.json", "wandb"}
 
 
+def test_wandb_that_has_no_key_says_what_to_do(directory, monkeypatch):
+    wandb = pytest.importorskip("wandb")
+
+    def init(**_):
+        raise wandb.Error("No API key configured.")
+
+    monkeypatch.setattr(wandb, "init", init)
+    monkeypatch.setenv("WANDB_MODE", "online")
+    with pytest.raises(OSError, match="key configured; run wandb login, or unset WANDB_MODE"):
+        sink.open_sinks(Config(wandb=True), directory, None)
+
+
+def test_only_a_disk_is_asked_for_room(tmp_path, monkeypatch, capsys):
+    def fail(*_):
+        raise OSError("no key; run wandb login")
+
+    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train_module, "train", fail)
+    command = "train --env Survive-v0 --num-seeds 1 --max-updates 1 --engine vmap --output out"
+    monkeypatch.setattr(sys, "argv", command.split())
+    with pytest.raises(SystemExit, match=r"^1$"):
+        train_module.main()
+    assert "(no key; run wandb login); then try again" in capsys.readouterr().err
+
+
 def test_a_missing_package_is_named_before_anything_starts(tmp_path, monkeypatch, capsys):
     """Also where a folder of its name lies beside."""
     (tmp_path / "wandb").mkdir()

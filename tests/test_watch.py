@@ -199,6 +199,7 @@ def test_a_simulator_that_is_not_there_is_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["--backend", "gymnasium"], "pip install 'gymnasium[mujoco]'"),
         (["--sed", 3], "error: unknown flag '--sed'. Did you mean '--seed'?"),
         (["--width", "wide"], "error: Error parsing --width"),
         (["--seed", 3], "seed 3 is not among the 3"),
@@ -218,7 +219,9 @@ def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
     make_run(tmp_path)
     (tmp_path / "policy.gif").mkdir()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "mediapy", None)
+    for package in ("mediapy", "gymnasium"):
+        monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("an environment was built"))
     with pytest.raises(SystemExit, match="2"):
         watch_run(monkeypatch, tmp_path, *arguments)
     error = capsys.readouterr().err

@@ -45,6 +45,17 @@ class Renderer:
         return self._renderer.render()
 
 
+def import_gymnasium() -> Any:
+    """Returns the module, or raises ValueError with a remedy."""
+    try:
+        import gymnasium
+    except ImportError as error:
+        raise ValueError(
+            f"--backend gymnasium needs Gymnasium ({error}); pip install 'gymnasium[mujoco]'"
+        ) from error
+    return gymnasium
+
+
 def import_mujoco() -> Any:
     """Returns MuJoCo; without a screen it is told to draw through EGL, where that is installed."""
     if not os.environ.get("DISPLAY") and ctypes.util.find_library("EGL"):

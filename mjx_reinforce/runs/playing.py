@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engines.episode import begin, hold, step
+from mjx_reinforce.export.films import import_gymnasium
 from mjx_reinforce.export.player import Player
 from mjx_reinforce.policies.actor import act
 
@@ -87,12 +88,7 @@ def gymnasium_simulator(player: Player, horizon: int) -> tuple[str, Callable[[in
     Raises:
       ValueError: Gymnasium is not installed, or has no such environment.
     """
-    try:
-        import gymnasium
-    except ImportError as error:
-        raise ValueError(
-            f"--backend gymnasium needs Gymnasium ({error}); pip install 'gymnasium[mujoco]'"
-        ) from error
+    gymnasium = import_gymnasium()
     env = _make(gymnasium, player, horizon)
 
     def play(episode: int, noise: bool) -> Episode:

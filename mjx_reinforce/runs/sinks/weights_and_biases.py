@@ -12,6 +12,7 @@ from mjx_reinforce.runs.sinks import over_seeds
 
 #: Which run it is, and up to which update it has rows.
 NAME = "wandb/mjx_reinforce.json"
+_TO_BE_ONLINE = "; run wandb login, or unset WANDB_MODE and send the run later by wandb sync"
 
 
 class WeightsAndBiases:
@@ -37,7 +38,7 @@ class WeightsAndBiases:
         known = read_json(self._path) if self._path.exists() else {}
         self._logged = int(known.get("updates", -1))
         mode: Any = os.environ.get("WANDB_MODE", "offline")
-        with _errors_as_os_errors():
+        with _errors_as_os_errors(_TO_BE_ONLINE if mode == "online" else ""):
             self._run = wandb.init(
                 project=os.environ.get("WANDB_PROJECT", "mjx_reinforce"),
                 name=os.environ.get("WANDB_NAME", directory.resolve().name),
@@ -70,11 +71,11 @@ class WeightsAndBiases:
 
 
 @contextlib.contextmanager
-def _errors_as_os_errors() -> Iterator[None]:
+def _errors_as_os_errors(remedy: str = "") -> Iterator[None]:
     """Raises W&B's own errors as OSError: a run warns of those, and goes on."""
     import wandb
 
     try:
         yield
     except wandb.Error as error:
-        raise OSError(str(error)) from error
+        raise OSError(str(error).rstrip(".") + remedy) from error
