@@ -5,7 +5,7 @@ import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from toys import Chain, SignedTarget, Survive, Target
+from toys import Chain, SignedTarget, Survive, Target, Tempting
 
 from mjx_reinforce import evaluate, mlp_policy, rollout, train_step
 from mjx_reinforce.learners import ars as ars_module
@@ -190,3 +190,25 @@ def test_normalisation_keeps_running():
 def test_nonsense_is_refused(settings, message):
     with pytest.raises(ValueError, match=message):
         ars(Target(), **settings)
+
+
+@pytest.mark.parametrize("settings", [{}, {"top_directions": 4}])
+def test_breaking_never_pays(settings):
+    """It ends an episode whose every step costs, and yet it is not searched for."""
+    _, _, metrics = train(Tempting(), 60, noise_std=1.0, step_size=0.1, engine="vmap", **settings)
+    broken = np.asarray(metrics["nonfinite_episodes"])
+    assert broken[:5].mean() > 2
+    assert broken[-5:].mean() < broken[:5].mean()
+
+
+@pytest.mark.parametrize("update", ["paper", "document"])
+def test_where_all_episodes_broke_nothing_is_learned(update):
+    class Hopeless(Tempting):
+        def step(self, state, action):
+            return super().step(state, jnp.ones(1))
+
+    learner = ars(Hopeless(), update=update, engine="vmap")
+    state = jax.jit(learner.init)(jax.random.key(0))
+    after, metrics = train_step(learner, state)
+    assert int(metrics["nonfinite_episodes"]) == 16
+    jax.tree.map(np.testing.assert_array_equal, after.actor, state.actor)

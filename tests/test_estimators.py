@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from toys import Chain, categorical, expected_return
+from toys import Chain, Tempting, categorical, expected_return
 
 from mjx_reinforce import Policy, Trajectory, reinforce, train_step
 from mjx_reinforce.learners import estimators as est
@@ -306,6 +306,56 @@ def test_one_step_is_a_sample_of_one():
     assert float(metrics["value_loss"]) == pytest.approx(
         1.0, rel=1e-5
     )  # seen 0, valued 0, earned 1
+
+
+def broken(trajectory, which=1):
+    return trajectory.replace(nonfinite=jnp.arange(3) == which)
+
+
+@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+def test_what_a_broken_episode_earned_has_no_effect(name):
+    """It may be anything; what is learned of the others is the same."""
+    estimator, trajectory = load(ESTIMATORS[name])(0.9), broken(make_trajectory())
+    rich = trajectory.replace(reward=trajectory.reward.at[0, 1].set(1e3))
+    assert_equal(update(estimator, rich), update(estimator, trajectory))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("which", range(3))
+@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+def test_a_broken_episode_is_the_worst(name, which, sign):
+    """At every step; the critic is of zeros."""
+    options = {"network": MLP((), 1, output_scale=0.0)} if name == "value-baseline" else {}
+    trajectory = make_trajectory()
+    trajectory = broken(trajectory.replace(reward=sign * trajectory.reward), which)
+    got = weights(load(ESTIMATORS[name])(0.9, **options), trajectory)
+    others = np.where(MASK & (np.arange(3) != which), got, np.inf)
+    assert np.all((got[:, which] <= others.min(axis=1) + 1e-6)[MASK[:, which]])
+
+
+def test_a_broken_episode_by_hand():
+    returns = returns_by_hand(0.9)
+    got = weights(est.reward_to_go(0.9), broken(make_trajectory(), 0))
+    returns[:, 0] = returns[:, 1:].min(axis=1)
+    np.testing.assert_allclose(got, np.where(MASK, returns, 0.0), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+def test_breaking_never_pays(name):
+    """It ends an episode whose every step costs, and yet it is not learned."""
+    learner = reinforce(
+        Tempting(),
+        estimator=load(ESTIMATORS[name])(1.0),
+        optimizer=optax.sgd(0.03),
+        num_episodes=64,
+        normalize_steps=0,
+        engine="vmap",
+    )
+    state = jax.jit(learner.init)(jax.random.key(0))
+    run = jax.jit(lambda s: jax.lax.scan(lambda s, _: learner.step(s), s, length=60))
+    broken = np.asarray(run(state)[1]["nonfinite_episodes"])
+    assert broken[:5].mean() > 10
+    assert broken[-5:].mean() < 5
 
 
 @pytest.mark.parametrize("name", sorted(ESTIMATORS))

@@ -263,6 +263,7 @@ def test_a_broken_simulation_is_counted_and_stays_in_its_seed():
         np.testing.assert_array_equal(np.isfinite(metrics[name]), [False, True], err_msg=name)
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x[1], y[1]), healthy.actor, mixed.actor)
     assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(mixed.actor))
+    np.testing.assert_array_equal(metrics["skipped_update"], [1, 0])  # all of them broke
 
 
 def test_a_gradient_that_is_not_finite_is_skipped():

@@ -104,6 +104,16 @@ class Drift(Survive):
         return state.replace(obs=jnp.where(broken, jnp.nan, obs), reward=reward, done=done)
 
 
+class Tempting(Toy):
+    """Three steps that cost 1 to 2 each, the least at -0.5; an action beyond 0.5 breaks it."""
+
+    max_episode_steps = 3
+
+    def step(self, state, action):
+        obs = jnp.where(action > 0.5, jnp.nan, state.obs)
+        return state.replace(obs=obs, reward=-1.0 - jnp.minimum((action[0] + 0.5) ** 2, 1.0))
+
+
 class Chain:
     """Two arms, up to three pulls; arm 0 may end the episode. Rewards depend on pull and arm.
 

@@ -5,7 +5,8 @@ the parameters move along the directions that made a difference:
 
     theta += step_size / (b sigma) * sum over the b best of (r_plus - r_minus) delta,
 
-with sigma the standard deviation of those 2 b returns. No gradient of the policy is taken. The
+with sigma the standard deviation of those 2 b returns. An episode in which the simulation left the
+finite numbers counts as the worst of the others; where all did, nothing is learned. No gradient of the policy is taken. The
 learner has the same two functions as ``reinforce``, so whatever drives one drives the other.
 """
 
@@ -37,6 +38,7 @@ from mjx_reinforce.learners.learner import (
     episode_metrics,
     keep_finite,
 )
+from mjx_reinforce.learners.returns import replace_broken
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.categorical import categorical
@@ -184,7 +186,8 @@ class _Search:
     def learn(self, state: TrainState, trial: Trial, key: jax.Array) -> tuple[TrainState, Metrics]:
         del key
         actor, trajectory = state.actor, trial.trajectory
-        returns = episode_returns(trajectory).reshape(2, self.num_directions)
+        returns = replace_broken(episode_returns(trajectory), trajectory.nonfinite)
+        returns = returns.reshape(2, self.num_directions)
         if self.update == "paper":
             increment = paper_increment(trial.directions, returns, self.top_directions)
         else:
@@ -193,7 +196,7 @@ class _Search:
         normalizer = normalize.update(
             actor.normalizer,
             trajectory.observation,
-            trajectory.mask,
+            trajectory.mask & ~trajectory.nonfinite,
             self.normalize_steps,
             self.normalize_min_std,
         )

@@ -10,6 +10,10 @@ every estimator here but two is unbiased for the same gradient; they differ in v
 ``standardize`` divides the weights of an update by a number that it computes from them, so that
 its gradient has another length, and is no longer exactly unbiased. ``mean_log_prob`` and
 ``normalized_returns`` come from published programs, and say what they follow instead.
+
+An episode in which the simulation left the finite numbers counts as the worst of the others: at
+each step its G[t] is the least of theirs (``returns.replace_broken``). In ``mean_log_prob`` and
+``normalized_returns``, where an episode is compared with itself, its weight is.
 """
 
 from collections.abc import Callable
@@ -22,7 +26,7 @@ import optax
 from jax import lax
 
 from mjx_reinforce.learners.gradients import accumulate_gradient
-from mjx_reinforce.learners.returns import discounted_returns
+from mjx_reinforce.learners.returns import discounted_returns, replace_broken
 from mjx_reinforce.policies.networks import MLP
 from mjx_reinforce.types import Trajectory
 
@@ -32,7 +36,8 @@ class Estimator(NamedTuple):
 
     init: (key, observation_size) -> state; consumes the key
     update: (state, trajectory) -> (weight [T, N], next state, metrics); the weight
-      is zero outside the mask, and the trajectory's observations are normalised
+      is zero outside the mask, and the trajectory's observations are normalised; what an episode
+      earned that broke (``trajectory.nonfinite``) is no return, see ``returns.replace_broken``
     min_episodes: the least N that ``update`` accepts
     """
 
@@ -46,7 +51,7 @@ def total_return(discount: float | jax.Array = 0.99) -> Estimator:
     _check_discount(discount)
 
     def weigh(trajectory):
-        returns = discounted_returns(trajectory.reward, discount)
+        returns = _returns(trajectory, discount)
         return jnp.broadcast_to(returns[0], returns.shape)
 
     return _stateless(weigh)
@@ -55,7 +60,7 @@ def total_return(discount: float | jax.Array = 0.99) -> Estimator:
 def reward_to_go(discount: float | jax.Array = 0.99) -> Estimator:
     """Weights an action by what came after it, G[t] (Sutton et al. 1999, theorem 1)."""
     _check_discount(discount)
-    return _stateless(lambda trajectory: discounted_returns(trajectory.reward, discount))
+    return _stateless(lambda trajectory: _returns(trajectory, discount))
 
 
 def leave_one_out(discount: float | jax.Array = 0.99, *, ended: str = "zero") -> Estimator:
@@ -78,7 +83,7 @@ def leave_one_out(discount: float | jax.Array = 0.99, *, ended: str = "zero") ->
         raise ValueError(f"ended must be 'zero' or 'skip', got {ended!r}")
 
     def update(state, trajectory):
-        returns = discounted_returns(trajectory.reward, discount)
+        returns = _returns(trajectory, discount)
         counted = jnp.ones_like(trajectory.mask) if ended == "zero" else trajectory.mask
         others = jnp.sum(counted, axis=1, keepdims=True) - counted
         sums = jnp.sum(jnp.where(counted, returns, 0.0), axis=1, keepdims=True)
@@ -105,7 +110,8 @@ def mean_log_prob(discount: float | jax.Array = 0.99) -> Estimator:
 
     def weigh(trajectory):
         returns = discounted_returns(trajectory.reward, discount)
-        return jnp.broadcast_to(_episode_mean(returns, trajectory.mask), returns.shape)
+        mean = _episode_mean(returns, trajectory.mask)
+        return jnp.broadcast_to(replace_broken(mean, trajectory.nonfinite), returns.shape)
 
     return _stateless(weigh)
 
@@ -127,7 +133,8 @@ def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
         returns = discounted_returns(trajectory.reward, discount)
         centred = jnp.where(mask, returns - _episode_mean(returns, mask), 0.0)
         variance = jnp.sum(centred**2, axis=0) / jnp.maximum(jnp.sum(mask, axis=0) - 1, 1)
-        return centred / (jnp.sqrt(variance) + float(jnp.finfo(jnp.float32).eps))
+        normalized = centred / (jnp.sqrt(variance) + float(jnp.finfo(jnp.float32).eps))
+        return replace_broken(normalized, trajectory.nonfinite)
 
     return _stateless(weigh)
 
@@ -179,7 +186,7 @@ def value_baseline(
         return _Critic(params, optimizer.init(params))
 
     def update(critic, trajectory):
-        returns = discounted_returns(trajectory.reward, discount)
+        returns = _returns(trajectory, discount)
         values = value(critic.params, trajectory.observation)
         weight = jnp.where(trajectory.mask, returns - values, 0.0)
         steps = jnp.maximum(jnp.sum(trajectory.mask), 1)
@@ -241,6 +248,12 @@ def discount_weights(estimator: Estimator, discount: float | jax.Array = 0.99) -
         return weight * powers[:, None], state, metrics
 
     return estimator._replace(update=update)
+
+
+def _returns(trajectory: Trajectory, discount: float | jax.Array) -> jax.Array:
+    """Returns G [T, N]; of an episode that broke, the least of the others."""
+    returns = discounted_returns(trajectory.reward, discount)
+    return replace_broken(returns, trajectory.nonfinite)
 
 
 def _stateless(weigh: Callable[[Trajectory], jax.Array]) -> Estimator:

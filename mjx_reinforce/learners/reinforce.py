@@ -4,7 +4,8 @@ One update plays N complete episodes and follows the gradient of
 
     (1/N) sum_n sum_t (weight[t, n] log pi(a[t, n] | o[t, n]) + entropy_cost H[t, n])
 
-with the weights that an estimator gives.
+with the weights that an estimator gives. An episode in which the simulation left the finite numbers
+counts as the worst of the others; where all did, nothing is learned.
 """
 
 import dataclasses
@@ -247,7 +248,7 @@ class _Reinforce:
         normalizer = normalize.update(
             actor.normalizer,
             trajectory.observation,
-            mask,
+            mask & ~trajectory.nonfinite,
             self.normalize_steps,
             self.normalize_min_std,
         )

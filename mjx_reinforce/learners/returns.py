@@ -1,4 +1,4 @@
-"""Returns to go of complete episodes, all steps at once."""
+"""Returns to go of complete episodes, all steps at once, and what stands for a broken one's."""
 
 import math
 
@@ -27,6 +27,21 @@ def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Ar
     steps_left = jnp.arange(length, 0, -1, dtype=reward.dtype)
     returns = own + jnp.power(discount, steps_left)[:, None] * later[:, None]
     return returns.reshape(-1, num_episodes)[:horizon]
+
+
+def replace_broken(returns: jax.Array, broken: jax.Array) -> jax.Array:
+    """Returns the returns, of an episode that broke the least of the others'.
+
+    What it earned until the simulation left the finite numbers is no return: where rewards are
+    negative, it would speak for breaking early. To leave it out would do so too, for the gradient of
+    what remains is that of an episode which earned 0.
+
+    Args:
+      returns: [..., N] such as G [T, N]; the others are those of the same step.
+      broken: [N] ``Trajectory.nonfinite``; where all are, all returns are infinite.
+    """
+    least = jnp.min(jnp.where(broken, jnp.inf, returns), axis=-1, keepdims=True)
+    return jnp.where(broken, least, returns)
 
 
 def _discounted_sums(x: jax.Array, discount: jax.Array) -> jax.Array:
