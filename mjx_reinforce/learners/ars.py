@@ -6,8 +6,9 @@ the parameters move along the directions that made a difference:
     theta += step_size / (b sigma) * sum over the b best of (r_plus - r_minus) delta,
 
 with sigma the standard deviation of those 2 b returns. An episode in which the simulation left the
-finite numbers counts as the worst of the others; where all did, nothing is learned. No gradient of the policy is taken. The
-learner has the same two functions as ``reinforce``, so whatever drives one drives the other.
+finite numbers counts as the worst of the others; where all did, nothing is learned. No gradient of
+the policy is taken. The learner has the same two functions as ``reinforce``, so whatever drives one
+drives the other.
 """
 
 import dataclasses

@@ -33,8 +33,8 @@ def replace_broken(returns: jax.Array, broken: jax.Array) -> jax.Array:
     """Returns the returns, of an episode that broke the least of the others'.
 
     What it earned until the simulation left the finite numbers is no return: where rewards are
-    negative, it would speak for breaking early. To leave it out would do so too, for the gradient of
-    what remains is that of an episode which earned 0.
+    negative, it would speak for breaking early. So would leaving it out: the gradient of what
+    remains is that of an episode which earned 0.
 
     Args:
       returns: [..., N] such as G [T, N]; the others are those of the same step.
