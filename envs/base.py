@@ -12,6 +12,7 @@ from brax.envs.base import Env, State
 from flax import struct
 from mujoco import mjx
 
+from mjx_reinforce.checks import changed
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.outcomes import check_outcome, check_start
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings, check_positive
@@ -238,6 +239,9 @@ class MujocoEnv(Env):
     def observation_size(self) -> int:
         """The number O of entries of an observation."""
         return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[0]
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({changed(self.settings)})"
 
     @property
     def action_size(self) -> int:

@@ -49,16 +49,24 @@ _HOME = {
     "save_policy": "export.policy_files",
 }
 
+#: Folders and files that are attributes too, also imported on first use.
+_MODULES = (
+    *("engines", "envs", "export", "fused", "learners", "physics", "policies"),
+    *("registry", "reports", "runs", "sweeps", "types"),
+)
+
 __all__ = [*_HOME, "__version__"]
 __version__ = "0.1.0"
 
 
 def __getattr__(name: str):
-    """Imports a public name from its module on first use (PEP 562)."""
+    """Imports a public name from its module, or a module, on first use (PEP 562)."""
+    if name in _MODULES:
+        return importlib.import_module(f"{__name__}.{name}")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted([*__all__, *_MODULES])

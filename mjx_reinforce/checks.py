@@ -1,5 +1,6 @@
 """Checks of what users give, and one line for what their code, or a library, raised."""
 
+import dataclasses
 import math
 import numbers
 import sysconfig
@@ -94,6 +95,31 @@ def _spoken(kind: Any) -> str:
     if origin is tuple:
         return f"({', '.join(map(_spoken, inner))})"
     return _KINDS[kind][1] if kind in _KINDS else getattr(kind, "__name__", str(kind))
+
+
+def check_kind(name: str, value: Any, kind: type, example: str) -> None:
+    """Raises ValueError for an object of another class.
+
+    Args:
+      name: what it is called, for the message.
+      value: what the user gave.
+      kind: the class.
+      example: what to write instead.
+    """
+    if not isinstance(value, kind):
+        what = getattr(value, "__name__", repr(value) if isinstance(value, str) else None)
+        got = what or f"a {type(value).__name__}"
+        raise ValueError(f"{name} must be of type {kind.__name__}, such as {example}, got {got}")
+
+
+def changed(settings: Any) -> str:
+    """Returns the fields of a dataclass that have other values than their defaults, as code."""
+    given = (
+        f"{field.name}={value!r}"
+        for field in dataclasses.fields(settings)
+        if field.init and (value := getattr(settings, field.name)) != field.default
+    )
+    return ", ".join(given)
 
 
 def is_nan(value: Any) -> bool:

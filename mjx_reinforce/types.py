@@ -70,6 +70,11 @@ class Trajectory:
     nonfinite: jax.Array
     simulated: jax.Array
 
+    def __repr__(self) -> str:
+        named = {"observation": self.observation, "action": self.action, "mask": self.mask}
+        shapes = (f"{name} {x.dtype}{list(x.shape)}" for name, x in named.items())
+        return f"Trajectory({', '.join(shapes)})"
+
     def first(self, steps: int) -> "Trajectory":
         """Returns the first so many steps of every episode."""
         return self.replace(  # pyright: ignore[reportAttributeAccessIssue]

@@ -218,8 +218,8 @@ def scene(env: Any) -> Any:
 
         return models.load(env.scene)
     raise ValueError(
-        f"{type(env).__name__} has no mj_model, so there is nothing to draw; "
-        "play its policy with mjx_reinforce.load"
+        f"{type(env).__name__} has no mj_model, so there is nothing to draw; in a wrapper, set "
+        "self.mj_model and self.dt to those of what it wraps; or play with mjx_reinforce.load"
     )
 
 

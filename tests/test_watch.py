@@ -288,4 +288,5 @@ def test_an_environment_without_a_model_is_refused(tmp_path, monkeypatch, capsys
         watch_run(monkeypatch, tmp_path)
     error = capsys.readouterr().err
     assert "Survive has no mj_model, so there is nothing to draw" in error
+    assert "in a wrapper, set self.mj_model and self.dt to those of what it wraps" in error
     assert error.count("\n") == 1

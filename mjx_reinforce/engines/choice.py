@@ -53,6 +53,9 @@ class Engine(NamedTuple):
     rollout: Callable[..., Trajectory]
     seconds: float = 0.0
 
+    def __repr__(self) -> str:
+        return f"Engine({self.name})"
+
 
 NAMES = ("auto", "vmap", "fused", "native")
 

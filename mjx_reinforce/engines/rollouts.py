@@ -8,8 +8,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from mjx_reinforce.checks import check_kind, check_parts
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.chunks import play_chunks
+from mjx_reinforce.policies.arguments import check_count, check_key
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Environment, Trajectory
 
@@ -60,7 +62,17 @@ def rollout(
     Returns:
       The episodes. A non-finite observation or reward ends its episode, with reward 0 for that
       step, and shows in ``nonfinite``.
+
+    Raises:
+      ValueError: an argument makes no sense.
     """
+    check_parts(env)
+    if not callable(act):
+        raise ValueError(f"act must be a function, such as learner.act, got a {type(act).__name__}")
+    check_kind("distribution", distribution, Distribution, "learner.policy.distribution")
+    check_key(key)
+    check_count("num_episodes", num_episodes)
+    check_count("horizon", horizon)
     if env_step is None:
         env_step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
     # Inside, episodes are the last axis: each scalar of the state is a contiguous row.

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce.checks import check_type
 from mjx_reinforce.export.policy_files import SavedPolicy, read_policy
 from mjx_reinforce.export.run_files import (
     Run,
@@ -35,6 +36,9 @@ class Player(NamedTuple):
     seed: int
     policy: Policy
     actor: Actor
+
+    def __repr__(self) -> str:
+        return f"Player({self.env}, seed {self.seed}, {self.policy!r})"
 
     @property
     def observation_size(self) -> int:
@@ -83,6 +87,7 @@ def load(run: str | Path, seed: Seed = "best", *, which: Which = "last") -> Play
     Raises:
       ValueError: there is no such run or seed, the run has not ended, or a file is damaged.
     """
+    check_type("run", run, str | Path)
     return load_seed(read_run(run), seed, which)[0]
 
 

@@ -16,10 +16,10 @@ import math
 from typing import Any, NamedTuple
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import optax
 
+from mjx_reinforce.checks import check_type
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.contract import check_environment
@@ -42,7 +42,9 @@ from mjx_reinforce.learners.learner import (
 from mjx_reinforce.learners.returns import replace_broken
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
+from mjx_reinforce.policies.arguments import check_count, check_key, check_number
 from mjx_reinforce.policies.categorical import categorical
+from mjx_reinforce.policies.contract import check_policy
 from mjx_reinforce.policies.deterministic import deterministic
 from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.types import (
@@ -97,9 +99,16 @@ def ars(
     """
     check_environment(env)
     horizon = check_horizon(env, horizon)
+    check_count("num_directions", num_directions)
+    check_type("top_directions", top_directions, int | None)
+    check_type("shared_starts", shared_starts, bool)
+    check_number("normalize_steps", normalize_steps, finite=False)
+    check_number("normalize_min_std", normalize_min_std)
     top = num_directions if top_directions is None else top_directions
     _check(num_directions, top, step_size, noise_std, update)
     size = observation_size(env)
+    if policy is not None:
+        check_policy(policy, env, size)
     search = _Search(
         env=env,
         policy=policy or _zero_policy(env, size),
@@ -152,6 +161,7 @@ class _Search:
             check_linear(self.policy)
 
     def init(self, key: jax.Array) -> TrainState:
+        check_key(key)
         policy_key, key = jax.random.split(key)
         normalizer = normalize.init(self.observation_size)
         return TrainState(
@@ -288,13 +298,10 @@ def _zero_policy(env: Environment, size: int) -> Policy:
 
 def _check(num_directions: int, top: int, step_size: Any, noise_std: Any, update: str) -> None:
     """Raises ValueError for numbers that make no sense; traced ones are taken on trust."""
-    if num_directions < 1:
-        raise ValueError(f"num_directions must be at least 1, got {num_directions}")
     if not 1 <= top <= num_directions:
         raise ValueError(f"top_directions must lie in [1, {num_directions}], got {top}")
     for name, value in (("step_size", step_size), ("noise_std", noise_std)):
-        if not (isinstance(value, jax.core.Tracer) or float(value) > 0):
-            raise ValueError(f"{name} must be positive, got {value}")
+        check_number(name, value, positive=True)
     if update not in ("paper", "document"):
         raise ValueError(f"update must be 'paper' or 'document', got {update!r}")
     if update == "document" and top != num_directions:

@@ -20,13 +20,14 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import jax.core
 import jax.numpy as jnp
 import optax
 from jax import lax
 
+from mjx_reinforce.checks import check_kind
 from mjx_reinforce.learners.gradients import accumulate_gradient
 from mjx_reinforce.learners.returns import discounted_returns, replace_broken
+from mjx_reinforce.policies.arguments import check_count, check_number, known_number
 from mjx_reinforce.policies.networks import MLP
 from mjx_reinforce.types import Trajectory
 
@@ -44,6 +45,9 @@ class Estimator(NamedTuple):
     init: Callable[[jax.Array, int], Any]
     update: Callable[[Any, Trajectory], tuple[jax.Array, Any, dict[str, jax.Array]]]
     min_episodes: int = 1
+
+    def __repr__(self) -> str:
+        return f"Estimator(of {self.min_episodes} episodes or more)"
 
 
 def total_return(discount: float | jax.Array = 0.99) -> Estimator:
@@ -169,8 +173,7 @@ def value_baseline(
       ValueError: ``num_fits`` is less than one or the discount is not in [0, 1].
     """
     _check_discount(discount)
-    if num_fits < 1:
-        raise ValueError(f"num_fits must be at least 1, got {num_fits}")
+    check_count("num_fits", num_fits)
     network = MLP((64, 64), 1) if network is None else network
     optimizer = optax.adam(3e-3) if optimizer is None else optimizer
 
@@ -183,6 +186,9 @@ def value_baseline(
 
     def init(key, observation_size):
         params = network.init(key, jnp.zeros(observation_size))
+        shape = jax.eval_shape(network.apply, params, jnp.zeros(observation_size)).shape
+        if shape != (1,):
+            raise ValueError(f"the network must return values [..., 1], got {list(shape)}")
         return _Critic(params, optimizer.init(params))
 
     def update(critic, trajectory):
@@ -218,7 +224,12 @@ def standardize(
       floor: added to the standard deviation, in the unit of the return.
       center: also subtract the mean over all steps; the root mean square is
         taken about zero otherwise.
+
+    Raises:
+      ValueError: what is given is no estimator, or the floor is negative.
     """
+    check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
+    check_number("floor", floor, finite=False)
 
     def update(state, trajectory):
         weight, state, metrics = estimator.update(state, trajectory)
@@ -240,6 +251,7 @@ def discount_weights(estimator: Estimator, discount: float | jax.Array = 0.99) -
     arXiv:1906.07073); with it, late steps hardly count. Most programs leave it
     out, and so does everything here unless wrapped in this.
     """
+    check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
     _check_discount(discount)
 
     def update(state, trajectory):
@@ -296,5 +308,6 @@ def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array)
 
 def _check_discount(discount: float | jax.Array) -> None:
     """Raises ValueError for a discount outside [0, 1]; a traced one is taken on trust."""
-    if not isinstance(discount, jax.core.Tracer) and not 0.0 <= float(discount) <= 1.0:
-        raise ValueError(f"the discount must lie in [0, 1], got {discount}")
+    number = known_number(discount)
+    if not (number is None or 0.0 <= number <= 1.0):
+        raise ValueError(f"the discount must lie in [0, 1], got {discount!r}")

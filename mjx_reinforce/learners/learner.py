@@ -1,6 +1,7 @@
 """What a learner is: ``init``, then ``play`` and ``learn`` in turn, over one state pytree."""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,6 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax.flatten_util import ravel_pytree
 
+from mjx_reinforce.checks import check_kind, check_type
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.policies.actor import Actor, act
@@ -37,6 +39,10 @@ class TrainState:
     estimator_state: Any
     start_key: jax.Array | None = None
 
+    def __repr__(self) -> str:
+        seeds = f", seeds {list(self.key.shape)}" if self.key.shape else ""
+        return f"TrainState({self.actor!r}{seeds})"
+
 
 class Learner(NamedTuple):
     """How a policy learns on one environment; any part may be replaced with ``_replace``.
@@ -55,6 +61,9 @@ class Learner(NamedTuple):
     learn: Callable[[TrainState, Any, jax.Array], tuple[TrainState, Metrics]]
     policy: Policy
     engine: Engine
+
+    def __repr__(self) -> str:
+        return f"Learner({self.policy!r}, {self.engine!r})"
 
     def step(
         self, state: TrainState, active: bool | jax.Array = True
@@ -78,7 +87,8 @@ class Learner(NamedTuple):
         return act(self.policy, actor, observation)
 
 
-def _train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics]:
+@functools.partial(jax.jit, static_argnums=0)
+def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics]:
     """Plays N episodes and makes one update, compiled.
 
     Nothing is donated: ``state`` stays usable. For many seeds,
@@ -101,10 +111,8 @@ def _train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metric
       ``clipped_gradients`` (see ``updates``),
       ``explained_variance`` (of an estimator with a baseline), and the estimator's own.
     """
+    check_kind("state", state, TrainState, "learner.init(jax.random.key(0))")
     return learner.step(state)
-
-
-train_step = jax.jit(_train_step, static_argnums=0)
 
 
 def check_horizon(env: Environment, horizon: int | None) -> int:
@@ -112,6 +120,7 @@ def check_horizon(env: Environment, horizon: int | None) -> int:
     horizon = getattr(env, "max_episode_steps", None) if horizon is None else horizon
     if horizon is None:
         raise ValueError("this environment declares no max_episode_steps: give a horizon")
+    check_type("horizon", horizon, int)
     if horizon < 1:
         raise ValueError(f"the horizon must be at least one step, got {horizon}")
     return horizon

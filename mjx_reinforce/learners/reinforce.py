@@ -17,11 +17,13 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from mjx_reinforce.checks import check_type
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.fused import any_lane
+from mjx_reinforce.learners.contract import check_estimator, check_optimizer, check_update
 from mjx_reinforce.learners.diagnostics import (
     nan_unless,
     policy_metrics,
@@ -40,7 +42,9 @@ from mjx_reinforce.learners.learner import (
 from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_optimizer
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
+from mjx_reinforce.policies.arguments import check_count, check_key, check_number
 from mjx_reinforce.policies.categorical import categorical
+from mjx_reinforce.policies.contract import check_policy
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.policies.normal import normal
 from mjx_reinforce.policies.policy import Policy, mlp_policy
@@ -84,7 +88,13 @@ def reinforce(
     num_seeds: int = 1,
     engine: str = "auto",
 ) -> Learner:
-    """Builds REINFORCE for an environment; the formula is at the top of this file.
+    """Builds REINFORCE for an environment.
+
+    One update plays N complete episodes and follows the gradient of
+
+        (1/N) sum_n sum_t (weight[t, n] log pi(a[t, n] | o[t, n]) + entropy_cost H[t, n])
+
+    with the weights that the estimator gives.
 
     Numbers such as ``entropy_cost``, the estimator's discount and the optimiser's learning rate
     may be traced: build the learner inside a function to vmap over them.
@@ -122,13 +132,31 @@ def reinforce(
     """
     check_environment(env)
     size = observation_size(env)
-    chosen = policy or mlp_policy(size, default_distribution(action_space(env)))
+    if policy is None:
+        policy = mlp_policy(size, default_distribution(action_space(env)))
+    if optimizer is None:
+        optimizer = make_optimizer()
+    check_count("num_episodes", num_episodes)
+    check_count("num_seeds", num_seeds)
+    check_number("entropy_cost", entropy_cost)
+    check_number("normalize_steps", normalize_steps, finite=False)
+    check_number("normalize_min_std", normalize_min_std)
+    if max_kl is not None:
+        check_number("max_kl", max_kl, positive=True, finite=False)
+    check_type("one_start", one_start, bool)
+    check_policy(policy, env, size, likelihood=True)
+    check_optimizer("optimizer", optimizer)
+    update = full_batch() if update is None else update
+    check_update(update)
+    if estimator is None:
+        estimator = standardize(leave_one_out(), floor=10.0)
+    check_estimator(estimator, env, size, num_episodes)
     return _Reinforce(
         env=env,
-        policy=chosen,
-        estimator=estimator or standardize(leave_one_out(), floor=10.0),
-        optimizer=optimizer or make_optimizer(),
-        update=update or full_batch(),
+        policy=policy,
+        estimator=estimator,
+        optimizer=optimizer,
+        update=update,
         num_episodes=num_episodes,
         horizon=check_horizon(env, horizon),
         entropy_cost=entropy_cost,
@@ -163,11 +191,6 @@ class _Reinforce:
     observation_size: int
 
     def __post_init__(self):
-        if self.num_episodes < self.estimator.min_episodes:
-            raise ValueError(
-                f"this estimator needs at least {self.estimator.min_episodes} episodes an update, "
-                f"got num_episodes={self.num_episodes}"
-            )
         if self.loss_per not in ("episode", "step"):
             raise ValueError(f"loss_per must be 'episode' or 'step', got {self.loss_per!r}")
 
@@ -187,6 +210,7 @@ class _Reinforce:
         return Actor(params=self.policy.init(key), normalizer=normalizer)
 
     def _init(self, key: jax.Array) -> TrainState:
+        check_key(key)
         policy_key, estimator_key, key = jax.random.split(key, 3)
         start_key = None
         if self.one_start:

@@ -17,6 +17,7 @@ from jax import lax
 from mjx_reinforce.engines.chunks import while_any
 from mjx_reinforce.learners.diagnostics import signal_to_noise
 from mjx_reinforce.learners.gradients import accumulate_gradient
+from mjx_reinforce.policies.arguments import check_count, check_number
 from mjx_reinforce.registry import check_name
 
 #: Optimisers by name.
@@ -101,8 +102,7 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
       ValueError: a number is less than one.
     """
     for name, value in (("num_updates", num_updates), ("batch_size", batch_size)):
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}")
+        check_count(name, value)
 
     def update(problem, key, params, opt_state):
         mask = problem.samples[-1].reshape(-1)
@@ -241,6 +241,12 @@ def make_optimizer(
       ValueError: the name is unknown.
     """
     check_name("optimizer", name, dict.fromkeys(OPTIMIZERS))
+    if not callable(learning_rate):
+        check_number("learning_rate", learning_rate)
+    check_number("weight_decay", weight_decay)
+    check_number("momentum", momentum)
+    if max_grad_norm is not None:
+        check_number("max_grad_norm", max_grad_norm, positive=True, finite=False)
     parts = []
     if max_grad_norm is not None:
         parts.append(clip_by_norm(max_grad_norm))

@@ -17,11 +17,21 @@ def continuous_box(name: str, space: Box | Discrete) -> Box:
     Raises:
       ValueError: the space is discrete.
     """
+    check_space(name, space)
     if not isinstance(space, Box):
         raise ValueError(
             f"{name} needs a continuous action space, this one is discrete; choose categorical"
         )
     return space
+
+
+def check_space(name: str, space: Box | Discrete) -> None:
+    """Raises ValueError for what is no action space."""
+    if not isinstance(space, Box | Discrete):
+        raise ValueError(
+            f"{name} needs an action space, such as env.action_space, or mjx_reinforce.Box(low, "
+            f"high) with arrays [A], got a {type(space).__name__}"
+        )
 
 
 def finite_box(name: str, space: Box | Discrete) -> Box:

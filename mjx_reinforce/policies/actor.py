@@ -5,6 +5,7 @@ from typing import Any
 import jax
 from flax import struct
 
+from mjx_reinforce.checks import check_kind
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.policy import Policy
 
@@ -20,6 +21,10 @@ class Actor:
     params: Any
     normalizer: normalize.Normalizer
 
+    def __repr__(self) -> str:
+        count = sum(x.size for x in jax.tree.leaves(self.params))
+        return f"Actor({count:,} parameters, {self.normalizer!r})"
+
 
 def act(policy: Policy, actor: Actor, observation: jax.Array) -> jax.Array:
     """Returns the parameters of the action distribution for each observation.
@@ -32,5 +37,15 @@ def act(policy: Policy, actor: Actor, observation: jax.Array) -> jax.Array:
     Returns:
       The outputs [..., K]: ``policy.distribution.mode(outputs)`` is the deterministic
       action, ``policy.distribution.sample(outputs, noise)`` a random one.
+
+    Raises:
+      ValueError: an argument is of another type, or the observation of another size.
     """
+    check_kind("policy", policy, Policy, "learner.policy")
+    check_kind("actor", actor, Actor, "state.actor")
+    size = actor.normalizer.mean.shape[-1]
+    if observation.shape[-1:] != (size,):
+        raise ValueError(
+            f"the observation must be [..., {size}], got one of shape {list(observation.shape)}"
+        )
     return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from mjx_reinforce.policies.action_range import check_space
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Box, Discrete
 
@@ -27,6 +28,7 @@ def categorical(
       ValueError: the space is continuous.
     """
     del initial_std, rescale
+    check_space("categorical", space)
     if not isinstance(space, Discrete):
         raise ValueError(
             "categorical needs a discrete action space, this one is continuous; choose normal"

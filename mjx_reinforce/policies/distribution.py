@@ -46,3 +46,6 @@ class Distribution(NamedTuple):
     num_scales: int = 0
     std: Callable[[jax.Array], jax.Array] | None = None
     kl: Callable[[jax.Array, jax.Array], jax.Array] | None = None
+
+    def __repr__(self) -> str:
+        return f"Distribution({self.num_outputs} outputs, {len(self.constants)} constants)"

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.policies.action_range import continuous_box, middle_and_half_range
+from mjx_reinforce.policies.arguments import check_number, known_number
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Box, Discrete
 
@@ -85,20 +86,15 @@ def gaussian_outputs(
     box = continuous_box(name, space)
     if std not in ("parameter", "softplus", "sigmoid"):
         raise ValueError(f"std must be 'parameter', 'softplus' or 'sigmoid', got {std!r}")
-    if not isinstance(initial_std, jax.core.Tracer):
-        _check_initial_std(std, float(initial_std))
+    check_number("initial_std", initial_std, positive=True)
+    number = known_number(initial_std)
+    if std == "sigmoid" and number is not None and number >= 1:
+        raise ValueError(f"a sigmoid std stays below 1, got initial_std={number}")
     size = len(box.low)
     middle, half = np.zeros(size, np.float32), np.ones(size, np.float32)
     if rescale:
         middle, half = middle_and_half_range(box)
     return GaussianOutputs(size, std, initial_std, middle, half)
-
-
-def _check_initial_std(std: str, initial_std: float) -> None:
-    if not (np.isfinite(initial_std) and initial_std > 0):
-        raise ValueError(f"initial_std must be positive and finite, got {initial_std}")
-    if std == "sigmoid" and initial_std >= 1:
-        raise ValueError(f"a sigmoid std stays below 1, got initial_std={initial_std}")
 
 
 def _log(x: Any) -> Any:

@@ -22,6 +22,9 @@ class Normalizer:
     mean: jax.Array
     m2: jax.Array
 
+    def __repr__(self) -> str:
+        return f"Normalizer(observation {list(self.mean.shape)})"
+
 
 def init(observation_size: int) -> Normalizer:
     """Returns the statistics before any observation; with them ``apply`` changes nothing."""

@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from mjx_reinforce.checks import check_kind, check_type
+from mjx_reinforce.policies.arguments import check_count
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.policies.networks import INITIALIZERS, MLP
 from mjx_reinforce.registry import check_name
@@ -15,13 +17,19 @@ class Policy(NamedTuple):
     """A parametrised distribution over actions, given the observation.
 
     init: (key) -> params; consumes the key
-    apply: (params, observation [..., O]) -> outputs [..., K] of ``distribution``
+    apply: (params, observation [..., O]) -> outputs [..., K] of ``distribution``: the
+      ``num_outputs`` entries that a network computes, then one for each of
+      ``distribution.constants``, which are parameters; ``normal`` has a log standard deviation for
+      each entry of the action. ``mlp_policy`` is an example
     distribution: the family of distributions that the outputs are the parameters of
     """
 
     init: Callable[[jax.Array], Any]
     apply: Callable[[Any, jax.Array], jax.Array]
     distribution: Distribution
+
+    def __repr__(self) -> str:
+        return f"Policy({self.distribution!r})"
 
 
 def mlp_policy(
@@ -50,6 +58,9 @@ def mlp_policy(
       ValueError: a layer has no units, the initialiser is unknown, or a second network
         is asked for and no standard deviation depends on the observation.
     """
+    check_count("observation_size", observation_size)
+    check_kind("distribution", distribution, Distribution, "mjx_reinforce.normal(env.action_space)")
+    check_type("hidden_sizes", hidden_sizes, tuple[int, ...])
     networks = _networks(distribution, tuple(hidden_sizes), shared_trunk, initializer)
     constants = distribution.constants
 

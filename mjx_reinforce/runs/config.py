@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from mjx_reinforce import envs
-from mjx_reinforce.checks import check_type
+from mjx_reinforce.checks import changed, check_type
 from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS, check_name
 from mjx_reinforce.runs.settings import (
     CheckpointSettings,
@@ -44,6 +44,9 @@ class Config(
     RunSettings,
 ):
     """Train policies, many seeds at once, and report over the seeds."""
+
+    def __repr__(self) -> str:
+        return f"Config({changed(self)})"
 
     @property
     def episodes_per_update(self) -> int:

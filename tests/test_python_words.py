@@ -1,0 +1,229 @@
+"""What a user of the Python interface is told, of mistakes and of objects: one line."""
+
+import io
+import pydoc
+
+import flax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from toys import Survive
+
+import mjx_reinforce as m
+from mjx_reinforce.runs.presets import PRESETS
+
+ENV = Survive()
+NORMAL = m.normal(ENV.action_space)
+LINEAR = m.mlp_policy(1, NORMAL, ())
+NAN = float("nan")
+
+
+def matrix(width):
+    """A policy whose outputs are a matrix times the observation."""
+    return m.Policy(lambda key: jnp.zeros((1, width)), lambda w, obs: obs @ w, NORMAL)
+
+
+def weigh(update):
+    return m.reward_to_go()._replace(update=update)
+
+
+def wide():
+    return m.mlp_policy(1, m.normal(m.Box(-np.ones(2), np.ones(2))))
+
+
+#: What is given to ``reinforce``, and what it must say.
+REFUSED = {
+    "no constants": (
+        {"policy": matrix(1)},
+        r"must return \[2, 2\]: .* then distribution.constants \[2, 1\], as parameters; got \[2, 1",
+    ),
+    "another width": ({"policy": matrix(5)}, r"must return \[2, 2\].*got \[2, 5\]"),
+    "a distribution": ({"policy": NORMAL}, "type Policy, such as mjx_reinforce.mlp_policy"),
+    "a function": ({"policy": m.mlp_policy}, "type Policy.* got mlp_policy"),
+    "other observations": (
+        {"policy": m.mlp_policy(3, NORMAL)},
+        r"apply\(.*\[2, 1\]\) fails: Scope",
+    ),
+    "other actions": ({"policy": wide()}, r"actions \[2, 2\] .* Survive takes \[2, 1\]"),
+    "no likelihood": (
+        {"policy": m.mlp_policy(1, m.deterministic(ENV.action_space))},
+        "choose a stochastic one",
+    ),
+    "a name": (
+        {"estimator": "reward-to-go"},
+        r"such as mjx_reinforce.reward_to_go\(0.99\), got 'reward-to-go'",
+    ),
+    "not called": ({"estimator": m.reward_to_go}, "type Estimator.* got reward_to_go"),
+    "weights [N]": (
+        {"estimator": weigh(lambda s, t: (t.reward[0], s, {}))},
+        r"float \[T, N\], here \[5, 16\]; got float32\[16\]",
+    ),
+    "bool weights": ({"estimator": weigh(lambda s, t: (t.mask, s, {}))}, r"got bool\[5, 16\]"),
+    "only weights": ({"estimator": weigh(lambda s, t: t.reward)}, "must return three things"),
+    "no metrics": ({"estimator": weigh(lambda s, t: (t.reward, s, None))}, "metrics as a dict"),
+    "a typing error": (
+        {"estimator": weigh(lambda s, t: (t.rewards, s, {}))},
+        "'rewards'.*test_python_words.py, line",
+    ),
+    "three values": (
+        {"estimator": m.value_baseline(network=flax.linen.Dense(3))},
+        r"must return values \[..., 1\], got \[3\]",
+    ),
+    "no episodes": ({"num_episodes": 0}, "num_episodes must be at least 1, got 0"),
+    "True episodes": ({"num_episodes": True}, "num_episodes must be a whole number, got True"),
+    "16.0 episodes": ({"num_episodes": 16.0}, "num_episodes must be a whole number, got 16.0"),
+    "1e3 steps": ({"horizon": 1e3}, "horizon must be a whole number, got 1000.0"),
+    "optax.adam": ({"optimizer": optax.adam}, r"such as optax.adam\(1e-2\), got adam"),
+    "a rate": ({"optimizer": 1e-3}, "optimizer must be of type .* got a float"),
+    "full_batch": ({"update": m.full_batch}, "got full_batch, which is to be called"),
+    "an update's name": ({"update": "each-step"}, "got 'each-step'"),
+    "entropy": ({"entropy_cost": NAN}, "entropy_cost must be 0 or more and finite, got nan"),
+    "normalize": ({"normalize_steps": NAN}, "normalize_steps must be 0 or more, got nan"),
+    "kl": ({"max_kl": 0}, "max_kl must be positive, got 0"),
+    "start": ({"one_start": 1}, "one_start must be True or False, got 1"),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_a_learner_is_refused(case, monkeypatch):
+    """When it is built, and before anything is compiled."""
+    monkeypatch.setattr(
+        "mjx_reinforce.engines.choice.choose", lambda *_: pytest.fail("it was not refused")
+    )
+    settings, message = REFUSED[case]
+    with pytest.raises(ValueError, match=message) as error:
+        m.reinforce(ENV, **settings)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"policy": m.mlp_policy(3, NORMAL)}, "policy.apply"),
+        ({"num_directions": True}, "num_directions must be a whole number, got True"),
+        ({"top_directions": 2.5}, "top_directions must be a whole number or None, got 2.5"),
+        ({"step_size": NAN}, "step_size must be positive and finite, got nan"),
+    ],
+)
+def test_a_search_is_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        m.ars(ENV, **settings)
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: m.reinforce(Survive), "Survive is a class, no environment yet: call it"),
+        (lambda: m.reward_to_go(NAN), r"must lie in \[0, 1\], got nan"),
+        (lambda: m.reward_to_go("0.9"), r"must lie in \[0, 1\], got '0.9'"),
+        (lambda: m.leave_one_out(None), r"must lie in \[0, 1\], got None"),
+        (lambda: m.leave_one_out(ENV), r"must lie in \[0, 1\], got <toys.Survive"),
+        (lambda: m.standardize("reward-to-go"), "type Estimator.* got 'reward-to-go'"),
+        (lambda: m.standardize(m.reward_to_go(), floor=NAN), "floor must be 0 or more, got nan"),
+        (lambda: m.discount_weights(0.9), "type Estimator.* got a float"),
+        (lambda: m.normal(ENV), "such as env.action_space, .* got a Survive"),
+        (lambda: m.categorical(2), "categorical needs an action space"),
+        (lambda: m.normal(ENV.action_space, initial_std="a"), "positive and finite, got 'a'"),
+        (lambda: m.mlp_policy(NORMAL, 1), "observation_size must be a whole number"),
+        (lambda: m.mlp_policy(1, ENV.action_space), "type Distribution.* got a Box"),
+        (lambda: m.mlp_policy(1, NORMAL, 32), "hidden_sizes must be a tuple.* got 32"),
+        (lambda: m.minibatches(2.5, 3), "num_updates must be a whole number, got 2.5"),
+        (lambda: m.make_optimizer("adam", "0.1"), "learning_rate must be 0 or more .* got '0.1'"),
+        (lambda: m.load(3), "run must be text or Path, got 3"),
+    ],
+)
+def test_a_part_is_refused(build, message):
+    with pytest.raises(ValueError, match=message):
+        build()
+
+
+@pytest.fixture(scope="module")
+def learner():
+    return m.reinforce(ENV, policy=LINEAR, engine="vmap")
+
+
+@pytest.fixture(scope="module")
+def state(learner):
+    return learner.init(jax.random.key(0))
+
+
+def play(learner, state, **changes):
+    given = {"env": ENV, "act": learner.act, "actor": state.actor, "distribution": NORMAL}
+    given |= {"key": jax.random.key(0), "num_episodes": 2, "horizon": 20} | changes
+    return m.rollout(**given)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"env": Survive}, "Survive is a class"),
+        ({"act": LINEAR}, "act must be a function, such as learner.act, got a Policy"),
+        ({"distribution": LINEAR}, "type Distribution.* got a Policy"),
+        ({"key": 0}, r"a random key, such as jax.random.key\(0\), got 0"),
+        ({"num_episodes": 0}, "num_episodes must be at least 1"),
+        ({"horizon": 20.0}, "horizon must be a whole number, got 20.0"),
+    ],
+)
+def test_a_rollout_is_refused(learner, state, changes, message):
+    with pytest.raises(ValueError, match=message):
+        play(learner, state, **changes)
+
+
+def test_acting_and_learning_are_refused(learner, state):
+    with pytest.raises(ValueError, match=r"must be \[..., 1\], got one of shape \[3\]"):
+        m.act(LINEAR, state.actor, jnp.zeros(3))
+    with pytest.raises(ValueError, match=r"such as state.actor, got a dict"):
+        m.act(LINEAR, state.actor.params, jnp.zeros(1))
+    with pytest.raises(ValueError, match=r"such as learner.policy, got a Learner"):
+        m.act(learner, state.actor, jnp.zeros(1))
+    with pytest.raises(ValueError, match=r"random key"):
+        learner.init(0)
+    with pytest.raises(ValueError, match=r"such as learner.init.* got a NoneType"):
+        m.train_step(learner, None)
+
+
+def test_an_object_is_one_short_line(learner, state):
+    shapes = jax.eval_shape(lambda: play(learner, state))
+    seeds = jax.eval_shape(jax.vmap(learner.init), jax.random.split(jax.random.key(0), 8))
+    made = m.envs.make("CartPole-v1"), m.envs.make("CartPole-v0")
+    presets = (config for _, config in PRESETS.values())
+    parts = learner, state, seeds, LINEAR, NORMAL, m.reward_to_go(), shapes
+    for thing in (*parts, *made, *presets):
+        assert repr(thing).startswith(f"{type(thing).__name__}(")
+        assert len(repr(thing)) < 500
+        assert "\n" not in repr(thing)
+        assert " at 0x" not in repr(thing)
+    assert repr(seeds).endswith("seeds [8])")
+    assert "mask bool[20, 2]" in repr(shapes)
+    assert [repr(env) for env in made] == [
+        "CartPole()",
+        "CartPole(max_episode_steps=200, reward_threshold=195.0)",
+    ]
+
+
+def test_modules_are_attributes():
+    assert m.envs.names()
+    assert m.fused.vmap
+    assert m.reports.__name__ == "mjx_reinforce.reports"
+    assert {"envs", "reinforce"} <= set(dir(m))
+    with pytest.raises(AttributeError, match=r"has no attribute 'nonsense'"):
+        m.nonsense  # noqa: B018
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("reinforce", "sum_n sum_t (weight[t, n] log pi(a[t, n] | o[t, n])"),
+        ("train_step", "train_step(learner"),
+        ("Policy", "distribution.constants"),
+    ],
+)
+def test_help_says_it(name, words):
+    text = io.StringIO()
+    pydoc.Helper(output=text).help(getattr(m, name))
+    shown = text.getvalue()
+    assert words in shown
+    assert "_train_step" not in shown.replace("mjx_reinforce", "")
+    assert "top of this file" not in shown
