@@ -258,7 +258,7 @@ def test_an_update_goes_no_further_than_it_may():
 
 
 def test_a_change_without_a_kl_is_kept_as_it_is():
-    policy = mlp_policy(1, normal(BOX), ())
+    policy = mlp_policy(1, normal(Survive.action_space), ())
     actor = reinforce(Survive(), policy=policy).init(jax.random.key(0)).actor
     visited = diagnostics.visited_steps(make_trajectory([4, 9], 20))
     same = diagnostics.within_kl(policy, actor, actor.params, visited, 0.01)

@@ -241,8 +241,9 @@ def make_optimizer(
       ValueError: the name is unknown.
     """
     check_name("optimizer", name, dict.fromkeys(OPTIMIZERS))
-    if not callable(learning_rate):
-        check_number("learning_rate", learning_rate)
+    rate: Any = learning_rate
+    if not callable(rate):
+        check_number("learning_rate", rate)
     check_number("weight_decay", weight_decay)
     check_number("momentum", momentum)
     if max_grad_norm is not None:
