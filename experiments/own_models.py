@@ -7,6 +7,7 @@ that is not simulated is refused, in words.
 
 import csv
 import dataclasses
+import importlib
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -15,7 +16,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 import tyro
 
@@ -23,6 +23,8 @@ from feature_models import MODELS
 from mjx_reinforce import normal, rollout
 from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.envs.base import MujocoEnv
+
+mujoco: Any = importlib.import_module("mujoco")  # pyright does not know what is in it
 
 FRAME_SKIP = 2
 STEPS = 20

@@ -6,7 +6,7 @@ The stages are MJX's own, in MJX's order, but for four:
   is active, or with a line search that ends when it is exact.
 - `contacts` finds the contacts of capsules as C MuJoCo 4.0 does; MJX 3.17 departs from it.
 - `runge_kutta` turns free and ball joints as C MuJoCo 4.0 does; MJX 3.17 departs from it.
-- `forward` computes the sensors of accelerations where there are no constraints too; MJX skips them.
+- `forward` computes the sensors of accelerations without constraints too, where MJX skips them.
 
 Gymnasium runs C MuJoCo, so its answer is the one we want. For a model without such contacts and
 joints, such as InvertedPendulum's, a step equals `mjx.step`.
