@@ -13,6 +13,7 @@ from mujoco import (  # a C extension
     MjSpec,  # pyright: ignore[reportAttributeAccessIssue]
     mjtEnableBit,  # pyright: ignore[reportAttributeAccessIssue]
     mjtIntegrator,  # pyright: ignore[reportAttributeAccessIssue]
+    mjtSensor,  # pyright: ignore[reportAttributeAccessIssue]
     mjx,
 )
 
@@ -56,8 +57,19 @@ _REMEDIES = {
     "margin/gap": "remove margin and gap from those geoms",
     "condim=1": 'set <option cone="pyramidal"/> or condim="3"',
     "sensor": "remove that sensor",
+    "mjSENS_": "remove those sensors",
+    "mjTRN_BODY": "replace the adhesion actuators by friction (friction, condim of the geoms), or "
+    "by a <weld> equality",
+    "mjTRN_SLIDERCRANK": "replace the slider-crank by the <motor> of a joint, or make its rod a "
+    "body that a <connect> equality holds",
+    "_USER": "replace the user-defined actuators by <motor>, <position>, <velocity> or <muscle>",
+    "mjEQ_": "replace those equalities by <connect>, <weld>, <joint> or <tendon>",
+    "ENBL_OVERRIDE": 'set <flag override="disable"/> and give geoms solref and solimp of their own',
+    "mjENBL_": "take that <flag> out of <option>",
     "Flex": "remove the flexible body",
 }
+#: What MJX refuses and no step depends on: the energy, and a check of the inverse dynamics.
+_ONLY_REPORTS = int(mjtEnableBit.mjENBL_ENERGY | mjtEnableBit.mjENBL_FWDINV)
 _ELSE = "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
 
 
@@ -88,6 +100,7 @@ def load(xml_file: str) -> Any:
             model = _compile(lambda text: MjSpec.from_string(text).compile(), text, xml_file)
     if not model.nu:
         raise ValueError(f"the model {xml_file!r} has no actuators; add an <actuator> element")
+    model.opt.enableflags &= ~_ONLY_REPORTS
     return model
 
 
@@ -111,6 +124,11 @@ def to_mjx(model: Any, xml_file: str) -> mjx.Model:
     """
     for feature, remedy in _ignored(model):
         raise ValueError(f"MJX cannot run {xml_file!r}: MJX would ignore {feature}; {remedy}")
+    if mjtSensor.mjSENS_RANGEFINDER in model.sensor_type and not model.nmat:
+        raise ValueError(
+            f"MJX cannot run {xml_file!r}: its rangefinders work only in a model that has a "
+            'material, a bug of MJX; add <asset><material name="any"/></asset>'
+        )
     try:
         converted = mjx.put_model(model, impl="jax")
         # Notices what the model alone does not show; its arrays are not made.

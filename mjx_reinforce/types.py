@@ -33,7 +33,8 @@ class Environment(Protocol):
     """What the trainer reads of an environment; brax and Playground environments satisfy it.
 
     ``reset`` and ``step`` are pure functions on one environment. The state they
-    return has at least ``obs`` [O], ``reward`` [] and ``done`` [].
+    return has at least ``obs`` [O], ``reward`` [] and ``done`` [], which is not 0 where the episode
+    ends. An episode has at least one step: ``done`` and ``reward`` of ``reset`` are not read.
     """
 
     def reset(self, rng: jax.Array) -> Any:

@@ -124,7 +124,19 @@ ARRAY = [
     lambda x: lax.linalg.triangular_solve(x[:, :3].T @ x[:, :3] + jnp.eye(3), x.T, lower=True),
     lambda x: jax.vmap(jnp.dot)(x, x), lambda x: {"a": x, "b": (x[0], None, jnp.ones(2))},
     lambda x: jnp.nonzero(jnp.array([0, 1, 1]), size=2)[0] + x[0, 0],
+    lambda x: x.at[jnp.zeros(0, int)].set(1.0), lambda x: x.at[jnp.zeros(0, int), 1].add(1.0),
+    lambda x: lax.top_k(x, 3), lambda x: lax.top_k(jnp.round(x), 2),
+    lambda x: lax.top_k(jnp.round(x.ravel()).astype(jnp.int32), 12), lambda x: lax.top_k(x, 0),
 ]  # fmt: skip
+
+
+def test_the_largest_are_ordered_as_xla_orders_them():
+    """By their bits: 0 above -0, NaN above infinity; the first of equal ones is the first."""
+    x = jnp.array([jnp.nan, 1, jnp.inf, -jnp.inf, -jnp.nan, -0.0, 0.0, -0.0, 0.0, 1, 2, 2])
+    x = jnp.stack([jnp.roll(x, shift) for shift in range(BATCH)])
+    got = jax.jit(fused.vmap(lambda row: lax.top_k(row, 11)))(x)
+    for ours, theirs in zip(got, lax.top_k(x, 11), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
 
 
 @pytest.mark.parametrize("fn", ARRAY)

@@ -184,6 +184,18 @@ def test_older_cpus(level, monkeypatch):
     assert_same_episodes(played(rollout.rollout, env, player, horizon=30), want, rounding=2e-5)
 
 
+def test_an_end_that_is_nan_is_no_end():
+    class Lost(Drifting):
+        def step(self, state, action):
+            after = super().step(state, action)
+            return after.replace(done=jnp.where(after.obs[0] > 0.75, jnp.nan, after.done))
+
+    env = Lost()
+    got, want = both(env, actor_and_act(env, (4,)), num_episodes=20)
+    assert 0 < want.nonfinite.mean() < 1
+    assert_same_episodes(got, want, rounding=2e-5)
+
+
 def test_a_nan_stays_in_its_lane():
     class Breaking(Drifting):
         def step(self, state, action):

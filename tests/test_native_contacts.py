@@ -115,6 +115,42 @@ def test_contacts(xml, room, monkeypatch):
     assert np.max(np.abs(ours - theirs).max(axis=1) / scale[steady]) < 1e-11
 
 
+#: Models made for MJX say how many pairs and contacts to look at: those that are nearest.
+NEAREST = """
+<mujoco>
+  <custom>
+    <numeric name="max_geom_pairs" data="2"/><numeric name="max_contact_points" data="3"/>
+  </custom>
+  <worldbody><geom type="plane" size="5 5 1"/>{}</worldbody>
+</mujoco>""".format(
+    "".join(
+        f"""<body pos="{x} 0 0"><joint type="slide" axis="1 0 0"/>
+        <joint type="slide" axis="0 0 1"/><geom type="sphere" size="0.15"/></body>"""
+        for x in (0.0, 0.2, 0.4)
+    )
+)
+
+
+@pytest.mark.cpu
+def test_the_nearest_pairs_and_contacts():
+    with jax.enable_x64(True):
+        env = Scene(NEAREST)
+        actor, act, distribution = actor_and_act(env, ())
+
+        def play(engine):
+            roll = lambda key: engine(  # noqa: E731
+                env, act, actor, distribution, key, num_episodes=64, horizon=2
+            )
+            return np.asarray(jax.jit(roll)(jax.random.key(0)).observation[1])
+
+        ours, theirs = play(rollout.rollout), play(rollouts.rollout)
+    jax.clear_caches()
+    touches = theirs[:, -3:].sum(axis=1)
+    assert {1, 2, 3} <= {*touches.astype(int)}
+    scale = 1 + np.abs(theirs).max(axis=1)
+    assert np.max(np.abs(ours - theirs).max(axis=1) / scale) < 1e-11
+
+
 BALL = """
 <mujoco><worldbody><geom type="plane" size="5 5 1"/>
   <body pos="0 0 0.1"><joint type="slide" axis="0 0 1"/><geom type="sphere" size="0.1"/></body>

@@ -5,8 +5,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import mujoco
 import pytest
+from mujoco import mjx
 
 from mjx_reinforce import envs
 from mjx_reinforce.envs import models
@@ -44,6 +46,45 @@ def test_what_mjx_lacks_is_named_with_a_remedy(option, floor, message):
     model = MjModel.from_xml_string(ONE_JOINT.format(option=option, floor=floor))
     with pytest.raises(ValueError, match=message):
         models.to_mjx(model, "mine.xml")
+
+
+#: What a user may have written, and what the message must say.
+REFUSED = {
+    '<actuator><adhesion body="b" ctrlrange="0 1" gain="1"/></actuator>': "TRN_BODY.*friction",
+    '<actuator><general cranksite="s" slidersite="t" cranklength="1"/></actuator>': (
+        "TRN_SLIDERCRANK.*<connect>"
+    ),
+    '<actuator><general joint="j" gaintype="user"/></actuator>': "GAIN_USER.*<motor>",
+    '<option><flag override="enable"/></option>': "ENBL_OVERRIDE.*solref",
+    '<sensor><user dim="1"/></sensor>': "SENS_USER.*remove those sensors",
+    '<sensor><rangefinder site="s"/></sensor>': 'rangefinders.*<material name="any"/>',
+}
+
+
+@pytest.mark.parametrize("element", REFUSED)
+def test_what_mjx_lacks_beside_options(element):
+    text = f"""<mujoco><worldbody><site name="t"/><body name="b"><joint name="j"/>
+        <geom size="1"/><site name="s"/></body></worldbody>{element}</mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(ValueError, match=REFUSED[element]):
+        models.to_mjx(model, "mine.xml")
+
+
+RANGEFINDER = """<mujoco><option><flag energy="enable" fwdinv="enable"/></option>
+  <asset><material name="any"/></asset>
+  <worldbody><geom type="plane" size="1 1 1"/>
+    <body pos="0 0 1"><joint name="j"/><geom size="0.1"/>
+      <site name="s" zaxis="0 0 -1"/></body></worldbody>
+  <actuator><motor joint="j"/></actuator>
+  <sensor><rangefinder site="s"/></sensor></mujoco>"""
+
+
+def test_what_only_reports_is_turned_off_and_a_rangefinder_measures(tmp_path):
+    (tmp_path / "mine.xml").write_text(RANGEFINDER, encoding="utf-8")
+    model = models.load(str(tmp_path / "mine.xml"))
+    ours, data = models.to_mjx(model, "mine.xml"), mjx.make_data(model, impl="jax")
+    seen = jax.jit(lambda: mjx.sensor_pos(ours, mjx.kinematics(ours, data)))()
+    assert float(seen.sensordata[0]) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(

@@ -132,15 +132,15 @@ def test_the_simulation_stops_when_all_episodes_are_over(length, steps):
     assert int(trajectory.simulated) == 4 * steps
 
 
-@pytest.mark.parametrize("entry", ["observation", "reward"])
+@pytest.mark.parametrize("entry", ["observation", "reward", "done"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_what_is_not_finite_ends_its_episode(entry, value):
     """The third step breaks in those episodes that start high; its reward is 0."""
 
     def spoil(state):
         broken = (state.obs[0] == 3) & (state.info > 0.5)
-        if entry == "reward":
-            return state.replace(reward=jnp.where(broken, value, state.reward))
+        if entry != "observation":
+            return state.replace(**{entry: jnp.where(broken, value, getattr(state, entry))})
         return state.replace(obs=state.obs.at[1].set(jnp.where(broken, value, state.obs[1])))
 
     key = jax.random.key(1)

@@ -78,7 +78,8 @@ def step(
     if deterministic is not None:
         action = _choose(deterministic, distribution.mode(outputs), action)
     after = env_step(state, action.T)
-    finite = jnp.all(jnp.isfinite(after.obs), axis=0) & jnp.isfinite(after.reward)
+    finite = jnp.all(jnp.isfinite(after.obs), axis=0)
+    finite &= jnp.isfinite(after.reward) & jnp.isfinite(after.done)
     broken = alive & ~finite
     return Step(
         observation=observation,

@@ -60,8 +60,8 @@ def rollout(
       env_step: ``env.step`` of N episodes, the last axis of every leaf; by default ``jax.vmap``.
 
     Returns:
-      The episodes. A non-finite observation or reward ends its episode, with reward 0 for that
-      step, and shows in ``nonfinite``.
+      The episodes. A non-finite observation, reward or ``done`` ends its episode, with reward 0 for
+      that step, and shows in ``nonfinite``.
 
     Raises:
       ValueError: an argument makes no sense.

@@ -6,6 +6,7 @@ then elements are only moved; a start that depends on the lane becomes a chain o
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -163,7 +164,7 @@ def _scatter(
     sizes = [1 if axis in hidden else next(update_sizes) for axis in range(operand.ndim)]
     trailing = range(updates.ndim - len(window_axes), updates.ndim)
     blocks = np.moveaxis(updates, window_axes, list(trailing))
-    blocks = blocks.reshape([int(np.prod(indices.shape[:-1], dtype=int)), -1])
+    blocks = blocks.reshape([math.prod(indices.shape[:-1]), math.prod(sizes)])
     flat = arrays.lift(operand).reshape(-1).copy()
     batching = (dims.operand_batching_dims, dims.scatter_indices_batching_dims)
     starts = _starts(indices, operand.ndim, dims.scatter_dims_to_operand_dims, *batching)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays
+from mjx_reinforce.fused import arrays, ops
 from mjx_reinforce.fused.graph import Graph
 
 
@@ -94,6 +94,56 @@ def _precedes(graph: Graph, x: Any, y: Any) -> Any:
     return graph.call("or", graph.call("lt", x, y), graph.call("and", number, nan))
 
 
+def _top_k(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
+    """The k largest elements, the first of equal ones first, and where they are.
+
+    The list of the k largest so far is in order, and each element in turn is put into it, behind
+    those that are no smaller.
+    """
+    k, axis = eqn.params["k"], eqn.params["axis"]
+    rows = np.moveaxis(arrays.lift(x), axis, -1)
+    found = [_largest(graph, list(row), k) for row in rows.reshape(-1, x.shape[axis])]
+    results = []
+    for part, out in zip(zip(*found, strict=True), eqn.outvars, strict=True):
+        scalars = [scalar for row in part for scalar in row]
+        packed = arrays.pack(scalars, (*rows.shape[:-1], k), out.aval.dtype)
+        results.append(np.moveaxis(packed, -1, axis))
+    return results
+
+
+def _largest(graph: Graph, row: list, k: int) -> tuple[list, list]:
+    """Returns the k largest scalars, and their positions."""
+    best: list[tuple] = []  # (order, value, position)
+    for i, value in enumerate(row):
+        order = _ordered(graph, value)
+        moving = order, value, np.int32(i)
+        for rank, other in enumerate(best):
+            wins = graph.call("gt", order, other[0])
+            choose = functools.partial(graph.select, wins)
+            best[rank], moving = (
+                tuple(map(choose, moving, other)),
+                tuple(map(choose, other, moving)),
+            )
+        if len(best) < k:
+            best.append(moving)
+    return [value for _, value, _ in best], [position for *_, position in best]
+
+
+def _ordered(graph: Graph, value: Any) -> Any:
+    """Returns an integer that is greater where XLA's total order puts a number higher.
+
+    That is -NaN, -inf, ..., -0, 0, ..., inf, NaN: the order of the bits, but for negative numbers.
+    """
+    if value.dtype.kind in "biu":
+        return value
+    integer = np.dtype(f"int{8 * value.dtype.itemsize}")
+    op = ops.Op("bitcast_convert_type", (("new_dtype", integer),))
+    bits = graph.apply(op, (value,), integer)
+    negative = graph.call("lt", bits, integer.type(0))
+    flipped = graph.call("xor", bits, integer.type(np.iinfo(integer).max))
+    return graph.select(negative, flipped, bits)
+
+
 def _reducer(combine: str, empty: float) -> Callable:
     return functools.partial(_reduce, combine=combine, empty=empty)
 
@@ -114,4 +164,5 @@ RULES = {
     "argmax": functools.partial(_arg_extreme, better="gt"),
     "argmin": functools.partial(_arg_extreme, better="lt"),
     "sort": _sort,
+    "top_k": _top_k,
 }
