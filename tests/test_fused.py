@@ -10,7 +10,7 @@ import pytest
 from jax import lax
 
 from mjx_reinforce import fused
-from mjx_reinforce.fused import scalarized
+from mjx_reinforce.fused import graph, jaxprs, scalarized, size
 
 BATCH = 6
 
@@ -364,6 +364,38 @@ def test_unused_results_are_not_computed():
 def test_unsupported_primitive_names_itself_and_its_line():
     with pytest.raises(fused.UnsupportedPrimitive, match=r"'eigh'.*test_fused\.py"):
         fused.vmap(lambda x: lax.linalg.eigh(x)[0])(jnp.ones((2, 3, 3)))
+
+
+SIZES = {
+    "elementwise": (lambda x: jnp.sin(x) + x, 12),
+    "product": (lambda x: x @ x.T, 2 * 9 * 4),
+    "reduction": (lambda x: x.sum(), 12),
+    "branches": (lambda x: lax.cond(x[0, 0] > 0, jnp.sin, lambda x: x * 2, x), 12),
+    "loop": (lambda x: lax.fori_loop(0, 40, lambda _, x: jnp.sin(x) * 2, x), 24),
+    "while": (lambda x: lax.while_loop(lambda x: x[0, 0] < 9, lambda x: x + 1, x), 24),
+}
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_the_size_is_known_before_anything_is_written(name):
+    fn, least = SIZES[name]
+    program, _ = jaxprs.trace(fn, jnp.ones((3, 4)))
+    assert least <= size.num_scalars(program) <= 2 * least + 15
+
+
+def test_what_is_too_large_is_refused_and_what_compiles_long_is_warned_of(monkeypatch):
+    def double(x):
+        return jnp.sin(x) * 2
+
+    with pytest.warns(UserWarning, match=r"is 20,002 scalar operations.*use jax\.vmap"):
+        jax.eval_shape(fused.vmap(double), jnp.ones((2, 10_001)))
+    monkeypatch.setattr(size, "MAX_SCALARS", 30)
+    with pytest.raises(fused.TooLarge, match="is about 40 scalar operations, more than 30"):
+        fused.vmap(double)(jnp.ones((2, 20)))
+    monkeypatch.setattr(size, "MAX_SCALARS", 40)
+    monkeypatch.setattr(graph, "_MOST", 39)
+    with pytest.raises(fused.TooLarge, match="is more than 39 scalar operations"):
+        fused.vmap(double)(jnp.ones((2, 20)))
 
 
 def test_gradient():

@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from toys import Survive, ToyState, categorical
 
 from mjx_reinforce import Box, envs, reinforce
 from mjx_reinforce.engines import choice, rollouts
-from mjx_reinforce.engines.native import available, objects, program, rollout
+from mjx_reinforce.engines.native import available, objects, outlook, program, rollout
 from mjx_reinforce.engines.native.cpu import lanes, machine
 from mjx_reinforce.engines.native.gpu import ptx
 from mjx_reinforce.registry import DISTRIBUTIONS, load
@@ -345,3 +346,85 @@ def test_lanes_have_no_numbers_of_8_bits():
     chosen = choice.choose("auto", env, choice.Player(act, actor, distribution), 500)
     assert chosen.name == "fused"
     assert "machine code cannot play this: its state has numbers of int8" in chosen.why
+
+
+@pytest.mark.parametrize("implementation", ["rbg", "unsafe_rbg"])
+def test_keys_of_another_generator(implementation):
+    """Their noise is not drawn here; auto plays them as ``vmap`` does, and says so."""
+    env = Drifting()
+    actor, act, distribution = actor_and_act(env, (4,))
+    key = jax.random.key(1, impl=implementation)
+    engine = choice.choose("auto", env, choice.Player(act, actor, distribution), 20)
+    assert engine.name == "native"
+
+    def play(engine):
+        return engine(env, act, actor, distribution, key, num_episodes=6, horizon=20)
+
+    with pytest.warns(UserWarning, match=f"the key is of {implementation}; vmap plays it"):
+        got = play(engine.rollout)
+    assert_same_episodes(got, play(rollouts.rollout), rounding=0)
+    with pytest.raises(ValueError, match=rf'of {implementation}; make .*impl="threefry2x32"'):
+        play(rollout.rollout)
+
+
+def chosen(env, name="auto"):
+    actor, act, distribution = actor_and_act(env, (4,))
+    return choice.choose(name, env, choice.Player(act, actor, distribution), 20)
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize(
+    "error", [KeyError("lost"), ValueError("cannot reshape"), RecursionError("deep")]
+)
+def test_auto_falls_back_whatever_the_writer_raises(error, monkeypatch):
+    def write(*_):
+        raise error
+
+    monkeypatch.setattr(program, "_write_cpu", write)
+    monkeypatch.setattr(objects, "folder", lambda: None)
+
+    class Unseen(Drifting):
+        def step(self, state, action):
+            after = super().step(state, action)
+            return after.replace(reward=after.reward + len(type(error).__name__))
+
+    engine = chosen(Unseen())
+    assert engine.name == "fused"
+    assert f"it cannot be written out ({type(error).__name__}" in engine.why
+    with pytest.raises(ValueError, match="native engine cannot play this: it cannot be written"):
+        chosen(Unseen(), "native")
+
+
+class Panorama(Drifting):
+    """Sees 2,000 numbers."""
+
+    def reset(self, rng):
+        state = super().reset(rng)
+        return state.replace(obs=jnp.tile(state.obs, 1_000))
+
+    def step(self, state, action):
+        return state.replace(obs=0.9 * state.obs, reward=jnp.sum(state.obs))
+
+
+def test_wide_observations_are_not_for_machine_code():
+    engine = chosen(Panorama())
+    assert engine.name == "vmap"
+    assert "fused does not support this environment: its observation has 2,000" in engine.why
+    assert "109 s, more than 80 s, because of an observation of 2,000 entries" in engine.why
+    assert outlook.announcement(Panorama()) is None
+    assert outlook.announcement(Drifting()) is None
+
+
+@pytest.mark.cpu
+def test_large_models_are_not_for_machine_code(monkeypatch):
+    """The reason says which bodies meet most, and people who wait are told of it beforehand."""
+    env = envs.make("Walker2d-v5")
+    assert outlook.seconds(env) == pytest.approx(5, abs=3)
+    monkeypatch.setattr(outlook, "_WORTH_SAYING", 1)
+    monkeypatch.setattr(objects, "folder", lambda: None)
+    assert "with up to 14 contacts, and compiling" in str(outlook.announcement(env))
+    monkeypatch.setattr(outlook, "MAX_SECONDS", 1)
+    engine = chosen(env)
+    assert engine.name == "vmap"
+    assert "more than 1 s, because of its size; its geoms can meet in" in engine.why
+    assert re.search(r"bodies 'world' \(\d+\), .* the feet alone, by contype", engine.why)

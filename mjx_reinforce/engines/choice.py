@@ -8,20 +8,23 @@ step, policy included, and repeats it in machine code for a CPU or in a kernel f
 
 import functools
 import time
+import warnings
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 
 from mjx_reinforce import fused
+from mjx_reinforce.checks import explain
 from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.engines.rollouts import rollout
+from mjx_reinforce.fused.vmap import MAX_OPERATIONS
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Environment, Trajectory, null_action
 
-#: An env step of more operations takes minutes to compile and runs slower than plain MJX.
-MAX_OPERATIONS = 20_000
+#: Each entry of an observation is an array of its own; XLA takes minutes to compile 2,000 of them.
+MAX_ENTRIES = 500
 #: On a CPU, branches of more operations are skipped where no episode needs them.
 _CPU_BRANCH_COST = 32
 
@@ -89,7 +92,7 @@ def _choose(name: str, env: Environment, player: Player | None, horizon: int | N
     if not against:
         device = "CPU" if jax.default_backend() == "cpu" else "GPU"
         why = f"machine code for this {device}" if name == "auto" else why
-        return Engine("native", why, native.rollout)
+        return Engine("native", why, _from_any_key if name == "auto" else native.rollout)
     if name == "native":
         raise ValueError(f"the native engine cannot play this: {against}; choose auto")
     instead = f"; machine code cannot play this: {against}" if name == "auto" else ""
@@ -121,6 +124,17 @@ def _against_native(
     return native.unsupported(env, *player, horizon)
 
 
+def _from_any_key(
+    env: Environment, act: Any, actor: Any, distribution: Any, key: jax.Array, **options: Any
+) -> Trajectory:
+    """Plays in machine code, or as ``vmap`` where that cannot draw the noise of the key."""
+    against = native.against_key(key)
+    if against:
+        warnings.warn(f"machine code cannot play this: {against}; vmap plays it", stacklevel=2)
+    play = rollout if against else native.rollout
+    return play(env, act, actor, distribution, key, **options)
+
+
 def unsupported_by_fused(env: Environment, step: Any) -> str | None:
     """Returns why an environment does not run, or not well, on the fused engine; None if it does.
 
@@ -135,10 +149,15 @@ def unsupported_by_fused(env: Environment, step: Any) -> str | None:
         states = jax.vmap(env.reset, out_axes=-1)(jax.random.split(jax.random.key(0), 1))
         return states, null_action(env)[..., None]
 
+    entries = jax.eval_shape(env.reset, jax.random.key(0)).obs.size
+    if entries > MAX_ENTRIES:
+        return f"its observation has {entries:,} entries, more than {MAX_ENTRIES:,}"
     try:
         written = step.write(*jax.eval_shape(one))
-    except (fused.UnsupportedPrimitive, TypeError) as error:
+    except (fused.TooLarge, fused.UnsupportedPrimitive, TypeError) as error:
         return " ".join(str(error).split())
+    except Exception as error:  # whatever it is, another engine may play this
+        return f"it cannot be written out ({explain(error)})"
     count = sum(written.operations.values())
     if count > MAX_OPERATIONS:
         return f"one env step takes {count:,} scalar operations, more than {MAX_OPERATIONS:,}"

@@ -17,16 +17,26 @@ What to know before using it:
   branch of `cond` runs only if some lane needs it. Under an outer `jax.vmap` both stay as they
   are: see `any_lane`.
 - Everything is written out, so it is for small states: tens to hundreds of scalars. A matrix
-  product of n × m × k becomes 2nmk operations.
+  product of n × m × k becomes 2nmk operations. What is larger than `size.MAX_SCALARS` raises
+  `TooLarge`; XLA takes minutes to compile what is larger than `vmap.MAX_OPERATIONS`, and that is
+  warned of.
 - Differentiation works where JAX's does: not in reverse through a `while`. Rules of
   `jax.custom_jvp` and `jax.custom_vjp` are not kept; the function itself is differentiated.
 - A primitive without a rule raises `UnsupportedPrimitive`, which names the line it came from.
 """
 
-from mjx_reinforce.fused.errors import UnsupportedPrimitive
+from mjx_reinforce.fused.errors import TooLarge, UnsupportedPrimitive
 from mjx_reinforce.fused.jaxprs import prune
 from mjx_reinforce.fused.lanes import any_lane
 from mjx_reinforce.fused.scalarized import Scalarized, scalarize
 from mjx_reinforce.fused.vmap import vmap
 
-__all__ = ["Scalarized", "UnsupportedPrimitive", "any_lane", "prune", "scalarize", "vmap"]
+__all__ = [
+    "Scalarized",
+    "TooLarge",
+    "UnsupportedPrimitive",
+    "any_lane",
+    "prune",
+    "scalarize",
+    "vmap",
+]

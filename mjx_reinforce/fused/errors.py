@@ -5,6 +5,10 @@ class UnsupportedPrimitive(NotImplementedError):  # noqa: N818 (reads as what it
     """A JAX primitive that cannot be written out, or not for a backend."""
 
 
+class TooLarge(NotImplementedError):  # noqa: N818 (reads as what it is)
+    """A function that is too large to be written out."""
+
+
 def no_rule(name: str, source: str) -> UnsupportedPrimitive:
     """Returns the error for a primitive without a rule.
 

@@ -12,9 +12,13 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.fused import arrays, folding, jaxprs, ops, simplify
+from mjx_reinforce.fused.errors import TooLarge
 from mjx_reinforce.fused.nodes import Captured, Gate, Loop, Node, Scalar, Scope, identity
+from mjx_reinforce.fused.size import MAX_SCALARS
 
 _BOOL = np.dtype(bool)
+#: `size` foresees what is written; where it errs, writing ends here.
+_MOST = 3 * MAX_SCALARS
 
 
 class Graph:
@@ -45,7 +49,7 @@ class Graph:
         self._evaluated: dict[int, Any] = {}  # kept, so that no id is given twice
         self.certain: set[Node] = set()
         self._scopes = [Scope(depth=0, floor=0)]
-        self._count = 0
+        self._count = self._applied = 0
         self._captured: dict[int, tuple[Captured, np.ndarray]] = {}
 
     @property
@@ -146,6 +150,9 @@ class Graph:
         """Applies an operation: a constant, an existing node, a simpler one or a new one."""
         if not any(isinstance(arg, Node) for arg in args):
             return folding.fold(op, args, dtype)
+        self._applied += 1
+        if self._applied > _MOST:
+            raise TooLarge(f"written out it is more than {_MOST:,} scalar operations")
         simpler = simplify.simplify(self, op, args, dtype)
         return self._share(op, args, dtype) if simpler is None else simpler
 

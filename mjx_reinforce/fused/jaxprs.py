@@ -105,6 +105,12 @@ def callee(eqn: Any) -> Program | None:
     return None
 
 
+def default_platform(eqn: Any) -> int:
+    """Returns which branch of `platform_dependent` is the default; its branches agree."""
+    platforms = list(eqn.params["platforms"])
+    return platforms.index(None) if None in platforms else 0
+
+
 def scan_parts(eqn: Any) -> ScanParts:
     """Returns how a `scan` equation's operands divide."""
     if "num_consts" in eqn.params:  # JAX 0.10

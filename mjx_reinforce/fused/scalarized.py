@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_reinforce.fused import arrays, evaluate, jaxprs, liveness, loops
+from mjx_reinforce.fused import arrays, evaluate, jaxprs, liveness, loops, size
 from mjx_reinforce.fused.backends import BACKENDS
 from mjx_reinforce.fused.graph import Graph
 from mjx_reinforce.fused.nodes import Scalar
@@ -82,8 +82,13 @@ def build(
         unrolled: a scan that reads and makes no arrays is written out up to this length.
         unrolled_arrays: one that reads or makes arrays is written out up to this length.
         unrolled_on_request: one whose `unroll` is more than 1 is, up to this length.
+
+    Raises:
+        TooLarge: it is more than is written out.
+        UnsupportedPrimitive: it uses a primitive that has no rule.
     """
     program, out_shape = jaxprs.trace(fn, *examples)
+    size.check_size(program)
     graph = Graph(branch_cost, unrolled, unrolled_arrays, unrolled_on_request)
     inputs = [
         _inputs(graph, number, variable.aval, varies)

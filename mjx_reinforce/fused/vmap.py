@@ -1,6 +1,7 @@
 """`vmap`: a drop-in for `jax.vmap` that leaves only elementwise work."""
 
 import functools
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,9 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.fused import scalarized
+
+#: XLA takes minutes to compile more operations, and what it makes of them is slow.
+MAX_OPERATIONS = 20_000
 
 
 def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 32) -> Callable:
@@ -34,6 +38,7 @@ def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 3
 
     Raises:
         ValueError: if no argument is mapped, the mapped sizes differ, or an axis does not fit.
+        TooLarge: if fn is more than is written out.
         UnsupportedPrimitive: if fn uses a primitive that has no rule.
     """
     write = _Writer(fn, in_axes, branch_cost)
@@ -42,6 +47,13 @@ def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 3
     def mapped(*args: Any, **kwargs: Any) -> Any:
         args, kwargs = jax.tree.map(jnp.asarray, (args, kwargs))
         written, axes = write(args, kwargs)
+        count = sum(written.operations.values())
+        if count > MAX_OPERATIONS:
+            warnings.warn(
+                f"written out this function is {count:,} scalar operations, and XLA takes minutes "
+                f"to compile more than {MAX_OPERATIONS:,}; use jax.vmap for it",
+                stacklevel=2,
+            )
         leaves = jax.tree.leaves((args, kwargs))
         batch = _batch_size(leaves, axes)
         rows = [_rows(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]

@@ -36,6 +36,7 @@ import jax
 import jax.numpy as jnp
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver, collision_sdf, scan
+from mujoco.mjx._src.collision_driver import geom_pairs
 from mujoco.mjx._src.collision_primitive import collider
 from mujoco.mjx._src.collision_types import Collision, GeomInfo
 from mujoco.mjx._src.forward import _advance as advance
@@ -53,6 +54,7 @@ __all__ = [
     "collider",
     "collision_with",
     "fenced",
+    "geom_pairs",
     "jax_fields",
     "make_frame",
     "num_contacts",

@@ -67,8 +67,12 @@ def policy_settings(env: Any, config: Config) -> dict[str, Any]:
 
 
 def _build_reinforce(env: Any, config: Config, shared: dict[str, Any]) -> Any:
+    from mjx_reinforce.engines.native import outlook
     from mjx_reinforce.learners.reinforce import reinforce
+    from mjx_reinforce.runs.heartbeat import to_screen
 
+    if config.engine in ("auto", "native") and (said := outlook.announcement(env)):
+        to_screen(said)
     return reinforce(
         env,
         estimator=_build_estimator(config),

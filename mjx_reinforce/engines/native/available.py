@@ -9,6 +9,8 @@ from mjx_reinforce.engines.native.gpu import seam as gpu
 
 #: LLVM 20, which llvmlite 0.45 has, is the first that reads the IR as it is written here.
 _OLDEST = (20,)
+#: JAX's generator whose noise it draws; `rollout` looks at the keys that it gets.
+GENERATOR = "threefry2x32"
 
 
 def platform() -> str:
@@ -42,8 +44,8 @@ def unavailable() -> str | None:
     if llvmlite.binding.llvm_version_info < _OLDEST:
         return f"llvmlite {llvmlite.__version__} is too old; pip install 'llvmlite>=0.45'"
     generator = jax.config.values["jax_default_prng_impl"]
-    if generator != "threefry2x32":
-        return f"it draws noise as threefry2x32 does, not as {generator}"
+    if generator != GENERATOR:
+        return f"it draws noise as {GENERATOR} does, not as {generator}"
     if not jax.config.values["jax_threefry_partitionable"]:
         return "it draws noise as JAX does with jax_threefry_partitionable"
     return gpu.unavailable() if platform() == "gpu" else None

@@ -1,6 +1,5 @@
 """From an environment and a policy to machine code, made once and kept on disk."""
 
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -8,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engines import episode
-from mjx_reinforce.engines.native import available, objects, step
+from mjx_reinforce.engines.native import available, objects, outlook, step
 from mjx_reinforce.engines.native.cpu import handler, machine, player, queue
 from mjx_reinforce.engines.native.cpu.denormals import flush
 from mjx_reinforce.engines.native.gpu import player as gpu_player
@@ -50,6 +49,7 @@ def build(
       length: steps whose noise is drawn with one key.
 
     Raises:
+      TooLarge: writing the step out would take minutes.
       UnsupportedPrimitive: the step has an operation that cannot be written.
     """
     examples = step.examples(env, actor)
@@ -60,13 +60,18 @@ def build(
     traced, shapes = jaxprs.trace(function, *examples)
     source = f"{jaxprs.fingerprint(traced)} {objects.source_digest(*_WRITERS)}"
     folder = objects.folder()
-    if on_cpu:
-        target = machine.this_machine()
-        write = functools.partial(_write_cpu, function, examples, target)
-        code = machine.load(source, write, handler.NAMES, target, folder)
-    else:
-        write = functools.partial(_write_gpu, function, examples)
+    target = machine.this_machine() if on_cpu else None
+
+    def write() -> str:  # not called where memory or disk has the code
+        outlook.check_seconds(env, traced, shapes.record[0].size)
+        if target is None:
+            return _write_gpu(function, examples)
+        return _write_cpu(function, examples, target)
+
+    if target is None:
         code = ptx.load(source, write, gpu_seam.compute_capability(), folder)
+    else:
+        code = machine.load(source, write, handler.NAMES, target, folder)
     return Program(code, shapes.record)
 
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce.checks import explain
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.chunks import chunk_length
 from mjx_reinforce.engines.native import available
@@ -20,9 +21,11 @@ from mjx_reinforce.engines.native.cpu import seam as cpu
 from mjx_reinforce.engines.native.gpu import seam as gpu
 from mjx_reinforce.engines.native.program import Program, build
 from mjx_reinforce.engines.native.step import stored
-from mjx_reinforce.fused import UnsupportedPrimitive
+from mjx_reinforce.fused import TooLarge, UnsupportedPrimitive
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Environment, Trajectory
+
+_REMEDY = f'make keys with jax.random.key(seed, impl="{available.GENERATOR}"), or choose auto'
 
 
 def rollout(
@@ -48,9 +51,12 @@ def rollout(
     Raises:
       ValueError: machine code cannot play this; see ``unsupported``.
     """
+    against = against_key(key)
+    if against:
+        raise ValueError(f"the native engine cannot play this: {against}; {_REMEDY}")
     try:
         program = build(env, act, actor, distribution, chunk_length(horizon))
-    except UnsupportedPrimitive as error:
+    except (TooLarge, UnsupportedPrimitive) as error:
         raise ValueError(f"the native engine cannot play this: {error}") from error
     begin = functools.partial(episode.begin, env, key)
     state, keys = jax.vmap(begin)(jnp.arange(num_episodes))
@@ -77,6 +83,14 @@ def rollout(
     )
 
 
+def against_key(key: jax.Array) -> str | None:
+    """Returns why machine code cannot play from a key, or None: its noise is threefry2x32's."""
+    implementation = str(jax.random.key_impl(key))
+    if implementation == available.GENERATOR:
+        return None
+    return f"it draws noise as {available.GENERATOR} does, and the key is of {implementation}"
+
+
 def _episodes_before_numbers(results: Sequence[jax.Array]) -> Sequence[jax.Array]:
     """Returns a kernel's results with the records' axes in the order that a CPU writes them in."""
     observation, action, reward = (jnp.swapaxes(x, 1, 2) for x in results[:3])
@@ -92,10 +106,12 @@ def unsupported(
         return reason
     try:
         build(env, act, actor, distribution, chunk_length(horizon))
-    except (UnsupportedPrimitive, TypeError) as error:
+    except (TooLarge, UnsupportedPrimitive, TypeError) as error:
         return " ".join(str(error).split())
-    except RuntimeError as error:
-        return f"LLVM refuses its program: {' '.join(str(error).split())}"
+    except Exception as error:  # whatever it is, another engine may play this
+        if type(error) is RuntimeError:
+            return f"LLVM refuses its program: {' '.join(str(error).split())}"
+        return f"it cannot be written out ({explain(error)})"
     return None
 
 

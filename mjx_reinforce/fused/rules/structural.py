@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays
+from mjx_reinforce.fused import arrays, jaxprs
 from mjx_reinforce.fused.graph import Graph
 
 
@@ -85,10 +85,7 @@ def _empty(graph: Graph, eqn: Any) -> list[np.ndarray]:
 
 
 def _platform_index(graph: Graph, eqn: Any) -> list[np.ndarray]:
-    """Picks the default branch of `platform_dependent`: its branches agree."""
-    platforms = list(eqn.params["platforms"])
-    default = platforms.index(None) if None in platforms else 0
-    return [np.asarray(default, eqn.outvars[0].aval.dtype)]
+    return [np.asarray(jaxprs.default_platform(eqn), eqn.outvars[0].aval.dtype)]
 
 
 def _identity(graph: Graph, eqn: Any, *operands: np.ndarray) -> list[np.ndarray]:
