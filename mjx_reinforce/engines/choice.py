@@ -23,8 +23,8 @@ from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Environment, Trajectory, null_action
 
-#: Each entry of an observation is an array of its own; XLA takes minutes to compile 2,000 of them.
-MAX_ENTRIES = 500
+#: Each entry of an observation is an array of its own; XLA takes longer and longer for more.
+MAX_ENTRIES = 200
 #: On a CPU, branches of more operations are skipped where no episode needs them.
 _CPU_BRANCH_COST = 32
 
