@@ -218,7 +218,8 @@ def page(rows: list[dict[str, Any]], settings: Settings) -> str:
     )
     played = sum(row["engine"] == "native" for row in rows)
     text = (
-        f"{len(rows)} models as their packages have them, {played} of them in machine code. "
+        f"{len(rows)} of {len(MODELS)} models as their packages have them, {played} of these in "
+        "machine code. "
         f"`experiments/shipped_models.py` made this on {datetime.date.today()} with {versions}, on "
         f"{os.cpu_count()} CPU cores that others loaded at the same time: times and speeds are "
         "rough. An env step is about 0.02 s of physics steps, from the first key frame or the "
