@@ -1,10 +1,10 @@
 """Draws docs/engine.png: env steps a second against the size of the task, engine by engine.
 
-``python experiments/engine_figure.py`` reads docs/engine.csv: for each task, device and engine the
-scalar operations of a step, and env steps a second; docs/benchmarks.md says of which day. With
-``--count`` it counts the operations first, in some minutes: a step is what ``native`` plays, with a
-16-32 policy and its noise. Those in the file were counted with JAX 0.12; 0.10.2 gives Pusher 0.1 %
-more.
+``python experiments/engine_figure.py`` reads docs/benchmarks.csv, and from docs/operations.csv the
+scalar operations of a step. With ``--count`` it counts the operations first, in some minutes: a
+step is what ``native`` plays, with a 16-32 policy and its noise. Those in the file were counted
+with JAX 0.12; 0.10.2 gives Pusher 0.1 % more. Machine code for GPUs writes few contacts out, so
+that its count differs from a CPU's.
 """
 
 import csv
@@ -17,24 +17,26 @@ import tyro
 from matplotlib.figure import Figure
 
 from benchmark import the_policy
+from benchmark_rows import read, speed
+from benchmark_tables import best, last_calls
 from mjx_reinforce import act, envs
 from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.native import program, step
 from mjx_reinforce.fused import scalarized
 
 DOCS = Path(__file__).parents[1] / "docs"
-#: engine -> colour (Okabe and Ito's, for all eyes) and marker
+#: engine and precision -> colour (Okabe and Ito's, for all eyes) and marker
 STYLES = {
-    "native": ("#0072B2", "o"),
-    "before native": ("#E69F00", "s"),
-    "plain MJX": ("#999999", "v"),
-    "MuJoCo Warp": ("#009E73", "^"),
-    "C MuJoCo": ("#D55E00", "D"),
+    ("native", "float32"): ("#0072B2", "o"),
+    ("native", "float64"): ("#56B4E9", "s"),
+    ("plain MJX", "float32"): ("#999999", "v"),
+    ("MuJoCo Warp", "float32"): ("#009E73", "^"),
+    ("C MuJoCo", "float64"): ("#D55E00", "D"),
 }
 #: Task, or task and device -> where its name stands, in points from its own, and on which side.
 PLACES = {
-    ("HalfCheetah", "two CPU cores"): ((7, -8), "left"),
-    ("Pusher", "two CPU cores"): ((7, 3), "left"),
+    ("HalfCheetah", "CPU"): ((7, -8), "left"),
+    ("Pusher", "CPU"): ((7, 3), "left"),
     "InvertedDoublePendulum": ((-6, -4), "right"),
     "Hopper": ((-7, 1), "right"),
     "HalfCheetah": ((0, 10), "center"),
@@ -50,34 +52,45 @@ def main(count: bool = False) -> None:
     Args:
       count: write the operations anew first.
     """
-    path = DOCS / "engine.csv"
+    path = DOCS / "operations.csv"
     with path.open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+        counted = list(csv.DictReader(file))
     if count:
-        for row in rows:
-            row["operations"] = operations(row["task"], "CPU" in row["device"])
+        for row in counted:
+            row["operations"] = operations(row["task"], row["device"] == "CPU")
         with path.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, rows[0], lineterminator="\n")
+            writer = csv.DictWriter(file, counted[0], lineterminator="\n")
             writer.writeheader()
-            writer.writerows(rows)
-    devices = list(dict.fromkeys(row["device"] for row in rows))
-    figure = Figure(figsize=(5.5 * len(devices), 4.8), dpi=150, layout="constrained")
-    for axes, device in zip(figure.subplots(1, len(devices), sharex=True), devices, strict=True):
+            writer.writerows(counted)
+    size = {(row["task"], row["device"]): float(row["operations"]) for row in counted}
+    raw = last_calls(read())
+    cards = {row["device"] for row in raw.gpu} - {"cpu"}
+    panels = {"GPU": (" and ".join(sorted(cards)), raw.gpu), "CPU": ("two CPU cores", raw.cpu)}
+    figure = Figure(figsize=(5.5 * len(panels), 4.8), dpi=150, layout="constrained")
+    for axes, (device, (title, rows)) in zip(
+        figure.subplots(1, len(panels), sharex=True), panels.items(), strict=True
+    ):
         lines = defaultdict(list)
-        for row in rows:
-            if row["device"] == device:
-                point = float(row["operations"]), float(row["env_steps_per_second"])
-                lines[row["engine"]].append(point)
-                if row["engine"] == "native":
-                    name = row["task"].removesuffix("-v5")
-                    usual = PLACES.get(name, ((7, 4), "left"))
-                    place, side = PLACES.get((name, device), usual)
-                    axes.annotate(name, point, place, textcoords="offset points", size=7, ha=side)
-        for engine, points in lines.items():
-            colour, marker = STYLES[engine]
+        for task in dict.fromkeys(row["task"] for row in rows if (row["task"], device) in size):
+            for kind in STYLES:
+                if row := best(rows, task, *kind):
+                    lines[kind].append((size[task, device], speed(row)))
+            name = task.removesuffix("-v5")
+            usual = PLACES.get(name, ((7, 4), "left"))
+            place, side = PLACES.get((name, device), usual)
+            axes.annotate(
+                name,
+                lines["native", "float32"][-1],
+                place,
+                textcoords="offset points",
+                size=7,
+                ha=side,
+            )
+        for (engine, precision), points in lines.items():
+            colour, marker = STYLES[engine, precision]
             x, y = zip(*points, strict=True)
-            axes.loglog(x, y, marker, color=colour, label=engine)
-        axes.set(title=device, xlabel="scalar operations of a step, a loop's body once")
+            axes.loglog(x, y, marker, color=colour, label=f"{engine}, {precision}")
+        axes.set(title=title, xlabel="scalar operations of a step, a loop's body once")
         axes.set_ylabel("env steps a second")
         axes.margins(x=0.6, y=0.12)
         axes.grid(alpha=0.3)

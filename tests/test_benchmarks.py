@@ -1,0 +1,68 @@
+"""The tables of speed say what docs/benchmarks.csv says, and its rows say all of a measurement."""
+
+import pytest
+
+import benchmark_rows as rows
+import benchmark_tables as tables
+from benchmark_peers import c_mujoco, warp_room
+
+ROW = {
+    "date": "2026-11-24T12:00:00",
+    "commit": "abc",
+    "machine": "a CPU, 2 of 2 threads",
+    "device": "cpu",
+    "jax": "0.10.2",
+    "task": "Hopper-v5",
+    "what": "rollout",
+    "engine": "native",
+    "precision": "float32",
+    "batch": 512,
+    "steps": 20,
+    "settings": "",
+    "env_steps_per_second": [1e6, 3e6, 2e6],
+}
+DOUBLE = ROW | {"precision": "float64", "env_steps_per_second": [4e5]}
+GPU = ROW | {"date": "2026-11-24T13:00:00", "device": "a GPU"}
+C = ROW | {"engine": "C MuJoCo", "precision": "float64", "env_steps_per_second": [1e5]}
+
+
+@pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
+def test_tables_are_those_of_the_raw_rows(page):
+    text = page.read_text(encoding="utf-8")
+    assert tables.filled(text, tables.last_calls(rows.read())) == text
+    assert "<!-- end -->" in text
+
+
+def test_rows_come_back_with_every_repetition(tmp_path):
+    path = tmp_path / "rows.csv"
+    rows.append(path, [ROW])
+    rows.append(path, [C])
+    back = rows.read(path)
+    assert [row["engine"] for row in back] == ["native", "C MuJoCo"]
+    assert back[0]["env_steps_per_second"] == [1e6, 3e6, 2e6]
+    assert rows.speed(back[0]) == 2e6
+
+
+def test_c_mujoco_stands_beside_its_own_precision_of_the_same_call():
+    old = {"date": "2026-11-23T12:00:00", "env_steps_per_second": [1e9]}
+    raw = tables.last_calls([ROW | old, C | old, ROW, DOUBLE, C, GPU])
+    line = next(line for line in tables.cpu(raw).splitlines() if line.startswith("| Hopper"))
+    cells = [cell.strip() for cell in line.split("|")[1:-1]]
+    assert cells == ["Hopper-v5", "512 x 20", "2.00e6", "4.00e5", "1.00e5", "4.0", "20", ""]
+    sentence = " ".join(tables.readme(raw).splitlines()[-4:])
+    assert "4.0 (Hopper) to 4.0 (Hopper) times the speed of C MuJoCo in equal precision" in sentence
+
+
+def test_peers_say_their_precision_and_settings():
+    candidate = c_mujoco("InvertedPendulum-v5", batch=2, steps=1)
+    candidate.run()
+    assert (candidate.env_steps, candidate.row["precision"]) == (2, "float64")
+    assert f"{rows.threads()} threads; NEWTON, 100 iterations" in candidate.row["settings"]
+
+
+def test_mujoco_warp_has_room_by_the_model():
+    pendulum, hopper = (
+        warp_room(task, worlds=4, steps=30) for task in ("InvertedPendulum-v5", "Hopper-v5")
+    )
+    assert pendulum == {"nconmax": 8, "njmax": 8}  # no contacts; two limits at most
+    assert pendulum["njmax"] < hopper["njmax"] < 256
