@@ -1,20 +1,23 @@
 """How far every environment is from the installed Gymnasium, in one table.
 
     python experiments/parity.py                               # all, minutes a task on a CPU
-    python experiments/parity.py --env Hopper-v5 --states 500 --json rows.json
+    python experiments/parity.py --env Hopper-v5 --states 500 --csv rows.csv
 
 Four questions to each environment, in double and in single precision: how far one env step from
 the same state leads apart; whether the same states end the episode; whether episodes start from the
 same distribution; whether a fixed policy earns the same distribution of returns. A task that
 Gymnasium lacks is compared with a transcription of the document it comes from.
 
+docs/parity.csv has the rows of docs/parity.md, whose tables `parity_tables.py` writes.
+
 The states are those that random actions reach from a reset, and as many pushed from there: onto the
 joints' limits and past them, faster, into the floor, over the point of falling. Actions go 20 %
 beyond their bounds.
 """
 
+import csv
 import dataclasses
-import json
+import datetime
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -29,12 +32,15 @@ from rich.table import Table
 from scipy import stats
 
 from mjx_reinforce import envs
+from mjx_reinforce.runs.files import provenance, version
 from mjx_reinforce.types import Discrete
 from parity_native import Native
 from parity_sides import Ours, Outcome, Peer, make_peer, stack
 from parity_states import draw_states
 
 DTYPES = ("float64", "float32")
+#: What a row in a file says besides.
+ORIGIN = ("date", "commit", "jax", "mujoco", "gymnasium", "engine", "tolerance")
 KEYS = (
     "env",
     "dtype",
@@ -75,8 +81,8 @@ class Settings:
     """At which Gymnasium's constraint solver stops; by default its own 1e-8. Given one, it is
     Newton's for all tasks (the Humanoids have PGS, which ends 1e-3 early); 0 tells Gymnasium's
     distance from the optimum, which is most of what is seen in double precision, from ours."""
-    json: Path | None = None
-    """Where to write the rows."""
+    csv: Path | None = None
+    """Where to append the rows, task by task."""
 
 
 def peer_steps(peer: Peer, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray) -> Outcome:
@@ -282,12 +288,29 @@ def main() -> None:
                 seed=settings.seed,
                 tolerance=settings.tolerance,
             )
+            both = []
             for dtype in settings.dtype:
-                rows.append(compare(env_id, dtype, theirs, settings, say))
+                both.append(compare(env_id, dtype, theirs, settings, say))
                 progress.advance(task)
+            if settings.csv:
+                append(settings.csv, both, settings)
+            rows += both
     show(console, rows)
-    if settings.json:
-        settings.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+def append(path: Path, rows: list[dict[str, Any]], settings: Settings) -> None:
+    """Adds rows to a file, with what they were made of; a new file gets its first line."""
+    made = provenance()
+    origin = {name: version(name) for name in ("jax", "mujoco", "gymnasium")}
+    origin |= {"date": datetime.date.today().isoformat(), "commit": made["git_commit"]}
+    origin |= {"engine": settings.engine, "tolerance": settings.tolerance}
+    with path.open("a", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, [*ORIGIN, *KEYS], lineterminator="\n")
+        if file.tell() == 0:
+            writer.writeheader()
+        for row in rows:
+            numbers = {k: f"{x:.3g}" if isinstance(x, float) else x for k, x in row.items()}
+            writer.writerow(origin | numbers)
 
 
 def show(console: Console, rows: list[dict[str, Any]]) -> None:
