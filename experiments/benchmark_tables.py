@@ -5,14 +5,14 @@
 greatest where several batches were tried; a ratio is of rows of one call.
 """
 
-import re
+import functools
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmark_rows import RAW, read, speed
-from seeds_markdown import listed, table
+from seeds_markdown import filled, listed, table
 
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmarks.md")
@@ -232,19 +232,16 @@ TABLES: dict[str, Callable[[Raw], str]] = {
 }
 
 
-def filled(text: str, raw: Raw) -> str:
+def page(text: str, raw: Raw) -> str:
     """Returns a page with its tables made anew."""
-    for name, make in TABLES.items():
-        place = re.compile(f"(<!-- {re.escape(name)} -->\n).*?(<!-- end -->)", re.DOTALL)
-        text = place.sub(lambda found, make=make: f"{found[1]}{make(raw)}\n{found[2]}", text)
-    return text
+    return filled(text, {name: functools.partial(make, raw) for name, make in TABLES.items()})
 
 
 def main() -> None:
     """Writes."""
     raw = last_calls(read(RAW))
-    for page in PAGES:
-        page.write_text(filled(page.read_text(encoding="utf-8"), raw), encoding="utf-8")
+    for path in PAGES:
+        path.write_text(page(path.read_text(encoding="utf-8"), raw), encoding="utf-8")
 
 
 if __name__ == "__main__":

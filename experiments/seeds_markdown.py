@@ -1,7 +1,8 @@
 """Numbers, lists and tables as Markdown."""
 
 import math
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 
 def percent(share: float, digits: int) -> str:
@@ -29,3 +30,18 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Returns a table of a header and rows [R][C]."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def filled(text: str, tables: Mapping[str, Callable[[], str]]) -> str:
+    """Returns a page whose text between ``<!-- NAME -->`` and ``<!-- end -->`` is made anew.
+
+    Args:
+      text: the page, in Markdown.
+      tables: by name, what makes the text; names that the page lacks are not made.
+    """
+
+    def made(found: re.Match[str]) -> str:
+        name = found[2]
+        return f"{found[1]}{tables[name]()}\n<!-- end -->" if name in tables else found[0]
+
+    return re.sub(r"(<!-- ([^\n]+) -->\n).*?<!-- end -->", made, text, flags=re.DOTALL)

@@ -26,10 +26,10 @@ GPU = ROW | {"date": "2026-11-24T13:00:00", "device": "a GPU"}
 C = ROW | {"engine": "C MuJoCo", "precision": "float64", "env_steps_per_second": [1e5]}
 
 
-@pytest.mark.parametrize("page", tables.PAGES, ids=lambda page: page.name)
-def test_tables_are_those_of_the_raw_rows(page):
-    text = page.read_text(encoding="utf-8")
-    assert tables.filled(text, tables.last_calls(rows.read())) == text
+@pytest.mark.parametrize("path", tables.PAGES, ids=lambda path: path.name)
+def test_tables_are_those_of_the_raw_rows(path):
+    text = path.read_text(encoding="utf-8")
+    assert tables.page(text, tables.last_calls(rows.read())) == text
     assert "<!-- end -->" in text
 
 
