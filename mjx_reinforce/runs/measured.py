@@ -9,7 +9,7 @@ and a linear policy, on 2026-11-23; all figures are good to a factor of two.
   networks are from ContinuousCartPole, InvertedPendulum and Swimmer on 2026-11-24, by the time of
   the processor: 3e10 to 6e10 a second and core.
 - GPU: an H200. Compiling depends on the host: two of its threads took twice as long as stands here,
-  16 quiet ones half as long. The rates of many episodes are those of ``docs/benchmarks.md``, halved
+  16 quiet ones half as long. The rates of many episodes are those of rollouts on that day, halved
   where there are no contacts, since training takes as long as playing there. For tasks with
   contacts the latency is the time that one env step of as many episodes took as were measured, and
   compiling is that of a rollout, while 16 other programs compiled, and 10 s. The operations of
