@@ -29,10 +29,15 @@ HEADER = (
 
 def main() -> None:
     """Writes."""
-    with RAW.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = read(RAW)
     tables = {engine: functools.partial(errors, rows, engine) for engine in ("vmap", "native")}
     PAGE.write_text(filled(PAGE.read_text(encoding="utf-8"), tables), encoding="utf-8")
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    """Returns the rows of a file."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def errors(rows: list[dict[str, str]], engine: str) -> str:

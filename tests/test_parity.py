@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import parity
+import parity_tables
 from mjx_reinforce import envs
 from mjx_reinforce.engines.native import available
 from parity_native import Native
@@ -150,3 +151,17 @@ def test_semi_implicit_euler_moves_with_the_new_velocity():
         np.testing.assert_allclose(after.qpos, start[0] + 0.02 * velocity, rtol=1e-6)
     with pytest.raises(ValueError, match="Did you mean 'euler'"):
         envs.make("CartPole-v1", kinematics_integrator="eular")
+
+
+def test_rows_in_a_file_become_the_table(tmp_path):
+    path, settings = tmp_path / "rows.csv", parity.Settings(engine="native")
+    row = dict.fromkeys(parity.KEYS, 0) | {"env": "Hopper-v5", "states": 5, "dtype": "float64"}
+    row |= {"qpos": 4.16e-9, "qvel": 0.14, "observation": 55.3, "return_p_value": 0.294}
+    parity.append(path, [row | {"qpos": 1.0}], settings)
+    parity.append(path, [row, row | {"dtype": "float32"}], settings)
+    rows = parity_tables.read(path)
+    assert all(made["jax"] == jax.__version__ for made in rows)
+    last = parity_tables.errors(rows, "native").splitlines()[-1]
+    moved = "4e-9 / 1e-1"
+    assert last == f"| Hopper-v5 | 5 | {moved} | 55 | 0 | {moved} | 0 | 0, 0 | 0.29, 0.29 |"
+    assert "Hopper" not in parity_tables.errors(rows, "vmap")
