@@ -272,7 +272,7 @@ def main() -> None:
     """Compares, prints and writes."""
     settings = tyro.cli(Settings, description=__doc__)
     jax.config.update("jax_default_matmul_precision", "highest")
-    console, rows = Console(width=180), []
+    console, rows, made = Console(width=180), [], origin(settings)
     with Progress(console=console) as progress:
         task = progress.add_task("", total=len(settings.env) * len(settings.dtype))
         for env_id in settings.env:
@@ -293,24 +293,27 @@ def main() -> None:
                 both.append(compare(env_id, dtype, theirs, settings, say))
                 progress.advance(task)
             if settings.csv:
-                append(settings.csv, both, settings)
+                append(settings.csv, both, made)
             rows += both
     show(console, rows)
 
 
-def append(path: Path, rows: list[dict[str, Any]], settings: Settings) -> None:
-    """Adds rows to a file, with what they were made of; a new file gets its first line."""
-    made = provenance()
-    origin = {name: version(name) for name in ("jax", "mujoco", "gymnasium")}
-    origin |= {"date": datetime.date.today().isoformat(), "commit": made["git_commit"]}
-    origin |= {"engine": settings.engine, "tolerance": settings.tolerance}
+def origin(settings: Settings) -> dict[str, Any]:
+    """Returns what all rows of a run say: when and of what it was made."""
+    made: dict[str, Any] = {name: version(name) for name in ("jax", "mujoco", "gymnasium")}
+    made |= {"date": datetime.date.today().isoformat(), "commit": provenance()["git_commit"]}
+    return made | {"engine": settings.engine, "tolerance": settings.tolerance}
+
+
+def append(path: Path, rows: list[dict[str, Any]], made: dict[str, Any]) -> None:
+    """Adds rows to a file, with their origin; a new file gets its first line."""
     with path.open("a", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, [*ORIGIN, *KEYS], lineterminator="\n")
         if file.tell() == 0:
             writer.writeheader()
         for row in rows:
             numbers = {k: f"{x:.3g}" if isinstance(x, float) else x for k, x in row.items()}
-            writer.writerow(origin | numbers)
+            writer.writerow(made | numbers)
 
 
 def show(console: Console, rows: list[dict[str, Any]]) -> None:

@@ -154,11 +154,11 @@ def test_semi_implicit_euler_moves_with_the_new_velocity():
 
 
 def test_rows_in_a_file_become_the_table(tmp_path):
-    path, settings = tmp_path / "rows.csv", parity.Settings(engine="native")
+    path, made = tmp_path / "rows.csv", parity.origin(parity.Settings(engine="native"))
     row = dict.fromkeys(parity.KEYS, 0) | {"env": "Hopper-v5", "states": 5, "dtype": "float64"}
     row |= {"qpos": 4.16e-9, "qvel": 0.14, "observation": 55.3, "return_p_value": 0.294}
-    parity.append(path, [row | {"qpos": 1.0}], settings)
-    parity.append(path, [row, row | {"dtype": "float32"}], settings)
+    parity.append(path, [row | {"qpos": 1.0}], made)
+    parity.append(path, [row, row | {"dtype": "float32"}], made)
     rows = parity_tables.read(path)
     assert all(made["jax"] == jax.__version__ for made in rows)
     last = parity_tables.errors(rows, "native").splitlines()[-1]
