@@ -17,20 +17,11 @@ from seeds_markdown import filled, listed, table
 ROOT = Path(__file__).parents[1]
 PAGES = (ROOT / "README.md", ROOT / "docs" / "benchmarks.md")
 #: The tasks of README.md's table.
-FEW = tuple(
-    f"{name}-v5"
-    for name in (
-        "InvertedPendulum",
-        "Reacher",
-        "HalfCheetah",
-        "Hopper",
-        "Walker2d",
-        "Ant",
-        "Humanoid",
-        "HumanoidStandup",
-    )
+FEW = ("InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5")
+OTHERS = (
+    *("InvertedDoublePendulum-v5", "Swimmer-v5", "Pusher-v5", "Humanoid-v5"),
+    *("HumanoidStandup-v5", "CartPole-v1"),
 )
-OTHERS = ("InvertedDoublePendulum-v5", "Swimmer-v5", "Pusher-v5", "CartPole-v1")
 
 
 class Raw(NamedTuple):

@@ -6,6 +6,7 @@ is loaded before an environment is made.
 """
 
 import importlib
+from typing import Any
 
 _HOME = {
     "Learner": "learners.learner",
@@ -59,7 +60,7 @@ __all__ = [*_HOME, "__version__"]
 __version__ = "0.1.0"
 
 
-def __getattr__(name: str):
+def __getattr__(name: str) -> Any:
     """Imports a public name from its module, or a module, on first use (PEP 562)."""
     if name in _MODULES:
         return importlib.import_module(f"{__name__}.{name}")
