@@ -173,7 +173,7 @@ class MujocoEnv(Env):
 
     def _forward_state(self, qpos: jax.Array, qvel: jax.Array) -> State:
         """Returns the state at positions and velocities, from one forward pass."""
-        start = mjx.make_data(self.mj_model, impl="jax").replace(qpos=qpos, qvel=qvel)
+        start = models.make_data(self.mj_model).replace(qpos=qpos, qvel=qvel)
         # MJX normalises quaternions in qpos itself; MuJoCo does so when it steps.
         data = physics.like(self._forward(start).replace(qpos=qpos), start)
         state, view = self._physics(data), Simulation(data)
@@ -212,13 +212,13 @@ class MujocoEnv(Env):
 
     def _before(self, state: Physics) -> "Before":
         """Returns the start of an env step as ``outcome`` may read it."""
-        data = mjx.make_data(self.mj_model, impl="jax")
+        data = models.make_data(self.mj_model)
         constant = {name: getattr(data, name) for name in models.CONSTANT}
         return Before(constant | state.carried | _carried(state))
 
     def _data(self, state: Physics) -> mjx.Data:
         """Returns a fresh simulation at the given state."""
-        return mjx.make_data(self.mj_model, impl="jax").replace(**_carried(state))
+        return models.make_data(self.mj_model).replace(**_carried(state))
 
     def _physics(self, data: mjx.Data) -> Physics:
         """Returns what the next env step needs to know of a simulation."""
@@ -228,7 +228,7 @@ class MujocoEnv(Env):
     @property
     def num_contacts(self) -> int:
         """The most contacts that the model can have at once."""
-        return mjx_internals.num_contacts(mjx.make_data(self.mj_model, impl="jax"))
+        return mjx_internals.num_contacts(models.make_data(self.mj_model))
 
     @property
     def dt(self) -> float:

@@ -112,6 +112,11 @@ def _compile(compiler: Callable[[str], Any], source: str, xml_file: str) -> Any:
         raise ValueError(f"MuJoCo cannot compile {xml_file!r}: {explain(error)}") from error
 
 
+def make_data(model: Any) -> mjx.Data:
+    """Returns MJX's simulation of a model at its start, on this process's own device."""
+    return mjx.make_data(model, impl="jax", device=jax.local_devices()[0])
+
+
 def to_mjx(model: Any, xml_file: str) -> mjx.Model:
     """Returns MJX's version of a compiled model.
 
@@ -130,9 +135,10 @@ def to_mjx(model: Any, xml_file: str) -> mjx.Model:
             'material, a bug of MJX; add <asset><material name="any"/></asset>'
         )
     try:
-        converted = mjx.put_model(model, impl="jax")
+        # Not on JAX's first device, which may be another process's.
+        converted = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
         # Notices what the model alone does not show; its arrays are not made.
-        jax.eval_shape(lambda: mjx.make_data(model, impl="jax"))
+        jax.eval_shape(lambda: make_data(model))
     except NotImplementedError as error:
         feature = str(error)
         remedy = next((change for part, change in _REMEDIES.items() if part in feature), _ELSE)

@@ -18,15 +18,22 @@ from typing import Any
 from mjx_reinforce import envs
 from mjx_reinforce.runs import resume
 from mjx_reinforce.runs.alarms import silence_alarms
-from mjx_reinforce.runs.command_line import parse, refuse, start
+from mjx_reinforce.runs.command_line import parse_all, refuse, start
 from mjx_reinforce.runs.config import Config, check
-from mjx_reinforce.runs.files import check_writable, choose_directory, prepare, remove_empty
+from mjx_reinforce.runs.files import (
+    check_writable,
+    choose_directory,
+    prepare,
+    remove_empty,
+    versions,
+)
 from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.memory import check_size
 from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.plan import Plan, make_plan
+from mjx_reinforce.runs.processes import Processes, joined
 from mjx_reinforce.runs.sinks.sink import check_installed, open_sinks
 from mjx_reinforce.runs.streams import accept_everything
 
@@ -51,24 +58,34 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
     made: Sequence[Path] = ()
     try:
         with _collection_paused():
-            config = parse(arguments)
+            config, settings = parse_all(arguments)
             check(config)
             check_size(config)
             check_installed(config)
-            directory, new = _directory(config)
-            held.enter_context(locked(directory))  # a folder in which another trains stays
-            made = new
-            interrupt.on_exit(lambda: remove_empty(made))
+            common = {**resume.recordable(config), **versions()}
+            processes = held.enter_context(joined(settings, interrupt, common))
+            share = processes.shares(config.num_seeds)[processes.index]
+            directory = Path()
+            if processes.index == 0:
+                directory, new = _directory(config)
+                held.enter_context(locked(directory))  # a folder in which another trains stays
+                made = new
+                interrupt.on_exit(lambda: remove_empty(made))
             # A module of the user's is imported before JAX starts, which it may set up.
             env = None if envs.is_ours(config.env) else envs.make(config.env)
             configure_jax()
             with heartbeat(to_screen, None, "writing the simulation out"):
-                ready, found = _start(env, config, start(arguments, "train")[0])
-            plan = make_plan(ready, config)
+                default = start(arguments, "train")[0]
+                ready, found = _start(env, config, default, processes, share)
+            plan = make_plan(ready, config, processes.count)
     except ValueError as error:
         refuse(str(error), made)
     try:
-        return train(ready, found, config, plan, directory, interrupt)
+        if processes.index:
+            return _serve(ready, config, processes, interrupt)
+        status = train(ready, found, config, plan, directory, interrupt, processes)
+        _end(processes, status)
+        return status
     except RuntimeError as error:  # XLA's
         if "RESOURCE_EXHAUSTED" not in str(error):
             raise
@@ -91,13 +108,17 @@ def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
     return directory, prepare(directory, config.overwrite)
 
 
-def _start(env: Any, config: Config, default: Config) -> tuple[Any, Any]:
+def _start(
+    env: Any, config: Config, default: Config, processes: Processes, share: slice
+) -> tuple[Any, Any]:
     """Returns a run that is ready, and the checkpoint from which it goes on, if any.
 
     Args:
       env: the environment, if it is the user's own.
       config: the settings.
       default: those that hold where the user gave none.
+      processes: that train it.
+      share: the seeds of this one. Only the first needs the checkpoint.
 
     Raises:
       ValueError: the settings do not fit the environment, or the run cannot go on here.
@@ -105,11 +126,35 @@ def _start(env: Any, config: Config, default: Config) -> tuple[Any, Any]:
     from mjx_reinforce.runs.files import provenance
     from mjx_reinforce.runs.ready import prepare
 
-    ready = prepare(config, default, env)
-    if config.resume is None:
+    ready = prepare(config, default, env, share)
+    if config.resume is None or processes.index:
         return ready, None
-    resume.check_program(config.resume, provenance())
-    return ready, resume.find(ready.parts.like, config, print)
+    present = {**provenance(), "num_processes": processes.count}
+    resume.check_program(config.resume, present)
+    like = ready.parts.like
+    if processes.count > 1:
+        from mjx_reinforce.runs.shares import shape_of_all
+
+        like = shape_of_all(like, config.num_seeds)
+    return ready, resume.find(like, config, print)
+
+
+def _serve(ready: Any, config: Config, processes: Processes, interrupt: Interrupt) -> int:
+    """Trains seeds for process 0, which has the run's files; returns the exit status."""
+    from mjx_reinforce.runs.shares import serve
+    from mjx_reinforce.runs.state import compile_parts
+
+    state, programs = compile_parts(ready.parts, config)
+    interrupt.defer(lambda _: processes.stop(interrupt.number or 0))
+    return serve(processes, programs, state)
+
+
+def _end(processes: Processes, status: int) -> None:
+    """Lets the other processes of a run end, as this one does."""
+    if processes.count > 1:
+        from mjx_reinforce.runs.shares import end
+
+        end(processes, status)
 
 
 def train(
@@ -119,6 +164,7 @@ def train(
     plan: Plan,
     directory: Path,
     interrupt: Interrupt,
+    processes: Processes,
 ) -> int:
     """Trains to the budget, a signal, or until nothing is finite, and writes the run's files.
 
@@ -129,6 +175,7 @@ def train(
       plan: what is said of it beforehand.
       directory: where the files go.
       interrupt: what listens to signals.
+      processes: that train it; this is the first.
 
     Returns:
       The exit status, see ``main``.
@@ -140,10 +187,10 @@ def train(
         interrupt.restore_screen(display.console.show_cursor)
         display.say(plan.text)
         with display.compiling(plan.compiling):
-            session, compile_seconds = _compile(ready, config, directory, display)
+            session, compile_seconds = _compile(ready, config, directory, display, processes)
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
         interrupt.defer(display.say)
-        _begin(session, found)
+        _begin(session, found, processes.count)
         session.correction = plan.correction
         display.start(compile_seconds)
         _loop(session, interrupt)
@@ -160,7 +207,9 @@ def train(
     return 0 if interrupt.number is None or test else 128 + interrupt.number
 
 
-def _compile(ready: Any, config: Config, directory: Path, display: Any) -> tuple[Any, float]:
+def _compile(
+    ready: Any, config: Config, directory: Path, display: Any, processes: Processes
+) -> tuple[Any, float]:
     """Returns a run before its first update, and how long it took to compile, in seconds."""
     with _collection_paused():
         from mjx_reinforce.reports.curves import load_libraries
@@ -174,6 +223,10 @@ def _compile(ready: Any, config: Config, directory: Path, display: Any) -> tuple
     started = time.perf_counter()
     with _collection_paused():
         state, programs = compile_parts(ready.parts, config, loading.start)
+        if processes.count > 1:
+            from mjx_reinforce.runs.shares import lead
+
+            state, programs = lead(processes, programs, state, config.num_seeds)
     seconds = ready.engine_seconds + time.perf_counter() - started
     record, best = Record(config, ready.threshold), first_best(state.train_states)
     known, log = dataclasses.replace(config, horizon=ready.horizon), RunLog(directory)
@@ -181,11 +234,12 @@ def _compile(ready: Any, config: Config, directory: Path, display: Any) -> tuple
     return session, seconds
 
 
-def _begin(session: Any, found: Any) -> None:
+def _begin(session: Any, found: Any, num_processes: int) -> None:
     """Writes the first files, or takes the run and its files back to where it goes on."""
     config, log = session.config, session.log
     if config.resume is None:
-        settings = dataclasses.asdict(config) | {"output": str(log.directory)}
+        where = {"output": str(log.directory), "num_processes": num_processes}
+        settings = dataclasses.asdict(config) | where
         del settings["resume"]
         log.begin(settings)
         session.sinks = open_sinks(config, log.directory, None)

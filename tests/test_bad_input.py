@@ -28,10 +28,10 @@ from mjx_reinforce import train as train_module
 from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS
 from mjx_reinforce.runs import display, jax_setup
 from mjx_reinforce.runs.build import build
+from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.relevance import READ, check_read
-from mjx_reinforce.train import parse
 
 
 @pytest.fixture

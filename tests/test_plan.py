@@ -13,7 +13,7 @@ from toys import Survive
 
 from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
-from mjx_reinforce.runs import measured, memory, operations, plan, ready
+from mjx_reinforce.runs import command_line, measured, memory, operations, plan, ready
 from mjx_reinforce.runs.blocks import block_length
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import of_task
@@ -46,36 +46,36 @@ def updates(path):
 
 @pytest.mark.parametrize("arguments", [["--env", "Ant-v5"], ["--seed", "3", "--env=Ant-v5"]])
 def test_a_task_has_its_own_defaults(arguments):
-    config = train_module.parse(arguments)
+    config = command_line.parse(arguments)
     assert (config.env, config.eval_episodes, config.env_steps) == ("Ant-v5", 4, 500_000)
     assert config.hidden_sizes == Config().hidden_sizes
 
 
 def test_a_flag_wins_over_the_tasks_default():
-    config = train_module.parse(["--env-steps", "7", "--env", "Ant-v5", "--eval-episodes", "9"])
+    config = command_line.parse(["--env-steps", "7", "--env", "Ant-v5", "--eval-episodes", "9"])
     assert (config.env_steps, config.eval_episodes) == (7, 9)
-    assert train_module.parse(["--env-steps", "None", "--env", "Ant-v5"]).env_steps is None
+    assert command_line.parse(["--env-steps", "None", "--env", "Ant-v5"]).env_steps is None
 
 
 def test_the_pendulum_has_a_linear_policy():
     for id in ("InvertedPendulum-v4", "InvertedPendulum-v5"):
-        assert train_module.parse(["--env", id]).hidden_sizes == ()
-    assert train_module.parse(["--hidden-sizes", "32", "32"]).hidden_sizes == (32, 32)
+        assert command_line.parse(["--env", id]).hidden_sizes == ()
+    assert command_line.parse(["--hidden-sizes", "32", "32"]).hidden_sizes == (32, 32)
 
 
 def test_a_task_without_an_entry_has_the_plain_defaults():
-    assert train_module.parse(["--env", "own:Task"]) == Config(env="own:Task")
+    assert command_line.parse(["--env", "own:Task"]) == Config(env="own:Task")
 
 
 def test_a_preset_keeps_its_settings_on_another_task():
-    config = train_module.parse(["baseline-truncated-normal", "--env", "Ant-v5"])
+    config = command_line.parse(["baseline-truncated-normal", "--env", "Ant-v5"])
     assert config == dataclasses.replace(PRESETS["baseline-truncated-normal"][1], env="Ant-v5")
 
 
 def test_help_shows_the_defaults_of_the_task(capsys):
     for arguments, default in ((["--help"], "280000"), (["--help", "--env", "Ant-v5"], "500000")):
         with pytest.raises(SystemExit):
-            train_module.parse(arguments)
+            command_line.parse(arguments)
         said = capsys.readouterr().out
         assert f"(default: {default})" in said
         assert "Defaults depend on the task" in said

@@ -21,6 +21,7 @@ from toys import Drift
 
 from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
+from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.export import files as export_files
 from mjx_reinforce.learners.learner import TrainState
 from mjx_reinforce.policies import normalize
@@ -304,6 +305,12 @@ def test_only_the_budget_may_change(run, parts, capsys, arguments, message):
     [
         (lambda old: {"packages": old["packages"] | {"jax": "0.1"}}, "was begun with jax 0.1"),
         (lambda old: {"device": "TPU"}, "was begun with device TPU"),
+        (lambda old: {"cpu": "i486"}, "was begun with cpu i486"),
+        (lambda old: {"cores": 77}, "was begun with cores 77"),
+        (
+            lambda old: {"jax_settings": {"jax_default_matmul_precision": "low"}},
+            "was begun with jax_default_matmul_precision low",
+        ),
         (lambda old: {"num_seeds": "four"}, "num_seeds is 'four'"),
         (lambda old: {"hidden_sizes": [1.5]}, "hidden_sizes is (1.5,)"),
         (lambda old: {"eval_every": None}, "eval_every is None: it is damaged, or of another"),
@@ -479,3 +486,15 @@ def test_a_record_comes_back_whole():
         for name, value in ours.items():
             np.testing.assert_array_equal(value, theirs[name])
             assert value.dtype == theirs[name].dtype
+
+
+def test_code_for_another_cpu_is_another_program(run, parts, monkeypatch, capsys):
+    """Though the machine is the same; nothing is promised then, and nothing changed."""
+    before = (parts / "config.json").read_bytes()
+    here = json.loads(before)["machine_code"]
+    monkeypatch.setenv(machine.VARIABLE, "x86-64")
+    assert run("--resume", "parts", "--max-updates", 24) == 2
+    error = capsys.readouterr().err
+    assert f"was begun with machine_code {here}, and here it is llvmlite" in error
+    assert "x86-64, 4 lanes" in error
+    assert (parts / "config.json").read_bytes() == before

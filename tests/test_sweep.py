@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import json
 import os
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -537,21 +536,3 @@ def test_from_python_a_report_can_be_left_out(monkeypatch, tmp_path, capsys, rep
     known = json.loads((tmp_path / "out" / "sweep.json").read_text())
     assert known["statistics_seconds"] == (1.5 if report else None)
     assert ("statistics and report" in capsys.readouterr().out) == report
-
-
-@pytest.mark.cpu  # each process needs a GPU of its own
-def test_two_processes_share_a_sweep(run, tmp_path):
-    command = f"{SMALL} --num-seeds 3 --max-updates 6 {RATES}"
-    assert run(f"{command} --output alone") == 0
-    with socket.socket() as free:
-        free.bind(("localhost", 0))
-        port = free.getsockname()[1]
-    command = command.replace("Drift-v0", "toys:Drift")
-    command += f" --output shared --distributed --coordinator localhost:{port} --num-processes 2"
-    started = [start(1, f"{command} --process-id {i}", tmp_path) for i in range(2)]
-    assert [process.wait(timeout=120) for process in started] == [0, 0]
-    assert len(list(Path("shared/parts").glob("*.npz"))) == 2
-    assert close(curves(Path("alone")), curves(Path("shared")))
-    rows = Path("shared/results.csv").read_text().splitlines()
-    assert len(rows) == 1 + 9
-    assert json.loads(Path("shared/sweep.json").read_text())["status"] == "finished"

@@ -11,8 +11,8 @@ from mjx_reinforce.reports.experiment import Configuration, Source
 
 #: What config.json says besides the settings.
 PROVENANCE = (
-    *("python", "packages", "git_commit", "device", "num_devices", "cpu_count", "x64"),
-    *("xla_flags", "resumed"),
+    *("python", "packages", "git_commit", "device", "cpu", "machine_code", "jax_settings"),
+    *("num_devices", "num_processes", "cpu_count", "cores", "x64", "xla_flags", "resumed"),
 )
 _COLUMNS = {"seed": np.int64, "env_steps": np.int64, "eval_return": np.float64}
 

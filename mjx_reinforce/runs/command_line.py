@@ -19,6 +19,7 @@ from mjx_reinforce.runs.files import remove_empty
 from mjx_reinforce.runs.flags import read
 from mjx_reinforce.runs.own_code import check_named
 from mjx_reinforce.runs.presets import PRESETS
+from mjx_reinforce.runs.processes import ProcessSettings, check_processes
 from mjx_reinforce.runs.relevance import check_read
 from mjx_reinforce.runs.settings import GROUPS
 
@@ -35,7 +36,12 @@ _FILES = (
 
 
 def parse(arguments: Sequence[str]) -> Config:
-    """Returns the settings that a command line asks for; --help exits.
+    """Returns the settings that a command line asks for, as ``parse_all``."""
+    return parse_all(arguments)[0]
+
+
+def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
+    """Returns the settings that a command line asks for, and its processes; --help exits.
 
     Args:
       arguments: a preset's name, if any, then flags.
@@ -46,19 +52,20 @@ def parse(arguments: Sequence[str]) -> Config:
         or is of the user's own environment, which is to be named again.
     """
     default, preset, flags, prog = start(arguments, "python -m mjx_reinforce.train")
-    config = _read(flags, default, prog)
+    config, processes = _read(flags, default, prog)
+    check_processes(processes)
     if config.resume is None:
-        return config
+        return config, processes
     if preset is not None:
         raise ValueError(f"--resume has the run's own settings: leave the preset {preset} out")
     known = resume.read_settings(config.resume)
-    asked = _read(flags, known, prog)
+    asked, _ = _read(flags, known, prog)
     resume.check_settings(known, asked)
     if resume.is_done(known, asked):
         print(f"{known.resume} is finished; to go on, give a larger --env-steps or --max-updates")
         sys.exit(0)
     check_resumed(known.env, arguments, config.resume)
-    return asked
+    return asked, processes
 
 
 def check_resumed(env: str, arguments: Sequence[str], directory: Path) -> None:
@@ -92,11 +99,14 @@ def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequ
     return PRESETS[preset][1], preset, flags, f"{prog} {preset}"
 
 
-def _read(arguments: Sequence[str], default: Config, prog: str) -> Config:
+def _read(arguments: Sequence[str], default: Config, prog: str) -> tuple[Config, ProcessSettings]:
     """Returns the settings that flags ask for, with others as given; --help exits."""
-    config = join_groups(read_groups(GROUPS, arguments, default, prog, _description()))
+    groups = {**GROUPS, "hosts": ProcessSettings}
+    parsed = read_groups(groups, arguments, default, prog, _description())
+    processes = parsed.pop("hosts")
+    config = join_groups(parsed)
     check_read(config, default)
-    return config
+    return config, processes
 
 
 def read_groups(

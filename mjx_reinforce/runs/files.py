@@ -184,16 +184,27 @@ def provenance() -> dict[str, Any]:
     """Returns what a result depends on besides its settings."""
     import jax
 
+    from mjx_reinforce.engines.native import available
+    from mjx_reinforce.runs.memory import num_cores
+
     return {
         "python": platform.python_version(),
-        "packages": {name: version(name) for name in _PACKAGES},
+        "packages": versions(),
         "git_commit": _git_commit(),
-        "device": str(jax.devices()[0].device_kind),
+        "device": str(jax.local_devices()[0].device_kind),
+        **available.known_by(),
         "num_devices": jax.device_count(),
         "cpu_count": os.cpu_count(),
+        # Among so many threads XLA divides sums on a CPU, which decides their rounding.
+        "cores": num_cores() if available.platform() == "cpu" else None,
         "x64": jax.numpy.zeros(()).dtype == "float64",
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
+
+
+def versions() -> dict[str, str | None]:
+    """Returns the versions of the packages that compute."""
+    return {name: version(name) for name in _PACKAGES}
 
 
 def version(package: str) -> str | None:

@@ -8,7 +8,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NoReturn
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -62,6 +62,24 @@ class Interrupt:
         """
         self._say = say
 
+    def ask(self, number: int) -> None:
+        """Does what the first signal of that number does, unless one came before."""
+        if self.number is None:
+            self._act(number)
+
+    def leave(self, status: int, say: Callable[[], Any] | None = None) -> NoReturn:
+        """Ends the process with a status, from any thread.
+
+        Args:
+          status: of the process.
+          say: tells the user why, once the screen is as it was.
+        """
+        _try(self._actions)
+        last = self._screen_actions + ([] if say is None else [say])
+        # Not for long: the screen may be a pipe that nobody reads.
+        _start(functools.partial(_try, last)).join(timeout=1)
+        os._exit(status)
+
     def _listen(self) -> None:
         with self._heard:
             while heard := self._heard.recv(1):
@@ -70,10 +88,7 @@ class Interrupt:
 
     def _act(self, number: int) -> None:
         if self._say is None or self.number is not None:
-            _try(self._actions)
-            # Not for long: the screen may be a pipe that nobody reads.
-            _start(functools.partial(_try, self._screen_actions)).join(timeout=1)
-            os._exit(128 + number)
+            self.leave(128 + number)
         self.number = number
         said = "stopping after the present block of updates or test; Ctrl-C again stops at once"
         _start(functools.partial(self._say, said))

@@ -38,8 +38,8 @@ _INPUTS = (
 _NAMES = ("start", "advance", "look")
 
 
-def key_of(config: Config) -> str | None:
-    """Returns a name for all that the programs of a run depend on.
+def key_of(config: Config, share: slice = slice(None)) -> str | None:
+    """Returns a name for all that the programs of a run depend on, for all seeds or a share.
 
     None where nothing is kept: on what is neither a CPU nor a GPU, of an environment of the user's,
     and where JAX is to look for NaNs, which it cannot in a program that is not traced.
@@ -54,6 +54,7 @@ def key_of(config: Config) -> str | None:
     settings = {k: v for k, v in recordable(config).items() if k not in _INPUTS}
     known = {
         "settings": settings | {"block": block_length(config)},
+        "share": (share.start, share.stop),
         "sources": objects.source_digest("mjx_reinforce"),
         "made_by": made_by,
         "numpy": version("numpy"),

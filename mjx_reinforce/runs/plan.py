@@ -1,5 +1,6 @@
 """What a run will do, how long that takes about, and how much memory it needs."""
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -74,16 +75,19 @@ class Plan(NamedTuple):
         return f"training takes about {duration(seconds)} in all, not {said} as was said"
 
 
-def make_plan(ready: Any, config: Config) -> Plan:
+def make_plan(ready: Any, config: Config, num_processes: int = 1) -> Plan:
     """Returns the plan of a run on this machine.
 
     Args:
       ready: the run, a ``ready.Ready``.
       config: its settings.
+      num_processes: that share its seeds.
 
     Raises:
       ValueError: the run does not fit into the memory that is here.
     """
+    what = _what(config)
+    config = dataclasses.replace(config, num_seeds=-(-config.num_seeds // num_processes))
     task, machine = task_of(ready.policy, ready.horizon, config), this_machine()
     base = task.base_memory if machine.shared else 0.0
     check_fits(config, task, machine.memory, base)
@@ -101,7 +105,7 @@ def make_plan(ready: Any, config: Config) -> Plan:
             time += ", more if some seeds' episodes stay short, since all wait for the last"
     memory = gigabytes(base + needed(config, task))
     text = (
-        f"Training {_what(config)} on {machine.name}, with the engine {ready.engine}: "
+        f"Training {what} on {_where(machine, num_processes)}, with the engine {ready.engine}: "
         f"{ready.why}. {time}. It needs about {memory} of memory."
     )
     return Plan(text, compiling, seconds, bounded)
@@ -125,6 +129,17 @@ def run_seconds(config: Config, task: Task, machine: Machine, speed: Speed) -> t
     steps = config.num_seeds * _steps(config, task, task.useful)[0]
     rate = measured.CPU_OPERATIONS if machine.shared else measured.GPU_OPERATIONS
     return (seconds + steps * beyond / rate) / machine.faster, bounded
+
+
+def _where(machine: Machine, num_processes: int) -> str:
+    """Returns on what a run trains: one device of each process."""
+    import jax
+
+    here = jax.local_device_count()
+    name = machine.name
+    if here > 1 and not machine.shared:
+        name += f", the first of the {here} here (a sweep trains on all),"
+    return name if num_processes == 1 else f"{num_processes} processes, each on {name}"
 
 
 def training_seconds(config: Config, task: Task, speed: Speed) -> tuple[float, bool]:

@@ -32,21 +32,22 @@ class Ready(NamedTuple):
     parts: Parts
 
 
-def prepare(config: Config, default: Config, env: Any = None) -> Ready:
+def prepare(config: Config, default: Config, env: Any = None, share: slice = slice(None)) -> Ready:
     """Returns what the settings come to; from disk, if they did before.
 
     Args:
       config: the settings.
       default: those that hold where the user gave none.
       env: the environment; by default the one that the settings name, built if it is needed.
+      share: which of the seeds are trained here, see ``shares``.
 
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    key = kept.key_of(config)
-    ready = None if key is None else _found(key, config)
+    key = kept.key_of(config, share)
+    ready = None if key is None else _found(key, config, share)
     if ready is None:
-        ready = made(envs.make(config.env) if env is None else env, config)
+        ready = made(envs.make(config.env) if env is None else env, config, share)
         if key is not None:
             facts = ready._asdict()
             del facts["parts"], facts["engine_seconds"]
@@ -56,12 +57,12 @@ def prepare(config: Config, default: Config, env: Any = None) -> Ready:
     return ready
 
 
-def _found(key: str, config: Config) -> Ready | None:
+def _found(key: str, config: Config, share: slice) -> Ready | None:
     """Returns what is on disk of the settings; None if nothing is."""
     found = kept.read(key)
     if found is None and config.resume is not None:
         # A run that is resumed has its time limit from config.json, also one that was not given.
-        first = kept.key_of(dataclasses.replace(config, horizon=None))
+        first = kept.key_of(dataclasses.replace(config, horizon=None), share)
         found = None if first is None else kept.read(first)
         if found is not None and found[0]["horizon"] != config.horizon:
             return None
@@ -72,8 +73,8 @@ def _found(key: str, config: Config) -> Ready | None:
     return Ready(**facts, engine_seconds=0.0, parts=parts)
 
 
-def made(env: Any, config: Config) -> Ready:
-    """Returns what the settings come to in an environment.
+def made(env: Any, config: Config, share: slice = slice(None)) -> Ready:
+    """Returns what the settings come to in an environment, for all seeds or a share of them.
 
     Raises:
       ValueError: the settings do not fit the environment.
@@ -87,5 +88,5 @@ def made(env: Any, config: Config) -> Ready:
         engine=learner.engine.name,
         why=learner.engine.why,
         engine_seconds=learner.engine.seconds,
-        parts=parts_of(env, learner, horizon, config),
+        parts=parts_of(env, learner, horizon, config, share),
     )

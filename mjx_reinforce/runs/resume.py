@@ -15,7 +15,10 @@ BUDGETS = ("env_steps", "max_updates", "stop_when_solved", "checkpoint_every")
 #: Settings that say where a run is, not what it does.
 PLACES = ("output", "overwrite", "resume")
 #: Entries of config.json on which every number of a run depends, besides its settings.
-_PROGRAM = ("packages", "git_commit", "device", "x64", "xla_flags")
+_PROGRAM = (
+    *("packages", "git_commit", "device", "cpu", "cores", "machine_code", "jax_settings"),
+    *("x64", "xla_flags", "num_processes"),
+)
 _OTHER = "damaged, or of another version of the program; resume with the version that wrote it"
 
 
@@ -145,7 +148,7 @@ def check_same_program(
     directory: Path, recorded: Mapping[str, Any], present: Mapping[str, Any]
 ) -> None:
     """Raises ValueError as ``check_program``, of what a file in the directory recorded."""
-    for name in _PROGRAM:
+    for name in (name for name in _PROGRAM if name in present):
         old, new = recorded.get(name), present[name]
         if isinstance(old, dict) and isinstance(new, dict):
             changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]

@@ -123,7 +123,13 @@ def beginning(build_learner: BuildLearner) -> Callable[..., RunState]:
     return begin
 
 
-def parts_of(env: Environment, learner: Learner, horizon: int, config: Config) -> Parts:
+def parts_of(
+    env: Environment,
+    learner: Learner,
+    horizon: int,
+    config: Config,
+    share: slice = slice(None),
+) -> Parts:
     """Returns the programs of a run.
 
     Args:
@@ -131,12 +137,14 @@ def parts_of(env: Environment, learner: Learner, horizon: int, config: Config) -
       learner: how.
       horizon: T, the time limit of an episode in steps.
       config: the settings of the run.
+      share: which of its seeds the programs are for; all by default.
     """
 
     # One program, whatever the seeds are: a program for each operation on keys takes longer.
     def first(seed: Any, eval_seed: Any) -> tuple[RunState, jax.Array]:
         roots = _seed_keys(seed, config.num_seeds), _eval_keys(eval_seed, config.num_seeds)
-        return beginning(lambda _: learner)(*roots, {}), _test_keys(eval_seed, config)
+        state = beginning(lambda _: learner)(*(keys[share] for keys in roots), {})
+        return state, _test_keys(eval_seed, config)[:, share]
 
     updates = block_of_updates(lambda _: learner, block_length(config))
     evaluate = evaluation(env, learner, horizon, config)
@@ -147,11 +155,11 @@ def parts_of(env: Environment, learner: Learner, horizon: int, config: Config) -
         return jax.tree.leaves(state), test_keys
 
     def advance(leaves: list[jax.Array], budget: tuple[jax.Array, jax.Array]) -> Any:
-        state, measured = updates(_joined(leaves, like), Budget(*budget))
+        state, measured = updates(restored(leaves, like), Budget(*budget))
         return jax.tree.leaves(plain(state)), *measured
 
     def look(leaves: list[jax.Array], keys: jax.Array) -> dict[str, jax.Array]:
-        actor = _joined(leaves, like.train_states.actor)
+        actor = restored(leaves, like.train_states.actor)
         return evaluate(actor, jax.random.wrap_key_data(keys))
 
     return Parts(like, lambda: start, lambda: advance, lambda: look)
@@ -171,11 +179,11 @@ def compile_parts(
 
     def start(*seeds: Any) -> tuple[RunState, jax.Array]:
         leaves, test_keys = parts.start()(*seeds)
-        return _joined(leaves, like), test_keys
+        return restored(leaves, like), test_keys
 
     def advance(state: RunState, budget: Budget) -> Any:
         leaves, made, metrics = parts.advance()(jax.tree.leaves(plain(state)), tuple(budget))
-        return _joined(leaves, like), made, metrics
+        return restored(leaves, like), made, metrics
 
     def look(actor: Actor, keys: jax.Array) -> dict[str, jax.Array]:
         return parts.look()(jax.tree.leaves(actor), keys)
@@ -204,7 +212,7 @@ def compile_parts(
     return first, Programs(advanced, evaluated, tested)
 
 
-def _joined(leaves: Sequence[jax.Array], like: Any) -> Any:
+def restored(leaves: Sequence[jax.Array | np.ndarray], like: Any) -> Any:
     """Returns a pytree like another of plain leaves; its keys are keys again."""
     return with_keys(jax.tree.unflatten(jax.tree.structure(like), leaves), like)
 

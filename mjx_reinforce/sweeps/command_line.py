@@ -6,11 +6,11 @@ from pathlib import Path
 
 from mjx_reinforce.runs.command_line import check_resumed, join_groups, read_groups, start
 from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.processes import ProcessSettings
 from mjx_reinforce.runs.relevance import changed
 from mjx_reinforce.runs.settings import GROUPS
 from mjx_reinforce.sweeps import grid
 from mjx_reinforce.sweeps.design import Design, SweepSettings, read_design
-from mjx_reinforce.sweeps.processes import ProcessSettings
 
 _PROG = "python -m mjx_reinforce.sweep"
 _DESCRIPTION = (

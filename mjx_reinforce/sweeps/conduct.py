@@ -11,6 +11,7 @@ import numpy as np
 from mjx_reinforce.runs.config import MAX_COUNT
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.plan import duration, is_wrong
+from mjx_reinforce.runs.processes import Processes
 from mjx_reinforce.runs.progress import Progress
 from mjx_reinforce.sweeps import carry, chunks, rungs
 from mjx_reinforce.sweeps.ahead import Clock, one_ahead
@@ -20,7 +21,6 @@ from mjx_reinforce.sweeps.groups import Group, learner_builder
 from mjx_reinforce.sweeps.history import History
 from mjx_reinforce.sweeps.plan import Part, divide, group_seconds
 from mjx_reinforce.sweeps.prepare import Prepared
-from mjx_reinforce.sweeps.processes import Processes
 from mjx_reinforce.sweeps.programs import Programs, compile_programs, shape_of_states
 from mjx_reinforce.sweeps.results import SweepFiles
 from mjx_reinforce.sweeps.rungs import Rung
@@ -92,7 +92,8 @@ class Conductor:
         for rung in rungs.schedule(groups, search, self._files.measured):
             if not self._train_rung(rung):
                 return False
-            self._processes.meet(f"rung {rung.name}")
+            if not self._processes.meet():
+                return False
             self._rungs_done += 1
         return True
 
@@ -170,7 +171,7 @@ class Conductor:
 
     def _left(self, stages: Sequence[Stage]) -> list[Stage]:
         """Returns what is still to be trained by this process."""
-        index, count = self._processes
+        index, count = self._processes.index, self._processes.count
         every = [runs.name for stage in stages for runs in stage.chunks]
         mine = {
             name for i, name in enumerate(every) if i % count == index and not self._files.has(name)

@@ -11,9 +11,9 @@ import tyro
 from mjx_reinforce.export.files import read_json
 from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.memory import check_size, gigabytes, host_memory
+from mjx_reinforce.runs.processes import ProcessSettings, check_processes
 from mjx_reinforce.runs.resume import PLACES, as_config
 from mjx_reinforce.sweeps.grid import check_over, configure, grid
-from mjx_reinforce.sweeps.processes import ProcessSettings, check_processes
 from mjx_reinforce.sweeps.search import draw
 
 #: What writing results.csv and curves.npz needs for a run with two evaluations (bytes).
@@ -87,6 +87,12 @@ def as_record(design: Design) -> dict[str, Any]:
     over = {name: list(values) for name, values in design.over.items()}
     names = ("exact", "search", "budget")
     return {"settings": settings, "over": over, **{name: getattr(design, name) for name in names}}
+
+
+def flat(design: Design) -> dict[str, Any]:
+    """Returns what ``as_record`` does, the settings among the rest."""
+    record = as_record(design)
+    return record.pop("settings") | record
 
 
 def read_design(directory: Path) -> Design:

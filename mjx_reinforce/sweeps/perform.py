@@ -8,14 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from mjx_reinforce.export.files import read_json, write_json
-from mjx_reinforce.runs.files import choose_directory, locked, prepare
+from mjx_reinforce.runs.files import choose_directory, locked, prepare, versions
 from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.own_code import env_flag
+from mjx_reinforce.runs.processes import Processes, joined
 from mjx_reinforce.runs.resume import check_same_program
-from mjx_reinforce.sweeps.design import Design, as_record, check_design
-from mjx_reinforce.sweeps.processes import Processes, join_processes
+from mjx_reinforce.sweeps.design import Design, as_record, check_design, flat
 
 
 def perform(
@@ -42,8 +42,9 @@ def perform(
     if known.get("status") == "finished":
         _finish_again(directory, known)
         return directory, True
-    processes = join_processes(design.processes)
     with contextlib.ExitStack() as held:
+        common = {**flat(design), **versions()}
+        processes = held.enter_context(joined(design.processes, interrupt, common))
         if processes.index == 0:
             new = prepare(directory, design.base.overwrite) if design.resume is None else []
             held.enter_context(locked(directory))  # a folder in which another trains stays
@@ -97,13 +98,15 @@ def _perform(
             if first:
                 files.open()
                 files.write(contents)
-            processes.meet("ready")
+            processes.meet()
 
         if interrupt is not None:
             interrupt.restore_screen(display.console.show_cursor)
         conductor = Conductor(prepared, design, processes, files, display, interrupt, ready)
         conductor.clock.compiling += prepared.engine_seconds
         ended = conductor.conduct()
+        if not ended and interrupt is not None and interrupt.number is not None:
+            processes.stop(interrupt.number)
         contents |= {
             "status": "finished" if ended else "interrupted",
             "compile_seconds": contents["compile_seconds"] + conductor.clock.compiling,

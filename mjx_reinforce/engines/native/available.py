@@ -1,6 +1,9 @@
-"""Whether machine code can play here."""
+"""Whether machine code can play here, and what the numbers of this machine depend on."""
 
+import hashlib
+import platform as host
 import sys
+from typing import Any
 
 import jax
 
@@ -11,6 +14,11 @@ from mjx_reinforce.engines.native.gpu import seam as gpu
 _OLDEST = (20,)
 #: JAX's generator whose noise it draws; `rollout` looks at the keys that it gets.
 GENERATOR = "threefry2x32"
+#: Settings of JAX that change numbers.
+_SETTINGS = (
+    *("jax_default_matmul_precision", "jax_default_prng_impl", "jax_threefry_partitionable"),
+    *("jax_random_seed_offset", "jax_disable_most_optimizations", "jax_numpy_dtype_promotion"),
+)
 
 
 def platform() -> str:
@@ -27,6 +35,37 @@ def made_for() -> str:
 
     made_for = gpu.this_machine() if platform() == "gpu" else machine.this_machine()
     return f"{llvmlite.__version__} {made_for}"
+
+
+def known_by() -> dict[str, Any]:
+    """Returns what decides how this machine rounds, in a few words each.
+
+    XLA compiles for the CPU that is here; native code may be made for an older one.
+    """
+    reason = unavailable()
+    if reason:
+        code = reason
+    elif platform() == "gpu":
+        code = made_for()
+    else:
+        code = f"llvmlite {made_for().partition(' ')[0]}, {_short(machine.this_machine())}"
+    cpu = _host_cpu() if platform() == "cpu" else None  # a GPU's numbers do not depend on it
+    settings = {name: str(jax.config.values[name]) for name in _SETTINGS}
+    return {"cpu": cpu, "machine_code": code, "jax_settings": settings}
+
+
+def _host_cpu() -> str:
+    """Returns the CPU that XLA compiles for."""
+    try:
+        return _short(machine.this_machine(machine.HOST))
+    except (ImportError, OSError):  # no llvmlite
+        return host.processor() or host.machine()
+
+
+def _short(made_for: machine.Machine) -> str:
+    """Returns a machine's name, with a hash of its many features."""
+    digest = hashlib.sha256(made_for.features.encode()).hexdigest()[:8]
+    return f"{made_for.cpu}, {made_for.lanes} lanes, features {digest}"
 
 
 def unavailable() -> str | None:

@@ -19,6 +19,8 @@ from mjx_reinforce.registry import check_name
 
 #: Asks for code that older CPUs run too; one of ``LEVELS``.
 VARIABLE = "MJX_REINFORCE_CPU"
+#: All that the CPU has, whatever the variable says.
+HOST = "host"
 #: The levels of x86-64: float32 values in a vector register, what a CPU has beyond the last level.
 LEVELS = {
     "x86-64": (4, ()),
@@ -66,21 +68,21 @@ def this_machine(level: str | None = None) -> Machine:
     """Returns this machine, or it at an older level of x86-64.
 
     Args:
-      level: one of ``LEVELS``; by default what the variable MJX_REINFORCE_CPU says, else all that
-        the CPU has.
+      level: one of ``LEVELS``, or ``HOST`` for all that the CPU has; by default what the variable
+        MJX_REINFORCE_CPU says, else ``HOST``.
 
     Raises:
       ValueError: the level is unknown, or this CPU is below it.
     """
     import llvmlite.binding as llvm
 
-    level = level or os.environ.get(VARIABLE)
+    level = level or os.environ.get(VARIABLE) or HOST
     triple = llvm.get_process_triple()
     try:
         features = llvm.get_host_cpu_features()
     except RuntimeError:  # where LLVM cannot ask, as on some ARM systems, the name says it
         features = llvm.targets.FeatureMap()
-    if level:
+    if level != HOST:
         check_name(VARIABLE, level, LEVELS)
         lanes = _check_level(level, triple, features)
         return Machine(triple, level, _WIDE if lanes == 16 else "", lanes)
