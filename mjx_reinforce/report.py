@@ -12,6 +12,7 @@ from typing import Any
 import tyro
 
 from mjx_reinforce.export.files import write_bytes
+from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
 from mjx_reinforce.reports.findings import Findings, find
@@ -19,7 +20,7 @@ from mjx_reinforce.reports.page import columns, document, tables
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.vega import ONE, draw
-from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.runs.defaults import check_task, of_task
 from mjx_reinforce.runs.files import version
 from mjx_reinforce.runs.flags import read
 from mjx_reinforce.runs.own_code import env_flag
@@ -149,7 +150,10 @@ def _picture(findings: Findings, figure: Figure, data: Mapping[str, columns.Tabl
 
 
 def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
-    """Returns how to see the worst seed of the best configuration: by its run, or trained again."""
+    """Returns how to see the worst seed of the best configuration.
+
+    By its run, by the policy that its sweep kept, or, where that is an older one, trained again.
+    """
     best = findings.results[0]
     directory = experiment.directories[findings.order[0]]
     seed = int(best.configuration.seed[tables.worst_seeds(best)[0]])
@@ -159,9 +163,21 @@ def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
             f"python -m mjx_reinforce.watch {shlex.quote(str(directory))} --seed {seed}"
             + env_flag(experiment.env),
         )
-    flags = _flags(experiment.settings | best.configuration.settings)
+    number = findings.order[0] - experiment.directories.index(directory)
+    place = directory / "policies" / f"{number:03d}"
+    if seed in seeds_in(place):
+        return Watch(
+            f"To watch the worst, seed {seed}, whose policy the sweep kept:",
+            f"python -m mjx_reinforce.watch {shlex.quote(str(place))} --seed {seed}",
+        )
+    try:
+        check_task(experiment.env)
+    except ValueError as error:
+        return Watch(f"The worst is seed {seed}; it cannot be trained again here: {error}.", "")
+    flags = _flags(experiment.settings | best.configuration.settings | {"env": experiment.env})
     return Watch(
-        f"A sweep keeps no policies. To watch the worst, seed {seed}, train it again:",
+        f"The sweep has not kept the policy of the worst, seed {seed}. Trained again it begins "
+        "alike, but rounds in another way, which makes another run of it on chaotic tasks:",
         f"python -m mjx_reinforce.train {flags} --num-seeds {seed + 1} --output again\n"
         f"python -m mjx_reinforce.watch again --seed {seed}{env_flag(experiment.env)}",
     )
@@ -174,13 +190,13 @@ def _flags(settings: Mapping[str, Any]) -> str:
     changed = {
         k: v for k, v in given.items() if v != defaults[k] and v != list(_items(defaults[k]))
     }
-    flags = [f"--env {settings['env']}"]
+    flags = [f"--env {shlex.quote(str(settings['env']))}"]
     for name, value in changed.items():
         flag = f"--{name.replace('_', '-')}"
         if isinstance(value, bool):
             flags.append(flag if value else flag.replace("--", "--no-", 1))
         else:
-            flags.append(" ".join([flag, *map(str, _items(value))]))
+            flags.append(shlex.join([flag, *map(str, _items(value))]))
     return " ".join(flags)
 
 

@@ -219,6 +219,38 @@ def test_a_run_alone_and_names_that_are_markup(tmp_path):
     assert f"watch '{directory}' --seed 0" in visible(page)
 
 
+def command_of(directory):
+    experiment = sources.read([directory])
+    return report.how_to_watch(experiment, findings.find(experiment))
+
+
+def test_the_worst_seed_is_watched_by_the_policy_that_its_sweep_kept(tmp_path):
+    directory = make_sweep(tmp_path / "a sweep", num_seeds=12)
+    experiment = sources.read([directory])
+    figures = findings.find(experiment)
+    number, best = figures.order[0], figures.results[0]
+    seed = int(best.configuration.seed[tables.worst_seeds(best)[0]])
+    place = directory / "policies" / f"{number:03d}"
+    (place / "policy").mkdir(parents=True)
+    known = {"env": "InvertedPendulum-v5", "horizon": 1000, "seeds": [seed, 99]}
+    (place / "config.json").write_text(json.dumps(known))
+    watch = report.how_to_watch(experiment, figures)
+    assert watch.command == f"python -m mjx_reinforce.watch '{place}' --seed {seed}"
+    (place / "config.json").write_text(json.dumps(known | {"seeds": [98, 99]}))
+    assert "train --env InvertedPendulum-v5" in command_of(directory).command
+
+
+def test_a_command_on_the_page_runs_nothing_else(tmp_path):
+    """Whatever sweep.json says: words are quoted, and an id that is none gives no command."""
+    hostile = "x; touch pwn; echo "
+    settings = {"env": "InvertedPendulum-v5", "num_seeds": 5, "seed": 0, "policy": hostile}
+    quoted = make_sweep(tmp_path / "quoted", num_seeds=5, over=ONE, settings=settings)
+    assert f" --policy '{hostile}' " in command_of(quoted).command
+    refused = make_sweep(tmp_path / "env", num_seeds=5, over=ONE, env=hostile, settings=settings)
+    assert command_of(refused).command == ""
+    assert "unknown environment" in command_of(refused).said
+
+
 def test_a_path_that_the_locale_cannot_read_is_escaped(tmp_path):
     """Where Python reads the file system as ASCII, a path's other bytes are surrogates."""
     directory = make_run(tmp_path / "run\udce6")

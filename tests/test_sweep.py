@@ -16,9 +16,13 @@ from toys import Drift
 from mjx_reinforce import envs
 from mjx_reinforce import sweep as sweep_module
 from mjx_reinforce import train as train_module
+from mjx_reinforce.export.player import load_seed
+from mjx_reinforce.export.run_files import choose_seed, read_run
 from mjx_reinforce.runs import plan as runs_plan
+from mjx_reinforce.runs.build import build
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.runs.state import eval_keys, evaluation
 from mjx_reinforce.sweeps import chunks, conduct, perform, plan, programs, rungs, search
 from mjx_reinforce.sweeps.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.groups import make_groups
@@ -536,3 +540,29 @@ def test_from_python_a_report_can_be_left_out(monkeypatch, tmp_path, capsys, rep
     known = json.loads((tmp_path / "out" / "sweep.json").read_text())
     assert known["statistics_seconds"] == (1.5 if report else None)
     assert ("statistics and report" in capsys.readouterr().out) == report
+
+
+def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
+    """To the bit: played on the starts of the sweep's evaluations they return what it measured."""
+    command = f"{SMALL} --num-seeds 5 --chunk-runs 6 --max-updates 6 {RATES} --output swept"
+    assert run(command) == 0
+    results, env = read_results(Path("swept")), envs.make("Drift-v0")
+    assert not list(Path("swept/parts").glob("policies-*"))
+    for number in range(3):
+        chosen = results.configuration == number
+        final, seeds = results.eval_return[-1, chosen], results.seed[chosen]
+        folder = Path(f"swept/policies/{number:03d}")
+        known = read_run(folder)
+        worst, best = int(seeds[final.argmin()]), int(seeds[final.argmax()])
+        assert known.seeds == tuple(sorted({worst, best}))
+        assert choose_seed(known, "worst") == worst
+        assert choose_seed(known, "best") == best
+        config = Config(env="Drift-v0", num_seeds=5, eval_episodes=2, hidden_sizes=(4,))
+        learner, horizon = build(env, config)
+        evaluate = jax.jit(evaluation(env, learner, horizon, config, sampled=False))
+        for seed in known.seeds:
+            actor = jax.tree.map(lambda x: x[None], load_seed(known, seed)[0].actor)
+            returns = evaluate(actor, eval_keys(config)[seed : seed + 1])["eval_return"]
+            np.testing.assert_array_equal(returns[0], final[seeds == seed][0])
+    with pytest.raises(ValueError, match="has the policies of the seeds"):
+        load_seed(read_run(Path("swept/policies/000")), 99)

@@ -94,7 +94,7 @@ def load(run: str | Path, seed: Seed = "best", *, which: Which = "last") -> Play
 def load_seed(run: Run, seed: Seed, which: Which = "last") -> tuple[Player, SavedPolicy]:
     """Loads one seed, as ``load``, with what its files say."""
     folder, number = policy_folder(run, which), choose_seed(run, seed, which)
-    saved = read_policy(folder, number)
+    saved = read_policy(folder, run.place(number))
     if isinstance(seed, str):
         ranked = len(final_returns(run, which))
         if ranked != saved.num_seeds:

@@ -57,7 +57,7 @@ def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None
         ``shared_trunk``, ``initializer``, ``rescale``: what ``build_policy`` reads.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    arrays = {name: np.asarray(value) for name, value in _flat(actor).items()}
+    arrays = {name: np.asarray(value) for name, value in arrays_of(actor).items()}
     arrays[_CHECKSUM] = np.array(_checksum(settings, arrays))
     write_json(directory / "policy.json", settings)
     write_arrays(directory / "actor.npz", arrays)  # last: where it is, the folder is whole
@@ -107,7 +107,7 @@ def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
             f"{settings_path} is damaged, or actor.npz beside it: they do not belong together "
             "(their checksum differs), so one of them was changed or is another run's"
         )
-    actor = jax.tree.map(lambda x: jnp.asarray(x if seed is None else x[seed]), _actor(arrays))
+    actor = jax.tree.map(lambda x: jnp.asarray(x if seed is None else x[seed]), actor_of(arrays))
     return SavedPolicy(policy, actor, settings, num_seeds)
 
 
@@ -120,13 +120,13 @@ def _damage_in(path: Path) -> Iterator[None]:
         raise ValueError(f"{path} is damaged: {error}") from error
 
 
-def _flat(actor: Actor) -> dict[str, Any]:
+def arrays_of(actor: Actor) -> dict[str, Any]:
     """Returns an actor's arrays under the names they have in the archive."""
     return traverse_util.flatten_dict(serialization.to_state_dict(actor), sep="/")
 
 
-def _actor(arrays: dict[str, Any]) -> Actor:
-    """Returns the actor of ``_flat``."""
+def actor_of(arrays: dict[str, Any]) -> Actor:
+    """Returns the actor of ``arrays_of``."""
     tree = traverse_util.unflatten_dict(arrays, sep="/")
     return Actor(params=tree["params"], normalizer=normalize.Normalizer(**tree["normalizer"]))
 
@@ -138,7 +138,7 @@ def _shapes(policy: Policy, observation_size: int) -> dict[str, tuple[int, ...]]
         params = policy.init(jax.random.key(0))
         return Actor(params=params, normalizer=normalize.init(observation_size))
 
-    return {name: array.shape for name, array in _flat(jax.eval_shape(first)).items()}
+    return {name: array.shape for name, array in arrays_of(jax.eval_shape(first)).items()}
 
 
 def _checksum(settings: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:

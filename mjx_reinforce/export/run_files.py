@@ -24,11 +24,22 @@ class Run(NamedTuple):
     directory: where it is
     env: the id of its environment
     horizon: the time limit in env steps
+    seeds: the numbers of the seeds whose policies are here, where a sweep kept a few; else all are
     """
 
     directory: Path
     env: str
     horizon: int
+    seeds: tuple[int, ...] | None = None
+
+    def place(self, seed: int) -> int:
+        """Returns where among the policies that of a seed is; ValueError if it was not kept."""
+        if self.seeds is None:
+            return seed
+        if seed not in self.seeds:
+            kept = " and ".join(map(str, self.seeds))
+            raise ValueError(f"{self.directory} has the policies of the seeds {kept}, not {seed}")
+        return self.seeds.index(seed)
 
 
 def read_run(directory: str | Path) -> Run:
@@ -51,7 +62,19 @@ def read_run(directory: str | Path) -> Run:
         )
     if not (directory / "policy").is_dir():
         raise ValueError(f"{directory} has no policy yet: {_NOT_YET}")
-    return Run(directory, env_id, horizon)
+    seeds = settings.get("seeds")
+    if seeds is not None and not (
+        isinstance(seeds, list) and all(type(seed) is int for seed in seeds)
+    ):
+        raise ValueError(f"{path} is damaged: seeds must be whole numbers, got {seeds!r}")
+    return Run(directory, env_id, horizon, None if seeds is None else tuple(seeds))
+
+
+def seeds_in(directory: Path) -> tuple[int, ...]:
+    """Returns the seeds whose policies a sweep kept in a directory; none where there are none."""
+    if not (directory / "config.json").is_file():
+        return ()
+    return read_run(directory).seeds or ()
 
 
 def policy_folder(run: Run, which: Which) -> Path:
@@ -90,7 +113,15 @@ def choose_seed(run: Run, seed: Seed, which: Which = "last") -> int:
     returns = final_returns(run, which)
     order = np.argsort(returns, kind="stable")
     ranked = {"worst": order[0], "median": order[(len(order) - 1) // 2], "best": returns.argmax()}
-    return int(ranked[seed])
+    place = int(ranked[seed])
+    if run.seeds is None:
+        return place
+    if len(run.seeds) != len(returns):
+        raise ValueError(
+            f"{run.directory / 'summary.json'} ranks {len(returns)} seeds, config.json names "
+            f"{len(run.seeds)}: they are of different runs"
+        )
+    return run.seeds[place]
 
 
 def final_returns(run: Run, which: Which) -> np.ndarray:

@@ -9,6 +9,7 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
+from mjx_reinforce import envs
 from mjx_reinforce.runs.config import Config
 
 #: Found by searches, random draws at first, then 768 to 1,536 seeds of each of the best; for the
@@ -143,6 +144,11 @@ _OF_TASKS: dict[str, dict[str, Any]] = {
 def of_task(env: str) -> Config:
     """Returns the default settings for an environment, also for one that the table lacks."""
     return dataclasses.replace(Config(env=env), **_OF_TASKS.get(env, {}))
+
+
+def check_task(env: str) -> None:
+    """Raises ValueError for what is no id of an environment, such as a file may name."""
+    envs.check_id(env)
 
 
 def named_task(arguments: Sequence[str]) -> str:

@@ -225,6 +225,7 @@ class Conductor:
         keep = self._design.search == "halving"
         if keep:  # for the next rung
             saver.save(states, history)
+        self._files.keep_policies(runs, history, layout.states(states).train_states.actor)
         self._files.add(runs, history)
         if not keep:
             saver.remove()

@@ -113,7 +113,7 @@ def _perform(
             "run_seconds": contents["run_seconds"] + conductor.clock.running,
         }
         if first:
-            _finish(design, files, contents)
+            _finish(design, prepared, files, contents)
             if ended and report:
                 display.say("writing the report")
                 contents["statistics_seconds"] = _report(directory)
@@ -122,14 +122,21 @@ def _perform(
     return ended
 
 
-def _finish(design: Design, files: Any, contents: dict[str, Any]) -> None:
+def _finish(design: Design, prepared: Any, files: Any, contents: dict[str, Any]) -> None:
     """Writes the last files of a sweep, or those of one that was interrupted."""
+    from mjx_reinforce.runs.build import policy_settings
+    from mjx_reinforce.sweeps.grid import configure
     from mjx_reinforce.sweeps.rungs import winner
+
+    def settings(number: int) -> tuple[dict[str, Any], int]:
+        [config] = configure(design.base, [prepared.configurations[number]])
+        return policy_settings(prepared.env, config), prepared.horizon
 
     files.finish()
     if contents["status"] == "finished":
         if design.search != "grid":
             contents["winner"] = winner(files.measured)
+        files.gather_policies(settings)
         files.remove_states()
     files.write(contents)
 

@@ -4,7 +4,8 @@ A part is what one chunk of runs measured. It is written whole, when the chunk e
 results.csv and curves.npz are made of: whatever else a crash leaves is written anew.
 """
 
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from mjx_reinforce.export.files import read_arrays, write_arrays, write_bytes, write_json
 from mjx_reinforce.reports.statistics import steps_to_solve
 from mjx_reinforce.runs import checkpoint, files
+from mjx_reinforce.sweeps import policies
 from mjx_reinforce.sweeps.chunks import Runs
 from mjx_reinforce.sweeps.history import History
 
@@ -61,6 +63,7 @@ class SweepFiles:
         """Writes a results.csv without rows; removes an older sweep."""
         for path in [*self.parts.glob("*.npz"), *self.parts.glob("*/*.npz")]:
             path.unlink()
+        shutil.rmtree(self.directory / "policies", ignore_errors=True)
         for name in _RESULTS[1:]:  # a report is replaced when there is a new one
             (self.directory / name).unlink(missing_ok=True)
         self.parts.mkdir(exist_ok=True)
@@ -89,6 +92,10 @@ class SweepFiles:
         """Returns the folder of a chunk's checkpoints."""
         return self.parts / chunk
 
+    def keep_policies(self, runs: Runs, history: History, actors: Any) -> None:
+        """Keeps the best and the worst policies of a chunk [R, ...], before its part."""
+        policies.write_part(self.parts, runs, history.now["eval_return"], actors)
+
     def add(self, runs: Runs, history: History) -> None:
         """Writes the part of a chunk, and appends its rows to results.csv."""
         curves = history.curves()
@@ -110,8 +117,14 @@ class SweepFiles:
             del joined["nonfinite"]
             write_arrays(self.directory / "curves.npz", joined, compressed=True)
 
+    def gather_policies(self, settings: Callable[[int], tuple[dict[str, Any], int]]) -> None:
+        """Writes the folder ``policies`` of a sweep that ended, see ``policies.gather``."""
+        policies.gather(self.directory, self.parts, settings)
+
     def remove_states(self) -> None:
         """Removes what a sweep needs only while it goes on."""
+        for path in self.parts.glob("policies-*.npz"):
+            path.unlink()
         for folder in self.parts.glob("*/"):
             checkpoint.remove(folder)
 
