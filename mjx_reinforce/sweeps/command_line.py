@@ -15,7 +15,8 @@ from mjx_reinforce.sweeps.design import Design, SweepSettings, read_design
 _PROG = "python -m mjx_reinforce.sweep"
 _DESCRIPTION = (
     "Train many configurations, many seeds of each, side by side. Leaves sweep.json, results.csv "
-    "(a row for each configuration and seed), curves.npz and report.html in the output directory. "
+    "(a row for each configuration and seed), curves.npz, report.html and policies/ (those of the "
+    "best and the worst seed of each configuration) in the output directory. "
     "All settings of python -m mjx_reinforce.train may be given, with its presets, and most may be "
     "swept. Seed 3 of a configuration is seed 3 of train with these settings, up to rounding."
 )
