@@ -17,6 +17,7 @@ from toys import Survive
 from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export.policy_files import build_policy
+from mjx_reinforce.runs import command_line
 from mjx_reinforce.runs.build import build, policy_settings
 from mjx_reinforce.runs.config import check
 from mjx_reinforce.runs.defaults import of_task
@@ -73,12 +74,12 @@ def test_a_preset_makes_sense(name):
     line, config = PRESETS[name]
     check(config)
     assert 20 < len(line) < 100
-    assert train_module.parse([name]) == config
-    assert train_module.parse([name, "--horizon", "7"]).horizon == 7
+    assert command_line.parse([name]) == config
+    assert command_line.parse([name, "--horizon", "7"]).horizon == 7
 
 
 def test_no_preset_is_the_default():
-    assert train_module.parse([]) == of_task("InvertedPendulum-v5")
+    assert command_line.parse([]) == of_task("InvertedPendulum-v5")
 
 
 @pytest.mark.parametrize(
@@ -119,9 +120,9 @@ def test_first_weights_are_pytorchs(name):
 
 @pytest.mark.parametrize("name", ["auto", "vmap", "fused", "native"])
 def test_engines_have_names(name):
-    assert train_module.parse(["--engine", name]).engine == name
+    assert command_line.parse(["--engine", name]).engine == name
     with pytest.raises(ValueError, match="'vmap'"):
-        train_module.parse(["--engine", "mjx"])
+        command_line.parse(["--engine", "mjx"])
 
 
 def test_an_unknown_preset_is_explained(monkeypatch, capsys):
@@ -131,8 +132,8 @@ def test_an_unknown_preset_is_explained(monkeypatch, capsys):
 
 def test_help_lists_presets_and_groups_without_jax():
     code = (
-        "import sys\nfrom mjx_reinforce import train\n"
-        "try: train.parse(['--help'])\n"
+        "import sys\nfrom mjx_reinforce.runs import command_line\n"
+        "try: command_line.parse(['--help'])\n"
         "except SystemExit: print('jax' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
@@ -146,7 +147,7 @@ def test_help_lists_presets_and_groups_without_jax():
 def test_defaults_that_a_policy_does_not_read_are_not_the_users(id, words):
     """Only what the command line itself says may be refused for doing nothing."""
     arguments = ["--env", id, *words]
-    config, default = train_module.parse(arguments), train_module.start(arguments, "train")[0]
+    config, default = command_line.parse(arguments), train_module.start(arguments, "train")[0]
     families = {"ars": "deterministic", "reinforce": "normal"}
     family = "categorical" if id.startswith("CartPole") else families[config.algorithm]
     check_read_by_policy(config, default, family)
