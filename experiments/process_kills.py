@@ -48,6 +48,8 @@ class Pair(NamedTuple):
     def wait_for_both(self) -> None:
         """Waits until each knows of the other."""
         while not all(HERE in self.said(i) for i in range(2)):
+            if all(process.poll() == 0 for process in self.processes):
+                return  # it is finished
             if any(process.poll() for process in self.processes):
                 sys.exit(f"a process failed: {self.said(0)} {self.said(1)}")
             time.sleep(0.01)
@@ -131,6 +133,9 @@ def main() -> None:
         with contextlib.suppress(subprocess.TimeoutExpired):
             pair.processes[0].wait(timeout=after)
             longest = time.monotonic() - began  # it ended before
+            continue
+        if pair.processes[1].poll() is not None:  # the first writes the report
+            pair.processes[0].wait()
             continue
         seconds, bad = kill(pair, victim)
         lived.append(seconds)
