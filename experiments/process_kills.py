@@ -101,6 +101,11 @@ def kill(pair: Pair, victim: int) -> tuple[float, list[str]]:
     return seconds, [*wrong, said[-1000:]] if wrong else []
 
 
+def differing(run: Path, whole: dict[str, bytes]) -> list[str]:
+    """Returns which files of a run are not those of the one that was left alone."""
+    return [f"{name} differs" for name in whole if (run / name).read_bytes() != whole[name]]
+
+
 def state(program: str, run: Path) -> str:
     """Returns what there is of a run."""
     if not (run / BEGUN[program]).exists():
@@ -138,10 +143,13 @@ def main() -> None:
             pair.processes[0].wait()
             continue
         seconds, bad = kill(pair, victim)
+        if pair.processes[1 - victim].returncode == 0:  # all had been done: it is to be there
+            wrong += differing(run, whole)
+            continue
         lived.append(seconds)
         left = state(program, run)
         finish(program, run)
-        bad += [f"{name} differs" for name in whole if (run / name).read_bytes() != whole[name]]
+        bad += differing(run, whole)
         wrong += bad
         print(
             f"{len(lived)}: process {victim} killed after {after:.1f} s; the other ended "
