@@ -237,10 +237,10 @@ def page(rows: list[dict[str, Any]], settings: Settings) -> str:
         "An env step is about 0.02 s of physics steps, from the first key frame or the "
         "reference pose with small noise, under an untrained 16-32 policy. The error is the largest"
         f" of qpos and qvel after one env step of {_EPISODES} episodes against C MuJoCo in double "
-        "precision, relative where a number is greater than one: in float32 with the solver options "
-        "of the model, in float64 with solvers that go on to the optimum (models made for MJX stop "
-        "them after a few iterations, C's and ours at different points). Episodes in which more "
-        "contacts touch than a model's max_contact_points keeps are not compared. A process had "
+        "precision, relative where a number is greater than one: in float32 with the solver's "
+        "options in the model, in float64 with solvers that go on to the optimum (models made for "
+        "MJX stop them after a few iterations, C's and ours at different points). Episodes in which "
+        "more contacts touch than a model's max_contact_points keeps are not compared. A process had "
         f"{settings.limit:.0f} s."
     )
     lines = [
