@@ -239,8 +239,8 @@ def page(rows: list[dict[str, Any]], settings: Settings) -> str:
         f" of qpos and qvel after one env step of {_EPISODES} episodes against C MuJoCo in double "
         "precision, relative where a number is greater than one: in float32 with the solver's "
         "options in the model, in float64 with solvers that go on to the optimum (models made for "
-        "MJX stop them after a few iterations, C's and ours at different points). Episodes in which "
-        "more contacts touch than max_contact_points keeps are not compared. A process had "
+        "MJX stop them after a few iterations, C's and ours at different points). Episodes in "
+        "which more contacts touch than max_contact_points keeps are not compared. A process had "
         f"{settings.limit:.0f} s."
     )
     lines = [
