@@ -257,7 +257,7 @@ def test_a_wrong_estimate_is_corrected_once_it_shows():
 
 
 def test_a_run_says_once_that_it_takes_another_time(run, monkeypatch, capsys):
-    plans = lambda ready, config: plan.Plan("a plan", 8.0, 1e5)  # noqa: E731
+    plans = lambda *args: plan.Plan("a plan", 8.0, 1e5)  # noqa: E731
     monkeypatch.setattr(train_module, "make_plan", plans)
     assert run("--max-updates", "120", "--output", "out", "--hidden-sizes") == 0
     lines = capsys.readouterr().out.splitlines()
