@@ -39,6 +39,7 @@ _IGNORED = (
     ("actuator_armature", "the armature of an actuator", _ON_JOINT),
     ("actuator_damping", "the damping of an actuator", _ON_JOINT),
     ("actuator_dampingpoly", "the polynomial damping of an actuator", _ON_JOINT),
+    ("actuator_actearly", "actearly of an actuator", 'remove actearly="true"'),
     ("jnt_stiffnesspoly", "the polynomial stiffness of a joint", _ONE_NUMBER),
     ("dof_dampingpoly", "the polynomial damping of a joint", _ONE_NUMBER),
     ("tendon_stiffnesspoly", "the polynomial stiffness of a tendon", _ONE_NUMBER),

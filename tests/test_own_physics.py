@@ -15,6 +15,7 @@ from mjx_reinforce.envs.base import MujocoEnv
 REFUSED = {
     "armature of an actuator": "would ignore the armature of an actuator",
     "damping of an actuator": "would ignore the damping of an actuator",
+    "actearly": "would ignore actearly of an actuator",
     "polynomial spring": "would ignore the polynomial stiffness of a joint",
     "polynomial damping": "would ignore the polynomial damping of a joint",
     "polynomial spring of a tendon": "would ignore the polynomial stiffness of a tendon",
