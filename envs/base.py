@@ -14,7 +14,7 @@ from mujoco import mjx
 
 from mjx_reinforce.checks import changed
 from mjx_reinforce.envs import models
-from mjx_reinforce.envs.outcomes import check_outcome, check_start
+from mjx_reinforce.envs.outcomes import check_outcome, check_shape, check_start
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings, check_positive
 from mjx_reinforce.fused import prune
 from mjx_reinforce.physics import mjx_internals
@@ -169,6 +169,8 @@ class MujocoEnv(Env):
           qpos: [nq] generalised positions (m, rad).
           qvel: [nv] generalised velocities (m/s, rad/s).
         """
+        check_shape("qpos", qpos, (self.mj_model.nq,))
+        check_shape("qvel", qvel, (self.mj_model.nv,))
         return self._start(qpos, qvel)
 
     def _forward_state(self, qpos: jax.Array, qvel: jax.Array) -> State:
@@ -184,6 +186,7 @@ class MujocoEnv(Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Returns the state one env step later under ``action`` [A]."""
+        check_shape("the action", action, (self.action_size,))
         start = cast(Any, state.pipeline_state)
         data = self._data(start)
         data = jax.lax.fori_loop(

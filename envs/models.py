@@ -11,6 +11,7 @@ import numpy as np
 from mujoco import (  # a C extension
     MjModel,  # pyright: ignore[reportAttributeAccessIssue]
     MjSpec,  # pyright: ignore[reportAttributeAccessIssue]
+    mjtDisableBit,  # pyright: ignore[reportAttributeAccessIssue]
     mjtEnableBit,  # pyright: ignore[reportAttributeAccessIssue]
     mjtIntegrator,  # pyright: ignore[reportAttributeAccessIssue]
     mjtSensor,  # pyright: ignore[reportAttributeAccessIssue]
@@ -154,5 +155,10 @@ def _ignored(model: Any) -> Iterator[tuple[str, str]]:
             yield feature, remedy
     if model.opt.enableflags & mjtEnableBit.mjENBL_SLEEP:
         yield "sleeping bodies", 'remove <flag sleep="enable"/>'
+    if model.opt.disableactuator:
+        yield "disabled groups of actuators", "remove actuatorgroupdisable, or those actuators"
+    for flag, values in (("spring", "stiffness"), ("damper", "damping")):
+        if model.opt.disableflags & getattr(mjtDisableBit, f"mjDSBL_{flag.upper()}"):
+            yield f'parts of <flag {flag}="disable"/>', f"remove it, and give no {values}"
     if model.opt.integrator == mjtIntegrator.mjINT_DISCRETE:
         yield "the integrator INT_DISCRETE", _REMEDIES["INT_IMPLICIT"]

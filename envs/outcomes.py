@@ -32,6 +32,12 @@ def check_start(name: str, start: Any, sizes: tuple[int, int]) -> tuple[Any, Any
     return qpos, qvel
 
 
+def check_shape(name: str, value: Any, expected: tuple[int, ...]) -> None:
+    """Raises ValueError for an array of another shape."""
+    if _shape(value) != expected:
+        raise ValueError(f"{name} must be {list(expected)}, got {_described(value)}")
+
+
 def check_outcome(name: str, outcome: Any) -> tuple[Any, Any, dict[str, Any]]:
     """Returns what ``outcome`` returned, if it is a reward, a termination, and terms.
 

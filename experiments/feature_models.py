@@ -237,6 +237,11 @@ MODELS = {
     "noslip": _scene('type="sphere"', option='noslip_iterations="5"'),
     "energy": _arm(flags='<flag energy="enable"/>'),
     "sleep": _scene('type="sphere"', flags='<flag sleep="enable"/>'),
+    "disabled actuators": _actuated(
+        '<motor joint="a" group="2"/>', option='actuatorgroupdisable="2"'
+    ),
+    "disabled springs": _arm(joint='stiffness="2"', flags='<flag spring="disable"/>'),
+    "disabled dampers": _arm(flags='<flag damper="disable"/>'),
     "no gravity": _arm(flags='<flag gravity="disable"/>'),
     "wind": _arm(option='density="10" viscosity=".5" wind="3 0 1"'),
     "fluid": _arm(option='density="100" viscosity="1"'),

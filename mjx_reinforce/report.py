@@ -55,6 +55,8 @@ def main() -> None:
     accept_everything()
     try:
         settings = read(Settings, sys.argv[1:], _PROGRAM, _ABOUT)
+        if settings.output is not None:
+            check_output(settings.output, settings.overwrite)
         experiment = sources.read(settings.sources)
         output = settings.output or _default_output(settings.sources)
         check_output(output, settings.overwrite)
@@ -168,7 +170,8 @@ def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
     if seed in seeds_in(place):
         return Watch(
             f"To watch the worst, seed {seed}, whose policy the sweep kept:",
-            f"python -m mjx_reinforce.watch {shlex.quote(str(place))} --seed {seed}",
+            f"python -m mjx_reinforce.watch {shlex.quote(str(place))} --seed {seed}"
+            + env_flag(experiment.env),
         )
     try:
         check_task(experiment.env)

@@ -80,6 +80,9 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             plan = make_plan(ready, config, processes.count)
     except ValueError as error:
         refuse(str(error), made)
+    except (ImportError, MemoryError) as error:
+        remedy = "see pip check, and ulimit -v where memory is short"
+        refuse(f"cannot load what this package needs ({error}); {remedy}", made)
     try:
         if processes.index:
             return _serve(ready, config, processes, interrupt)

@@ -3,7 +3,6 @@
 import dataclasses
 import math
 import os
-import shlex
 import sys
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -132,8 +131,7 @@ def _check_env(settings: Settings, run: Run) -> None:
     """Raises ValueError for another environment than the run's, or where one must be named."""
     if settings.env not in (None, run.env):
         raise ValueError(f"--env is {settings.env}, but {run.directory} was trained on {run.env}")
-    command = f"python -m mjx_reinforce.watch {shlex.quote(str(run.directory))}"
-    check_named(run.env, settings.env, run.directory, command)
+    check_named(run.env, settings.env, run.directory)
 
 
 def _waiting(what: str) -> AbstractContextManager[Any]:

@@ -61,12 +61,12 @@ def said(monkeypatch, capsys):
     return run
 
 
-GOING_ON = {
-    "train --resume run": "--resume run",
-    "train --resume run --max-updates 9": "--resume run",
-    "sweep --resume rates": "--resume rates",
-    "watch run": "python -m mjx_reinforce.watch run",
-}
+GOING_ON = (
+    "train --resume run",
+    "train --resume run --max-updates 9",
+    "sweep --resume rates",
+    "watch run",
+)
 
 
 @pytest.mark.parametrize("command", GOING_ON)
@@ -74,7 +74,7 @@ def test_code_that_only_a_file_names_is_not_run(folder, said, command):
     error, status = said(command)
     assert status == 2
     assert not (folder / "ran").exists()
-    assert error.endswith(f"if you trust it, name it: {GOING_ON[command]} --env {ENV}\n")
+    assert error.endswith(f"if you trust it, add --env {ENV} to the command\n")
     assert error.count("\n") == 1
 
 

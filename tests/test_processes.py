@@ -158,10 +158,11 @@ def test_a_signal_to_one_process_stops_all(tmp_path, program):
     assert json.loads((tmp_path / "out" / name).read_text())["status"] == "interrupted"
     if program == "train":  # with as many processes it goes on
         alone = [sys.executable, "-m", "mjx_reinforce.train", "--resume", "out"]
+        alone += ["--env", "toys:Drift"]
         paths = os.pathsep.join([str(Path(__file__).parent), str(Path(__file__).parents[1])])
         environment = os.environ | {"PYTHONPATH": paths}
         refused = subprocess.run(alone, cwd=tmp_path, env=environment, capture_output=True)
-        assert b"was begun with num_processes 2, and here it is 1" in refused.stderr
+        assert b"was begun on 2 processes, and here there are 1" in refused.stderr
 
 
 class Listener:

@@ -209,7 +209,8 @@ def in_place(chosen, lengths, widths, num_devices):
 @pytest.mark.parametrize("exact", [False, True])
 def test_packing_changes_nothing(run, monkeypatch, exact):
     """Neither which runs share a slot, nor how wide it is, nor that those that ended lie aside."""
-    command = f"{STEPS} --num-seeds 4 {'--exact' * exact}"
+    # With this seed one run trains last, alone.
+    command = f"{STEPS} --num-seeds 4 --seed 2 {'--exact' * exact}"
     shapes = []
 
     def packed(*arguments):
@@ -316,7 +317,7 @@ def test_a_sweep_that_crashed_goes_on(run, monkeypatch, where):
         with pytest.raises(CrashError):
             sweep_module.main()
     assert json.loads(Path("crashed/sweep.json").read_text())["status"] == "running"
-    assert len(list(Path("crashed/parts").glob("*.npz"))) == 1
+    assert len(list(Path("crashed/parts").glob("[0-9]*.npz"))) == 1
     assert run("--resume crashed") == 0
     assert same(curves(Path("whole")), curves(Path("crashed")))
     assert Path("whole/results.csv").read_bytes() == Path("crashed/results.csv").read_bytes()
@@ -553,7 +554,8 @@ def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
         final, seeds = results.eval_return[-1, chosen], results.seed[chosen]
         folder = Path(f"swept/policies/{number:03d}")
         known = read_run(folder)
-        worst, best = int(seeds[final.argmin()]), int(seeds[final.argmax()])
+        ranked = np.nan_to_num(final, nan=-np.inf)  # a broken evaluation is the worst
+        worst, best = int(seeds[ranked.argmin()]), int(seeds[ranked.argmax()])
         assert known.seeds == tuple(sorted({worst, best}))
         assert choose_seed(known, "worst") == worst
         assert choose_seed(known, "best") == best

@@ -36,6 +36,16 @@ class Step(NamedTuple):
     state: Any
 
 
+def check_scalars(**arguments: Any) -> None:
+    """Raises ValueError for an argument of a rollout that must be one number [], and is not."""
+    for name, value in arguments.items():
+        if jnp.shape(value) != ():
+            raise ValueError(
+                f"{name} must be [], got the shape {list(jnp.shape(value))}; play several seeds by "
+                "jax.vmap"
+            )
+
+
 def begin(env: Environment, key: jax.Array, episode: jax.Array) -> tuple[Any, jax.Array]:
     """Returns the start state of an episode, by its number, and the key of its noise."""
     reset_key, noise_key = jax.random.split(jax.random.fold_in(key, episode))

@@ -73,6 +73,7 @@ def rollout(
     check_key(key)
     check_count("num_episodes", num_episodes)
     check_count("horizon", horizon)
+    episode.check_scalars(num_deterministic=num_deterministic, active=active)
     if env_step is None:
         env_step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
     # Inside, episodes are the last axis: each scalar of the state is a contiguous row.

@@ -1,7 +1,6 @@
 """The command line of ``python -m mjx_reinforce.train``: presets, flags, and runs that go on."""
 
 import dataclasses
-import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -76,7 +75,7 @@ def check_resumed(env: str, arguments: Sequence[str], directory: Path) -> None:
       arguments: the command line.
       directory: of what goes on.
     """
-    check_named(env, named_task(arguments), directory, f"--resume {shlex.quote(str(directory))}")
+    check_named(env, named_task(arguments), directory)
 
 
 def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequence[str], str]:

@@ -14,18 +14,17 @@ def env_flag(env: str) -> str:
     return f" --env {shlex.quote(env)}" if ":" in env else ""
 
 
-def check_named(env: str, named: str | None, directory: Path, command: str) -> None:
+def check_named(env: str, named: str | None, directory: Path) -> None:
     """Raises ValueError if a command would import code that only a file names.
 
     Args:
       env: the environment, as the files of a run say.
       named: the environment, as the command line says, if it does.
       directory: of the run.
-      command: what the user wrote, without --env.
     """
     envs.check_id(env)
     if ":" in env and named != env:
         raise ValueError(
             f"{directory} was trained on {env}, and this would run that code; if you trust it, "
-            f"name it: {command}{env_flag(env)}"
+            f"add{env_flag(env)} to the command"
         )

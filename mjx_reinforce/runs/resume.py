@@ -154,6 +154,11 @@ def check_same_program(
             changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]
             if changed:
                 name, old, new = changed[0], old.get(changed[0]), new.get(changed[0])
+        if old != new and name == "num_processes":
+            raise ValueError(
+                f"{directory} was begun on {old or 1} processes, and here there are {new}; resume "
+                "it with --distributed on as many, wherever they are"
+            )
         if old != new:
             raise ValueError(
                 f"{directory} was begun with {name} {old}, and here it is {new}, so its numbers "

@@ -6,11 +6,12 @@ with Humanoid-v5 (1.9 million operations), 54 s with dm_control's humanoid (2.7 
 19 s and 116 s with observations of 500 and 2,000 entries, of which some 8 s are XLA's.
 """
 
+from typing import Any
+
 import jax
 
 from mjx_reinforce.engines.native import available
 from mjx_reinforce.fused import TooLarge, jaxprs, size
-from mjx_reinforce.physics.collisions import advice
 from mjx_reinforce.types import Environment, null_action
 
 #: Nobody waits longer for what `jax.vmap` compiles in less.
@@ -33,11 +34,17 @@ def check_seconds(env: Environment, traced: jaxprs.Program, entries: int) -> Non
         model = getattr(env, "mj_model", None)
         wide = _PER_PAIR_OF_ENTRIES * entries**2 > expected / 2
         cause = f"of an observation of {entries:,} entries" if wide else "of its size"
-        remedy = "" if wide or model is None else advice(model)
+        remedy = "" if wide or model is None else _fewer_contacts(model)
         raise TooLarge(
             f"writing it out and compiling it would take about {expected:.0f} s, more than "
             f"{MAX_SECONDS} s, because {cause}{'; ' if remedy else ''}{remedy}"
         )
+
+
+def _fewer_contacts(model: Any) -> str:
+    from mjx_reinforce.physics.collisions import advice  # imports MJX, which takes a second
+
+    return advice(model)
 
 
 def seconds(env: Environment) -> float:

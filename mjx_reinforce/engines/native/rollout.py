@@ -58,6 +58,7 @@ def rollout(
         program = build(env, act, actor, distribution, chunk_length(horizon))
     except (TooLarge, UnsupportedPrimitive) as error:
         raise ValueError(f"the native engine cannot play this: {error}") from error
+    episode.check_scalars(num_deterministic=num_deterministic, active=active, threads=threads)
     begin = functools.partial(episode.begin, env, key)
     state, keys = jax.vmap(begin)(jnp.arange(num_episodes))
     given = (
