@@ -178,6 +178,12 @@ class Listener:
         self.left.append(status)
 
 
+@pytest.fixture(autouse=True)
+def silent(monkeypatch):
+    """Threads that still wait when their test is over say nothing in the tests after it."""
+    monkeypatch.setattr(module, "to_screen", lambda text: None)
+
+
 def join_all(count, changes=None, common=None):
     """What each of some processes, here threads, comes to: its Processes, or what it raised."""
     port, found, leave = free_port(), {}, threading.Event()

@@ -224,6 +224,7 @@ def test_help_says_it(name, words):
     text = io.StringIO()
     pydoc.Helper(output=text).help(getattr(m, name))
     shown = text.getvalue()
-    assert words in shown
+    # Python 3.13 breaks a long signature into lines.
+    assert words in " ".join(shown.split()).replace("( ", "(")
     assert "_train_step" not in shown.replace("mjx_reinforce", "")
     assert "top of this file" not in shown
