@@ -228,3 +228,20 @@ def test_help_says_it(name, words):
     assert words in " ".join(shown.split()).replace("( ", "(")
     assert "_train_step" not in shown.replace("mjx_reinforce", "")
     assert "top of this file" not in shown
+
+
+@pytest.mark.parametrize("engine", ["vmap", "native"])
+def test_a_mask_of_several_seeds_is_refused(engine):
+    """Machine code took its length for the number of seeds, and wrote beyond its buffers."""
+    learner = m.reinforce(Survive(), num_episodes=4, engine=engine)
+    state = learner.init(jax.random.key(0))
+    with pytest.raises(ValueError, match=r"active must be \[\], got the shape \[3\]"):
+        learner.play(state, jax.random.key(1), jnp.ones(3, bool))
+
+
+def test_states_and_actions_of_another_shape_are_refused():
+    env = m.envs.make("InvertedPendulum-v5")
+    with pytest.raises(ValueError, match=r"qpos must be \[2\], got the shape \[1\]"):
+        env.set_state(jnp.zeros(1), jnp.zeros(2))
+    with pytest.raises(ValueError, match=r"the action must be \[1\], got the shape \[3\]"):
+        jax.eval_shape(env.step, env.set_state(jnp.zeros(2), jnp.zeros(2)), jnp.zeros(3))
