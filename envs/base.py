@@ -181,24 +181,24 @@ class MujocoEnv(Env):
         state, view = self._physics(data), Simulation(data)
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
-        terms = self._checked_outcome(self._before(state), view, action)[2]
+        terms = self._checked_outcome(self._before(state, start), view, action)[2]
         return State(cast(Any, state), self.observe(view), zero, zero, dict.fromkeys(terms, zero))
 
     def step(self, state: State, action: jax.Array) -> State:
         """Returns the state one env step later under ``action`` [A]."""
         check_shape("the action", action, (self.action_size,))
-        start = cast(Any, state.pipeline_state)
-        data = self._data(start)
+        before = cast(Any, state.pipeline_state)
+        start = models.make_data(self.mj_model).replace(**_carried(before))
         data = jax.lax.fori_loop(
             0,
             self.frame_skip,
             lambda _, data: physics.like(self._physics_step(data), data),
-            data.replace(ctrl=jnp.asarray(action, data.ctrl.dtype)),
+            start.replace(ctrl=jnp.asarray(action, start.ctrl.dtype)),
         )
         if self.contact_forces:
             data = mjx.rne_postconstraint(self.model, data)
         view = Simulation(data)
-        reward, terminated, terms = self._checked_outcome(self._before(start), view, action)
+        reward, terminated, terms = self._checked_outcome(self._before(before, start), view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
@@ -213,15 +213,10 @@ class MujocoEnv(Env):
         """Returns what ``outcome`` returns, or raises ValueError where it is no outcome."""
         return check_outcome(type(self).__name__, self.outcome(before, data, action))
 
-    def _before(self, state: Physics) -> "Before":
+    def _before(self, state: Physics, start: mjx.Data) -> Before:
         """Returns the start of an env step as ``outcome`` may read it."""
-        data = models.make_data(self.mj_model)
-        constant = {name: getattr(data, name) for name in models.CONSTANT}
+        constant = {name: getattr(start, name) for name in models.CONSTANT}
         return Before(constant | state.carried | _carried(state))
-
-    def _data(self, state: Physics) -> mjx.Data:
-        """Returns a fresh simulation at the given state."""
-        return models.make_data(self.mj_model).replace(**_carried(state))
 
     def _physics(self, data: mjx.Data) -> Physics:
         """Returns what the next env step needs to know of a simulation."""

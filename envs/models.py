@@ -33,9 +33,9 @@ NOT_CARRIED = {
     "plugin": ("nplugin", "plugins", "remove them"),
     "plastic": ("nplastic", "plastic springs", "remove springyield"),
 }
-#: What else MJX ignores in silence, likewise.
 _ON_JOINT = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
+#: What else MJX ignores in silence, likewise.
 _IGNORED = (
     ("actuator_armature", "the armature of an actuator", _ON_JOINT),
     ("actuator_damping", "the damping of an actuator", _ON_JOINT),

@@ -206,8 +206,7 @@ def engines(raw: Raw) -> str:
     """All engines on two cores, where they were measured."""
     rows = []
     for row in raw.cpu:
-        if best(raw.cpu, row["task"], "plain MJX"):
-            plain = best(raw.cpu, row["task"], "plain MJX")
+        if plain := best(raw.cpu, row["task"], "plain MJX"):
             cells = (row["task"], row["engine"], row["precision"], at(row), rate(row))
             rows.append((*cells, ratio(row, plain)))
     header = ("task", "engine", "precision", "episodes x steps", "env steps/s", "/ plain MJX")

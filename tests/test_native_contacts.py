@@ -77,6 +77,19 @@ class Scene(Survive):
         return jnp.concatenate([data.qacc, data.qfrc_constraint, force, touches])
 
 
+def played(env):
+    """What 64 states show after a step, by machine code and by ``vmap``."""
+    actor, act, distribution = actor_and_act(env, ())
+
+    def play(engine):
+        roll = lambda key: engine(  # noqa: E731
+            env, act, actor, distribution, key, num_episodes=64, horizon=2
+        )
+        return np.asarray(jax.jit(roll)(jax.random.key(0)).observation[1])
+
+    return play(rollout.rollout), play(rollouts.rollout)
+
+
 @pytest.mark.cpu
 @pytest.mark.parametrize(("xml", "room"), [(SCENE, 2), (MANY_FEET, 3)], ids=["all kinds", "feet"])
 def test_contacts(xml, room, monkeypatch):
@@ -84,15 +97,7 @@ def test_contacts(xml, room, monkeypatch):
     monkeypatch.setattr(touching, "_room", lambda model: room)
     with jax.enable_x64(True):
         env = Scene(xml)
-        actor, act, distribution = actor_and_act(env, ())
-
-        def play(engine):
-            roll = lambda key: engine(  # noqa: E731
-                env, act, actor, distribution, key, num_episodes=64, horizon=2
-            )
-            return np.asarray(jax.jit(roll)(jax.random.key(0)).observation[1])
-
-        ours, theirs = play(rollout.rollout), play(rollouts.rollout)
+        ours, theirs = played(env)
         starts, _ = jax.vmap(functools.partial(episode.begin, env, jax.random.key(0)))(
             jnp.arange(len(theirs))
         )
@@ -135,15 +140,7 @@ NEAREST = """
 def test_the_nearest_pairs_and_contacts():
     with jax.enable_x64(True):
         env = Scene(NEAREST)
-        actor, act, distribution = actor_and_act(env, ())
-
-        def play(engine):
-            roll = lambda key: engine(  # noqa: E731
-                env, act, actor, distribution, key, num_episodes=64, horizon=2
-            )
-            return np.asarray(jax.jit(roll)(jax.random.key(0)).observation[1])
-
-        ours, theirs = play(rollout.rollout), play(rollouts.rollout)
+        ours, theirs = played(env)
     jax.clear_caches()
     touches = theirs[:, -3:].sum(axis=1)
     assert {1, 2, 3} <= {*touches.astype(int)}

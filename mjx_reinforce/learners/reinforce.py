@@ -1,12 +1,4 @@
-"""REINFORCE (Williams 1992).
-
-One update plays N complete episodes and follows the gradient of
-
-    (1/N) sum_n sum_t (weight[t, n] log pi(a[t, n] | o[t, n]) + entropy_cost H[t, n])
-
-with the weights that an estimator gives. An episode in which the simulation left the finite numbers
-counts as the worst of the others; where all did, nothing is learned.
-"""
+"""REINFORCE (Williams 1992): ``reinforce`` has the formula."""
 
 import dataclasses
 import functools
@@ -94,7 +86,8 @@ def reinforce(
 
         (1/N) sum_n sum_t (weight[t, n] log pi(a[t, n] | o[t, n]) + entropy_cost H[t, n])
 
-    with the weights that the estimator gives.
+    with the weights that the estimator gives. An episode in which the simulation left the finite
+    numbers counts as the worst of the others; where all did, nothing is learned.
 
     Numbers such as ``entropy_cost``, the estimator's discount and the optimiser's learning rate
     may be traced: build the learner inside a function to vmap over them.

@@ -69,8 +69,7 @@ def lead(
 
 def end(processes: Processes, status: int) -> None:
     """Tells all others to end with that status."""
-    if processes.count > 1:
-        processes.tell(_encode(_END, {"status": np.array(status)}))
+    processes.tell(_encode(_END, {"status": np.array(status)}))
 
 
 def serve(processes: Processes, programs: Programs, state: RunState) -> int:

@@ -51,6 +51,7 @@ def rollout(
     Raises:
       ValueError: machine code cannot play this; see ``unsupported``.
     """
+    episode.check_scalars(num_deterministic=num_deterministic, active=active, threads=threads)
     against = against_key(key)
     if against:
         raise ValueError(f"the native engine cannot play this: {against}; {_REMEDY}")
@@ -58,7 +59,6 @@ def rollout(
         program = build(env, act, actor, distribution, chunk_length(horizon))
     except (TooLarge, UnsupportedPrimitive) as error:
         raise ValueError(f"the native engine cannot play this: {error}") from error
-    episode.check_scalars(num_deterministic=num_deterministic, active=active, threads=threads)
     begin = functools.partial(episode.begin, env, key)
     state, keys = jax.vmap(begin)(jnp.arange(num_episodes))
     given = (
