@@ -285,6 +285,7 @@ def _finish(
       compile_seconds: wall time of compiling.
       test: from ``Session.test``, empty if the run was interrupted.
     """
+    from mjx_reinforce.learners import counts
     from mjx_reinforce.reports.curves import draw_learning_curve
     from mjx_reinforce.runs.nonfinite import HOPELESS
 
@@ -294,7 +295,7 @@ def _finish(
     summary = {
         **(end if test else {"status": "interrupted"}),
         **record.summary(engine, compile_seconds, run_seconds),
-        "best_updates": session.best.num_updates.tolist(),
+        "best_updates": counts.to_int(session.best.num_updates).tolist(),
         **test,
     }
     history, training = record.history(), record.training()

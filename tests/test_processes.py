@@ -289,14 +289,11 @@ def test_a_coordinator_is_host_and_port(where):
 def test_seeds_of_a_process_that_made_fewer_updates_stand_still():
     longer = {
         "active": np.ones((3, 2), bool),
-        "updates_total": np.array([[1, 1], [2, 2], [3, 3]]),
-        "env_steps_total": np.array([[5, 6], [7, 8], [9, 10]]),
+        "env_steps": np.array([[5, 6], [7, 8], [9, 10]]),
         "episode_return": np.ones((3, 2), np.float32),
     }
     shorter = {name: x[:1, :1] for name, x in longer.items()}
-    counts = [{}, {"updates_total": np.array([4]), "env_steps_total": np.array([50])}]
-    joint = _together_in_time([longer, shorter], counts)
+    joint = _together_in_time([longer, shorter])
     assert joint["active"].tolist() == [[True] * 3] + [[True, True, False]] * 2
-    assert joint["updates_total"][:, 2].tolist() == [1, 4, 4]
-    assert joint["env_steps_total"][:, 2].tolist() == [5, 50, 50]
+    assert joint["env_steps"][:, 2].tolist() == [5, 0, 0]
     assert joint["episode_return"].dtype == np.float32

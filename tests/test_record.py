@@ -19,17 +19,15 @@ from mjx_reinforce.runs.record import Record
 from mjx_reinforce.types import Trajectory
 
 
-def block(random, num_updates, num_seeds, first):
+def block(random, num_updates, num_seeds):
     """Metrics of a block in which the last seed stands still after its first update."""
     active = np.ones((num_updates, num_seeds), bool)
     active[1:, -1] = False
-    made = first + np.cumsum(active, axis=0)
     names = ("episode_return", "episode_length", "entropy", "gradient_norm")
     floats = {name: random.normal(size=active.shape).astype(np.float32) for name in names}
     return floats | {
         "active": active,
-        "updates_total": made.astype(np.int32),
-        "env_steps_total": (10 * made).astype(np.int32),
+        "env_steps": np.where(active, 10, 0).astype(np.int32),
         "simulated_steps": random.integers(1, 99, active.shape, np.int32),
         "nonfinite_episodes": random.integers(0, 2, active.shape, np.int32),
         "skipped_update": random.integers(0, 2, active.shape, np.int32),
@@ -50,7 +48,7 @@ def filled():
     record, random = Record(Config(num_seeds=3, max_updates=100), 2.0), np.random.default_rng(0)
     record.add_evaluation(evaluation(1, 2, 3), 0.1)
     for i in range(2):
-        record.add_updates(block(random, 4, 3, record.updates))
+        record.add_updates(block(random, 4, 3))
         record.add_evaluation(evaluation(i, np.nan, -3.5), 1.0 + i / 3)
     return record
 

@@ -23,6 +23,7 @@ from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
 from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.export import files as export_files
+from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.learner import TrainState
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor
@@ -429,7 +430,9 @@ def test_ties_go_to_the_later_and_nan_is_never_best():
         normalizer = jax.vmap(lambda _: normalize.init(2))(jnp.zeros(3))
         return TrainState(
             key=jax.random.split(jax.random.key(0), 3),
-            num_updates=jnp.full(3, updates, jnp.int32),
+            num_updates=jnp.tile(counts.from_int(updates), (3, 1)),
+            env_steps=jnp.tile(counts.zero(), (3, 1)),
+            progress=jnp.zeros(3),
             actor=Actor(params={"w": jnp.full((3, 2), float(updates))}, normalizer=normalizer),
             opt_state=(),
             estimator_state=(),
@@ -439,7 +442,7 @@ def test_ties_go_to_the_later_and_nan_is_never_best():
     best = first_best(state(0))
     for updates, returns in ((0, [1, 2, nan]), (5, [1, 1, 3]), (10, [0, 2, nan])):
         best = keep_best(best, state(updates), np.array(returns, np.float32))
-    assert best.num_updates.tolist() == [5, 10, 5]
+    assert counts.to_int(best.num_updates).tolist() == [5, 10, 5]
     np.testing.assert_array_equal(best.actor.params["w"][:, 0], [5, 10, 5])
     np.testing.assert_array_equal(best.eval_return, [1, 2, 3])
 
@@ -462,8 +465,8 @@ def test_a_record_comes_back_whole():
     def block():
         floats = ("episode_return", "episode_length", "entropy", "gradient_norm")
         metrics = {name: rng.random((3, 2), np.float32) for name in floats}
-        counts = ("env_steps_total", "updates_total", "simulated_steps", "nonfinite_episodes")
-        metrics |= {name: rng.integers(0, 3, (3, 2)) for name in (*counts, "skipped_update")}
+        whole = ("env_steps", "simulated_steps", "nonfinite_episodes", "skipped_update")
+        metrics |= {name: rng.integers(0, 3, (3, 2)) for name in whole}
         return metrics | {"active": rng.random((3, 2)) < 0.7}
 
     record.add_evaluation(evaluation(), 0.5)

@@ -21,7 +21,7 @@ from mjx_reinforce import train as train_module
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.reports.statistics import smooth
 from mjx_reinforce.runs.build import build
-from mjx_reinforce.runs.config import MAX_COUNT, Config, check_step_count
+from mjx_reinforce.runs.config import MAX_OF_UPDATE, Config, check_step_count
 from mjx_reinforce.runs.files import append_csv, create_csv
 from mjx_reinforce.runs.nonfinite import as_events
 from mjx_reinforce.runs.record import Record
@@ -252,8 +252,12 @@ def test_env_steps_that_cannot_be_counted_are_refused(monkeypatch, settings, mos
         check_step_count(config, horizon=20)
 
 
-def test_counts_fit_into_int32():
-    assert jnp.iinfo(jnp.int32).max == MAX_COUNT
+def test_an_update_that_cannot_be_counted_is_refused():
+    config = Config(num_episodes=2**21, env_steps=10**12)
+    check_step_count(config, horizon=2**10 - 1)
+    with pytest.raises(ValueError, match="an update may play 2,147,483,648 env steps"):
+        check_step_count(config, horizon=2**10)
+    assert jnp.iinfo(jnp.int32).max == MAX_OF_UPDATE
 
 
 def test_a_ready_policy_may_be_trained():
@@ -266,8 +270,6 @@ def test_a_ready_policy_may_be_trained():
 
 METRICS = {  # two updates of two seeds; the second seed stands still in the second update
     "active": np.array([[True, True], [True, False]]),
-    "updates_total": np.array([[1, 1], [2, 1]], np.int32),
-    "env_steps_total": np.array([[30, 40], [70, 40]], np.int32),
     "env_steps": np.array([[30, 40], [40, 0]], np.int32),
     "simulated_steps": np.array([[50, 60], [40, 0]], np.int32),
     "episode_return": np.array([[3.0, 4.0], [5.0, 0.0]], np.float32),

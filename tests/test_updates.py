@@ -1,5 +1,6 @@
 """Updates and optimisers against loops by hand."""
 
+import dataclasses
 import functools
 
 import jax
@@ -10,7 +11,7 @@ import pytest
 from toys import Survive, Target
 
 from mjx_reinforce import mlp_policy, normal, reinforce, train_step
-from mjx_reinforce.learners import estimators, schedules, updates
+from mjx_reinforce.learners import counts, estimators, schedules, updates
 from mjx_reinforce.learners.updates import Problem
 from mjx_reinforce.runs.build import _build_optimizer
 from mjx_reinforce.runs.config import Config
@@ -29,12 +30,16 @@ def surrogate(params, samples):
     return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
 
 
+#: Before the first update.
+START = schedules.Clock(jnp.zeros(()), jnp.zeros(()))
+
+
 def make_problem(optimizer, divisor=3, mask=MASK, seed=0):
     rng = np.random.default_rng(seed)
     observation, action = rng.normal(size=(2, *mask.shape, 1))
     weight = np.where(mask, rng.normal(size=mask.shape), 0.0)
     samples = tuple(map(jnp.asarray, (observation, action, weight, mask)))
-    return Problem(surrogate, optimizer, samples, divisor)
+    return Problem(surrogate, optimizer, samples, divisor, START)
 
 
 PARAMS = {"w": jnp.array(0.7), "b": jnp.array(-0.4)}
@@ -113,7 +118,7 @@ def test_each_step_of_one_seed_ends_with_its_own_episodes():
     samples = jax.tree.map(lambda *x: jnp.stack(x), *[p.samples for p in problems])
 
     def update(samples):
-        return run(updates.each_step(), Problem(surrogate, optimizer, samples, 3))
+        return run(updates.each_step(), Problem(surrogate, optimizer, samples, 3, START))
 
     together = jax.vmap(update)(samples)
     for s, problem in enumerate(problems):
@@ -160,10 +165,9 @@ def test_minibatches_draw_every_played_step_alike_and_no_other():
 
     def which(key):
         number = jnp.asarray(np.where(MASK, np.arange(MASK.size).reshape(MASK.shape), np.nan))
-        linear = Problem(
-            lambda w, s: (w * jnp.sum(s[0]), {"entropy": 0.0}), optax.sgd(1.0), (number, MASK), 1
-        )
-        linear = linear._replace(samples=jax.tree.map(jnp.asarray, linear.samples))
+        samples = tuple(map(jnp.asarray, (number, MASK)))
+        total = lambda w, s: (w * jnp.sum(s[0]), {"entropy": 0.0})  # noqa: E731
+        linear = Problem(total, optax.sgd(1.0), samples, 1, START)
         return -updates.minibatches(1, 1)(linear, key, jnp.zeros(()), linear.optimizer.init(0.0))[0]
 
     drawn = np.asarray(jax.vmap(which)(jax.random.split(jax.random.key(0), 8000))).round()
@@ -295,37 +299,98 @@ UPDATES = {
 }
 
 
+def clock(progress=0.0, env_steps=0.0):
+    return schedules.Clock(jnp.asarray(progress), jnp.asarray(env_steps))
+
+
 @pytest.mark.parametrize("name", UPDATES)
-def test_the_rate_falls_with_the_env_steps_of_the_rollouts(name):
-    """Of each update the env steps are counted, however many optimiser steps it makes."""
-    played = float(np.sum(MASK))
+@pytest.mark.parametrize("length", [None, 10])
+def test_the_rate_falls_with_the_budget_or_with_env_steps(name, length):
+    """All optimiser steps of an update have the rate of its beginning."""
     plain = updates.make_optimizer("sgd", 0.1, max_grad_norm=None)
-    decaying = optax.chain(plain, schedules.decay_rate(0.2, 2 * played))
-    state = decaying.init(PARAMS)
-    for number, factor in enumerate((1.0, 0.6, 0.2, 0.2)):
-        counted = state[-1].env_steps
-        assert float(counted) == pytest.approx(number * played)
-        change, _ = decaying.update(PARAMS, state, PARAMS, env_steps=jnp.zeros(()))
-        expected = jax.tree.map(lambda x, factor=factor: -0.1 * factor * x, PARAMS)
-        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), change, expected)
-        problem = make_problem(decaying)
-        _, state, _ = UPDATES[name](problem, jax.random.key(number), PARAMS, state)
+    decaying = optax.chain(plain, schedules.decay_rate(0.2, length))
+
+    def moved(optimizer, now):
+        problem = make_problem(optimizer)._replace(clock=now)
+        return UPDATES[name](problem, jax.random.key(3), PARAMS, optimizer.init(PARAMS))[0]
+
+    for share, factor in ((0.0, 1.0), (0.5, 0.6), (1.0, 0.2), (3.0, 0.2)):
+        now = clock(share) if length is None else clock(0.9, 10 * share)
+        scaled = updates.make_optimizer("sgd", 0.1 * factor, max_grad_norm=None)
+        expected, actual = moved(scaled, now), moved(decaying, now)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), actual, expected)
 
 
-def test_the_std_shrinks_with_the_env_steps_besides_what_is_learned():
-    """Two rollouts of 8 steps, then one that passes the end of 20 by 4."""
+def test_the_std_shrinks_with_the_budget_besides_what_is_learned():
     params = {"network": jnp.ones(2), "constants": jnp.log(jnp.array([0.5, 0.3]))}
     learned = jax.tree.map(lambda x: 0.1 * jnp.ones_like(x), params)
     optimizer = optax.chain(optax.sgd(1.0), schedules.shrink_std(0.1, 20))
     state = optimizer.init(params)
     total = jnp.zeros(2)
-    for share in (0.4, 0.4, 0.2, 0.0):
-        change, state = optimizer.update(learned, state, params, env_steps=jnp.asarray(8))
+    for played, share in ((0, 0.0), (5, 0.25), (15, 0.5), (25, 0.25), (35, 0.0), (10, -0.5)):
+        now = clock(env_steps=float(played))
+        change, state = optimizer.update(learned, state, params, clock=now)
         np.testing.assert_allclose(change["network"], [-0.1, -0.1], rtol=1e-6)
         expected = np.full(2, -0.1 + share * np.log(0.1))
         np.testing.assert_allclose(change["constants"], expected, rtol=1e-5)
         total += change["constants"] + 0.1
-    np.testing.assert_allclose(jnp.exp(total), [0.1, 0.1], rtol=1e-5)
+    np.testing.assert_allclose(total, [0.5 * np.log(0.1)] * 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("budget", [10**6, 10**12, 2**53])
+def test_schedules_are_exact_for_budgets_of_any_size(budget):
+    """Shares of counts in two words, and the std after 10,000 updates however small each is."""
+    limit = counts.from_int(budget)
+    rate = schedules.decay_rate(0.0)
+
+    @jax.jit
+    def share_of(count):
+        return counts.number(count) / counts.number(limit)
+
+    for used in (0, 1, budget // 3, 2**31 - 1, 2**31, 2**32, 2**32 + 7, budget - 1, budget):
+        if used <= budget:
+            now = schedules.Clock(share_of(counts.from_int(used)), jnp.zeros(()))
+            factor = rate.update(jnp.ones(()), (), clock=now)[0]
+            assert float(factor) == pytest.approx(1 - used / budget, abs=2e-7)
+
+    shrink = schedules.shrink_std(1e-3)
+    each, log_std = budget // 10_000, jnp.zeros(1)
+
+    def one(carry, _):
+        state, log_std, count = carry
+        now = schedules.Clock(share_of(count), jnp.zeros(()))
+        change, state = shrink.update({"constants": jnp.zeros(1)}, state, None, clock=now)
+        count = jax.lax.fori_loop(0, each // 2**30, lambda _, c: counts.plus(c, 2**30), count)
+        count = counts.plus(count, each % 2**30)
+        return (state, log_std + change["constants"], count), None
+
+    start = shrink.init(None), log_std, counts.zero()
+    (_, log_std, count), _ = jax.lax.scan(one, start, length=10_001)
+    assert counts.to_int(count) == each * 10_001
+    np.testing.assert_allclose(log_std, np.log(1e-3), rtol=3e-4)
+
+
+def test_the_discount_looks_further_ahead():
+    found = [float(schedules.look_further(0.9, 0.999, jnp.asarray(s))) for s in (0, 0.5, 1)]
+    np.testing.assert_allclose(found, [0.9, 0.99, 0.999], rtol=1e-6)
+
+
+def test_an_estimator_may_change_with_the_budget():
+    """Halfway through the budget the update is that of the discount that lies between."""
+
+    def changing(progress):
+        return estimators.reward_to_go(schedules.look_further(0.9, 0.999, progress))
+
+    def step(estimator, progress):
+        learner = reinforce(Target(), estimator=estimator, num_episodes=4)
+        state = jax.jit(learner.init)(jax.random.key(0))
+        return train_step(learner, dataclasses.replace(state, progress=jnp.asarray(progress)))[0]
+
+    halfway, fixed = step(changing, 0.5), step(estimators.reward_to_go(0.99), 0.0)
+    for one, other in zip(*map(jax.tree.leaves, (halfway.actor, fixed.actor)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+    first = step(changing, 0.0)
+    assert not np.allclose(*(jax.tree.leaves(x.actor.params)[0] for x in (first, fixed)))
 
 
 def test_settings_become_the_schedules_they_name():
@@ -336,20 +401,21 @@ def test_settings_become_the_schedules_they_name():
         config = Config(optimizer="sgd", learning_rate=0.1, max_grad_norm=None, **settings)
         optimizer = _build_optimizer(config)
         state, found = optimizer.init(params), []
-        for _ in range(3):
-            change, state = optimizer.update(params, state, params, env_steps=jnp.asarray(50))
+        for now in (clock(0.0, 0.0), clock(0.25, 50.0), clock(0.5, 100.0)):
+            change, state = optimizer.update(params, state, params, clock=now)
             found.append((float(change["network"][0]), float(change["constants"][0])))
         return np.array(found)
 
     rates = changes(decay_steps=100)
     np.testing.assert_allclose(rates[:, 0], [-0.1, -0.055, -0.01], rtol=1e-5)
+    np.testing.assert_allclose(changes()[:, 0], [-0.1, -0.0775, -0.055], rtol=1e-5)
     rates = changes(decay_steps=100, final_learning_rate=0.05)
     np.testing.assert_allclose(rates[:, 0], [-0.1, -0.075, -0.05], rtol=1e-5)
     np.testing.assert_allclose(changes(decay_steps=None)[:, 0], [-0.1] * 3, rtol=1e-5)
     rates = changes(decay_steps=None, decay_updates=2)
     np.testing.assert_allclose(rates[:, 0], [-0.1, -0.055, -0.01], rtol=1e-5)
     shrunk = changes(decay_steps=100, initial_std=0.6, final_std=0.03)
-    np.testing.assert_allclose(shrunk[:, 1], np.log(0.05) * np.array([0.5, 0.5, 0]), rtol=1e-5)
+    np.testing.assert_allclose(shrunk[:, 1], np.log(0.05) * np.array([0, 0.5, 0.5]), rtol=1e-5)
 
 
 def test_a_policy_without_an_std_of_its_own_has_nothing_to_shrink():

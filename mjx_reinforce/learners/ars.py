@@ -24,6 +24,7 @@ from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.engines.rollouts import episode_returns
+from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.ars_increments import (
     check_linear,
     document_increment,
@@ -166,7 +167,9 @@ class _Search:
         normalizer = normalize.init(self.observation_size)
         return TrainState(
             key=key,
-            num_updates=jnp.zeros((), jnp.int32),
+            num_updates=counts.zero(),
+            env_steps=counts.zero(),
+            progress=jnp.zeros(()),
             actor=Actor(params=self.policy.init(policy_key), normalizer=normalizer),
             opt_state=(),
             estimator_state=(),

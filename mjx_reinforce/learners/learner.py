@@ -13,6 +13,7 @@ from jax.flatten_util import ravel_pytree
 from mjx_reinforce.checks import check_kind, check_type
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
+from mjx_reinforce.learners import counts
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.policy import Policy
 from mjx_reinforce.types import Environment, Trajectory
@@ -25,7 +26,10 @@ class TrainState:
     """All that the next update needs; it holds no environment state.
 
     key: [] the seed's own random key, split by every update
-    num_updates: [] how many updates were made
+    num_updates: [2] how many updates were made, as ``counts`` has it
+    env_steps: [2] how many env steps were played in them, likewise
+    progress: [] the share of the budget that is used, for what changes with it, such as the
+      learning rate; whoever drives the learner sets it
     actor: the policy's parameters and the observation statistics
     opt_state: the optimiser's state
     estimator_state: the estimator's, such as a critic
@@ -34,6 +38,8 @@ class TrainState:
 
     key: jax.Array
     num_updates: jax.Array
+    env_steps: jax.Array
+    progress: jax.Array
     actor: Actor
     opt_state: Any
     estimator_state: Any
@@ -77,7 +83,12 @@ class Learner(NamedTuple):
         key, play_key, learn_key = jax.random.split(state.key, 3)
         played = self.play(state, play_key, active)
         learned, metrics = self.learn(state, played, learn_key)
-        after = dataclasses.replace(learned, key=key, num_updates=state.num_updates + 1)
+        after = dataclasses.replace(
+            learned,
+            key=key,
+            num_updates=counts.plus(state.num_updates, 1),
+            env_steps=counts.plus(state.env_steps, metrics["env_steps"]),
+        )
         if active is not True:
             after = jax.tree.map(lambda new, old: jnp.where(active, new, old), after, state)
         return after, metrics

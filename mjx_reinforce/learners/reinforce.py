@@ -15,6 +15,7 @@ from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.fused import any_lane
+from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.contract import check_estimator, check_optimizer, check_update
 from mjx_reinforce.learners.diagnostics import (
     nan_unless,
@@ -31,6 +32,7 @@ from mjx_reinforce.learners.learner import (
     episode_metrics,
     keep_finite,
 )
+from mjx_reinforce.learners.schedules import Clock
 from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_optimizer
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
@@ -66,7 +68,7 @@ def reinforce(
     env: Environment,
     *,
     policy: Policy | None = None,
-    estimator: Estimator | None = None,
+    estimator: Estimator | Callable[[jax.Array], Estimator] | None = None,
     optimizer: optax.GradientTransformation | None = None,
     update: Update | None = None,
     num_episodes: int = 16,
@@ -96,7 +98,8 @@ def reinforce(
       env: what is played; any brax-style environment.
       policy: by default an MLP of 32 and 32 tanh units with ``default_distribution``.
       estimator: by default leave-one-out on the return to go (discount 0.99), divided by its
-        standard deviation plus 10.
+        standard deviation plus 10. Or a function from ``TrainState.progress`` [] to one, where
+        its numbers change as the budget is used.
       optimizer: by default Adam at 1e-2 with the gradient's norm clipped at 1.
       update: how the gradient is spent, from ``updates``; by default in one optimiser step.
       num_episodes: N, episodes an update.
@@ -143,11 +146,12 @@ def reinforce(
     check_update(update)
     if estimator is None:
         estimator = standardize(leave_one_out(), floor=10.0)
-    check_estimator(estimator, env, size, num_episodes)
+    changes = callable(estimator)  # an ``Estimator`` is not
+    check_estimator(estimator(jnp.zeros(())) if changes else estimator, env, size, num_episodes)
     return _Reinforce(
         env=env,
         policy=policy,
-        estimator=estimator,
+        estimator=estimator if changes else lambda progress: estimator,
         optimizer=optimizer,
         update=update,
         num_episodes=num_episodes,
@@ -169,7 +173,7 @@ class _Reinforce:
 
     env: Environment
     policy: Policy
-    estimator: Estimator
+    estimator: Callable[[jax.Array], Estimator]
     optimizer: optax.GradientTransformation
     update: Update
     num_episodes: int
@@ -211,10 +215,14 @@ class _Reinforce:
         actor = self._first_actor(policy_key)
         return TrainState(
             key=key,
-            num_updates=jnp.zeros((), jnp.int32),
+            num_updates=counts.zero(),
+            env_steps=counts.zero(),
+            progress=jnp.zeros(()),
             actor=actor,
             opt_state=self.optimizer.init(actor.params),
-            estimator_state=self.estimator.init(estimator_key, self.observation_size),
+            estimator_state=self.estimator(jnp.zeros(())).init(
+                estimator_key, self.observation_size
+            ),
             start_key=start_key,
         )
 
@@ -251,12 +259,14 @@ class _Reinforce:
         actor, mask = state.actor, trajectory.mask
         scaled = normalize.apply(actor.normalizer, trajectory.observation)
         seen = dataclasses.replace(trajectory, observation=scaled)
-        weight, estimator_state, metrics = self.estimator.update(state.estimator_state, seen)
+        estimator = self.estimator(state.progress)
+        weight, estimator_state, metrics = estimator.update(state.estimator_state, seen)
         problem = Problem(
             surrogate=_surrogate(self.policy, self.entropy_cost),
             optimizer=self.optimizer,
             samples=(scaled, trajectory.action, weight, mask),
             divisor=jnp.maximum(jnp.sum(mask), 1) if self.loss_per == "step" else self.num_episodes,
+            clock=Clock(state.progress, counts.number(state.env_steps)),
         )
         params, opt_state, update_metrics = self.update(problem, key, actor.params, state.opt_state)
         visited = visited_steps(trajectory)

@@ -1,43 +1,69 @@
-"""What changes with the env steps played: optax transformations that stand behind an optimiser.
+"""What changes as a run goes on: optax transformations that stand behind an optimiser.
 
-Counted in env steps, a policy whose episodes are short keeps its rate and its noise, and one that
-has learned to play long ones settles soon. ``updates`` tells the optimiser of each rollout's steps.
+They go by the share of the budget that is used, which ``updates`` tells the optimiser of, or by the
+env steps played. Counted in env steps, a policy whose episodes are short keeps its rate and its
+noise, and one that has learned to play long ones settles soon.
 """
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
+#: The standard deviation shrinks in so many steps. Each is far greater than float32's rounding of
+#: its logarithm, however many updates there are.
+_STEPS = 4096
 
-class Played(NamedTuple):
-    """State of a schedule: how many env steps were played so far, float []."""
 
+class Clock(NamedTuple):
+    """How far a run was before a rollout.
+
+    progress: [] the share of its budget that was used
+    env_steps: [] float, how many the seed had played
+    """
+
+    progress: jax.Array
     env_steps: jax.Array
 
 
+class Shrunk(NamedTuple):
+    """State of ``shrink_std``: the share of its change that was made so far, []."""
+
+    share: jax.Array
+
+
+def share(clock: Clock, env_steps: float | jax.Array | None) -> jax.Array:
+    """Returns how much [] of a schedule has passed, at most 1.
+
+    Args:
+      clock: of the run.
+      env_steps: the schedule's length; None is as long as the budget.
+    """
+    passed = clock.progress if env_steps is None else clock.env_steps / env_steps
+    return jnp.minimum(passed, 1.0)
+
+
 def decay_rate(
-    least: float | jax.Array, env_steps: float | jax.Array
+    least: float | jax.Array, env_steps: float | jax.Array | None = None
 ) -> optax.GradientTransformationExtraArgs:
     """Multiplies changes by a factor that falls linearly from 1 to ``least``, then stays.
 
     Args:
       least: the factor at the end.
-      env_steps: over which it falls.
+      env_steps: over which it falls; None: over the budget.
     """
 
-    def change(updates, before, after):
-        del after
-        factor = least + (1 - least) * jnp.maximum(1 - before / env_steps, 0)
-        return jax.tree.map(lambda x: factor * x, updates)
+    def update(updates, state, params=None, *, clock: Clock, **_: Any):
+        del params
+        factor = 1 + (least - 1) * share(clock, env_steps)
+        return jax.tree.map(lambda x: factor * x, updates), state
 
-    return _schedule(change)
+    return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)
 
 
 def shrink_std(
-    ratio: float | jax.Array, env_steps: float | jax.Array
+    ratio: float | jax.Array, env_steps: float | jax.Array | None = None
 ) -> optax.GradientTransformationExtraArgs:
     """Multiplies standard deviations that are parameters by ``ratio`` in all, evenly in the log.
 
@@ -47,26 +73,31 @@ def shrink_std(
 
     Args:
       ratio: of the standard deviation at the end to that at the start.
-      env_steps: over which it shrinks.
+      env_steps: over which it shrinks; None: over the budget.
     """
 
-    def change(updates, before, after):
-        share = jnp.minimum(after / env_steps, 1) - jnp.minimum(before / env_steps, 1)
-        return updates | {"constants": updates["constants"] + share * jnp.log(ratio)}
-
-    return _schedule(change)
-
-
-def _schedule(change: Callable[..., Any]) -> optax.GradientTransformationExtraArgs:
-    """Changes updates by a function of them and of the env steps before and after the rollout."""
+    def update(updates, state, params=None, *, clock: Clock, **_: Any):
+        del params
+        now = jnp.floor(share(clock, env_steps) * _STEPS) / _STEPS
+        change = (now - state.share) * jnp.log(ratio)
+        return updates | {"constants": updates["constants"] + change}, Shrunk(now)
 
     def init(params):
         del params
-        return Played(jnp.zeros(()))
-
-    def update(updates, state, params=None, **rollout: Any):
-        del params
-        after = state.env_steps + rollout["env_steps"]
-        return change(updates, state.env_steps, after), Played(after)
+        return Shrunk(jnp.zeros(()))
 
     return optax.GradientTransformationExtraArgs(init, update)
+
+
+def look_further(
+    first: float | jax.Array, last: float | jax.Array, progress: jax.Array
+) -> jax.Array:
+    """Returns the discount [] at a share of the budget: 1 / (1 - discount) changes geometrically.
+
+    Args:
+      first: the discount at the beginning, less than 1.
+      last: at the end, likewise.
+      progress: [] the share of the budget that is used.
+    """
+    ahead = jnp.log1p(-jnp.asarray(first)), jnp.log1p(-jnp.asarray(last))
+    return -jnp.expm1(ahead[0] + progress * (ahead[1] - ahead[0]))

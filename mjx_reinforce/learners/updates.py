@@ -17,6 +17,7 @@ from jax import lax
 from mjx_reinforce.engines.chunks import while_any
 from mjx_reinforce.learners.diagnostics import signal_to_noise
 from mjx_reinforce.learners.gradients import accumulate_gradient
+from mjx_reinforce.learners.schedules import Clock
 from mjx_reinforce.policies.arguments import check_count, check_number
 from mjx_reinforce.registry import check_name
 
@@ -32,12 +33,14 @@ class Problem(NamedTuple):
     optimizer: what turns gradients into changes
     samples: observation [T, N, O], action [T, N, ...], weight [T, N] and mask [T, N]
     divisor: [] by which the sum over all samples is divided
+    clock: how far the run was before the rollout
     """
 
     surrogate: Callable[[Any, tuple[jax.Array, ...]], tuple[jax.Array, dict[str, jax.Array]]]
     optimizer: optax.GradientTransformation
     samples: tuple[jax.Array, ...]
     divisor: int | jax.Array
+    clock: Clock
 
 
 #: The gradient's noise is measured on one of so many episodes, and on so many at most.
@@ -66,9 +69,7 @@ def full_batch() -> Update:
         metrics = {"entropy": sums["entropy"] / jnp.maximum(env_steps, 1)}
         if mask.shape[1] > 1:
             metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
-        params, opt_state, step = _descend(
-            problem, grads, problem.divisor, params, opt_state, env_steps
-        )
+        params, opt_state, step = _descend(problem, grads, problem.divisor, params, opt_state)
         return params, opt_state, metrics | step
 
     return update
@@ -111,13 +112,12 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
         drawn = jax.random.randint(key, (num_updates, batch_size), 1, 1 + jnp.maximum(ranks[-1], 1))
         # Where the first, second, ... step inside the mask is; ``drawn`` counts from 1.
         indices = jnp.searchsorted(ranks, drawn)
-        share = ranks[-1] / num_updates
 
         def one(carry, index):
             params, opt_state = carry
             batch = jax.tree.map(lambda x: x[index], flat)
             grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, batch)
-            params, opt_state, step = _descend(problem, grads, batch_size, params, opt_state, share)
+            params, opt_state, step = _descend(problem, grads, batch_size, params, opt_state)
             return (params, opt_state), step | {"entropy": sums["entropy"] / batch_size}
 
         (params, opt_state), steps = lax.scan(one, (params, opt_state), indices)
@@ -145,9 +145,7 @@ def each_step() -> Update:
                 lambda x: lax.dynamic_index_in_dim(x, t, keepdims=False), problem.samples
             )
             grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, now)
-            params, opt_state, step = _descend(
-                problem, grads, problem.divisor, params, opt_state, jnp.sum(now[-1])
-            )
+            params, opt_state, step = _descend(problem, grads, problem.divisor, params, opt_state)
             return params, opt_state, step | sums
 
         def more(carry):
@@ -178,15 +176,11 @@ def _descend(
     divisor: int | jax.Array,
     params: Any,
     opt_state: Any,
-    env_steps: jax.Array,
 ) -> tuple[Any, Any, dict[str, jax.Array]]:
-    """Makes one optimiser step on summed gradients; also returns the metrics of that step.
-
-    ``env_steps`` [] were played for it; the optimiser is told so, for ``schedules``.
-    """
+    """Makes one optimiser step on summed gradients; also returns the metrics of that step."""
     grads = jax.tree.map(lambda g: g / divisor, grads)
     optimizer = optax.with_extra_args_support(problem.optimizer)
-    changes, opt_state = optimizer.update(grads, opt_state, params, env_steps=env_steps)
+    changes, opt_state = optimizer.update(grads, opt_state, params, clock=problem.clock)
     metrics = {"gradient_norm": optax.tree.norm(grads)}
     parts = jax.tree.leaves(opt_state, is_leaf=lambda x: isinstance(x, ClipState))
     for part in parts:

@@ -17,7 +17,7 @@ class Best:
 
     actor: [S, ...] each seed's
     eval_return: [S] what its evaluation returned; -inf before the first
-    num_updates: [S] int32, how many updates the seed had made then
+    num_updates: [S, 2] how many updates the seed had made then, as ``counts`` has it
     """
 
     actor: Actor
@@ -27,9 +27,9 @@ class Best:
 
 def shape_of_best(train_states: TrainState) -> Best:
     """Returns the shapes of the best policies of states, or of their shapes."""
-    counts = train_states.num_updates
-    returns = jax.ShapeDtypeStruct(counts.shape, jnp.result_type(float))
-    return Best(actor=train_states.actor, eval_return=returns, num_updates=counts)
+    num_updates = train_states.num_updates
+    returns = jax.ShapeDtypeStruct(num_updates.shape[:1], jnp.result_type(float))
+    return Best(actor=train_states.actor, eval_return=returns, num_updates=num_updates)
 
 
 def first_best(train_states: TrainState) -> Best:

@@ -104,6 +104,16 @@ def _build_ars(env: Any, config: Config, shared: dict[str, Any]) -> Any:
 
 
 def _build_estimator(config: Config) -> Any:
+    """Returns an estimator; where its discount changes, a function from the used share to one."""
+    from mjx_reinforce.learners.schedules import look_further
+
+    first, last = config.discount, config.final_discount
+    if last is None:
+        return _estimator(config, first)
+    return lambda progress: _estimator(config, look_further(first, last, progress))
+
+
+def _estimator(config: Config, discount: Any) -> Any:
     import optax
 
     from mjx_reinforce.learners import estimators
@@ -117,11 +127,11 @@ def _build_estimator(config: Config) -> Any:
             "optimizer": optax.adam(config.value_learning_rate),
             "num_fits": config.value_fits,
         }
-    estimator = load(ESTIMATORS[config.estimator])(config.discount, **settings)
+    estimator = load(ESTIMATORS[config.estimator])(discount, **settings)
     if config.standardize:
         estimator = estimators.standardize(estimator, floor=config.standardize_floor)
     if config.discount_weights:
-        estimator = estimators.discount_weights(estimator, config.discount)
+        estimator = estimators.discount_weights(estimator, discount)
     return estimator
 
 
@@ -146,14 +156,12 @@ def _build_optimizer(config: Config) -> Any:
     )
     if config.decay_steps is None:
         return optimizer
-    optimizer = optax.chain(
-        optimizer, schedules.decay_rate(final / config.learning_rate, config.decay_steps)
-    )
+    length = None if config.decay_steps == "budget" else config.decay_steps
+    optimizer = optax.chain(optimizer, schedules.decay_rate(final / config.learning_rate, length))
     if config.final_std is None:
         return optimizer
-    return optax.chain(
-        optimizer, schedules.shrink_std(config.final_std / config.initial_std, config.decay_steps)
-    )
+    ratio = config.final_std / config.initial_std
+    return optax.chain(optimizer, schedules.shrink_std(ratio, length))
 
 
 def _build_update(config: Config) -> Any:

@@ -20,8 +20,11 @@ from mjx_reinforce.runs.settings import (
     UpdateSettings,
 )
 
-#: The greatest number of updates, and of env steps of a seed: they are counted as int32.
-MAX_COUNT = 2**31 - 1
+#: What is counted exactly up to 2^53, as a double does; see ``learners.counts``.
+COUNTED = ("env_steps", "max_updates", "decay_steps")
+MAX_COUNT = 2**53
+#: The greatest of what an update counts, such as its env steps: they are int32.
+MAX_OF_UPDATE = 2**31 - 1
 #: The greatest learning rate.
 _MAX_RATE = 1000
 #: The greatest of other numbers, and one over the least: float32 holds their cubes.
@@ -64,7 +67,8 @@ def check(config: Config) -> None:
     for names, holds, rule in _RULES:
         for name in names.split():
             value = getattr(config, name)
-            if not ((value is None and name in _OPTIONAL) or holds(value)):
+            spoken = isinstance(value, str) or (value is None and name in _OPTIONAL)
+            if not (spoken or holds(value)):
                 raise ValueError(f"{flag(name)} must be {rule}, got {reprlib.repr(value)}")
     if config.env_steps is None and config.max_updates is None:
         raise ValueError("nothing would end this run: give --env-steps or --max-updates a number")
@@ -92,10 +96,15 @@ def check_step_count(config: Config, horizon: int) -> None:
         bounds.append(config.env_steps - 1 + an_update)
     if config.max_updates is not None:
         bounds.append(config.max_updates * an_update)
+    each = f"{config.episodes_per_update:,} episodes an update, up to {horizon:,} steps each"
+    if an_update > MAX_OF_UPDATE:
+        raise ValueError(
+            f"an update may play {an_update:,} env steps of a seed ({each}), more than the "
+            "2^31 - 1 that can be counted; lower --num-episodes or --horizon"
+        )
     if min(bounds) > MAX_COUNT:
         raise ValueError(
-            f"a seed may play {min(bounds):,} env steps ({config.episodes_per_update:,} episodes "
-            f"an update, up to {horizon:,} steps each), more than the 2^31 - 1 that can be "
+            f"a seed may play {min(bounds):,} env steps ({each}), more than the 2^53 that can be "
             "counted; give --env-steps, or lower --max-updates or --horizon"
         )
 
@@ -112,13 +121,16 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         "at least 1",
     ),
     ("normalize_steps", lambda x: x >= 0, "at least 0"),
-    ("decay_steps", lambda x: x <= 2**24, "at most 2^24, for float32 counts no further"),
-    ("env_steps", lambda x: x < 2**30, "less than 2^30, for each seed"),
     (
-        "max_updates num_episodes horizon decay_steps decay_updates eval_every eval_episodes "
+        " ".join(COUNTED),
+        lambda x: x <= MAX_COUNT,
+        "at most 2^53, for no more is counted exactly",
+    ),
+    (
+        "num_episodes horizon decay_updates eval_every eval_episodes "
         "test_episodes "
         "normalize_steps minibatch_size num_directions checkpoint_every",
-        lambda x: x <= MAX_COUNT,
+        lambda x: x <= MAX_OF_UPDATE,
         "less than 2^31",
     ),
     (
@@ -127,7 +139,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         f"at most {_MAX_STEPS:,}, for an update makes so many steps one after the other",
     ),
     ("seed eval_seed", lambda x: 0 <= x < 2**32, "in [0, 2^32)"),
-    ("discount", lambda x: 0 <= x <= 1, "in [0, 1]"),
+    ("discount final_discount", lambda x: 0 <= x <= 1, "in [0, 1]"),
     ("momentum", lambda x: 0 <= x <= 1 - 2**-24, "in [0, 1 - 2^-24], the last float32 below 1"),
     (
         "hidden_sizes value_hidden_sizes",
@@ -136,7 +148,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ),
     (
         "hidden_sizes value_hidden_sizes",
-        lambda x: all(n <= MAX_COUNT for n in x),
+        lambda x: all(n <= MAX_OF_UPDATE for n in x),
         "less than 2^31 in every layer",
     ),
     (
@@ -183,6 +195,11 @@ def _check_reinforce(config: Config) -> None:
             "--policy deterministic has no log-probability for --algorithm reinforce to follow; "
             "choose --policy auto or --algorithm ars"
         )
+    if config.final_discount is not None and max(config.discount, config.final_discount) == 1:
+        raise ValueError(
+            f"--discount {config.discount} and --final-discount {config.final_discount}: one that "
+            "changes must be less than 1, such as 0.9999"
+        )
     if config.decay_steps is not None and config.decay_updates is not None:
         raise ValueError(
             f"the learning rate decays over --decay-steps {config.decay_steps} or over "
@@ -194,7 +211,7 @@ def _check_reinforce(config: Config) -> None:
             f"--decay-updates {config.decay_updates} has no length; choose --decay-steps"
         )
     steps = (config.decay_updates or 0) * config.minibatch_updates
-    if config.update == "minibatches" and steps > MAX_COUNT:
+    if config.update == "minibatches" and steps > MAX_OF_UPDATE:
         raise ValueError(
             f"the learning rate would decay over {steps:,} optimiser steps, more than the 2^31 - 1 "
             "that can be counted; lower --decay-updates or --minibatch-updates"

@@ -19,7 +19,7 @@ _PENDULUM: dict[str, Any] = {
     "num_episodes": 4,
     "learning_rate": 0.014,
     "final_learning_rate": 1e-4,
-    "decay_steps": 250_000,
+    "decay_steps": "budget",
     "max_kl": 0.01,
     "discount": 0.995,
     "initial_std": 0.6,

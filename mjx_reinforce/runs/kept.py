@@ -81,7 +81,7 @@ def keep(key: str, facts: dict[str, Any], parts: Parts) -> Parts:
         return parts
     _write(key, "facts", json.dumps(whole).encode())
     shapes, actor = _leaves(parts.like), _leaves(parts.like.train_states.actor)
-    seed, count = (jax.ShapeDtypeStruct((), x) for x in (np.uint32, np.int32))
+    seed, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), (2,)))
     given = {
         "start": (seed, seed),
         "advance": (shapes, (count, count)),

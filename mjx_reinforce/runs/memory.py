@@ -4,7 +4,6 @@ The factors were read off XLA's own account of its programs (``memory_analysis``
 toys with 4 and 300 observations and 1,000 seeds of InvertedPendulum.
 """
 
-import dataclasses
 import importlib.util
 import itertools
 import math
@@ -14,7 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mjx_reinforce.runs.blocks import block_length
-from mjx_reinforce.runs.config import MAX_COUNT, Config
+from mjx_reinforce.runs.config import COUNTED, MAX_OF_UPDATE, Config, flag
 from mjx_reinforce.runs.measured import TASKS, Task
 
 _FLOAT = 4  # bytes
@@ -126,13 +125,12 @@ def check_size(config: Config) -> None:
     What is not known yet is taken to be small: the sizes of a task of the user's own, and the
     memory of an accelerator.
     """
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
+    for name, value in vars(config).items():
         numbers = value if isinstance(value, tuple) else (value,)
-        counts = [x for x in numbers if isinstance(x, int) and not field.name.endswith("seed")]
-        if max(counts, default=0) > MAX_COUNT:
-            flag = f"--{field.name.replace('_', '-')}"
-            raise ValueError(f"{flag} must be less than 2^31, got {max(counts)}")
+        counts = [x for x in numbers if isinstance(x, int)]
+        small = name not in COUNTED and not name.endswith("seed")
+        if small and max(counts, default=0) > MAX_OF_UPDATE:
+            raise ValueError(f"{flag(name)} must be less than 2^31, got {max(counts)}")
     if not _may_have_accelerator():
         task = TASKS.get(config.env, Task(1, 1, 1, 1.0, 0.0))
         check_fits(config, task, host_memory(), task.base_memory)

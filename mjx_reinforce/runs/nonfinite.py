@@ -20,11 +20,12 @@ _FEWEST = 5
 _NAMED = 5
 
 
-def nonfinite_updates(metrics: Arrays) -> Arrays:
+def nonfinite_updates(metrics: Arrays, updates: np.ndarray) -> Arrays:
     """Returns the M updates of a block that met numbers which are not finite.
 
     Args:
       metrics: [K, S] each, as for ``Record.add_updates``.
+      updates: [K, S] how many each seed had made after each of them.
 
     Returns:
       [M] each: ``seed``, ``update`` (how many the seed had made before it), ``episodes`` (how many
@@ -32,7 +33,7 @@ def nonfinite_updates(metrics: Arrays) -> Arrays:
     """
     episodes, skipped = metrics["nonfinite_episodes"], metrics["skipped_update"]
     k, s = np.nonzero((episodes + skipped) * metrics["active"])
-    found = (s, metrics["updates_total"][k, s] - 1, episodes[k, s], skipped[k, s])
+    found = (s, updates[k, s] - 1, episodes[k, s], skipped[k, s])
     return {name: x.astype(kind) for (name, kind), x in zip(FIELDS.items(), found, strict=True)}
 
 

@@ -96,8 +96,8 @@ class Record:
         """
         active, episodes = metrics["active"], self._config.episodes_per_update
         finite = metrics["nonfinite_episodes"] == 0
-        env_steps = metrics["env_steps_total"].astype(np.int64)
-        updates = metrics["updates_total"].astype(np.int64)
+        env_steps = self.env_steps + np.cumsum(metrics["env_steps"], axis=0, dtype=np.int64)
+        updates = self.updates + np.cumsum(active, axis=0, dtype=np.int64)
         made = active.any(axis=1)
         returns = np.where(finite, metrics["episode_return"], np.nan)
         training = {
@@ -109,7 +109,7 @@ class Record:
         self.env_steps, self.updates = env_steps[-1], updates[-1]
         self._simulated += _sum(metrics["simulated_steps"])
         self._broken_in_a_row = nonfinite.broken_in_a_row(self._broken_in_a_row, metrics, episodes)
-        met = nonfinite.nonfinite_updates(metrics)
+        met = nonfinite.nonfinite_updates(metrics, updates)
         self._tables["nonfinite"].append(met)
         self._remember(metrics | {"episode_return": returns})
         return met

@@ -12,11 +12,11 @@ FREE_STD = ("normal", "truncated-normal", "clipped-normal", "tanh-normal")
 #: the most general first. What stands in none is always read.
 READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
     (
-        "num_episodes estimator discount discount_weights standardize standardize_floor "
-        "value_learning_rate value_fits value_hidden_sizes update minibatch_updates "
-        "minibatch_size loss_per entropy_cost optimizer learning_rate final_learning_rate "
-        "decay_steps decay_updates weight_decay max_grad_norm max_kl final_std "
-        "momentum",
+        "num_episodes estimator discount final_discount discount_weights standardize "
+        "standardize_floor value_learning_rate value_fits value_hidden_sizes update "
+        "minibatch_updates minibatch_size loss_per entropy_cost optimizer learning_rate "
+        "final_learning_rate decay_steps decay_updates weight_decay max_grad_norm max_kl "
+        "final_std momentum",
         lambda c: c.algorithm == "reinforce",
         "--algorithm reinforce",
     ),

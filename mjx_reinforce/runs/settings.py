@@ -85,6 +85,9 @@ class EstimatorSettings:
     normalized-returns (their docstrings say how)."""
     discount: float = 0.99
     """Discount of rewards, in [0, 1]."""
+    final_discount: float | None = None
+    """It goes to this one over the budget, evenly in the logarithm of 1 / (1 - discount), the
+    steps that it looks ahead: noisy gradients want few, sure ones many. None: it stays."""
     discount_weights: bool = False
     """Multiply the weight at step t by discount^t, which most programs leave out."""
     standardize: bool = True
@@ -122,9 +125,10 @@ class UpdateSettings:
     """Adam's b1: how much of the last mean gradient the next one keeps."""
     final_learning_rate: float | None = None
     """Learning rate after the decay, which is linear; a tenth of the first if not given."""
-    decay_steps: int | None = 280_000
-    """Env steps of a seed over which the learning rate decays, and the noise with --final-std.
-    None: it stays, or see --decay-updates."""
+    decay_steps: int | Literal["budget"] | None = "budget"
+    """Env steps of a seed over which the learning rate decays, and the noise with --final-std:
+    budget is as long as the run, whatever --env-steps or --max-updates says. None: it stays, or
+    see --decay-updates."""
     decay_updates: int | None = None
     """Updates over which the learning rate decays; needs --decay-steps None."""
     weight_decay: float = 0.0

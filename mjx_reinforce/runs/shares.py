@@ -53,9 +53,8 @@ def lead(
 
     def advance(before: RunState) -> tuple[RunState, Arrays]:
         answers = ask("advance", before)
-        return _state(_together([_part(x, "state") for x in answers]), like), _together_in_time(
-            [_part(x, "metrics") for x in answers], [_counts(x, like) for x in answers]
-        )
+        states, metrics = ([_part(x, group) for x in answers] for group in ("state", "metrics"))
+        return _state(_together(states), like), _together_in_time(metrics)
 
     def evaluate(present: RunState) -> Arrays:
         return _together(ask("evaluate", present))
@@ -124,27 +123,16 @@ def _together(parts: Sequence[Arrays]) -> Arrays:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _counts(answer: Arrays, like: RunState) -> Arrays:
-    """Returns what the metrics of a seed that stands still go on to say."""
-    state = _state(_part(answer, "state"), like)
-    updates = np.asarray(state.train_states.num_updates)
-    return {"updates_total": updates, "env_steps_total": np.asarray(state.env_steps)}
-
-
-def _together_in_time(parts: Sequence[Arrays], counts: Sequence[Arrays]) -> Arrays:
+def _together_in_time(parts: Sequence[Arrays]) -> Arrays:
     """Returns the metrics [K, S] of all seeds; those of a process that made fewer stand still."""
     length = max(len(part["active"]) for part in parts)
 
-    def filled(part: Arrays, still: Arrays, name: str) -> np.ndarray:
-        missing = length - len(part[name]), *part[name].shape[1:]
-        rest = np.broadcast_to(still.get(name, np.zeros((), part[name].dtype)), missing)
-        return np.concatenate([part[name], rest.astype(part[name].dtype)])
+    def filled(rows: np.ndarray) -> np.ndarray:
+        missing = np.zeros((length - len(rows), *rows.shape[1:]), rows.dtype)
+        return np.concatenate([rows, missing])
 
     return {
-        name: np.concatenate(
-            [filled(part, still, name) for part, still in zip(parts, counts, strict=True)], axis=1
-        )
-        for name in parts[0]
+        name: np.concatenate([filled(part[name]) for part in parts], axis=1) for name in parts[0]
     }
 
 

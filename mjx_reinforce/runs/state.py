@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 from jax import lax
 
+from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.learner import Learner, TrainState
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.runs.blocks import block_length
@@ -30,13 +31,11 @@ class RunState:
     """All that a run needs to go on.
 
     train_states: [S, ...] the ``TrainState`` of every seed
-    env_steps: [S] int32, how many each seed has played in training
     eval_keys: [S] the key of each seed's evaluations, from which its start states are drawn
     settings: [S] each, settings that differ from seed to seed; none where all seeds have the same
     """
 
     train_states: TrainState
-    env_steps: jax.Array
     eval_keys: jax.Array
     settings: dict[str, jax.Array] = dataclasses.field(default_factory=dict)
 
@@ -44,12 +43,12 @@ class RunState:
 class Budget(NamedTuple):
     """What each seed may use. It is an input of the programs: another budget compiles nothing.
 
-    env_steps: [] int32, a seed stops after the update that reaches it
-    updates: [] int32, how many it makes at most
+    env_steps: [2] a count, see ``counts``; a seed stops after the update that reaches it
+    updates: [2] likewise, how many it makes at most
     """
 
-    env_steps: jax.Array | np.int32
-    updates: jax.Array | np.int32
+    env_steps: jax.Array | np.ndarray
+    updates: jax.Array | np.ndarray
 
 
 class Parts(NamedTuple):
@@ -77,9 +76,8 @@ class Programs(NamedTuple):
 
     advance: (RunState) -> (RunState, metrics [K, S]), ``eval_every`` updates later, or where all
       budgets are used; a seed whose budget is used earlier stands still. The memory of its
-      argument is used again. To the metrics of ``Learner.step`` it adds ``active`` (False for a
-      seed that stood still), and ``updates_total`` and ``env_steps_total``, the seed's counts
-      after the update
+      argument is used again. To the metrics of ``Learner.step`` it adds ``active``, False for a
+      seed that stood still
     evaluate: (RunState) -> [S] each, what ``evaluation.evaluate`` returns for every seed
     test: (Actor [S, ...]) -> the same on ``test_episodes`` start states (rounded up to whole
       evaluations) that nothing else is played on
@@ -115,7 +113,6 @@ def beginning(build_learner: BuildLearner) -> Callable[..., RunState]:
     def begin(keys: jax.Array, eval_keys: jax.Array, settings: dict[str, jax.Array]) -> RunState:
         return RunState(
             train_states=jax.vmap(init)(keys, settings),
-            env_steps=jnp.zeros(len(keys), jnp.int32),
             eval_keys=eval_keys,
             settings=settings,
         )
@@ -197,7 +194,8 @@ def compile_parts(
         advancing = traced.compile()
         compiled, (first, test_keys) = looking.result(), starting.result()
     # No update: a GPU's driver translates a program's kernel, also the evaluation's, at first use.
-    first = jax.block_until_ready(advancing(first, Budget(np.int32(0), np.int32(0)))[0])
+    nothing = Budget(counts.from_int(0), counts.from_int(0))
+    first = jax.block_until_ready(advancing(first, nothing)[0])
 
     def advanced(state: RunState) -> tuple[RunState, Arrays]:
         state, made, metrics = advancing(state, budget)
@@ -257,7 +255,7 @@ def _for_each_seed(key: jax.Array, num_seeds: int) -> jax.Array:
 def budget_of(config: Config) -> Budget:
     """Returns the budget; what has no limit has the greatest count."""
     limits = (config.env_steps, config.max_updates)
-    return Budget(*(np.int32(MAX_COUNT if limit is None else limit) for limit in limits))
+    return Budget(*(counts.from_int(MAX_COUNT if limit is None else limit) for limit in limits))
 
 
 def block_of_updates(build_learner: BuildLearner, length: int) -> Callable[..., Any]:
@@ -272,8 +270,14 @@ def block_of_updates(build_learner: BuildLearner, length: int) -> Callable[..., 
     """
 
     def active(state: RunState, budget: Budget) -> jax.Array:
-        used = state.env_steps >= budget.env_steps
-        return ~(used | (state.train_states.num_updates >= budget.updates))
+        used = counts.reached(state.train_states.env_steps, budget.env_steps)
+        return ~(used | counts.reached(state.train_states.num_updates, budget.updates))
+
+    def progress(state: RunState, budget: Budget) -> jax.Array:
+        """Returns the share [S] of its budget that each seed has used."""
+        made = state.train_states.env_steps, state.train_states.num_updates
+        shares = [counts.number(x) / counts.number(y) for x, y in zip(made, budget, strict=True)]
+        return jnp.minimum(jnp.maximum(*shares), 1.0)
 
     def step(state: TrainState, settings: dict[str, jax.Array], going: jax.Array) -> Any:
         return build_learner(settings).step(state, going)
@@ -281,11 +285,9 @@ def block_of_updates(build_learner: BuildLearner, length: int) -> Callable[..., 
     @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
     def update(state: RunState, budget: Budget) -> tuple[RunState, dict[str, jax.Array]]:
         going = active(state, budget)
-        train_states, metrics = jax.vmap(step)(state.train_states, state.settings, going)
-        env_steps = state.env_steps + metrics["env_steps"]
-        counts = {"updates_total": train_states.num_updates, "env_steps_total": env_steps}
-        state = dataclasses.replace(state, train_states=train_states, env_steps=env_steps)
-        return state, metrics | counts | {"active": going}
+        before = dataclasses.replace(state.train_states, progress=progress(state, budget))
+        train_states, metrics = jax.vmap(step)(before, state.settings, going)
+        return dataclasses.replace(state, train_states=train_states), metrics | {"active": going}
 
     def advance(state: RunState, budget: Budget) -> tuple[RunState, Any]:
         def unfinished(carry: Any) -> jax.Array:

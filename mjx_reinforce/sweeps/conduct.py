@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.learners import counts
 from mjx_reinforce.runs.config import MAX_COUNT
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.plan import duration, is_wrong
@@ -242,8 +243,8 @@ class Conductor:
         shape_of = functools.partial(shape_of_states, build, tuple(before.group.settings))
         states = carry.last_states(self._files, before.chunks, shape_of, self._display.say)
         states = carry.choose(states, before.chunks, runs)
-        history.now["updates"] = np.asarray(states.train_states.num_updates, np.int64)
-        history.now["env_steps"] = np.asarray(states.env_steps, np.int64)
+        history.now["updates"] = counts.to_int(states.train_states.num_updates)
+        history.now["env_steps"] = counts.to_int(states.train_states.env_steps)
         return programs.layout.rows(states)
 
     def _part_done(self, more: float = 0.0) -> float:

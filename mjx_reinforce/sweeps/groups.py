@@ -14,6 +14,7 @@ _REINFORCE = (
     "final_learning_rate",
     "decay_steps",
     "discount",
+    "final_discount",
     "entropy_cost",
     "standardize_floor",
     "max_grad_norm",
@@ -74,7 +75,11 @@ def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, fl
         settings.pop("final_learning_rate", None)
     elif "learning_rate" in settings and config.final_learning_rate is None:
         settings["final_learning_rate"] = config.learning_rate / 10
-    return {name: float(value) for name, value in settings.items() if value is not None}
+    return {
+        name: float(value)
+        for name, value in settings.items()
+        if not (value is None or isinstance(value, str))
+    }
 
 
 def learner_builder(env: Any, config: Config) -> Callable[[dict[str, Any]], Any]:

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce.learners import counts
 from mjx_reinforce.runs.blocks import block_length
 from mjx_reinforce.runs.config import MAX_COUNT, Config
 from mjx_reinforce.runs.keys import plain, with_keys
@@ -32,6 +33,9 @@ from mjx_reinforce.sweeps.devices import NONE, RUNS, Devices
 from mjx_reinforce.sweeps.history import Measured
 from mjx_reinforce.sweeps.layout import Layout
 from mjx_reinforce.sweeps.packing import pack
+
+#: What ``history.Measured`` has of a run's counts since the start.
+_COUNTS = ("updates", "env_steps")
 
 
 class Movers(NamedTuple):
@@ -97,8 +101,8 @@ class Programs(NamedTuple):
             measured = []
             slot, which = self._put((states[runs], runs >= 0))
             for _ in range(count):  # the host does not wait for any
-                slot, moved, counts = movers.block(slot, which, self.limits)
-                measured.append((moved, counts | movers.look(slot, moved)))
+                slot, moved, used = movers.block(slot, which, self.limits)
+                measured.append((moved, used | movers.look(slot, moved)))
             return jax.device_get((slot, measured))
 
         rows, measured = zip(*_side_by_side(move, lanes), strict=True)
@@ -142,10 +146,11 @@ def _threads() -> ThreadPoolExecutor:
 
 def _joined(lanes: np.ndarray, slots: Sequence[Any]) -> Measured:
     """Returns what was measured in slots, each of which has (which lanes count [W], values [W])."""
-    counts, values = zip(*slots, strict=True)
-    kept = np.concatenate(counts)
+    which, values = zip(*slots, strict=True)
+    kept = np.concatenate(which)
     joined = {name: np.concatenate([slot[name] for slot in values])[kept] for name in values[0]}
-    return Measured(lanes.reshape(-1)[kept], joined)
+    totals = {name: counts.to_int(joined[name]) for name in _COUNTS if name in joined}
+    return Measured(lanes.reshape(-1)[kept], joined | totals)
 
 
 def compile_programs(
@@ -265,10 +270,12 @@ def _movers(
         def block(rows: jax.Array, which: jax.Array, budget: Budget) -> Any:
             before = with_keys(layout.traced_states(rows), like)
             # A lane without a run has no budget.
-            env_steps = jnp.where(which, before.env_steps, MAX_COUNT)
-            before = dataclasses.replace(before, env_steps=env_steps)
+            played = before.train_states.env_steps
+            played = jnp.where(which[:, None], played, counts.from_int(MAX_COUNT))
+            train_states = dataclasses.replace(before.train_states, env_steps=played)
+            before = dataclasses.replace(before, train_states=train_states)
             after, (_, metrics) = updates(before, budget)
-            moved = after.train_states.num_updates > before.train_states.num_updates
+            moved = jnp.any(metrics["active"], axis=0)
             return layout.traced_rows(plain(after)), moved, _counts(after, metrics)
 
         # Policies and engines are those of any of its learners.
@@ -298,6 +305,6 @@ def _counts(after: RunState, metrics: dict[str, jax.Array]) -> dict[str, jax.Arr
     broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
     return {
         "updates": after.train_states.num_updates,
-        "env_steps": after.env_steps,
+        "env_steps": after.train_states.env_steps,
         "nonfinite": jnp.sum(broken & metrics["active"], axis=0, dtype=jnp.int32),
     }

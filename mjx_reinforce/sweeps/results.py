@@ -103,7 +103,7 @@ class SweepFiles:
             "configuration": runs.configuration.astype(np.int32),
             "seed": runs.seed.astype(np.int32),
             "eval_return": curves["eval_return"].astype(np.float32),
-            "env_steps": curves["env_steps"].astype(np.int32),
+            "env_steps": curves["env_steps"].astype(np.int64),
             "nonfinite": history.now["nonfinite"].astype(np.int32),
         }
         write_arrays(self._path(runs.name), part)
