@@ -76,7 +76,7 @@ def play(engine: Any, env: Shown, states: int, steps: int, deterministic: bool) 
     """Plays ``states`` episodes of ``steps`` steps, without noise if so wished."""
     distribution = normal(env.action_space)
     actor = jnp.concatenate([jnp.zeros(env.action_size), jnp.asarray(distribution.constants)])
-    size = {"num_episodes": states, "horizon": steps, "num_deterministic": states * deterministic}
+    size = {"num_episodes": states, "horizon": steps, "deterministic": deterministic}
     roll = jax.jit(lambda actor, key: engine(env, act, actor, distribution, key, **size))
     return jax.tree.map(np.asarray, roll(actor, jax.random.key(0)))
 

@@ -110,7 +110,7 @@ def simulated(engine: str, env: Shown) -> np.ndarray:
 
     @jax.jit
     def play(constants: jax.Array) -> jax.Array:
-        lengths: Any = {"num_episodes": 1, "horizon": STEPS + 1, "num_deterministic": 1}
+        lengths: Any = {"num_episodes": 1, "horizon": STEPS + 1, "deterministic": True}
         played = ENGINES[engine](env, act, constants, distribution, jax.random.key(0), **lengths)
         return played.observation[1:, 0]
 

@@ -73,7 +73,7 @@ def _own_simulation(run: Run, num_episodes: int) -> Any:
                 jax.random.key(ROOT + 1),
                 num_episodes=num_episodes,
                 horizon=horizon,
-                num_deterministic=num_episodes,
+                deterministic=True,
             )
         )
 

@@ -62,6 +62,8 @@ class Trajectory:
     nonfinite: [N] True where the simulation left the finite numbers
     simulated: [] int32, env steps that were simulated for these episodes, those in which an
       episode was over already included
+
+    An episode that was not played has no step: its mask is False throughout.
     """
 
     observation: jax.Array
@@ -83,6 +85,16 @@ class Trajectory:
             action=self.action[:steps],
             reward=self.reward[:steps],
             mask=self.mask[:steps],
+        )
+
+    def episodes(self, part: slice) -> "Trajectory":
+        """Returns a part of the episodes; ``simulated`` remains that of all."""
+        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+            observation=self.observation[:, part],
+            action=self.action[:, part],
+            reward=self.reward[:, part],
+            mask=self.mask[:, part],
+            nonfinite=self.nonfinite[part],
         )
 
 

@@ -64,7 +64,7 @@ def one_step(id, engine, solver="exact", **options):
             distribution,
             key,
             num_episodes=NUM_STATES,
-            num_deterministic=NUM_STATES,
+            deterministic=True,
             horizon=2,
             **options,
         )

@@ -97,7 +97,7 @@ def test_every_distribution_draws_the_same_noise(name):
         distribution = load(DISTRIBUTIONS[name])(space)
     env = Drifting(space)
     player = actor_and_act(env, (4,), distribution=distribution)
-    got, want = both(env, player, num_deterministic=2)
+    got, want = both(env, player, deterministic=jnp.arange(5) % 2 == 0)
     assert len(np.unique(want.mask.sum(axis=1))) > 5
     assert_same_episodes(got, want, rounding=2e-5)
     assert np.all(got.observation[~got.mask] == 0)
@@ -151,6 +151,51 @@ def test_a_seed_that_stands_still_plays_nothing():
         if leaf.ndim > 1:
             np.testing.assert_array_equal(leaf[::2], whole[::2])
     assert not any(np.any(x) for x in jax.tree.leaves(none))
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_only_active_episodes_are_played(threads):
+    """They are, to the bit, what the same episodes are alone, by their own keys; some are modes."""
+    env = Drifting()
+    actor, act, distribution = actor_and_act(env, (5,))
+    keys = jax.random.split(jax.random.key(1), (3, 40))
+    chosen = np.arange(120).reshape(3, 40) % 3 == 1
+    chosen[1] = False
+    modes = np.arange(40) % 2 == 0
+
+    def one(keys, active, modes):
+        options = {"horizon": 60, "active": active, "deterministic": modes, "threads": threads}
+        size = {"num_episodes": len(keys)}
+        return rollout.rollout(env, act, actor, distribution, keys, **size, **options)
+
+    some = jax.jit(jax.vmap(one, in_axes=(0, 0, None)))(keys, jnp.array(chosen), modes)
+    assert some.mask.any()
+    for s in range(3):
+        got = jax.tree.map(lambda x, s=s: np.asarray(x)[s], some)
+        rest = got.replace(
+            observation=got.observation[:, ~chosen[s]], action=got.action[:, ~chosen[s]]
+        )
+        assert not any(x.any() for x in (rest.observation, rest.action, got.mask[:, ~chosen[s]]))
+        assert not got.reward[:, ~chosen[s]].any()
+        assert bool(got.simulated) == chosen[s].any()
+        if chosen[s].any():
+            alone = jax.jit(one)(keys[s][chosen[s]], True, modes[chosen[s]])
+            for name in ("observation", "action", "reward", "mask"):
+                part = getattr(got, name)[:, chosen[s]]
+                np.testing.assert_array_equal(part, getattr(alone, name), err_msg=name)
+
+
+@pytest.mark.cpu
+def test_steps_are_counted_for_the_seed_that_a_lane_played():
+    """A lane waits for the longest episode; lanes without any count nothing."""
+    env = Drifting()
+    got = played(rollout.rollout, env, actor_and_act(env, ()), num_seeds=2, num_episodes=2)
+    lengths = got.mask.sum(axis=1)
+    assert len(np.unique(lengths)) > 1
+    np.testing.assert_array_equal(got.simulated, 2 * lengths.max())
+    many = played(rollout.rollout, env, actor_and_act(env, ()), num_episodes=200)
+    assert many.simulated.sum() % machine.this_machine().lanes == 0
+    assert np.all(many.simulated >= many.mask.sum((1, 2)))
 
 
 def assert_identical(got, want):

@@ -98,9 +98,8 @@ def test_contacts(xml, room, monkeypatch):
     with jax.enable_x64(True):
         env = Scene(xml)
         ours, theirs = played(env)
-        starts, _ = jax.vmap(functools.partial(episode.begin, env, jax.random.key(0)))(
-            jnp.arange(len(theirs))
-        )
+        keys = episode.episode_keys(jax.random.key(0), len(theirs))
+        starts, _ = jax.vmap(functools.partial(episode.begin, env))(keys)
         forward = jax.jit(jax.vmap(env.forward, in_axes=(0, None)))
         moved = [np.asarray(forward(starts.info, x)) for x in (1e-15, 1e-14, 1e-13, -1e-13, -1e-12)]
     jax.clear_caches()

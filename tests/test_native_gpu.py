@@ -36,7 +36,7 @@ def test_the_same_episodes_as_everywhere(pendulum, monkeypatch, threads):
     gpu_on_cpu.emulate(monkeypatch, threads)
     toys = ((env, actor_and_act(env, (4,))) for env in (Drifting(), Bytes()))
     for env, who in (pendulum, *toys):
-        got, want = both(env, who, num_deterministic=2, horizon=100)
+        got, want = both(env, who, deterministic=jnp.arange(5) < 2, horizon=100)
         assert got.mask[:, 0].all()
         assert not got.mask[:, -1].all()
         assert_same_episodes(got, want, rounding=2e-5)
@@ -73,6 +73,34 @@ def test_seeds_that_are_not_active_are_not_played(pendulum, monkeypatch):
     for got, want in zip(jax.tree.leaves(some), jax.tree.leaves(all_seeds), strict=True):
         assert not got[[0, 2]].any()
         np.testing.assert_array_equal(got[[1, 3]], want[[1, 3]])
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_episodes_that_are_not_active_are_not_played(pendulum, monkeypatch, threads):
+    """Also in step with others: a thread that never had an episode counts no steps."""
+    block = gpu_on_cpu.Block(threads)
+    gpu_on_cpu.emulate(monkeypatch, block=block)
+    monkeypatch.setattr(lockstep, "LONG", 0)
+    env, (actor, act, distribution) = pendulum
+
+    def one(key, active):
+        size = {"num_episodes": 5, "horizon": 20, "deterministic": jnp.arange(5) % 2 == 1}
+        return rollout.rollout(env, act, actor, distribution, key, active=active, **size)
+
+    keys = jax.random.split(jax.random.key(0), 3)
+    chosen = np.array([[0] * 5, [0, 1, 0, 0, 1], [0] * 5]).astype(bool)
+    play = jax.jit(jax.vmap(one))
+    some, every = (
+        jax.tree.map(np.asarray, play(keys, x)) for x in (jnp.array(chosen), jnp.ones((3, 5), bool))
+    )
+    assert block.apart is None
+    np.testing.assert_array_equal(some.mask, every.mask & chosen[:, None])
+    for name in ("observation", "action", "reward"):
+        played = some.mask.reshape(some.mask.shape + (1,) * (getattr(some, name).ndim - 3))
+        np.testing.assert_array_equal(getattr(some, name), played * getattr(every, name))
+    assert not some.simulated[[0, 2]].any()
+    lengths = some.mask[1].sum(axis=0)
+    assert some.simulated[1] == (lengths.sum() if threads == 1 else 2 * lengths.max())
 
 
 def test_in_step_or_apart_an_episode_is_the_same(monkeypatch):

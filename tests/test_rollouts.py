@@ -9,7 +9,7 @@ import pytest
 from toys import Chain, Toy, ToyState, categorical
 
 from mjx_reinforce import Distribution
-from mjx_reinforce.engines import rollouts
+from mjx_reinforce.engines import choice, episode, rollouts
 
 #: Two entries of an action, noise added; the mode is what the network says.
 PLAIN = Distribution(
@@ -57,9 +57,10 @@ def play(env, key=None, *, num_episodes=4, horizon=6, distribution=PLAIN, act=ac
     return jax.tree.map(np.asarray, roll(jnp.array([0.1, 2.0]), distribution, key))
 
 
-def by_hand(env, key, num_episodes, horizon, chunk, num_deterministic=0):
+def by_hand(env, key, num_episodes, horizon, chunk, deterministic=False):
     """The episodes one by one; an episode's keys come from its own index and the chunk."""
     shape = horizon, num_episodes
+    deterministic = np.broadcast_to(deterministic, num_episodes)
     observation, action = np.zeros((2, *shape, 2), np.float32)
     reward, mask = np.zeros(shape, np.float32), np.zeros(shape, bool)
     for n in range(num_episodes):
@@ -70,7 +71,7 @@ def by_hand(env, key, num_episodes, horizon, chunk, num_deterministic=0):
                 noise_key, draw_key = jax.random.split(noise_key)
                 noise = PLAIN.noise(draw_key, (chunk,))
             outputs = act(jnp.array([0.1, 2.0]), state.obs)
-            chosen = outputs if n < num_deterministic else outputs + noise[t % chunk]
+            chosen = outputs if deterministic[n] else outputs + noise[t % chunk]
             observation[t, n], action[t, n], mask[t, n] = state.obs, chosen, True
             state = env.step(state, chosen)
             reward[t, n] = state.reward
@@ -85,17 +86,52 @@ def assert_is(trajectory, expected):
         np.testing.assert_allclose(getattr(trajectory, name), values, rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("num_deterministic", [0, 1, 4])
-def test_episodes_are_those_of_a_loop(num_deterministic):
-    """The last step is in the mask, everything behind it is zero, the first ones take the mode."""
+@pytest.mark.parametrize("deterministic", [False, (False, True, True, False), True])
+def test_episodes_are_those_of_a_loop(deterministic):
+    """The last step is in the mask, everything behind it is zero, those chosen take the mode."""
     env, key = Counter(length=8), jax.random.key(3)
-    trajectory = play(env, key, num_deterministic=num_deterministic)
-    expected = by_hand(env, key, 4, 6, 6, num_deterministic)
+    chosen = deterministic if isinstance(deterministic, bool) else jnp.array(deterministic)
+    trajectory = play(env, key, deterministic=chosen)
+    expected = by_hand(env, key, 4, 6, 6, deterministic)
     lengths = expected[-1].sum(axis=0)
     assert lengths.min() < 6  # some end by themselves,
     assert lengths.max() == 6  # some at the horizon
     assert_is(trajectory, expected)
     assert not trajectory.nonfinite.any()
+
+
+def test_episodes_of_given_keys():
+    env, keys = Counter(length=8), jax.random.split(jax.random.key(3), 4)
+    trajectory = play(env, keys)
+    for n in range(4):
+        folded = episode.episode_keys(keys[n], 3)
+        one = play(env, folded[2:], num_episodes=1)
+        np.testing.assert_array_equal(one.observation[:, 0], play(env, keys[n]).observation[:, 2])
+        alone = play(env, keys[n : n + 1], num_episodes=1)
+        assert_is(trajectory.episodes(slice(n, n + 1)), list(jax.tree.leaves(alone))[:4])
+    with pytest.raises(ValueError, match=r"key must be \[\] or \[5\], got the shape \[4\]"):
+        play(env, keys, num_episodes=5)
+
+
+@pytest.mark.parametrize("engine", ["vmap", "fused"])
+def test_only_active_episodes_are_played(engine):
+    """Seeds side by side, each with a choice of its own."""
+    env, keys = Counter(length=8), jax.random.split(jax.random.key(0), 3)
+    active = jnp.array([[True, False, True, False], [False] * 4, [True] * 4])
+    roll = choice.choose(engine, env).rollout
+
+    def one(key, active):
+        size = {"num_episodes": 4, "horizon": 100}
+        return roll(env, act, jnp.array([0.1, 2.0]), PLAIN, key, active=active, **size)
+
+    some = jax.tree.map(np.asarray, jax.vmap(one)(keys, active))
+    every = jax.tree.map(np.asarray, jax.vmap(one)(keys, jnp.ones((3, 4), bool)))
+    np.testing.assert_array_equal(some.mask, every.mask & np.asarray(active)[:, None])
+    assert every.mask[:, 0].all()
+    for name in ("observation", "action", "reward"):
+        played = some.mask.reshape(some.mask.shape + (1,) * (getattr(some, name).ndim - 3))
+        np.testing.assert_array_equal(getattr(some, name), played * getattr(every, name))
+    assert not some.nonfinite.any()
 
 
 @pytest.mark.parametrize(("horizon", "chunk"), [(1, 1), (50, 50), (51, 17), (100, 50)])
@@ -214,7 +250,7 @@ def test_discrete_actions_have_no_last_axis():
         horizon=3,
         distribution=categorical(2),
         act=lambda actor, observation: jnp.stack([observation[:, 0], 2 * observation[:, 1]], -1),
-        num_deterministic=5,
+        deterministic=True,
     )
     # Arm 0 first, then arm 1, and where both are equal arm 0.
     assert trajectory.action.shape == (3, 5)

@@ -45,7 +45,7 @@ def test_the_film_is_the_episode(tmp_path, env_id):
         jax.random.key(0),
         num_episodes=1,
         horizon=60,
-        num_deterministic=1,
+        deterministic=True,
     )
     length = int(played.mask.sum())
     assert f"return {float(played.reward.sum()):.1f} in {length} steps" in said

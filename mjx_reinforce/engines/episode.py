@@ -36,19 +36,36 @@ class Step(NamedTuple):
     state: Any
 
 
-def check_scalars(**arguments: Any) -> None:
-    """Raises ValueError for an argument of a rollout that must be one number [], and is not."""
+def check_shapes(*shapes: tuple[int, ...], **arguments: Any) -> None:
+    """Raises ValueError for an argument of a rollout whose shape is none of ``shapes``."""
     for name, value in arguments.items():
-        if jnp.shape(value) != ():
+        if jnp.shape(value) not in shapes:
             raise ValueError(
-                f"{name} must be [], got the shape {list(jnp.shape(value))}; play several seeds by "
-                "jax.vmap"
+                f"{name} must be {' or '.join(str(list(x)) for x in shapes)}, got the shape "
+                f"{list(jnp.shape(value))}; play several seeds by jax.vmap"
             )
 
 
-def begin(env: Environment, key: jax.Array, episode: jax.Array) -> tuple[Any, jax.Array]:
-    """Returns the start state of an episode, by its number, and the key of its noise."""
-    reset_key, noise_key = jax.random.split(jax.random.fold_in(key, episode))
+def episode_keys(key: jax.Array, num_episodes: int) -> jax.Array:
+    """Returns the keys [N] of N episodes.
+
+    Args:
+      key: [N] these keys, or [], and the key of episode i is this one folded with i.
+      num_episodes: N.
+
+    Raises:
+      ValueError: the keys are of another number.
+    """
+    several = jax.random.key_data(key)[..., 0]
+    check_shapes((), (num_episodes,), key=several)
+    if several.ndim:
+        return key
+    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_episodes))
+
+
+def begin(env: Environment, key: jax.Array) -> tuple[Any, jax.Array]:
+    """Returns the start state of an episode, by its own key, and the key of its noise."""
+    reset_key, noise_key = jax.random.split(key)
     return env.reset(reset_key), noise_key
 
 

@@ -38,25 +38,25 @@ def rollout(
     *,
     num_episodes: int,
     horizon: int,
-    num_deterministic: int = 0,
+    deterministic: bool | jax.Array = False,
     active: bool | jax.Array = True,
     env_step: Callable[[Any, jax.Array], Any] | None = None,
 ) -> Trajectory:
     """Plays N episodes from fresh resets, each to its end or to the horizon.
 
-    An episode's reset and noise come from the key folded with its own index, whatever N is. When
-    all are over the simulation stops.
+    An episode's reset and noise come from its own key alone, whatever N is. When all are over the
+    simulation stops.
 
     Args:
       env: what is played.
       act: (actor, observation [N, O]) -> outputs [N, K] of the distribution.
       actor: what ``act`` reads.
       distribution: the family whose parameters the outputs are.
-      key: consumed.
+      key: consumed; [N] the episodes' own, or [] and that of episode i is this one folded with i.
       num_episodes: N.
       horizon: T, the time limit in steps; reaching it ends an episode.
-      num_deterministic: how many episodes, the first ones, take the mode.
-      active: [] where False, nothing is played: a finished seed beside others that train.
+      deterministic: [] or [N] whether an episode takes the mode.
+      active: [] or [N] whether an episode is played: else it has no step, and zeros stand for it.
       env_step: ``env.step`` of N episodes, the last axis of every leaf; by default ``jax.vmap``.
 
     Returns:
@@ -73,14 +73,14 @@ def rollout(
     check_key(key)
     check_count("num_episodes", num_episodes)
     check_count("horizon", horizon)
-    episode.check_scalars(num_deterministic=num_deterministic, active=active)
+    episode.check_shapes((), (num_episodes,), deterministic=deterministic, active=active)
     if env_step is None:
         env_step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
     # Inside, episodes are the last axis: each scalar of the state is a contiguous row.
-    start = jax.vmap(functools.partial(episode.begin, env, key), out_axes=(-1, 0))
-    state, noise_keys = start(jnp.arange(num_episodes))
-    deterministic = jnp.arange(num_episodes) < num_deterministic if num_deterministic else None
-    step = functools.partial(_step, env_step, act, distribution, actor, deterministic)
+    start = jax.vmap(functools.partial(episode.begin, env), out_axes=(-1, 0))
+    state, noise_keys = start(episode.episode_keys(key, num_episodes))
+    modes = None if deterministic is False else jnp.broadcast_to(deterministic, num_episodes)
+    step = functools.partial(_step, env_step, act, distribution, actor, modes)
     none = jnp.zeros(num_episodes, bool)
     progress = _Progress(state, none | active, none)
     records = _empty_records(step, progress, distribution, horizon)

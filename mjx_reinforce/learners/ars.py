@@ -190,7 +190,7 @@ class _Search:
                 self.policy.distribution,
                 key,
                 num_episodes=self.num_directions,
-                num_deterministic=self.num_directions,
+                deterministic=True,
                 horizon=self.horizon,
                 active=active,
             )

@@ -47,7 +47,7 @@ def evaluate(
         key,
         num_episodes=(1 + sampled) * num_episodes,
         horizon=horizon,
-        num_deterministic=num_episodes,
+        deterministic=jnp.arange((1 + sampled) * num_episodes) < num_episodes,
         active=active,
     )
     returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)

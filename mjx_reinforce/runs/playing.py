@@ -59,7 +59,7 @@ def simulator(env: Any, player: Player, horizon: int) -> Callable[[int, bool], E
             reward = jnp.where(played.broken, jnp.nan, played.reward)
             return (after, played.alive), (after.pipeline_state.qpos, reward, alive)
 
-        start, noise_key = begin(env, key, episode)
+        start, noise_key = begin(env, jax.random.fold_in(key, episode))
         noises = distribution.noise(noise_key, (horizon,))
         first = start.pipeline_state.qpos
         return first, jax.lax.scan(advance, (start, jnp.array(True)), noises)[1]

@@ -19,6 +19,7 @@ from mjx_reinforce.engines.native import available
 from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.cpu import seam as cpu
 from mjx_reinforce.engines.native.gpu import seam as gpu
+from mjx_reinforce.engines.native.plays import MODE, NOT_PLAYED, SAMPLES
 from mjx_reinforce.engines.native.program import Program, build
 from mjx_reinforce.engines.native.step import stored
 from mjx_reinforce.fused import TooLarge, UnsupportedPrimitive
@@ -37,21 +38,22 @@ def rollout(
     *,
     num_episodes: int,
     horizon: int,
-    num_deterministic: int = 0,
+    deterministic: bool | jax.Array = False,
     active: bool | jax.Array = True,
     threads: int = 0,
 ) -> Trajectory:
     """Plays N episodes from fresh resets; arguments and result are those of `rollouts.rollout`.
 
     Vmapped over seeds it remains one call, in which no lane waits for another: an episode that is
-    over makes room for the next, of whatever seed.
+    over makes room for the next, of whatever seed. One that is not played takes no lane.
 
     At most ``threads`` threads play; 0 stands for all that XLA has.
 
     Raises:
       ValueError: machine code cannot play this; see ``unsupported``.
     """
-    episode.check_scalars(num_deterministic=num_deterministic, active=active, threads=threads)
+    episode.check_shapes((), (num_episodes,), deterministic=deterministic, active=active)
+    episode.check_shapes((), threads=threads)
     against = against_key(key)
     if against:
         raise ValueError(f"the native engine cannot play this: {against}; {_REMEDY}")
@@ -59,11 +61,11 @@ def rollout(
         program = build(env, act, actor, distribution, chunk_length(horizon))
     except (TooLarge, UnsupportedPrimitive) as error:
         raise ValueError(f"the native engine cannot play this: {error}") from error
-    begin = functools.partial(episode.begin, env, key)
-    state, keys = jax.vmap(begin)(jnp.arange(num_episodes))
+    begin = functools.partial(episode.begin, env)
+    state, keys = jax.vmap(begin)(episode.episode_keys(key, num_episodes))
+    plays = jnp.where(active, jnp.where(deterministic, MODE, SAMPLES), NOT_PLAYED)
     given = (
-        jnp.asarray(active, jnp.int32),
-        jnp.int32(num_deterministic),
+        jnp.broadcast_to(plays.astype(jnp.int32), num_episodes),
         jax.random.key_data(keys),
         *(x.reshape(-1) for x in jax.tree.leaves(actor) if x.size),
         *(stored(x).reshape(num_episodes, -1) for x in jax.tree.leaves(state) if x.size),

@@ -11,36 +11,16 @@ declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)
 ; Makes a job of the buffers' data [arguments + results] and the sizes of the results.
 define ptr @open(ptr %buffers, ptr %sizes, i64 %seeds, i64 %episodes, i64 %horizon) {
 entry:
-  %list.bytes = shl i64 %seeds, 3
-  %all.bytes = add i64 %list.bytes, $fixed_bytes
-  %job = call ptr @malloc(i64 %all.bytes)
+  %job = call ptr @malloc(i64 $fixed_bytes)
   call void @llvm.memset.p0.i64(ptr %job, i8 0, i64 $job_bytes, i1 false)
   %data = getelementptr i8, ptr %job, i64 $job_bytes
   call void @llvm.memcpy.p0.p0.i64(ptr %data, ptr %buffers, i64 $data_bytes, i1 false)
   %bytes = getelementptr i8, ptr %data, i64 $data_bytes
   call void @llvm.memcpy.p0.p0.i64(ptr %bytes, ptr %sizes, i64 $sizes_bytes, i1 false)
-  %list = getelementptr i8, ptr %bytes, i64 $sizes_bytes
-  %flags.at = getelementptr ptr, ptr %data, i64 $active_arg
-  %flags = load ptr, ptr %flags.at
-  br label %seed
-seed:
-  %s = phi i64 [0, %entry], [%s.next, %look]
-  %num = phi i64 [0, %entry], [%num.next, %look]
-  %more = icmp ult i64 %s, %seeds
-  br i1 %more, label %look, label %size
-look:
-  %flag.at = getelementptr i32, ptr %flags, i64 %s
-  %flag = load i32, ptr %flag.at
-  %on = icmp ne i32 %flag, 0
-  %slot = getelementptr i64, ptr %list, i64 %num
-  store i64 %s, ptr %slot
-  %one = zext i1 %on to i64
-  %num.next = add i64 %num, %one
-  %s.next = add i64 %s, 1
-  br label %seed
+  br label %size
 size:
-  %r = phi i64 [0, %seed], [%r.next, %size]
-  %sum = phi i64 [0, %seed], [%sum.next, %size]
+  %r = phi i64 [0, %entry], [%r.next, %size]
+  %sum = phi i64 [0, %entry], [%sum.next, %size]
   %size.at = getelementptr i64, ptr %bytes, i64 %r
   %size.r = load i64, ptr %size.at
   %sum.next = add i64 %sum, %size.r
@@ -48,7 +28,7 @@ size:
   %sized = icmp eq i64 %r.next, $num_results
   br i1 %sized, label %done, label %size
 done:
-  %total = mul i64 %num, %episodes
+  %total = mul i64 %seeds, %episodes
   %megabytes = lshr i64 %sum.next, 20
   %chunks = add i64 %megabytes, 1
   %refs.at = getelementptr %Job, ptr %job, $refs
@@ -59,12 +39,8 @@ done:
   store i64 %episodes, ptr %episodes.at
   %horizon.at = getelementptr %Job, ptr %job, $horizon
   store i64 %horizon, ptr %horizon.at
-  %active.at = getelementptr %Job, ptr %job, $active
-  store ptr %list, ptr %active.at
   %data.at = getelementptr %Job, ptr %job, $data
   store ptr %data, ptr %data.at
-  %num.at = getelementptr %Job, ptr %job, $num_active
-  store i64 %num, ptr %num.at
   %bytes.at = getelementptr %Job, ptr %job, $bytes
   store ptr %bytes, ptr %bytes.at
   %chunks.at = getelementptr %Job, ptr %job, $chunks
@@ -157,7 +133,7 @@ done:
   ret void
 }
 
-; Waits for the threads that work, divides the lane steps among the active seeds, ends the job.
+; Waits for the threads that work, and ends the job.
 define void @close(ptr %job) {
 entry:
   fence seq_cst
@@ -166,38 +142,10 @@ entry:
 wait:
   %running = load atomic i64, ptr %running.at acquire, align 8
   %idle = icmp eq i64 %running, 0
-  br i1 %idle, label %divide, label %yield
+  br i1 %idle, label %done, label %yield
 yield:
   %yielded = call i32 @sched_yield()
   br label %wait
-divide:
-  %simulated.at = getelementptr %Job, ptr %job, $simulated
-  %simulated = load i64, ptr %simulated.at
-  %num.at = getelementptr %Job, ptr %job, $num_active
-  %num = load i64, ptr %num.at
-  %list.at = getelementptr %Job, ptr %job, $active
-  %list = load ptr, ptr %list.at
-  %data.at = getelementptr %Job, ptr %job, $data
-  %data = load ptr, ptr %data.at
-  %steps.at = getelementptr ptr, ptr %data, i64 $simulated_data
-  %steps = load ptr, ptr %steps.at
-  %none = icmp eq i64 %num, 0
-  br i1 %none, label %done, label %seed
-seed:
-  %k = phi i64 [0, %divide], [%k.next, %seed]
-  %share = udiv i64 %simulated, %num
-  %rest = urem i64 %simulated, %num
-  %extra.bit = icmp ult i64 %k, %rest
-  %extra = zext i1 %extra.bit to i64
-  %own = add i64 %share, %extra
-  %own.32 = trunc i64 %own to i32
-  %seed.at = getelementptr i64, ptr %list, i64 %k
-  %s = load i64, ptr %seed.at
-  %to = getelementptr i32, ptr %steps, i64 %s
-  store i32 %own.32, ptr %to
-  %k.next = add i64 %k, 1
-  %last = icmp eq i64 %k.next, %num
-  br i1 %last, label %done, label %seed
 done:
   call void @release(ptr %job)
   ret void
@@ -320,9 +268,9 @@ size:
   %sized = icmp eq i64 %r.next, $num_results
   br i1 %sized, label %shapes, label %size
 shapes:
-  %active.at = getelementptr ptr, ptr %args, i64 $active_arg
-  %active = load ptr, ptr %active.at
-  %seeds = call i64 @elements(ptr %active)
+  %threads.at = getelementptr ptr, ptr %args, i64 $threads_arg
+  %threads = load ptr, ptr %threads.at
+  %seeds = call i64 @elements(ptr %threads)
   %keys.at = getelementptr ptr, ptr %args, i64 $keys_arg
   %keys = load ptr, ptr %keys.at
   %episodes = call i64 @dim_from_end(ptr %keys, i64 2)

@@ -1,9 +1,9 @@
 """The way from XLA to the player, in LLVM IR: a handler of XLA's FFI, and the threads of a job.
 
 The player defines ``@work(ptr %job)``. All threads of a job call it once; it fetches items by
-adding 1 to ``next``, atomically, until that is ``total`` or more, and before it returns it adds the
-lane steps it simulated to ``simulated``, likewise. Item k is episode k % ``episodes`` of seed
-``active``[k / ``episodes``]. All results are zero when it starts; arrays are aligned to 16 bytes.
+adding 1 to ``next``, atomically, until that is ``total`` or more. Item k is episode
+k % ``episodes`` of seed k / ``episodes``. All results are zero when it starts; arrays are aligned
+to 16 bytes.
 """
 
 from collections.abc import Sequence
@@ -21,18 +21,15 @@ FIELDS = (
     "total",  # i64: items
     "episodes",  # i64: episodes of each seed, N
     "horizon",  # i64: steps of an episode at most, T
-    "simulated",  # i64: lane steps
-    "active",  # ptr to i64: the active seeds
     "data",  # ptr to ptr: the arguments' data, then the results'
-    "num_active",  # i64: active seeds
     "bytes",  # ptr to i64: the size of each result
     "chunks",  # i64: parts in which the results are set to zero
     "chunk",  # i64: the part to be set to zero next
     "filled",  # i64: parts that are zero
 )
-_POINTERS = ("active", "data", "bytes")
+_POINTERS = ("data", "bytes")
 #: The arguments and results that mean something here.
-ACTIVE, THREADS, KEYS = 0, 1, 3
+PLAYS, THREADS, KEYS = range(3)
 REWARD, SIMULATED = 2, 5
 #: Bytes from the start of a struct to a member, in xla/ffi/api/c_api.h of major version 0.
 OFFSETS = {
@@ -63,9 +60,8 @@ def handler_text(num_args: int, result_bytes: Sequence[int], lanes: int = 1) -> 
     ``@close`` it when these have returned.
 
     Args:
-      num_args: the number of arguments: active [*B] int32, threads [*B] int32 (at most so many, 0
-        for all), the number of deterministic episodes [*B] int32, keys [*B, N, 2] uint32, and
-        the player's.
+      num_args: the number of arguments: plays [*B, N] int32 (of ``native.plays``), threads [*B]
+        int32 (at most so many, 0 for all), keys [*B, N, 2] uint32, and the player's.
       result_bytes: the bytes of an element of each result: observation [*B, T, N, O],
         action [*B, T, N, A], reward [*B, T, N], length [*B, N], broken [*B, N],
         simulated [*B] int32.
@@ -88,10 +84,8 @@ def handler_text(num_args: int, result_bytes: Sequence[int], lanes: int = 1) -> 
         "fixed_bytes": job_bytes + data_bytes + sizes_bytes,
         "lanes": lanes,
         "lanes_less_1": lanes - 1,
-        "active_arg": ACTIVE,
         "threads_arg": THREADS,
         "keys_arg": KEYS,
         "reward_ret": REWARD,
-        "simulated_data": num_args + SIMULATED,
     }
     return Template(_TEXT.read_text("utf-8")).substitute(values)

@@ -36,6 +36,7 @@ class Layout:
         broken: 1 where an episode left the finite numbers.
         seed: which seed a lane plays for.
         episode: which of its episodes.
+        counted: the steps of the episodes that it has ended.
         size: of all, in bytes.
     """
 
@@ -45,6 +46,7 @@ class Layout:
     broken: Field
     seed: Field
     episode: Field
+    counted: Field
     size: int
 
     @property
@@ -104,5 +106,5 @@ def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> Layout:
         return Field(begin, np.dtype(dtype), count)
 
     inputs = [field(x.dtype, int(np.prod(x.shape, dtype=int))) for x in leaves]
-    others = [field(np.int32, 1), field(np.int64, 1), field(np.int64, 1)]
+    others = [field(np.int32, 1), *(field(np.int64, 1) for _ in range(3))]
     return Layout(inputs, actor, state, *others, size=end)

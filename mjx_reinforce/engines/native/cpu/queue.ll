@@ -39,39 +39,52 @@ end:
   ret void
 }
 
-; Gives a lane the next episode, if there is one.
+; Gives a lane the next episode that is played, if there is one.
 define internal void @begin(ptr %job, ptr %memory, i64 %lane) {
 entry:
   %next = getelementptr inbounds %Job, ptr %job, $next
-  %number = atomicrmw add ptr %next, i64 1 monotonic
   %total.at = getelementptr inbounds %Job, ptr %job, $total
   %total = load i64, ptr %total.at
-  %some = icmp ult i64 %number, %total
-  %alive = zext i1 %some to i32
+  %data.at = getelementptr inbounds %Job, ptr %job, $data
+  %data = load ptr, ptr %data.at
+  %plays.at = getelementptr inbounds ptr, ptr %data, i64 $plays_arg
+  %plays = load ptr, ptr %plays.at
   ${alive_at}
-  store i32 %alive, ptr %alive.at
   ${seed_at}
   %old = load i64, ptr %seed.at
+  br label %fetch
+fetch:
+  %number = atomicrmw add ptr %next, i64 1 monotonic
+  %some = icmp ult i64 %number, %total
+  br i1 %some, label %look, label %none
+look:
+  %play.at = getelementptr inbounds i32, ptr %plays, i64 %number
+  %play = load i32, ptr %play.at
+  %skipped = icmp eq i32 %play, $not_played
+  br i1 %skipped, label %fetch, label %fill
+none:
+  store i32 0, ptr %alive.at
   %never = icmp eq i64 %old, -1
   %any = icmp ne i64 %total, 0
   %unset = and i1 %never, %any
-  %load = or i1 %some, %unset
-  br i1 %load, label %fill, label %end
+  br i1 %unset, label %fill, label %end
 fill:
   ; A lane without an episode has the values of one, so that it computes nothing unheard of.
-  %item = select i1 %some, i64 %number, i64 0
+  %item = phi i64 [%number, %look], [0, %none]
+  %kind = phi i32 [%play, %look], [$not_played, %none]
+  %runs = icmp ne i32 %kind, $not_played
+  %alive = zext i1 %runs to i32
+  store i32 %alive, ptr %alive.at
+  %is.mode = icmp eq i32 %kind, $mode
+  %flag = zext i1 %is.mode to i32
+  ${deterministic_at}
+  store i32 %flag, ptr %mode.lane
+  ${step_at}
+  store i32 0, ptr %step.at
   %episodes.at = getelementptr inbounds %Job, ptr %job, $episodes
   %episodes = load i64, ptr %episodes.at
-  %active.at = getelementptr inbounds %Job, ptr %job, $active
-  %active = load ptr, ptr %active.at
-  %data.at = getelementptr inbounds %Job, ptr %job, $data
-  %data = load ptr, ptr %data.at
-  %k = udiv i64 %item, %episodes
-  %chosen = getelementptr inbounds i64, ptr %active, i64 %k
-  %index = load i64, ptr %chosen
+  %index = udiv i64 %item, %episodes
   %episode = urem i64 %item, %episodes
-  %before = mul i64 %index, %episodes
-  %row = add i64 %before, %episode
   ${episode_at}
   store i64 %episode, ptr %episode.at
   store i64 %index, ptr %seed.at
@@ -82,17 +95,6 @@ $copy_actor
   br label %state
 state:
 $copy_state
-  %modes.at = getelementptr inbounds ptr, ptr %data, i64 $deterministic_arg
-  %modes = load ptr, ptr %modes.at
-  %mode.at = getelementptr inbounds i32, ptr %modes, i64 %index
-  %mode = load i32, ptr %mode.at
-  %limit = sext i32 %mode to i64
-  %below = icmp slt i64 %episode, %limit
-  %flag = zext i1 %below to i32
-  ${deterministic_at}
-  store i32 %flag, ptr %mode.lane
-  ${step_at}
-  store i32 0, ptr %step.at
   br label %end
 end:
   ret void
@@ -123,6 +125,41 @@ entry:
   %flags = load ptr, ptr %flags.at
   %flag.at = getelementptr inbounds i32, ptr %flags, i64 %row
   store i32 %broke, ptr %flag.at
+  ${counted_at}
+  %counted = load i64, ptr %counted.at
+  %own = sext i32 %steps to i64
+  %counted.next = add i64 %counted, %own
+  store i64 %counted.next, ptr %counted.at
+  call void @count(ptr %data, i64 %index, i32 %steps)
   call void @begin(ptr %job, ptr %memory, i64 %lane)
+  ret void
+}
+
+; Counts what a lane without an episode simulated for its last seed, after so many steps of all.
+define internal void @settle(ptr %job, ptr %memory, i64 %lane, i64 %iterations) {
+entry:
+  ${counted_at}
+  %counted = load i64, ptr %counted.at
+  %never = icmp eq i64 %counted, 0
+  br i1 %never, label %end, label %add
+add:
+  %waited = sub i64 %iterations, %counted
+  %steps = trunc i64 %waited to i32
+  ${seed_at}
+  %index = load i64, ptr %seed.at
+  %data.at = getelementptr inbounds %Job, ptr %job, $data
+  %data = load ptr, ptr %data.at
+  call void @count(ptr %data, i64 %index, i32 %steps)
+  br label %end
+end:
+  ret void
+}
+
+; Adds to the simulated steps of a seed.
+define internal void @count(ptr %data, i64 %index, i32 %steps) {
+  %simulated.at = getelementptr inbounds ptr, ptr %data, i64 $simulated_data
+  %simulated = load ptr, ptr %simulated.at
+  %own = getelementptr inbounds i32, ptr %simulated, i64 %index
+  %before = atomicrmw add ptr %own, i32 %steps monotonic
   ret void
 }

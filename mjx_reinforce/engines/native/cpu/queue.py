@@ -1,24 +1,26 @@
 """How a lane begins and ends an episode: LLVM IR that moves one lane's values.
 
-The episodes of all active seeds are numbered, and the job has the next number. ``@begin(job,
-memory, lane)`` gives a lane the next episode, if there is one; ``@finish``, of the same arguments,
-writes down how a lane's episode ended and then gives it the next.
+The episodes of all seeds are numbered, and the job has the next number. ``@begin(job, memory,
+lane)`` gives a lane the next episode that is played, if there is one; ``@finish``, of the same
+arguments, writes down how a lane's episode ended and then gives it the next. ``@settle(job, memory,
+lane, iterations)`` counts the steps that a lane waited for others behind its last episode.
 """
 
 from importlib.resources import files
 from string import Template
 
+from mjx_reinforce.engines.native import plays
 from mjx_reinforce.engines.native.cpu import handler
 from mjx_reinforce.engines.native.cpu.lanes import Field, Layout
 
 #: The buffers of a call: so many arguments of its own, those of the actor and the state, the
 #: results, of which so many are records of steps.
-NUM_CONTROLS, NUM_RECORDS = 4, 3
-_DETERMINISTIC, _LENGTH, _BROKEN = 2, 3, 4
+NUM_CONTROLS, NUM_RECORDS = 3, 3
+_LENGTH, _BROKEN = 3, 4
 
 
 def queue_text(places: Layout, lanes: int) -> str:
-    """Returns ``@begin`` and ``@finish`` for lanes whose values lie at ``places``."""
+    """Returns ``@begin``, ``@finish`` and ``@settle`` for lanes whose values are at ``places``."""
     actor, state = places.actor_fields, places.state_fields
     first_state = NUM_CONTROLS + len(actor)
     first_result = first_state + len(state)
@@ -30,17 +32,21 @@ def queue_text(places: Layout, lanes: int) -> str:
         "episode_at": _lane("%episode.at", places.episode),
         "step_at": _lane("%step.at", places.step),
         "broken_at": _lane("%broken.at", places.broken),
+        "counted_at": _lane("%counted.at", places.counted),
         "deterministic_at": _lane("%mode.lane", places.deterministic),
-        "deterministic_arg": str(_DETERMINISTIC),
+        "plays_arg": str(handler.PLAYS),
+        "not_played": str(plays.NOT_PLAYED),
+        "mode": str(plays.MODE),
         "length_data": str(first_result + _LENGTH),
         "broken_data": str(first_result + _BROKEN),
+        "simulated_data": str(first_result + handler.SIMULATED),
         "copy_actor": "\n".join(
             _copy(f"actor{i}", field, NUM_CONTROLS + i, "%index") for i, field in enumerate(actor)
         ),
         "copy_state": "\n".join(
             [
-                *(_copy(f"state{i}", x, first_state + i, "%row") for i, x in enumerate(state)),
-                _copy("keys", places.key, handler.KEYS, "%row"),
+                *(_copy(f"state{i}", x, first_state + i, "%item") for i, x in enumerate(state)),
+                _copy("keys", places.key, handler.KEYS, "%item"),
             ]
         ),
     }

@@ -83,13 +83,13 @@ def _register(code: Code) -> bool:
 def _play(code: Code, results: Sequence[jax.ShapeDtypeStruct], *args: Any) -> list[np.ndarray]:
     """Plays without XLA: on threads of its own, from NumPy arrays."""
     given = [np.asarray(x, order="C") for x in args]
-    active, threads, keys = (given[i] for i in (handler.ACTIVE, handler.THREADS, handler.KEYS))
-    mapped = active.shape[: active.ndim - len(results[handler.SIMULATED].shape)]
+    threads, keys = given[handler.THREADS], given[handler.KEYS]
+    mapped = threads.shape[: threads.ndim - len(results[handler.SIMULATED].shape)]
     made: list[Any] = [np.empty(mapped + x.shape, x.dtype) for x in results]
     data = (ctypes.c_void_p * (len(given) + len(made)))(*(x.ctypes.data for x in [*given, *made]))
     sizes = (ctypes.c_int64 * len(made))(*(x.nbytes for x in made))
     episodes, horizon = keys.shape[-2], made[handler.REWARD].shape[-2]
-    job = _function(code, "open", 2, 3)(data, sizes, active.size, episodes, horizon)
+    job = _function(code, "open", 2, 3)(data, sizes, threads.size, episodes, horizon)
     most = os.cpu_count() or 1
     count = min(int(threads.flat[0]) or most, most)
     with ThreadPoolExecutor(count) as pool:

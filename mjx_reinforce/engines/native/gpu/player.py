@@ -12,6 +12,7 @@ import numpy as np
 
 from mjx_reinforce.engines.native.gpu.lockstep import LONG, Lockstep, operations, some_of_block
 from mjx_reinforce.engines.native.gpu.scratch import ScratchText
+from mjx_reinforce.engines.native.plays import MODE, NOT_PLAYED
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.fused.backends.llvm import Input
 
@@ -19,7 +20,7 @@ _INT = np.dtype(np.int32)
 #: The kernel's name. Its attributes are #0.
 ENTRY = "play"
 #: What a kernel reads before the actor and the state, by name; see ``kernel_text``.
-CONTROLS = ("sizes", "active", "deterministic", "keys")
+CONTROLS = ("sizes", "plays", "keys")
 #: What it writes.
 RESULTS = ("observation", "action", "reward", "length", "broken", "simulated", "next")
 #: The arguments of a step behind the actor and the state: keys, t, deterministic.
@@ -46,15 +47,14 @@ class _Leaf(NamedTuple):
 def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
     """Returns the LLVM IR of ``@play``, without a target.
 
-    Its arguments are pointers to: sizes [3] int32 (seeds S, episodes N, steps T), active [S] int32,
-    deterministic [S] int32 (episodes whose actions are the mode), keys [S, N, 2] uint32, the leaves
-    of the actor [S, ...] and of the state [S, N, ...] that are not empty; as many again as there
-    are results, which it does not read; and the results, which are zero when it starts:
-    observation [S, T, O, N], action [S, T, A, N], reward [S, T, N], length [S, N] int32,
-    broken [S, N] int32, simulated [S] int32 and next [1] int32, the item to be fetched next; and,
-    if there are long arrays, the buffer of ``scratch.ScratchText``. Item k is episode k % N of seed
-    k / N. A thread counts the steps that it waits for others in its block as simulated for the seed
-    it played last.
+    Its arguments are pointers to: sizes [3] int32 (seeds S, episodes N, steps T), plays [S, N]
+    int32 (of ``native.plays``), keys [S, N, 2] uint32, the leaves of the actor [S, ...] and of the
+    state [S, N, ...] that are not empty; as many again as there are results, which it does not
+    read; and the results, which are zero when it starts: observation [S, T, O, N], action
+    [S, T, A, N], reward [S, T, N], length [S, N] int32, broken [S, N] int32, simulated [S] int32
+    and next [1] int32, the item to be fetched next; and, if there are long arrays, the buffer of
+    ``scratch.ScratchText``. Item k is episode k % N of seed k / N. A thread counts the steps that
+    it waits for others in its block as simulated for the seed it played last, if there is one.
 
     Args:
         step: of ``step.step_function`` where an episode is running, written out.
@@ -109,7 +109,9 @@ class _Kernel:
         self._play(running)
         text.line(f"br label %{head}")
         text.start(end)
-        self._count_steps()
+        played = text.let(f"icmp ne i32 {text.load(self.at.pointer, _INT)}, 0")
+        with text.when(played):
+            self._count_steps()
         text.line("ret void")
         pointers = [*(f"%{name}" for name in CONTROLS), *self.given["actor"], *self.given["state"]]
         unread = [f"%zero.{name}" for name in RESULTS]
@@ -122,7 +124,7 @@ class _Kernel:
         return kernel + _ATTRIBUTES.format(*blocks)
 
     def _fetch(self, items: str) -> None:
-        """Writes how a thread takes the next episode of an active seed, if there is one."""
+        """Writes how a thread takes the next episode that is played, if there is one."""
         text = self.text
         head, look, fill, end = (text.label() for _ in range(4))
         text.line(f"br label %{head}")
@@ -141,15 +143,16 @@ class _Kernel:
         text.store("0", self.limit, _INT)
         text.line(f"br label %{end}")
         text.start(look)
-        seed = text.let(f"udiv i32 {item}, {self.episodes}")
-        active = text.load(text.at("%active", _INT, self._wide(seed)), _INT)
-        text.line(f"br i1 {text.let(f'icmp ne i32 {active}, 0')}, label %{fill}, label %{head}")
+        plays = text.load(text.at("%plays", _INT, self._wide(item)), _INT)
+        is_played = text.let(f"icmp ne i32 {plays}, {NOT_PLAYED}")
+        text.line(f"br i1 {is_played}, label %{fill}, label %{head}")
         text.start(fill)
-        self._begin(item, seed, "1")
+        is_mode = text.let(f"icmp eq i32 {plays}, {MODE}")
+        self._begin(item, text.let(f"zext i1 {is_mode} to i32"), "1")
         text.line(f"br label %{end}")
         text.start(end)
 
-    def _begin(self, item: str, seed: str, running: str) -> None:
+    def _begin(self, item: str, mode: str, running: str) -> None:
         """Writes how a thread begins an episode."""
         text = self.text
         place = self._wide(item)
@@ -158,9 +161,6 @@ class _Kernel:
         ):
             self._copy(given, place, leaf, leaf.count)
         self._copy("%keys", place, self.keys, 2)
-        episode = text.let(f"urem i32 {item}, {self.episodes}")
-        modes = text.load(text.at("%deterministic", _INT, self._wide(seed)), _INT)
-        mode = text.let(f"zext i1 {text.let(f'icmp slt i32 {episode}, {modes}')} to i32")
         for value, where in (
             (mode, self.mode.pointer),
             ("0", self.at.pointer),

@@ -98,7 +98,7 @@ def launch(
       kernel: of ``player.kernel_text``.
       record: shape and dtype of the observation, the action and the reward of a step.
       horizon: T, the steps of an episode at most.
-      args: active [], deterministic [], keys [N, 2], and the leaves of actor and state [N, ...].
+      args: plays [N], keys [N, 2], and the leaves of the actor [...] and of the state [N, ...].
 
     Returns:
       What the kernel does, without the seeds' axis.
@@ -123,8 +123,7 @@ def launch(
 def _launch(
     kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: Any
 ) -> Sequence[jax.Array]:
-    keys = args[2]
-    seeds, episodes = keys.shape[:2]
+    seeds, episodes = args[0].shape
     shape = jax.ShapeDtypeStruct
     observation, action, reward = (
         shape((seeds, horizon, int(np.prod(x.shape, dtype=int)), episodes), x.dtype) for x in record
