@@ -166,12 +166,13 @@ def train(
     with Progress(*columns, MofNCompleteColumn(), TimeElapsedColumn()) as progress:
         bar = progress.add_task(label, total=config.max_updates)
         for _ in range(-(-config.max_updates // config.eval_every)):
-            state, metrics = programs.advance(state)
+            state, metrics, _ = programs.advance(state, False)
             active = np.asarray(metrics["active"])
             env_steps += int(np.sum(np.asarray(metrics["env_steps"]), where=active))
-            evaluated = score == "eval_return"
-            new = programs.evaluate(state)[score][None] if evaluated else np.asarray(metrics[score])
-            scores.append(new)
+            if score == "eval_return":
+                scores.append(programs.evaluate(state).measured[score][None])
+            else:
+                scores.append(np.asarray(metrics[score]))
             progress.update(bar, completed=min(len(scores) * config.eval_every, config.max_updates))
     seconds = time.perf_counter() - compiled
     times = {"compile_seconds": compiled - started, "run_seconds": seconds, "env_steps": env_steps}

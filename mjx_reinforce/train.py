@@ -260,18 +260,20 @@ def _begin(session: Any, found: Any, num_processes: int) -> None:
 def _loop(session: Any, interrupt: Interrupt) -> None:
     """Trains until the budget is used or nothing is finite, or a signal came.
 
-    A block that was interrupted is not evaluated, which may take minutes: the resumed run begins
-    with that.
+    Policies are evaluated with the updates that follow; where their returns decide whether any do,
+    before. A block that was interrupted is not evaluated, which may take minutes: the resumed run
+    does that.
     """
-    while True:
-        if not session.record.evaluated():
+    record = session.record
+    while interrupt.number is None:
+        if session.config.stop_when_solved and not record.evaluated():
             session.evaluate()
-            session.save_if_due()
-        if session.record.finished() or session.record.hopeless() or interrupt.number is not None:
-            return
+        if record.finished() or record.hopeless():
+            break
         session.advance()
-        if interrupt.number is not None:
-            return
+        session.save_if_due()
+    if not record.evaluated() and (interrupt.number is None or not record.begun()):
+        session.evaluate()
 
 
 def _finish(

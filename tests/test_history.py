@@ -29,7 +29,16 @@ def filled():
 def test_runs_that_are_not_moved_repeat_their_last():
     history = filled()
     assert history.curves()["eval_return"].tolist() == [[1, 2, 3, 4], [1, 8, 3, 7], [1, 9, 3, 7]]
-    assert history.curves()["env_steps"].tolist() == [[0] * 4, [0, 50, 0, 130], [0, 60, 0, 130]]
+    assert history.curves()["env_steps"].tolist() == [[0] * 4, [0] * 4, [0, 50, 0, 0]]
+    assert not history.evaluated()
+    last = measured([0, 1, 2, 3], eval_return=[5, 6, 7, 8], eval_steps=[1, 2, 3, 4])
+    history.keep([last], 2.0)
+    assert history.curves()["env_steps"][-1].tolist() == [0, 60, 0, 130]
+    assert history.evaluated()
+
+
+def test_measurements_add_up():
+    history = filled()
     assert history.now["eval_steps"].tolist() == [10, 7, 30, 5]
     assert history.now["nonfinite"].tolist() == [0, 2, 0, 1]
     assert history.training().tolist() == [True, True, True, False]
@@ -46,9 +55,8 @@ def test_used_is_the_mean_share_of_all_budgets():
 
 def test_a_history_is_restored():
     history, copy = filled(), History(CONFIG)
-    assert not copy.begun()
+    assert not copy.evaluated()
     copy.restore({name: x.copy() for name, x in history.arrays().items()})
-    assert copy.begun()
     for each in (history, copy):
         each.keep([measured([0], eval_return=[5], updates=[9], env_steps=[99])], 2.0)
     one, other = history.arrays(), copy.arrays()

@@ -34,6 +34,7 @@ from mjx_reinforce.runs.files import locked
 from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.record import Record
 from mjx_reinforce.runs.session import Session
+from mjx_reinforce.runs.state import Looked
 from trainings import results
 
 SIZE = ["--num-seeds", "3", "--eval-episodes", "2", "--hidden-sizes", "4"]
@@ -441,7 +442,9 @@ def test_ties_go_to_the_later_and_nan_is_never_best():
     nan = np.nan
     best = first_best(state(0))
     for updates, returns in ((0, [1, 2, nan]), (5, [1, 1, 3]), (10, [0, 2, nan])):
-        best = keep_best(best, state(updates), np.array(returns, np.float32))
+        now = state(updates)
+        measured = {"eval_return": np.array(returns, np.float32)}
+        best = keep_best(best, Looked(jax.device_get(now.actor), now.num_updates, measured))
     assert counts.to_int(best.num_updates).tolist() == [5, 10, 5]
     np.testing.assert_array_equal(best.actor.params["w"][:, 0], [5, 10, 5])
     np.testing.assert_array_equal(best.eval_return, [1, 2, 3])

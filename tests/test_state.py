@@ -9,9 +9,11 @@ import pytest
 from toys import Toy
 
 from mjx_reinforce import envs
+from mjx_reinforce.learners import counts
 from mjx_reinforce.reports.statistics.aggregates import interval
 from mjx_reinforce.runs import ready
 from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.keys import plain, with_keys
 from mjx_reinforce.runs.state import compile_parts
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
@@ -25,9 +27,9 @@ def test_they_have_run_once_without_an_update():
         program = prepared.parts.advance()
 
         def counted(*arguments):
-            leaves, count, metrics = program(*arguments)
-            jax.debug.callback(lambda x: made.append(int(x)), count)
-            return leaves, count, metrics
+            leaves, block, present = program(*arguments)
+            jax.debug.callback(lambda x: made.append(int(x)), block[0])
+            return leaves, block, present
 
         return counted
 
@@ -35,10 +37,51 @@ def test_they_have_run_once_without_an_update():
     state, programs = compile_parts(parts, CONFIG)
     jax.effects_barrier()
     assert made == [0]
-    assert not state.env_steps.any()
-    programs.advance(state)
+    assert not state.train_states.env_steps.any()
+    programs.advance(state, True)
     jax.effects_barrier()
     assert made[1] > 0
+
+
+def test_evaluations_ride_with_the_updates_that_follow():
+    """They measure the policies before these, and leave what is trained as it is, to the bit."""
+    prepared = ready.made(envs.make(CONFIG.env), CONFIG)
+    assert prepared.engine == "native"
+    assert prepared.parts.rides
+    first, programs = compile_parts(prepared.parts, CONFIG)
+    kept = jax.tree.map(np.asarray, plain(first))
+
+    def again():
+        return with_keys(jax.tree.map(jnp.array, kept), first)
+
+    alone = programs.evaluate(again())
+    one, metrics, looked = programs.advance(again(), True)
+    other, same, none = programs.advance(again(), False)
+    assert none is None
+    assert np.all(metrics.pop("simulated_steps")[0] > same.pop("simulated_steps")[0])
+    for tree, like in ((looked.actor, alone.actor), (plain(one), plain(other)), (metrics, same)):
+        jax.tree.map(np.testing.assert_array_equal, tree, like)
+    for name in ("eval_return", "eval_return_stochastic", "eval_length", "eval_steps"):
+        np.testing.assert_array_equal(looked.measured[name], alone.measured[name])
+    assert looked.num_updates.tolist() == [[0, 0]] * 2
+    made = metrics["active"].sum(axis=0)
+    assert counts.to_int(one.train_states.num_updates).tolist() == made.tolist()
+
+
+def test_runs_count_beyond_32_bits():
+    """A budget that ends two updates beyond 2^32 env steps, and half of its schedules."""
+    config = dataclasses.replace(CONFIG, env_steps=2**32 + 200, eval_every=50)
+    state, programs = compile_parts(ready.made(envs.make(config.env), config).parts, config)
+    played = jnp.tile(jnp.asarray(counts.from_int(2**32 - 50)), (2, 1))
+    train_states = dataclasses.replace(state.train_states, env_steps=played)
+    state, metrics, _ = programs.advance(
+        dataclasses.replace(state, train_states=train_states), True
+    )
+    total = 2**32 - 50 + metrics["env_steps"].sum(axis=0)
+    assert counts.to_int(state.train_states.env_steps).tolist() == total.tolist()
+    last = metrics["env_steps"][metrics["active"].sum(axis=0) - 1, [0, 1]]
+    assert np.all((total >= 2**32 + 200) & (total - last < 2**32 + 200))
+    np.testing.assert_allclose(state.train_states.progress, 1, atol=1e-6)
 
 
 class Luck(Toy):
@@ -62,9 +105,9 @@ def measure(monkeypatch):
     def measure(**changes):
         config = dataclasses.replace(LUCK, **changes)
         state, programs = compile_parts(ready.made(envs.make(config.env), config).parts, config)
-        first = programs.evaluate(state)
-        state = programs.advance(state)[0]
-        return first, programs.evaluate(state), programs.test(state.train_states.actor)
+        state, _, first = programs.advance(state, True)
+        later = programs.evaluate(state).measured
+        return first.measured, later, programs.test(state.train_states.actor)
 
     return measure
 

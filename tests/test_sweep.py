@@ -468,9 +468,9 @@ def test_programs_have_run_once_for_no_run_before_they_train(run, monkeypatch):
         advance = block_of_updates(*arguments)
 
         def counted(*arguments):
-            state, (count, metrics) = advance(*arguments)
-            jax.debug.callback(lambda x: made.append(int(x)), count)
-            return state, (count, metrics)
+            state, block = advance(*arguments)
+            jax.debug.callback(lambda x: made.append(int(x)), block.made)
+            return state, block
 
         return counted
 

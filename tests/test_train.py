@@ -154,10 +154,12 @@ def test_the_saved_policy_plays_like_the_trained_one(run, tmp_path):
         (["--horizon", "0"], "--horizon must be at least 1"),
         (["--env-steps", "None"], "nothing would end this run"),
         (["--max-updates", "0"], "--max-updates must be at least 1, got 0"),
-        (["--max-updates", str(2**31)], "--max-updates must be less than 2^31, got 2147483648"),
+        (["--max-updates", str(2**53 + 1)], "--max-updates must be at most 2^53"),
+        (["--env-steps", str(2**53 + 1)], "--env-steps must be at most 2^53"),
+        (["--horizon", str(2**31)], "--horizon must be less than 2^31, got 2147483648"),
         (
             [
-                *("--num-episodes", "16", "--env-steps", "None", "--max-updates", "134218"),
+                *("--num-episodes", "16", "--env-steps", "None", "--max-updates", str(2**50)),
                 *("--output", "out"),
             ],
             "give --env-steps, or lower",

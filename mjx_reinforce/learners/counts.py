@@ -7,13 +7,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+Count = jax.Array | np.ndarray
+
 
 def from_int(number: int) -> np.ndarray:
     """Returns a whole number from 0 to 2^53 as a count [2]."""
     return np.array(divmod(number, 2**32), np.uint32)
 
 
-def to_int(count: jax.Array | np.ndarray) -> np.ndarray:
+def to_int(count: Count) -> np.ndarray:
     """Returns counts [..., 2] as int64 [...] on the host."""
     words = np.asarray(count).astype(np.int64)
     return words[..., 0] * 2**32 + words[..., 1]
@@ -24,18 +26,19 @@ def zero() -> jax.Array:
     return jnp.zeros(2, jnp.uint32)
 
 
-def plus(count: jax.Array, number: int | jax.Array) -> jax.Array:
+def plus(count: Count, number: int | jax.Array) -> jax.Array:
     """Returns a count [2], a whole number [] from 0 to 2^32 - 1 later."""
     low = count[1] + jnp.asarray(number).astype(jnp.uint32)
     return jnp.stack([count[0] + (low < count[1]), low])
 
 
-def reached(count: jax.Array, limit: jax.Array) -> jax.Array:
+def reached(count: Count, limit: Count) -> jax.Array:
     """Returns whether [...] counts [..., 2] are at a limit [2] or beyond."""
-    high, low = count[..., 0], count[..., 1]
+    high, low = jnp.asarray(count[..., 0]), jnp.asarray(count[..., 1])
     return (high > limit[0]) | ((high == limit[0]) & (low >= limit[1]))
 
 
-def number(count: jax.Array) -> jax.Array:
+def number(count: Count) -> jax.Array:
     """Returns counts [..., 2] as the nearest float [...]."""
-    return count[..., 0].astype(float) * 2.0**32 + count[..., 1].astype(float)
+    words = jnp.asarray(count).astype(float)
+    return words[..., 0] * 2.0**32 + words[..., 1]

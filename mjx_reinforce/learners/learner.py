@@ -50,12 +50,46 @@ class TrainState:
         return f"TrainState({self.actor!r}{seeds})"
 
 
+class Guests(NamedTuple):
+    """E episodes that are played in one go with those of an update, and from which nothing learns.
+
+    keys: [E] their own keys, as ``engines.episode.episode_keys`` makes them
+    num_modes: how many of them, the first, take the policy's mode; the others its samples
+    active: [] whether they are played
+    """
+
+    keys: jax.Array
+    num_modes: int
+    active: jax.Array
+
+    def deterministic(self) -> jax.Array:
+        """Returns which of them [E] take the mode."""
+        return jnp.arange(len(self.keys)) < self.num_modes
+
+
+class Host(NamedTuple):
+    """A ``Learner.play`` that can take guests.
+
+    alone: as ``Learner.play``
+    with_guests: (TrainState, key, active, ``Guests``) -> what ``alone`` returns, and the
+      ``Trajectory`` of the guests
+    """
+
+    alone: Callable[[TrainState, jax.Array, Any], Any]
+    with_guests: Callable[[TrainState, jax.Array, Any, Guests], tuple[Any, Trajectory]]
+
+    def __call__(self, state: TrainState, key: jax.Array, active: Any = True) -> Any:
+        """Plays without guests."""
+        return self.alone(state, key, active)
+
+
 class Learner(NamedTuple):
     """How a policy learns on one environment; any part may be replaced with ``_replace``.
 
     init: (key) -> TrainState; consumes the key
     play: (TrainState, key, active) -> what is played for one update, a ``Trajectory`` of N fresh
-      episodes or a pytree that holds one; nothing where ``active`` [] is False; consumes the key
+      episodes or a pytree that holds one; nothing where ``active`` [] is False; consumes the key.
+      A ``Host`` where guests do not make the others wait
     learn: (TrainState, what was played, key) -> (TrainState, metrics), with the actor and all else
       that changes by learning; consumes the key
     policy: the policy that is trained
@@ -80,8 +114,18 @@ class Learner(NamedTuple):
           state: from ``init`` or the step before.
           active: [] where False nothing is played and the state stays.
         """
+        after, metrics, _ = self.step_with(state, active, None)
+        return after, metrics
+
+    def step_with(
+        self, state: TrainState, active: bool | jax.Array, guests: Guests | None
+    ) -> tuple[TrainState, Metrics, Trajectory | None]:
+        """Makes one update as ``step``; also returns the episodes of guests, if there are any."""
         key, play_key, learn_key = jax.random.split(state.key, 3)
-        played = self.play(state, play_key, active)
+        if guests is not None and isinstance(self.play, Host):
+            played, looked = self.play.with_guests(state, play_key, active, guests)
+        else:
+            played, looked = self.play(state, play_key, active), None
         learned, metrics = self.learn(state, played, learn_key)
         after = dataclasses.replace(
             learned,
@@ -91,7 +135,7 @@ class Learner(NamedTuple):
         )
         if active is not True:
             after = jax.tree.map(lambda new, old: jnp.where(active, new, old), after, state)
-        return after, metrics
+        return after, metrics, looked
 
     def act(self, actor: Actor, observation: jax.Array) -> jax.Array:
         """Returns the outputs [..., K] of the policy's distribution; see ``policies.actor.act``."""

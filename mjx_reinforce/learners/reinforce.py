@@ -14,6 +14,7 @@ from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.contract import check_environment
+from mjx_reinforce.engines.episode import episode_keys
 from mjx_reinforce.fused import any_lane
 from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.contract import check_estimator, check_optimizer, check_update
@@ -25,6 +26,8 @@ from mjx_reinforce.learners.diagnostics import (
 )
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.learners.learner import (
+    Guests,
+    Host,
     Learner,
     Metrics,
     TrainState,
@@ -146,12 +149,12 @@ def reinforce(
     check_update(update)
     if estimator is None:
         estimator = standardize(leave_one_out(), floor=10.0)
-    changes = callable(estimator)  # an ``Estimator`` is not
-    check_estimator(estimator(jnp.zeros(())) if changes else estimator, env, size, num_episodes)
+    estimator_at = _at(estimator)
+    check_estimator(estimator_at(jnp.zeros(())), env, size, num_episodes)
     return _Reinforce(
         env=env,
         policy=policy,
-        estimator=estimator if changes else lambda progress: estimator,
+        estimator=estimator_at,
         optimizer=optimizer,
         update=update,
         num_episodes=num_episodes,
@@ -165,6 +168,13 @@ def reinforce(
         num_seeds=num_seeds,
         observation_size=size,
     ).learner(engine)
+
+
+def _at(
+    estimator: Estimator | Callable[[jax.Array], Estimator],
+) -> Callable[[jax.Array], Estimator]:
+    """Returns a function from the progress [] to an estimator."""
+    return estimator if callable(estimator) else lambda progress: estimator
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -196,7 +206,10 @@ class _Reinforce:
         actor = jax.eval_shape(self._first_actor, jax.random.key(0))
         player = choice.Player(self._act, actor, self.policy.distribution)
         chosen = choice.choose(engine, self.env, player, self.horizon)
-        play = functools.partial(self._play, chosen)
+        play: Any = functools.partial(self._play, chosen)
+        if chosen.name == "native" and not self.one_start:
+            # Elsewhere an episode that is not played takes its place all the same.
+            play = Host(play, functools.partial(self._play_with, chosen))
         return Learner(self._init, play, self._learn, self.policy, chosen)
 
     def _act(self, actor: Actor, observation: jax.Array) -> jax.Array:
@@ -239,6 +252,24 @@ class _Reinforce:
             horizon=self.horizon,
             active=active,
         )
+
+    def _play_with(
+        self, engine: Engine, state: TrainState, key: jax.Array, active: Any, guests: Guests
+    ) -> tuple[Trajectory, Trajectory]:
+        """Plays as ``_play``, with guests before its own episodes."""
+        count, own = len(guests.keys), jnp.zeros(self.num_episodes, bool)
+        played = engine.rollout(
+            self.env,
+            self._act,
+            state.actor,
+            self.policy.distribution,
+            jnp.concatenate([guests.keys, episode_keys(key, self.num_episodes)]),
+            num_episodes=count + self.num_episodes,
+            horizon=self.horizon,
+            deterministic=jnp.concatenate([guests.deterministic(), own]),
+            active=jnp.concatenate([jnp.broadcast_to(guests.active, count), own | active]),
+        )
+        return played.episodes(slice(count, None)), played.episodes(slice(count))
 
     def _learn(
         self, state: TrainState, trajectory: Trajectory, key: jax.Array

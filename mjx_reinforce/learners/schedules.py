@@ -54,9 +54,9 @@ def decay_rate(
       env_steps: over which it falls; None: over the budget.
     """
 
-    def update(updates, state, params=None, *, clock: Clock, **_: Any):
+    def update(updates, state, params=None, **rollout: Any):
         del params
-        factor = 1 + (least - 1) * share(clock, env_steps)
+        factor = 1 + (least - 1) * share(rollout["clock"], env_steps)
         return jax.tree.map(lambda x: factor * x, updates), state
 
     return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)
@@ -76,9 +76,9 @@ def shrink_std(
       env_steps: over which it shrinks; None: over the budget.
     """
 
-    def update(updates, state, params=None, *, clock: Clock, **_: Any):
+    def update(updates, state, params=None, **rollout: Any):
         del params
-        now = jnp.floor(share(clock, env_steps) * _STEPS) / _STEPS
+        now = jnp.floor(share(rollout["clock"], env_steps) * _STEPS) / _STEPS
         change = (now - state.share) * jnp.log(ratio)
         return updates | {"constants": updates["constants"] + change}, Shrunk(now)
 

@@ -9,6 +9,7 @@ from flax import struct
 
 from mjx_reinforce.learners.learner import TrainState
 from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.runs.state import Looked
 
 
 @struct.dataclass(kw_only=True)
@@ -40,16 +41,17 @@ def first_best(train_states: TrainState) -> Best:
     return Best(actor=actor, eval_return=worst, num_updates=num_updates)
 
 
-def keep_best(best: Best, train_states: TrainState, eval_return: np.ndarray) -> Best:
+def keep_best(best: Best, looked: Looked) -> Best:
     """Takes in an evaluation; of two that are equal, the later is the better.
 
     Args:
       best: so far.
-      train_states: [S, ...] whose actors were evaluated; they are copied.
-      eval_return: [S]; one that is not a number is never the best.
+      looked: the evaluation; a return that is not a number is never the best.
     """
-    actor, num_updates = jax.device_get((train_states.actor, train_states.num_updates))
-    present = Best(actor=actor, eval_return=eval_return, num_updates=num_updates)
+    eval_return = looked.measured["eval_return"]
+    present = Best(
+        actor=looked.actor, eval_return=eval_return, num_updates=np.asarray(looked.num_updates)
+    )
     better = eval_return >= np.asarray(best.eval_return)
 
     def choose(new: np.ndarray, old: Any) -> np.ndarray:

@@ -76,7 +76,7 @@ def keep(key: str, facts: dict[str, Any], parts: Parts) -> Parts:
       parts: its programs.
     """
     try:
-        whole = {"facts": facts, "like": describe(parts.like)}
+        whole = {"facts": facts, "like": describe(parts.like), "rides": parts.rides}
     except TypeError:
         return parts
     _write(key, "facts", json.dumps(whole).encode())
@@ -84,7 +84,7 @@ def keep(key: str, facts: dict[str, Any], parts: Parts) -> Parts:
     seed, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), (2,)))
     given = {
         "start": (seed, seed),
-        "advance": (shapes, (count, count)),
+        "advance": (shapes, (count, count), jax.ShapeDtypeStruct((), bool)),
         "look": (actor, eval_keys_shape(parts.like)),
     }
     return parts._replace(
@@ -103,7 +103,7 @@ def read(key: str) -> tuple[dict[str, Any], Parts] | None:
         return None
     whole = json.loads(found["facts"])
     programs = {name: functools.partial(_program, found[name]) for name in _NAMES}
-    return whole["facts"], Parts(like=rebuild(whole["like"]), **programs)
+    return whole["facts"], Parts(rebuild(whole["like"]), **programs, rides=whole["rides"])
 
 
 def _program(content: bytes) -> Callable[..., Any]:

@@ -155,12 +155,22 @@ class Record:
         last = self._tables["evaluations"].latest(1)
         return bool(last) and np.array_equal(last["updates"][0], self.updates)
 
+    def begun(self) -> bool:
+        """Returns whether there is an evaluation."""
+        return bool(self._tables["evaluations"].latest(1))
+
     def finished(self) -> bool:
-        """Returns whether the budget is used, or all seeds are solved and that was to end it."""
+        """Returns whether the budget is used, or all seeds are solved and that was to end it.
+
+        Raises:
+          KeyError: solved seeds were to end it, and there is no evaluation.
+        """
+        if self._used(self.env_steps, self.updates).min() >= 1.0:
+            return True
+        if not self._config.stop_when_solved or self.threshold is None:
+            return False
         last = self._tables["evaluations"].latest(1, "eval_return")["eval_return"]
-        solved = self.threshold is not None and np.all(last >= self.threshold)
-        used = self._used(self.env_steps, self.updates)
-        return bool(used.min() >= 1.0 or (self._config.stop_when_solved and solved))
+        return bool(np.all(last >= self.threshold))
 
     def hopeless(self) -> bool:
         """Returns whether all seeds that still train were broken throughout a block of updates."""

@@ -13,7 +13,7 @@ from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.record import Record
 from mjx_reinforce.runs.resume import recordable
 from mjx_reinforce.runs.sinks.sink import Queue
-from mjx_reinforce.runs.state import Programs, RunState
+from mjx_reinforce.runs.state import Looked, Programs, RunState
 
 #: Between checkpoints, where the user has not said how many updates.
 _CHECKPOINT_SECONDS = 60.0
@@ -56,6 +56,8 @@ class Session:
         self.state, self.best = state, best
         self._began = self._saved_at = time.perf_counter()
         self._saved_updates = 0
+        #: Wall time at which the present policies were there (s).
+        self._reached = 0.0
         #: Whether the newest checkpoint is of the present state.
         self.saved = False
         self._failing: set[str] = set()
@@ -70,24 +72,31 @@ class Session:
         self.record.restore(found.record)
         self._began = time.perf_counter() - found.seconds
         self._saved_updates, self.saved = self._updates(), True
+        self._reached = found.seconds
 
     def seconds(self) -> float:
         """Returns the wall time since the run began, without that of compiling."""
         return time.perf_counter() - self._began
 
     def advance(self) -> None:
-        """Makes a block of updates."""
-        self.state, metrics = self.programs.advance(self.state)
+        """Evaluates the present policies unless they were, and makes a block of updates."""
+        look = not self.record.evaluated()
+        self.state, metrics, looked = self.programs.advance(self.state, look)
+        if looked is not None:
+            self._take(looked)
         self.saved = False
         met = self.record.add_updates(metrics)
+        self._reached = self.seconds()
         self.display.show_nonfinite(met, self.config.num_seeds)
 
     def evaluate(self) -> None:
-        """Evaluates the present policies, writes the rows, and keeps the best."""
-        result = self.programs.evaluate(self.state)
-        self.best = keep_best(self.best, self.state.train_states, result["eval_return"])
-        seconds = self.seconds()
-        rows = self.record.add_evaluation(result, seconds)
+        """Evaluates the present policies."""
+        self._take(self.programs.evaluate(self.state))
+
+    def _take(self, looked: Looked) -> None:
+        """Writes the rows of an evaluation of the policies at hand, and keeps the best."""
+        self.best = keep_best(self.best, looked)
+        rows = self.record.add_evaluation(looked.measured, self._reached)
         self._attempt("metrics.csv", lambda: self.log.add_rows(rows))
         for sink in self.sinks:
             self._attempt(sink.name, functools.partial(sink.write, rows))

@@ -16,7 +16,7 @@ import numpy as np
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.runs.keys import plain
 from mjx_reinforce.runs.processes import Processes
-from mjx_reinforce.runs.state import Arrays, Programs, RunState, restored
+from mjx_reinforce.runs.state import Arrays, Looked, Programs, RunState, restored
 
 #: What a process is asked for, besides the names of ``Programs``.
 _END = "end"
@@ -51,13 +51,16 @@ def lead(
         processes.tell(*(_encode(name, part) for part in parts[1:]))
         return gathered(_answer(name, parts[0], programs, like))
 
-    def advance(before: RunState) -> tuple[RunState, Arrays]:
-        answers = ask("advance", before)
-        states, metrics = ([_part(x, group) for x in answers] for group in ("state", "metrics"))
-        return _state(_together(states), like), _together_in_time(metrics)
+    def advance(before: RunState, look: bool) -> tuple[RunState, Arrays, Looked | None]:
+        answers = ask("look and advance" if look else "advance", before)
+        states, metrics, looked = (
+            [_part(x, group) for x in answers] for group in ("state", "metrics", "looked")
+        )
+        evaluation = _looked(before, _together(looked)) if look else None
+        return _state(_together(states), like), _together_in_time(metrics), evaluation
 
-    def evaluate(present: RunState) -> Arrays:
-        return _together(ask("evaluate", present))
+    def evaluate(present: RunState) -> Looked:
+        return _looked(present, _together(ask("evaluate", present)))
 
     def test(actor: Actor) -> Arrays:
         return _together(ask("test", actor))
@@ -94,13 +97,20 @@ def _answer(name: str, given: Arrays, programs: Programs, like: RunState) -> Arr
     """Returns what a program makes of the leaves that it is given."""
     # In memory of the device's own, which may be donated.
     leaves = [jnp.array(given[str(i)]) for i in range(len(given))]
-    if name == "advance":
-        state, metrics = programs.advance(restored(leaves, like))
-        moved = {f"state/{k}": x for k, x in _leaves(state).items()}
-        return moved | {f"metrics/{k}": x for k, x in metrics.items()}
+    if name in ("advance", "look and advance"):
+        state, metrics, looked = programs.advance(restored(leaves, like), name != "advance")
+        measured = {} if looked is None else looked.measured
+        groups = {"state": _leaves(state), "metrics": metrics, "looked": measured}
+        return {f"{group}/{k}": x for group, arrays in groups.items() for k, x in arrays.items()}
     if name == "evaluate":
-        return programs.evaluate(restored(leaves, like))
+        return programs.evaluate(restored(leaves, like)).measured
     return programs.test(jax.tree.unflatten(jax.tree.structure(like.train_states.actor), leaves))
+
+
+def _looked(state: RunState, measured: Arrays) -> Looked:
+    """Returns an evaluation of states on the host."""
+    actor, num_updates = jax.device_get((state.train_states.actor, state.train_states.num_updates))
+    return Looked(actor, num_updates, measured)
 
 
 def _state(leaves: Arrays, like: RunState) -> RunState:

@@ -13,11 +13,11 @@ from flax import struct
 from jax import lax
 
 from mjx_reinforce.learners import counts
-from mjx_reinforce.learners.learner import Learner, TrainState
+from mjx_reinforce.learners.learner import Guests, Host, Learner, TrainState
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.runs.blocks import block_length
 from mjx_reinforce.runs.config import MAX_COUNT, Config
-from mjx_reinforce.runs.evaluation import evaluate
+from mjx_reinforce.runs.evaluation import evaluate, guests_of, measure
 from mjx_reinforce.runs.keys import plain, with_keys
 from mjx_reinforce.types import Environment
 
@@ -60,31 +60,47 @@ class Parts(NamedTuple):
     like: the shapes of a ``RunState``
     start: (seed, eval_seed) -> the first state's leaves, and the data of the keys [K, S] of the
       last test, which plays the episodes of K evaluations
-    advance: (leaves, (env_steps, updates) as in ``Budget``) -> leaves, how many updates were made,
-      metrics; as ``block_of_updates``
+    advance: (leaves, (env_steps, updates) as in ``Budget``, whether to evaluate []) -> as
+      ``block_of_updates``, with the leaves of states and of actors
     look: (leaves of the actors, data of the keys [S]) -> as ``evaluation``
+    rides: whether ``advance`` evaluates; else ``look`` does, before it
     """
 
     like: RunState
     start: Callable[[], Callable[..., Any]]
     advance: Callable[[], Callable[..., Any]]
     look: Callable[[], Callable[..., Any]]
+    rides: bool
+
+
+class Looked(NamedTuple):
+    """An evaluation of the policies of all seeds.
+
+    actor: [S, ...] the policies
+    num_updates: [S, 2] how many updates had made them
+    measured: [S] each, what ``evaluation.evaluate`` returns
+    """
+
+    actor: Actor
+    num_updates: Any
+    measured: Arrays
 
 
 class Programs(NamedTuple):
     """The compiled programs of a run, over all seeds at once.
 
-    advance: (RunState) -> (RunState, metrics [K, S]), ``eval_every`` updates later, or where all
-      budgets are used; a seed whose budget is used earlier stands still. The memory of its
-      argument is used again. To the metrics of ``Learner.step`` it adds ``active``, False for a
-      seed that stood still
-    evaluate: (RunState) -> [S] each, what ``evaluation.evaluate`` returns for every seed
+    advance: (RunState, whether to evaluate it) -> (RunState, metrics [K, S], ``Looked`` or None),
+      ``eval_every`` updates later, or where all budgets are used. The evaluation is that of the
+      policies before these updates, and costs next to nothing where it rides with them. A seed
+      whose budget is used earlier stands still. The memory of the argument is used again. To the
+      metrics of ``Learner.step`` it adds ``active``, False for a seed that stood still
+    evaluate: (RunState) -> ``Looked``, of its policies
     test: (Actor [S, ...]) -> the same on ``test_episodes`` start states (rounded up to whole
       evaluations) that nothing else is played on
     """
 
-    advance: Callable[[RunState], tuple[RunState, Arrays]]
-    evaluate: Callable[[RunState], Arrays]
+    advance: Callable[[RunState, bool], tuple[RunState, Arrays, Looked | None]]
+    evaluate: Callable[[RunState], Looked]
     test: Callable[[Actor], Arrays]
 
 
@@ -143,7 +159,9 @@ def parts_of(
         state = beginning(lambda _: learner)(*(keys[share] for keys in roots), {})
         return state, _test_keys(eval_seed, config)[:, share]
 
-    updates = block_of_updates(lambda _: learner, block_length(config))
+    rides = isinstance(learner.play, Host)
+    visit = evaluation_guests(config) if rides else None
+    updates = block_of_updates(lambda _: learner, block_length(config), visit)
     evaluate = evaluation(env, learner, horizon, config)
     like = jax.eval_shape(first, np.uint32(0), np.uint32(0))[0]
 
@@ -151,15 +169,17 @@ def parts_of(
         state, test_keys = plain(first(seed, eval_seed))
         return jax.tree.leaves(state), test_keys
 
-    def advance(leaves: list[jax.Array], budget: tuple[jax.Array, jax.Array]) -> Any:
-        state, measured = updates(restored(leaves, like), Budget(*budget))
-        return jax.tree.leaves(plain(state)), *measured
+    def advance(leaves: list[jax.Array], budget: tuple[jax.Array, jax.Array], look: Any) -> Any:
+        before = restored(leaves, like)
+        state, block = updates(before, Budget(*budget), look)
+        present = before.train_states.actor, before.train_states.num_updates
+        return jax.tree.leaves(plain(state)), tuple(block), jax.tree.leaves(present)
 
     def look(leaves: list[jax.Array], keys: jax.Array) -> dict[str, jax.Array]:
         actor = restored(leaves, like.train_states.actor)
         return evaluate(actor, jax.random.wrap_key_data(keys))
 
-    return Parts(like, lambda: start, lambda: advance, lambda: look)
+    return Parts(like, lambda: start, lambda: advance, lambda: look, rides)
 
 
 def compile_parts(
@@ -178,9 +198,9 @@ def compile_parts(
         leaves, test_keys = parts.start()(*seeds)
         return restored(leaves, like), test_keys
 
-    def advance(state: RunState, budget: Budget) -> Any:
-        leaves, made, metrics = parts.advance()(jax.tree.leaves(plain(state)), tuple(budget))
-        return restored(leaves, like), made, metrics
+    def advance(state: RunState, budget: Budget, look: Any) -> Any:
+        leaves, block, present = parts.advance()(jax.tree.leaves(plain(state)), tuple(budget), look)
+        return restored(leaves, like), Block(*block), present
 
     def look(actor: Actor, keys: jax.Array) -> dict[str, jax.Array]:
         return parts.look()(jax.tree.leaves(actor), keys)
@@ -189,20 +209,29 @@ def compile_parts(
     with ThreadPoolExecutor() as pool:  # one compiles while the next is traced
         starting = pool.submit(jax.jit(start), *seeds)
         looking = pool.submit(jax.jit(look).lower(like.train_states.actor, keys).compile)
-        traced = jax.jit(advance, donate_argnums=0).lower(like, budget)
+        traced = jax.jit(advance, donate_argnums=0).lower(like, budget, np.bool_(False))
         meanwhile()
         advancing = traced.compile()
         compiled, (first, test_keys) = looking.result(), starting.result()
     # No update: a GPU's driver translates a program's kernel, also the evaluation's, at first use.
     nothing = Budget(counts.from_int(0), counts.from_int(0))
-    first = jax.block_until_ready(advancing(first, nothing)[0])
+    first = jax.block_until_ready(advancing(first, nothing, np.bool_(False))[0])
 
-    def advanced(state: RunState) -> tuple[RunState, Arrays]:
-        state, made, metrics = advancing(state, budget)
-        return state, {name: x[: int(made)] for name, x in to_numpy(metrics).items()}
+    def advanced(state: RunState, look: bool) -> tuple[RunState, Arrays, Looked | None]:
+        before = evaluated(state) if look and not parts.rides else None
+        state, block, present = advancing(state, budget, np.bool_(look))
+        metrics = {name: x[: int(block.made)] for name, x in to_numpy(block.metrics).items()}
+        if look and parts.rides:
+            *actor, num_updates = jax.device_get(present)
+            actor = jax.tree.unflatten(jax.tree.structure(like.train_states.actor), actor)
+            before = Looked(actor, num_updates, to_numpy(block.looked))
+        return state, metrics, before
 
-    def evaluated(state: RunState) -> Arrays:
-        return to_numpy(compiled(state.train_states.actor, jax.random.key_data(state.eval_keys)))
+    def evaluated(state: RunState) -> Looked:
+        measured = compiled(state.train_states.actor, jax.random.key_data(state.eval_keys))
+        present = state.train_states.actor, state.train_states.num_updates
+        actor, num_updates = jax.device_get(present)
+        return Looked(actor, num_updates, to_numpy(measured))
 
     def tested(actor: Actor) -> Arrays:
         return joined([to_numpy(compiled(actor, keys)) for keys in np.asarray(test_keys)])
@@ -258,15 +287,33 @@ def budget_of(config: Config) -> Budget:
     return Budget(*(counts.from_int(MAX_COUNT if limit is None else limit) for limit in limits))
 
 
-def block_of_updates(build_learner: BuildLearner, length: int) -> Callable[..., Any]:
+class Block(NamedTuple):
+    """What a block of updates measured.
+
+    made: [] how many updates were made
+    metrics: [length, S] each; the rows after the last update are zero
+    looked: [S] each, what ``evaluation.measure`` returns of the policies before the first update;
+      empty where the evaluation does not ride with it
+    """
+
+    made: jax.Array
+    metrics: dict[str, jax.Array]
+    looked: dict[str, jax.Array]
+
+
+def block_of_updates(
+    build_learner: BuildLearner, length: int, visit: Callable[..., Guests] | None
+) -> Callable[..., tuple[RunState, Block]]:
     """Returns a function that makes ``length`` updates of all seeds, or fewer if that is the end.
 
-    It takes a ``RunState`` and a ``Budget``. Its result is the state, how many updates were made
-    [], and their metrics [length, S], of which the rows after the last update are zero.
+    It takes a ``RunState``, a ``Budget``, and whether to evaluate the policies before the first
+    update, [] or [S]. Its result is the state, and a ``Block``.
 
     Args:
       build_learner: called while the settings of one seed are traced.
       length: rows of the metrics.
+      visit: (key of an evaluation [], whether it is made []) -> its episodes, which are played in
+        one go with those of the first update; None where learners cannot.
     """
 
     def active(state: RunState, budget: Budget) -> jax.Array:
@@ -279,33 +326,54 @@ def block_of_updates(build_learner: BuildLearner, length: int) -> Callable[..., 
         shares = [counts.number(x) / counts.number(y) for x, y in zip(made, budget, strict=True)]
         return jnp.minimum(jnp.maximum(*shares), 1.0)
 
-    def step(state: TrainState, settings: dict[str, jax.Array], going: jax.Array) -> Any:
-        return build_learner(settings).step(state, going)
+    def step(
+        state: TrainState,
+        settings: dict[str, jax.Array],
+        going: jax.Array,
+        eval_key: jax.Array,
+        look: jax.Array,
+    ) -> Any:
+        guests = None if visit is None else visit(eval_key, look)
+        state, metrics, played = build_learner(settings).step_with(state, going, guests)
+        looked = {} if guests is None or played is None else measure(played, guests)
+        return state, metrics | {"active": going}, looked
 
     @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
-    def update(state: RunState, budget: Budget) -> tuple[RunState, dict[str, jax.Array]]:
-        going = active(state, budget)
+    def update(state: RunState, budget: Budget, look: jax.Array) -> Any:
         before = dataclasses.replace(state.train_states, progress=progress(state, budget))
-        train_states, metrics = jax.vmap(step)(before, state.settings, going)
-        return dataclasses.replace(state, train_states=train_states), metrics | {"active": going}
+        going, looks = active(state, budget), jnp.broadcast_to(look, len(state.eval_keys))
+        train_states, metrics, looked = jax.vmap(step)(
+            before, state.settings, going, state.eval_keys, looks
+        )
+        return dataclasses.replace(state, train_states=train_states), metrics, looked
 
-    def advance(state: RunState, budget: Budget) -> tuple[RunState, Any]:
-        def unfinished(carry: Any) -> jax.Array:
-            made, state, _ = carry
-            return (made < length) & jnp.any(active(state, budget))
+    def advance(state: RunState, budget: Budget, look: jax.Array) -> tuple[RunState, Block]:
+        def unfinished(carry: tuple[RunState, Block]) -> jax.Array:
+            state, block = carry
+            return (block.made < length) & jnp.any(active(state, budget))
 
-        def body(carry: Any) -> Any:
-            made, state, rows = carry
-            state, row = update(state, budget)
+        def body(carry: tuple[RunState, Block]) -> tuple[RunState, Block]:
+            state, (made, rows, looked) = carry
+            state, row, now = update(state, budget, look & (made == 0))
             write = functools.partial(lax.dynamic_update_index_in_dim, index=made, axis=0)
-            return made + 1, state, jax.tree.map(write, rows, row)
+            looked = jax.tree.map(lambda x, old: jnp.where(made == 0, x, old), now, looked)
+            return state, Block(made + 1, jax.tree.map(write, rows, row), looked)
 
-        row = jax.eval_shape(update, state, budget)[1]
+        _, row, looked = jax.eval_shape(update, state, budget, look)
+        zeros = functools.partial(jax.tree.map, lambda x: jnp.zeros(x.shape, x.dtype))
         rows = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), row)
-        made, state, rows = lax.while_loop(unfinished, body, (jnp.int32(0), state, rows))
-        return state, (made, rows)
+        return lax.while_loop(unfinished, body, (state, Block(jnp.int32(0), rows, zeros(looked))))
 
     return advance
+
+
+def evaluation_guests(config: Config, *, sampled: bool = True) -> Callable[..., Guests]:
+    """Returns (key [], whether it is made []) -> the episodes of an evaluation."""
+
+    def visit(key: jax.Array, active: jax.Array) -> Guests:
+        return guests_of(key, num_episodes=config.eval_episodes, active=active, sampled=sampled)
+
+    return visit
 
 
 def evaluation(

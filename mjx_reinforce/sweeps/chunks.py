@@ -134,8 +134,6 @@ def train(
       Whether it ended, or was left.
     """
     began = time.perf_counter() - history.seconds
-    if not history.begun():
-        history.keep([programs.evaluate(states)], time.perf_counter() - began)
     blocks = 1
     while (training := history.training()).any():
         measured = programs.advance(states, training, history.now["eval_steps"], blocks)
@@ -145,4 +143,6 @@ def train(
             return False
         enough = len(measured) * _SECONDS / (history.seconds - last)
         blocks = max(1, min(int(enough), 2 * len(measured), most))
+    if not history.evaluated():
+        history.keep([programs.evaluate(states)], time.perf_counter() - began)
     return True

@@ -14,17 +14,17 @@ from mjx_reinforce.runs.table import Table
 
 Arrays = dict[str, np.ndarray]
 
-#: What is kept of every evaluation.
-_CURVES = ("eval_return", "env_steps")
+#: What is kept of every evaluation, and the name of its latest.
+_CURVES = {"eval_return": "eval_return", "env_steps": "eval_env_steps"}
 
 
 class Measured(NamedTuple):
-    """One evaluation of some runs, and the block of updates before it.
+    """One evaluation of some runs, and the block of updates after it.
 
     runs: [n] their numbers
     values: [n] each: ``eval_return``, and ``eval_steps``, those of all its episodes; of runs that
-      made updates also ``updates`` and ``env_steps`` since the start, and ``nonfinite``, how many
-      updates of the block met numbers that are not finite
+      then made updates also ``updates`` and ``env_steps`` since the start, and ``nonfinite``, how
+      many updates of the block met numbers that are not finite
     """
 
     runs: np.ndarray
@@ -34,14 +34,15 @@ class Measured(NamedTuple):
 class History:
     """What each of R runs has measured.
 
-    now: [R] each, the latest of what ``Measured`` has; ``nonfinite`` since the start
-    seconds: wall time from the beginning to the last evaluation
+    now: [R] each, the latest of what ``Measured`` has; ``nonfinite`` since the start, and
+      ``eval_env_steps``, the env steps before the latest evaluation
+    seconds: wall time from the beginning to the last block
     """
 
     def __init__(self, config: Config):
         """Begins before the first update; R is ``config.num_seeds``."""
         self._config = config
-        counts = ("updates", "env_steps", "nonfinite", "eval_steps")
+        counts = ("updates", "env_steps", "nonfinite", "eval_steps", "eval_env_steps")
         self.now: Arrays = {name: np.zeros(config.num_seeds, np.int64) for name in counts}
         self.now["eval_return"] = np.zeros(config.num_seeds, np.float32)
         self.seconds = 0.0
@@ -49,7 +50,7 @@ class History:
         self._before = self.now["env_steps"], self.seconds
 
     def keep(self, blocks: Sequence[Measured], seconds: float) -> None:
-        """Takes in blocks of updates and their evaluations.
+        """Takes in evaluations and the blocks of updates after them.
 
         Args:
           blocks: one after the other; runs that are not in them stay as they are.
@@ -58,9 +59,10 @@ class History:
         now = self.now
         self._before, self.seconds = (now["env_steps"].copy(), self.seconds), seconds
         for runs, values in blocks:
+            now["eval_env_steps"][runs] = now["env_steps"][runs]
             for name, measured in values.items():
                 now[name][runs] = measured + (now[name][runs] if name == "nonfinite" else 0)
-            self._curves.append({name: now[name][None].copy() for name in _CURVES})
+            self._curves.append({name: now[own][None].copy() for name, own in _CURVES.items()})
 
     def arrays(self) -> Arrays:
         """Returns all that was measured, by name, for ``restore``."""
@@ -78,9 +80,10 @@ class History:
         self._before = self.now["env_steps"], self.seconds
         self._curves = Table({name: arrays[f"curves.{name}"] for name in _CURVES})
 
-    def begun(self) -> bool:
-        """Returns whether there is an evaluation."""
-        return bool(self._curves.latest(1))
+    def evaluated(self) -> bool:
+        """Returns whether the present policies of all runs have been evaluated."""
+        same = np.array_equal(self.now["eval_env_steps"], self.now["env_steps"])
+        return same and bool(self._curves.latest(1))
 
     def curves(self) -> Arrays:
         """Returns ``eval_return``, and ``env_steps`` until then, [E, R] each."""

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.learners import counts
+from mjx_reinforce.learners.learner import Host
 from mjx_reinforce.runs.blocks import block_length
 from mjx_reinforce.runs.config import MAX_COUNT, Config
 from mjx_reinforce.runs.keys import plain, with_keys
@@ -26,6 +27,7 @@ from mjx_reinforce.runs.state import (
     budget_of,
     eval_keys,
     evaluation,
+    evaluation_guests,
     seed_keys,
 )
 from mjx_reinforce.sweeps.ahead import Clock, started
@@ -36,18 +38,23 @@ from mjx_reinforce.sweeps.packing import pack
 
 #: What ``history.Measured`` has of a run's counts since the start.
 _COUNTS = ("updates", "env_steps")
+#: And of an evaluation.
+_LOOKED = ("eval_return", "eval_steps")
 
 
 class Movers(NamedTuple):
     """What moves the runs of one slot on. States are rows of bytes, see ``layout.Layout``.
 
     block: (states [W, B], which lanes have a run [W], budget) -> (states [W, B], which runs made an
-      update [W], and what ``history.Measured`` has of updates [W]), as ``state.block_of_updates``
+      update [W], and what ``history.Measured`` has of updates [W], and of evaluations where these
+      ride), as ``state.block_of_updates``
     look: (states [W, B], which [W]) -> what ``history.Measured`` has of evaluations [W]
+    rides: whether ``block`` evaluates; else ``look`` does, before it
     """
 
     block: Callable[..., tuple[jax.Array, jax.Array, dict[str, jax.Array]]]
     look: Callable[[jax.Array, jax.Array], dict[str, jax.Array]]
+    rides: bool
 
 
 class Programs(NamedTuple):
@@ -82,7 +89,7 @@ class Programs(NamedTuple):
     def advance(
         self, states: np.ndarray, training: np.ndarray, lengths: np.ndarray, blocks: int
     ) -> list[Measured]:
-        """Makes blocks of updates of the runs that still train, and evaluates them after each.
+        """Evaluates the runs that still train and makes a block of updates, several times.
 
         Args:
           states: [R, B] of all runs; changed.
@@ -101,8 +108,9 @@ class Programs(NamedTuple):
             measured = []
             slot, which = self._put((states[runs], runs >= 0))
             for _ in range(count):  # the host does not wait for any
+                looked = {} if movers.rides else movers.look(slot, which)
                 slot, moved, used = movers.block(slot, which, self.limits)
-                measured.append((moved, used | movers.look(slot, moved)))
+                measured.append((moved, looked | used))
             return jax.device_get((slot, measured))
 
         rows, measured = zip(*_side_by_side(move, lanes), strict=True)
@@ -265,7 +273,10 @@ def _movers(
     """
     with ThreadPoolExecutor() as pool, tracing:  # the first compiles while the second is traced
         like = jax.eval_shape(beginning(build_learner), *_arguments(traced, width))
-        updates = block_of_updates(build_learner, block_length(config))
+        learner = build_learner({})  # policies and engines are those of any
+        rides = isinstance(learner.play, Host)
+        visit = evaluation_guests(config, sampled=False) if rides else None
+        updates = block_of_updates(build_learner, block_length(config), visit)
 
         def block(rows: jax.Array, which: jax.Array, budget: Budget) -> Any:
             before = with_keys(layout.traced_states(rows), like)
@@ -274,17 +285,19 @@ def _movers(
             played = jnp.where(which[:, None], played, counts.from_int(MAX_COUNT))
             train_states = dataclasses.replace(before.train_states, env_steps=played)
             before = dataclasses.replace(before, train_states=train_states)
-            after, (_, metrics) = updates(before, budget)
-            moved = jnp.any(metrics["active"], axis=0)
-            return layout.traced_rows(plain(after)), moved, _counts(after, metrics)
+            after, measured = updates(before, budget, which)
+            moved = jnp.any(measured.metrics["active"], axis=0)
+            counted = _counts(after, measured.metrics)
+            return layout.traced_rows(plain(after)), moved, counted | seen(measured.looked)
 
-        # Policies and engines are those of any of its learners.
-        evaluate = evaluation(env, build_learner({}), horizon, config, sampled=False)
+        def seen(measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
+            return {name: measured[name] for name in _LOOKED if name in measured}
+
+        evaluate = evaluation(env, learner, horizon, config, sampled=False)
 
         def look(rows: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
             states = with_keys(layout.traced_states(rows), like)
-            measured = evaluate(states.train_states.actor, states.eval_keys, which)
-            return {name: measured[name] for name in ("eval_return", "eval_steps")}
+            return seen(evaluate(states.train_states.actor, states.eval_keys, which))
 
         budget = devices.put(budget_of(config), NONE)
         rows = jax.eval_shape(layout.traced_rows, jax.eval_shape(plain, like))
@@ -297,7 +310,7 @@ def _movers(
     # No run: a GPU's driver translates the kernels of a program when it first runs.
     none = devices.put((np.zeros(rows.shape, rows.dtype), np.zeros(width, bool)), RUNS)
     jax.block_until_ready(advanced(*none, budget))
-    return Movers(advanced, looked)
+    return Movers(advanced, looked, rides)
 
 
 def _counts(after: RunState, metrics: dict[str, jax.Array]) -> dict[str, jax.Array]:
