@@ -84,6 +84,8 @@ def base_settings(task: str, num_seeds: int) -> Config:
         max_updates=MAX_UPDATES,
         eval_every=2,
         value_hidden_sizes=(32, 32),
+        value_fit="full-batch",
+        value_fits=10,
     )
 
 

@@ -22,7 +22,7 @@ ESTIMATORS = {
     "total-return": "mjx_reinforce.learners.estimators:total_return",
     "reward-to-go": "mjx_reinforce.learners.estimators:reward_to_go",
     "leave-one-out": "mjx_reinforce.learners.estimators:leave_one_out",
-    "value-baseline": "mjx_reinforce.learners.estimators:value_baseline",
+    "value-baseline": "mjx_reinforce.learners.value_baseline:value_baseline",
     "mean-log-prob": "mjx_reinforce.learners.estimators:mean_log_prob",
     "normalized-returns": "mjx_reinforce.learners.estimators:normalized_returns",
 }

@@ -13,14 +13,17 @@ from toys import Chain, Tempting, categorical, expected_return
 from mjx_reinforce import Policy, Trajectory, reinforce, train_step
 from mjx_reinforce.learners import estimators as est
 from mjx_reinforce.learners.returns import discounted_returns
+from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
 from mjx_reinforce.policies.networks import MLP
 from mjx_reinforce.registry import ESTIMATORS, load
+from mjx_reinforce.runs.keys import plain
 
 LENGTHS = np.array([4, 1, 3])
 REWARD = np.array([[1.0, 2.0, 0.5], [0.5, 9.0, 1.5], [2.0, 9.0, 1.0], [3.0, 9.0, 9.0]])
 
 
-FACTORIES = [load(path) for path in ESTIMATORS.values()]
+MAKERS = {name: load(path) for name, path in ESTIMATORS.items()}
+MAKERS["full-batch value-baseline"] = full_batch_value_baseline
 MASK = np.arange(4)[:, None] < LENGTHS
 
 
@@ -38,7 +41,8 @@ def make_trajectory(mask=MASK, observation=0.0, action=0.0, reward=0.0):
 
 
 def update(estimator, trajectory):
-    return estimator.update(estimator.init(jax.random.key(0), 1), trajectory)
+    """Weights, state with the data of keys in their place, metrics."""
+    return plain(estimator.update(estimator.init(jax.random.key(0), 1), trajectory))
 
 
 def weights(estimator, trajectory):
@@ -120,13 +124,13 @@ def test_normalized_returns_by_hand():
         assert np.all(got[length:, n] == 0.0)
 
 
-def test_value_baseline_by_hand():
+def test_full_batch_value_baseline_by_hand():
     """Two gradient steps of a linear critic on the mean squared error, after its use."""
     returns, seen = (
         returns_by_hand(0.9)[MASK],
         np.asarray(make_trajectory().observation)[MASK][:, 0],
     )
-    estimator = est.value_baseline(
+    estimator = full_batch_value_baseline(
         0.9, network=flax.linen.Dense(1), optimizer=optax.sgd(0.1), num_fits=2
     )
     critic = estimator.init(jax.random.key(0), 1)
@@ -146,12 +150,12 @@ def test_value_baseline_by_hand():
     assert float(params["bias"][0]) == pytest.approx(bias, rel=1e-5)
 
 
-def test_the_critics_defaults_are_as_documented():
-    explicit = est.value_baseline(
+def test_the_full_batch_critics_defaults_are_as_documented():
+    explicit = full_batch_value_baseline(
         0.99, network=MLP((64, 64), 1), optimizer=optax.adam(3e-3), num_fits=10
     )
     assert_equal(
-        update(est.value_baseline(), make_trajectory()), update(explicit, make_trajectory())
+        update(full_batch_value_baseline(), make_trajectory()), update(explicit, make_trajectory())
     )
 
 
@@ -160,13 +164,92 @@ def test_the_critics_optimizer_keeps_its_state_and_sees_the_parameters():
     optimizer = optax.chain(optax.add_decayed_weights(0.5), optax.sgd(0.1, momentum=0.9))
     trajectory, network = make_trajectory(), flax.linen.Dense(1)
     one, two = (
-        est.value_baseline(0.9, network=network, optimizer=optimizer, num_fits=fits)
+        full_batch_value_baseline(0.9, network=network, optimizer=optimizer, num_fits=fits)
         for fits in (1, 2)
     )
     critic = one.init(jax.random.key(0), 1)
     twice = one.update(one.update(critic, trajectory)[1], trajectory)[1]
     at_once = two.update(critic, trajectory)[1]
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-6), twice, at_once)
+
+
+def test_value_baseline_by_hand():
+    """Two updates of a linear critic of (observation, time), two drawn minibatches each."""
+    returns = returns_by_hand(0.9)[MASK]
+    seen = np.asarray(make_trajectory().observation)[MASK][:, 0]
+    inputs = np.stack([seen, np.nonzero(MASK)[0] / 4, np.ones_like(seen)], axis=1)
+    optimizer = optax.sgd(0.1, momentum=0.5)
+    estimator = value_baseline(
+        0.9,
+        horizon=4,
+        network=flax.linen.Dense(1),
+        optimizer=optimizer,
+        num_fits=2,
+        batch_size=5,
+    )
+    critic = estimator.init(jax.random.key(0), 1)
+    line = np.append(np.asarray(critic.params["params"]["kernel"])[:, 0], 0.0)
+    trace, mean, variance = np.zeros(3), 0.0, 0.0
+    for share in (1.0, 0.5):
+        key, draw_key = jax.random.split(critic.key)
+        drawn = jax.random.randint(draw_key, (2, 5), 1, MASK.sum() + 1)
+        expected = returns - (mean + np.sqrt(variance) * inputs @ line)
+        weight, critic, metrics = estimator.update(critic, make_trajectory())
+        np.testing.assert_allclose(np.asarray(weight)[MASK], expected, rtol=1e-5, atol=1e-5)
+        assert np.all(np.asarray(weight)[~MASK] == 0.0)
+        assert float(metrics["value_loss"]) == pytest.approx(np.mean(expected**2), rel=1e-5)
+        mean += share * (returns.mean() - mean)
+        variance += share * (np.mean((returns - mean) ** 2) - variance)
+        targets = (returns - mean) / np.sqrt(variance)
+        for batch in np.asarray(drawn) - 1:
+            error = inputs[batch] @ line - targets[batch]
+            trace = 0.5 * trace + np.mean(2 * error[:, None] * inputs[batch], axis=0)
+            line = line - 0.1 * trace
+        params = critic.params["params"]
+        got = np.append(np.asarray(params["kernel"])[:, 0], np.asarray(params["bias"]))
+        np.testing.assert_allclose(got, line, rtol=1e-4, atol=1e-6)
+        assert jnp.array_equal(critic.key, key)
+
+
+def test_a_fitted_value_explains_the_time_that_is_left():
+    """Of episodes that differ in nothing but their noise: V(t) is known but for that."""
+    steps, episodes = 50, 64
+    noise = jax.random.normal(jax.random.key(1), (10, steps, episodes))
+    mask = jnp.ones((steps, episodes), bool)
+    estimator = value_baseline(1.0, horizon=steps)
+    critic = estimator.init(jax.random.key(0), 1)
+    for reward in 1000 * (1 + 0.1 * noise):
+        trajectory = Trajectory(
+            observation=jnp.zeros((steps, episodes, 1)),
+            action=jnp.zeros((steps, episodes, 1)),
+            reward=reward,
+            mask=mask,
+            nonfinite=jnp.zeros(episodes, bool),
+            simulated=jnp.int32(mask.size),
+        )
+        _, critic, metrics = estimator.update(critic, trajectory)
+    # Of G the time explains 1 - (0.1^2 50 / 2) / (50^2 / 12): 0.9988.
+    assert float(metrics["explained_variance"]) > 0.99
+
+
+def test_the_critics_defaults_are_as_documented():
+    explicit = value_baseline(
+        0.99,
+        horizon=1000,
+        network=MLP((64, 64), 1),
+        optimizer=optax.adam(3e-3),
+        num_fits=32,
+        batch_size=256,
+    )
+    assert_equal(update(value_baseline(), make_trajectory()), update(explicit, make_trajectory()))
+
+
+def test_returns_that_do_not_vary_are_learned_at_once():
+    trajectory = make_trajectory().replace(reward=jnp.where(jnp.asarray(MASK), 3.0, 0.0))
+    estimator = value_baseline(0.0)
+    critic = estimator.update(estimator.init(jax.random.key(0), 1), trajectory)[1]
+    weight = estimator.update(critic, trajectory)[0]
+    np.testing.assert_allclose(weight, 0.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.1, -1e6])
@@ -218,17 +301,39 @@ def test_discount_weights_multiplies_by_the_power_of_the_time():
     np.testing.assert_allclose(got, raw * 0.5 ** np.arange(4)[:, None], rtol=1e-6)
 
 
-@pytest.mark.parametrize("wrap", [est.standardize, est.discount_weights])
+def shift(estimator):
+    return est.shift_rewards(estimator, 0.5)
+
+
+def test_a_shift_is_taken_off_the_reward_of_every_step_and_of_no_other():
+    trajectory = make_trajectory()
+    shifted = trajectory.replace(reward=jnp.where(trajectory.mask, trajectory.reward - 0.5, 0.0))
+    for make in (est.reward_to_go, est.leave_one_out, value_baseline):
+        assert_equal(update(shift(make(0.9)), trajectory), update(make(0.9), shifted))
+    raw, got = (weights(e(est.reward_to_go(1.0)), trajectory) for e in (lambda e: e, shift))
+    left = np.where(MASK, LENGTHS - np.arange(4)[:, None], 0)
+    np.testing.assert_allclose(got, raw - 0.5 * left, rtol=1e-6)
+
+
+def test_no_shift_leaves_every_bit():
+    plain, same = est.leave_one_out(0.9), est.shift_rewards(est.leave_one_out(0.9), 0.0)
+    assert_equal(update(same, make_trajectory()), update(plain, make_trajectory()))
+
+
+@pytest.mark.parametrize("wrap", [est.standardize, est.discount_weights, shift])
 def test_wrapping_keeps_what_an_estimator_requires_learns_and_measures(wrap):
-    inner = est.value_baseline(0.9)
+    inner = value_baseline(0.9)
     assert wrap(est.leave_one_out()).min_episodes == 2
     _, critic, metrics = update(inner, make_trajectory())
     _, wrapped_critic, wrapped_metrics = update(wrap(inner), make_trajectory())
-    assert_equal(critic, wrapped_critic)
-    assert_equal(metrics, {name: wrapped_metrics[name] for name in metrics})
+    assert jax.tree.structure(critic) == jax.tree.structure(wrapped_critic)
+    assert metrics.keys() <= wrapped_metrics.keys()
+    if wrap is not shift:  # which changes what is learned
+        assert_equal(critic, wrapped_critic)
+        assert_equal(metrics, {name: wrapped_metrics[name] for name in metrics})
 
 
-@pytest.mark.parametrize("make", FACTORIES)
+@pytest.mark.parametrize("make", MAKERS.values())
 def test_the_default_discount_is_099(make):
     assert_equal(weights(make(), make_trajectory()), weights(make(0.99), make_trajectory()))
 
@@ -243,11 +348,11 @@ def test_leave_one_out_needs_two_episodes():
     assert est.reward_to_go(0.9).min_episodes == 1
 
 
-@pytest.mark.parametrize("wrap", [lambda e: e, est.standardize, est.discount_weights])
-@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+@pytest.mark.parametrize("wrap", [lambda e: e, est.standardize, est.discount_weights, shift])
+@pytest.mark.parametrize("name", sorted(MAKERS))
 def test_nothing_after_the_end_has_any_effect_on_the_weights(name, wrap):
     """A normalised observation behind the end may be anything: no weight reads it."""
-    estimator = wrap(load(ESTIMATORS[name])(0.9))
+    estimator = wrap(MAKERS[name](0.9))
     clean = weights(estimator, make_trajectory())
     poisoned = weights(estimator, make_trajectory(observation=np.nan, action=np.nan))
     np.testing.assert_array_equal(clean, poisoned)
@@ -255,7 +360,7 @@ def test_nothing_after_the_end_has_any_effect_on_the_weights(name, wrap):
     assert np.any(clean[MASK] != 0.0)
 
 
-@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+@pytest.mark.parametrize("name", sorted(MAKERS))
 def test_nothing_after_the_end_has_any_effect_on_what_is_learned(name):
     """The observation stays finite, as it does clipped: a critic is differentiated.
 
@@ -264,7 +369,7 @@ def test_nothing_after_the_end_has_any_effect_on_what_is_learned(name):
     Only a mean that counts ended episodes as the 0 they earn relies on that 0.
     """
     options = {"ended": "skip"} if name == "leave-one-out" else {}
-    estimator = load(ESTIMATORS[name])(0.0, **options)
+    estimator = MAKERS[name](0.0, **options)
     clean = update(estimator, make_trajectory())
     huge = make_trajectory(observation=1e30, action=np.nan, reward=1e30)
     assert_equal(update(estimator, huge), clean)
@@ -285,9 +390,9 @@ def test_standardize_reads_no_weight_outside_the_mask(center):
 
 
 @pytest.mark.parametrize("wrap", [lambda e: e, functools.partial(est.standardize, center=True)])
-@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+@pytest.mark.parametrize("name", sorted(MAKERS))
 def test_a_seed_that_plays_nothing_stays_finite(name, wrap):
-    estimator = wrap(load(ESTIMATORS[name])(0.9))
+    estimator = wrap(MAKERS[name](0.9))
     weight, state, metrics = update(estimator, make_trajectory(mask=np.zeros((4, 3), bool)))
     assert np.all(np.asarray(weight) == 0.0)
     assert np.isnan(metrics.pop("explained_variance", np.nan))
@@ -300,7 +405,7 @@ def test_one_step_is_a_sample_of_one():
     trajectory = make_trajectory(mask=np.pad(mask, ((0, 2), (0, 2))))
     scaled, _, metrics = update(est.standardize(est.reward_to_go(), floor=0.0), trajectory)
     assert float(metrics["weight_std"]) == float(scaled[0, 0]) == 1.0
-    estimator = est.value_baseline(network=flax.linen.Dense(1), num_fits=1)
+    estimator = full_batch_value_baseline(network=flax.linen.Dense(1), num_fits=1)
     critic = estimator.init(jax.random.key(0), 1)
     _, _, metrics = estimator.update(critic, trajectory)
     assert float(metrics["value_loss"]) == pytest.approx(
@@ -312,23 +417,23 @@ def broken(trajectory, which=1):
     return trajectory.replace(nonfinite=jnp.arange(3) == which)
 
 
-@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+@pytest.mark.parametrize("name", sorted(MAKERS))
 def test_what_a_broken_episode_earned_has_no_effect(name):
     """It may be anything; what is learned of the others is the same."""
-    estimator, trajectory = load(ESTIMATORS[name])(0.9), broken(make_trajectory())
+    estimator, trajectory = MAKERS[name](0.9), broken(make_trajectory())
     rich = trajectory.replace(reward=trajectory.reward.at[0, 1].set(1e3))
     assert_equal(update(estimator, rich), update(estimator, trajectory))
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("which", range(3))
-@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+@pytest.mark.parametrize("name", sorted(MAKERS))
 def test_a_broken_episode_is_the_worst(name, which, sign):
     """At every step; the critic is of zeros."""
-    options = {"network": MLP((), 1, output_scale=0.0)} if name == "value-baseline" else {}
+    options = {"network": MLP((), 1, output_scale=0.0)} if "value-baseline" in name else {}
     trajectory = make_trajectory()
     trajectory = broken(trajectory.replace(reward=sign * trajectory.reward), which)
-    got = weights(load(ESTIMATORS[name])(0.9, **options), trajectory)
+    got = weights(MAKERS[name](0.9, **options), trajectory)
     others = np.where(MASK & (np.arange(3) != which), got, np.inf)
     assert np.all((got[:, which] <= others.min(axis=1) + 1e-6)[MASK[:, which]])
 
@@ -340,12 +445,12 @@ def test_a_broken_episode_by_hand():
     np.testing.assert_allclose(got, np.where(MASK, returns, 0.0), rtol=1e-6)
 
 
-@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+@pytest.mark.parametrize("name", sorted(MAKERS))
 def test_breaking_never_pays(name):
     """It ends an episode whose every step costs, and yet it is not learned."""
     learner = reinforce(
         Tempting(),
-        estimator=load(ESTIMATORS[name])(1.0),
+        estimator=MAKERS[name](1.0),
         optimizer=optax.sgd(0.03),
         num_episodes=64,
         normalize_steps=0,
@@ -358,9 +463,9 @@ def test_breaking_never_pays(name):
     assert broken[-5:].mean() < 5
 
 
-@pytest.mark.parametrize("name", sorted(ESTIMATORS))
+@pytest.mark.parametrize("name", sorted(MAKERS))
 def test_permuting_episodes_permutes_weights(name):
-    estimator, order = load(ESTIMATORS[name])(0.9), np.array([2, 0, 1])
+    estimator, order = MAKERS[name](0.9), np.array([2, 0, 1])
     trajectory = make_trajectory()
     permuted = trajectory.replace(
         **{k: getattr(trajectory, k)[:, order] for k in ("observation", "action", "reward", "mask")}
@@ -379,12 +484,35 @@ def tabular_policy():
     return Policy(init, lambda params, observation: observation @ params, categorical(2))
 
 
+def already_fitted(estimator):
+    """An estimator whose critic begins with what it learned from three episodes of Chain."""
+    earned = jnp.asarray(Chain.rewards[:, 1:], jnp.float32)
+    trajectory = Trajectory(
+        observation=jnp.broadcast_to(jnp.eye(3)[:, None], (3, 3, 3)),
+        action=jnp.ones((3, 3), jnp.int32),
+        reward=jnp.broadcast_to(earned, (3, 3)),
+        mask=jnp.ones((3, 3), bool),
+        nonfinite=jnp.zeros(3, bool),
+        simulated=jnp.int32(9),
+    )
+
+    def init(key, observation_size):
+        return estimator.update(estimator.init(key, observation_size), trajectory)[1]
+
+    return estimator._replace(init=init)
+
+
+SMALL_CRITIC = {"network": MLP((4,), 1), "num_fits": 4, "optimizer": optax.adam(0.2)}
 CASES = {
     "total return": (est.total_return(1.0), 1.0),
     "reward to go": (est.reward_to_go(1.0), 1.0),
     "leave one out": (est.leave_one_out(1.0), 1.0),
     "leave one out of the living": (est.leave_one_out(1.0, ended="skip"), 1.0),
-    "value baseline": (est.value_baseline(1.0, network=MLP((4,), 1), num_fits=1), 1.0),
+    "value baseline": (
+        already_fitted(value_baseline(1.0, horizon=3, batch_size=8, **SMALL_CRITIC)),
+        1.0,
+    ),
+    "full-batch": (already_fitted(full_batch_value_baseline(1.0, **SMALL_CRITIC)), 1.0),
     "discounted with gamma^t": (est.discount_weights(est.leave_one_out(0.5), 0.5), 0.5),
 }
 
@@ -432,7 +560,7 @@ def assert_unbiased(estimator, objective):
 
 
 @pytest.mark.parametrize(
-    "make", [*FACTORIES, functools.partial(est.discount_weights, est.reward_to_go())]
+    "make", [*MAKERS.values(), functools.partial(est.discount_weights, est.reward_to_go())]
 )
 def test_a_discount_lies_between_0_and_1(make):
     make(0.0), make(1.0)
@@ -445,7 +573,14 @@ def test_a_discount_lies_between_0_and_1(make):
 def test_nonsense_is_refused():
     with pytest.raises(ValueError, match="'zero' or 'skip', got 'alive'"):
         est.leave_one_out(ended="alive")
+    for name in ("horizon", "num_fits", "batch_size"):
+        with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
+            value_baseline(**{name: 0})  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="num_fits must be at least 1, got 0"):
-        est.value_baseline(num_fits=0)
+        full_batch_value_baseline(num_fits=0)
+    with pytest.raises(ValueError, match="must be a finite number, got nan"):
+        est.shift_rewards(est.reward_to_go(), float("nan"))
+    with pytest.raises(ValueError, match="estimator"):
+        est.shift_rewards(est.reward_to_go, 1.0)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="at least 2 episodes"):
         reinforce(Chain(), policy=tabular_policy(), estimator=est.leave_one_out(), num_episodes=1)

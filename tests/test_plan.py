@@ -105,6 +105,7 @@ def test_what_was_measured_are_our_tasks():
             | {"estimator": "value-baseline"},
             "--value-hidden-sizes",
         ),
+        ({"estimator": "value-baseline", "value_batch_size": 10**8}, "lower --value-batch-size"),
         ({"num_seeds": 2**31}, "--num-seeds must be less than 2^31, got 2147483648"),
         ({"hidden_sizes": (8, 2**40)}, "--hidden-sizes must be less than 2^31"),
     ],
@@ -143,7 +144,8 @@ def test_the_memory_of_a_wide_network():
 )
 def test_the_memory_of_a_value_network(sizes, episodes, gigabytes):
     """As XLA says, for four seeds."""
-    settings = {"estimator": "value-baseline", "value_hidden_sizes": sizes}
+    settings = {"estimator": "value-baseline", "value_fit": "full-batch"}
+    settings |= {"value_hidden_sizes": sizes}
     config = dataclasses.replace(of_task("InvertedPendulum-v5"), num_episodes=episodes, **settings)
     needed = memory.needed(config, measured.TASKS[config.env])
     assert gigabytes * 1e9 < needed < 1.2 * gigabytes * 1e9
@@ -202,9 +204,16 @@ def test_the_operations_of_networks_by_hand():
     task, plain = Task(4, 1, 50, 1.0, 0.0), Config(estimator="reward-to-go")
     assert operations.per_step(plain, task) == 10 * 1282
     value = dataclasses.replace(
-        plain, estimator="value-baseline", value_hidden_sizes=(16,), value_fits=3
+        plain,
+        estimator="value-baseline",
+        value_hidden_sizes=(16,),
+        value_fit="full-batch",
+        value_fits=3,
     )
     assert operations.per_step(value, task) == 10 * 1282 + (2 + 6 * 3) * 97
+    # 3 minibatches of 400 are 1.5 times the 16 * 50 steps of a rollout.
+    fitted = dataclasses.replace(value, value_fit="minibatches", value_batch_size=400)
+    assert operations.per_step(fitted, task) == 10 * 1282 + (2 + 6 * 1.5) * 97
     # 50 minibatches of 128 are 8 times the 16 * 50 steps of a rollout.
     drawn = dataclasses.replace(plain, update="minibatches")
     assert operations.per_step(drawn, task) == (4 + 6 * 8) * 1282
@@ -231,7 +240,8 @@ TRAINED = [
 @pytest.mark.parametrize(("env", "seeds", "settings", "steps", "seconds"), TRAINED)
 def test_estimates_are_good_to_a_factor_of_three(env, seeds, settings, steps, seconds):
     if any(name.startswith("value") for name in settings):
-        settings = settings | {"estimator": "value-baseline"}
+        fitted = {"value_fit": "full-batch", "value_fits": 10}
+        settings = {"estimator": "value-baseline"} | fitted | settings
     config = dataclasses.replace(of_task(env), num_seeds=seeds, **settings)
     config = dataclasses.replace(config, env_steps=steps // seeds)
     machine = plan.Machine("two cores", measured.CPU, 1.0, 1e10, shared=True)

@@ -16,19 +16,17 @@ each step its G[t] is the least of theirs (``returns.replace_broken``). In ``mea
 ``normalized_returns``, where an episode is compared with itself, its weight is.
 """
 
+import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
-from jax import lax
 
 from mjx_reinforce.checks import check_kind
-from mjx_reinforce.learners.gradients import accumulate_gradient
 from mjx_reinforce.learners.returns import discounted_returns, replace_broken
-from mjx_reinforce.policies.arguments import check_count, check_number, known_number
-from mjx_reinforce.policies.networks import MLP
+from mjx_reinforce.policies.arguments import check_number, known_number
 from mjx_reinforce.types import Trajectory
 
 
@@ -143,74 +141,6 @@ def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
     return _stateless(weigh)
 
 
-class _Critic(NamedTuple):
-    """State of ``value_baseline``: the network's parameters and its optimiser's state."""
-
-    params: Any
-    opt_state: Any
-
-
-def value_baseline(
-    discount: float | jax.Array = 0.99,
-    *,
-    network: Any = None,
-    optimizer: optax.GradientTransformation | None = None,
-    num_fits: int = 10,
-) -> Estimator:
-    """Weights an action by G[t] - V(o[t]), V learned (Sutton and Barto 2018, section 13.4).
-
-    V is fitted to G after its values were used, so a weight never depends on its
-    own episode through V.
-
-    Args:
-      discount: in [0, 1].
-      network: a flax module from [..., O] to [..., 1]; by default an MLP of 64
-        and 64 tanh units.
-      optimizer: what fits it; by default Adam at 3e-3.
-      num_fits: full-batch gradient steps on the mean squared error, each update.
-
-    Raises:
-      ValueError: ``num_fits`` is less than one or the discount is not in [0, 1].
-    """
-    _check_discount(discount)
-    check_count("num_fits", num_fits)
-    network = MLP((64, 64), 1) if network is None else network
-    optimizer = optax.adam(3e-3) if optimizer is None else optimizer
-
-    def value(params, observation):
-        return network.apply(params, observation)[..., 0]
-
-    def squared_error(params, chunk):
-        observation, returns, mask = chunk
-        return jnp.sum(jnp.where(mask, (value(params, observation) - returns) ** 2, 0.0)), {}
-
-    def init(key, observation_size):
-        params = network.init(key, jnp.zeros(observation_size))
-        shape = jax.eval_shape(network.apply, params, jnp.zeros(observation_size)).shape
-        if shape != (1,):
-            raise ValueError(f"the network must return values [..., 1], got {list(shape)}")
-        return _Critic(params, optimizer.init(params))
-
-    def update(critic, trajectory):
-        returns = _returns(trajectory, discount)
-        values = value(critic.params, trajectory.observation)
-        weight = jnp.where(trajectory.mask, returns - values, 0.0)
-        steps = jnp.maximum(jnp.sum(trajectory.mask), 1)
-        data = (trajectory.observation, returns, trajectory.mask)
-
-        def fit(critic, _):
-            loss, grads, _ = accumulate_gradient(squared_error, critic.params, data)
-            grads = jax.tree.map(lambda g: g / steps, grads)
-            updates, opt_state = optimizer.update(grads, critic.opt_state, critic.params)
-            return _Critic(optax.apply_updates(critic.params, updates), opt_state), loss / steps
-
-        critic, losses = lax.scan(fit, critic, length=num_fits)
-        explained = explained_variance(weight, returns, trajectory.mask)
-        return weight, critic, {"explained_variance": explained, "value_loss": losses[0]}
-
-    return Estimator(init, update)
-
-
 def standardize(
     estimator: Estimator, *, floor: float | jax.Array = 1e-8, center: bool = False
 ) -> Estimator:
@@ -258,6 +188,34 @@ def discount_weights(estimator: Estimator, discount: float | jax.Array = 0.99) -
         weight, state, metrics = estimator.update(state, trajectory)
         powers = discount ** jnp.arange(weight.shape[0], dtype=weight.dtype)
         return weight * powers[:, None], state, metrics
+
+    return estimator._replace(update=update)
+
+
+def shift_rewards(estimator: Estimator, shift: float | jax.Array) -> Estimator:
+    """Gives an estimator the rewards less ``shift``, which is what the policy then learns from.
+
+    Where an episode can end early, that is another objective: a bonus for every step survived is
+    worth that much less (Mania et al. 2018, arXiv:1803.07055, subtract the survival
+    bonus of MuJoCo's walkers, whose policies would else learn to stand still). Where all episodes
+    are of one length, the gradient is the same but for its noise. Returns that are reported stay
+    those of the task.
+
+    Args:
+      estimator: whose rewards are shifted.
+      shift: subtracted from the reward of every step, in its unit; it may be negative.
+
+    Raises:
+      ValueError: what is given is no estimator, or the shift is no finite number.
+    """
+    check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
+    number = known_number(shift)
+    if not (number is None or math.isfinite(number)):
+        raise ValueError(f"the shift of the rewards must be a finite number, got {shift!r}")
+
+    def update(state, trajectory):
+        reward = jnp.where(trajectory.mask, trajectory.reward - shift, 0.0)
+        return estimator.update(state, dataclasses.replace(trajectory, reward=reward))
 
     return estimator._replace(update=update)
 

@@ -1,4 +1,4 @@
-"""Gradients of sums over time, in chunks: bounded memory, and dead chunks are skipped."""
+"""Sums and maps over the steps of episodes in chunks: bounded memory, dead chunks are skipped."""
 
 from collections.abc import Callable
 from typing import Any
@@ -33,29 +33,72 @@ def accumulate_gradient(
     Returns:
       The loss [], its gradient like ``params``, and the metrics, all summed.
     """
-    mask = data[-1]
-    horizon, num_episodes = mask.shape
-    samples = MAX_SAMPLES * (1 if jax.default_backend() == "cpu" else GPU_FACTOR)
-    length = largest_divisor(horizon, min(MAX_STEPS, max(1, samples // num_episodes)))
-    chunks = jax.tree.map(lambda x: x.reshape(horizon // length, length, *x.shape[1:]), data)
-    needed = jnp.any(chunks[-1], axis=(1, 2))
     differentiate = jax.value_and_grad(loss, has_aux=True)
 
-    def visit(index):
-        chunk = jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, index, keepdims=False), chunks)
+    def visit(chunk):
         (value, metrics), grads = differentiate(params, chunk)
         return value, grads, metrics
 
-    zeros = jax.tree.map(
-        lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(visit, jnp.zeros((), jnp.int32))
-    )
+    return accumulate(visit, data)
+
+
+def accumulate(function: Callable[[Any], Any], data: tuple[Any, ...]) -> Any:
+    """Sums a function over chunks of time.
+
+    Args:
+      function: chunk of data -> a pytree of sums over the chunk, of zeros where its mask is empty.
+      data: as for ``accumulate_gradient``.
+    """
+    chunks, needed = _in_chunks(data)
+    sums = jax.eval_shape(function, _chunk(chunks, jnp.zeros((), jnp.int32)))
 
     def body(carry):
         index, sums = carry
-        return index + 1, jax.tree.map(jnp.add, sums, visit(index))
+        return index + 1, jax.tree.map(jnp.add, sums, function(_chunk(chunks, index)))
+
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), sums)
+    return while_any(_more(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
+
+
+def map_steps(function: Callable[[Any], jax.Array], data: tuple[Any, ...]) -> jax.Array:
+    """Applies a function of single steps to all of them; returns [T, N], 0 outside the mask.
+
+    Args:
+      function: data [..., *] of any steps -> a number for each, [...].
+      data: as for ``accumulate_gradient``.
+    """
+    chunks, needed = _in_chunks(data)
+
+    def body(carry):
+        index, values = carry
+        chunk = _chunk(chunks, index)
+        own = jnp.where(chunk[-1], function(chunk), 0.0)
+        return index + 1, lax.dynamic_update_index_in_dim(values, own, index, 0)
+
+    one = jax.eval_shape(function, _chunk(chunks, jnp.zeros((), jnp.int32)))
+    zeros = jnp.zeros((needed.size, *one.shape), one.dtype)
+    values = while_any(_more(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
+    return values.reshape(data[-1].shape)
+
+
+def _in_chunks(data: tuple[Any, ...]) -> tuple[tuple[Any, ...], jax.Array]:
+    """Returns the data [C, length, N, ...], and which of the C chunks have a step to visit."""
+    horizon, num_episodes = data[-1].shape
+    samples = MAX_SAMPLES * (1 if jax.default_backend() == "cpu" else GPU_FACTOR)
+    length = largest_divisor(horizon, min(MAX_STEPS, max(1, samples // num_episodes)))
+    chunks = jax.tree.map(lambda x: x.reshape(horizon // length, length, *x.shape[1:]), data)
+    return chunks, jnp.any(chunks[-1], axis=(1, 2))
+
+
+def _chunk(chunks: tuple[Any, ...], index: jax.Array) -> tuple[Any, ...]:
+    return jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, index, keepdims=False), chunks)
+
+
+def _more(needed: jax.Array) -> Callable[[Any], jax.Array]:
+    """Returns the condition of a loop over chunks, whose carry begins with the next one's index."""
 
     def more(carry):
         index = carry[0]
         return (index < needed.size) & needed[jnp.minimum(index, needed.size - 1)]
 
-    return while_any(more, body, (jnp.zeros((), jnp.int32), zeros))[1]
+    return more

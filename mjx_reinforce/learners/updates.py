@@ -17,6 +17,7 @@ from jax import lax
 from mjx_reinforce.engines.chunks import while_any
 from mjx_reinforce.learners.diagnostics import signal_to_noise
 from mjx_reinforce.learners.gradients import accumulate_gradient
+from mjx_reinforce.learners.samples import draw_steps
 from mjx_reinforce.learners.schedules import Clock
 from mjx_reinforce.policies.arguments import check_count, check_number
 from mjx_reinforce.registry import check_name
@@ -108,10 +109,7 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
     def update(problem, key, params, opt_state):
         mask = problem.samples[-1].reshape(-1)
         flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), problem.samples)
-        ranks = jnp.cumsum(mask)
-        drawn = jax.random.randint(key, (num_updates, batch_size), 1, 1 + jnp.maximum(ranks[-1], 1))
-        # Where the first, second, ... step inside the mask is; ``drawn`` counts from 1.
-        indices = jnp.searchsorted(ranks, drawn)
+        indices = draw_steps(key, mask, (num_updates, batch_size))
 
         def one(carry, index):
             params, opt_state = carry

@@ -75,7 +75,7 @@ def _build_reinforce(env: Any, config: Config, shared: dict[str, Any]) -> Any:
         to_screen(said)
     return reinforce(
         env,
-        estimator=_build_estimator(config),
+        estimator=_build_estimator(config, shared["horizon"]),
         optimizer=_build_optimizer(config),
         update=_build_update(config),
         num_episodes=config.num_episodes,
@@ -103,36 +103,49 @@ def _build_ars(env: Any, config: Config, shared: dict[str, Any]) -> Any:
     )
 
 
-def _build_estimator(config: Config) -> Any:
+def _build_estimator(config: Config, horizon: int) -> Any:
     """Returns an estimator; where its discount changes, a function from the used share to one."""
     from mjx_reinforce.learners.schedules import look_further
 
     first, last = config.discount, config.final_discount
     if last is None:
-        return _estimator(config, first)
-    return lambda progress: _estimator(config, look_further(first, last, progress))
+        return _estimator(config, horizon, first)
+    return lambda progress: _estimator(config, horizon, look_further(first, last, progress))
 
 
-def _estimator(config: Config, discount: Any) -> Any:
-    import optax
-
+def _estimator(config: Config, horizon: int, discount: Any) -> Any:
     from mjx_reinforce.learners import estimators
-    from mjx_reinforce.policies.networks import MLP
+    from mjx_reinforce.policies.arguments import known_number
     from mjx_reinforce.registry import ESTIMATORS, load
 
-    settings = {}
     if config.estimator == "value-baseline":
-        settings = {
-            "network": MLP(config.value_hidden_sizes, 1, initializer=config.initializer),
-            "optimizer": optax.adam(config.value_learning_rate),
-            "num_fits": config.value_fits,
-        }
-    estimator = load(ESTIMATORS[config.estimator])(discount, **settings)
+        estimator = _build_value_baseline(config, horizon, discount)
+    else:
+        settings = {"ended": config.ended_episodes} if config.estimator == "leave-one-out" else {}
+        estimator = load(ESTIMATORS[config.estimator])(discount, **settings)
+    if known_number(config.reward_shift) != 0:
+        estimator = estimators.shift_rewards(estimator, config.reward_shift)
     if config.standardize:
         estimator = estimators.standardize(estimator, floor=config.standardize_floor)
     if config.discount_weights:
         estimator = estimators.discount_weights(estimator, discount)
     return estimator
+
+
+def _build_value_baseline(config: Config, horizon: int, discount: Any) -> Any:
+    import optax
+
+    from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
+    from mjx_reinforce.policies.networks import MLP
+
+    shared = {
+        "network": MLP(config.value_hidden_sizes, 1, initializer=config.initializer),
+        "optimizer": optax.adam(config.value_learning_rate),
+        "num_fits": config.value_fits,
+    }
+    if config.value_fit == "full-batch":
+        return full_batch_value_baseline(discount, **shared)
+    return value_baseline(discount, horizon=horizon, batch_size=config.value_batch_size, **shared)
 
 
 def _build_optimizer(config: Config) -> Any:

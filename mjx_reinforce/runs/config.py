@@ -115,8 +115,8 @@ _OPTIONAL = {field.name for field in dataclasses.fields(Config) if "None" in str
 _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     (
         "num_seeds num_episodes env_steps max_updates horizon decay_steps decay_updates eval_every "
-        "checkpoint_every eval_episodes test_episodes value_fits minibatch_updates "
-        "minibatch_size num_directions top_directions",
+        "checkpoint_every eval_episodes test_episodes value_fits value_batch_size "
+        "minibatch_updates minibatch_size num_directions top_directions",
         lambda x: x >= 1,
         "at least 1",
     ),
@@ -129,7 +129,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     (
         "num_episodes horizon decay_updates eval_every eval_episodes "
         "test_episodes "
-        "normalize_steps minibatch_size num_directions checkpoint_every",
+        "normalize_steps minibatch_size value_batch_size num_directions checkpoint_every",
         lambda x: x <= MAX_OF_UPDATE,
         "less than 2^31",
     ),
@@ -168,6 +168,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         lambda x: math.isfinite(x) and x >= 0,
         "finite and not negative",
     ),
+    ("reward_shift", lambda x: math.isfinite(x) and abs(x) <= _MAX_SIZE, "finite, in float32"),
     # Weights are about 1, and most optimisers move each of them by about the rate.
     (
         "learning_rate final_learning_rate value_learning_rate step_size",

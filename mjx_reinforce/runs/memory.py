@@ -63,14 +63,22 @@ def parts(config: Config, task: Task) -> list[Part]:
     network = _ACTIVATIONS * held + _PARAMETERS * policies * num_parameters(config, task)
     critic = config.value_hidden_sizes if config.estimator == "value-baseline" else ()
     critics = _CRITIC_PARAMETERS * seeds * critic_parameters(config, task)
+    valued, fitted = steps, 0
+    if config.value_fit == "minibatches" and critic:
+        fitted = seeds * config.value_batch_size
+        valued = seeds * min(horizon, _CHUNK) * episodes
     widest = max([values, *config.hidden_sizes])
     drawn = seeds * config.minibatch_size if config.update == "minibatches" else 0
     return [
         Part(_FLOAT * drawn * widest, "--minibatch-size or --num-seeds"),
+        Part(
+            _FLOAT * fitted * (config.value_fits + values + _ACTIVATIONS * sum(critic)),
+            "--value-batch-size, --value-fits or --num-seeds",
+        ),
         Part(_FLOAT * _COPIES * steps * values, f"--num-seeds, {fewer} or --horizon"),
         Part(_FLOAT * network, f"--hidden-sizes, --num-seeds or {fewer}"),
         Part(
-            _FLOAT * (_ACTIVATIONS * steps * sum(critic) + critics),
+            _FLOAT * (_ACTIVATIONS * valued * sum(critic) + critics),
             "--value-hidden-sizes, --num-seeds or --horizon",
         ),
         Part(_EVALUATED * evaluated, "--eval-episodes, --num-seeds or --horizon"),

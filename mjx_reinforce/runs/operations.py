@@ -15,7 +15,7 @@ def per_step(config: Config, task: Task) -> float:
 
     The policy plays and measures how far it moved, and learns from each step once, or from what
     minibatches draw. The value network gives each step its value, and is fitted ``value_fits``
-    times.
+    times, on all of them or on minibatches.
 
     Args:
       config: the settings.
@@ -24,10 +24,13 @@ def per_step(config: Config, task: Task) -> float:
     policy = num_parameters(config, task)
     if config.algorithm == "ars":
         return _FORWARDS * policy
+    steps = config.num_episodes * (config.horizon or task.horizon)
     learned = 1.0
     if config.update == "minibatches":
-        steps = config.num_episodes * (config.horizon or task.horizon)
         learned = config.minibatch_updates * config.minibatch_size / steps
+    fitted = config.value_fits
+    if config.value_fit == "minibatches":
+        fitted *= config.value_batch_size / steps
     once = _FORWARDS + _BACKWARDS
-    value = critic_parameters(config, task) * (_FORWARDS + once * config.value_fits)
+    value = critic_parameters(config, task) * (_FORWARDS + once * fitted)
     return (2 * _FORWARDS + once * learned) * policy + value

@@ -48,6 +48,7 @@ _BASELINE = dataclasses.replace(
     estimator="value-baseline",
     discount_weights=True,
     value_learning_rate=3e-4,
+    value_fit="full-batch",
     value_fits=1,
     loss_per="step",
     learning_rate=3e-4,

@@ -12,11 +12,11 @@ FREE_STD = ("normal", "truncated-normal", "clipped-normal", "tanh-normal")
 #: the most general first. What stands in none is always read.
 READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
     (
-        "num_episodes estimator discount final_discount discount_weights standardize "
-        "standardize_floor value_learning_rate value_fits value_hidden_sizes update "
-        "minibatch_updates minibatch_size loss_per entropy_cost optimizer learning_rate "
-        "final_learning_rate decay_steps decay_updates weight_decay max_grad_norm max_kl "
-        "final_std momentum",
+        "num_episodes estimator ended_episodes discount final_discount reward_shift "
+        "discount_weights standardize standardize_floor value_learning_rate value_fit value_fits "
+        "value_batch_size value_hidden_sizes update minibatch_updates minibatch_size loss_per "
+        "entropy_cost optimizer learning_rate final_learning_rate decay_steps decay_updates "
+        "weight_decay max_grad_norm max_kl final_std momentum",
         lambda c: c.algorithm == "reinforce",
         "--algorithm reinforce",
     ),
@@ -26,10 +26,12 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
         "--algorithm ars",
     ),
     (
-        "value_learning_rate value_fits value_hidden_sizes",
+        "value_learning_rate value_fit value_fits value_batch_size value_hidden_sizes",
         lambda c: c.estimator == "value-baseline",
         "--estimator value-baseline",
     ),
+    ("value_batch_size", lambda c: c.value_fit == "minibatches", "--value-fit minibatches"),
+    ("ended_episodes", lambda c: c.estimator == "leave-one-out", "--estimator leave-one-out"),
     ("standardize_floor", lambda c: c.standardize, "--standardize"),
     ("overwrite", lambda c: c.output is not None or c.resume is not None, "--output DIR"),
     (

@@ -83,11 +83,18 @@ class EstimatorSettings:
     """total-return; reward-to-go; leave-one-out (less that of the other episodes);
     value-baseline (less a learned value); and two that are published but odd: mean-log-prob,
     normalized-returns (their docstrings say how)."""
+    ended_episodes: Literal["zero", "skip"] = "zero"
+    """How leave-one-out counts the other episodes that are over at a step: zero, as the 0 that
+    they still earn; skip, not at all, which is less noisy where episodes end at different times."""
     discount: float = 0.99
     """Discount of rewards, in [0, 1]."""
     final_discount: float | None = None
     """It goes to this one over the budget, evenly in the logarithm of 1 / (1 - discount), the
     steps that it looks ahead: noisy gradients want few, sure ones many. None: it stays."""
+    reward_shift: float = 0.0
+    """Subtracted from the reward of every step for training alone, such as the bonus for staying
+    alive, which may keep a policy from moving (Mania et al. 2018). Returns stay those of the
+    task."""
     discount_weights: bool = False
     """Multiply the weight at step t by discount^t, which most programs leave out."""
     standardize: bool = True
@@ -96,8 +103,14 @@ class EstimatorSettings:
     """Added to that standard deviation, in units of return."""
     value_learning_rate: float = 3e-3
     """Adam's learning rate for the value network of value-baseline."""
-    value_fits: int = 10
-    """Its gradient steps an update, on the squared error over the rollout."""
+    value_fit: Literal["minibatches", "full-batch"] = "minibatches"
+    """minibatches: it reads the time besides the observation, and is fitted, in units of the
+    return's standard deviation, to steps drawn from the episodes; full-batch: as published programs
+    do it, it reads the observation alone, and each gradient step takes the whole rollout."""
+    value_fits: int = 32
+    """Its gradient steps an update, on the squared error."""
+    value_batch_size: int = 256
+    """Steps of the episodes a minibatch, drawn with replacement."""
     value_hidden_sizes: tuple[int, ...] = (64, 64)
     """Units of its tanh layers."""
 

@@ -15,6 +15,7 @@ _REINFORCE = (
     "decay_steps",
     "discount",
     "final_discount",
+    "reward_shift",
     "entropy_cost",
     "standardize_floor",
     "max_grad_norm",
