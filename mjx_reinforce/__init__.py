@@ -35,6 +35,7 @@ _HOME = {
     "full_batch": "learners.updates",
     "minibatches": "learners.updates",
     "each_step": "learners.updates",
+    "natural_gradient": "learners.natural_gradient",
     "make_optimizer": "learners.updates",
     "Actor": "policies.actor",
     "act": "policies.actor",

@@ -107,6 +107,17 @@ def test_folders_that_may_not_be_entered_are_named(tmp_path, command, message):
         ("--shared-starts --step-size 0.5", "--step-size 0.5 --shared-starts would do nothing"),
         ("--minibatch-size 64", "only --update minibatches reads that; leave it out"),
         ("--minibatch-updates 5", "choose --update minibatches"),
+        ("--natural-damping 1e-2", "only --update natural-gradient reads that"),
+        ("--update natural-gradient --max-kl 0.01 --momentum 0.7", "would do nothing"),
+        ("--update natural-gradient --max-kl 0.01 --optimizer sgd", "another --update"),
+        (
+            "--env CartPole-v1 --update natural-gradient --max-kl 0.01 --learning-rate 0.1",
+            "only another --update than natural-gradient, or --final-learning-rate reads that",
+        ),
+        (
+            "--env Reacher-v5 --update natural-gradient --hidden-sizes --natural-iterations 5",
+            "only hidden layers or another --policy than normal reads that",
+        ),
         ("--value-fits 5", "only --estimator value-baseline"),
         (
             "--estimator reward-to-go --ended-episodes skip",
@@ -161,6 +172,14 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ("--final-std 0", "--final-std must be positive and finite, got 0.0"),
         ("--algorithm ars --max-kl 0.02", "--max-kl 0.02 would do nothing"),
         ("--discount -0.1", "in [0, 1], got -0.1"),
+        (
+            "--env CartPole-v1 --update natural-gradient",
+            "has the length of its steps from --max-kl, which is None: give a number",
+        ),
+        (
+            "--update natural-gradient --policy tanh-normal",
+            "needs a distribution whose KL divergence is known: choose normal,",
+        ),
         ("--reward-shift nan", "--reward-shift must be finite, in float32, got nan"),
         ("--seed -1", "--seed must be in [0, 2^32), got -1"),
         ("--eval-seed 4294967296", "--eval-seed must be in [0, 2^32)"),
@@ -627,7 +646,7 @@ RIGHT = {
     "value_fit": st.sampled_from(["minibatches", "full-batch"]),
     "ended_episodes": st.sampled_from(["zero", "skip"]),
     "reward_shift": st.floats(-5.0, 5.0),
-    "update": st.sampled_from(["full-batch", "minibatches", "each-step"]),
+    "update": st.sampled_from(["full-batch", "natural-gradient", "minibatches", "each-step"]),
     "ars_update": st.sampled_from(["paper", "document"]),
     "loss_per": st.sampled_from(["episode", "step"]),
     "initializer": st.sampled_from(["orthogonal", "torch"]),

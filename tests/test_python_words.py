@@ -78,6 +78,10 @@ REFUSED = {
     "optax.adam": ({"optimizer": optax.adam}, r"such as optax.adam\(1e-2\), got adam"),
     "a rate": ({"optimizer": 1e-3}, "optimizer must be of type .* got a float"),
     "full_batch": ({"update": m.full_batch}, "got full_batch, which is to be called"),
+    "natural_gradient": (
+        {"update": m.natural_gradient},
+        "got natural_gradient, which is to be called",
+    ),
     "an update's name": ({"update": "each-step"}, "got 'each-step'"),
     "entropy": ({"entropy_cost": NAN}, "entropy_cost must be 0 or more and finite, got nan"),
     "normalize": ({"normalize_steps": NAN}, "normalize_steps must be 0 or more, got nan"),

@@ -9,6 +9,7 @@ import optax
 from mjx_reinforce.checks import check_kind, explain
 from mjx_reinforce.learners import updates
 from mjx_reinforce.learners.estimators import Estimator
+from mjx_reinforce.learners.natural_gradient import natural_gradient
 from mjx_reinforce.types import Environment, Trajectory, null_action
 
 #: Steps and episodes of the trajectory that an estimator is tried on: no two axes have one size.
@@ -22,7 +23,7 @@ def check_optimizer(name: str, value: Any) -> None:
 
 def check_update(update: Any) -> None:
     """Raises ValueError for what is no update, or a function that makes one."""
-    makers = updates.full_batch, updates.minibatches, updates.each_step
+    makers = updates.full_batch, updates.minibatches, updates.each_step, natural_gradient
     if update in makers or not callable(update):
         got = f"{update.__name__}, which is to be called" if update in makers else repr(update)
         raise ValueError(f"update must be such as mjx_reinforce.full_batch(), got {got}")

@@ -52,6 +52,8 @@ _NOISE_SHARE, _NOISE_EPISODES = 32, 64
 #: made the optimiser and it clips, ``clipped_gradients`` (1 or 0), means over optimiser steps; and
 #: what an update adds.
 Update = Callable[[Problem, jax.Array, Any, Any], tuple[Any, Any, dict[str, jax.Array]]]
+#: (problem, key, params, gradient) -> what the optimiser is given for it; may consume the key.
+Turn = Callable[[Problem, jax.Array, Any, Any], Any]
 
 
 def full_batch() -> Update:
@@ -61,16 +63,27 @@ def full_batch() -> Update:
     episodes of that gradient, see ``diagnostics.signal_to_noise``. The noise is estimated from one
     episode in 32, at least from one and at most from 64: from few it is right on average alone.
     """
+    return whole_rollout(lambda problem, key, params, gradient: gradient)
+
+
+def whole_rollout(turn: Turn) -> Update:
+    """``full_batch``, in which ``turn`` makes another step of the gradient."""
 
     def update(problem, key, params, opt_state):
-        del key
         mask = problem.samples[-1]
         _, grads, sums = accumulate_gradient(problem.surrogate, params, problem.samples)
         env_steps = jnp.sum(mask)
         metrics = {"entropy": sums["entropy"] / jnp.maximum(env_steps, 1)}
         if mask.shape[1] > 1:
             metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
-        params, opt_state, step = _descend(problem, grads, problem.divisor, params, opt_state)
+        params, opt_state, step = _descend(
+            problem,
+            grads,
+            problem.divisor,
+            params,
+            opt_state,
+            turn=lambda gradient: turn(problem, key, params, gradient),
+        )
         return params, opt_state, metrics | step
 
     return update
@@ -174,11 +187,15 @@ def _descend(
     divisor: int | jax.Array,
     params: Any,
     opt_state: Any,
+    turn: Callable[[Any], Any] = lambda gradient: gradient,
 ) -> tuple[Any, Any, dict[str, jax.Array]]:
-    """Makes one optimiser step on summed gradients; also returns the metrics of that step."""
+    """Makes one optimiser step on summed gradients; also returns the metrics of that step.
+
+    The optimiser is given what ``turn`` makes of the mean gradient.
+    """
     grads = jax.tree.map(lambda g: g / divisor, grads)
     optimizer = optax.with_extra_args_support(problem.optimizer)
-    changes, opt_state = optimizer.update(grads, opt_state, params, clock=problem.clock)
+    changes, opt_state = optimizer.update(turn(grads), opt_state, params, clock=problem.clock)
     metrics = {"gradient_norm": optax.tree.norm(grads)}
     parts = jax.tree.leaves(opt_state, is_leaf=lambda x: isinstance(x, ClipState))
     for part in parts:

@@ -34,6 +34,8 @@ class Distribution(NamedTuple):
     std: (outputs [..., K]) -> [..., A] the standard deviation in the action's unit, before what
       the family does to keep actions in their range; None where there is none
     kl: (outputs, other outputs) -> [...] the divergence KL(first || second) in nats, if it is known
+    fisher: (constants [K - num_outputs]) -> [K] the diagonal of the Fisher matrix in ``outputs``,
+      of a family in which it is diagonal and depends on these alone; else None
     """
 
     num_outputs: int
@@ -46,6 +48,7 @@ class Distribution(NamedTuple):
     num_scales: int = 0
     std: Callable[[jax.Array], jax.Array] | None = None
     kl: Callable[[jax.Array, jax.Array], jax.Array] | None = None
+    fisher: Callable[[jax.Array], jax.Array] | None = None
 
     def __repr__(self) -> str:
         return f"Distribution({self.num_outputs} outputs, {len(self.constants)} constants)"

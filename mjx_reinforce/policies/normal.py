@@ -60,7 +60,11 @@ def normal(
     def mode(outputs):
         return base.split(outputs)[0]
 
-    return base.distribution(sample, mode, log_prob, entropy, kl=kl)
+    def fisher(constants):
+        return jnp.concatenate([(base.half * jnp.exp(-constants)) ** 2, 2.0 + 0.0 * constants])
+
+    distribution = base.distribution(sample, mode, log_prob, entropy, kl=kl)
+    return distribution._replace(fisher=fisher) if std == "parameter" else distribution
 
 
 def normal_softplus(

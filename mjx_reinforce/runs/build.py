@@ -77,7 +77,7 @@ def _build_reinforce(env: Any, config: Config, shared: dict[str, Any]) -> Any:
         env,
         estimator=_build_estimator(config, shared["horizon"]),
         optimizer=_build_optimizer(config),
-        update=_build_update(config),
+        update=_build_update(config, shared["policy"]),
         num_episodes=config.num_episodes,
         entropy_cost=config.entropy_cost,
         loss_per=config.loss_per,
@@ -167,6 +167,9 @@ def _build_optimizer(config: Config) -> Any:
         max_grad_norm=config.max_grad_norm,
         momentum=config.momentum,
     )
+    if config.update == "natural-gradient":
+        # Its steps have their length from max_kl; of that a decaying rate leaves a share.
+        optimizer = optax.chain(optax.sgd(rate), optax.scale(1 / config.learning_rate))
     if config.decay_steps is None:
         return optimizer
     length = None if config.decay_steps == "budget" else config.decay_steps
@@ -177,9 +180,18 @@ def _build_optimizer(config: Config) -> Any:
     return optax.chain(optimizer, schedules.shrink_std(ratio, length))
 
 
-def _build_update(config: Config) -> Any:
+def _build_update(config: Config, policy: Any) -> Any:
     from mjx_reinforce.learners import updates
+    from mjx_reinforce.learners.natural_gradient import natural_gradient
 
+    if config.update == "natural-gradient":
+        assert config.max_kl is not None  # checked
+        return natural_gradient(
+            policy,
+            config.max_kl,
+            damping=config.natural_damping,
+            iterations=config.natural_iterations,
+        )
     if config.update == "minibatches":
         return updates.minibatches(config.minibatch_updates, config.minibatch_size)
     return updates.full_batch() if config.update == "full-batch" else updates.each_step()

@@ -116,7 +116,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     (
         "num_seeds num_episodes env_steps max_updates horizon decay_steps decay_updates eval_every "
         "checkpoint_every eval_episodes test_episodes value_fits value_batch_size "
-        "minibatch_updates minibatch_size num_directions top_directions",
+        "natural_iterations minibatch_updates minibatch_size num_directions top_directions",
         lambda x: x >= 1,
         "at least 1",
     ),
@@ -134,7 +134,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         "less than 2^31",
     ),
     (
-        "value_fits minibatch_updates",
+        "value_fits natural_iterations minibatch_updates",
         lambda x: x <= _MAX_STEPS,
         f"at most {_MAX_STEPS:,}, for an update makes so many steps one after the other",
     ),
@@ -158,7 +158,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ),
     (
         "initial_std final_std learning_rate final_learning_rate max_grad_norm max_kl "
-        "value_learning_rate "
+        "value_learning_rate natural_damping "
         "step_size noise_std",
         lambda x: math.isfinite(x) and x > 0,
         "positive and finite",
@@ -177,7 +177,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ),
     (
         "initial_std final_std noise_std max_grad_norm max_kl standardize_floor entropy_cost "
-        "weight_decay normalize_min_std",
+        "weight_decay normalize_min_std natural_damping",
         lambda x: x == 0 or 1 / _MAX_SIZE <= x <= _MAX_SIZE,
         f"in [{1 / _MAX_SIZE:g}, {_MAX_SIZE:g}], for runs compute in float32",
     ),
@@ -200,6 +200,11 @@ def _check_reinforce(config: Config) -> None:
         raise ValueError(
             f"--discount {config.discount} and --final-discount {config.final_discount}: one that "
             "changes must be less than 1, such as 0.9999"
+        )
+    if config.update == "natural-gradient" and config.max_kl is None:
+        raise ValueError(
+            "--update natural-gradient has the length of its steps from --max-kl, which is None: "
+            "give a number, such as 0.01"
         )
     if config.decay_steps is not None and config.decay_updates is not None:
         raise ValueError(

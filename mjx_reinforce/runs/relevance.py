@@ -14,9 +14,10 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
     (
         "num_episodes estimator ended_episodes discount final_discount reward_shift "
         "discount_weights standardize standardize_floor value_learning_rate value_fit value_fits "
-        "value_batch_size value_hidden_sizes update minibatch_updates minibatch_size loss_per "
-        "entropy_cost optimizer learning_rate final_learning_rate decay_steps decay_updates "
-        "weight_decay max_grad_norm max_kl final_std momentum",
+        "value_batch_size value_hidden_sizes update natural_damping natural_iterations "
+        "minibatch_updates minibatch_size loss_per entropy_cost optimizer learning_rate "
+        "final_learning_rate decay_steps decay_updates weight_decay max_grad_norm max_kl "
+        "final_std momentum",
         lambda c: c.algorithm == "reinforce",
         "--algorithm reinforce",
     ),
@@ -38,6 +39,27 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
         "minibatch_updates minibatch_size",
         lambda c: c.update == "minibatches",
         "--update minibatches",
+    ),
+    (
+        "natural_damping natural_iterations",
+        lambda c: c.update == "natural-gradient",
+        "--update natural-gradient",
+    ),
+    (
+        "natural_iterations",
+        lambda c: bool(c.hidden_sizes) or c.policy != "normal",
+        "hidden layers or another --policy than normal",
+    ),
+    # The natural gradient's step has its length from --max-kl.
+    (
+        "optimizer momentum weight_decay max_grad_norm",
+        lambda c: c.update != "natural-gradient",
+        "another --update than natural-gradient",
+    ),
+    (
+        "learning_rate",
+        lambda c: c.update != "natural-gradient" or c.final_learning_rate is not None,
+        "another --update than natural-gradient, or --final-learning-rate",
     ),
     # A minibatch is averaged over its own steps.
     (
@@ -105,7 +127,8 @@ def check_read_by_policy(config: Config, default: Config, policy: str) -> None:
       policy: the distribution that stands for ``auto``, which depends on the environment.
     """
     chosen = dataclasses.replace(config, policy=policy)
-    given = {"initial_std", "final_std", "rescale"}.intersection(changed(config, default))
+    read = {"initial_std", "final_std", "rescale", "natural_iterations"}
+    given = read.intersection(changed(config, default))
     check_read(chosen, dataclasses.replace(chosen, **dict.fromkeys(given, object())))
 
 

@@ -119,9 +119,17 @@ class EstimatorSettings:
 class UpdateSettings:
     """How the gradient becomes changes of the parameters (reinforce)."""
 
-    update: Literal["full-batch", "minibatches", "each-step"] = "full-batch"
-    """full-batch: one optimiser step a rollout; minibatches: several, on steps drawn from it;
-    each-step: one for every time step, in order. Only full-batch measures gradient_snr."""
+    update: Literal["full-batch", "natural-gradient", "minibatches", "each-step"] = "full-batch"
+    """full-batch: one optimiser step a rollout; natural-gradient: one along the natural gradient,
+    as long as --max-kl says, of which decays of the learning rate leave a share; minibatches:
+    several, on steps drawn from it; each-step: one for every time step, in order. Only the first
+    two measure gradient_snr."""
+    natural_damping: float = 1e-3
+    """Added to the diagonal of the Fisher matrix of natural-gradient: directions in which the
+    policy hardly changes are followed less far."""
+    natural_iterations: int = 10
+    """Conjugate gradients that solve for its direction; a linear policy with the distribution
+    normal needs none."""
     minibatch_updates: int = 50
     """Optimiser steps a rollout, of minibatches."""
     minibatch_size: int = 128
@@ -207,8 +215,8 @@ class LogSettings:
     """Where the rows of metrics.csv go besides. The charts' step is the number of updates.
 
     A column is empty where nothing is measured: gradient_snr, the signal-to-noise ratio of the
-    gradient over episodes, needs --update full-batch or ars, and two episodes or directions;
-    explained_variance a baseline; clipped_gradients --max-grad-norm.
+    gradient over episodes, needs --update full-batch or natural-gradient, or ars, and two episodes
+    or directions; explained_variance a baseline; clipped_gradients --max-grad-norm.
     """
 
     tensorboard: bool = False

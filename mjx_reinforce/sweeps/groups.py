@@ -20,6 +20,7 @@ _REINFORCE = (
     "standardize_floor",
     "max_grad_norm",
     "max_kl",
+    "natural_damping",
     "normalize_min_std",
     "momentum",
     "value_learning_rate",

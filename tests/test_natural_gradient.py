@@ -1,0 +1,265 @@
+"""The natural gradient against a Fisher matrix made of score outer products, and its length."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jax.flatten_util import ravel_pytree
+from toys import Drift, SignedTarget
+
+from mjx_reinforce import mlp_policy, natural_gradient, reinforce, train_step
+from mjx_reinforce.learners import natural_gradient as module
+from mjx_reinforce.learners import schedules
+from mjx_reinforce.learners.reinforce import _surrogate
+from mjx_reinforce.learners.updates import Problem, full_batch
+from mjx_reinforce.policies.categorical import categorical
+from mjx_reinforce.policies.normal import normal
+from mjx_reinforce.policies.tanh_normal import tanh_normal
+from mjx_reinforce.runs.build import build
+from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.types import Box, Discrete
+
+MASK = np.arange(6)[:, None] < np.array([6, 1, 0, 4])
+BOX = Box(np.array([-1.0, 0.0]), np.array([1.0, 4.0]))
+FAMILIES = {
+    "linear normal": (normal(BOX), ()),
+    "normal": (normal(BOX), (3,)),
+    "softplus": (normal(BOX, std="softplus"), (3,)),
+    "linear softplus": (normal(BOX, std="softplus"), ()),
+    "categorical": (categorical(Discrete(3)), (3,)),
+}
+DAMPING, MAX_KL = 1e-2, 1e-3
+
+
+def make(name, seed=0):
+    """A policy with weights far from the first ones, and what a rollout of it leaves."""
+    distribution, hidden_sizes = FAMILIES[name]
+    policy = mlp_policy(3, distribution, hidden_sizes)
+    keys = jax.random.split(jax.random.key(seed), 6)
+    flat, unravel = ravel_pytree(policy.init(keys[0]))
+    params = jax.tree.map(
+        lambda x: x.astype(float), unravel(0.5 * jax.random.normal(keys[1], flat.shape, flat.dtype))
+    )
+    observation = jax.random.normal(keys[2], (*MASK.shape, 3))
+    noise = distribution.noise(keys[3], MASK.shape)
+    action = distribution.sample(policy.apply(params, observation), noise)
+    weight = jnp.where(MASK, jax.random.normal(keys[4], MASK.shape), 0.0)
+    samples = (observation, action, weight, jnp.asarray(MASK))
+    return policy, params, Problem(_surrogate(policy, 0.0), optax.sgd(1.0), samples, 4)
+
+
+def actions_and_probabilities(distribution, outputs):
+    """Of a Normal the nodes and weights of a quadrature that is exact for a score's square."""
+    if not distribution.constants and distribution.std is None:
+        return np.arange(3), jax.nn.softmax(outputs)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(3)
+    pairs = np.array(list(itertools.product(nodes, nodes)))
+    share = np.array([a * b for a, b in itertools.product(weights, weights)]) / (2 * np.pi)
+    return distribution.sample(outputs, jnp.asarray(pairs)), share
+
+
+def dense_fisher(policy, params, observations):
+    """The mean over observations of E[score score^T], [P, P]."""
+    flat, unravel = ravel_pytree(params)
+    total = np.zeros((flat.size, flat.size))
+    for observation in observations:
+        outputs = policy.apply(params, observation)
+        actions, shares = actions_and_probabilities(policy.distribution, outputs)
+
+        def log_prob(flat, action, observation=observation):
+            return policy.distribution.log_prob(policy.apply(unravel(flat), observation), action)
+
+        scores = np.asarray(jax.vmap(jax.grad(log_prob), (None, 0))(flat, jnp.asarray(actions)))
+        total += (scores.T * np.asarray(shares)) @ scores
+    return total / len(observations)
+
+
+def step(update, policy, params, problem, key=None):
+    """Returns the change of the parameters in one vector, and the metrics."""
+    key = jax.random.key(7) if key is None else key
+    after, _, metrics = update(problem, key, params, problem.optimizer.init(params))
+    return np.asarray(ravel_pytree(after)[0] - ravel_pytree(params)[0]), metrics
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_the_step_is_that_of_a_dense_fisher_matrix(name):
+    with jax.enable_x64(True):
+        policy, params, problem = make(name)
+        iterations = 1 if name == "linear normal" else 60  # which is exact without
+        update = natural_gradient(policy, MAX_KL, damping=DAMPING, iterations=iterations)
+        got, metrics = step(update, policy, params, problem)
+        fisher = dense_fisher(policy, params, np.asarray(problem.samples[0])[MASK])
+        plain, plain_metrics = step(full_batch(), policy, params, problem)
+        direction = np.linalg.solve(fisher + DAMPING * np.eye(len(fisher)), plain)
+        expected = np.sqrt(2 * MAX_KL / (plain @ direction)) * direction
+        np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-9)
+        model = 0.5 * got @ (fisher + DAMPING * np.eye(len(fisher))) @ got
+        assert model == pytest.approx(MAX_KL, rel=1e-6)
+        assert metrics.keys() == plain_metrics.keys()
+        assert metrics["gradient_norm"] == pytest.approx(plain_metrics["gradient_norm"])
+
+
+def test_single_precision_and_observations_that_never_change():
+    """One entry is 0 and one repeats another: the Fisher matrix is singular."""
+    for name in ("linear normal", "normal"):
+        policy, params, problem = make(name)
+        observation, *others = problem.samples
+        observation = observation.at[..., 1].set(0.0).at[..., 2].set(observation[..., 0])
+        problem = problem._replace(samples=(observation, *others))
+        update = natural_gradient(policy, MAX_KL, damping=1e-3, iterations=30)
+        got, _ = step(update, policy, params, problem)
+        assert got.dtype == np.float32
+        with jax.enable_x64(True):
+            wide = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), params)
+            samples = tuple(
+                jnp.asarray(np.asarray(x), bool if x.dtype == bool else float)
+                for x in problem.samples
+            )
+            expected, _ = step(update, policy, wide, problem._replace(samples=samples))
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(got, expected, rtol=0, atol=2e-3 * scale)
+
+
+def test_the_fisher_matrix_of_a_normal_is_the_curvature_of_its_divergence():
+    distribution = normal(BOX)
+    outputs = jnp.array([0.3, -0.2, np.log(0.5), np.log(2.0)])
+    curvature = jax.hessian(distribution.kl, argnums=1)(outputs, outputs)
+    np.testing.assert_allclose(
+        np.diag(distribution.fisher(outputs[2:])), curvature, rtol=1e-5, atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("name", ["linear normal", "normal"])
+def test_no_gradient_is_no_step(name):
+    policy, params, problem = make(name)
+    observation, action, weight, mask = problem.samples
+    problem = problem._replace(samples=(observation, action, 0 * weight, mask))
+    got, _ = step(natural_gradient(policy, MAX_KL), policy, params, problem)
+    assert np.all(got == 0.0)
+
+
+@pytest.mark.parametrize("name", ["linear normal", "categorical"])
+def test_the_scale_of_the_weights_does_not_matter(name):
+    policy, params, problem = make(name)
+    update = natural_gradient(policy, MAX_KL)
+    expected, _ = step(update, policy, params, problem)
+    observation, action, weight, mask = problem.samples
+    for scale in (2.0**-50, 2.0**20):  # of which float32 rounds none
+        scaled = problem._replace(samples=(observation, action, scale * weight, mask))
+        got, _ = step(update, policy, params, scaled)
+        np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_steps_are_drawn_where_there_are_many(monkeypatch):
+    """From inside the mask; the direction is about that of all."""
+    policy, params, problem = make("normal")
+    observation, *others = problem.samples
+    poisoned = jnp.where(MASK[..., None], observation, jnp.nan)
+    update = natural_gradient(policy, MAX_KL, damping=0.1)
+    every, _ = step(update, policy, params, problem)
+    monkeypatch.setattr(module, "MAX_STEPS", 20)
+    keys = jax.random.split(jax.random.key(0), 20)
+
+    def draw(key, observation=observation):
+        samples = (observation, *others)
+        after, *_ = update(problem._replace(samples=samples), key, params, optax.sgd(1.0).init({}))
+        return ravel_pytree(after)[0] - ravel_pytree(params)[0]
+
+    drawn = np.asarray(jax.vmap(draw)(keys))
+    cosines = drawn @ every / np.linalg.norm(drawn, axis=1) / np.linalg.norm(every)
+    assert len(np.unique(cosines)) == len(keys)
+    assert cosines.mean() > 0.8
+    found = jax.vmap(lambda key: module.draw_steps(key, jnp.asarray(MASK), (20,)))(keys)
+    assert np.all(np.isfinite(poisoned.reshape(-1, 3)[found]))
+
+
+def learn(update, policy, optimizer=None, **settings):
+    learner = reinforce(
+        Drift(),
+        policy=policy,
+        update=update,
+        optimizer=optax.sgd(1.0) if optimizer is None else optimizer,
+        num_episodes=3,
+        normalize_steps=0,
+        engine="vmap",
+        **settings,
+    )
+    state = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(3), 4))
+    return jax.jit(jax.vmap(learner.step))(state)[1]
+
+
+@pytest.mark.parametrize("hidden_sizes", [(), (8,)])
+def test_a_step_moves_the_policy_by_about_the_divergence(hidden_sizes):
+    """Of four seeds side by side; a factor on the step counts by its square."""
+    policy = mlp_policy(1, normal(Drift.action_space), hidden_sizes)
+    update = natural_gradient(policy, 1e-3, iterations=20)
+    metrics = learn(update, policy)
+    assert np.all(metrics["skipped_update"] == 0)
+    np.testing.assert_allclose(metrics["kl"], 1e-3, rtol=0.1)
+    np.testing.assert_allclose(learn(update, policy, optax.sgd(0.5))["kl"], 2.5e-4, rtol=0.1)
+    shrinking = optax.chain(optax.sgd(0.0), schedules.shrink_std(0.5, 100))
+    assert np.all(learn(update, policy, shrinking)["kl"] > 1e-4)
+
+
+def test_seeds_side_by_side_are_the_seeds_alone():
+    policy = mlp_policy(1, normal(Drift.action_space), (8,))
+    settings = {"num_episodes": 4, "optimizer": optax.sgd(1.0), "engine": "vmap"}
+    learner = reinforce(
+        Drift(), policy=policy, update=natural_gradient(policy, 1e-2), max_kl=1e-2, **settings
+    )
+    states = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 3))
+    together, _ = jax.jit(jax.vmap(learner.step))(states)
+    for seed in range(3):
+        state = jax.tree.map(lambda x, seed=seed: x[seed], states)
+        alone, _ = train_step(learner, state)
+        for got, expected in zip(
+            jax.tree.leaves(together.actor.params), jax.tree.leaves(alone.actor.params), strict=True
+        ):
+            np.testing.assert_allclose(got[seed], expected, rtol=1e-3, atol=1e-5)
+
+
+def test_settings_become_the_update():
+    """The learning rate leaves a share of the step, relative to its first value."""
+    natural = Config(
+        update="natural-gradient",
+        max_kl=0.01,
+        hidden_sizes=(),
+        normalize_steps=0,
+        num_episodes=64,
+        engine="vmap",
+    )
+    check(natural)
+
+    def moved(**settings):
+        config = dataclasses.replace(natural, **settings)
+        learner, _ = build(SignedTarget(), config)
+        state = jax.jit(learner.init)(jax.random.key(0))
+        first, _ = train_step(learner, state)
+        second, metrics = train_step(learner, first)
+        return float(metrics["kl"]), second
+
+    constant, _ = moved(decay_steps=None)
+    assert constant == pytest.approx(0.01, rel=0.25)
+    assert moved(decay_steps=None, learning_rate=1e-3)[0] == pytest.approx(constant, rel=1e-3)
+    decayed, _ = moved(decay_steps=1)  # to a tenth of the step, a hundredth of the divergence
+    assert decayed == pytest.approx(1e-4, rel=0.25)
+
+
+def test_nonsense_is_refused():
+    policy = mlp_policy(1, normal(Drift.action_space))
+    with pytest.raises(ValueError, match="KL divergence is known"):
+        natural_gradient(mlp_policy(1, tanh_normal(Drift.action_space)), 0.01)
+    with pytest.raises(ValueError, match="max_kl must be positive"):
+        natural_gradient(policy, 0.0)
+    with pytest.raises(ValueError, match="damping must be positive"):
+        natural_gradient(policy, 0.01, damping=0.0)
+    with pytest.raises(ValueError, match="iterations must be at least 1"):
+        natural_gradient(policy, 0.01, iterations=0)
+    with pytest.raises(ValueError, match="policy must be of type Policy"):
+        natural_gradient(normal(Drift.action_space), 0.01)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="length of its steps from --max-kl, which is None"):
+        check(Config(update="natural-gradient"))
