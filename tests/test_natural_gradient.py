@@ -196,7 +196,7 @@ def learn(update, policy, optimizer=None, **settings):
 def test_a_step_moves_the_policy_by_about_the_divergence(hidden_sizes):
     """Of four seeds side by side; a factor on the step counts by its square."""
     policy = mlp_policy(1, normal(Drift.action_space), hidden_sizes)
-    update = natural_gradient(policy, 1e-3, iterations=20)
+    update = natural_gradient(policy, 1e-3, damping=1e-3, iterations=20)
     metrics = learn(update, policy)
     assert np.all(metrics["skipped_update"] == 0)
     np.testing.assert_allclose(metrics["kl"], 1e-3, rtol=0.1)
@@ -227,6 +227,7 @@ def test_settings_become_the_update():
     natural = Config(
         update="natural-gradient",
         max_kl=0.01,
+        natural_damping=1e-4,
         hidden_sizes=(),
         normalize_steps=0,
         num_episodes=64,

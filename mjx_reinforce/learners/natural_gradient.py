@@ -36,7 +36,7 @@ def natural_gradient(
     policy: Policy,
     max_kl: float | jax.Array,
     *,
-    damping: float | jax.Array = 1e-3,
+    damping: float | jax.Array = 0.1,
     iterations: int = 10,
 ) -> Update:
     """One step along x = (F + damping I)^-1 g, with the gradient g of the whole rollout.
@@ -60,7 +60,8 @@ def natural_gradient(
       policy: the one that is trained.
       max_kl: in nats, the mean over the visited steps.
       damping: added to the diagonal of F, in its unit, nats per square of a parameter. It keeps
-        directions in which the policy hardly changes from being followed far.
+        directions in which the policy hardly changes, where the gradient is mostly noise, from
+        being followed far. What it adds to the model of the KL divergence, the policy moves less.
       iterations: of the conjugate gradients.
 
     Raises:

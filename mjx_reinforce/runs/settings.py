@@ -124,7 +124,7 @@ class UpdateSettings:
     as long as --max-kl says, of which decays of the learning rate leave a share; minibatches:
     several, on steps drawn from it; each-step: one for every time step, in order. Only the first
     two measure gradient_snr."""
-    natural_damping: float = 1e-3
+    natural_damping: float = 0.1
     """Added to the diagonal of the Fisher matrix of natural-gradient: directions in which the
     policy hardly changes are followed less far."""
     natural_iterations: int = 10
