@@ -27,7 +27,7 @@ from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.runs.build import build, policy_settings
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.presets import PRESETS
-from mjx_reinforce.runs.state import compile_parts, parts_of
+from mjx_reinforce.runs.state import budget_of, compile_parts, parts_of
 from reproduce_cases import CASES, Case, limit, load_reference
 from reproduce_figures import draw
 from reproduce_mistakes import STALE, clamped, stale_starts
@@ -161,12 +161,12 @@ def train(
     if stale:
         learner = stale_starts(lambda env: build(env, config, policy)[0], env)
     state, programs = compile_parts(parts_of(env, learner, horizon, config), config)
-    compiled = time.perf_counter()
+    compiled, budget = time.perf_counter(), budget_of(config)
     scores, env_steps, columns = [], 0, Progress.get_default_columns()
     with Progress(*columns, MofNCompleteColumn(), TimeElapsedColumn()) as progress:
         bar = progress.add_task(label, total=config.max_updates)
         for _ in range(-(-config.max_updates // config.eval_every)):
-            state, metrics, _ = programs.advance(state, False)
+            state, metrics, _ = programs.advance(state, False, budget)
             active = np.asarray(metrics["active"])
             env_steps += int(np.sum(np.asarray(metrics["env_steps"]), where=active))
             if score == "eval_return":

@@ -123,7 +123,7 @@ TASKS: dict[str, Task] = {
 def settings_of(task: Task, num_seeds: int, env_steps: int) -> Config:
     """Returns the settings of a task's runs: its defaults, but for these and ``eval_every``."""
     config = dataclasses.replace(
-        of_task(task.env), num_seeds=num_seeds, seed=task.root, env_steps=env_steps, **task.settings
+        of_task(task.env, env_steps, num_seeds), seed=task.root, **task.settings
     )
     if "eval_every" in task.settings:
         return config

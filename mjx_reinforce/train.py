@@ -19,7 +19,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.runs import resume
 from mjx_reinforce.runs.alarms import silence_alarms
 from mjx_reinforce.runs.command_line import parse_all, refuse, start
-from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.runs.config import MAX_COUNT, Config, check
 from mjx_reinforce.runs.files import (
     check_writable,
     choose_directory,
@@ -135,6 +135,8 @@ def _start(
     present = {**provenance(), "num_processes": processes.count}
     resume.check_program(config.resume, present)
     like = ready.parts.like
+    if config.minutes is not None:  # more than any checkpoint has used
+        config = dataclasses.replace(config, env_steps=MAX_COUNT)
     if processes.count > 1:
         from mjx_reinforce.runs.shares import shape_of_all
 
@@ -190,7 +192,7 @@ def train(
         interrupt.restore_screen(display.console.show_cursor)
         display.say(plan.text)
         with display.compiling(plan.compiling):
-            session, compile_seconds = _compile(ready, config, directory, display, processes)
+            session, compile_seconds = _compile(ready, found, config, directory, display, processes)
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
         interrupt.defer(display.say)
         _begin(session, found, processes.count)
@@ -211,12 +213,16 @@ def train(
 
 
 def _compile(
-    ready: Any, config: Config, directory: Path, display: Any, processes: Processes
+    ready: Any, found: Any, config: Config, directory: Path, display: Any, processes: Processes
 ) -> tuple[Any, float]:
-    """Returns a run before its first update, and how long it took to compile, in seconds."""
+    """Returns a run before its first update, and how long it took to compile, in seconds.
+
+    Arguments are those of ``train``.
+    """
     with _collection_paused():
         from mjx_reinforce.reports.curves import load_libraries
         from mjx_reinforce.runs.best import first_best
+        from mjx_reinforce.runs.initial import begin_with, last_actors
         from mjx_reinforce.runs.log import RunLog
         from mjx_reinforce.runs.record import Record
         from mjx_reinforce.runs.session import Session
@@ -231,10 +237,32 @@ def _compile(
 
             state, programs = lead(processes, programs, state, config.num_seeds)
     seconds = ready.engine_seconds + time.perf_counter() - started
+    if config.init_from is not None and found is None:
+        state = begin_with(state, last_actors(config, ready.policy))
+    if config.minutes is not None:
+        config, state = _with_budget(config, programs, state, found, display)
     record, best = Record(config, ready.threshold), first_best(state.train_states)
     known, log = dataclasses.replace(config, horizon=ready.horizon), RunLog(directory)
     session = Session(known, ready.policy, programs, record, log, display, state, best)
     return session, seconds
+
+
+def _with_budget(
+    config: Config, programs: Any, state: Any, found: Any, display: Any
+) -> tuple[Config, Any]:
+    """Returns the settings with env steps in place of minutes, and the state before the first.
+
+    A run that goes on does so from its checkpoint for that long.
+    """
+    from mjx_reinforce.runs.minutes import env_steps_in
+
+    minutes = config.minutes
+    assert minutes is not None
+    first = state if found is None else found.state[0]
+    env_steps, back = env_steps_in(60 * minutes, programs, first, config.max_updates)
+    display.say(f"about {minutes:g} min are {env_steps:,} env steps of a seed here")
+    config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
+    return config, back if found is None else state
 
 
 def _begin(session: Any, found: Any, num_processes: int) -> None:

@@ -24,7 +24,7 @@ from mjx_reinforce.runs import kept, ready, trees
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.jax_setup import configure_jax
-from mjx_reinforce.runs.state import compile_parts
+from mjx_reinforce.runs.state import budget_of, compile_parts
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
 SETTINGS = {
@@ -51,7 +51,7 @@ def numbers(prepared, config):
     state, programs = compile_parts(prepared.parts, config)
     measured = []
     for _ in range(2):
-        state, metrics, looked = programs.advance(state, True)
+        state, metrics, looked = programs.advance(state, True, budget_of(config))
         measured += [metrics, looked.measured, programs.evaluate(state).measured]
     leaves = [jax.random.key_data(state.train_states.key), state.train_states.env_steps]
     leaves += jax.tree.leaves(state.train_states.actor)
@@ -293,14 +293,14 @@ from mjx_reinforce import envs
 from mjx_reinforce.runs import ready
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.jax_setup import configure_jax
-from mjx_reinforce.runs.state import compile_parts
+from mjx_reinforce.runs.state import budget_of, compile_parts
 configure_jax()
 if sys.argv[1] == "second":
     envs.make = None
 config = Config(env="InvertedPendulum-v5", num_seeds=2, num_episodes=2, eval_episodes=2)
 prepared = ready.prepare(config, config)
 state, programs = compile_parts(prepared.parts, config)
-state, metrics, looked = programs.advance(state, True)
+state, metrics, looked = programs.advance(state, True, budget_of(config))
 print(prepared.engine, metrics["episode_return"].tolist(), looked.measured["eval_return"])
 print("mujoco" in sys.modules)
 """

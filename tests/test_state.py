@@ -14,7 +14,7 @@ from mjx_reinforce.reports.statistics.aggregates import interval
 from mjx_reinforce.runs import ready
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.keys import plain, with_keys
-from mjx_reinforce.runs.state import compile_parts
+from mjx_reinforce.runs.state import budget_of, compile_parts
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
 
@@ -38,7 +38,7 @@ def test_they_have_run_once_without_an_update():
     jax.effects_barrier()
     assert made == [0]
     assert not state.train_states.env_steps.any()
-    programs.advance(state, True)
+    programs.advance(state, True, budget_of(CONFIG))
     jax.effects_barrier()
     assert made[1] > 0
 
@@ -49,14 +49,14 @@ def test_evaluations_ride_with_the_updates_that_follow():
     assert prepared.engine == "native"
     assert prepared.parts.rides
     first, programs = compile_parts(prepared.parts, CONFIG)
-    kept = jax.tree.map(np.asarray, plain(first))
+    kept, budget = jax.tree.map(np.asarray, plain(first)), budget_of(CONFIG)
 
     def again():
         return with_keys(jax.tree.map(jnp.array, kept), first)
 
     alone = programs.evaluate(again())
-    one, metrics, looked = programs.advance(again(), True)
-    other, same, none = programs.advance(again(), False)
+    one, metrics, looked = programs.advance(again(), True, budget)
+    other, same, none = programs.advance(again(), False, budget)
     assert none is None
     assert np.all(metrics.pop("simulated_steps")[0] > same.pop("simulated_steps")[0])
     for tree, like in ((looked.actor, alone.actor), (plain(one), plain(other)), (metrics, same)):
@@ -74,9 +74,8 @@ def test_runs_count_beyond_32_bits():
     state, programs = compile_parts(ready.made(envs.make(config.env), config).parts, config)
     played = jnp.tile(jnp.asarray(counts.from_int(2**32 - 50)), (2, 1))
     train_states = dataclasses.replace(state.train_states, env_steps=played)
-    state, metrics, _ = programs.advance(
-        dataclasses.replace(state, train_states=train_states), True
-    )
+    state = dataclasses.replace(state, train_states=train_states)
+    state, metrics, _ = programs.advance(state, True, budget_of(config))
     total = 2**32 - 50 + metrics["env_steps"].sum(axis=0)
     assert counts.to_int(state.train_states.env_steps).tolist() == total.tolist()
     last = metrics["env_steps"][metrics["active"].sum(axis=0) - 1, [0, 1]]
@@ -105,7 +104,7 @@ def measure(monkeypatch):
     def measure(**changes):
         config = dataclasses.replace(LUCK, **changes)
         state, programs = compile_parts(ready.made(envs.make(config.env), config).parts, config)
-        state, _, first = programs.advance(state, True)
+        state, _, first = programs.advance(state, True, budget_of(config))
         later = programs.evaluate(state).measured
         return first.measured, later, programs.test(state.train_states.actor)
 

@@ -13,7 +13,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs import resume
 from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.defaults import named_task, of_task
+from mjx_reinforce.runs.defaults import for_arguments, named, named_task
 from mjx_reinforce.runs.files import remove_empty
 from mjx_reinforce.runs.flags import read
 from mjx_reinforce.runs.own_code import check_named
@@ -52,6 +52,11 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
     """
     default, preset, flags, prog = start(arguments, "python -m mjx_reinforce.train")
     config, processes = _read(flags, default, prog)
+    if config.minutes is not None and named(flags, "--env-steps"):
+        raise ValueError(
+            f"--minutes {config.minutes:g} and --env-steps {config.env_steps} both say when the "
+            "run ends; leave one out"
+        )
     check_processes(processes)
     if config.resume is None:
         return config, processes
@@ -92,10 +97,19 @@ def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequ
       ValueError: there is no such preset.
     """
     if not arguments or arguments[0].startswith("-"):
-        return of_task(named_task(arguments)), None, arguments, f"{prog} [PRESET]"
+        return _default(arguments), None, arguments, f"{prog} [PRESET]"
     preset, *flags = arguments
     check_name("preset", preset, PRESETS)
     return PRESETS[preset][1], preset, flags, f"{prog} {preset}"
+
+
+def _default(arguments: Sequence[str]) -> Config:
+    """Returns the settings that hold where the user gives none: a task's, or those of a run."""
+    if not (like := named(arguments, "--like")):
+        return for_arguments(arguments)
+    known = resume.read_settings(Path(like))
+    check_resumed(known.env, arguments, Path(like))
+    return dataclasses.replace(known, resume=None)
 
 
 def _read(arguments: Sequence[str], default: Config, prog: str) -> tuple[Config, ProcessSettings]:
@@ -151,8 +165,9 @@ def _description() -> str:
     return (
         "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. "
         f"Leaves {', '.join(_FILES)} in the run directory.\n\n"
-        "Defaults depend on the task: --help shows those of InvertedPendulum-v5, --help --env ID "
-        "those of another.\n\n"
+        "Defaults depend on the task and on the budget: --help shows those of InvertedPendulum-v5, "
+        "--help --env ID those of another, for about a minute of training here, and with "
+        "--env-steps N those for N env steps.\n\n"
         f"Presets, published programs whose settings replace the defaults:\n{presets()}\n\n"
         f"Environments: {', '.join(envs.names())}."
     )

@@ -159,7 +159,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     (
         "initial_std final_std learning_rate final_learning_rate max_grad_norm max_kl "
         "value_learning_rate natural_damping "
-        "step_size noise_std",
+        "step_size noise_std minutes",
         lambda x: math.isfinite(x) and x > 0,
         "positive and finite",
     ),

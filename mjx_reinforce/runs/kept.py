@@ -32,7 +32,7 @@ from mjx_reinforce.runs.trees import describe, rebuild
 
 #: Settings that change no program. Of the budgets, ``block_length`` says what does.
 _INPUTS = (
-    *("seed", "eval_seed", "env_steps", "max_updates", "checkpoint_every"),
+    *("seed", "eval_seed", "env_steps", "max_updates", "minutes", "checkpoint_every", "init_from"),
     *("tensorboard", "wandb", "jsonl"),
 )
 _NAMES = ("start", "advance", "look")

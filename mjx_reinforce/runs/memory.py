@@ -33,6 +33,10 @@ _EVALUATED = 10
 _METRICS = 20
 
 
+#: CPU cores that make a run faster; it was not tried with more.
+_USEFUL_CORES = 4
+
+
 class Part(NamedTuple):
     """A part of what a run needs.
 
@@ -163,6 +167,16 @@ def gigabytes(size: float) -> str:
     if size < 5e7:
         return f"{max(1, round(size / 1e6))} MB"
     return f"{size / 1e9:,.1f} GB" if size < 1e10 else f"{size / 1e9:,.0f} GB"
+
+
+def has_gpu() -> bool:
+    """Returns whether JAX is likely to find an NVIDIA GPU; JAX is not imported."""
+    return _may_have_accelerator() and any(Path("/dev").glob("nvidia[0-9]*"))
+
+
+def cpu_factor() -> float:
+    """Returns how many times as fast as two cores this machine's are together."""
+    return min(num_cores(), _USEFUL_CORES) / 2
 
 
 def _may_have_accelerator() -> bool:

@@ -10,6 +10,7 @@ from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.measured import Speed, Task
 from mjx_reinforce.runs.memory import (
     check_fits,
+    cpu_factor,
     gigabytes,
     host_memory,
     needed,
@@ -24,8 +25,6 @@ _ACCURACY = 2.0
 _WRONG, _NOTICED = 3.0, 10.0
 #: Networks up to this many parameters are as fast as those that were measured.
 _MEASURED_PARAMETERS = 20_000
-#: CPU cores that make a run faster; it was not tried with more.
-_USEFUL_CORES = 4
 #: A small run of a task that was not measured takes so much memory, like most (bytes).
 _BASE_MEMORY = 2.5e9
 
@@ -93,7 +92,10 @@ def make_plan(ready: Any, config: Config, num_processes: int = 1) -> Plan:
     check_fits(config, task, machine.memory, base)
     speed = machine.speeds.get(config.env)
     known = num_parameters(config, task) <= _MEASURED_PARAMETERS
-    if speed is None or speed.engine != ready.engine or not known:
+    if config.minutes is not None:
+        time, compiling = "The first updates show how many env steps that is", None
+        seconds, bounded = 60 * config.minutes, False
+    elif speed is None or speed.engine != ready.engine or not known:
         time, compiling = "How long this takes here is not known", None
         seconds, bounded = None, False
     else:
@@ -124,7 +126,7 @@ def run_seconds(config: Config, task: Task, machine: Machine, speed: Speed) -> t
     They learn from whole updates, in which short episodes wait for the longest.
     """
     seconds, bounded = training_seconds(config, task, speed)
-    own = operations.per_step(of_task(config.env), task)
+    own = operations.per_step(of_task(config.env, env_steps=1), task)
     beyond = max(0.0, operations.per_step(config, task) - own)
     steps = config.num_seeds * _steps(config, task, task.useful)[0]
     rate = measured.CPU_OPERATIONS if machine.shared else measured.GPU_OPERATIONS
@@ -179,7 +181,7 @@ def this_machine() -> Machine:
     if device.platform == "cpu":
         cores = num_cores()
         name = f"{cores} CPU core{'s' * (cores > 1)}"
-        return Machine(name, measured.CPU, min(cores, _USEFUL_CORES) / 2, host_memory(), True)
+        return Machine(name, measured.CPU, cpu_factor(), host_memory(), True)
     memory = float((device.memory_stats() or {}).get("bytes_limit", float("inf")))
     return Machine(f"one {device.device_kind}", measured.GPU, 1.0, memory, False)
 
@@ -204,13 +206,15 @@ def _range(seconds: float) -> str:
 
 def _what(config: Config) -> str:
     """Returns what is trained and for how long."""
-    budgets = []
-    if config.env_steps is not None:
+    budgets, each = [], " each" if config.minutes is None else ""
+    if config.minutes is not None:
+        budgets.append(f"{config.minutes:g} min together")
+    elif config.env_steps is not None:
         budgets.append(f"{config.env_steps:,} env steps")
     if config.max_updates is not None:
         budgets.append(f"{config.max_updates:,} updates")
     seeds = f"{config.num_seeds:,} seed{'s' * (config.num_seeds > 1)}"
-    return f"{seeds} of {config.env} by {config.algorithm}, {' or '.join(budgets)} each,"
+    return f"{seeds} of {config.env} by {config.algorithm}, {' or '.join(budgets)}{each},"
 
 
 def task_of(policy: Mapping[str, Any], horizon: int, config: Config) -> Task:

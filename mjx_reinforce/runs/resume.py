@@ -11,9 +11,9 @@ from typing import Any, Literal
 from mjx_reinforce.runs.config import Config
 
 #: What may change when a run goes on: when it ends, and how often it is saved.
-BUDGETS = ("env_steps", "max_updates", "stop_when_solved", "checkpoint_every")
+BUDGETS = ("env_steps", "max_updates", "minutes", "stop_when_solved", "checkpoint_every")
 #: Settings that say where a run is, not what it does.
-PLACES = ("output", "overwrite", "resume")
+PLACES = ("output", "overwrite", "resume", "like")
 #: Entries of config.json on which every number of a run depends, besides its settings.
 _PROGRAM = (
     *("packages", "git_commit", "device", "cpu", "cores", "machine_code", "jax_settings"),
@@ -216,6 +216,8 @@ def _size(path: Path) -> int:
 def _serves(found: Any, config: Config) -> bool:
     """Returns whether a run with this budget passes through a checkpoint.
 
+    One with a budget in time goes on from any: it is no other run's equal.
+
     Raises:
       ValueError: the budget is smaller than what it has used.
     """
@@ -229,4 +231,4 @@ def _serves(found: Any, config: Config) -> bool:
             raise ValueError(
                 f"{flag} {budget} is less than the {used} of the run so far; give at least that"
             )
-    return found.is_even(config.eval_every)
+    return config.minutes is not None or found.is_even(config.eval_every)

@@ -13,7 +13,7 @@ from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.record import Record
 from mjx_reinforce.runs.resume import recordable
 from mjx_reinforce.runs.sinks.sink import Queue
-from mjx_reinforce.runs.state import Looked, Programs, RunState
+from mjx_reinforce.runs.state import Looked, Programs, RunState, budget_of
 
 #: Between checkpoints, where the user has not said how many updates.
 _CHECKPOINT_SECONDS = 60.0
@@ -56,6 +56,7 @@ class Session:
         self.state, self.best = state, best
         self._began = self._saved_at = time.perf_counter()
         self._saved_updates = 0
+        self._budget = budget_of(config)
         #: Wall time at which the present policies were there (s).
         self._reached = 0.0
         #: Whether the newest checkpoint is of the present state.
@@ -81,7 +82,7 @@ class Session:
     def advance(self) -> None:
         """Evaluates the present policies unless they were, and makes a block of updates."""
         look = not self.record.evaluated()
-        self.state, metrics, looked = self.programs.advance(self.state, look)
+        self.state, metrics, looked = self.programs.advance(self.state, look, self._budget)
         if looked is not None:
             self._take(looked)
         self.saved = False

@@ -19,8 +19,12 @@ class RunSettings:
     seed: int = 0
     """Root of all randomness; the seeds' keys are split from it."""
     env_steps: int | None = 280_000
-    """Training budget of each seed in env steps; it stops after the update that reaches it.
-    None leaves it to --max-updates."""
+    """Training budget of each seed in env steps; it stops after the update that reaches it. What
+    about a minute gives here if not given. None leaves it to --max-updates."""
+    minutes: float | None = None
+    """In place of --env-steps, about how long to train, all seeds together: the first updates show
+    how many env steps that is. The number goes into config.json, so that --like RUN repeats the
+    run to the last bit."""
     max_updates: int | None = None
     """Stop every seed after this many updates; with --num-episodes 1, as many episodes."""
     stop_when_solved: bool = False
@@ -36,6 +40,11 @@ class RunSettings:
     """How episodes are played: vmap (the step mapped by jax.vmap), fused (the step written out as
     scalar operations), native (whole episodes in machine code for this CPU or NVIDIA GPU), or auto,
     the fastest here."""
+    like: Path | None = None
+    """Take all settings from the run in this directory, but for what is given beside it."""
+    init_from: str | None = None
+    """Begin with the last policies of the run in this directory, which may have other settings, but
+    for the policy's own. Seed i begins with the policy of its seed i, or of i modulo its seeds."""
     output: Path | None = None
     """Run directory; runs/<env>-<time> if not given."""
     overwrite: bool = False

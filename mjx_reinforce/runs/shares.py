@@ -16,7 +16,7 @@ import numpy as np
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.runs.keys import plain
 from mjx_reinforce.runs.processes import Processes
-from mjx_reinforce.runs.state import Arrays, Looked, Programs, RunState, restored
+from mjx_reinforce.runs.state import Arrays, Budget, Looked, Programs, RunState, restored
 
 #: What a process is asked for, besides the names of ``Programs``.
 _END = "end"
@@ -45,14 +45,17 @@ def lead(
         assert others is not None, "a process left a run that had not ended"
         return [mine, *(_decode(content)[1] for content in others)]
 
-    def ask(name: str, tree: Any) -> list[Arrays]:
+    def ask(name: str, tree: Any, **common: np.ndarray) -> list[Arrays]:
         leaves = _leaves(tree)
-        parts = [{k: x[each] for k, x in leaves.items()} for each in shares]
+        parts = [{k: x[each] for k, x in leaves.items()} | common for each in shares]
         processes.tell(*(_encode(name, part) for part in parts[1:]))
         return gathered(_answer(name, parts[0], programs, like))
 
-    def advance(before: RunState, look: bool) -> tuple[RunState, Arrays, Looked | None]:
-        answers = ask("look and advance" if look else "advance", before)
+    def advance(
+        before: RunState, look: bool, budget: Budget
+    ) -> tuple[RunState, Arrays, Looked | None]:
+        limits = np.stack([np.asarray(limit) for limit in budget])
+        answers = ask("look and advance" if look else "advance", before, budget=limits)
         states, metrics, looked = (
             [_part(x, group) for x in answers] for group in ("state", "metrics", "looked")
         )
@@ -96,9 +99,11 @@ def serve(processes: Processes, programs: Programs, state: RunState) -> int:
 def _answer(name: str, given: Arrays, programs: Programs, like: RunState) -> Arrays:
     """Returns what a program makes of the leaves that it is given."""
     # In memory of the device's own, which may be donated.
+    budget = given.pop("budget", None)
     leaves = [jnp.array(given[str(i)]) for i in range(len(given))]
-    if name in ("advance", "look and advance"):
-        state, metrics, looked = programs.advance(restored(leaves, like), name != "advance")
+    if budget is not None:
+        before, look = restored(leaves, like), name != "advance"
+        state, metrics, looked = programs.advance(before, look, Budget(*budget))
         measured = {} if looked is None else looked.measured
         groups = {"state": _leaves(state), "metrics": metrics, "looked": measured}
         return {f"{group}/{k}": x for group, arrays in groups.items() for k, x in arrays.items()}

@@ -89,17 +89,17 @@ class Looked(NamedTuple):
 class Programs(NamedTuple):
     """The compiled programs of a run, over all seeds at once.
 
-    advance: (RunState, whether to evaluate it) -> (RunState, metrics [K, S], ``Looked`` or None),
-      ``eval_every`` updates later, or where all budgets are used. The evaluation is that of the
-      policies before these updates, and costs next to nothing where it rides with them. A seed
-      whose budget is used earlier stands still. The memory of the argument is used again. To the
-      metrics of ``Learner.step`` it adds ``active``, False for a seed that stood still
+    advance: (RunState, whether to evaluate it, ``Budget``) -> (RunState, metrics [K, S], ``Looked``
+      or None), ``eval_every`` updates later, or where all budgets are used. The evaluation is that
+      of the policies before these updates, and costs next to nothing where it rides with them. A
+      seed whose budget is used earlier stands still. The memory of the argument is used again. To
+      the metrics of ``Learner.step`` it adds ``active``, False for a seed that stood still
     evaluate: (RunState) -> ``Looked``, of its policies
     test: (Actor [S, ...]) -> the same on ``test_episodes`` start states (rounded up to whole
       evaluations) that nothing else is played on
     """
 
-    advance: Callable[[RunState, bool], tuple[RunState, Arrays, Looked | None]]
+    advance: Callable[[RunState, bool, Budget], tuple[RunState, Arrays, Looked | None]]
     evaluate: Callable[[RunState], Looked]
     test: Callable[[Actor], Arrays]
 
@@ -217,7 +217,9 @@ def compile_parts(
     nothing = Budget(counts.from_int(0), counts.from_int(0))
     first = jax.block_until_ready(advancing(first, nothing, np.bool_(False))[0])
 
-    def advanced(state: RunState, look: bool) -> tuple[RunState, Arrays, Looked | None]:
+    def advanced(
+        state: RunState, look: bool, budget: Budget
+    ) -> tuple[RunState, Arrays, Looked | None]:
         before = evaluated(state) if look and not parts.rides else None
         state, block, present = advancing(state, budget, np.bool_(look))
         metrics = {name: x[: int(block.made)] for name, x in to_numpy(block.metrics).items()}

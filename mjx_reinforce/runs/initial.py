@@ -1,0 +1,55 @@
+"""Where the policies of a run begin, if not anew: at the last ones of another run."""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.state import RunState
+
+#: Settings of a policy that only say how its first parameters were drawn.
+_DRAWN = ("initial_std", "initializer", "env")
+
+
+def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
+    """Returns the actors [S, ...] with which the seeds of a run begin.
+
+    Args:
+      config: its settings, with ``init_from``.
+      policy: what ``build.policy_settings`` returns.
+
+    Raises:
+      ValueError: there is no such run, it has no policies, or they are of another form.
+    """
+    from mjx_reinforce.export.policy_files import read_policy
+    from mjx_reinforce.export.run_files import read_run
+
+    assert config.init_from is not None
+    directory = Path(config.init_from)
+    read_run(directory)
+    saved = read_policy(directory / "policy")
+    for name, value in policy.items():
+        old = saved.settings.get(name, value)
+        if name not in _DRAWN and old != value:
+            flag = f"--{name.replace('_', '-')}"
+            raise ValueError(
+                f"the policies in {directory} have {name} {old}, and this run {value}; give "
+                f"{flag} that value, or leave --init-from out"
+            )
+    seeds = np.arange(config.num_seeds) % saved.num_seeds
+    return jax.tree.map(lambda x: x[seeds], saved.actor)
+
+
+def begin_with(state: RunState, actors: Actor) -> RunState:
+    """Returns the state of a run before its first update, with actors [S, ...] of another."""
+    old = state.train_states.actor
+    actor = jax.tree.map(lambda new, like: jnp.asarray(new, like.dtype), actors, old)
+    return dataclasses.replace(
+        state, train_states=dataclasses.replace(state.train_states, actor=actor)
+    )
