@@ -178,7 +178,8 @@ def measure(
         critic = estimator.init(jax.random.key(settings.seed), fresh.observation.shape[-1])
         # What an estimator learns it learns of the other episodes.
         weight, _, metrics = update(update(critic, others)[1], fresh)
-        found = noise_scale(episode_gradients(learner.policy, state.actor.params, fresh, weight))
+        each = episode_gradients(learner.policy, state.actor.params, fresh, weight)
+        found = noise_scale(each[np.asarray(fresh.mask[0])])
         low, high = found.interval
         yield (
             shared

@@ -217,6 +217,10 @@ def test_the_operations_of_networks_by_hand():
     # 50 minibatches of 128 are 8 times the 16 * 50 steps of a rollout.
     drawn = dataclasses.replace(plain, update="minibatches")
     assert operations.per_step(drawn, task) == (4 + 6 * 8) * 1282
+    natural = dataclasses.replace(plain, update="natural-gradient", natural_iterations=3)
+    assert operations.per_step(natural, task) == (4 + 6 * (1 + 3)) * 1282
+    few = dataclasses.replace(natural, num_episodes=2 * 4096 // 50, hidden_sizes=(32, 32))
+    assert operations.per_step(few, task) == pytest.approx((4 + 6 * 2.5) * 1282, rel=0.01)
     assert operations.per_step(dataclasses.replace(value, algorithm="ars"), task) == 2 * 1282
 
 

@@ -25,7 +25,7 @@ from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.state import eval_keys, evaluation
 from mjx_reinforce.sweeps import chunks, conduct, perform, plan, programs, rungs, search
 from mjx_reinforce.sweeps.grid import configure, grid, read_over
-from mjx_reinforce.sweeps.groups import make_groups
+from mjx_reinforce.sweeps.groups import learner_builder, make_groups
 from mjx_reinforce.sweeps.packing import pack
 from mjx_reinforce.sweeps.reading import read_results
 from mjx_reinforce.sweeps.results import join
@@ -162,7 +162,7 @@ def test_a_sweeps_plan_counts_value_networks(monkeypatch):
     """Six configurations of 128 seeds: announced with 27 s, it was not done in 11 minutes."""
     monkeypatch.setattr(runs_plan, "num_cores", lambda: 2)
     env, base = envs.make("CartPole-v1"), of_task("CartPole-v1")
-    base = dataclasses.replace(base, num_seeds=128)
+    base = dataclasses.replace(base, num_seeds=128, value_fit="full-batch", value_fits=10)
     said = {}
     for estimator in ("leave-one-out", "value-baseline"):
         group = make_groups([dataclasses.replace(base, estimator=estimator)] * 2, (), exact=False)
@@ -191,6 +191,44 @@ def test_an_exact_run_does_not_depend_on_the_others(run):
     assert run(f"{command} {more} --output beside") == 0
     beside = curves(Path("beside"))
     assert same({"": whole["eval_return"][:, 3:6]}, {"": beside["eval_return"][:, 3:6]})
+
+
+def test_numbers_of_shifts_dampings_and_values_are_traced():
+    """As arguments of one program, side by side, they do what they do alone."""
+    base = dataclasses.replace(
+        Config(env="Drift-v0"),
+        estimator="value-baseline",
+        value_fits=3,
+        value_batch_size=16,
+        update="natural-gradient",
+        max_kl=1e-2,
+        num_episodes=4,
+        hidden_sizes=(4,),
+        engine="vmap",
+    )
+    configs = [
+        dataclasses.replace(base, reward_shift=shift, natural_damping=damping)
+        for shift, damping in ((0.0, 0.1), (0.5, 0.1), (0.5, 1.0))
+    ]
+    (group,) = make_groups(configs, ("reward_shift",), exact=True)
+    assert {"reward_shift", "natural_damping", "max_kl", "value_learning_rate"} <= {*group.settings}
+    builder, key = learner_builder(Drift(), group.config), jax.random.key(3)
+
+    def trained(learner):
+        state = learner.step(learner.init(key))[0]
+        return learner.step(state)[0].actor.params
+
+    together = jax.jit(jax.vmap(lambda settings: trained(builder(settings))))(group.settings)
+    found = []
+    for number, config in enumerate(configs):
+        alone = jax.jit(lambda config=config: trained(build(Drift(), config)[0]))()
+        jax.tree.map(
+            lambda x, y, number=number: np.testing.assert_allclose(x[number], y, atol=1e-4),
+            together,
+            alone,
+        )
+        found.append(np.concatenate([np.ravel(x) for x in jax.tree.leaves(alone)]))
+    assert np.abs(found[0] - found[1]).max() > 1e-3 < np.abs(found[1] - found[2]).max()
 
 
 #: Runs end one by one, for the noisier their actions are the shorter are their episodes.

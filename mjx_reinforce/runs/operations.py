@@ -8,14 +8,17 @@ from mjx_reinforce.runs.measured import Task
 from mjx_reinforce.runs.memory import critic_parameters, num_parameters
 
 _FORWARDS, _BACKWARDS = 2, 4
+#: Steps that each of the natural gradient's iterations passes over at most, forwards and backwards.
+_FISHER_STEPS = 4096
 
 
 def per_step(config: Config, task: Task) -> float:
     """Returns the operations for each env step that a run plays and trains on.
 
     The policy plays and measures how far it moved, and learns from each step once, or from what
-    minibatches draw. The value network gives each step its value, and is fitted ``value_fits``
-    times, on all of them or on minibatches.
+    minibatches draw; the natural gradient passes over some of them again and again. The value
+    network gives each step its value, and is fitted ``value_fits`` times, on all of them or on
+    minibatches.
 
     Args:
       config: the settings.
@@ -28,6 +31,8 @@ def per_step(config: Config, task: Task) -> float:
     learned = 1.0
     if config.update == "minibatches":
         learned = config.minibatch_updates * config.minibatch_size / steps
+    elif config.update == "natural-gradient" and config.hidden_sizes:
+        learned += config.natural_iterations * min(1, _FISHER_STEPS / steps)
     fitted = config.value_fits
     if config.value_fit == "minibatches":
         fitted *= config.value_batch_size / steps
