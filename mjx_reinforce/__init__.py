@@ -12,6 +12,7 @@ _HOME = {
     "Learner": "learners.learner",
     "TrainState": "learners.learner",
     "reinforce": "learners.reinforce",
+    "AutoEpisodes": "learners.pace",
     "train_step": "learners.learner",
     "ars": "learners.ars",
     "Distribution": "policies.distribution",

@@ -16,7 +16,7 @@ from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.engines.episode import episode_keys
 from mjx_reinforce.fused import any_lane
-from mjx_reinforce.learners import counts
+from mjx_reinforce.learners import counts, pace
 from mjx_reinforce.learners.contract import check_estimator, check_optimizer, check_update
 from mjx_reinforce.learners.diagnostics import (
     nan_unless,
@@ -35,6 +35,7 @@ from mjx_reinforce.learners.learner import (
     episode_metrics,
     keep_finite,
 )
+from mjx_reinforce.learners.pace import AutoEpisodes
 from mjx_reinforce.learners.schedules import Clock
 from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_optimizer
 from mjx_reinforce.policies import normalize
@@ -74,7 +75,7 @@ def reinforce(
     estimator: Estimator | Callable[[jax.Array], Estimator] | None = None,
     optimizer: optax.GradientTransformation | None = None,
     update: Update | None = None,
-    num_episodes: int = 16,
+    num_episodes: int | AutoEpisodes = 16,
     horizon: int | None = None,
     entropy_cost: float | jax.Array = 0.0,
     loss_per: str = "episode",
@@ -105,7 +106,8 @@ def reinforce(
         its numbers change as the budget is used.
       optimizer: by default Adam at 1e-2 with the gradient's norm clipped at 1.
       update: how the gradient is spent, from ``updates``; by default in one optimiser step.
-      num_episodes: N, episodes an update.
+      num_episodes: N, episodes an update; or ``AutoEpisodes()``, as many as the gradient's noise
+        asks for, between bounds. That needs the update ``full_batch``, which measures the noise.
       horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
       entropy_cost: weight of the policy's entropy H, in return per nat.
       loss_per: "episode" divides the sum by N; "step" by the number of steps played, so that the
@@ -135,6 +137,12 @@ def reinforce(
         policy = mlp_policy(size, default_distribution(action_space(env)))
     if optimizer is None:
         optimizer = make_optimizer()
+    update = full_batch() if update is None else update
+    check_update(update)
+    auto = None
+    if isinstance(num_episodes, AutoEpisodes):
+        pace.check_auto(num_episodes, update)
+        auto, num_episodes = num_episodes, num_episodes.most
     check_count("num_episodes", num_episodes)
     check_count("num_seeds", num_seeds)
     check_number("entropy_cost", entropy_cost)
@@ -145,8 +153,6 @@ def reinforce(
     check_type("one_start", one_start, bool)
     check_policy(policy, env, size, likelihood=True)
     check_optimizer("optimizer", optimizer)
-    update = full_batch() if update is None else update
-    check_update(update)
     if estimator is None:
         estimator = standardize(leave_one_out(), floor=10.0)
     estimator_at = _at(estimator)
@@ -158,6 +164,7 @@ def reinforce(
         optimizer=optimizer,
         update=update,
         num_episodes=num_episodes,
+        auto=auto,
         horizon=check_horizon(env, horizon),
         entropy_cost=entropy_cost,
         loss_per=loss_per,
@@ -187,6 +194,7 @@ class _Reinforce:
     optimizer: optax.GradientTransformation
     update: Update
     num_episodes: int
+    auto: AutoEpisodes | None
     horizon: int
     entropy_cost: float | jax.Array
     loss_per: str
@@ -206,11 +214,21 @@ class _Reinforce:
         actor = jax.eval_shape(self._first_actor, jax.random.key(0))
         player = choice.Player(self._act, actor, self.policy.distribution)
         chosen = choice.choose(engine, self.env, player, self.horizon)
-        play: Any = functools.partial(self._play, chosen)
-        if chosen.name == "native" and not self.one_start:
+        if self.auto is None:
+            return self._with_engine(chosen)
+        *narrower, widest = (
+            dataclasses.replace(self, num_episodes=room)._with_engine(chosen)
+            for room in self.auto.rooms()
+        )
+        return widest._replace(narrower=tuple(narrower))
+
+    def _with_engine(self, engine: Engine) -> Learner:
+        play: Any = functools.partial(self._play, engine)
+        if engine.name == "native" and not self.one_start:
             # Elsewhere an episode that is not played takes its place all the same.
-            play = Host(play, functools.partial(self._play_with, chosen))
-        return Learner(self._init, play, self._learn, self.policy, chosen)
+            play = Host(play, functools.partial(self._play_with, engine))
+        room = self.num_episodes
+        return Learner(self._init, play, self._learn, self.policy, engine, room=room)
 
     def _act(self, actor: Actor, observation: jax.Array) -> jax.Array:
         return act(self.policy, actor, observation)
@@ -237,6 +255,7 @@ class _Reinforce:
                 estimator_key, self.observation_size
             ),
             start_key=start_key,
+            pace=None if self.auto is None else pace.begin(self.auto),
         )
 
     def _play(
@@ -250,8 +269,14 @@ class _Reinforce:
             key,
             num_episodes=self.num_episodes,
             horizon=self.horizon,
-            active=active,
+            active=self._chosen(state, active),
         )
+
+    def _chosen(self, state: TrainState, active: Any) -> Any:
+        """Returns which episodes are played, [] or [N]."""
+        if state.pace is None:
+            return active
+        return (jnp.arange(self.num_episodes) < state.pace.num_episodes) & active
 
     def _play_with(
         self, engine: Engine, state: TrainState, key: jax.Array, active: Any, guests: Guests
@@ -267,7 +292,9 @@ class _Reinforce:
             num_episodes=count + self.num_episodes,
             horizon=self.horizon,
             deterministic=jnp.concatenate([guests.deterministic(), own]),
-            active=jnp.concatenate([jnp.broadcast_to(guests.active, count), own | active]),
+            active=jnp.concatenate(
+                [jnp.broadcast_to(guests.active, count), own | self._chosen(state, active)]
+            ),
         )
         return played.episodes(slice(count, None)), played.episodes(slice(count))
 
@@ -275,6 +302,8 @@ class _Reinforce:
         self, state: TrainState, trajectory: Trajectory, key: jax.Array
     ) -> tuple[TrainState, Metrics]:
         """Learns; where all episodes, of many seeds, were short, from their first steps alone."""
+        if self.auto is not None:
+            trajectory = dataclasses.replace(trajectory, played=trajectory.mask[0])
         few = len(trajectory.mask) // _FEW
         if few < CHUNK_STEPS or self.num_seeds * trajectory.mask.size < _MANY:
             return self._learn_from(state, trajectory, key)
@@ -296,10 +325,14 @@ class _Reinforce:
             surrogate=_surrogate(self.policy, self.entropy_cost),
             optimizer=self.optimizer,
             samples=(scaled, trajectory.action, weight, mask),
-            divisor=jnp.maximum(jnp.sum(mask), 1) if self.loss_per == "step" else self.num_episodes,
+            divisor=self._divisor(trajectory),
             clock=Clock(state.progress, counts.number(state.env_steps)),
+            played=trajectory.played,
         )
         params, opt_state, update_metrics = self.update(problem, key, actor.params, state.opt_state)
+        if self.auto is not None and state.pace is not None:
+            paced = pace.follow(state.pace, self.auto, update_metrics.pop("noise"))
+            state = dataclasses.replace(state, pace=paced)
         visited = visited_steps(trajectory)
         if self.max_kl is not None:
             params = within_kl(self.policy, actor, params, visited, self.max_kl)
@@ -320,6 +353,14 @@ class _Reinforce:
         sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
         diagnostics = nan_unless(sound, metrics | update_metrics | change)
         return state, episode_metrics(trajectory) | diagnostics | {"skipped_update": skipped}
+
+    def _divisor(self, trajectory: Trajectory) -> int | jax.Array:
+        """Returns what the sum over all steps is divided by."""
+        if self.loss_per == "step":
+            return jnp.maximum(jnp.sum(trajectory.mask), 1)
+        if trajectory.played is None:
+            return self.num_episodes
+        return jnp.maximum(trajectory.num_played(), 1)
 
 
 class _OneStart:

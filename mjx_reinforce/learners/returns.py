@@ -29,7 +29,9 @@ def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Ar
     return returns.reshape(-1, num_episodes)[:horizon]
 
 
-def replace_broken(returns: jax.Array, broken: jax.Array) -> jax.Array:
+def replace_broken(
+    returns: jax.Array, broken: jax.Array, played: jax.Array | None = None
+) -> jax.Array:
     """Returns the returns, of an episode that broke the least of the others'.
 
     What it earned until the simulation left the finite numbers is no return: where rewards are
@@ -39,8 +41,10 @@ def replace_broken(returns: jax.Array, broken: jax.Array) -> jax.Array:
     Args:
       returns: [..., N] such as G [T, N]; the others are those of the same step.
       broken: [N] ``Trajectory.nonfinite``; where all are, all returns are infinite.
+      played: [N] ``Trajectory.played``.
     """
-    least = jnp.min(jnp.where(broken, jnp.inf, returns), axis=-1, keepdims=True)
+    without = broken if played is None else broken | ~played
+    least = jnp.min(jnp.where(without, jnp.inf, returns), axis=-1, keepdims=True)
     return jnp.where(broken, least, returns)
 
 

@@ -1,0 +1,108 @@
+"""As many episodes an update as the gradient's noise asks for.
+
+Noise and signal of a gradient are alike at the simple noise scale B = tr Cov(g) / |E g|^2, with g
+of one episode (McCandlish et al. 2018, arXiv:1812.06162, equation 2.9). Far fewer episodes than B
+give steps that are mostly noise, and far more cost time that further steps would use better.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from mjx_reinforce.policies.arguments import check_count, check_number
+
+#: The share of an update in the running means. They are over about the last 2 / _SHARE - 1 = 19
+#: updates: B of one update is known to a factor of two or so, that of 19 to a third of it, and it
+#: takes hundreds of updates to change by as much.
+_SHARE = 0.1
+#: The number of episodes changes by this factor an update at most.
+_FACTOR = 2
+#: The arrays of an update have room for the most episodes, or that divided by this number once or
+#: more often: whichever is the least that is enough.
+_ROOM_SHARE = 4
+
+
+class AutoEpisodes(NamedTuple):
+    """The number of episodes of an update follows the gradient's noise.
+
+    least: how many an update plays at least, 2 or more
+    most: and at most
+    ratio: how many it plays for each episode of the noise scale B: at 1, noise equals signal
+    """
+
+    least: int = 16
+    most: int = 2048
+    ratio: float = 1.0
+
+    def rooms(self) -> list[int]:
+        """Returns the numbers of episodes that the arrays of an update may have room for."""
+        rooms = [self.most]
+        while rooms[0] >= _ROOM_SHARE * self.least:
+            rooms.insert(0, -(-rooms[0] // _ROOM_SHARE))
+        return rooms
+
+
+class Noise(NamedTuple):
+    """What the gradients of groups of episodes say of the noise, unbiased both.
+
+    signal: [] |E g|^2, of the mean gradient; an estimate, which may be negative
+    noise: [] tr Cov(g), of the gradient of one episode
+    """
+
+    signal: jax.Array
+    noise: jax.Array
+
+
+@struct.dataclass(kw_only=True)
+class Pace:
+    """How many episodes the next update plays, and what that follows from.
+
+    num_episodes: [] int32
+    signal: [] running mean of ``Noise.signal``, as of zeros before the first update
+    noise: [] running mean of ``Noise.noise``, likewise: the two have the same bias, which cancels
+    """
+
+    num_episodes: jax.Array
+    signal: jax.Array
+    noise: jax.Array
+
+
+def check_auto(auto: AutoEpisodes, update: Any) -> None:
+    """Raises ValueError for bounds that make no sense, or an update that measures no noise."""
+    check_count("AutoEpisodes.least", auto.least, 2)
+    check_count("AutoEpisodes.most", auto.most, auto.least)
+    check_number("AutoEpisodes.ratio", auto.ratio, positive=True)
+    if not getattr(update, "measures_noise", False):
+        raise ValueError(
+            "AutoEpisodes needs the update full_batch(), for others do not measure the gradient's "
+            "noise; choose that, or a number of episodes"
+        )
+
+
+def begin(auto: AutoEpisodes) -> Pace:
+    """Returns the pace of the first update, which plays the fewest episodes."""
+    zero = jnp.zeros(())
+    return Pace(num_episodes=jnp.int32(auto.least), signal=zero, noise=zero)
+
+
+def follow(pace: Pace, auto: AutoEpisodes, measured: Noise) -> Pace:
+    """Returns the pace of the next update.
+
+    Where the mean signal is not positive, noise hides it: the number of episodes grows. An update
+    in which something was not finite says nothing.
+    """
+    sound = jnp.isfinite(measured.signal) & jnp.isfinite(measured.noise)
+
+    def mean(old: jax.Array, new: jax.Array) -> jax.Array:
+        return jnp.where(sound, old + _SHARE * (new - old), old)
+
+    signal, noise = mean(pace.signal, measured.signal), mean(pace.noise, measured.noise)
+    enough = signal * auto.most > auto.ratio * noise
+    wanted = jnp.where(enough, auto.ratio * noise / jnp.where(enough, signal, 1.0), auto.most)
+    wanted = jnp.clip(jnp.round(wanted), auto.least, auto.most).astype(jnp.int32)
+    before = pace.num_episodes
+    wanted = jnp.clip(wanted, -(-before // _FACTOR), _FACTOR * before)
+    number = jnp.clip(wanted, auto.least, auto.most)
+    return Pace(num_episodes=jnp.where(sound, number, before), signal=signal, noise=noise)
