@@ -28,6 +28,7 @@ def block(random, num_updates, num_seeds):
     return floats | {
         "active": active,
         "env_steps": np.where(active, 10, 0).astype(np.int32),
+        "episodes": random.integers(4, 9, active.shape, np.int32),
         "simulated_steps": random.integers(1, 99, active.shape, np.int32),
         "nonfinite_episodes": random.integers(0, 2, active.shape, np.int32),
         "skipped_update": random.integers(0, 2, active.shape, np.int32),
@@ -118,8 +119,9 @@ def test_a_seed_is_broken_while_nothing_of_it_is_finite():
         "active": np.array([[1, 1, 1, 1], [1, 1, 1, 0], [1, 1, 1, 0]], bool),
         "nonfinite_episodes": np.array([[4, 4, 3, 4], [0, 4, 4, 0], [4, 4, 4, 0]]),
         "skipped_update": np.array([[0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]]),
+        "episodes": np.full((3, 4), 4),
     }
-    count = nonfinite.broken_in_a_row(np.array([2, 0, 5, 1]), metrics, num_episodes=4)
+    count = nonfinite.broken_in_a_row(np.array([2, 0, 5, 1]), metrics)
     assert count.tolist() == [5, 3, 2, 2]
 
 

@@ -273,6 +273,7 @@ def test_a_ready_policy_may_be_trained():
 METRICS = {  # two updates of two seeds; the second seed stands still in the second update
     "active": np.array([[True, True], [True, False]]),
     "env_steps": np.array([[30, 40], [40, 0]], np.int32),
+    "episodes": np.array([[2, 2], [2, 2]], np.int32),
     "simulated_steps": np.array([[50, 60], [40, 0]], np.int32),
     "episode_return": np.array([[3.0, 4.0], [5.0, 0.0]], np.float32),
     "episode_length": np.array([[15.0, 20.0], [20.0, 0.0]], np.float32),

@@ -43,7 +43,7 @@ def as_events(updates: Arrays) -> list[dict[str, Any]]:
     return [dict(zip(FIELDS, event, strict=True)) for event in zip(*columns, strict=True)]
 
 
-def broken_in_a_row(before: np.ndarray, metrics: Arrays, num_episodes: int) -> np.ndarray:
+def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
     """Returns how many of its latest updates each seed was broken in, without one between.
 
     An update is broken if all its episodes left the finite numbers, or if it was skipped.
@@ -51,9 +51,9 @@ def broken_in_a_row(before: np.ndarray, metrics: Arrays, num_episodes: int) -> n
     Args:
       before: [S] the same before this block.
       metrics: [K, S] each, as for ``Record.add_updates``.
-      num_episodes: how many an update plays.
     """
-    broken = (metrics["nonfinite_episodes"] >= num_episodes) | (metrics["skipped_update"] > 0)
+    broken = metrics["nonfinite_episodes"] >= metrics["episodes"]
+    broken |= metrics["skipped_update"] > 0
     count = before
     for active_now, broken_now in zip(metrics["active"], broken, strict=True):
         count = np.where(active_now, np.where(broken_now, count + 1, 0), count)

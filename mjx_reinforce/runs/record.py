@@ -23,6 +23,7 @@ class Record:
 
     updates: [S] int64, how many each seed has made
     env_steps: [S] int64, how many each seed has played in training
+    episodes: [S] int64, likewise
     seconds: wall time from the end of compilation to the last evaluation
     threshold: the return that counts as solved, if any
     """
@@ -37,6 +38,7 @@ class Record:
         self._config, self.threshold = config, threshold
         self.updates = np.zeros(config.num_seeds, np.int64)
         self.env_steps = np.zeros(config.num_seeds, np.int64)
+        self.episodes = np.zeros(config.num_seeds, np.int64)
         self.seconds = 0.0
         kinds = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
         self._tables = {
@@ -53,6 +55,7 @@ class Record:
         kept = {
             "updates": self.updates,
             "env_steps": self.env_steps,
+            "episodes": self.episodes,
             "seconds": np.asarray(self.seconds, np.float64),
             "broken_in_a_row": self._broken_in_a_row,
             "simulated": np.asarray(self._simulated, np.int64),
@@ -75,6 +78,7 @@ class Record:
             if group:
                 groups[group][name] = values
         self.updates, self.env_steps = arrays["updates"], arrays["env_steps"]
+        self.episodes = arrays["episodes"]
         self.seconds, self._simulated = float(arrays["seconds"]), int(arrays["simulated"])
         self._evaluated = int(arrays["evaluated"])
         self._broken_in_a_row = arrays["broken_in_a_row"]
@@ -94,21 +98,23 @@ class Record:
           The updates in it that met numbers which are not finite, see
           ``nonfinite.nonfinite_updates``.
         """
-        active, episodes = metrics["active"], self._config.episodes_per_update
+        active, played = metrics["active"], metrics["episodes"]
         finite = metrics["nonfinite_episodes"] == 0
         env_steps = self.env_steps + np.cumsum(metrics["env_steps"], axis=0, dtype=np.int64)
         updates = self.updates + np.cumsum(active, axis=0, dtype=np.int64)
+        episodes = self.episodes + np.cumsum(active * played, axis=0, dtype=np.int64)
         made = active.any(axis=1)
         returns = np.where(finite, metrics["episode_return"], np.nan)
         training = {
             "episode_return": np.where(active, returns, np.nan),
             "env_steps": env_steps,
-            "episodes": updates * episodes,
+            "episodes": episodes,
         }
         self._tables["training"].append({name: x[made] for name, x in training.items()})
         self.env_steps, self.updates = env_steps[-1], updates[-1]
+        self.episodes = episodes[-1]
         self._simulated += _sum(metrics["simulated_steps"])
-        self._broken_in_a_row = nonfinite.broken_in_a_row(self._broken_in_a_row, metrics, episodes)
+        self._broken_in_a_row = nonfinite.broken_in_a_row(self._broken_in_a_row, metrics)
         met = nonfinite.nonfinite_updates(metrics, updates)
         self._tables["nonfinite"].append(met)
         self._remember(metrics | {"episode_return": returns})
@@ -132,14 +138,13 @@ class Record:
         Returns:
           The cells of its rows in metrics.csv, see ``rows``.
         """
-        episodes = self.updates * self._config.episodes_per_update
-        counts = {"env_steps": self.env_steps, "episodes": episodes, "updates": self.updates}
+        counts = {"env_steps": self.env_steps, "episodes": self.episodes, "updates": self.updates}
         row = result | counts | {"seconds": np.asarray(seconds, np.float64)}
         self._tables["evaluations"].append({name: x[None] for name, x in row.items()})
         self._count(result)
         self.seconds = seconds
         return rows.of_evaluation(
-            result, self._last, self.updates, episodes, self.env_steps, seconds
+            result, self._last, self.updates, self.episodes, self.env_steps, seconds
         )
 
     def add_test(self, result: Arrays) -> None:
