@@ -40,6 +40,7 @@ from trainings import results
 SIZE = ["--num-seeds", "3", "--eval-episodes", "2", "--hidden-sizes", "4"]
 ANY = ["--env", "Drift-v0", "--env-steps", "None", *SIZE]
 COMMON = [*ANY, "--num-episodes", "4"]
+AUTO = ["--num-episodes", "auto", "--min-episodes", "2", "--max-episodes", "16"]
 
 
 @pytest.fixture
@@ -69,11 +70,12 @@ def assert_same(one, other):
         ["--estimator", "value-baseline", "--value-hidden-sizes", "4", "--value-fits", "2"],
         ["--algorithm", "ars", "--num-directions", "3"],
         ["--one-start", "--update", "minibatches", "--minibatch-updates", "3"],
+        [*AUTO, "--decay-steps", "9000"],
     ],
 )
 def test_a_run_in_two_parts_is_the_run_in_one(run, tmp_path, arguments):
     """Also where the first part ends in the middle of a block, or between two checkpoints."""
-    common = ANY if "ars" in arguments else COMMON
+    common = ANY if {"ars", "auto"} & {*arguments} else COMMON
     assert run(*common, *arguments, "--max-updates", 24, "--output", "whole") == 0
     more = ["--checkpoint-every", 5, "--output", "parts"]
     assert run(*common, *arguments, "--max-updates", 10, *more) == 0
@@ -84,6 +86,21 @@ def test_a_run_in_two_parts_is_the_run_in_one(run, tmp_path, arguments):
     assert config["max_updates"] == 24
     assert [entry["updates"] for entry in config["resumed"]] == [10, 10]
     assert not list((tmp_path / "parts").rglob(".*"))
+
+
+def test_episodes_are_counted_where_their_number_follows_the_noise(run, tmp_path):
+    """Each seed's own, between the bounds, and not the same in every update."""
+    assert run(*ANY, *AUTO, "--max-updates", 20, "--eval-every", 1, "--output", "out") == 0
+    rows = list(csv.DictReader((tmp_path / "out" / "metrics.csv").read_text().splitlines()))
+    seeds = sorted({row["seed"] for row in rows})
+    counts = [[int(row["episodes"]) for row in rows if row["seed"] == s] for s in seeds]
+    played = np.diff(counts, axis=1)
+    assert played.shape == (len(seeds), 20)
+    assert played.min() >= 2
+    assert played.max() <= 16
+    assert np.all(played[:, 0] == 2)
+    assert len(np.unique(played)) > 3
+    assert len({*map(tuple, played)}) == len(seeds)
 
 
 def test_seeds_that_stood_still_are_played_again(run, tmp_path):
@@ -468,7 +485,7 @@ def test_a_record_comes_back_whole():
     def block():
         floats = ("episode_return", "episode_length", "entropy", "gradient_norm")
         metrics = {name: rng.random((3, 2), np.float32) for name in floats}
-        whole = ("env_steps", "simulated_steps", "nonfinite_episodes", "skipped_update")
+        whole = ("env_steps", "episodes", "simulated_steps", "nonfinite_episodes", "skipped_update")
         metrics |= {name: rng.integers(0, 3, (3, 2)) for name in whole}
         return metrics | {"active": rng.random((3, 2)) < 0.7}
 

@@ -180,9 +180,11 @@ def test_chunks_change_nothing_but_rounding(run):
     assert close(curves(Path("whole")), curves(Path("parts")))
 
 
-def test_an_exact_run_does_not_depend_on_the_others(run):
+@pytest.mark.parametrize("episodes", ["4", "auto --min-episodes 2 --max-episodes 40"])
+def test_an_exact_run_does_not_depend_on_the_others(run, episodes):
     """Neither on its chunk, nor on what is swept beside it."""
-    command = f"{SMALL} --num-seeds 3 --max-updates 11 --exact"
+    small = SMALL.replace("--num-episodes 4", f"--num-episodes {episodes}")
+    command = f"{small} --num-seeds 3 --max-updates 11 --exact"
     assert run(f"{command} {RATES} --output whole") == 0
     assert run(f"{command} {RATES} --chunk-runs 2 --output parts") == 0
     whole = curves(Path("whole"))

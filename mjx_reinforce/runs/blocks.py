@@ -17,5 +17,5 @@ def block_length(config: Config) -> int:
     if config.max_updates is not None:
         bounds.append(config.max_updates)
     if config.env_steps is not None:
-        bounds.append(-(-config.env_steps // config.episodes_per_update))
+        bounds.append(-(-config.env_steps // config.fewest_episodes))
     return min(config.eval_every, max(_ALWAYS_ROOM, min(bounds)))

@@ -68,6 +68,7 @@ def policy_settings(env: Any, config: Config) -> dict[str, Any]:
 
 def _build_reinforce(env: Any, config: Config, shared: dict[str, Any]) -> Any:
     from mjx_reinforce.engines.native import outlook
+    from mjx_reinforce.learners.pace import AutoEpisodes
     from mjx_reinforce.learners.reinforce import reinforce
     from mjx_reinforce.runs.heartbeat import to_screen
 
@@ -78,7 +79,9 @@ def _build_reinforce(env: Any, config: Config, shared: dict[str, Any]) -> Any:
         estimator=_build_estimator(config, shared["horizon"]),
         optimizer=_build_optimizer(config),
         update=_build_update(config, shared["policy"]),
-        num_episodes=config.num_episodes,
+        num_episodes=AutoEpisodes(config.min_episodes, config.max_episodes)
+        if config.num_episodes == "auto"
+        else config.num_episodes,
         entropy_cost=config.entropy_cost,
         loss_per=config.loss_per,
         max_kl=config.max_kl,

@@ -53,8 +53,16 @@ class Config(
 
     @property
     def episodes_per_update(self) -> int:
-        """Episodes that a seed plays for an update."""
-        return self.num_episodes if self.algorithm == "reinforce" else 2 * self.num_directions
+        """Episodes that a seed plays for an update, at most."""
+        if self.algorithm == "ars":
+            return 2 * self.num_directions
+        return self.max_episodes if self.num_episodes == "auto" else self.num_episodes
+
+    @property
+    def fewest_episodes(self) -> int:
+        """Episodes that a seed plays for an update, at least."""
+        auto = self.algorithm == "reinforce" and self.num_episodes == "auto"
+        return self.min_episodes if auto else self.episodes_per_update
 
 
 def check(config: Config) -> None:
@@ -120,6 +128,7 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         lambda x: x >= 1,
         "at least 1",
     ),
+    ("min_episodes max_episodes", lambda x: x >= 2, "at least 2: one alone shows no noise"),
     ("normalize_steps", lambda x: x >= 0, "at least 0"),
     (
         " ".join(COUNTED),
@@ -186,7 +195,9 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
 
 def _check_reinforce(config: Config) -> None:
     """Raises ValueError for settings that do not go together."""
-    if config.estimator == "leave-one-out" and config.num_episodes < 2:
+    if config.num_episodes == "auto":
+        _check_auto(config)
+    elif config.estimator == "leave-one-out" and config.num_episodes < 2:
         raise ValueError(
             f"leave-one-out needs at least two episodes an update, got --num-episodes "
             f"{config.num_episodes}; raise it or choose --estimator reward-to-go"
@@ -221,6 +232,20 @@ def _check_reinforce(config: Config) -> None:
         raise ValueError(
             f"the learning rate would decay over {steps:,} optimiser steps, more than the 2^31 - 1 "
             "that can be counted; lower --decay-updates or --minibatch-updates"
+        )
+
+
+def _check_auto(config: Config) -> None:
+    """Raises ValueError for settings that do not go with a number of episodes that changes."""
+    if config.min_episodes > config.max_episodes:
+        raise ValueError(
+            f"--min-episodes must be at most --max-episodes {config.max_episodes}, got "
+            f"{config.min_episodes}"
+        )
+    if config.update not in ("full-batch", "natural-gradient"):
+        raise ValueError(
+            "--num-episodes auto needs --update full-batch or natural-gradient, for "
+            f"{config.update} does not measure the gradient's noise; choose one, or a number"
         )
 
 

@@ -61,7 +61,8 @@ def parts(config: Config, task: Task) -> list[Part]:
     values = task.observation + task.action + 3
     evaluated = seeds * horizon * 2 * config.eval_episodes
     follows = config.algorithm == "reinforce"  # a gradient; else it searches with many policies
-    fewer = "--num-episodes" if follows else "--num-directions"
+    room = "--max-episodes" if config.num_episodes == "auto" else "--num-episodes"
+    fewer = room if follows else "--num-directions"
     held = seeds * (min(horizon, _CHUNK) if follows else 1) * episodes * sum(config.hidden_sizes)
     policies = seeds if follows else seeds * 2 * config.num_directions
     network = _ACTIVATIONS * held + _PARAMETERS * policies * num_parameters(config, task)

@@ -27,7 +27,7 @@ def per_step(config: Config, task: Task) -> float:
     policy = num_parameters(config, task)
     if config.algorithm == "ars":
         return _FORWARDS * policy
-    steps = config.num_episodes * (config.horizon or task.horizon)
+    steps = config.fewest_episodes * (config.horizon or task.horizon)
     learned = 1.0
     if config.update == "minibatches":
         learned = config.minibatch_updates * config.minibatch_size / steps

@@ -147,7 +147,7 @@ def _where(machine: Machine, num_processes: int) -> str:
 def training_seconds(config: Config, task: Task, speed: Speed) -> tuple[float, bool]:
     """Returns how long the networks that were measured take (s), and whether at most so long."""
     steps, bounded = _steps(config, task, useful_part(task, speed))
-    episodes = config.episodes_per_update
+    episodes = config.fewest_episodes  # with more, evaluations take less of it
     evaluated = 2 * config.eval_episodes / (config.eval_every * episodes)
     total = config.num_seeds * steps * (1 + evaluated)
     return speed.seconds(total, config.num_seeds * episodes), bounded

@@ -12,7 +12,8 @@ FREE_STD = ("normal", "truncated-normal", "clipped-normal", "tanh-normal")
 #: the most general first. What stands in none is always read.
 READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
     (
-        "num_episodes estimator ended_episodes discount final_discount reward_shift "
+        "num_episodes min_episodes max_episodes "
+        "estimator ended_episodes discount final_discount reward_shift "
         "discount_weights standardize standardize_floor value_learning_rate value_fit value_fits "
         "value_batch_size value_hidden_sizes update natural_damping natural_iterations "
         "minibatch_updates minibatch_size loss_per entropy_cost optimizer learning_rate "
@@ -33,6 +34,11 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
     ),
     ("value_batch_size", lambda c: c.value_fit == "minibatches", "--value-fit minibatches"),
     ("ended_episodes", lambda c: c.estimator == "leave-one-out", "--estimator leave-one-out"),
+    (
+        "min_episodes max_episodes",
+        lambda c: c.num_episodes == "auto",
+        "--num-episodes auto",
+    ),
     ("standardize_floor", lambda c: c.standardize, "--standardize"),
     ("overwrite", lambda c: c.output is not None or c.resume is not None, "--output DIR"),
     (

@@ -29,8 +29,13 @@ class RunSettings:
     """Stop every seed after this many updates; with --num-episodes 1, as many episodes."""
     stop_when_solved: bool = False
     """Stop once every seed's last evaluation reached the environment's reward threshold."""
-    num_episodes: int = 16
-    """Complete episodes played for one update, for each seed. (ars: see --num-directions.)"""
+    num_episodes: int | Literal["auto"] = 16
+    """Complete episodes played for one update, for each seed. auto: as many as noise and signal of
+    the gradient are equal with, measured as the seed learns. (ars: see --num-directions.)"""
+    min_episodes: int = 16
+    """With --num-episodes auto, how many an update plays at least,"""
+    max_episodes: int = 2048
+    """and at most: memory holds so many."""
     horizon: int | None = None
     """Steps after which an episode ends; the environment's own limit if not given."""
     one_start: bool = False
