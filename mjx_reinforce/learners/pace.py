@@ -14,8 +14,8 @@ from flax import struct
 from mjx_reinforce.policies.arguments import check_count, check_number
 
 #: The share of an update in the running means. They are over about the last 2 / _SHARE - 1 = 19
-#: updates: B of one update is known to a factor of two or so, that of 19 to a third of it, and it
-#: takes hundreds of updates to change by as much.
+#: updates: where B episodes are played, B of one update is known to 0.5 to 0.8 of itself, of 19 to
+#: 0.1 to 0.2 (docs/statistics.md), and it takes some ten updates or more to double.
 _SHARE = 0.1
 #: The number of episodes changes by this factor an update at most.
 _FACTOR = 2
