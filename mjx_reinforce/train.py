@@ -240,29 +240,23 @@ def _compile(
     if config.init_from is not None and found is None:
         state = begin_with(state, last_actors(config, ready.policy))
     if config.minutes is not None:
-        config, state = _with_budget(config, programs, state, found, display)
+        first = state if found is None else found.state[0]
+        config = _with_budget(config, programs, first, display)
     record, best = Record(config, ready.threshold), first_best(state.train_states)
     known, log = dataclasses.replace(config, horizon=ready.horizon), RunLog(directory)
     session = Session(known, ready.policy, programs, record, log, display, state, best)
     return session, seconds
 
 
-def _with_budget(
-    config: Config, programs: Any, state: Any, found: Any, display: Any
-) -> tuple[Config, Any]:
-    """Returns the settings with env steps in place of minutes, and the state before the first.
-
-    A run that goes on does so from its checkpoint for that long.
-    """
+def _with_budget(config: Config, programs: Any, state: Any, display: Any) -> Config:
+    """Returns the settings with env steps in place of minutes, from a state on."""
     from mjx_reinforce.runs.minutes import env_steps_in
 
     minutes = config.minutes
     assert minutes is not None
-    first = state if found is None else found.state[0]
-    env_steps, back = env_steps_in(60 * minutes, programs, first, config.max_updates)
-    display.say(f"about {minutes:g} min are {env_steps:,} env steps of a seed here")
-    config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
-    return config, back if found is None else state
+    env_steps = env_steps_in(60 * minutes, programs, state, config.max_updates)
+    display.say(f"{minutes:g} min are about {env_steps:,} env steps of a seed in all here")
+    return dataclasses.replace(config, env_steps=env_steps, minutes=None)
 
 
 def _begin(session: Any, found: Any, num_processes: int) -> None:
