@@ -34,6 +34,9 @@ FAMILIES = {
 }
 DAMPING, MAX_KL = 1e-2, 1e-3
 
+#: Before the first update.
+START = schedules.Clock(jnp.zeros(()), jnp.zeros(()))
+
 
 def make(name, seed=0):
     """A policy with weights far from the first ones, and what a rollout of it leaves."""
@@ -49,7 +52,7 @@ def make(name, seed=0):
     action = distribution.sample(policy.apply(params, observation), noise)
     weight = jnp.where(MASK, jax.random.normal(keys[4], MASK.shape), 0.0)
     samples = (observation, action, weight, jnp.asarray(MASK))
-    return policy, params, Problem(_surrogate(policy, 0.0), optax.sgd(1.0), samples, 4)
+    return policy, params, Problem(_surrogate(policy, 0.0), optax.sgd(1.0), samples, 4, START)
 
 
 def actions_and_probabilities(distribution, outputs):

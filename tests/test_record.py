@@ -76,7 +76,7 @@ def test_a_record_is_restored_exactly(tmp_path):
         assert repr(record.progress()) == repr(copy.progress())
         both = []
         for x in (record, copy):
-            x.add_updates(block(np.random.default_rng(i), 5, 3, x.updates))
+            x.add_updates(block(np.random.default_rng(i), 5, 3))
             both.append(x.add_evaluation(evaluation(5, 6, i), 3.0))
         assert repr(both[0]) == repr(both[1])
 
@@ -93,7 +93,7 @@ def test_a_block_waits_for_its_evaluation():
     assert not record.evaluated()
     record.add_evaluation(evaluation(1, 2, 3), 0.1)
     assert record.evaluated()
-    record.add_updates(block(np.random.default_rng(0), 4, 3, record.updates))
+    record.add_updates(block(np.random.default_rng(0), 4, 3))
     assert not record.evaluated()
     copy = Record(Config(num_seeds=3, max_updates=100), 2.0)
     copy.restore(record.arrays())
@@ -136,7 +136,7 @@ def test_a_run_is_hopeless_if_all_that_train_are():
 
 
 def test_a_block_of_broken_updates_is_one_line():
-    metrics = block(np.random.default_rng(1), 4, 9, 6)
+    metrics = block(np.random.default_rng(1), 4, 9)
     metrics["nonfinite_episodes"] = np.full((4, 9), 2)
     metrics["skipped_update"] = np.zeros((4, 9), int)
     assert nonfinite.describe(nonfinite.nonfinite_updates(metrics), 1000) == (

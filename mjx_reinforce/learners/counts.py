@@ -39,6 +39,6 @@ def reached(count: Count, limit: Count) -> jax.Array:
 
 
 def number(count: Count) -> jax.Array:
-    """Returns counts [..., 2] as the nearest float [...]."""
+    """Returns counts [..., 2] as floats [...], to their precision."""
     words = jnp.asarray(count).astype(float)
     return words[..., 0] * 2.0**32 + words[..., 1]

@@ -71,7 +71,8 @@ class Guests(NamedTuple):
         return jnp.arange(len(self.keys)) < self.num_modes
 
 
-class Host(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Host:
     """A ``Learner.play`` that can take guests.
 
     alone: as ``Learner.play``

@@ -55,6 +55,8 @@ from mjx_reinforce.types import (
     observation_size,
 )
 
+#: Where functions are that make estimators, and are no schedules of them.
+_ESTIMATORS = tuple(f"mjx_reinforce.learners.{name}" for name in ("estimators", "value_baseline"))
 #: Episodes are short if none is longer than the horizon divided by this. An update passes over all
 #: steps that there may be, so it takes its time from the horizon, not from the episodes.
 _FEW = 8
@@ -181,7 +183,8 @@ def _at(
     estimator: Estimator | Callable[[jax.Array], Estimator],
 ) -> Callable[[jax.Array], Estimator]:
     """Returns a function from the progress [] to an estimator."""
-    return estimator if callable(estimator) else lambda progress: estimator
+    made_here = getattr(estimator, "__module__", "") in _ESTIMATORS  # such as ``reward_to_go``
+    return estimator if callable(estimator) and not made_here else lambda progress: estimator
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
