@@ -25,15 +25,15 @@ class Critic(NamedTuple):
     """State of ``value_baseline``.
 
     params, opt_state: of the network
-    key: [] of the minibatches
-    updates: [] float, those in which anything was played
+    seed: [] uint32, from which, with the number of updates, the minibatches are drawn
+    updates: [] int32, those in which anything was played
     mean, variance: [] running moments of the returns to go; the network's values are in their
       standard deviations from their mean, 0 before the first update
     """
 
     params: Any
     opt_state: Any
-    key: jax.Array
+    seed: jax.Array
     updates: jax.Array
     mean: jax.Array
     variance: jax.Array
@@ -80,9 +80,10 @@ def value_baseline(
 
     def init(key, observation_size):
         network_key, key = jax.random.split(key)
+        seed = jax.random.bits(key, (), jnp.uint32)
         params = _first_params(network, network_key, observation_size + 1)
         zero = jnp.zeros(())
-        return Critic(params, fitter.init(params), key, zero, zero, zero)
+        return Critic(params, fitter.init(params), seed, jnp.zeros((), jnp.int32), zero, zero)
 
     def update(critic, trajectory):
         mask, num_episodes = trajectory.mask, trajectory.mask.shape[1]
@@ -95,7 +96,7 @@ def value_baseline(
 
         updates, mean, variance = _moments(critic, returns, mask)
         unit = jnp.where(variance > 0, jnp.sqrt(variance), 1.0)
-        key, draw_key = jax.random.split(critic.key)
+        draw_key = jax.random.fold_in(jax.random.key(critic.seed), critic.updates)
         observations = trajectory.observation.reshape(mask.size, -1)
         targets = (returns.reshape(-1) - mean) / unit
 
@@ -112,7 +113,7 @@ def value_baseline(
 
         indices = draw_steps(draw_key, mask, (num_fits, batch_size))
         (params, opt_state), _ = lax.scan(fit, (critic.params, critic.opt_state), indices)
-        return weight, Critic(params, opt_state, key, updates, mean, variance), metrics
+        return weight, Critic(params, opt_state, critic.seed, updates, mean, variance), metrics
 
     return Estimator(init, update)
 
