@@ -135,7 +135,8 @@ def sweep_settings_of(task: Task, num_seeds: int, env_steps: int) -> Config:
     """Returns the settings from which a task's sweep moves."""
     config = settings_of(task, num_seeds, env_steps)
     most = task.patience * _updates(task, config, env_steps)
-    return dataclasses.replace(config, max_updates=most, eval_every=_SWEEP_EVERY)
+    decay = env_steps if config.decay_steps == "budget" else config.decay_steps  # a number moves
+    return dataclasses.replace(config, max_updates=most, eval_every=_SWEEP_EVERY, decay_steps=decay)
 
 
 def horizon(env: str) -> int:

@@ -139,7 +139,8 @@ def test_a_block_of_broken_updates_is_one_line():
     metrics = block(np.random.default_rng(1), 4, 9)
     metrics["nonfinite_episodes"] = np.full((4, 9), 2)
     metrics["skipped_update"] = np.zeros((4, 9), int)
-    assert nonfinite.describe(nonfinite.nonfinite_updates(metrics), 1000) == (
+    made = 6 + np.cumsum(metrics["active"], axis=0)
+    assert nonfinite.describe(nonfinite.nonfinite_updates(metrics, made), 1000) == (
         "updates 6 to 9: 9 of 1,000 seeds met numbers that are not finite (0, 1, 2, 3, 4, ...): "
         "66 episodes, 0 updates skipped"  # the last seed made one update of four
     )

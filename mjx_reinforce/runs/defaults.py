@@ -202,7 +202,7 @@ def of_task(
     if env_steps is not None:
         chosen = many if env_steps >= _MANY else few
         return dataclasses.replace(chosen, env_steps=env_steps, num_seeds=num_seeds)
-    if seconds is None and env in _SOLVED:
+    if seconds is None and (env in _SOLVED or env not in _OF_TASKS):
         return dataclasses.replace(few, num_seeds=num_seeds)
     time, together = seconds or _SECONDS, min(num_seeds, Config.num_seeds)
     given = env_steps_in(time, dataclasses.replace(many, num_seeds=together))
