@@ -125,7 +125,11 @@ def moves(base: Config) -> Mapping[str, list[Any]]:
     found: dict[str, list[Any]] = {}
     for name, counts in _MOVED.items():
         value = getattr(base, name)
-        if value is None or (name == "standardize_floor" and not base.standardize):
+        if (
+            value is None
+            or isinstance(value, str)
+            or (name == "standardize_floor" and not base.standardize)
+        ):
             continue
         values = [_moved(name, value, factor, counts) for factor in (1 / FACTOR, 1, FACTOR)]
         found[name] = list(dict.fromkeys(values))
