@@ -77,6 +77,10 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             with heartbeat(to_screen, None, "writing the simulation out"):
                 default = start(arguments, "train")[0]
                 ready, found = _start(env, config, default, processes, share)
+            if config.init_from is not None and found is None:
+                from mjx_reinforce.runs.initial import last_actors
+
+                last_actors(config, ready.policy)  # refused before anything is compiled
             plan = make_plan(ready, config, processes.count)
     except ValueError as error:
         refuse(str(error), made)

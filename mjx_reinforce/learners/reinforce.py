@@ -184,7 +184,10 @@ def _at(
 ) -> Callable[[jax.Array], Estimator]:
     """Returns a function from the progress [] to an estimator."""
     made_here = getattr(estimator, "__module__", "") in _ESTIMATORS  # such as ``reward_to_go``
-    return estimator if callable(estimator) and not made_here else lambda progress: estimator
+    if callable(estimator) and not made_here:
+        return estimator
+    unchanging: Any = estimator
+    return lambda progress: unchanging
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)

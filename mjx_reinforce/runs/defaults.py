@@ -174,6 +174,8 @@ _SCALED: dict[str, Any] = {"num_episodes": 2048, "momentum": 0.5, "normalize_ste
 #: Nothing more is to be had of these in a minute than in what is said above.
 _SOLVED = ("InvertedPendulum-v5", "InvertedPendulum-v4")
 
+#: Where a budget is large, it has about so many evaluations.
+_EVALUATIONS = 50
 #: A default run trains for about so long (s) with as many seeds as a default run has, and never
 #: less than the task's settings above say.
 _SECONDS = 60.0
@@ -201,7 +203,7 @@ def of_task(
         many = dataclasses.replace(few, **{**_SCALED, **_AT_SCALE[env]})
     if env_steps is not None:
         chosen = many if env_steps >= _MANY else few
-        return dataclasses.replace(chosen, env_steps=env_steps, num_seeds=num_seeds)
+        return _spaced(dataclasses.replace(chosen, env_steps=env_steps, num_seeds=num_seeds))
     if seconds is None and (env in _SOLVED or env not in _OF_TASKS):
         return dataclasses.replace(few, num_seeds=num_seeds)
     time, together = seconds or _SECONDS, min(num_seeds, Config.num_seeds)
@@ -210,7 +212,19 @@ def of_task(
     if not has_gpu() and given < _MANY:  # there few episodes take little time
         chosen, given = few, env_steps_in(time, dataclasses.replace(few, num_seeds=together))
     least = 1 if seconds else few.env_steps or 0
-    return dataclasses.replace(chosen, env_steps=max(given, least), num_seeds=num_seeds)
+    return _spaced(dataclasses.replace(chosen, env_steps=max(given, least), num_seeds=num_seeds))
+
+
+def _spaced(config: Config) -> Config:
+    """Returns settings whose evaluations are no more than ``_EVALUATIONS``, if episodes are long.
+
+    They are no rarer than the task's own until its budget is several times the one above.
+    """
+    if config.env not in measured.TASKS or config.env_steps is None:
+        return config
+    played = config.episodes_per_update * measured.TASKS[config.env].horizon
+    every = config.env_steps // played // _EVALUATIONS
+    return dataclasses.replace(config, eval_every=max(config.eval_every, every))
 
 
 def env_steps_in(seconds: float, config: Config) -> int:
