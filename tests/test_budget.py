@@ -107,19 +107,20 @@ def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, env, gpu):
     # More seeds than a default run has leave each with what it would learn.
     assert of_task(env, num_seeds=1000) == dataclasses.replace(config, num_seeds=1000)
     assert parse(["--env", env]) == config
-    scaled = env in defaults._AT_SCALE and gpu
-    assert (config.normalize_steps is None) == scaled
+    if gpu and env in defaults._OF_BUDGETS:
+        assert config.num_episodes >= 1024
     one, two = (of_task(env, seconds=x).env_steps for x in (60.0, 120.0))
     assert two == pytest.approx(2 * one, rel=0.06)
 
 
 def test_a_budget_chooses_the_settings():
-    few, many = (of_task("Hopper-v5", steps) for steps in (1_000_000, 1_000_000_000_000))
-    assert (few.num_episodes, many.num_episodes) == (16, 2048)
+    few, some, many = (of_task("Hopper-v5", steps) for steps in (10**6, 3 * 10**6, 10**12))
+    assert [x.num_episodes for x in (few, some, many)] == [16, 64, 2048]
+    assert some.update == "natural-gradient"
     assert few.eval_every == 10
     assert many.env_steps == 10**12
     assert many.eval_every == 10**12 // (2048 * 1000 * 50)
-    for config in (few, many):
+    for config in (few, some, many):
         words = ["--env", "Hopper-v5", "--env-steps", str(config.env_steps)]
         assert parse(words) == config
     assert parse(["--env=Hopper-v5", "--env-steps=1000000", "--num-seeds=9"]).num_seeds == 9

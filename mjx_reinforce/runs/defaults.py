@@ -143,34 +143,55 @@ _OF_TASKS: dict[str, dict[str, Any]] = {
 }
 
 
-#: From so many env steps of a seed on, the settings of ``_AT_SCALE`` hold.
-_MANY = 30_000_000
-
-#: Environment id -> what else differs where the budget is large: many episodes, nearly exact
-#: gradients, long steps. Measured on one H100 with 8 seeds (4 of Ant), at 4e7 to 5e8 env steps.
-_AT_SCALE: dict[str, dict[str, Any]] = {
-    "Reacher-v5": {"learning_rate": 0.01, "max_kl": 0.02},
-    "Pusher-v5": {"learning_rate": 0.01, "max_kl": 0.03},
-    "HalfCheetah-v5": {"learning_rate": 0.01, "max_kl": 0.02, "eval_every": 10},
-    "Hopper-v5": {"learning_rate": 0.02, "max_kl": 0.03, "discount": 0.995, "initial_std": 0.6},
-    "Walker2d-v5": {
-        "num_episodes": 1024,
-        "learning_rate": 0.01,
-        "max_kl": 0.02,
-        "discount": 0.995,
-        "initial_std": 0.5,
-        "standardize_floor": 1.0,
-    },
-    "Ant-v5": {
-        "learning_rate": 0.02,
-        "max_kl": 0.03,
-        "initial_std": 0.4,
-        "eval_every": 5,
-    },
+#: What differs where many episodes make a nearly exact gradient, and long steps follow it.
+_MANY_EPISODES: dict[str, Any] = {
+    "num_episodes": 2048,
+    "momentum": 0.5,
+    "normalize_steps": None,
 }
-#: What all of them share.
-_SCALED: dict[str, Any] = {"num_episodes": 2048, "momentum": 0.5, "normalize_steps": None}
+#: And where the step is that of the natural gradient.
+_NATURAL: dict[str, Any] = {
+    "update": "natural-gradient",
+    "num_episodes": 64,
+    "max_kl": 0.02,
+    "discount": 0.995,
+    "ended_episodes": "skip",
+}
 
+#: Environment id -> from so many env steps of a seed on, what else differs. Rows from 30 million on
+#: were measured on one H100 with 8 seeds (Ant: 4), up to 5e8 env steps; those before on two cores
+#: with 2 seeds, at 5 to 15 million.
+_OF_BUDGETS: dict[str, tuple[tuple[int, dict[str, Any]], ...]] = {
+    "Reacher-v5": ((30_000_000, _MANY_EPISODES | {"learning_rate": 0.01, "max_kl": 0.02}),),
+    "Pusher-v5": ((30_000_000, _MANY_EPISODES | {"learning_rate": 0.01, "max_kl": 0.03}),),
+    "HalfCheetah-v5": ((30_000_000, _MANY_EPISODES | {"learning_rate": 0.01, "max_kl": 0.02}),),
+    "Hopper-v5": (
+        (3_000_000, _NATURAL | {"initial_std": 0.6, "normalize_steps": None}),
+        (
+            30_000_000,
+            _MANY_EPISODES
+            | {"learning_rate": 0.02, "max_kl": 0.03, "discount": 0.995, "initial_std": 0.6},
+        ),
+    ),
+    "Walker2d-v5": (
+        (5_000_000, _NATURAL | {"initial_std": 0.5, "standardize_floor": 1.0}),
+        (
+            30_000_000,
+            _MANY_EPISODES
+            | {
+                "num_episodes": 1024,
+                "learning_rate": 0.01,
+                "max_kl": 0.02,
+                "discount": 0.995,
+                "initial_std": 0.5,
+                "standardize_floor": 1.0,
+            },
+        ),
+    ),
+    "Ant-v5": (
+        (30_000_000, _MANY_EPISODES | {"learning_rate": 0.02, "max_kl": 0.03, "initial_std": 0.4}),
+    ),
+}
 #: Nothing more is to be had of these in a minute than in what is said above.
 _SOLVED = ("InvertedPendulum-v5", "InvertedPendulum-v4")
 
@@ -197,22 +218,34 @@ def of_task(
         learns is then the same, and takes longer.
       seconds: that time; None: about a minute, or less where nothing more is to be had.
     """
-    few = dataclasses.replace(Config(env=env), **_OF_TASKS.get(env, {}))
-    many = few
-    if env in _AT_SCALE:
-        many = dataclasses.replace(few, **{**_SCALED, **_AT_SCALE[env]})
+    few = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **_OF_TASKS.get(env, {}))
+    if env_steps is None and seconds is None and (env in _SOLVED or env not in _OF_TASKS):
+        return few
+    rows = [(0, few)]
+    for least, settings in _OF_BUDGETS.get(env, ()):
+        rows.append((least, dataclasses.replace(few, **settings)))
     if env_steps is not None:
-        chosen = many if env_steps >= _MANY else few
-        return _spaced(dataclasses.replace(chosen, env_steps=env_steps, num_seeds=num_seeds))
-    if seconds is None and (env in _SOLVED or env not in _OF_TASKS):
-        return dataclasses.replace(few, num_seeds=num_seeds)
-    time, together = seconds or _SECONDS, min(num_seeds, Config.num_seeds)
-    given = env_steps_in(time, dataclasses.replace(many, num_seeds=together))
-    chosen = many
-    if not has_gpu() and given < _MANY:  # there few episodes take little time
-        chosen, given = few, env_steps_in(time, dataclasses.replace(few, num_seeds=together))
+        chosen = next(config for least, config in reversed(rows) if env_steps >= least)
+        return _spaced(dataclasses.replace(chosen, env_steps=env_steps))
+    given, chosen = _in_time(seconds or _SECONDS, rows)
     least = 1 if seconds else few.env_steps or 0
-    return _spaced(dataclasses.replace(chosen, env_steps=max(given, least), num_seeds=num_seeds))
+    return _spaced(dataclasses.replace(chosen, env_steps=max(given, least)))
+
+
+def _in_time(seconds: float, rows: Sequence[tuple[int, Config]]) -> tuple[int, Config]:
+    """Returns the budget that a time gives here, and the settings for it.
+
+    Args:
+      seconds: the time.
+      rows: from so many env steps on, the settings; the least first, which is 0. On a GPU the last
+        hold in any case: few episodes take as long there as many.
+    """
+    for least, config in reversed(rows):
+        together = min(config.num_seeds, Config.num_seeds)
+        given = env_steps_in(seconds, dataclasses.replace(config, num_seeds=together))
+        if has_gpu() or given >= least:
+            return given, config
+    raise AssertionError("the first row holds for any budget")
 
 
 def _spaced(config: Config) -> Config:
