@@ -4,10 +4,10 @@ Runs of ``train`` with four seeds of 16 episodes an update and a 32-32 policy, t
 evaluating, on 2026-11-22, and of InvertedPendulum on a CPU with its default settings, of 4 episodes
 and a linear policy, on 2026-11-23; all figures are good to a factor of two.
 
-- CPU: two cores of a shared machine on which nothing else ran, on 2026-11-24 a quarter of a minute of
-  each task; the Humanoids' rates are those of rollouts, halved. The operations of larger networks and of value
-  networks are from ContinuousCartPole, InvertedPendulum and Swimmer on 2026-11-24, by the time of
-  the processor: 3e10 to 6e10 a second and core.
+- CPU: two cores of a shared machine on which nothing else ran, on 2026-11-24, a quarter of a
+  minute of each task; the Humanoids' rates are those of rollouts, halved. The operations of larger
+  networks and of value networks are from ContinuousCartPole, InvertedPendulum and Swimmer on that
+  day, by the time of the processor: 3e10 to 6e10 a second and core.
 - GPU: an H200. Compiling depends on the host: two of its threads took twice as long as stands here,
   16 quiet ones half as long. The rates of many episodes are those of rollouts on that day, halved
   where there are no contacts, since training takes as long as playing there. For tasks with
