@@ -188,7 +188,7 @@ def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
 
 def _flags(settings: Mapping[str, Any]) -> str:
     """Returns the flags of settings that are not the defaults of their task."""
-    defaults = dataclasses.asdict(of_task(settings["env"], settings["env_steps"]))
+    defaults = dataclasses.asdict(of_task(settings["env"], settings.get("env_steps")))
     given = {k: v for k, v in settings.items() if k in defaults and k not in _NOT_AGAIN}
     changed = {
         k: v for k, v in given.items() if v != defaults[k] and v != list(_items(defaults[k]))

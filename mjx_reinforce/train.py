@@ -291,15 +291,19 @@ def _loop(session: Any, interrupt: Interrupt) -> None:
     does that.
     """
     record = session.record
-    while interrupt.number is None:
+
+    def over() -> bool:
         if session.config.stop_when_solved and not record.evaluated():
             session.evaluate()
-        if record.finished() or record.hopeless():
-            break
+        return record.finished() or record.hopeless()
+
+    while interrupt.number is None and not over():
         session.advance()
-        session.save_if_due()
+        if not record.finished():  # else it is saved with its evaluation
+            session.save_if_due()
     if not record.evaluated() and (interrupt.number is None or not record.begun()):
         session.evaluate()
+    session.save_if_due()
 
 
 def _finish(

@@ -626,6 +626,10 @@ WRONG = {
         | _TEXT,
     ),
     **dict.fromkeys(("seed", "eval_seed"), st.integers(max_value=-1) | st.integers(2**32) | _TEXT),
+    **dict.fromkeys(
+        ("env_steps", "max_updates"),
+        st.integers(max_value=0) | st.integers(min_value=2**53 + 1) | st.floats() | _TEXT,
+    ),
     "num_seeds": st.integers(max_value=0) | st.floats() | _TEXT,
     "normalize_steps": st.integers(max_value=-1) | st.integers(min_value=2**31) | _TEXT,
     "discount": st.floats(max_value=-1e-9) | st.floats(min_value=1.001) | st.just(math.nan) | _TEXT,

@@ -39,7 +39,8 @@ from trainings import results
 
 SIZE = ["--num-seeds", "3", "--eval-episodes", "2", "--hidden-sizes", "4"]
 ANY = ["--env", "Drift-v0", "--env-steps", "None", *SIZE]
-COMMON = [*ANY, "--num-episodes", "4"]
+#: A rate that lasts as long as the budget would make another run of a larger one.
+COMMON = [*ANY, "--num-episodes", "4", "--decay-steps", "9000"]
 AUTO = ["--num-episodes", "auto", "--min-episodes", "2", "--max-episodes", "16"]
 
 

@@ -172,7 +172,7 @@ def entry_point(name):
 def test_a_second_signal_ends_at_once(tmp_path):
     """Although a block of updates takes minutes."""
     process = start(tmp_path, *FOREVER, "--eval-every", 1_000_000)
-    wait_for(lambda: rows(tmp_path) > 4, process)
+    wait_for(lambda: rows(tmp_path) > 0, process)  # the first evaluation is in the block
     time.sleep(0.5)
     process.send_signal(signal.SIGINT)
     assert process.poll() is None

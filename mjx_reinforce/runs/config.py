@@ -136,9 +136,8 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
         "at most 2^53, for no more is counted exactly",
     ),
     (
-        "num_episodes horizon decay_updates eval_every eval_episodes "
-        "test_episodes "
-        "normalize_steps minibatch_size value_batch_size num_directions checkpoint_every",
+        "num_episodes min_episodes max_episodes horizon decay_updates eval_every eval_episodes "
+        "test_episodes normalize_steps minibatch_size value_batch_size num_directions checkpoint_every",
         lambda x: x <= MAX_OF_UPDATE,
         "less than 2^31",
     ),

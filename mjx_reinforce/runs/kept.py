@@ -27,7 +27,7 @@ from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.files import provenance, version
 from mjx_reinforce.runs.keys import plain
 from mjx_reinforce.runs.resume import recordable
-from mjx_reinforce.runs.state import Parts, eval_keys_shape
+from mjx_reinforce.runs.state import Budget, Parts, eval_keys_shape
 from mjx_reinforce.runs.trees import describe, rebuild
 
 #: Settings that change no program. Of the budgets, ``block_length`` says what does.
@@ -84,7 +84,7 @@ def keep(key: str, facts: dict[str, Any], parts: Parts) -> Parts:
     seed, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), (2,)))
     given = {
         "start": (seed, seed),
-        "advance": (shapes, (count, count), jax.ShapeDtypeStruct((), bool)),
+        "advance": (shapes, (count,) * len(Budget._fields), jax.ShapeDtypeStruct((), bool)),
         "look": (actor, eval_keys_shape(parts.like)),
     }
     return parts._replace(

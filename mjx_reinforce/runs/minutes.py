@@ -28,8 +28,7 @@ def env_steps_in(
       state: from which it goes on.
       max_updates: of the run, if any.
     """
-    most = MAX_COUNT if max_updates is None else max_updates
-    budget = Budget(counts.from_int(MAX_COUNT), counts.from_int(most))
+    budget = Budget.of(None, max_updates)
     copy = jax.tree.map(jnp.copy, state)
     began, past = time.perf_counter(), [(0.0, _played(state))]
     going = True

@@ -45,10 +45,20 @@ class Budget(NamedTuple):
 
     env_steps: [2] a count, see ``counts``; a seed stops after the update that reaches it
     updates: [2] likewise, how many it makes at most
+    all_env_steps: [2] how long schedules last; more than ``env_steps`` where a run goes on later
+    all_updates: [2] likewise
     """
 
-    env_steps: jax.Array | np.ndarray
-    updates: jax.Array | np.ndarray
+    env_steps: counts.Count
+    updates: counts.Count
+    all_env_steps: counts.Count
+    all_updates: counts.Count
+
+    @classmethod
+    def of(cls, env_steps: int | None, updates: int | None) -> "Budget":
+        """Returns a budget, of which what has no limit has the greatest count."""
+        limits = [counts.from_int(MAX_COUNT if x is None else x) for x in (env_steps, updates)]
+        return cls(*limits, *limits)
 
 
 class Parts(NamedTuple):
@@ -60,7 +70,7 @@ class Parts(NamedTuple):
     like: the shapes of a ``RunState``
     start: (seed, eval_seed) -> the first state's leaves, and the data of the keys [K, S] of the
       last test, which plays the episodes of K evaluations
-    advance: (leaves, (env_steps, updates) as in ``Budget``, whether to evaluate []) -> as
+    advance: (leaves, what ``Budget`` has, whether to evaluate []) -> as
       ``block_of_updates``, with the leaves of states and of actors
     look: (leaves of the actors, data of the keys [S]) -> as ``evaluation``
     rides: whether ``advance`` evaluates; else ``look`` does, before it
@@ -169,7 +179,7 @@ def parts_of(
         state, test_keys = plain(first(seed, eval_seed))
         return jax.tree.leaves(state), test_keys
 
-    def advance(leaves: list[jax.Array], budget: tuple[jax.Array, jax.Array], look: Any) -> Any:
+    def advance(leaves: list[jax.Array], budget: Sequence[jax.Array], look: Any) -> Any:
         before = restored(leaves, like)
         state, block = updates(before, Budget(*budget), look)
         present = before.train_states.actor, before.train_states.num_updates
@@ -214,7 +224,7 @@ def compile_parts(
         advancing = traced.compile()
         compiled, (first, test_keys) = looking.result(), starting.result()
     # No update: a GPU's driver translates a program's kernel, also the evaluation's, at first use.
-    nothing = Budget(counts.from_int(0), counts.from_int(0))
+    nothing = Budget.of(0, 0)
     first = jax.block_until_ready(advancing(first, nothing, np.bool_(False))[0])
 
     def advanced(
@@ -285,8 +295,7 @@ def _for_each_seed(key: jax.Array, num_seeds: int) -> jax.Array:
 
 def budget_of(config: Config) -> Budget:
     """Returns the budget; what has no limit has the greatest count."""
-    limits = (config.env_steps, config.max_updates)
-    return Budget(*(counts.from_int(MAX_COUNT if limit is None else limit) for limit in limits))
+    return Budget.of(config.env_steps, config.max_updates)
 
 
 class Block(NamedTuple):
@@ -323,10 +332,13 @@ def block_of_updates(
         return ~(used | counts.reached(state.train_states.num_updates, budget.updates))
 
     def progress(state: RunState, budget: Budget) -> jax.Array:
-        """Returns the share [S] of its budget that each seed has used."""
-        made = state.train_states.env_steps, state.train_states.num_updates
-        shares = [counts.number(x) / counts.number(y) for x, y in zip(made, budget, strict=True)]
-        return jnp.minimum(jnp.maximum(*shares), 1.0)
+        """Returns the share [S] of its whole budget that each seed has used."""
+        env_steps = counts.number(state.train_states.env_steps)
+        updates = counts.number(state.train_states.num_updates)
+        # No seed goes on whose budget is nothing.
+        limits = (counts.number(x) for x in (budget.all_env_steps, budget.all_updates))
+        one, other = (jnp.maximum(limit, 1.0) for limit in limits)
+        return jnp.minimum(jnp.maximum(env_steps / one, updates / other), 1.0)
 
     def step(
         state: TrainState,

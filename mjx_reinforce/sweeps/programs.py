@@ -66,6 +66,7 @@ class Programs(NamedTuple):
     keys: [S, 2], the data of those that the seeds begin with
     eval_keys: [S, 2], the data of those of the seeds' evaluations, the same in all configurations
     limits: the budget of each run, on all devices
+    whole: the settings of all that a run is to do, in one or more parts
     devices: among which a slot is divided
     shape_of: the shapes of the states of so many runs
     layout: of their bytes
@@ -77,14 +78,15 @@ class Programs(NamedTuple):
     keys: np.ndarray
     eval_keys: np.ndarray
     limits: Budget
+    whole: Config
     devices: Devices
     shape_of: Callable[[int], RunState]
     layout: Layout
     clock: Clock
 
     def of(self, config: Config) -> "Programs":
-        """Returns the same programs for settings with another budget or another seed."""
-        return self._replace(**_inputs(config, self.devices))
+        """Returns the same programs for settings with a part of the budget, or another seed."""
+        return self._replace(**_inputs(config, self.whole, self.devices))
 
     def advance(
         self, states: np.ndarray, training: np.ndarray, lengths: np.ndarray, blocks: int
@@ -190,11 +192,12 @@ def compile_programs(
     compile_for = functools.partial(compile_for, layout, threading.Lock())
     movers = {width: started(functools.partial(compile_for, width)) for width in widths}
     begin = started(functools.partial(_begin, build_learner, traced, widths[0], devices, layout))
-    inputs = started(functools.partial(_inputs, config, devices))
+    inputs = started(functools.partial(_inputs, config, config, devices))
     movers[widths[0]].result()
     return Programs(
         begin=begin.result(),
         movers=movers,
+        whole=config,
         devices=devices,
         shape_of=functools.partial(shape_of_states, build_learner, traced),
         layout=layout,
@@ -203,10 +206,12 @@ def compile_programs(
     )
 
 
-def _inputs(config: Config, devices: Devices) -> dict[str, Any]:
+def _inputs(config: Config, whole: Config, devices: Devices) -> dict[str, Any]:
     """Returns what is no part of a program, as ``Programs`` has it."""
+    part, all_of_it = budget_of(config), budget_of(whole)
+    budget = Budget(part.env_steps, part.updates, all_of_it.env_steps, all_of_it.updates)
     keys = jax.device_get(plain({"keys": seed_keys(config), "eval_keys": eval_keys(config)}))
-    return keys | {"limits": devices.put(budget_of(config), NONE)}
+    return keys | {"limits": devices.put(budget, NONE)}
 
 
 def shape_of_states(
