@@ -137,7 +137,8 @@ _RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
     ),
     (
         "num_episodes min_episodes max_episodes horizon decay_updates eval_every eval_episodes "
-        "test_episodes normalize_steps minibatch_size value_batch_size num_directions checkpoint_every",
+        "test_episodes normalize_steps minibatch_size value_batch_size num_directions "
+        "checkpoint_every",
         lambda x: x <= MAX_OF_UPDATE,
         "less than 2^31",
     ),
