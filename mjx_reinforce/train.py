@@ -145,7 +145,13 @@ def _start(
         from mjx_reinforce.runs.shares import shape_of_all
 
         like = shape_of_all(like, config.num_seeds)
-    return ready, resume.find(like, config, print)
+    found = resume.find(like, config, print)
+    if found is None and config.minutes is not None:
+        raise ValueError(
+            f"{config.resume} has no checkpoint to go on from for {config.minutes:g} min; leave "
+            "--minutes out to train it again, or start another run"
+        )
+    return ready, found
 
 
 def _serve(ready: Any, config: Config, processes: Processes, interrupt: Interrupt) -> int:

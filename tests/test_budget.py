@@ -84,7 +84,7 @@ def test_a_run_begins_with_the_policies_of_another(run, tmp_path):
             ["--init-from", "wide", "--hidden-sizes", 4],
             r"have hidden_sizes \[5\], and this run \[4",
         ),
-        (["--like", "nowhere"], "cannot resume nowhere"),
+        (["--like", "nowhere"], "--like nowhere: there is no run"),
     ],
 )
 def test_nonsense_is_refused_in_words(run, capsys, arguments, words):
@@ -119,8 +119,29 @@ def test_a_budget_chooses_the_settings():
     assert some.update == "natural-gradient"
     assert few.eval_every == 10
     assert many.env_steps == 10**12
+    assert few.decay_steps == 1_500_000  # it does not end before the run
+    assert some.decay_steps == many.decay_steps == "budget"
     assert many.eval_every == 10**12 // (2048 * 1000 * 50)
     for config in (few, some, many):
         words = ["--env", "Hopper-v5", "--env-steps", str(config.env_steps)]
         assert parse(words) == config
     assert parse(["--env=Hopper-v5", "--env-steps=1000000", "--num-seeds=9"]).num_seeds == 9
+
+
+def test_settings_of_two_sources_are_refused(run, tmp_path, capsys):
+    assert run(*SMALL, "--max-updates", 2, "--output", "out") == 0
+    assert run("--resume", "out", "--like", "out") == 2
+    assert "leave --like out" in capsys.readouterr().err
+    assert run("categorical-cartpole", "--like", "out") == 2
+    assert "leave the preset categorical-cartpole out" in capsys.readouterr().err
+
+
+def test_minutes_never_begin_a_run_again(run, tmp_path, capsys):
+    """Its checkpoints are gone: what it left stays."""
+    assert run(*SMALL, "--max-updates", 2, "--output", "out") == 0
+    for path in (tmp_path / "out" / "checkpoint").iterdir():
+        path.unlink()
+    before = results(tmp_path / "out")
+    assert run("--resume", "out", "--minutes", 1) == 2
+    assert "has no checkpoint to go on from" in capsys.readouterr().err
+    assert results(tmp_path / "out") == before

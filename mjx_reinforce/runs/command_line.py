@@ -58,6 +58,8 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
             "run ends; leave one out"
         )
     check_processes(processes)
+    if preset is not None and config.like is not None:
+        raise ValueError(f"--like has all settings of a run: leave the preset {preset} out")
     if config.resume is None:
         return config, processes
     if preset is not None:
@@ -107,6 +109,8 @@ def _default(arguments: Sequence[str]) -> Config:
     """Returns the settings that hold where the user gives none: a task's, or those of a run."""
     if not (like := named(arguments, "--like")):
         return for_arguments(arguments)
+    if not (Path(like) / "config.json").is_file():
+        raise ValueError(f"--like {like}: there is no run, for it has no config.json")
     known = resume.read_settings(Path(like))
     check_resumed(known.env, arguments, Path(like))
     return dataclasses.replace(known, resume=None)

@@ -226,10 +226,9 @@ def of_task(
         rows.append((least, dataclasses.replace(few, **settings)))
     if env_steps is not None:
         chosen = next(config for least, config in reversed(rows) if env_steps >= least)
-        return _spaced(dataclasses.replace(chosen, env_steps=env_steps))
+        return _with_budget(chosen, env_steps)
     given, chosen = _in_time(seconds or _SECONDS, rows)
-    least = 1 if seconds else few.env_steps or 0
-    return _spaced(dataclasses.replace(chosen, env_steps=max(given, least)))
+    return _with_budget(chosen, max(given, 1 if seconds else few.env_steps or 0))
 
 
 def _in_time(seconds: float, rows: Sequence[tuple[int, Config]]) -> tuple[int, Config]:
@@ -248,15 +247,19 @@ def _in_time(seconds: float, rows: Sequence[tuple[int, Config]]) -> tuple[int, C
     raise AssertionError("the first row holds for any budget")
 
 
-def _spaced(config: Config) -> Config:
-    """Returns settings whose evaluations are no more than ``_EVALUATIONS``, if episodes are long.
+def _with_budget(config: Config, env_steps: int) -> Config:
+    """Returns settings with a budget, to which what is made for a smaller one is stretched.
 
-    They are no rarer than the task's own until its budget is several times the one above.
+    Schedules that would end before it are as long as it, and where episodes are long there are no
+    more than ``_EVALUATIONS``.
     """
-    if config.env not in measured.TASKS or config.env_steps is None:
+    config = dataclasses.replace(config, env_steps=env_steps)
+    if isinstance(config.decay_steps, int) and config.decay_steps < env_steps:
+        config = dataclasses.replace(config, decay_steps="budget")
+    if config.env not in measured.TASKS:
         return config
     played = config.episodes_per_update * measured.TASKS[config.env].horizon
-    every = config.env_steps // played // _EVALUATIONS
+    every = env_steps // played // _EVALUATIONS
     return dataclasses.replace(config, eval_every=max(config.eval_every, every))
 
 

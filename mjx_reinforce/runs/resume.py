@@ -105,6 +105,8 @@ def check_settings(known: Config, asked: Config) -> None:
     """
     if asked.output is not None or asked.overwrite:
         raise ValueError("--resume goes on in the run's own directory: leave --output out")
+    if asked.like is not None:
+        raise ValueError("--resume goes on with the run's own settings: leave --like out")
     for field in dataclasses.fields(Config):
         old, new = getattr(known, field.name), getattr(asked, field.name)
         if old != new and field.name not in (*BUDGETS, *PLACES):
