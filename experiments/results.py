@@ -8,6 +8,7 @@ another machine: what the stages after ``train`` need of them, to be unpacked in
     python experiments/results.py pack DIR FILE     # FILE.tar.gz, of the runs that have ended
     python experiments/results.py sensitivity DIR   # DIR/sensitivity/TASK: a sweep
     python experiments/results.py play DIR          # DIR/play/TASK.csv, docs/films
+    python experiments/results.py seconds DIR       # reads runs, DIR/NAME, that were given a time
     python experiments/results.py page DIR          # experiments/results, docs/results.md
     python experiments/results.py readme            # README.md, its part on results
 
@@ -35,6 +36,8 @@ def main() -> None:
     sensitivity = commands.add_parser("sensitivity", help="move every setting by a factor of 3")
     pack = commands.add_parser("pack", help="one file of what the later stages need of runs")
     play = commands.add_parser("play", help="play the best and median seeds in Gymnasium; films")
+    clock = commands.add_parser("seconds", help="keep what runs reached in their seconds")
+    clock.add_argument("directory", type=Path, help="of runs of mjx_reinforce.train")
     page = commands.add_parser("page", help="gather what the stages left, and write the page")
     readme = commands.add_parser("readme", help="write the part of README.md on results")
     for command in (train, sensitivity, pack, play, page):
@@ -50,7 +53,7 @@ def main() -> None:
     for command in (play, page):
         command.add_argument("--docs", type=Path, default=ROOT / "docs", help="of page and films")
     kept = ROOT / "experiments" / "results"
-    for command in (page, readme):
+    for command in (clock, page, readme):
         command.add_argument("--results", type=Path, default=kept, help="of the small files")
     readme.add_argument("--readme", type=Path, default=ROOT / "README.md", help="to be changed")
     arguments = parser.parse_args()
@@ -98,12 +101,23 @@ def _play(arguments: argparse.Namespace) -> int:
 
 
 def _page(arguments: argparse.Namespace) -> int:
+    import results_clock
     import results_files
     import results_page
 
     if arguments.directory is not None:
         results_files.gather(TASKS.values(), arguments.directory, arguments.results)
-    results_page.write(results_files.load(TASKS.values(), arguments.results), arguments.docs)
+    parts = results_files.load(TASKS.values(), arguments.results)
+    clock = results_clock.sections(arguments.results, arguments.docs)
+    results_page.write(parts, arguments.docs, clock)
+    return 0
+
+
+def _seconds(arguments: argparse.Namespace) -> int:
+    import results_seconds
+
+    for found in results_seconds.gather(arguments.directory, arguments.results):
+        print(found)
     return 0
 
 
@@ -122,6 +136,7 @@ _COMMANDS = {
     "sensitivity": _sensitivity,
     "pack": _pack,
     "play": _play,
+    "seconds": _seconds,
     "page": _page,
     "readme": _readme,
 }

@@ -34,7 +34,7 @@ def draw(results: Sequence[Result], folder: Path) -> None:
             figure.savefig(folder / f"{name}.png", metadata={"Software": None})
 
 
-def _panels(count: int) -> tuple[Any, list[Any]]:
+def panels(count: int) -> tuple[Any, list[Any]]:
     """Returns a figure and so many axes."""
     from matplotlib.figure import Figure
 
@@ -51,7 +51,7 @@ def _curves(results: Sequence[Result]) -> Any:
     """Draws a panel a task; the pendulum's begins late, on a logarithmic axis."""
     from matplotlib.ticker import EngFormatter
 
-    figure, axes = _panels(len(results))
+    figure, axes = panels(len(results))
     for ax, result in zip(axes, results, strict=True):
         curve = result.curve
         steps = curve["env_steps"]
@@ -81,7 +81,7 @@ def _curves(results: Sequence[Result]) -> Any:
 
 def _sensitivity(results: Sequence[Result]) -> Any:
     """Draws a panel a task: a line a setting, over the factor by which it is moved."""
-    figure, axes = _panels(len(results))
+    figure, axes = panels(len(results))
     settings: dict[str, None] = {}
     for result in results:
         settings |= dict.fromkeys(str(x) for x in (result.moved or {})["setting"][1:])

@@ -19,12 +19,13 @@ _VERDICTS = {
 }
 
 
-def write(parts: Sequence[Result | Task], docs: Path) -> None:
+def write(parts: Sequence[Result | Task], docs: Path, clock: Sequence[str] = ()) -> None:
     """Writes results.md, and its pictures into the folder results.
 
     Args:
       parts: what is kept of each task, or the task where nothing is.
       docs: the folder.
+      clock: the sections on returns by seconds.
 
     Raises:
       ValueError: nothing is kept of any task.
@@ -33,14 +34,16 @@ def write(parts: Sequence[Result | Task], docs: Path) -> None:
     if not results:
         raise ValueError("there is no result yet: run the stage train, then page DIR")
     results_figures.draw(results, docs / "results")
-    (docs / "results.md").write_text(page(parts, docs), encoding="utf-8")
+    (docs / "results.md").write_text(page(parts, docs, clock), encoding="utf-8")
 
 
-def page(parts: Sequence[Result | Task], docs: Path) -> str:
+def page(parts: Sequence[Result | Task], docs: Path, clock: Sequence[str] = ()) -> str:
     """Returns the page's text; films and pictures are linked where they are in ``docs``."""
     results = [part for part in parts if isinstance(part, Result)]
     sections = [
         "# Results",
+        *clock,
+        "## By env steps",
         _introduction(results),
         _missing(parts),
         tables.results_table(results),
@@ -255,6 +258,8 @@ def _commands(results: Sequence[Result]) -> str:
 python experiments/results.py train DIR         # every task, one after the other
 python experiments/results.py sensitivity DIR   # moves every setting
 python experiments/results.py play DIR          # Gymnasium and films
+python experiments/results.py seconds DIR       # runs of mjx_reinforce.train that had a time
+python experiments/peers.py sb3                 # Stable-Baselines3 in the same seconds
 python experiments/results.py page DIR          # this page
 python experiments/results.py readme            # the tables of README.md
 ```

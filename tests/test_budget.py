@@ -1,6 +1,7 @@
 """Budgets: those of the defaults, in time, and of runs that begin where others ended."""
 
 import dataclasses
+import math
 import json
 import re
 import sys
@@ -108,20 +109,21 @@ def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, env, gpu):
     assert of_task(env, num_seeds=1000) == dataclasses.replace(config, num_seeds=1000)
     assert parse(["--env", env]) == config
     if gpu and env in defaults._OF_BUDGETS:
-        assert config.num_episodes >= 1024
+        assert config.num_episodes >= 128
+    assert config.env_steps <= defaults._ENOUGH.get(env, math.inf)
     one, two = (of_task(env, seconds=x).env_steps for x in (60.0, 120.0))
     assert two == pytest.approx(2 * one, rel=0.06)
 
 
 def test_a_budget_chooses_the_settings():
     few, some, many = (of_task("Hopper-v5", steps) for steps in (10**6, 3 * 10**6, 10**12))
-    assert [x.num_episodes for x in (few, some, many)] == [16, 64, 2048]
+    assert [x.num_episodes for x in (few, some, many)] == [16, 64, 1024]
     assert some.update == "natural-gradient"
     assert few.eval_every == 10
     assert many.env_steps == 10**12
     assert few.decay_steps == 1_500_000  # it does not end before the run
     assert some.decay_steps == many.decay_steps == "budget"
-    assert many.eval_every == 10**12 // (2048 * 1000 * 50)
+    assert many.eval_every == 10**12 // (1024 * 1000 * 50)
     for config in (few, some, many):
         words = ["--env", "Hopper-v5", "--env-steps", str(config.env_steps)]
         assert parse(words) == config

@@ -145,11 +145,11 @@ _OF_TASKS: dict[str, dict[str, Any]] = {
 
 #: What differs where many episodes make a nearly exact gradient, and long steps follow it.
 _MANY_EPISODES: dict[str, Any] = {
-    "num_episodes": 2048,
+    "num_episodes": 1024,
     "momentum": 0.5,
     "normalize_steps": None,
 }
-#: And where the step is that of the natural gradient.
+#: And where the step is that of the natural gradient,
 _NATURAL: dict[str, Any] = {
     "update": "natural-gradient",
     "num_episodes": 64,
@@ -157,46 +157,51 @@ _NATURAL: dict[str, Any] = {
     "discount": 0.995,
     "ended_episodes": "skip",
 }
+#: of few episodes or many.
+_MANY_NATURAL: dict[str, Any] = _NATURAL | _MANY_EPISODES | {"max_kl": 0.05}
+#: Where an update takes many seconds.
+_FEW_UPDATES: dict[str, Any] = _MANY_NATURAL | {"max_kl": 0.1, "discount": 0.99, "eval_every": 2}
 
-#: Environment id -> from so many env steps of a seed on, what else differs. The last rows were
-#: measured on one H100 with 8 seeds (Ant: 4), up to 5e8 env steps; those before on two cores with 2
-#: to 4 seeds, at 4 to 15 million.
+#: Environment id -> from so many env steps of a seed on, what else differs. The last rows, of 1,024
+#: episodes, were found on one H100; those before on two cores with 2 to 4 seeds, at 4 to 15
+#: million env steps.
 _OF_BUDGETS: dict[str, tuple[tuple[int, dict[str, Any]], ...]] = {
     "Reacher-v5": ((100_000_000, _MANY_EPISODES | {"learning_rate": 0.01, "max_kl": 0.02}),),
     "Pusher-v5": (
         (2_000_000, {"learning_rate": 1e-3}),
-        (100_000_000, _MANY_EPISODES | {"learning_rate": 0.01, "max_kl": 0.03}),
+        (100_000_000, _MANY_NATURAL | {"discount": 0.99, "initial_std": 0.9}),
     ),
-    "HalfCheetah-v5": ((100_000_000, _MANY_EPISODES | {"learning_rate": 0.01, "max_kl": 0.02}),),
+    "Swimmer-v5": (
+        (
+            20_000_000,
+            _MANY_NATURAL | {"num_episodes": 128, "max_kl": 0.03, "discount": 0.9993},
+        ),
+    ),
+    "HalfCheetah-v5": (
+        (100_000_000, {"num_episodes": 1024, "learning_rate": 0.02, "max_kl": 0.04}),
+    ),
     "Hopper-v5": (
         (3_000_000, _NATURAL | {"initial_std": 0.6, "normalize_steps": None}),
-        (
-            100_000_000,
-            _MANY_EPISODES
-            | {"learning_rate": 0.02, "max_kl": 0.03, "discount": 0.995, "initial_std": 0.6},
-        ),
+        (100_000_000, _MANY_NATURAL | {"initial_std": 0.6}),
     ),
     "Walker2d-v5": (
         (5_000_000, _NATURAL | {"initial_std": 0.5, "standardize_floor": 1.0}),
-        (
-            100_000_000,
-            _MANY_EPISODES
-            | {
-                "num_episodes": 1024,
-                "learning_rate": 0.01,
-                "max_kl": 0.02,
-                "discount": 0.995,
-                "initial_std": 0.5,
-                "standardize_floor": 1.0,
-            },
-        ),
+        (100_000_000, _MANY_NATURAL | {"initial_std": 0.5, "standardize_floor": 1.0}),
     ),
     "Ant-v5": (
         (100_000_000, _MANY_EPISODES | {"learning_rate": 0.02, "max_kl": 0.03, "initial_std": 0.4}),
     ),
+    "Humanoid-v5": ((100_000_000, _FEW_UPDATES | {"initial_std": 0.3}),),
+    "HumanoidStandup-v5": ((100_000_000, _FEW_UPDATES),),
 }
-#: Nothing more is to be had of these in a minute than in what is said above.
+#: Nothing more is to be had of these in a minute than in what is said above,
 _SOLVED = ("InvertedPendulum-v5", "InvertedPendulum-v4")
+#: or than in so many env steps of a seed.
+_ENOUGH = {
+    "InvertedDoublePendulum-v5": 4_000_000,
+    "Reacher-v5": 100_000_000,
+    "Swimmer-v5": 40_000_000,
+}
 
 #: Where a budget is large, it has about so many evaluations.
 _EVALUATIONS = 50
@@ -231,6 +236,8 @@ def of_task(
         chosen = next(config for least, config in reversed(rows) if env_steps >= least)
         return _with_budget(chosen, env_steps)
     given, chosen = _in_time(seconds or _SECONDS, rows)
+    if seconds is None:
+        given = min(given, _ENOUGH.get(env, given))
     return _with_budget(chosen, max(given, 1 if seconds else few.env_steps or 0))
 
 

@@ -8,12 +8,12 @@ and a linear policy, on 2026-11-23; all figures are good to a factor of two.
   minute of each task; the Humanoids' rates are those of rollouts, halved. The operations of larger
   networks and of value networks are from ContinuousCartPole, InvertedPendulum and Swimmer on that
   day, by the time of the processor: 3e10 to 6e10 a second and core.
-- GPU: an H200. Compiling depends on the host: two of its threads took twice as long as stands here,
-  16 quiet ones half as long. The rates of many episodes are those of rollouts on that day, halved
-  where there are no contacts, since training takes as long as playing there. For tasks with
-  contacts the latency is the time that one env step of as many episodes took as were measured, and
-  compiling is that of a rollout, while 16 other programs compiled, and 10 s. The operations of
-  networks were not measured: they are taken to be a tenth of what the card can do.
+- GPU: an H100, on 2026-11-24, from runs of 16 seeds with 1,024 episodes (Swimmer: 128, the double
+  pendulum: 16) an update, and of 8 seeds of Ant; how an update's time divides into what every
+  update takes and what each episode adds was guessed, but for the pendulums and carts, which an
+  H200 ran before. The Humanoids' rates are those of rollouts on an H200. Compiling depends on the
+  host: while many other programs run it takes up to four times as long. The operations of networks
+  were not measured: they are taken to be a tenth of what the card can do.
 """
 
 from typing import NamedTuple
@@ -100,20 +100,20 @@ CPU = {
     "ContinuousCartPole-v0": _CART_CPU,
 }
 
-#: On one H200.
+#: On one GPU.
 GPU = {
     "InvertedPendulum-v5": _PENDULUM_GPU,
     "InvertedPendulum-v4": _PENDULUM_GPU,
-    "InvertedDoublePendulum-v5": Speed("native", 14, 3.4e-5, 1e9),
-    "Reacher-v5": Speed("native", 14, 5.6e-5, 1.3e9),
-    "Pusher-v5": Speed("native", 25, 1.1e-3, 5.9e7),
-    "Swimmer-v5": Speed("native", 13, 5e-5, 6e8),
-    "HalfCheetah-v5": Speed("native", 22, 6.9e-4, 4.9e7),
-    "Hopper-v5": Speed("native", 21, 3.9e-4, 8.6e7),
-    "Walker2d-v5": Speed("native", 20, 1.6e-3, 2.1e7),
-    "Ant-v5": Speed("native", 40, 1.4e-2, 2.4e6),
-    "Humanoid-v5": Speed("native", 70, 6.1e-2, 5.5e5),
-    "HumanoidStandup-v5": Speed("native", 70, 1e-1, 3.3e5),
+    "InvertedDoublePendulum-v5": Speed("native", 14, 4.5e-5, 1e9),
+    "Reacher-v5": Speed("native", 14, 3e-5, 6e8),
+    "Pusher-v5": Speed("native", 25, 1e-3, 1.8e7),
+    "Swimmer-v5": Speed("native", 13, 3e-5, 6e8),
+    "HalfCheetah-v5": Speed("native", 22, 1.1e-4, 2e8),
+    "Hopper-v5": Speed("native", 21, 1.2e-4, 1.7e8),
+    "Walker2d-v5": Speed("native", 20, 2.3e-4, 5.6e7),
+    "Ant-v5": Speed("native", 40, 2e-3, 4.1e6),
+    "Humanoid-v5": Speed("native", 70, 1.4e-2, 7e5),
+    "HumanoidStandup-v5": Speed("native", 70, 2e-2, 4e5),
     "CartPole-v1": _CART_GPU,
     "CartPole-v0": _CART_GPU,
     "ContinuousCartPole-v0": _CART_GPU,

@@ -1,0 +1,164 @@
+"""The first part of docs/results.md: returns by seconds, on a GPU and on two cores."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+import results_seconds as kept
+from mjx_reinforce.reports.statistics.aggregates import interval
+from results_figures import panels
+from results_tables import estimate, number, seconds
+from seeds_markdown import listed, table
+
+_PEERS = ("Stable-Baselines3 PPO", "Stable-Baselines3 SAC")
+#: Blue and vermilion for the machines, black and grey for others.
+_COLOURS = {"GPU": "#0072b2", "CPU": "#d55e00"}
+
+
+def sections(results: Path, docs: Path) -> list[str]:
+    """Returns the sections of the page, none where no run was given a time.
+
+    Args:
+      results: the folder of the small files.
+      docs: that of published.csv and peers.csv, and of the picture.
+    """
+    groups = kept.load(results)
+    if not groups:
+        return []
+    gpu, cpu = ([x for x in groups if _is_gpu(x.device) == wanted] for wanted in (True, False))
+    parts = ["## Against the clock", _words(groups)]
+    if gpu:
+        parts += [f"### On one {listed(dict.fromkeys(x.device for x in gpu))}", _gpu(gpu, docs)]
+    if cpu:
+        parts += ["### On two threads of a processor", _cpu_words(), _cpu(cpu, docs)]
+    _draw(groups, results, docs)
+    return [*parts, "![Return against seconds of training](results/seconds.png)"]
+
+
+def _is_gpu(device: str) -> bool:
+    return "threads" not in device
+
+
+def _words(groups: Sequence[kept.Group]) -> str:
+    roots = listed(dict.fromkeys(row["root"] for group in groups for row in group.rows))
+    return (
+        "The settings are those that a budget of that size selects (`runs/defaults.py`). Time is\n"
+        "that of training with its evaluations, of all seeds together; compiling is apart. After\n"
+        "a minute: the last evaluation until then, of a run that goes on; a run that is given one\n"
+        "minute has faster schedules. At the end: episodes from starts that were used nowhere\n"
+        "else. There is no critic, no importance weight, no replayed step: an update is one\n"
+        "gradient of the episodes just played. No search used these seeds\n"
+        f"(roots {roots}).\n"
+        "Published figures are the best of each algorithm in [published.csv](published.csv),\n"
+        "whatever the version of the task, with the env steps of a seed."
+    )
+
+
+def _gpu(groups: Sequence[kept.Group], docs: Path) -> str:
+    rows = []
+    for group in groups:
+        final = interval("mean", group.final)
+        rows.append(
+            [
+                group.task,
+                str(len(group.final)),
+                f"{number(group.minute.mean())}, {number(group.minute.min())}",
+                estimate(final),
+                number(group.final.min()),
+                number(group.final.max()),
+                seconds(group.seconds) + (" (stopped)" if group.stopped else ""),
+                f"{group.env_steps:.2g}".replace("e+0", "e").replace("e+", "e"),
+                _published(docs, group.task, "PPO"),
+                _published(docs, group.task, "SAC"),
+            ]
+        )
+    header = ["task", "seeds", "after a minute: mean, worst", "at the end: mean (95 %)", "worst"]
+    header += ["best seed", "seconds, all seeds", "env steps a seed", "PPO, published"]
+    return table([*header, "SAC, published"], rows)
+
+
+def _published(docs: Path, task: str, algorithm: str) -> str:
+    figure = kept.published(docs / "published.csv", task, algorithm)
+    if figure is None:
+        return "none"
+    return f"{number(figure.mean)} ({figure.source}, {figure.env_steps / 1e6:.2g} million)"
+
+
+def _cpu_words() -> str:
+    return (
+        "One seed a run, with the default command. Beside it Stable-Baselines3 on Gymnasium's\n"
+        "tasks, one seed, after a minute and after ten, with the settings of its zoo\n"
+        "([peers.csv](peers.csv)), on two threads of the same processor as the rows of 2 of 32\n"
+        "threads."
+    )
+
+
+def _cpu(groups: Sequence[kept.Group], docs: Path) -> str:
+    others = kept.peers(docs / "peers.csv")
+    rows = []
+    for group in groups:
+        rows.append(
+            [
+                group.task,
+                group.device,
+                str(len(group.final)),
+                _spread(group.minute),
+                f"{_spread(group.final)} after {seconds(group.seconds)}",
+                *(_peer(others.get((group.task, peer))) for peer in _PEERS),
+            ]
+        )
+    header = ["task", "on", "runs", "after a minute: median (worst, best)", "at the end"]
+    return table([*header, "PPO: 1, 10 minutes", "SAC: 1, 10 minutes"], rows)
+
+
+def _spread(values: np.ndarray) -> str:
+    low, middle, high = (number(float(f(values))) for f in (np.min, np.median, np.max))
+    return f"{middle} ({low}, {high})"
+
+
+def _peer(budgets: dict[float, list[float]] | None) -> str:
+    if budgets is None:
+        return "not run"
+    found = (budgets.get(seconds) for seconds in (60.0, 600.0))
+    return ", ".join(number(float(np.mean(x))) if x else "not run" for x in found)
+
+
+def _draw(groups: Sequence[kept.Group], results: Path, docs: Path) -> None:
+    """Draws a panel a task: our means with intervals, and what others reached."""
+    found = kept.curves(results)
+    others = kept.peers(docs / "peers.csv")
+    tasks = list(dict.fromkeys(group.task for group in groups))
+    figure, axes = panels(len(tasks))
+    for ax, task in zip(axes, tasks, strict=True):
+        for (name, device), curve in found.items():
+            if name != task:
+                continue
+            colour = _COLOURS["GPU" if _is_gpu(device) else "CPU"]
+            ax.fill_between(curve["seconds"], curve["low"], curve["high"], color=colour, alpha=0.25)
+            ax.plot(curve["seconds"], curve["mean"], color=colour)
+        for algorithm, style in (("PPO", "--"), ("SAC", ":")):
+            if best := kept.published(docs / "published.csv", task, algorithm):
+                ax.axhline(best.mean, color="black", linestyle=style, linewidth=1)
+        for peer, marker in zip(_PEERS, ("o", "s"), strict=True):
+            for at, values in others.get((task, peer), {}).items():
+                ax.plot(at, np.mean(values), marker, color="#777777", markersize=5)
+        ax.set(title=task, xscale="log", xlabel="seconds of training")
+    axes[0].set_ylabel("return without noise")
+    figure.legend(*_legend(), loc="outside lower center", ncols=6, frameon=False)
+    (docs / "results").mkdir(parents=True, exist_ok=True)
+    figure.savefig(docs / "results" / "seconds.png", metadata={"Software": None})
+
+
+def _legend() -> tuple[list, list[str]]:
+    from matplotlib.lines import Line2D
+
+    shown = {
+        "one GPU, all seeds together": Line2D([], [], color=_COLOURS["GPU"]),
+        "two threads, one seed": Line2D([], [], color=_COLOURS["CPU"]),
+        "PPO, published": Line2D([], [], color="black", linestyle="--"),
+        "SAC, published": Line2D([], [], color="black", linestyle=":"),
+        "Stable-Baselines3 PPO": Line2D([], [], color="#777777", marker="o", linestyle=""),
+        "and SAC, two threads": Line2D([], [], color="#777777", marker="s", linestyle=""),
+    }
+    return list(shown.values()), list(shown)
