@@ -163,18 +163,18 @@ _MANY_NATURAL: dict[str, Any] = _NATURAL | _MANY_EPISODES | {"max_kl": 0.05}
 _FEW_UPDATES: dict[str, Any] = _MANY_NATURAL | {"max_kl": 0.1, "discount": 0.99, "eval_every": 2}
 
 #: Environment id -> from so many env steps of a seed on, what else differs. The last rows, of 1,024
-#: episodes, were found on one H100; those before on two cores with 2 to 4 seeds, at 4 to 15
-#: million env steps.
+#: episodes, were found on one H100; those before, and Swimmer's, on two cores with 2 to 8 seeds,
+#: at 4 to 20 million env steps (experiments/tuning, round 12).
 _OF_BUDGETS: dict[str, tuple[tuple[int, dict[str, Any]], ...]] = {
     "Reacher-v5": ((100_000_000, _MANY_EPISODES | {"learning_rate": 0.01, "max_kl": 0.02}),),
     "Pusher-v5": (
-        (2_000_000, {"learning_rate": 1e-3}),
+        (2_000_000, _NATURAL | {"discount": 0.99, "initial_std": 0.9, "normalize_steps": None}),
         (100_000_000, _MANY_NATURAL | {"discount": 0.99, "initial_std": 0.9}),
     ),
     "Swimmer-v5": (
         (
             20_000_000,
-            _MANY_NATURAL | {"num_episodes": 128, "max_kl": 0.03, "discount": 0.9993},
+            _MANY_NATURAL | {"num_episodes": 128, "max_kl": 0.01, "discount": 0.9993},
         ),
     ),
     "HalfCheetah-v5": (
