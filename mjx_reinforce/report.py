@@ -20,13 +20,14 @@ from mjx_reinforce.reports.page import columns, document, tables
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.vega import ONE, draw
+from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.defaults import check_task, of_task
 from mjx_reinforce.runs.files import version
 from mjx_reinforce.runs.flags import read
+from mjx_reinforce.runs.lines import say_error
 from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.streams import accept_everything
 
-_PROGRAM = "python -m mjx_reinforce.report"
 _ABOUT = (
     "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG) "
     "and numbers (CSV) in a folder beside it."
@@ -54,7 +55,7 @@ def main() -> None:
     """Reads the command line, writes the report, and exits: 0 done, 2 bad input, 130 stopped."""
     accept_everything()
     try:
-        settings = read(Settings, sys.argv[1:], _PROGRAM, _ABOUT)
+        settings = read(Settings, sys.argv[1:], command("report"), _ABOUT)
         if settings.output is not None:
             check_output(settings.output, settings.overwrite)
         experiment = sources.read(settings.sources)
@@ -62,7 +63,7 @@ def main() -> None:
         check_output(output, settings.overwrite)
         seconds = _write(experiment, output)
     except (ValueError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        say_error(str(error))
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)

@@ -24,9 +24,11 @@ from mjx_reinforce.export.films import (
 )
 from mjx_reinforce.export.run_files import Run, Seed, Which, choose_seed, read_run
 from mjx_reinforce.runs.alarms import silence_alarms
+from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.flags import read
 from mjx_reinforce.runs.heartbeat import heartbeat
 from mjx_reinforce.runs.jax_setup import configure_jax
+from mjx_reinforce.runs.lines import say_error
 from mjx_reinforce.runs.own_code import check_named
 from mjx_reinforce.runs.streams import accept_everything
 
@@ -84,9 +86,9 @@ def main() -> None:
     accept_everything()
     silence_alarms()
     try:
-        film(read(Settings, sys.argv[1:], "python -m mjx_reinforce.watch", Settings.__doc__ or ""))
+        film(read(Settings, sys.argv[1:], command("watch"), Settings.__doc__ or ""))
     except (ValueError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        say_error(str(error))
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)

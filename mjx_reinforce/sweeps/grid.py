@@ -7,6 +7,7 @@ import typing
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
+from mjx_reinforce.checks import whole_number
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs.config import Config, check, flag
 from mjx_reinforce.runs.relevance import check_read
@@ -152,7 +153,7 @@ def _as(kind: Any, word: str) -> Any:
     if typing.get_origin(kind) is tuple:
         inner = typing.get_args(kind)[0]
         return tuple(_as(inner, part) for part in word.split(",")) if word != "none" else ()
-    return kind(word)
+    return whole_number(word) if kind is int else kind(word)
 
 
 def _no(word: str) -> Any:
