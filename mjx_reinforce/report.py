@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import tyro
 
@@ -20,6 +20,7 @@ from mjx_reinforce.reports.page import columns, document, tables
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.vega import ONE, draw
+from mjx_reinforce.reports.page.words import answer
 from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.defaults import check_task, of_task
 from mjx_reinforce.runs.files import version
@@ -61,14 +62,15 @@ def main() -> None:
         experiment = sources.read(settings.sources)
         output = settings.output or _default_output(settings.sources)
         check_output(output, settings.overwrite)
-        seconds = _write(experiment, output)
+        written = _write(experiment, output)
     except (ValueError, OSError) as error:
         say_error(str(error))
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
     size = output.stat().st_size / 1e6
-    print(f"{output} ({size:.1f} MB, {seconds:.1f} s), pictures and tables in {_beside(output)}")
+    took = f"{size:.1f} MB, {written.seconds:.1f} s"
+    print(f"{output} ({took}), pictures and tables in {_beside(output)}")
 
 
 def _default_output(chosen: Sequence[Path]) -> Path:
@@ -94,8 +96,21 @@ def check_output(output: Path, overwrite: bool) -> None:
             raise ValueError(f"{path} exists; pass --overwrite or another --output")
 
 
-def write(chosen: Sequence[Path], output: Path) -> float:
-    """Writes the page, and its pictures and tables beside it; returns how long it took (s).
+class Written(NamedTuple):
+    """A page that was written.
+
+    seconds: how long that took
+    answer: what the page says first, in sentences
+    best: the place of the best configuration among those of the sources
+    """
+
+    seconds: float
+    answer: list[str]
+    best: int
+
+
+def write(chosen: Sequence[Path], output: Path) -> Written:
+    """Writes the page, and its pictures and tables beside it.
 
     Replaces what is there; ``check_output`` refuses that.
 
@@ -110,7 +125,7 @@ def write(chosen: Sequence[Path], output: Path) -> float:
     return _write(sources.read(chosen), output)
 
 
-def _write(experiment: Experiment, output: Path) -> float:
+def _write(experiment: Experiment, output: Path) -> Written:
     """Does what ``write`` says, of what was read."""
     started = time.perf_counter()
     findings = find(experiment)
@@ -130,7 +145,7 @@ def _write(experiment: Experiment, output: Path) -> float:
     watch = how_to_watch(experiment, findings)
     text = document.render(findings, drawn, data, files, watch, ours, seconds)
     write_bytes(output, encoded(text))
-    return time.perf_counter() - started
+    return Written(time.perf_counter() - started, answer(findings), findings.order[0])
 
 
 def _beside(output: Path) -> Path:

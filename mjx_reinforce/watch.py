@@ -29,6 +29,7 @@ from mjx_reinforce.runs.flags import read
 from mjx_reinforce.runs.heartbeat import heartbeat
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.lines import say_error
+from mjx_reinforce.runs.newest import RUNS, choose_run
 from mjx_reinforce.runs.own_code import check_named
 from mjx_reinforce.runs.streams import accept_everything
 
@@ -49,8 +50,8 @@ Play = Callable[[int, bool], Any]
 class Settings:
     """Play one episode of a trained policy, print its return, and make a film of it."""
 
-    run: tyro.conf.Positional[Path]
-    """The run directory that training left."""
+    run: tyro.conf.Positional[Path] = RUNS
+    """The run directory that training left, or a folder of runs, whose newest plays."""
     env: str | None = None
     """Needed where a run was trained on module:Class, code of your own or of another: that name
     again, for then it is run."""
@@ -86,7 +87,8 @@ def main() -> None:
     accept_everything()
     silence_alarms()
     try:
-        film(read(Settings, sys.argv[1:], command("watch"), Settings.__doc__ or ""))
+        settings = read(Settings, sys.argv[1:], command("watch"), Settings.__doc__ or "")
+        film(dataclasses.replace(settings, run=choose_run(settings.run)))
     except (ValueError, OSError) as error:
         say_error(str(error))
         sys.exit(2)
