@@ -130,11 +130,11 @@ def about_unknown(unknown: Sequence[str], arguments: Sequence[str], form: type, 
 
 
 def _about_flag(flag: str, flags: Mapping[str, Known], prog: str) -> str:
-    if flag in flags:
+    if flag in flags and not flags[flag].positional:
         return f"{flag} stands after --, which ends the flags: leave -- out"
     plain = "--" + flag.strip("".join(_DASHES)).replace("_", "-").lower()
     if plain in flags and flags[plain].positional:
-        return f"{plain.removeprefix('--')} has no flag: leave {flag} out, and keep what follows it"
+        return f"unknown flag {flag!r}: leave it out, and write what follows it alone"
     if plain in flags:
         return f"unknown flag {flag!r}: write {plain}"
     value = plain.replace("--no-", "--", 1)
