@@ -15,7 +15,12 @@ def main() -> None:
     from mjx_reinforce.runs.commands import COMMANDS
 
     name, sys.argv[1:] = _command(sys.argv[1:])
-    importlib.import_module(COMMANDS[name][0]).main()
+    module = importlib.import_module(COMMANDS[name][0])
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # each command ends in its own way
+    try:
+        module.main()
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 def _command(arguments: list[str]) -> tuple[str, list[str]]:
@@ -43,7 +48,7 @@ def _command(arguments: list[str]) -> tuple[str, list[str]]:
 
     if first.startswith("-") or first in PRESETS:
         return "train", arguments
-    said = about_word(first, has_env=True, prog=SCRIPT)
+    said = about_word(first, trains=True, prog=SCRIPT)
     if said is None:
         near = nearest(first, PRESETS)
         hint = f" Did you mean {near!r}?" if near else ""

@@ -203,7 +203,7 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ),
         ("--num-seeds abc", "--num-seeds takes a whole number, such as 4 or 2e6, got 'abc'"),
         ("--num-seeds 1.5e0", "--num-seeds takes a whole number, such as 4 or 2e6, got '1.5e0'"),
-        ("--num-seeds", "Missing value for argument '--num-seeds'"),
+        ("--num-seeds", "--num-seeds needs a value after it"),
         ("--num-seeds 3 4", "no flag takes '4'"),
         ("--num-seeds 3 gymnasium-tutorial", "a preset comes before all flags"),
         ("--num-sedes 3", "unknown flag '--num-sedes'. Did you mean '--num-seeds'?"),

@@ -83,7 +83,7 @@ def test_commands_are_called_as_this_one_was(monkeypatch):
 @pytest.mark.parametrize("name", ["train", "sweep"])
 def test_help_has_ten_settings_and_help_all_the_rest(call, name):
     brief, whole = call(name, "--help")[1], call(name, "--help", "all")[1]
-    shown, every = (re.findall(r"(?m)^[|│] (--[a-z-]+)", page) for page in (brief, whole))
+    shown, every = (re.findall(r"(?m)^[|│ ] (--[a-z][a-z-]+)", page) for page in (brief, whole))
     assert len(shown) == 10
     if name == "train":
         assert shown == [f"--{name.replace('_', '-')}" for name in MAIN]
@@ -182,3 +182,83 @@ def test_tasks_are_listed_as_ever():
 )
 def test_the_nearest_name_is_found(typed, meant):
     assert registry.nearest(typed, envs.names()) == meant
+
+
+# Mistakes.
+
+#: What a stranger may type after ``mjx-reinforce``, and what the answer must say.
+MISTAKES = {
+    # The task, or the command, is not where it belongs.
+    "Hopper-v5": "'Hopper-v5' is a task: write mjx-reinforce train --env Hopper-v5",
+    "train Hopper-v5": "'Hopper-v5' is a task: write --env Hopper-v5",
+    "train --num-seeds 3 Hopper-v5": "'Hopper-v5' is a task: write --env Hopper-v5",
+    "sweep Hopper-v5 --over discount 0.9 1": "'Hopper-v5' is a task: write --env Hopper-v5",
+    "train hopper": "unknown task 'hopper'. Did you mean --env Hopper-v5?",
+    "train --env Hoper-v5": "unknown environment 'Hoper-v5'. Did you mean 'Hopper-v5'?",
+    "train --env cheetah": "Did you mean 'HalfCheetah-v5'?",
+    "train --env my_arm": "Your own is named module:Class.",
+    "train my_arm:Arm": "'my_arm:Arm' is a task: write --env my_arm:Arm",
+    "train my_arm.py": "'my_arm.py' is a file; a task is a class in one: write --env module:Class",
+    "train runs/first": "'runs/first' is a directory: --output runs/first writes a run there",
+    "envs Hoper": "Did you mean 'Hopper-v5'?",
+    "envs --env Hopper-v5": "unknown flag '--env': leave it out",
+    "trian": "Did you mean the command mjx-reinforce train?",
+    "play runs/first": "Did you mean the command mjx-reinforce watch?",
+    "train watch": "'watch' is a command of its own: mjx-reinforce watch",
+    "train train": "the command 'train' is given twice",
+    "train --seed 1 sweep": "'sweep' is a command of its own: mjx-reinforce sweep",
+    "gymnasium-tutorail": "Did you mean 'gymnasium-tutorial'?",
+    # Flags of other libraries, and misspelt ones.
+    "train --seeds 3": "unknown flag '--seeds'. Did you mean '--num-seeds'?",
+    "train --lr 0.1": "unknown flag '--lr'. Did you mean '--learning-rate'?",
+    "train --lr=0.1": "unknown flag '--lr'. Did you mean '--learning-rate'?",
+    "train --steps 1e6": "unknown flag '--steps'. Did you mean '--env-steps'?",
+    "train --total_timesteps 1e6": "Did you mean '--env-steps'?",
+    "train --gamma 0.9": "Did you mean '--discount'?",
+    "train --batch-size 32": "Did you mean '--num-episodes'?",
+    "train -n 3": "Did you mean '--num-seeds'?",
+    "train --num-sedes 3": "Did you mean '--num-seeds'?",
+    "train -env Hopper-v5": "unknown flag '-env': write --env",
+    "train --Env Hopper-v5": "unknown flag '--Env': write --env",
+    "train --num-seeds 3 \N{EM DASH}env Hopper-v5": "unknown flag '\N{EM DASH}env': write --env",
+    "train env=Hopper-v5": "'env=Hopper-v5' lacks its dashes: write --env Hopper-v5",
+    "train --no-learning-rate": "--learning-rate is no switch but takes a value",
+    "train --version": "mjx-reinforce --version says it",
+    "train --device cuda": "JAX_PLATFORMS=cuda before the command",
+    "train --over discount 0.9 1": "unknown flag '--over': it is one of mjx-reinforce sweep",
+    "watch --run runs/first": "unknown flag '--run': leave it out",
+    # Values.
+    "train --env": "--env needs a value after it",
+    "train --env-steps 1.5": "takes a whole number, such as 4 or 2e6, or None, got '1.5'",
+    "train --env-steps 1M": "--env-steps takes a whole number, such as 4 or 2e6, or None, got '1M'",
+    "train --num-seeds many": "--num-seeds takes a whole number, such as 4 or 2e6, got 'many'",
+    "train --num-episodes few": "a whole number, such as 4 or 2e6, or auto, got 'few'",
+    "train --decay-steps long": "such as 4 or 2e6, or None or budget, got 'long'",
+    "train --learning-rate 0,1": "--learning-rate takes a number, such as 0.5, got '0,1'",
+    "train --hidden-sizes 64,64": "takes whole numbers with spaces between them, such as 32 32",
+    "train --standardize False": "it takes no value, got 'False'; --no-standardize switches it off",
+    "train --num-seeds 3 4": "no flag takes '4': --num-seeds takes one value",
+    "train --algorithm PPO": "invalid choice 'PPO' for argument '--algorithm'. Expected one of",
+    "train --estimator value_baseline": "Did you mean 'value-baseline'?",
+    "watch --seed first": "--seed takes a whole number, such as 4 or 2e6, or best or worst or",
+    "watch --output film.avi runs/first": "runs/first is no run directory",
+    "watch runs/first runs/second": "no flag takes 'runs/second'",
+    # What is swept, reported, exported.
+    "sweep": "nothing is swept: give --over a setting and its values, such as --over learning-rate",
+    "sweep --over lr 0.1 0.2": "unknown setting 'lr' after --over. Did you mean 'learning-rate'?",
+    "sweep --over learning-rate 0.1,0.2": "'0.1,0.2', which is no number; write spaces between",
+    "sweep --over num-episodes 1.5 2": "'1.5', which is no whole number or auto",
+    "report": "there is nothing to report on: name a run or a sweep directory",
+    "report nowhere": "there is no directory nowhere; name that of a run or a sweep",
+    "export": "mjx-reinforce export needs RUN and --to",
+    "export runs/first --to torch": "invalid choice 'torch' for argument '--to'",
+}
+
+
+@pytest.mark.parametrize("typed", MISTAKES)
+def test_a_mistake_gets_the_remedy(call, typed):
+    status, out, err = call(*typed.split())
+    assert (status, out) == (2, "")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert MISTAKES[typed] in err

@@ -65,7 +65,7 @@ def _read_source(directory: Path) -> Source:
     if (directory / "config.json").is_file():
         return run_source.read(directory)
     if not directory.is_dir():
-        raise ValueError(f"there is no directory {directory}")
+        raise ValueError(f"there is no directory {directory}; name that of a run or a sweep")
     raise ValueError(
         f"{directory} is neither a run nor a sweep: it has no config.json and no sweep.json"
     )

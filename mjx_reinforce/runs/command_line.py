@@ -109,7 +109,7 @@ def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequ
     if not arguments or arguments[0].startswith("-"):
         return _default(arguments), None, arguments, f"{prog} [PRESET]"
     preset, *flags = arguments
-    if preset not in PRESETS and (said := about_word(preset, has_env=True, prog=prog)):
+    if preset not in PRESETS and (said := about_word(preset, trains=True, prog=prog)):
         raise ValueError(said)
     check_name("preset", preset, PRESETS)
     return PRESETS[preset][1], preset, flags, f"{prog} {preset}"

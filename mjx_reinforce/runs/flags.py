@@ -15,32 +15,24 @@ import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from mjx_reinforce.checks import whole_number
-from mjx_reinforce.runs.hints import about_unknown, known
+from mjx_reinforce.runs.hints import about_unknown, known, required, unknown_flags
 from mjx_reinforce.runs.lines import columns_of, say_error, wrapped
 
 Form = TypeVar("Form")
 
 #: Columns that --help is written for at least: of 20 columns tyro makes thousands of lines.
 _LEAST_WIDTH = 60
-#: What tyro says of a value that is not of its type -> what we say.
+#: What tyro says of a value -> what we say.
 _PLAIN = {
-    r"Error parsing (\S+): no type matching {None}\|INT .* from \['(.*?)'\].*": (
-        r"\1 takes a whole number, such as 4 or 2e6, or None, got '\2'"
-    ),
-    r"Error parsing (\S+): no type matching {None}\|FLOAT .* from \['(.*?)'\].*": (
-        r"\1 takes a number, such as 0.5, or None, got '\2'"
-    ),
-    r"Error parsing (\S+): no type matching INT\|{auto} .* from \['(.*?)'\].*": (
-        r"\1 takes a whole number, such as 4 or 2e6, or auto, got '\2'"
-    ),
-    r"Error parsing (\S+): no type matching {None}\|INT\|{budget} .* from \['(.*?)'\].*": (
-        r"\1 takes a whole number, such as 4 or 2e6, budget or None, got '\2'"
-    ),
+    r"Missing value for argument '(\S+)'.*": r"\1 needs a value after it",
     r"Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]": (
         r"\1 takes whole numbers with spaces between them, such as 32 32, got \2"
     ),
     r"Error parsing (\S+): (takes .*)": r"\1 \2",
 }
+#: Of a value that is of none of several types.
+_NO_TYPE = r"Error parsing (\S+): no type matching (\S+) could be instantiated from \[(.*?)\]\..*"
+_TYPES = {"INT": "a whole number, such as 4 or 2e6,", "FLOAT": "a number, such as 0.5,"}
 #: How numbers are read, everywhere.
 _NUMBERS = ConstructorRegistry()
 
@@ -102,7 +94,9 @@ def read(
             if brief:
                 print(f"\n--help all shows all {len(known(form))} settings.")
             raise
-        raise ValueError(f"{_first_section(box.getvalue())} (see --help)") from stop
+        if wrong := unknown_flags(arguments, form):
+            raise ValueError(about_unknown(wrong, arguments, form, prog)) from stop
+        raise ValueError(f"{_plain(box.getvalue(), form, prog)} (see --help)") from stop
     if unknown:
         raise ValueError(about_unknown(unknown, arguments, form, prog))
     return _as(form, parsed)
@@ -197,6 +191,22 @@ def _described(page: str, description: str) -> str:
     return "\n\n".join([usage, wrapped(description, columns), rest])
 
 
+def _plain(box: str, form: type, prog: str) -> str:
+    """Returns a message of tyro's in our words."""
+    text = _first_section(box)
+    if text.startswith("Missing from"):
+        return f"{prog} needs {' and '.join(required(form))}"
+    if found := re.match(_NO_TYPE, text):
+        flag, kinds, value = found.groups()
+        spoken = [_TYPES.get(kind) or kind.strip("{}").split(",") for kind in kinds.split("|")]
+        numbers = [each for each in spoken if isinstance(each, str)]
+        names = [name for each in spoken if isinstance(each, list) for name in each]
+        return f"{flag} takes {' or '.join([*numbers, *names])}, got {value}"
+    for pattern, replacement in _PLAIN.items():
+        text = re.sub(pattern, replacement, text)
+    return text
+
+
 def _first_section(box: str) -> str:
     """Returns the first paragraph of a message of tyro's, without its frame and title."""
     lines = [line.strip("│ ") for line in box.splitlines()[1:]]
@@ -207,10 +217,7 @@ def _first_section(box: str) -> str:
                 break
         else:
             said.append(line)
-    text = " ".join(said)
-    for pattern, replacement in _PLAIN.items():
-        text = re.sub(pattern, replacement, text)
-    return text
+    return " ".join(said)
 
 
 @contextlib.contextmanager

@@ -2,7 +2,7 @@
 
 import dataclasses
 import difflib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, get_args, get_type_hints
 
@@ -16,7 +16,7 @@ from mjx_reinforce.runs.presets import PRESETS
 #: Flags of other libraries, and short forms -> ours.
 _OTHERS = {
     "--env": "env-id env-name environment task task-id game model robot e",
-    "--num-seeds": "seeds n-seeds nseeds num-seed number-of-seeds runs num-runs repeats trials",
+    "--num-seeds": "n seeds n-seeds nseeds num-seed number-of-seeds runs num-runs repeats trials",
     "--seed": "random-seed rng-seed",
     "--env-steps": "steps n-steps num-steps timesteps total-timesteps num-timesteps total-steps "
     "env-step max-steps budget-steps frames n-timesteps train-steps",
@@ -76,10 +76,21 @@ _NONE = {
 }
 
 
+#: Words of other libraries for a command -> ours.
+_COMMANDS = {
+    **dict.fromkeys(("run", "learn", "fit", "start"), "train"),
+    **dict.fromkeys(("play", "film", "video", "render", "view", "enjoy", "eval", "show"), "watch"),
+    **dict.fromkeys(("tune", "search", "grid", "optimize", "ablate"), "sweep"),
+    **dict.fromkeys(("plot", "compare", "analyze", "stats", "html"), "report"),
+    **dict.fromkeys(("save", "onnx", "convert"), "export"),
+    **dict.fromkeys(("tasks", "list", "env", "environments"), "envs"),
+}
 #: Flags of one command alone.
 _ELSEWHERE = {"--over": "sweep", "--search": "sweep", "--budget": "sweep", "--to": "export"}
 
 
+#: What switches are given elsewhere.
+_TRUTHS = ("true", "false", "yes", "no", "on", "off", "0", "1", "none")
 #: What a flag may begin with that was typed or copied from a document, whose dashes are longer.
 _DASHES = ("-", "\N{EN DASH}", "\N{EM DASH}")
 
@@ -111,6 +122,23 @@ def _known(form: type) -> Iterator[tuple[str, Known]]:
             yield f"--{field.name.replace('_', '-')}", Known(kind is bool, positional)
 
 
+def required(form: type) -> list[str]:
+    """Returns what a command line must have, as --help calls it."""
+    flags = known(form)
+    needed = (f for f in dataclasses.fields(form) if f.default is dataclasses.MISSING)
+    names = (f"--{field.name.replace('_', '-')}" for field in needed)
+    return [name[2:].upper() if flags[name].positional else name for name in names]
+
+
+def unknown_flags(arguments: Sequence[str], form: type) -> list[str]:
+    """Returns the flags on a command line that are not in a form."""
+    flags = known(form)
+    switches = {flag.replace("--", "--no-", 1) for flag, known in flags.items() if known.switch}
+    named = {flag for flag, known in flags.items() if not known.positional}
+    words = [word for word in arguments if word.startswith("--") and word != "--"]
+    return [x for x in words if x.partition("=")[0].replace("_", "-") not in named | switches]
+
+
 def about_unknown(unknown: Sequence[str], arguments: Sequence[str], form: type, prog: str) -> str:
     """Returns the message about what stands on a command line and is not in its form.
 
@@ -124,14 +152,16 @@ def about_unknown(unknown: Sequence[str], arguments: Sequence[str], form: type, 
     for word in unknown:
         if word.startswith(_DASHES):
             return _about_flag(word.partition("=")[0], flags, prog)
-    place = arguments.index(unknown[0])
-    before = arguments[place - 1].replace("_", "-") if place else ""
-    return _about_value(unknown, before, flags, prog)
+    before = arguments[: arguments.index(unknown[0])]
+    last = next((word for word in reversed(before) if word.startswith("--")), "")
+    return _about_value(unknown, last.replace("_", "-"), flags, prog)
 
 
 def _about_flag(flag: str, flags: Mapping[str, Known], prog: str) -> str:
     if flag in flags and not flags[flag].positional:
         return f"{flag} stands after --, which ends the flags: leave -- out"
+    if " " in flag:
+        return f"{flag!r} is one word: leave the quotes out"
     plain = "--" + flag.strip("".join(_DASHES)).replace("_", "-").lower()
     if plain in flags and flags[plain].positional:
         return f"unknown flag {flag!r}: leave it out, and write what follows it alone"
@@ -145,63 +175,71 @@ def _about_flag(flag: str, flags: Mapping[str, Known], prog: str) -> str:
     if plain in _ELSEWHERE:
         other = _ELSEWHERE[plain]
         return f"unknown flag {flag!r}: it is one of {command(other)}"
-    meant = [each for each in _MEANT.get(plain, ()) if each in flags]
-    near = meant[0] if meant else nearest_flag(plain, flags)
+    meant = [each for each in other_names(plain) if each in flags]
+    alike = difflib.get_close_matches(plain, flags, n=1) if len(plain) > len("--xy") else []
+    near = next(iter([*meant, *alike]), None)
     hint = f" Did you mean {near!r}?" if near else ""
     return f"unknown flag {flag!r}.{hint} (See {prog.removesuffix(' [PRESET]')} --help.)"
 
 
-def nearest_flag(flag: str, flags: Iterable[str]) -> str | None:
-    """Returns the flag that is spelt most like another, if any is alike."""
-    return next(iter(difflib.get_close_matches(flag, flags, n=1)), None)
+def other_names(flag: str) -> Sequence[str]:
+    """Returns the flags that other libraries call so."""
+    return _MEANT.get(flag, ())
 
 
-def _about_value(words: Sequence[str], before: str, flags: Mapping[str, Known], prog: str) -> str:
-    """Returns the message about words that follow a flag, or another word, and that none takes."""
-    word = words[0]
-    if before in flags and flags[before].switch:
-        no = before.replace("--", "--no-", 1)
-        return f"{before} is a switch: it takes no value, got {word!r}; {no} switches it off"
-    name, equals, value = word.partition("=")
-    if equals and (flag := "--" + name.replace("_", "-")) in flags:
-        return f"{word!r} lacks its dashes: write {flag} {value}"
-    if said := about_word(word, "--env" in flags, prog):
+def _about_value(words: Sequence[str], flag: str, flags: Mapping[str, Known], prog: str) -> str:
+    """Returns the message about words after a flag, if it is not empty, which none takes."""
+    word, trains = words[0], "--num-seeds" in flags
+    if flag in flags and flags[flag].switch and word.lower() in _TRUTHS:
+        no = flag.replace("--", "--no-", 1)
+        return f"{flag} is a switch: it takes no value, got {word!r}; {no} switches it off"
+    if said := about_word(word, trains, prog):
         return said
     if word in PRESETS:
         return f"{word!r} is a preset, and a preset comes before all flags (see --help)"
-    why = f": {before} takes one value" if before in flags else ""
+    why = f": {flag} takes one value" if flag in flags and not flags[flag].switch else ""
+    if why and trains:
+        why += f"; {command('sweep')} --over {flag[2:]} compares several"
     return f"no flag takes {' '.join(map(repr, words))}{why} (see --help)"
 
 
-def about_word(word: str, has_env: bool, prog: str) -> str | None:
+def about_word(word: str, trains: bool, prog: str) -> str | None:
     """Returns the message about a word that stands where none may, if its meaning is known.
 
     Args:
       word: what the user typed.
-      has_env: whether the program trains on a task, which has the flag --env.
+      trains: whether the program trains on a task.
       prog: the name of the program.
     """
+    if word.startswith(_DASHES[1:]):
+        return f"{word!r} begins with a long dash: write --{word.strip(''.join(_DASHES))}"
     if word in COMMANDS:
         if prog.partition(" [")[0].endswith(word):
             return f"the command {word!r} is given twice: leave one out"
         return f"{word!r} is a command of its own: {command(word)}"
     if word in ("help", "version"):
         return f"{word!r} is written --help" if word == "help" else _NONE["--version"]
-    if not has_env:
+    if not trains:
         return None
+    train = f"{command('train')} " if prog == SCRIPT else ""
+    name, equals, value = word.partition("=")
+    if equals:
+        return f"{word!r} lacks its dashes: write {train}--{name.replace('_', '-')} {value}"
     if word in envs.names() or ":" in word:
-        return f"{word!r} is a task: write --env {word}"
+        return f"{word!r} is a task: write {train}--env {word}"
     if Path(word).suffix in (".py", ".xml"):
-        return f"{word!r} is a file; a task is a class in one: write --env module:Class"
-    if (Path(word) / "config.json").is_file():
+        return f"{word!r} is a file; a task is a class in one: write {train}--env module:Class"
+    if len(Path(word).parts) > 1:
         return (
-            f"{word!r} is a run: --resume {word} goes on with it, --like {word} repeats it, "
-            f"--init-from {word} begins with its policies"
+            f"{word!r} is a directory: --output {word} writes a run there, --resume {word} goes on "
+            f"with the run in it, --like {word} repeats it, --init-from {word} begins with its "
+            "policies"
         )
-    tasks = {each.lower() for each in envs.names()}
+    if word in _COMMANDS:
+        return f"unknown word {word!r}. Did you mean the command {command(_COMMANDS[word])}?"
     near = nearest(word, [*envs.names(), *PRESETS, *COMMANDS])
-    if near and near.lower() in tasks:
-        return f"unknown task {word!r}. Did you mean --env {near}?"
     if near in COMMANDS:
         return f"unknown word {word!r}. Did you mean the command {command(near)}?"
+    if near in envs.names():
+        return f"unknown task {word!r}. Did you mean {train}--env {near}?"
     return None
