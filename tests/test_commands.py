@@ -77,6 +77,13 @@ def test_commands_are_called_as_this_one_was(monkeypatch):
         assert commands.command("watch") == said
 
 
+def test_a_sweep_records_what_was_typed(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/mjx-reinforce", "--over", "policy", "a b"])
+    assert commands.typed("sweep") == "mjx-reinforce sweep --over policy 'a b'"
+    monkeypatch.setattr(sys, "argv", ["my study.py", "7"])
+    assert commands.typed("sweep") == "'my study.py' 7"
+
+
 # Help.
 
 

@@ -425,7 +425,10 @@ def test_values_are_read_as_their_settings_are():
     ("arguments", "message"),
     [
         ("", "nothing is swept"),
-        ("--over learning-rat 1 2", "unknown setting 'learning_rat'"),
+        (
+            "--over learning-rat 1 2",
+            "unknown setting 'learning-rat' after --over. Did you mean 'learning-rate'?",
+        ),
         ("--over learning-rate", "needs two values or more"),
         ("--over learning-rate 1e-3", "for one value pass --learning-rate"),
         ("--over learning-rate 1e-3 1e-3", "has the value 0.001 twice"),

@@ -1,5 +1,6 @@
 """The commands of ``mjx-reinforce``, and how a user calls them."""
 
+import shlex
 import sys
 from pathlib import Path
 
@@ -17,9 +18,18 @@ COMMANDS = {
 
 def command(name: str) -> str:
     """Returns how to call a command, in the way in which this program was called."""
+    return f"{SCRIPT} {name}" if _by_script() else f"python -m mjx_reinforce.{name}"
+
+
+def typed(name: str) -> str:
+    """Returns the command line of this process, whose command it is, to be typed again."""
+    return f"{command(name)} {shlex.join(sys.argv[1:])}" if _by_script() else shlex.join(sys.argv)
+
+
+def _by_script() -> bool:
+    """Returns whether the script took the name of the command from the command line."""
     called = Path(sys.argv[0])
-    by_script = called.stem == SCRIPT or called.parts[-2:] == ("mjx_reinforce", "__main__.py")
-    return f"{SCRIPT} {name}" if by_script else f"python -m mjx_reinforce.{name}"
+    return called.stem == SCRIPT or called.parts[-2:] == ("mjx_reinforce", "__main__.py")
 
 
 def menu(version: str) -> str:

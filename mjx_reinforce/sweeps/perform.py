@@ -2,13 +2,12 @@
 
 import contextlib
 import shlex
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.export.files import read_json, write_json
-from mjx_reinforce.runs.commands import command
+from mjx_reinforce.runs.commands import command, typed
 from mjx_reinforce.runs.files import choose_directory, locked, prepare, versions
 from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
 from mjx_reinforce.runs.interrupt import Interrupt
@@ -183,7 +182,7 @@ def _contents(design: Design, prepared: Any, known: Mapping[str, Any]) -> dict[s
         "compile_seconds": known.get("compile_seconds", 0.0),
         "run_seconds": known.get("run_seconds", 0.0),
         "statistics_seconds": None,
-        "command": known.get("command", shlex.join(sys.argv)),
+        "command": known.get("command", typed("sweep")),
         **provenance(),
     }
 
