@@ -1,6 +1,7 @@
 """The command line as a stranger finds it: its menu, its help, its hints. Nothing is compiled."""
 
 import importlib.metadata
+import os
 import re
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from mjx_reinforce.envs.__main__ import main as envs_main
 from mjx_reinforce.runs import commands, lines
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.runs.newest import choose_run
 from mjx_reinforce.runs.settings import MAIN
 
 
@@ -189,6 +191,26 @@ def test_tasks_are_listed_as_ever():
 )
 def test_the_nearest_name_is_found(typed, meant):
     assert registry.nearest(typed, envs.names()) == meant
+
+
+# The newest run.
+
+
+def test_without_a_name_the_newest_run_plays(call, monkeypatch, tmp_path):
+    status, _, err = call("watch")
+    assert status == 2
+    assert "mjx-reinforce train trains one" in err
+    for name, written in {"first": 100, "last": 300, "second": 200}.items():
+        run = tmp_path / "runs" / name
+        (run / "policy").mkdir(parents=True)
+        (run / "config.json").write_text("{}")
+        os.utime(run / "policy", (written, written))
+    (tmp_path / "runs" / "unfinished").mkdir()
+    (tmp_path / "runs" / "unfinished" / "config.json").write_text("{}")
+    assert "runs/last/config.json is damaged" in call("watch")[2]
+    assert "runs/first/config.json is damaged" in call("watch", "runs/first")[2]
+    assert choose_run(tmp_path / "runs") == tmp_path / "runs/last"
+    assert choose_run(tmp_path / "HalfCheetah-v5") == tmp_path / "HalfCheetah-v5"
 
 
 # Mistakes.
