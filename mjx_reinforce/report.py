@@ -14,11 +14,13 @@ import tyro
 from mjx_reinforce.export.files import write_bytes
 from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.reports import sources
-from mjx_reinforce.reports.experiment import Experiment
+from mjx_reinforce.reports.experiment import Experiment, relabel
+from mjx_reinforce.reports.film import Film, make
 from mjx_reinforce.reports.findings import Findings, find
-from mjx_reinforce.reports.page import columns, document, tables
+from mjx_reinforce.reports.page import columns, document, latex, tables
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
+from mjx_reinforce.reports.page.listings import listings
 from mjx_reinforce.reports.page.vega import ONE, draw
 from mjx_reinforce.runs.defaults import check_task, of_task
 from mjx_reinforce.runs.files import version
@@ -28,8 +30,8 @@ from mjx_reinforce.runs.streams import accept_everything
 
 _PROGRAM = "python -m mjx_reinforce.report"
 _ABOUT = (
-    "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG) "
-    "and numbers (CSV) in a folder beside it."
+    "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG, "
+    "SVG, PDF) and tables (CSV, LaTeX) in a folder beside it."
 )
 
 
@@ -48,6 +50,12 @@ class Settings:
     current folder. Its pictures and tables go into a folder of the same name without .html."""
     overwrite: bool = False
     """Replace a page that exists, and the pictures and tables of the same names beside it."""
+    labels: tuple[str, ...] = ()
+    """Other names for configurations, each OLD=NEW, where OLD is the name on the page and NEW has no =:
+    --labels "estimator reinforce=REINFORCE" "estimator leave-one-out=leave-one-out baseline"."""
+    film: bool = True
+    """On the page of one run, show the seed with the median return; the film takes as long as
+    mjx_reinforce.watch."""
 
 
 def main() -> None:
@@ -60,7 +68,8 @@ def main() -> None:
         experiment = sources.read(settings.sources)
         output = settings.output or _default_output(settings.sources)
         check_output(output, settings.overwrite)
-        seconds = _write(experiment, output)
+        experiment = relabel(experiment, _new_names(settings.labels))
+        seconds = _write(experiment, output, film=settings.film)
     except (ValueError, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
@@ -68,6 +77,15 @@ def main() -> None:
         sys.exit(130)
     size = output.stat().st_size / 1e6
     print(f"{output} ({size:.1f} MB, {seconds:.1f} s), pictures and tables in {_beside(output)}")
+
+
+def _new_names(labels: Sequence[str]) -> dict[str, str]:
+    """Returns new names of configurations by the old ones; raises ValueError for what is none."""
+    for text in labels:
+        old, equals, new = text.rpartition("=")
+        if not (old and equals and new.strip()):
+            raise ValueError(f"--labels takes OLD=NEW, got {text!r}")
+    return {old: new.strip() for old, _, new in (text.rpartition("=") for text in labels)}
 
 
 def _default_output(chosen: Sequence[Path]) -> Path:
@@ -109,8 +127,8 @@ def write(chosen: Sequence[Path], output: Path) -> float:
     return _write(sources.read(chosen), output)
 
 
-def _write(experiment: Experiment, output: Path) -> float:
-    """Does what ``write`` says, of what was read."""
+def _write(experiment: Experiment, output: Path, *, film: bool = False) -> float:
+    """Does what ``write`` says, of what was read; ``film`` shows a run's median seed, too."""
     started = time.perf_counter()
     findings = find(experiment)
     drawn, data = figures(findings), tables.chart_tables(findings)
@@ -118,18 +136,32 @@ def _write(experiment: Experiment, output: Path) -> float:
         "results.csv": columns.results_csv(findings),
         "summary.csv": columns.summary_csv(findings),
     }
+    if findings.comparisons:
+        files["pairs.csv"] = columns.pairs_csv(findings)
+    if findings.learning.levels:
+        files["effects.csv"] = columns.effects_csv(findings)
     beside = _beside(output)
     beside.mkdir(exist_ok=True)
-    for name, content in {**files, **_tables(findings, data)}.items():
+    texts = {**files, **_tables(findings, data), **latex.tables(listings(findings))}
+    for name, content in texts.items():
         write_bytes(beside / name, encoded(content))
     for figure in drawn:
-        write_bytes(beside / f"{figure.name}.png", _picture(findings, figure, data))
+        for ending, picture in _pictures(findings, figure, data).items():
+            write_bytes(beside / f"{figure.name}.{ending}", picture)
+    shown = _film(experiment, beside / "film.gif") if film else None
     seconds = time.perf_counter() - started
     ours = version("mjx-reinforce") or "not installed"
     watch = how_to_watch(experiment, findings)
-    text = document.render(findings, drawn, data, files, watch, ours, seconds)
+    text = document.render(findings, drawn, data, files, watch, shown, ours, seconds)
     write_bytes(output, encoded(text))
     return time.perf_counter() - started
+
+
+def _film(experiment: Experiment, output: Path) -> Film | None:
+    """Returns the film of a run that has policies; runs of code of one's own are not played."""
+    directory = experiment.directories[0]
+    alone = len(experiment.configurations) == 1 and (directory / "policy").is_dir()
+    return make(directory, output) if alone and not env_flag(experiment.env) else None
 
 
 def _beside(output: Path) -> Path:
@@ -142,8 +174,10 @@ def _tables(findings: Findings, data: Mapping[str, columns.Table]) -> dict[str, 
     return {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
 
 
-def _picture(findings: Findings, figure: Figure, data: Mapping[str, columns.Table]) -> bytes:
-    """Returns a figure as a PNG file."""
+def _pictures(
+    findings: Findings, figure: Figure, data: Mapping[str, columns.Table]
+) -> dict[str, bytes]:
+    """Returns a figure as files, by their endings."""
     labels = [each.configuration.label for each in findings.results]
     data = {**data, **ONE}
     names = [*figure.tables, *figure.hidden, *ONE]

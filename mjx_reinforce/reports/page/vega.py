@@ -73,13 +73,18 @@ def specification(
     return spec | {"config": config(), "autosize": {"type": "fit-x", "contains": "padding"}}
 
 
-def draw(spec: dict[str, Any], datasets: dict[str, Any], title: str) -> bytes:
-    """Returns a specification and its data as a PNG file."""
+def draw(spec: dict[str, Any], datasets: dict[str, Any], title: str) -> dict[str, bytes]:
+    """Returns a specification and its data as pictures, by the endings of their files."""
     import vl_convert
 
     whole = spec | {"datasets": datasets, "width": 720, "background": "var(--paper)"}
     whole["title"] = {"text": title, "anchor": "start", "color": "var(--ink)", "offset": 14}
-    return vl_convert.vegalite_to_png(json.loads(in_light(json.dumps(whole))), scale=2)
+    svg = vl_convert.vegalite_to_svg(json.loads(in_light(json.dumps(whole))))
+    return {
+        "png": vl_convert.svg_to_png(svg, scale=2),
+        "svg": svg.encode(),
+        "pdf": vl_convert.svg_to_pdf(svg),
+    }
 
 
 def named(data: str) -> alt.Chart:
