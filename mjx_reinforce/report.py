@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import shlex
 import sys
 import time
@@ -14,14 +15,15 @@ import tyro
 from mjx_reinforce.export.files import write_bytes
 from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.reports import sources
-from mjx_reinforce.reports.experiment import Experiment, relabel
+from mjx_reinforce.reports.experiment import Experiment
 from mjx_reinforce.reports.film import Film, make
 from mjx_reinforce.reports.findings import Findings, find
-from mjx_reinforce.reports.page import columns, document, latex, tables
+from mjx_reinforce.reports.page import columns, document, latex, tables, tasks_page
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.listings import listings
 from mjx_reinforce.reports.page.vega import ONE, draw
+from mjx_reinforce.reports.tasks import find_tasks, rename
 from mjx_reinforce.runs.defaults import check_task, of_task
 from mjx_reinforce.runs.files import version
 from mjx_reinforce.runs.flags import read
@@ -44,14 +46,15 @@ class Settings:
     """What is reported on, and where the page goes."""
 
     sources: tyro.conf.Positional[tuple[Path, ...]]
-    """Run or sweep directories, all of one task. Several are compared."""
+    """Run or sweep directories. Several of one task are compared; those of several tasks are put
+    together by normalized scores."""
     output: Path | None = None
     """The page. By default report.html in the run or sweep that it is of, or, of several, in the
     current folder. Its pictures and tables go into a folder of the same name without .html."""
     overwrite: bool = False
     """Replace a page that exists, and the pictures and tables of the same names beside it."""
     labels: tuple[str, ...] = ()
-    """Other names for configurations, each OLD=NEW, where OLD is the name on the page and NEW has no =:
+    """Other names for configurations, each OLD=NEW; NEW has no "=" in it:
     --labels "estimator reinforce=REINFORCE" "estimator leave-one-out=leave-one-out baseline"."""
     film: bool = True
     """On the page of one run, show the seed with the median return; the film takes as long as
@@ -65,11 +68,10 @@ def main() -> None:
         settings = read(Settings, sys.argv[1:], _PROGRAM, _ABOUT)
         if settings.output is not None:
             check_output(settings.output, settings.overwrite)
-        experiment = sources.read(settings.sources)
+        experiments = rename(sources.read_tasks(settings.sources), _new_names(settings.labels))
         output = settings.output or _default_output(settings.sources)
         check_output(output, settings.overwrite)
-        experiment = relabel(experiment, _new_names(settings.labels))
-        seconds = _write(experiment, output, film=settings.film)
+        seconds = _write_all(experiments, output, film=settings.film)
     except (ValueError, OSError) as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
@@ -121,10 +123,42 @@ def write(chosen: Sequence[Path], output: Path) -> float:
       output: the page.
 
     Raises:
-      ValueError: a source is damaged, or they are of different tasks.
+      ValueError: a source is damaged, or tasks have no configuration in common.
       OSError: a file cannot be read or written.
     """
-    return _write(sources.read(chosen), output)
+    return _write_all(rename(sources.read_tasks(chosen), {}), output)
+
+
+def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = False) -> float:
+    """Writes the page of one task, or that of several, with a page of each beside it."""
+    if len(experiments) == 1:
+        return _write(experiments[0], output, film=film)
+    started = time.perf_counter()
+    tasks = find_tasks(experiments)
+    beside = _beside(output)
+    beside.mkdir(exist_ok=True)
+    pages = []
+    for each in experiments:
+        name = re.sub(r"[^\w.-]", "_", each.env)
+        page = beside / f"{name}.html"
+        _write(each, page)
+        pages.append((page.name, f"{beside.name}/{page.name}"))
+    drawn, data = tasks_page.figures(tasks), tasks_page.chart_tables(tasks)
+    labels = tasks_page.labels(tasks)
+    files = {"scores.csv": columns.table_csv(tasks_page.scores(tasks), labels)}
+    texts = {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
+    for name, content in {**files, **texts, **latex.tables(tasks_page.listed(tasks))}.items():
+        write_bytes(beside / name, encoded(content))
+    for figure in drawn:
+        _draw(figure, data, labels, figure.title, beside)
+    seconds = time.perf_counter() - started
+    text = tasks_page.render(tasks, drawn, data, files, pages, _ours(), seconds)
+    write_bytes(output, encoded(text))
+    return time.perf_counter() - started
+
+
+def _ours() -> str:
+    return version("mjx-reinforce") or "not installed"
 
 
 def _write(experiment: Experiment, output: Path, *, film: bool = False) -> float:
@@ -140,19 +174,17 @@ def _write(experiment: Experiment, output: Path, *, film: bool = False) -> float
         files["pairs.csv"] = columns.pairs_csv(findings)
     if findings.learning.levels:
         files["effects.csv"] = columns.effects_csv(findings)
-    beside = _beside(output)
+    beside, labels = _beside(output), [each.configuration.label for each in findings.results]
     beside.mkdir(exist_ok=True)
     texts = {**files, **_tables(findings, data), **latex.tables(listings(findings))}
     for name, content in texts.items():
         write_bytes(beside / name, encoded(content))
     for figure in drawn:
-        for ending, picture in _pictures(findings, figure, data).items():
-            write_bytes(beside / f"{figure.name}.{ending}", picture)
+        _draw(figure, data, labels, findings.experiment.title, beside)
     shown = _film(experiment, beside / "film.gif") if film else None
     seconds = time.perf_counter() - started
-    ours = version("mjx-reinforce") or "not installed"
     watch = how_to_watch(experiment, findings)
-    text = document.render(findings, drawn, data, files, watch, shown, ours, seconds)
+    text = document.render(findings, drawn, data, files, watch, shown, _ours(), seconds)
     write_bytes(output, encoded(text))
     return time.perf_counter() - started
 
@@ -174,15 +206,18 @@ def _tables(findings: Findings, data: Mapping[str, columns.Table]) -> dict[str, 
     return {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
 
 
-def _pictures(
-    findings: Findings, figure: Figure, data: Mapping[str, columns.Table]
-) -> dict[str, bytes]:
-    """Returns a figure as files, by their endings."""
-    labels = [each.configuration.label for each in findings.results]
-    data = {**data, **ONE}
+def _draw(
+    figure: Figure,
+    data: Mapping[str, columns.Table],
+    labels: Sequence[str],
+    title: str,
+    folder: Path,
+) -> None:
+    """Writes a figure as PNG, SVG and PDF."""
     names = [*figure.tables, *figure.hidden, *ONE]
-    needed = {name: columns.rows(data[name], labels) for name in names}
-    return draw(figure.spec, needed, findings.experiment.title)
+    needed = {name: columns.rows({**data, **ONE}[name], labels) for name in names}
+    for ending, picture in draw(figure.spec, needed, title).items():
+        write_bytes(folder / f"{figure.name}.{ending}", picture)
 
 
 def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:

@@ -82,7 +82,7 @@ def _speeds(results: Sequence[Result]) -> list[Speed]:
     solving = [each.solving for each in results if each.solving is not None]
     pairs = list(itertools.combinations(range(len(solving)), 2))
     found = [
-        log_rank(solving[i].steps, solving[i].solved, solving[j].steps, solving[j].solved)
+        log_rank(solving[i].steps, solving[i].solved, solving[j].steps, solving[j].solved).p_value
         for i, j in pairs
     ]
     return [

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jinja2
 from markupsafe import Markup
 
-from mjx_reinforce.reports.experiment import count, say, spoken
+from mjx_reinforce.reports.experiment import Experiment, count, say, spoken
 from mjx_reinforce.reports.film import Film
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.page import charts, learning, palette, vega, words
@@ -73,33 +73,53 @@ def render(
       version: of this program.
       seconds: how long the report has taken so far.
     """
-    import vl_convert
-
-    loader = jinja2.Environment(
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=_unbroken,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    template = loader.from_string(_read("page.html"))
     content = {
         "labels": _labels(findings),
         "specs": {figure.name: figure.spec for figure in drawn},
         "tables": {**chart_tables, **vega.ONE},
         "moments": short(findings.grid[moments(findings)], 7),
         "files": files,
-        "row": charts.ROW,
-        "light": palette.LIGHT,
     }
-    return template.render(
+    return fill(
+        "page.html",
+        content,
         **_text(findings, drawn),
-        **_provenance(findings),
+        **provenance(findings.experiment),
         watch=watch,
         film=film,
-        bibtex=bibtex(version),
-        files=[(name, _size(text)) for name, text in files.items()],
         moments=content["moments"],
+        version=version,
+        seconds=seconds,
+    )
+
+
+def fill(
+    name: str, content: Mapping[str, Any], *, version: str, seconds: float, **text: Any
+) -> str:
+    """Returns the page that a template makes.
+
+    Args:
+      name: of the template.
+      content: what page.js draws: ``labels``, ``specs``, ``tables``, ``moments`` and ``files``.
+      version: of this program.
+      seconds: how long the report has taken so far.
+      text: what the template says.
+    """
+    import vl_convert
+
+    loader = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_read),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=_unbroken,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return loader.get_template(name).render(
+        **text,
+        bibtex=bibtex(version),
+        date=datetime.date.today().strftime("%-d %B %Y"),
+        files=[(name, _size(text)) for name, text in content["files"].items()],
         version=version,
         seconds=f"{seconds:.1f} s",
         light=palette.LIGHT,
@@ -109,7 +129,7 @@ def render(
         css=Markup(_read("page.css")),
         script=Markup(_read("page.js")),
         vega_bundle=Markup(vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")),
-        content=Markup(_json(content)),
+        content=Markup(_json({**content, "row": charts.ROW, "light": palette.LIGHT})),
     )
 
 
@@ -165,7 +185,6 @@ def _text(findings: Findings, drawn: list[Figure]) -> dict[str, Any]:
     return {
         "title": findings.experiment.title,
         "asked": findings.experiment.asked,
-        "date": datetime.date.today().strftime("%-d %B %Y"),
         "contents": contents,
         "answer": learning.answer(findings),
         "key_figures": key_figures(findings),
@@ -191,9 +210,8 @@ def _numbers(listed: Mapping[str, Listing]) -> dict[str, int]:
     return {name: place for place, name in enumerate(names, start=1)}
 
 
-def _provenance(findings: Findings) -> dict[str, Any]:
+def provenance(experiment: Experiment) -> dict[str, Any]:
     """Returns where the numbers come from, as pairs of names and values."""
-    experiment = findings.experiment
     directories = list(dict.fromkeys(map(str, experiment.directories)))
     facts = [("read from", ", ".join(directories))]
     facts += [

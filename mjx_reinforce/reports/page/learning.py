@@ -29,7 +29,7 @@ def answer(findings: Findings) -> list[str]:
     tied = len(words.unsure(findings)) == len(findings.results[:COMPARED]) - 1
     lead = []
     if first is not None and tied:
-        lead = [f"{first.configuration.label} learns fastest; the returns at the end are a tie."]
+        lead = [f"Fastest is {first.configuration.label}; the returns at the end are a tie."]
     return [*lead, *said, *sentences(findings)]
 
 
@@ -58,9 +58,8 @@ def _of_speed(findings: Findings) -> Iterator[str]:
     tests = [each for each in speeds if first in (each.first, each.second)]
     slower = [each for each in tests if each.adjusted < LEVEL]
     pairs = count(len(speeds), "pair")
-    yield (
-        f"{compared[first].configuration.label} solves the task soonest: {_half(compared[first])}."
-    )
+    half = f": {_half(compared[first])}" if first else ""  # the best's is said already
+    yield f"The task is solved soonest by {compared[first].configuration.label}{half}."
     if slower:
         worst = p_value(max(each.adjusted for each in slower))
         which = (

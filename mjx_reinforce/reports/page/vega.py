@@ -1,7 +1,7 @@
 """What the report's charts share: their look, their scales, and how they are drawn."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import altair as alt
@@ -85,6 +85,19 @@ def draw(spec: dict[str, Any], datasets: dict[str, Any], title: str) -> dict[str
         "svg": svg.encode(),
         "pdf": vl_convert.svg_to_pdf(svg),
     }
+
+
+def renamed(spec: Any, names: Mapping[str, str]) -> Any:
+    """Returns a specification whose data have other names."""
+    if isinstance(spec, list):
+        return [renamed(part, names) for part in spec]
+    if not isinstance(spec, dict):
+        return spec
+    found = {key: renamed(part, names) for key, part in spec.items()}
+    data = found.get("data")
+    if isinstance(data, dict) and data.get("name") in names:
+        found["data"] = data | {"name": names[data["name"]]}
+    return found
 
 
 def named(data: str) -> alt.Chart:

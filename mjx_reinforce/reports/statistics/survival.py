@@ -1,7 +1,7 @@
 """How fast seeds learn: env steps to a threshold, where some never do, and areas under curves."""
 
 import warnings
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -139,14 +139,22 @@ def restricted_mean(
     return Estimate(value, max(value - half, 0.0), min(value + half, until))
 
 
+class LogRank(NamedTuple):
+    """The log-rank test of two groups.
+
+    statistic: standard normal where both solve the task equally soon; above 0 where the first group
+      solves it sooner. 0 where no seed solves it, or all at the same env step.
+    p_value: two-sided.
+    """
+
+    statistic: float
+    p_value: float
+
+
 def log_rank(
-    steps: ArrayLike,
-    solved: ArrayLike,
-    other_steps: ArrayLike,
-    other_solved: ArrayLike,
-    alternative: Literal["two-sided", "less", "greater"] = "two-sided",
-) -> float:
-    """Returns the p value of the log-rank test that two groups solve a task equally soon.
+    steps: ArrayLike, solved: ArrayLike, other_steps: ArrayLike, other_solved: ArrayLike
+) -> LogRank:
+    """Tests whether two groups of seeds solve a task equally soon.
 
     The test compares the whole Kaplan-Meier curves (Mantel 1966, Cancer Chemotherapy Reports 50;
     Peto and Peto 1972), so that seeds that never solved the task count as censored. It takes the
@@ -157,18 +165,25 @@ def log_rank(
       solved: [S] of the same.
       other_steps: [S'] of the other.
       other_solved: [S'] of the same.
-      alternative: "greater" tests that the first group solves the task later, "less" sooner.
-
-    Returns:
-      The p value; 1 (one-sided: a half) where no seed solved the task, or all at the same env step.
     """
     groups = []
     for some, done in ((steps, solved), (other_steps, other_solved)):
         some, done = np.asarray(some, float), np.asarray(done, bool)
         groups.append(stats.CensoredData(uncensored=some[done], right=some[~done]))
     with np.errstate(invalid="ignore"):  # without a difference to see, the statistic is 0 / 0
-        p_value = float(stats.logrank(*groups, alternative=alternative).pvalue)
-    return p_value if np.isfinite(p_value) else 1.0 if alternative == "two-sided" else 0.5
+        test = stats.logrank(*groups)
+    known = np.isfinite(test.statistic)
+    return LogRank(float(test.statistic), float(test.pvalue)) if known else LogRank(0.0, 1.0)
+
+
+def combined(statistics: ArrayLike) -> float:
+    """Returns the p value, two-sided, of independent tests together (Stouffer et al. 1949).
+
+    Args:
+      statistics: [T] standard normal under the hypothesis, such as of ``log_rank`` on T tasks.
+    """
+    statistics = np.asarray(statistics, float)
+    return float(2 * stats.norm.sf(abs(statistics.sum()) / np.sqrt(len(statistics))))
 
 
 def mean_while_training(eval_return: np.ndarray, env_steps: np.ndarray, until: float) -> np.ndarray:
