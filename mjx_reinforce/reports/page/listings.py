@@ -41,11 +41,15 @@ def key_figures(findings: Findings) -> list[tuple[str, str, str]]:
     ends = max(int(each.configuration.env_steps[-1].max()) for each in findings.results)
     found = [
         ("seeds trained", f"{seeds:,}", count(len(findings.results), "configuration")),
-        ("return of the best", number(best.mean.value), interval(best.mean)),
+        (
+            "return of the best" if findings.comparisons else "mean return",
+            number(best.mean.value),
+            interval(best.mean),
+        ),
     ]
     if (solving := best.solving) is not None:
         said = f"of {len(best.final):,}; {interval(solving.rate, percent)}"
-        found.append(("its seeds solved", f"{solving.at_end:,}", said))
+        found.append(("seeds that solve it", f"{solving.at_end:,}", said))
         until = steps(solving.median.value)
         found.append(("env steps until half", until, interval(solving.median, steps)))
     else:

@@ -139,9 +139,10 @@ def _solving(findings: Findings) -> Iterator[str]:
         return
     solving, seeds = best.solving, len(best.final)
     fell = int(solving.fell.sum())
+    whose = "its " if len(findings.results) > 1 else ""
     kept = f"; {fell:,} had solved it and fell back" if fell else ""
     yield (
-        f"{solving.at_end:,} of its {count(seeds, 'seed')} solve the task at the end "
+        f"{solving.at_end:,} of {whose}{count(seeds, 'seed')} solve the task at the end "
         f"({percent(float(solving.rate.value))}, 95 % interval {interval(solving.rate, percent)}; "
         f"solved is a return of {number(findings.experiment.threshold or 0.0)}){kept}."
     )
