@@ -45,7 +45,7 @@ def test_citation_and_changelog_agree():
     newest = re.findall(r"^## (\d\S*) \((.*)\)$", text("CHANGELOG.md"), re.M)[0]
     assert newest == (version, date)
     assert int(date[:4]) == YEAR
-    assert PROJECT["tool"]["setuptools_scm"]["fallback_version"] == version
+    assert PROJECT["tool"]["setuptools_scm"]["fallback_version"] == f"{version}.dev0"
     assert f'version: "{version}"' in text("conda/recipe.yaml")
 
 
