@@ -60,6 +60,7 @@ _MODULES = (
     *("registry", "reports", "runs", "sweeps", "types"),
 )
 
+__version__: str
 __all__ = [*_HOME, "__version__"]
 
 

@@ -131,17 +131,19 @@ def write(chosen: Sequence[Path], output: Path) -> float:
 
 def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = False) -> float:
     """Writes the page of one task, or that of several, with a page of each beside it."""
-    if len(experiments) == 1:
-        return _write(experiments[0], output, film=film)
     started = time.perf_counter()
+    if len(experiments) == 1:
+        _write(find(experiments[0]), output, started, film=film)
+        return time.perf_counter() - started
     tasks = find_tasks(experiments)
     beside = _beside(output)
     beside.mkdir(exist_ok=True)
     pages = []
-    for each in experiments:
+    for each, shared in zip(experiments, tasks.findings, strict=True):
         name = re.sub(r"[^\w.-]", "_", each.env)
         page = beside / f"{name}.html"
-        _write(each, page)
+        whole = len(shared.results) == len(each.configurations)
+        _write(shared if whole else find(each), page, started)
         pages.append((page.name, f"{beside.name}/{page.name}"))
     drawn, data = tasks_page.figures(tasks), tasks_page.chart_tables(tasks)
     labels = tasks_page.labels(tasks)
@@ -161,10 +163,9 @@ def _ours() -> str:
     return version("mjx-reinforce") or "not installed"
 
 
-def _write(experiment: Experiment, output: Path, *, film: bool = False) -> float:
-    """Does what ``write`` says, of what was read; ``film`` shows a run's median seed, too."""
-    started = time.perf_counter()
-    findings = find(experiment)
+def _write(findings: Findings, output: Path, started: float, *, film: bool = False) -> None:
+    """Writes the page of one task; ``film`` shows a run's median seed, too."""
+    experiment = findings.experiment
     drawn, data = figures(findings), tables.chart_tables(findings)
     files = {
         "results.csv": columns.results_csv(findings),
@@ -186,7 +187,6 @@ def _write(experiment: Experiment, output: Path, *, film: bool = False) -> float
     watch = how_to_watch(experiment, findings)
     text = document.render(findings, drawn, data, files, watch, shown, _ours(), seconds)
     write_bytes(output, encoded(text))
-    return time.perf_counter() - started
 
 
 def _film(experiment: Experiment, output: Path) -> Film | None:

@@ -191,7 +191,7 @@ def test_the_fastest_over_tasks(two_tasks):
     assert labels == ["learning rate 0.003", "learning rate 0.01", "learning rate 0.001"]
     assert all(min(each.statistics) > 0 for each in found.faster)
     said = visible(folder / "report.html")
-    assert "The tasks are solved soonest by learning rate 0.003: sooner than by each other" in said
+    assert "The tasks are solved soonest by learning rate 0.003: sooner than by any other" in said
     assert "Not every task has these configurations, which are left out: learning rate 0.03" in said
 
 

@@ -15,6 +15,7 @@ from mjx_reinforce.reports.page.tables import task_tables
 from mjx_reinforce.reports.page.words import LEVEL, interval, number, p_value, percent
 from mjx_reinforce.reports.tasks import Faster, Tasks, in_order
 
+_SCORE = "A score of 0 is that of untrained policies; table 1 says what 1 is in each task."
 _METHODS = (
     "A score is (return - zero) / (one - zero), with the returns of the first table for zero and "
     "one. Seeds whose return is not finite have the worst finite return of their task.",
@@ -166,8 +167,13 @@ def answer(tasks: Tasks) -> list[str]:
     envs = count(len(tasks.findings), "task")
     mean = f"{number(float(best.mean.value))} (95 % interval {interval(best.mean)})"
     if len(tasks.overall) == 1:
-        return [f"Over {envs} the mean score is {mean}: 0 is untrained, 1 is as the table says."]
-    said = [f"Over {envs}, the greatest mean score is that of {best.label}: {mean}."]
+        return [f"Over {envs}, the mean score is {mean}.", _SCORE]
+    second = tasks.overall[1]
+    next_mean = f"{number(float(second.mean.value))} (95 % interval {interval(second.mean)})"
+    said = [
+        f"Over {envs}, the greatest mean score is that of {best.label}: {mean}.",
+        f"The next is {second.label}: {next_mean}. {_SCORE}",
+    ]
     return [*said, *_of_speed(tasks), *_of_tasks(tasks)]
 
 
@@ -187,7 +193,7 @@ def _of_speed(tasks: Tasks) -> Iterator[str]:
         bound = " or less" if len(own) > 1 and not worst.startswith("p <") else ""
         yield (
             f"The tasks are solved soonest by {names[first]}: sooner than by "
-            f"{'the other' if len(own) == 1 else 'each other'} by the log-rank tests of all tasks "
+            f"{'the other' if len(own) == 1 else 'any other'}, by the log-rank tests of all tasks "
             f"together ({worst}{bound} after Holm's correction for "
             f"{count(len(tasks.faster), 'pair')})."
         )
