@@ -106,3 +106,11 @@ def test_workflows_know_the_versions_of_python():
         if re.search(r":: 3\.\d+$", each)
     ]
     assert f"python: {json.dumps(versions)}" in text(".github/workflows/wheel.yml")
+
+
+def test_windows_is_told_where_it_trains():
+    """Windows has no fcntl."""
+    code = "import sys; sys.modules['fcntl'] = None; import mjx_reinforce.train"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "ImportError: training and reports need Linux or macOS; on Windows" in done.stderr

@@ -118,7 +118,7 @@ def fill(
     return loader.get_template(name).render(
         **text,
         bibtex=bibtex(version),
-        date=datetime.date.today().strftime("%-d %B %Y"),
+        date=f"{datetime.date.today():%d %B %Y}".lstrip("0"),
         files=[(name, _size(text)) for name, text in content["files"].items()],
         version=version,
         seconds=f"{seconds:.1f} s",
