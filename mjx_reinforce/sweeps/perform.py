@@ -159,7 +159,7 @@ def _report(directory: Path) -> "Written":
     """Writes the report of a sweep."""
     from mjx_reinforce import report
 
-    return report.write([directory], directory / "report.html")
+    return report.write_sweep(directory, directory / "report.html")
 
 
 def _contents(design: Design, prepared: Any, known: Mapping[str, Any]) -> dict[str, Any]:
