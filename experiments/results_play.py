@@ -1,6 +1,6 @@
 """The best and the median policy of every task in Gymnasium and in our simulation, and films."""
 
-import dataclasses
+import functools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce import envs
-from mjx_reinforce.export.files import read_json
+from mjx_reinforce import Player, envs, load
 from mjx_reinforce.export.films import Renderer, import_mujoco, write_film
 from mjx_reinforce.export.run_files import Run, read_run
 from mjx_reinforce.runs.jax_setup import configure_jax
@@ -41,38 +40,46 @@ def play(tasks: Iterable[Task], directory: Path, films: Path, num_episodes: int)
             continue
         print(f"== {task.name}", flush=True)
         run = read_run(directory / task.name)
-        ours = _own_simulation(run, num_episodes)
+        ours = own_simulation(run, load(run.directory), num_episodes)
         rows: list[dict[str, Any]] = []
         for policy in POLICIES:
             rows += _play(run, policy, num_episodes, ours, films / f"{task.name}-{policy}.gif")
         write_played(path, rows)
 
 
-def _own_simulation(run: Run, num_episodes: int) -> Any:
-    """Returns a function from an actor to the returns [N] of episodes from fresh starts."""
+def own_simulation(run: Run, player: Player, num_episodes: int) -> Any:
+    """Returns a function from an actor to the returns [N] of episodes without noise.
+
+    Args:
+      run: gives the task and its time limit.
+      player: whose policy the actors are of.
+      num_episodes: N.
+
+    Returns:
+      (actor, root of all randomness of the starts) -> returns [N].
+    """
     import jax
 
+    from mjx_reinforce.engines import choice
     from mjx_reinforce.engines.rollouts import episode_returns
-    from mjx_reinforce.runs.build import build
-    from mjx_reinforce.runs.resume import as_config
+    from mjx_reinforce.policies.actor import act
 
-    path = run.directory / "config.json"
-    config = dataclasses.replace(as_config(read_json(path), path), num_seeds=1, engine="auto")
-    env = envs.make(run.env)
-    learner, horizon = build(env, config)
+    env, policy = envs.make(run.env), player.policy
+    whose = choice.Player(functools.partial(act, policy), player.actor, policy.distribution)
+    engine = choice.choose("auto", env, whose, run.horizon)
 
     @jax.jit
-    def returns(actor):
+    def returns(actor, root):
         return episode_returns(
-            learner.engine.rollout(
+            engine.rollout(
                 env,
-                learner.act,
+                whose.act,
                 actor,
-                learner.policy.distribution,
+                policy.distribution,
                 # Training and its evaluations split the keys of their roots; this is not split.
-                jax.random.key(ROOT + 1),
+                jax.random.key(root),
                 num_episodes=num_episodes,
-                horizon=horizon,
+                horizon=run.horizon,
                 deterministic=True,
             )
         )
@@ -89,7 +96,7 @@ def _play(run: Run, policy: Any, num_episodes: int, ours: Any, film: Path) -> li
     version, simulate = gymnasium_simulator(player, run.horizon)
     episodes = [simulate(number, False) for number in range(num_episodes)]
     returns = {
-        "ours": np.asarray(ours(player.actor), float).tolist(),
+        "ours": np.asarray(ours(player.actor, ROOT + 1), float).tolist(),
         f"gymnasium {version}": [episode.total for episode in episodes],
     }
     for name, values in returns.items():
