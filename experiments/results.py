@@ -11,6 +11,7 @@ another machine: what the stages after ``train`` need of them, to be unpacked in
     python experiments/results.py page DIR          # experiments/results, docs/results.md
     python experiments/results.py readme            # README.md, its part on results
     python experiments/results.py pretrained DIR    # the package's policies, of all runs in DIR
+    python experiments/results.py films             # docs/films, of the package's policies
 
 ``page`` without DIR writes the page anew from the small files in experiments/results. The tasks,
 their budgets, their seeds and the published figures are the table in results_tasks.py.
@@ -51,7 +52,8 @@ def main() -> None:
     pretrained.add_argument("--episodes", type=int, default=256, help="that choose, and measure")
     pretrained.add_argument("--folder", type=Path, default=None, help="in place of the package's")
     play.add_argument("--episodes", type=int, default=100, help="of each policy, in both")
-    for command in (play, page):
+    films = commands.add_parser("films", help="of the package's policies, side by side")
+    for command in (play, page, films):
         command.add_argument("--docs", type=Path, default=ROOT / "docs", help="of page and films")
     kept = ROOT / "experiments" / "results"
     for command in (page, readme):
@@ -130,6 +132,13 @@ def _pretrained(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _films(arguments: argparse.Namespace) -> int:
+    import results_films
+
+    results_films.write(arguments.docs / "films")
+    return 0
+
+
 _COMMANDS = {
     "train": _train,
     "sensitivity": _sensitivity,
@@ -138,6 +147,7 @@ _COMMANDS = {
     "page": _page,
     "readme": _readme,
     "pretrained": _pretrained,
+    "films": _films,
 }
 
 if __name__ == "__main__":

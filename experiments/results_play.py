@@ -1,19 +1,20 @@
 """The best and the median policy of every task in Gymnasium and in our simulation, and films."""
 
 import functools
-import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjx_reinforce import Player, envs, load
-from mjx_reinforce.export.films import Renderer, import_mujoco, write_film
+from mjx_reinforce.export.films import import_mujoco
 from mjx_reinforce.export.run_files import Run, read_run
+from mjx_reinforce.export.takes import Take, side_by_side
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.watch import scene
 from results_files import POLICIES, write_played
+from results_films import save
 from results_runs import ended
 from results_tasks import ROOT, Task
 
@@ -101,7 +102,7 @@ def _play(run: Run, policy: Any, num_episodes: int, ours: Any, film: Path) -> li
     }
     for name, values in returns.items():
         print(f"{policy}, seed {player.seed}: mean return {np.mean(values):.1f} in {name}")
-    _film(film, run.env, [episode.qpos for episode in episodes])
+    _film(film, run.env, f"{run.env}, {policy} seed", episodes)
     return [
         {
             "policy": policy,
@@ -115,21 +116,11 @@ def _play(run: Run, policy: Any, num_episodes: int, ours: Any, film: Path) -> li
     ]
 
 
-def _film(path: Path, env_id: str, episodes: Sequence[np.ndarray]) -> None:
-    """Writes a film of episodes [T, nq] one after the other, until it is long enough."""
+def _film(path: Path, env_id: str, label: str, episodes: Sequence[Any]) -> None:
+    """Writes a film of episodes one after the other, until it is long enough."""
     env = envs.make(env_id)
-    renderer = Renderer(scene(env), *_SIZE)
-    skip = max(1, math.ceil(1 / (env.dt * _RATE) - 1e-9))
-    shown = np.concatenate([qpos[::skip] for qpos in episodes])
-    shown = shown[: max(1, round(_SECONDS / (env.dt * skip)))]
-    samples = [_plain(renderer.draw(qpos)) for qpos in shown[:: -(-len(shown) // 4)]]
-    write_film(path, _frames(renderer, shown), 1 / (env.dt * skip), samples)
-
-
-def _frames(renderer: Renderer, shown: np.ndarray) -> Iterator[np.ndarray]:
-    return (_plain(renderer.draw(qpos)) for qpos in shown)
-
-
-def _plain(frame: np.ndarray) -> np.ndarray:
-    """Returns a picture with 8 levels of each colour, which takes half the space in a film."""
-    return frame // 32 * 32 + 16
+    qpos = np.concatenate([episode.qpos for episode in episodes])
+    # The return is a sum over the film: each episode but the first begins by taking back the last.
+    rewards = [np.append(episode.rewards, -episode.rewards.sum()) for episode in episodes]
+    take = Take(label, scene(env), env.dt, qpos, np.concatenate(rewards)[:-1])
+    save(path, side_by_side([take], *_SIZE, seconds=_SECONDS, max_rate=_RATE))

@@ -76,8 +76,8 @@ def cast(settings: Any, source: Source) -> list[Role]:
     if settings.beside is None:
         return [main._replace(label=source.env)]
     if settings.beside == "untrained":
-        untrained = Role("before training", "untrained", _untrained(main.player))
-        return [untrained, main._replace(label="after training")]
+        before = Role("before training", "untrained", untrained(main.player))
+        return [before, main._replace(label="after training")]
     return [_role(settings.beside, settings, source), main]
 
 
@@ -91,7 +91,7 @@ def _role(seed: Any, settings: Any, source: Source) -> Role:
     return Role(f"seed {player.seed}{rank}", f"seed {player.seed}", player)
 
 
-def _untrained(player: Any) -> Any:
+def untrained(player: Any) -> Any:
     """Returns a player whose policy has random parameters, as training begins with."""
     import jax
 
