@@ -53,6 +53,7 @@ def main() -> None:
     pretrained.add_argument("--folder", type=Path, default=None, help="in place of the package's")
     play.add_argument("--episodes", type=int, default=100, help="of each policy, in both")
     films = commands.add_parser("films", help="of the package's policies, side by side")
+    films.add_argument("--arm", type=Path, help="a run directory of my_arm:Arm, for arm.gif")
     for command in (play, page, films):
         command.add_argument("--docs", type=Path, default=ROOT / "docs", help="of page and films")
     kept = ROOT / "experiments" / "results"
@@ -135,7 +136,7 @@ def _pretrained(arguments: argparse.Namespace) -> int:
 def _films(arguments: argparse.Namespace) -> int:
     import results_films
 
-    results_films.write(arguments.docs / "films")
+    results_films.write(arguments.docs / "films", arguments.arm)
     return 0
 
 

@@ -202,7 +202,7 @@ def test_return_and_time_stand_in_the_picture(monkeypatch):
     take = takes.Take("mine", None, 0.5, np.zeros((5, 1)), np.array([1.0, 2.0, 400.0, 1000.0]))
     for step in range(5):
         takes._picture(take, takes.Renderer(), 0.5 * step)
-    assert said[0] == ("mine", "return 0    0.0 s")
+    assert said[0] == ("mine", "return 0.0    0.0 s")
     assert said[3:] == [("mine", "return 403    1.5 s"), ("mine", "return 1,403    2.0 s")]
 
 

@@ -10,6 +10,8 @@ _SKY, _HORIZON = (0.30, 0.50, 0.72), (0.86, 0.91, 0.95)
 _TILES = (0.40, 0.46, 0.50), (0.50, 0.56, 0.60)
 #: Colour of the light, and the angle at which what stands upright is seen (degrees).
 _LIGHT, _ELEVATION = (0.45, 0.45, 0.45), -14
+#: The size of a plane without an end, and the colour of a geom that was given none.
+_ENDLESS, _UNCOLORED = (0, 0, 0.1), (0.5, 0.5, 0.5, 1)
 #: Side of a tile, in lengths of the model; the floor's distance below a model that stands on none.
 _TILE, _GAP = 0.5, 0.25
 
@@ -19,8 +21,8 @@ def dress(spec: Any, *, replace: bool) -> Any:
 
     Args:
       spec: the model, an ``MjSpec``; it is changed.
-      replace: whether they take the place of the model's own sky and of the colours of its planes;
-        otherwise only what the model lacks is added.
+      replace: whether they take the place of the model's own sky and lights and of the colours of
+        its planes; otherwise the model gets only what it lacks.
     """
     import mujoco
 
@@ -41,17 +43,16 @@ def dress(spec: Any, *, replace: bool) -> Any:
             width=64,
             height=384,
         )
-    if replace or not planes:
-        _add_tiles(spec, kinds, length)
     if not planes:
         planes = [spec.worldbody.add_geom(name="mjx_reinforce_floor", contype=0, conaffinity=0)]
         planes[0].type, planes[0].pos = kinds.mjtGeom.mjGEOM_PLANE, (0, 0, lowest - _GAP * length)
-        planes[0].size = (0, 0, 0.1)
-        replace = True
-    if replace:
-        for plane in planes:
+        planes[0].size = _ENDLESS
+    _add_tiles(spec, kinds, length)
+    for plane in planes:
+        if replace or (not plane.material and np.allclose(plane.rgba, _UNCOLORED)):
             plane.material, plane.rgba = "mjx_reinforce_tiles", (1, 1, 1, 1)
-            plane.size = (0, 0, 0.1)  # without an end
+        if replace:
+            plane.size = _ENDLESS
     if replace and middle is not None:
         getattr(spec.visual, "global").elevation = _ELEVATION
         if np.isnan(spec.stat.extent):

@@ -114,7 +114,8 @@ def _picture(take: Take, renderer: Renderer, seconds: float) -> np.ndarray:
         arrow = float(shown[np.flatnonzero(shown)[-1]]) if shown.any() else 0.0
     picture = renderer.draw(take.qpos[step], arrow, take.pushed)
     total, time = np.sum(take.rewards[:step]), step * take.dt
-    return caption(picture, take.label, f"return {total:,.0f}   {time:4.1f} s")
+    earned = f"{total:,.0f}" if abs(total) >= 100 else f"{total:.1f}"
+    return caption(picture, take.label, f"return {earned}   {time:4.1f} s")
 
 
 def caption(picture: np.ndarray, left: str, right: str) -> np.ndarray:
