@@ -65,7 +65,7 @@ from mjx_reinforce.envs.base import MujocoEnv
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Write the class of an environment from a MuJoCo model (MJCF); its reward is yours to write."""
+    """Write the class of an environment from a MuJoCo model; its reward is yours to write."""
 
     model: tyro.conf.Positional[Path]
     """The model, .xml."""
