@@ -30,7 +30,7 @@ def live(env: Any, model: Any, player: Player, horizon: int, settings: Any) -> N
     kinds: Any = mujoco
     simulation, drawn = InMujoco(env), kinds.MjData(model)
     try:
-        window = mujoco.viewer.launch_passive(model, drawn)
+        window = mujoco.viewer.launch_passive(model, drawn, show_left_ui=False, show_right_ui=False)
     except Exception as error:  # of GLFW, or on macOS, where it wants mjpython
         raise ValueError(
             f"MuJoCo's viewer does not open ({error}); on macOS, start with mjpython in place of "
