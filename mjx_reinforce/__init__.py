@@ -50,6 +50,7 @@ _HOME = {
     "Trajectory": "types",
     "Player": "export.player",
     "load": "export.player",
+    "pretrained": "export.pretrained",
     "load_policy": "export.policy_files",
     "save_policy": "export.policy_files",
 }

@@ -227,7 +227,9 @@ def about_word(word: str, trains: bool, prog: str) -> str | None:
         return f"{word!r} lacks its dashes: write {train}--{name.replace('_', '-')} {value}"
     if word in envs.names() or ":" in word:
         return f"{word!r} is a task: write {train}--env {word}"
-    if Path(word).suffix in (".py", ".xml"):
+    if Path(word).suffix == ".xml":
+        return f"{word!r} is a model: {command('new')} {word} writes a task on it"
+    if Path(word).suffix == ".py":
         return f"{word!r} is a file; a task is a class in one: write {train}--env module:Class"
     if len(Path(word).parts) > 1:
         return (
