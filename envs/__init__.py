@@ -103,7 +103,10 @@ def check_id(id: str) -> None:
             "own_model.py"
         )
     if ":" not in id:
-        check_name("environment", id, _TABLE)
+        try:
+            check_name("environment", id, _TABLE)
+        except ValueError as error:
+            raise ValueError(f"{error} Your own is named module:Class.") from None
     elif not re.fullmatch(r"\w+(\.\w+)*:\w+", id):
         raise ValueError(
             f"the environment {id!r} is not of the form module:Class, such as own_model:Crane for "

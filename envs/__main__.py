@@ -1,6 +1,40 @@
-"""``python -m mjx_reinforce.envs`` lists the environments."""
+"""``python -m mjx_reinforce.envs`` lists the environments, or describes one."""
+
+import dataclasses
+import sys
+
+import tyro
 
 from mjx_reinforce import envs
+from mjx_reinforce.runs.commands import command
+from mjx_reinforce.runs.flags import one_line_errors, read
+from mjx_reinforce.runs.lines import for_stream
+from mjx_reinforce.runs.streams import accept_everything
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """List the tasks, or describe one: sizes, rules, default settings, and how long it takes."""
+
+    env: tyro.conf.Positional[str | None] = None
+    """The task to describe, an id or module:Class for your own; all are listed if not given."""
+
+
+def main() -> None:
+    """Reads the command line, prints, and exits: 0 done, 2 bad input, 130 interrupted."""
+    accept_everything()
+    with one_line_errors():
+        settings = read(Settings, sys.argv[1:], command("envs"), Settings.__doc__ or "")
+        if settings.env is None:
+            print("\n".join(envs.names()))
+            return
+        envs.check_id(settings.env)
+        from mjx_reinforce.runs.about_task import about_task
+        from mjx_reinforce.runs.jax_setup import configure_jax
+
+        configure_jax()
+        print(for_stream(about_task(settings.env), sys.stdout))
+
 
 if __name__ == "__main__":
-    print("\n".join(envs.names()))
+    main()

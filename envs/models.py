@@ -84,26 +84,44 @@ def load(xml_file: str) -> Any:
     Raises:
       ValueError: there is no such file, MuJoCo cannot compile it, or nothing in it can be moved.
     """
-    if "/" in xml_file or "\\" in xml_file:
-        if not Path(xml_file).is_file():
-            raise ValueError(f"there is no model {xml_file!r} in {Path.cwd()}")
+    if is_own(xml_file):
         model = _compile(MjModel.from_xml_path, xml_file, xml_file)
     else:
-        asset = importlib.resources.files("mjx_reinforce.envs") / "assets" / xml_file
-        if not asset.is_file():
-            raise ValueError(
-                f"the package has no model {xml_file!r}; give a path with a folder for your own, "
-                f"such as './{xml_file}'"
-            )
         with warnings.catch_warnings():
             # HalfCheetah's total mass is given as Gymnasium gives it, which MuJoCo deprecates.
             warnings.filterwarnings("ignore", ".*'settotalmass' is deprecated")
-            text = asset.read_text(encoding="utf-8")
+            text = _asset(xml_file)
             model = _compile(lambda text: MjSpec.from_string(text).compile(), text, xml_file)
     if not model.nu:
         raise ValueError(f"the model {xml_file!r} has no actuators; add an <actuator> element")
     model.opt.enableflags &= ~_ONLY_REPORTS
     return model
+
+
+def is_own(xml_file: str) -> bool:
+    """Returns whether a model is the user's, by a path; raises ValueError where no file is."""
+    own = "/" in xml_file or "\\" in xml_file
+    if own and not Path(xml_file).is_file():
+        raise ValueError(f"there is no model {xml_file!r} in {Path.cwd()}")
+    return own
+
+
+def spec(xml_file: str) -> Any:
+    """Returns a model before it is compiled, an ``MjSpec`` of the reader's own, as ``load``."""
+    if is_own(xml_file):
+        return _compile(MjSpec.from_file, xml_file, xml_file)
+    return _compile(MjSpec.from_string, _asset(xml_file), xml_file)
+
+
+def _asset(xml_file: str) -> str:
+    """Returns the text of a model of the package, or raises ValueError."""
+    asset = importlib.resources.files("mjx_reinforce.envs") / "assets" / xml_file
+    if not asset.is_file():
+        raise ValueError(
+            f"the package has no model {xml_file!r}; give a path with a folder for your own, "
+            f"such as './{xml_file}'"
+        )
+    return asset.read_text(encoding="utf-8")
 
 
 def _compile(compiler: Callable[[str], Any], source: str, xml_file: str) -> Any:

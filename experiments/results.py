@@ -11,6 +11,8 @@ another machine: what the stages after ``train`` need of them, to be unpacked in
     python experiments/results.py seconds DIR       # reads runs, DIR/NAME, that were given a time
     python experiments/results.py page DIR          # experiments/results, docs/results.md
     python experiments/results.py readme            # README.md, its part on results
+    python experiments/results.py pretrained DIR    # the package's policies, of all runs in DIR
+    python experiments/results.py films             # docs/films, of the package's policies
 
 ``page`` without DIR writes the page anew from the small files in experiments/results. The tasks,
 their budgets, their seeds and the published figures are the table in results_tasks.py.
@@ -40,7 +42,8 @@ def main() -> None:
     clock.add_argument("directory", type=Path, help="of runs of mjx_reinforce.train")
     page = commands.add_parser("page", help="gather what the stages left, and write the page")
     readme = commands.add_parser("readme", help="write the part of README.md on results")
-    for command in (train, sensitivity, pack, play, page):
+    pretrained = commands.add_parser("pretrained", help="the policies that the package has")
+    for command in (train, sensitivity, pack, play, page, pretrained):
         needed = None if command is not page else "?"
         command.add_argument("directory", type=Path, nargs=needed, help="of all stages")
     pack.add_argument("file", type=Path, help="to be written, .tar.gz")
@@ -49,8 +52,12 @@ def main() -> None:
     for command in (train, sensitivity):
         command.add_argument("--num-seeds", type=int, help="in place of the table's")
         command.add_argument("--env-steps", type=int, help="of a seed, in place of the table's")
+    pretrained.add_argument("--episodes", type=int, default=256, help="that choose, and measure")
+    pretrained.add_argument("--folder", type=Path, default=None, help="in place of the package's")
     play.add_argument("--episodes", type=int, default=100, help="of each policy, in both")
-    for command in (play, page):
+    films = commands.add_parser("films", help="of the package's policies, side by side")
+    films.add_argument("--arm", type=Path, help="a run directory of my_arm:Arm, for arm.gif")
+    for command in (play, page, films):
         command.add_argument("--docs", type=Path, default=ROOT / "docs", help="of page and films")
     kept = ROOT / "experiments" / "results"
     for command in (clock, page, readme):
@@ -131,6 +138,22 @@ def _readme(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _pretrained(arguments: argparse.Namespace) -> int:
+    import results_pretrained
+    from mjx_reinforce.export.pretrained import FOLDER
+
+    folder = arguments.folder or FOLDER
+    results_pretrained.pack(arguments.directory, folder, arguments.episodes)
+    return 0
+
+
+def _films(arguments: argparse.Namespace) -> int:
+    import results_films
+
+    results_films.write(arguments.docs / "films", arguments.arm)
+    return 0
+
+
 _COMMANDS = {
     "train": _train,
     "sensitivity": _sensitivity,
@@ -139,6 +162,8 @@ _COMMANDS = {
     "seconds": _seconds,
     "page": _page,
     "readme": _readme,
+    "pretrained": _pretrained,
+    "films": _films,
 }
 
 if __name__ == "__main__":

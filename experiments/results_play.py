@@ -1,20 +1,20 @@
 """The best and the median policy of every task in Gymnasium and in our simulation, and films."""
 
-import dataclasses
-import math
-from collections.abc import Iterable, Iterator, Sequence
+import functools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mjx_reinforce import envs
-from mjx_reinforce.export.files import read_json
-from mjx_reinforce.export.films import Renderer, import_mujoco, write_film
+from mjx_reinforce import Player, envs, load
+from mjx_reinforce.export.films import import_mujoco
 from mjx_reinforce.export.run_files import Run, read_run
+from mjx_reinforce.export.takes import Take, side_by_side
 from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.watch import scene
 from results_files import POLICIES, write_played
+from results_films import save
 from results_runs import ended
 from results_tasks import ROOT, Task
 
@@ -41,38 +41,46 @@ def play(tasks: Iterable[Task], directory: Path, films: Path, num_episodes: int)
             continue
         print(f"== {task.name}", flush=True)
         run = read_run(directory / task.name)
-        ours = _own_simulation(run, num_episodes)
+        ours = own_simulation(run, load(run.directory), num_episodes)
         rows: list[dict[str, Any]] = []
         for policy in POLICIES:
             rows += _play(run, policy, num_episodes, ours, films / f"{task.name}-{policy}.gif")
         write_played(path, rows)
 
 
-def _own_simulation(run: Run, num_episodes: int) -> Any:
-    """Returns a function from an actor to the returns [N] of episodes from fresh starts."""
+def own_simulation(run: Run, player: Player, num_episodes: int) -> Any:
+    """Returns a function from an actor to the returns [N] of episodes without noise.
+
+    Args:
+      run: gives the task and its time limit.
+      player: whose policy the actors are of.
+      num_episodes: N.
+
+    Returns:
+      (actor, root of all randomness of the starts) -> returns [N].
+    """
     import jax
 
+    from mjx_reinforce.engines import choice
     from mjx_reinforce.engines.rollouts import episode_returns
-    from mjx_reinforce.runs.build import build
-    from mjx_reinforce.runs.resume import as_config
+    from mjx_reinforce.policies.actor import act
 
-    path = run.directory / "config.json"
-    config = dataclasses.replace(as_config(read_json(path), path), num_seeds=1, engine="auto")
-    env = envs.make(run.env)
-    learner, horizon = build(env, config)
+    env, policy = envs.make(run.env), player.policy
+    whose = choice.Player(functools.partial(act, policy), player.actor, policy.distribution)
+    engine = choice.choose("auto", env, whose, run.horizon)
 
     @jax.jit
-    def returns(actor):
+    def returns(actor, root):
         return episode_returns(
-            learner.engine.rollout(
+            engine.rollout(
                 env,
-                learner.act,
+                whose.act,
                 actor,
-                learner.policy.distribution,
+                policy.distribution,
                 # Training and its evaluations split the keys of their roots; this is not split.
-                jax.random.key(ROOT + 1),
+                jax.random.key(root),
                 num_episodes=num_episodes,
-                horizon=horizon,
+                horizon=run.horizon,
                 deterministic=True,
             )
         )
@@ -89,12 +97,12 @@ def _play(run: Run, policy: Any, num_episodes: int, ours: Any, film: Path) -> li
     version, simulate = gymnasium_simulator(player, run.horizon)
     episodes = [simulate(number, False) for number in range(num_episodes)]
     returns = {
-        "ours": np.asarray(ours(player.actor), float).tolist(),
+        "ours": np.asarray(ours(player.actor, ROOT + 1), float).tolist(),
         f"gymnasium {version}": [episode.total for episode in episodes],
     }
     for name, values in returns.items():
         print(f"{policy}, seed {player.seed}: mean return {np.mean(values):.1f} in {name}")
-    _film(film, run.env, [episode.qpos for episode in episodes])
+    _film(film, run.env, f"{run.env}, {policy} seed", episodes)
     return [
         {
             "policy": policy,
@@ -108,21 +116,11 @@ def _play(run: Run, policy: Any, num_episodes: int, ours: Any, film: Path) -> li
     ]
 
 
-def _film(path: Path, env_id: str, episodes: Sequence[np.ndarray]) -> None:
-    """Writes a film of episodes [T, nq] one after the other, until it is long enough."""
+def _film(path: Path, env_id: str, label: str, episodes: Sequence[Any]) -> None:
+    """Writes a film of episodes one after the other, until it is long enough."""
     env = envs.make(env_id)
-    renderer = Renderer(scene(env), *_SIZE)
-    skip = max(1, math.ceil(1 / (env.dt * _RATE) - 1e-9))
-    shown = np.concatenate([qpos[::skip] for qpos in episodes])
-    shown = shown[: max(1, round(_SECONDS / (env.dt * skip)))]
-    samples = [_plain(renderer.draw(qpos)) for qpos in shown[:: -(-len(shown) // 4)]]
-    write_film(path, _frames(renderer, shown), 1 / (env.dt * skip), samples)
-
-
-def _frames(renderer: Renderer, shown: np.ndarray) -> Iterator[np.ndarray]:
-    return (_plain(renderer.draw(qpos)) for qpos in shown)
-
-
-def _plain(frame: np.ndarray) -> np.ndarray:
-    """Returns a picture with 8 levels of each colour, which takes half the space in a film."""
-    return frame // 32 * 32 + 16
+    qpos = np.concatenate([episode.qpos for episode in episodes])
+    # The return is a sum over the film: each episode but the first begins by taking back the last.
+    rewards = [np.append(episode.rewards, -episode.rewards.sum()) for episode in episodes]
+    take = Take(label, scene(env), env.dt, qpos, np.concatenate(rewards)[:-1])
+    save(path, side_by_side([take], *_SIZE, seconds=_SECONDS, max_rate=_RATE))

@@ -50,6 +50,7 @@ _HOME = {
     "Trajectory": "types",
     "Player": "export.player",
     "load": "export.player",
+    "pretrained": "export.pretrained",
     "load_policy": "export.policy_files",
     "save_policy": "export.policy_files",
 }
@@ -60,17 +61,29 @@ _MODULES = (
     *("registry", "reports", "runs", "sweeps", "types"),
 )
 
+__version__: str
 __all__ = [*_HOME, "__version__"]
-__version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
     """Imports a public name from its module, or a module, on first use (PEP 562)."""
+    if name == "__version__":
+        return _version()
     if name in _MODULES:
         return importlib.import_module(f"{__name__}.{name}")
     if name not in _HOME:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def _version() -> str:
+    """Returns the version of the installed package."""
+    from importlib import metadata
+
+    try:
+        return metadata.version("mjx-reinforce")
+    except metadata.PackageNotFoundError:
+        return "0+not.installed"
 
 
 def __dir__() -> list[str]:

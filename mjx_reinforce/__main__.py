@@ -1,14 +1,60 @@
-"""The script ``mjx-reinforce``, and ``python -m mjx_reinforce``: they train."""
+"""The script ``mjx-reinforce``, and ``python -m mjx_reinforce``: all commands, and their menu."""
 
 import signal
+import sys
 
 
 def main() -> None:
-    """Does what ``train.main`` does; Ctrl-C ends the imports before it without a traceback."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    from mjx_reinforce import train
+    """Does what a command does, which stands first; Ctrl-C ends its imports without a traceback.
 
-    train.main()
+    Flags alone, or a preset, train.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    import importlib
+
+    from mjx_reinforce.runs.commands import COMMANDS
+
+    name, sys.argv[1:] = _command(sys.argv[1:])
+    module = importlib.import_module(COMMANDS[name][0])
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # each command ends in its own way
+    try:
+        module.main()
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+def _command(arguments: list[str]) -> tuple[str, list[str]]:
+    """Returns a command and its own arguments; or prints what is asked for, or wrong, and exits."""
+    from mjx_reinforce.runs.commands import COMMANDS, SCRIPT, menu
+
+    first = arguments[0] if arguments else "--help"
+    if first in COMMANDS:
+        return first, arguments[1:]
+    from mjx_reinforce.runs.files import version
+    from mjx_reinforce.runs.lines import for_stream, say_error
+    from mjx_reinforce.runs.streams import accept_everything
+
+    accept_everything()
+    ours = version("mjx-reinforce") or "not installed"
+    if first in ("-h", "--help", "help"):
+        print(for_stream(menu(ours), sys.stdout))
+        sys.exit(0)
+    if first in ("-V", "--version", "version"):
+        print(SCRIPT, ours)
+        sys.exit(0)
+    from mjx_reinforce.registry import nearest
+    from mjx_reinforce.runs.hints import about_word
+    from mjx_reinforce.runs.presets import PRESETS
+
+    if first.startswith("-") or first in PRESETS:
+        return "train", arguments
+    said = about_word(first, trains=True, prog=SCRIPT)
+    if said is None:
+        near = nearest(first, PRESETS)
+        hint = f" Did you mean {near!r}?" if near else ""
+        said = f"unknown command {first!r}.{hint} Commands: {', '.join(COMMANDS)}."
+    say_error(said)
+    sys.exit(2)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Checks of what users give, and one line for what their code, or a library, raised."""
 
 import dataclasses
+import decimal
 import math
 import numbers
 import sysconfig
@@ -120,6 +121,21 @@ def changed(settings: Any) -> str:
         if field.init and (value := getattr(settings, field.name)) != field.default
     )
     return ", ".join(given)
+
+
+def whole_number(text: str) -> int:
+    """Returns a whole number as people write it, such as 2000000, 2_000_000 or 2e6.
+
+    Raises:
+      ValueError: the text is no number, or one with a fraction, or of a hundred digits and more.
+    """
+    try:
+        number = decimal.Decimal(text)
+    except decimal.InvalidOperation:
+        number = decimal.Decimal("nan")
+    if not number.is_finite() or number.adjusted() >= 100 or number != int(number):
+        raise ValueError(f"takes a whole number, such as 4 or 2e6, got {text!r}")
+    return int(number)
 
 
 def is_nan(value: Any) -> bool:

@@ -2,7 +2,7 @@
 
 import difflib
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 #: Action distributions: name -> "module:function" of an action space.
@@ -38,9 +38,24 @@ def check_name(kind: str, name: str, known: Mapping[str, Any]) -> None:
     """
     if name in known:
         return
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.4)
-    hint = f" Did you mean {near[0]!r}?" if near else ""
+    near = nearest(name, known, cutoff=0.4)
+    hint = f" Did you mean {near!r}?" if near else ""
     raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(known))}.")
+
+
+def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
+    """Returns the known name that somebody meant, whatever the case of the letters, if any is near.
+
+    Args:
+      name: what the user typed; a known name that contains it is near.
+      known: the names.
+      cutoff: how alike names must be, from 0 to 1 (all).
+    """
+    plain = {each.lower(): each for each in sorted(known)}
+    typed = name.lower()
+    inside = [each for each in plain if len(typed) > 2 and typed in each]
+    near = difflib.get_close_matches(typed, inside or plain, n=1, cutoff=0 if inside else cutoff)
+    return plain[near[0]] if near else None
 
 
 def load(entry: str | Callable[..., Any]) -> Callable[..., Any]:

@@ -2,12 +2,13 @@
 
 import dataclasses
 import os
+import re
 import shlex
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import tyro
 
@@ -15,21 +16,26 @@ from mjx_reinforce.export.files import write_bytes
 from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
+from mjx_reinforce.reports.film import Film, make
 from mjx_reinforce.reports.findings import Findings, find
-from mjx_reinforce.reports.page import columns, document, tables
+from mjx_reinforce.reports.page import columns, document, latex, tables, tasks_page
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
+from mjx_reinforce.reports.page.listings import listings
 from mjx_reinforce.reports.page.vega import ONE, draw
+from mjx_reinforce.reports.page.words import answer
+from mjx_reinforce.reports.tasks import find_tasks, rename
+from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.defaults import check_task, of_task
 from mjx_reinforce.runs.files import version
 from mjx_reinforce.runs.flags import read
+from mjx_reinforce.runs.lines import say_error
 from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.streams import accept_everything
 
-_PROGRAM = "python -m mjx_reinforce.report"
 _ABOUT = (
-    "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG) "
-    "and numbers (CSV) in a folder beside it."
+    "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG, "
+    "SVG, PDF) and tables (CSV, LaTeX) in a folder beside it."
 )
 
 
@@ -42,32 +48,49 @@ class Settings:
     """What is reported on, and where the page goes."""
 
     sources: tyro.conf.Positional[tuple[Path, ...]]
-    """Run or sweep directories, all of one task. Several are compared."""
+    """Run or sweep directories. Several of one task are compared; those of several tasks are put
+    together by normalized scores."""
     output: Path | None = None
     """The page. By default report.html in the run or sweep that it is of, or, of several, in the
     current folder. Its pictures and tables go into a folder of the same name without .html."""
     overwrite: bool = False
     """Replace a page that exists, and the pictures and tables of the same names beside it."""
+    labels: tuple[str, ...] = ()
+    """Other names for configurations, each OLD=NEW; NEW has no "=" in it:
+    --labels "estimator reinforce=REINFORCE" "estimator leave-one-out=leave-one-out baseline"."""
+    film: bool = True
+    """On the page of one run, show the seed with the median return; the film takes as long as
+    mjx_reinforce.watch."""
 
 
 def main() -> None:
     """Reads the command line, writes the report, and exits: 0 done, 2 bad input, 130 stopped."""
     accept_everything()
     try:
-        settings = read(Settings, sys.argv[1:], _PROGRAM, _ABOUT)
+        settings = read(Settings, sys.argv[1:], command("report"), _ABOUT)
         if settings.output is not None:
             check_output(settings.output, settings.overwrite)
-        experiment = sources.read(settings.sources)
+        experiments = rename(sources.read_tasks(settings.sources), _new_names(settings.labels))
         output = settings.output or _default_output(settings.sources)
         check_output(output, settings.overwrite)
-        seconds = _write(experiment, output)
+        seconds = _write_all(experiments, output, film=settings.film)
     except (ValueError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        say_error(str(error))
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
     size = output.stat().st_size / 1e6
-    print(f"{output} ({size:.1f} MB, {seconds:.1f} s), pictures and tables in {_beside(output)}")
+    took = f"{size:.1f} MB, {seconds:.1f} s"
+    print(f"{output} ({took}), pictures and tables in {_beside(output)}")
+
+
+def _new_names(labels: Sequence[str]) -> dict[str, str]:
+    """Returns new names of configurations by the old ones; raises ValueError for what is none."""
+    for text in labels:
+        old, equals, new = text.rpartition("=")
+        if not (old and equals and new.strip()):
+            raise ValueError(f"--labels takes OLD=NEW, got {text!r}")
+    return {old: new.strip() for old, _, new in (text.rpartition("=") for text in labels)}
 
 
 def _default_output(chosen: Sequence[Path]) -> Path:
@@ -93,6 +116,27 @@ def check_output(output: Path, overwrite: bool) -> None:
             raise ValueError(f"{path} exists; pass --overwrite or another --output")
 
 
+class Written(NamedTuple):
+    """A page that was written.
+
+    seconds: how long that took
+    answer: what the page says first, in sentences
+    best: the place of the best configuration among those of the sources
+    """
+
+    seconds: float
+    answer: list[str]
+    best: int
+
+
+def write_sweep(directory: Path, output: Path) -> Written:
+    """Does what ``write`` does for one sweep, and returns what the page says first."""
+    started = time.perf_counter()
+    findings = find(sources.read([directory]))
+    _write(findings, output, started)
+    return Written(time.perf_counter() - started, answer(findings), findings.order[0])
+
+
 def write(chosen: Sequence[Path], output: Path) -> float:
     """Writes the page, and its pictures and tables beside it; returns how long it took (s).
 
@@ -103,33 +147,77 @@ def write(chosen: Sequence[Path], output: Path) -> float:
       output: the page.
 
     Raises:
-      ValueError: a source is damaged, or they are of different tasks.
+      ValueError: a source is damaged, or tasks have no configuration in common.
       OSError: a file cannot be read or written.
     """
-    return _write(sources.read(chosen), output)
+    return _write_all(rename(sources.read_tasks(chosen), {}), output)
 
 
-def _write(experiment: Experiment, output: Path) -> float:
-    """Does what ``write`` says, of what was read."""
+def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = False) -> float:
+    """Writes the page of one task, or that of several, with a page of each beside it."""
     started = time.perf_counter()
-    findings = find(experiment)
+    if len(experiments) == 1:
+        _write(find(experiments[0]), output, started, film=film)
+        return time.perf_counter() - started
+    tasks = find_tasks(experiments)
+    beside = _beside(output)
+    beside.mkdir(exist_ok=True)
+    pages = []
+    for each, shared in zip(experiments, tasks.findings, strict=True):
+        name = re.sub(r"[^\w.-]", "_", each.env)
+        page = beside / f"{name}.html"
+        whole = len(shared.results) == len(each.configurations)
+        _write(shared if whole else find(each), page, started)
+        pages.append((page.name, f"{beside.name}/{page.name}"))
+    drawn, data = tasks_page.figures(tasks), tasks_page.chart_tables(tasks)
+    labels = tasks_page.labels(tasks)
+    files = {"scores.csv": columns.table_csv(tasks_page.scores(tasks), labels)}
+    texts = {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
+    for name, content in {**files, **texts, **latex.tables(tasks_page.listed(tasks))}.items():
+        write_bytes(beside / name, encoded(content))
+    for figure in drawn:
+        _draw(figure, data, labels, figure.title, beside)
+    seconds = time.perf_counter() - started
+    text = tasks_page.render(tasks, drawn, data, files, pages, _ours(), seconds)
+    write_bytes(output, encoded(text))
+    return time.perf_counter() - started
+
+
+def _ours() -> str:
+    return version("mjx-reinforce") or "not installed"
+
+
+def _write(findings: Findings, output: Path, started: float, *, film: bool = False) -> None:
+    """Writes the page of one task; ``film`` shows a run's median seed, too."""
+    experiment = findings.experiment
     drawn, data = figures(findings), tables.chart_tables(findings)
     files = {
         "results.csv": columns.results_csv(findings),
         "summary.csv": columns.summary_csv(findings),
     }
-    beside = _beside(output)
+    if findings.comparisons:
+        files["pairs.csv"] = columns.pairs_csv(findings)
+    if findings.learning.levels:
+        files["effects.csv"] = columns.effects_csv(findings)
+    beside, labels = _beside(output), [each.configuration.label for each in findings.results]
     beside.mkdir(exist_ok=True)
-    for name, content in {**files, **_tables(findings, data)}.items():
+    texts = {**files, **_tables(findings, data), **latex.tables(listings(findings))}
+    for name, content in texts.items():
         write_bytes(beside / name, encoded(content))
     for figure in drawn:
-        write_bytes(beside / f"{figure.name}.png", _picture(findings, figure, data))
+        _draw(figure, data, labels, findings.experiment.title, beside)
+    shown = _film(experiment, beside / "film.gif") if film else None
     seconds = time.perf_counter() - started
-    ours = version("mjx-reinforce") or "not installed"
     watch = how_to_watch(experiment, findings)
-    text = document.render(findings, drawn, data, files, watch, ours, seconds)
+    text = document.render(findings, drawn, data, files, watch, shown, _ours(), seconds)
     write_bytes(output, encoded(text))
-    return time.perf_counter() - started
+
+
+def _film(experiment: Experiment, output: Path) -> Film | None:
+    """Returns the film of a run that has policies; runs of code of one's own are not played."""
+    directory = experiment.directories[0]
+    alone = len(experiment.configurations) == 1 and (directory / "policy").is_dir()
+    return make(directory, output) if alone and not env_flag(experiment.env) else None
 
 
 def _beside(output: Path) -> Path:
@@ -142,13 +230,18 @@ def _tables(findings: Findings, data: Mapping[str, columns.Table]) -> dict[str, 
     return {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
 
 
-def _picture(findings: Findings, figure: Figure, data: Mapping[str, columns.Table]) -> bytes:
-    """Returns a figure as a PNG file."""
-    labels = [each.configuration.label for each in findings.results]
-    data = {**data, **ONE}
+def _draw(
+    figure: Figure,
+    data: Mapping[str, columns.Table],
+    labels: Sequence[str],
+    title: str,
+    folder: Path,
+) -> None:
+    """Writes a figure as PNG, SVG and PDF."""
     names = [*figure.tables, *figure.hidden, *ONE]
-    needed = {name: columns.rows(data[name], labels) for name in names}
-    return draw(figure.spec, needed, findings.experiment.title)
+    needed = {name: columns.rows({**data, **ONE}[name], labels) for name in names}
+    for ending, picture in draw(figure.spec, needed, title).items():
+        write_bytes(folder / f"{figure.name}.{ending}", picture)
 
 
 def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:

@@ -1,10 +1,9 @@
 """``python -m mjx_reinforce.watch RUN`` plays a trained policy and makes a film of it."""
 
 import dataclasses
-import math
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Literal
@@ -22,33 +21,34 @@ from mjx_reinforce.export.films import (
     mediapy_with_ffmpeg,
     write_film,
 )
-from mjx_reinforce.export.run_files import Run, Seed, Which, choose_seed, read_run
+from mjx_reinforce.export.run_files import Seed, Which
 from mjx_reinforce.runs.alarms import silence_alarms
+from mjx_reinforce.runs.cast import Role, Source, cast, main_seed, read_source
+from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.flags import read
 from mjx_reinforce.runs.heartbeat import heartbeat
 from mjx_reinforce.runs.jax_setup import configure_jax
+from mjx_reinforce.runs.lines import say_error
+from mjx_reinforce.runs.newest import RUNS, choose_run
 from mjx_reinforce.runs.own_code import check_named
 from mjx_reinforce.runs.streams import accept_everything
 
-#: Frames a second at most: what a film shows, and what GIF viewers play.
-_MAX_RATE = 30
-#: Pictures, spread over the film, whose colours it has.
-_SAMPLES = 4
+#: Positions that change by less do not show (m, rad).
+_STILL = 0.05
 #: Settings that are whole numbers, with the least and the greatest that is accepted.
 _RANGES = (
     *(("width", 1, 4096), ("height", 1, 4096)),
     *(("episode", 0, 2**31 - 1), ("episodes", 1, 10_000)),
 )
 
-Play = Callable[[int, bool], Any]
-
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """Play one episode of a trained policy, print its return, and make a film of it."""
 
-    run: tyro.conf.Positional[Path]
-    """The run directory that training left."""
+    run: tyro.conf.Positional[Path] = RUNS
+    """The run directory that training left; or a folder of runs, whose newest plays; or the name of
+    a task, such as HalfCheetah-v5, whose trained policy comes with the package."""
     env: str | None = None
     """Needed where a run was trained on module:Class, code of your own or of another: that name
     again, for then it is run."""
@@ -57,9 +57,20 @@ class Settings:
     """
     which: Which = "last"
     """The policy at the end of training, or the one that did best on the way, if it was kept."""
-    backend: Literal["mjx", "gymnasium"] = "mjx"
-    """Which simulation is filmed; "gymnasium" plays the same policy in the installed Gymnasium,
-    and prints the returns of --episodes in both."""
+    beside: Literal["untrained"] | Seed | None = None
+    """A second policy, on the left, from the same start: untrained (before and after), or another
+    seed of the run, such as worst."""
+    push: float = 0.0
+    """Push the highest body with this force (N) along x, for 0.1 s every 3 s, now left, now right.
+    Shows that what stands still is held. The pendulums bear 10."""
+    live: bool = False
+    """Show episode after episode in MuJoCo's viewer, in place of a film; the mouse pulls at bodies
+    (a double click selects, Ctrl and a drag pulls). Needs a screen."""
+    backend: Literal["mjx", "mujoco", "gymnasium"] | None = None
+    """Which simulation is filmed: "mjx", as in training; "mujoco", C MuJoCo, which starts at once;
+    "gymnasium", the installed Gymnasium, and then the returns of --episodes in it and in mjx are
+    printed. By default mjx for a run, mujoco with --push or --live and for a policy of the package.
+    """
     episodes: int = 16
     """With --backend gymnasium: how many episodes are compared."""
     episode: int = 0
@@ -68,11 +79,12 @@ class Settings:
     """Draw actions from the policy, as training does, instead of taking its mode."""
     output: Path | None = None
     """The film, .gif or, after pip install mediapy imageio-ffmpeg, .mp4.
-    By default RUN/seed-NUMBER.gif, or RUN/seed-NUMBER-gymnasium.gif."""
+    By default RUN/seed-NUMBER.gif, or RUN/seed-NUMBER-gymnasium.gif; for a policy of the package
+    TASK.gif."""
     seconds: float = 20.0
     """Length of the film at most, in simulated seconds; the episode is played to its end."""
     width: int = 480
-    """Pixels."""
+    """Pixels of each policy's picture."""
     height: int = 360
     """Pixels."""
     overwrite: bool = False
@@ -84,9 +96,10 @@ def main() -> None:
     accept_everything()
     silence_alarms()
     try:
-        film(read(Settings, sys.argv[1:], "python -m mjx_reinforce.watch", Settings.__doc__ or ""))
+        settings = read(Settings, sys.argv[1:], command("watch"), Settings.__doc__ or "")
+        film(dataclasses.replace(settings, run=choose_run(settings.run)))
     except (ValueError, OSError) as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        say_error(str(error))
         sys.exit(2)
     except KeyboardInterrupt:
         sys.exit(130)
@@ -99,39 +112,67 @@ def film(settings: Settings) -> None:
       ValueError: a setting is out of range, or the run is damaged, or nothing can be drawn here.
       OSError: a file cannot be read or written.
     """
-    run = read_run(settings.run)
-    _check_env(settings, run)
-    output = check(settings, choose_seed(run, settings.seed, settings.which))
+    source = read_source(settings.run)
+    _check_env(settings, source)
+    output = check(settings, source)
     if settings.backend == "gymnasium":
         import_gymnasium()
     import_mujoco()
     configure_jax()
-    from mjx_reinforce.export.player import load_seed
+    from mjx_reinforce.runs.simulations import check_size
 
-    player, _ = load_seed(run, settings.seed, settings.which)
-    env = _make(run, player.observation_size)
-    renderer = Renderer(scene(env), settings.width, settings.height)
-    simulators = _simulators(settings, env, player, run.horizon)
-    name, play = list(simulators.items())[-1]
+    roles = cast(settings, source)
+    env = envs.make(source.env)
+    check_size(env, roles[-1].player, source)
+    if settings.live:
+        from mjx_reinforce.runs.live import live
+
+        live(env, scene(env), roles[-1].player, source.horizon, settings)
+        return
+    model = scene(env)
+    Renderer(model, settings.width, settings.height)  # raises before anything is compiled
+    from mjx_reinforce.export.takes import side_by_side
+
+    takes = [_take(settings, source, env, model, role) for role in roles]
+    shown = side_by_side(takes, settings.width, settings.height, seconds=settings.seconds)
+    samples = [*map(shown.draw, shown.samples)]
+    frames = map(shown.draw, track(range(shown.length), "drawing", transient=True))
+    write_film(output, frames, shown.rate, samples)
+    print(f"{shown.length} frames in {output}")
+    if len(takes) == 1 and settings.push == 0 and _stands_still(takes[0]):
+        print("It hardly moves, since it is held; --push 10 shows what holds it.")
+
+
+def _take(settings: Settings, source: Source, env: Any, model: Any, role: Role) -> Any:
+    """Returns the episode of one policy, and says what it earned."""
+    from mjx_reinforce.export.takes import Take
+    from mjx_reinforce.runs.mujoco_playing import pushed_body
+    from mjx_reinforce.runs.simulations import simulators
+
+    by_name = simulators(settings.backend, env, role.player, source, settings.push)
+    name, play = list(by_name.items())[-1]
     with _waiting("compiling and playing"):
         episode = play(settings.episode, settings.noise)
         steps = f"{len(episode.rewards)} steps in {name}"
-        print(f"{run.env}, seed {player.seed}: return {episode.total:.1f} in {steps}")
-        if len(simulators) > 1:
-            print(compare(settings, simulators))
-    skip = max(1, math.ceil(1 / (env.dt * _MAX_RATE) - 1e-9))
-    shown = episode.qpos[: max(1, round(settings.seconds / env.dt)) : skip]
-    samples = [renderer.draw(qpos) for qpos in shown[:: -(-len(shown) // _SAMPLES)]]
-    frames = track(map(renderer.draw, shown), "drawing", len(shown), transient=True)
-    write_film(output, frames, 1 / (env.dt * skip), samples)
-    print(f"{len(shown)} frames in {output}")
+        print(f"{source.env}, {role.name}: return {episode.total:.1f} in {steps}")
+        if len(by_name) > 1:
+            print(compare(settings, by_name))
+    body = pushed_body(env.mj_model) if settings.push else 0
+    pushes = episode.pushes
+    return Take(role.label, model, env.dt, episode.qpos, episode.rewards, pushes, body)
 
 
-def _check_env(settings: Settings, run: Run) -> None:
+def _stands_still(take: Any) -> bool:
+    """Returns whether the film shows nothing after its first tenth."""
+    later = take.qpos[len(take.qpos) // 10 :]
+    return len(later) * take.dt > 5 and float(np.ptp(later, axis=0).max()) < _STILL
+
+
+def _check_env(settings: Settings, source: Source) -> None:
     """Raises ValueError for another environment than the run's, or where one must be named."""
-    if settings.env not in (None, run.env):
-        raise ValueError(f"--env is {settings.env}, but {run.directory} was trained on {run.env}")
-    check_named(run.env, settings.env, run.directory)
+    if settings.env not in (None, source.env):
+        raise ValueError(f"--env is {settings.env}, but {settings.run} was trained on {source.env}")
+    check_named(source.env, settings.env, settings.run)
 
 
 def _waiting(what: str) -> AbstractContextManager[Any]:
@@ -140,31 +181,7 @@ def _waiting(what: str) -> AbstractContextManager[Any]:
     return console.status(what) if console.is_terminal else heartbeat(console.print, None, what)
 
 
-def _make(run: Run, size: int) -> Any:
-    """Returns the run's environment; raises ValueError if its observations are not of a size."""
-    from mjx_reinforce.types import observation_size
-
-    env = envs.make(run.env)
-    if observation_size(env) != size:
-        raise ValueError(
-            f"the policy in {run.directory} takes observations of {size} entries, {run.env} has "
-            f"{observation_size(env)}: config.json and policy/ are of different runs"
-        )
-    return env
-
-
-def _simulators(settings: Settings, env: Any, player: Any, horizon: int) -> dict[str, Play]:
-    """Returns what plays, by name; the last is filmed."""
-    from mjx_reinforce.runs.playing import gymnasium_simulator, simulator
-
-    simulators: dict[str, Play] = {"mjx": simulator(env, player, horizon)}
-    if settings.backend == "gymnasium":
-        version, play = gymnasium_simulator(player, horizon)
-        simulators[f"gymnasium {version}"] = play
-    return simulators
-
-
-def compare(settings: Settings, simulators: dict[str, Play]) -> str:
+def compare(settings: Settings, simulators: Mapping[str, Any]) -> str:
     """Returns the mean and range of the returns in each simulation, side by side."""
     said = []
     for name, play in simulators.items():
@@ -174,15 +191,12 @@ def compare(settings: Settings, simulators: dict[str, Play]) -> str:
     return f"mean return of {settings.episodes} episodes: {', '.join(said)}"
 
 
-def check(settings: Settings, seed: int) -> Path:
+def check(settings: Settings, source: Source) -> Path:
     """Returns the film's path.
 
-    Args:
-      settings: the command line.
-      seed: the number of the seed that plays.
-
     Raises:
-      ValueError: a setting is out of range, or the film exists or cannot be written.
+      ValueError: a setting is out of range, the run has no such seed, or the film exists or cannot
+        be written.
     """
     if not 0 < settings.seconds < float("inf"):
         raise ValueError(f"--seconds must be positive and finite, got {settings.seconds}")
@@ -190,8 +204,14 @@ def check(settings: Settings, seed: int) -> Path:
         value = getattr(settings, name)
         if not least <= value <= most:
             raise ValueError(f"--{name} must be in [{least}, {most}], got {value}")
-    name = f"seed-{seed}{'-gymnasium' * (settings.backend == 'gymnasium')}.gif"
-    output = settings.output or settings.run / name
+    _check_together(settings)
+    number = main_seed(settings, source)
+    suffix = "-gymnasium" * (settings.backend == "gymnasium")
+    name = f"seed-{number}" if source.run else source.env
+    folder = source.run.directory if source.run else Path()
+    output = settings.output or folder / f"{name}{suffix}.gif"
+    if settings.live:
+        return output
     if output.suffix.lower() not in (".gif", ".mp4"):
         raise ValueError(f"{output} is no film; end --output in .gif or .mp4")
     if not (output.parent.is_dir() and os.access(output.parent, os.W_OK)):
@@ -203,18 +223,40 @@ def check(settings: Settings, seed: int) -> Path:
     return output
 
 
+def _check_together(settings: Settings) -> None:
+    """Raises ValueError for settings that exclude each other, or where --live has no screen."""
+    if not abs(settings.push) < float("inf"):
+        raise ValueError(f"--push must be finite, got {settings.push}")
+    for name in ("push", "live"):
+        if getattr(settings, name) and settings.backend not in (None, "mujoco"):
+            raise ValueError(
+                f"--{name} needs C MuJoCo, and --backend is {settings.backend}; leave one out"
+            )
+    if settings.live and settings.beside is not None:
+        raise ValueError("--live shows one policy; leave --beside out")
+    screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if settings.live and sys.platform == "linux" and not screen:
+        raise ValueError(
+            "--live needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
+            "leave --live out to write a film"
+        )
+
+
 def scene(env: Any) -> Any:
-    """Returns the MuJoCo model that an environment's ``qpos`` moves.
+    """Returns the MuJoCo model that an environment's ``qpos`` moves, with a floor and a sky.
 
     Raises:
       ValueError: it has none.
     """
+    settings = getattr(env, "settings", None)
+    xml_file = getattr(env, "scene", None) or getattr(settings, "xml_file", None)
+    if xml_file is not None:
+        from mjx_reinforce.envs import models
+        from mjx_reinforce.export.scenery import dress
+
+        return dress(models.spec(xml_file), replace=not models.is_own(xml_file))
     if hasattr(env, "mj_model"):
         return env.mj_model
-    if hasattr(env, "scene"):
-        from mjx_reinforce.envs import models
-
-        return models.load(env.scene)
     raise ValueError(
         f"{type(env).__name__} has no mj_model, so there is nothing to draw; in a wrapper, set "
         "self.mj_model and self.dt to those of what it wraps; or play with mjx_reinforce.load"

@@ -201,9 +201,9 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
             "--decay-steps None",
             "decay over 2,500,000,000 optimiser steps",
         ),
-        ("--num-seeds abc", "--num-seeds: invalid literal for int() with base 10: 'abc'"),
-        ("--num-seeds 1e3", "'1e3'"),
-        ("--num-seeds", "Missing value for argument '--num-seeds'"),
+        ("--num-seeds abc", "--num-seeds takes a whole number, such as 4 or 2e6, got 'abc'"),
+        ("--num-seeds 1.5e0", "--num-seeds takes a whole number, such as 4 or 2e6, got '1.5e0'"),
+        ("--num-seeds", "--num-seeds needs a value after it"),
         ("--num-seeds 3 4", "no flag takes '4'"),
         ("--num-seeds 3 gymnasium-tutorial", "a preset comes before all flags"),
         ("--num-sedes 3", "unknown flag '--num-sedes'. Did you mean '--num-seeds'?"),
@@ -215,7 +215,7 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ("--hidden-sizes 4.5", "--hidden-sizes"),
         ("--learning-rate fast", "--learning-rate"),
         ("--optimizer rmsprop", "('adam', 'adamw', 'sgd')"),
-        ("--one-start yes", "no flag takes 'yes'"),
+        ("--one-start yes", "--one-start is a switch: it takes no value, got 'yes'"),
         ("gymnasium-tutorail", "Did you mean 'gymnasium-tutorial'"),
         ("--env :X", "':X' is not of the form module:Class"),
         ("--env os:", "not of the form module:Class"),
@@ -223,9 +223,15 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ("--env .relative:X", "not of the form module:Class"),
         ("--env folder/own_model.py:Crane", "is a file: write module:Class, such as own_model"),
         ("--env own_model.py", "'own_model.py' is a file"),
-        ("--env-steps nan", "--env-steps takes a whole number or None, got 'nan'"),
-        ("--env-steps 280,000", "--env-steps takes a whole number or None, got '280,000'"),
-        ("--max-grad-norm none", "--max-grad-norm takes a number or None, got 'none'"),
+        (
+            "--env-steps nan",
+            "--env-steps takes a whole number, such as 4 or 2e6, or None, got 'nan'",
+        ),
+        ("--env-steps 280,000", "such as 4 or 2e6, or None, got '280,000'"),
+        (
+            "--max-grad-norm none",
+            "--max-grad-norm takes a number, such as 0.5, or None, got 'none'",
+        ),
         ("--hidden-sizes 32,32", "takes whole numbers with spaces between them, such as 32 32"),
         ("-- --num-seeds 3", "leave -- out"),
         ("--hidden-sizes " + "2 " * 101, "at most 100 layers"),
@@ -585,7 +591,7 @@ def test_a_run_that_nobody_reads_goes_on(monkeypatch, tmp_path):
 def test_help_is_of_some_hundred_lines_on_every_terminal(monkeypatch, capsys, columns):
     monkeypatch.setenv("COLUMNS", columns)
     with pytest.raises(SystemExit, match="0"):
-        parse(["--help"])
+        parse(["--help", "all"])
     assert capsys.readouterr().out.count("\n") < 500
     assert os.environ["COLUMNS"] == columns
 

@@ -16,10 +16,21 @@ PACKAGE = ROOT / "mjx_reinforce"
 #: Folders and root modules from the ground up; a file imports from its own folder and those before.
 ORDER = (
     *("checks", "types", "registry", "fused", "physics", "envs", "policies", "engines", "learners"),
-    *("export", "reports", "runs", "report", "sweeps", "sweep", "train", "watch", "__main__"),
+    *(
+        "export",
+        "reports",
+        "runs",
+        "report",
+        "sweeps",
+        "sweep",
+        "train",
+        "watch",
+        "new",
+        "__main__",
+    ),
 )
 #: Who may know that our environments exist; all others take any environment as an argument.
-MAY_IMPORT_ENVS = {"envs", "runs", "sweeps", "sweep", "train", "watch", "__main__"}
+MAY_IMPORT_ENVS = {"envs", "runs", "sweeps", "sweep", "train", "watch", "new", "__main__"}
 
 
 def modules(root, parent):

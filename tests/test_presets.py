@@ -133,7 +133,7 @@ def test_an_unknown_preset_is_explained(monkeypatch, capsys):
 def test_help_lists_presets_and_groups_without_jax():
     code = (
         "import sys\nfrom mjx_reinforce.runs import command_line\n"
-        "try: command_line.parse(['--help'])\n"
+        "try: command_line.parse(['--help', 'all'])\n"
         "except SystemExit: print('jax' in sys.modules)"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)

@@ -193,6 +193,22 @@ def test_without_a_terminal_an_evaluation_is_one_line(monkeypatch, capsys):
     assert second.endswith("worst     7.0  2,000 steps/s, mean 1,000  25.0 %  left 0:01:00")
 
 
+@pytest.mark.parametrize("width", [60, 200])
+def test_sentences_wrap_at_words_and_commands_do_not_wrap(monkeypatch, width):
+    console = screen(width)
+    monkeypatch.setattr(display, "_Screen", lambda **_: console)
+    text = " ".join(f"sentence-{i}, which the terminal would cut." for i in range(12))
+    line = f"python -m mjx_reinforce.watch {'x' * 300}"
+    shown = display.Display()
+    shown.say(text)
+    shown.show_commands({"To see it": line})
+    *sentences, command = console.file.getvalue().splitlines()
+    assert max(map(len, sentences)) <= width
+    assert len(sentences) > 1
+    assert " ".join(sentences).split() == text.split()
+    assert command == f"To see it:  {line}"
+
+
 def test_the_end_table_has_counts():
     returns = np.full((1, 1000), 1000.0)
     returns[0, :3] = 573.6, 600.0, np.nan
@@ -208,6 +224,9 @@ def test_the_end_table_has_counts():
     assert "nan, 1000.0" in written
     assert "not finite │ 1 of 1,000" in written
     assert "Files in t/[bold]x" in written
+    assert "the picture is learning_curve.png" in written
+    for command in ("watch", "report"):  # each on one line, to be copied
+        assert f"python -m mjx_reinforce.{command} 't/[bold]x'\n" in console.file.getvalue()
     assert "100" not in written.replace("1000.0", "").replace("1,000", "")
 
 

@@ -321,7 +321,10 @@ def test_pages_go_where_they_belong(tmp_path, monkeypatch, capsys):
         assert (status, "report exists; pass --overwrite" in said) == (2, True)
         assert said_by_main(monkeypatch, capsys, *chosen, "--overwrite")[0] == 0
     status, said = said_by_main(monkeypatch, capsys, tmp_path / "none")
-    assert (status, said) == (2, f"error: there is no directory {tmp_path / 'none'}\n")
+    assert (status, said) == (
+        2,
+        f"error: there is no directory {tmp_path / 'none'}; name that of a run or a sweep\n",
+    )
 
 
 @pytest.mark.parametrize("name", ["page.txt", "none/page.html", "folder.html", "page.html"])

@@ -151,6 +151,7 @@ class Interrupting:
             os.kill(os.getpid(), signal.SIGINT)
 
 sys.meta_path.insert(0, Interrupting())
+sys.argv.append("train")
 from mjx_reinforce.__main__ import main
 main()
 """

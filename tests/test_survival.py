@@ -8,7 +8,10 @@ from scipy import stats
 
 from mjx_reinforce.reports.statistics.survival import (
     collapses,
+    combined,
     kaplan_meier,
+    log_rank,
+    mean_while_training,
     median_steps,
     restricted_mean,
     time_to_threshold,
@@ -104,3 +107,63 @@ def test_properties(seeds):
     found = restricted_mean(steps, solved, until)
     np.testing.assert_allclose(restricted_mean(steps[::-1], solved[::-1], until), found)
     assert 0 <= found.low <= found.value <= found.high <= until
+
+
+def expected_less_observed(steps, solved, others, others_solved):
+    """Mantel's statistic by its definition: a table of two rows at each time that a seed solves."""
+    difference = variance = 0.0
+    for when in np.unique(np.concatenate([steps[solved], others[others_solved]])):
+        left, right = np.sum(steps >= when), np.sum(others >= when)
+        events = np.sum(steps[solved] == when) + np.sum(others[others_solved] == when)
+        total = left + right
+        difference += np.sum(steps[solved] == when) - events * left / total
+        if total > 1:
+            variance += events * left * right * (total - events) / (total**2 * (total - 1))
+    return difference / np.sqrt(variance)
+
+
+def test_log_rank_is_mantels():
+    random = np.random.default_rng(4)
+    steps, others = random.integers(1, 30, 25), random.integers(5, 40, 31)
+    solved, others_solved = random.random(25) < 0.7, random.random(31) < 0.6
+    found = log_rank(steps, solved, others, others_solved)
+    by_hand = expected_less_observed(steps, solved, others, others_solved)
+    assert found.statistic == pytest.approx(by_hand)
+    assert found.statistic > 0  # the first solve it sooner
+    assert found.p_value == pytest.approx(2 * stats.norm.sf(abs(by_hand)))
+    turned = log_rank(others, others_solved, steps, solved)
+    assert turned.statistic == pytest.approx(-found.statistic)
+
+
+def test_log_rank_of_what_does_not_differ():
+    none, all_of_them = np.zeros(4, bool), np.ones(4, bool)
+    for solved in (none, all_of_them):
+        assert log_rank([7] * 4, solved, [7] * 4, solved) == (0.0, 1.0)
+
+
+def test_log_rank_finds_nothing_where_there_is_nothing():
+    """Of equal groups, one test in twenty has p below 0.05."""
+    random = np.random.default_rng(0)
+    steps = random.exponential(100, (400, 2, 40))
+    ends = np.minimum(steps, 150)
+    found = [
+        log_rank(e[0], s[0] < 150, e[1], s[1] < 150).p_value
+        for e, s in zip(ends, steps, strict=True)
+    ]
+    assert 0.02 < np.mean(np.array(found) < 0.05) < 0.09
+
+
+def test_tests_of_several_tasks_together():
+    assert combined([1.96]) == pytest.approx(0.05, abs=1e-3)
+    assert combined([2.0, -2.0]) == 1.0
+    assert combined([1.5] * 4) == pytest.approx(2 * stats.norm.sf(3.0))
+
+
+def test_mean_while_training_is_the_area_by_the_width():
+    steps = np.array([[0, 0, 0], [10, 10, 10], [30, 10, 30]])
+    returns = np.array([[0.0, 4.0, 1.0], [10.0, 8.0, np.nan], [10.0, 8.0, 1.0]])
+    whole = mean_while_training(returns, steps, 30)
+    assert whole[:2].tolist() == pytest.approx([(50 + 200) / 30, 6.0])  # the second stood still
+    assert np.isnan(whole[2])
+    assert mean_while_training(returns, steps, 5)[0] == pytest.approx(2.5)
+    assert mean_while_training(returns[:1], steps[:1], 5).tolist() == [0.0, 4.0, 1.0]

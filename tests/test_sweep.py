@@ -18,6 +18,7 @@ from mjx_reinforce import sweep as sweep_module
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export.player import load_seed
 from mjx_reinforce.export.run_files import choose_seed, read_run
+from mjx_reinforce.report import Written
 from mjx_reinforce.runs import plan as runs_plan
 from mjx_reinforce.runs.build import build
 from mjx_reinforce.runs.config import Config
@@ -42,7 +43,8 @@ RATES = "--over learning-rate 1e-2 3e-2 1e-1"
 @pytest.fixture
 def run(monkeypatch, tmp_path):
     monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
-    monkeypatch.setattr(perform, "_report", lambda directory: 0.0)  # which tests of its own has
+    nothing = Written(0.0, [], 0)  # the report has tests of its own
+    monkeypatch.setattr(perform, "_report", lambda directory: nothing)
     monkeypatch.chdir(tmp_path)
 
     def run(command, module=sweep_module):
@@ -363,7 +365,8 @@ def test_a_sweep_that_crashed_goes_on(run, monkeypatch, where):
     assert same(curves(Path("whole")), curves(Path("crashed")))
     assert Path("whole/results.csv").read_bytes() == Path("crashed/results.csv").read_bytes()
     reported = []
-    monkeypatch.setattr(perform, "_report", lambda directory: reported.append(directory) or 1.0)
+    written = Written(1.0, [], 0)
+    monkeypatch.setattr(perform, "_report", lambda directory: reported.append(directory) or written)
     assert run("--resume crashed") == 0  # there is nothing left to do
     assert reported == []
     path = Path("crashed/sweep.json")
@@ -422,7 +425,10 @@ def test_values_are_read_as_their_settings_are():
     ("arguments", "message"),
     [
         ("", "nothing is swept"),
-        ("--over learning-rat 1 2", "unknown setting 'learning_rat'"),
+        (
+            "--over learning-rat 1 2",
+            "unknown setting 'learning-rat' after --over. Did you mean 'learning-rate'?",
+        ),
         ("--over learning-rate", "needs two values or more"),
         ("--over learning-rate 1e-3", "for one value pass --learning-rate"),
         ("--over learning-rate 1e-3 1e-3", "has the value 0.001 twice"),
@@ -571,7 +577,8 @@ def test_ranges_are_drawn_as_their_settings_are():
 @pytest.mark.parametrize("report", [True, False])
 def test_from_python_a_report_can_be_left_out(monkeypatch, tmp_path, capsys, report):
     monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
-    monkeypatch.setattr(perform, "_report", lambda directory: 1.5)
+    written = Written(1.5, ["The best is learning rate 0.03.", "It is sure."], 1)
+    monkeypatch.setattr(perform, "_report", lambda directory: written)
     base = Config(
         env="Drift-v0", num_seeds=2, num_episodes=4, eval_episodes=2, env_steps=None, max_updates=2
     )
@@ -581,7 +588,11 @@ def test_from_python_a_report_can_be_left_out(monkeypatch, tmp_path, capsys, rep
     assert results.eval_return.shape[1] == 4
     known = json.loads((tmp_path / "out" / "sweep.json").read_text())
     assert known["statistics_seconds"] == (1.5 if report else None)
-    assert ("statistics and report" in capsys.readouterr().out) == report
+    said = capsys.readouterr().out
+    assert ("statistics and report" in said) == report
+    assert ("The best is learning rate 0.03.\nIt is sure.\n" in said) == report
+    assert (f"mjx_reinforce.watch {tmp_path}/out/policies/001\n" in said) == report
+    assert (tmp_path / "out/policies/001/config.json").is_file()
 
 
 def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):

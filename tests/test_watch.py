@@ -19,6 +19,7 @@ from toys import Survive, ToyState
 
 from mjx_reinforce import act, envs, load, load_policy, watch
 from mjx_reinforce.engines.rollouts import rollout
+from mjx_reinforce.export import takes
 from mjx_reinforce.runs import playing
 
 
@@ -165,9 +166,10 @@ def test_both_simulations_are_said_side_by_side(tmp_path, monkeypatch, capsys):
 
     class Blank:
         def __init__(self, *_):
-            self.draw = lambda qpos: np.full((8, 8, 3), len(qpos), np.uint8)
+            self.draw = lambda qpos, *_: np.full((8, 8, 3), len(qpos), np.uint8)
 
     monkeypatch.setattr(watch, "Renderer", Blank)
+    monkeypatch.setattr(takes, "Renderer", Blank)
     run = make_run(tmp_path)
     watch_run(monkeypatch, run, "--backend", "gymnasium", "--episodes", 2)
     said = capsys.readouterr().out.splitlines()
@@ -201,7 +203,7 @@ def test_a_simulator_that_is_not_there_is_named(tmp_path, monkeypatch):
     [
         (["--backend", "gymnasium"], "pip install 'gymnasium[mujoco]'"),
         (["--sed", 3], "error: unknown flag '--sed'. Did you mean '--seed'?"),
-        (["--width", "wide"], "error: Error parsing --width"),
+        (["--width", "wide"], "--width takes a whole number, such as 4 or 2e6, got 'wide'"),
         (["--seed", 3], "seed 3 is not among the 3"),
         (["--which", "best"], "has no policy/best"),
         (["--episodes", 0], "--episodes must be in [1, 10000], got 0"),
@@ -213,12 +215,19 @@ def test_a_simulator_that_is_not_there_is_named(tmp_path, monkeypatch):
         (["--output", "policy.gif", "--overwrite"], "policy.gif exists"),
         (["--output", "config.json", "--overwrite"], "config.json is no film"),
         (["--output", "film.mp4"], "pip install mediapy imageio-ffmpeg"),
+        (["--live"], "--live needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set"),
+        (["--live", "--backend", "mjx"], "--live needs C MuJoCo, and --backend is mjx"),
+        (["--push", 9, "--backend", "mjx"], "--push needs C MuJoCo, and --backend is mjx"),
+        (["--push", "inf"], "--push must be finite, got inf"),
+        (["--live", "--beside", "worst"], "--live shows one policy; leave --beside out"),
     ],
 )
 def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
     make_run(tmp_path)
     (tmp_path / "policy.gif").mkdir()
     monkeypatch.chdir(tmp_path)
+    for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(variable, raising=False)
     for package in ("mediapy", "gymnasium"):
         monkeypatch.setitem(sys.modules, package, None)
     monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("an environment was built"))

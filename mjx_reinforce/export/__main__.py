@@ -10,6 +10,7 @@ from typing import Literal
 import tyro
 
 from mjx_reinforce.export.run_files import Seed, Which, read_run
+from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.flags import one_line_errors, read
 from mjx_reinforce.runs.streams import accept_everything
 
@@ -36,7 +37,7 @@ class Settings:
 def main() -> None:
     """Reads the command line, exports, and exits: 0 done, 2 bad input, 130 interrupted."""
     accept_everything()
-    prog = "python -m mjx_reinforce.export"
+    prog = command("export")
     with one_line_errors():
         settings = read(Settings, sys.argv[1:], prog, Settings.__doc__ or "")
         print("\n".join(map(str, export(settings))))

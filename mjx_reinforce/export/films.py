@@ -4,13 +4,21 @@ import ctypes.util
 import io
 import os
 import tempfile
-from collections.abc import Iterable, Sequence
+import weakref
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mjx_reinforce.export.files import write_bytes
+
+#: Colours of a .gif, beside the one that is transparent, and fewer of them for a small file.
+_COLORS, _FEWER_COLORS = 255, (128, 64, 32, 16, 8)
+#: Pictures, spread over a film, whose colours it has.
+_SAMPLES = 4
+#: The colour of an arrow: red, green, blue, opacity.
+_ARROW = (0.95, 0.35, 0.1, 1.0)
 
 
 class Renderer:
@@ -26,6 +34,8 @@ class Renderer:
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, width)
         model.vis.global_.offheight = max(model.vis.global_.offheight, height)
         model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.4, 0.6
+        # Without a GPU smooth edges take half the time of a picture, and show no better in it.
+        model.vis.quality.offsamples = 0
         # Without a GPU a fine shadow takes half the time of a picture, and shows no better in it.
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, 2 * max(width, height))
         cameras = [model.camera(i).name for i in range(model.ncam)]
@@ -36,13 +46,34 @@ class Renderer:
             self._renderer = mujoco.Renderer(model, height, width)
         except Exception as error:  # each of MuJoCo's backends has its own
             raise _no_drawing(error) from error
+        # Without this it closes itself when Python ends, too late for its own modules.
+        weakref.finalize(self, self._renderer.close)
 
-    def draw(self, qpos: np.ndarray) -> np.ndarray:
-        """Returns a picture [height, width, 3] uint8 at positions [nq]."""
+    def draw(self, qpos: np.ndarray, push: float = 0.0, body: int = 0) -> np.ndarray:
+        """Returns a picture [height, width, 3] uint8.
+
+        Args:
+          qpos: [nq] generalised positions.
+          push: a force along x (N), drawn as an arrow of fixed length; none where it is 0.
+          body: the number of the body that it pushes.
+        """
         self._data.qpos[:] = qpos
         self._forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
+        if push:
+            self._add_arrow(self._data.xipos[body], np.sign(push))
         return self._renderer.render()
+
+    def _add_arrow(self, place: np.ndarray, sign: float) -> None:
+        """Adds an arrow along x that ends at a place [3] to the scene."""
+        mujoco, scene = import_mujoco(), self._renderer.scene
+        length = 0.25 * self._model.stat.extent
+        geom, kind = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_ARROW
+        scene.ngeom += 1
+        zero, no_turn = np.zeros(3), np.eye(3).ravel()
+        mujoco.mjv_initGeom(geom, kind, zero, zero, no_turn, np.array(_ARROW, np.float32))
+        start = place - [sign * length, 0, 0]
+        mujoco.mjv_connector(geom, kind, 0.08 * length, start, place)
 
 
 def import_gymnasium() -> Any:
@@ -75,7 +106,11 @@ def _no_drawing(error: Exception) -> ValueError:
 
 
 def write_film(
-    path: Path, frames: Iterable[np.ndarray], rate: float, samples: Sequence[np.ndarray]
+    path: Path,
+    frames: Iterable[np.ndarray],
+    rate: float,
+    samples: Sequence[np.ndarray],
+    colors: int = _COLORS,
 ) -> None:
     """Writes a film at once.
 
@@ -83,10 +118,11 @@ def write_film(
       path: .gif or .mp4.
       frames: pictures [height, width, 3] uint8.
       rate: frames a second.
-      samples: a few of the pictures; a .gif has the 256 colours that show these best.
+      samples: a few of the pictures; a .gif has the colours that show these best.
+      colors: how many a .gif has, 255 at most; fewer make a smaller file.
     """
     if path.suffix.lower() == ".gif":
-        write_bytes(path, _gif(frames, rate, np.concatenate(samples)))
+        write_bytes(path, gif(frames, rate, samples, colors))
     else:
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             partial = Path(folder) / path.name
@@ -94,19 +130,59 @@ def write_film(
             os.replace(partial, path)
 
 
-def _gif(frames: Iterable[np.ndarray], rate: float, sample: np.ndarray) -> bytes:
-    """Returns a .gif with one palette, that of a sample [H, W, 3]: one a picture takes 6 ms."""
+def write_small_gif(path: Path, frames: Sequence[np.ndarray], rate: float, most_bytes: int) -> None:
+    """Writes a .gif of so many bytes at most, with as many colours as that allows.
+
+    Args:
+      path: .gif.
+      frames: pictures [height, width, 3] uint8.
+      rate: frames a second.
+      most_bytes: of the file.
+
+    Raises:
+      ValueError: the film is larger with the fewest colours.
+    """
+    samples = frames[:: -(-len(frames) // _SAMPLES)]
+    for colors in _FEWER_COLORS:
+        film = gif(frames, rate, samples, colors)
+        if len(film) <= most_bytes:
+            write_bytes(path, film)
+            return
+    raise ValueError(
+        f"{path} would have {len(film)} bytes, {most_bytes} are allowed: make it shorter or smaller"
+    )
+
+
+def gif(
+    frames: Iterable[np.ndarray], rate: float, samples: Sequence[np.ndarray], colors: int
+) -> bytes:
+    """Returns a .gif with one palette, that of the samples: one a picture takes 6 ms.
+
+    What does not change from a picture to the next is transparent, which packs well.
+    """
     from PIL import Image
 
-    palette = Image.fromarray(sample).quantize(256, dither=Image.Dither.NONE)
-    pictures = (
-        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
-        for frame in frames
-    )
-    options: dict[str, Any] = {"save_all": True, "loop": 0, "duration": 1000 / rate}
-    film = io.BytesIO()
+    sample = Image.fromarray(np.concatenate(samples))
+    palette = sample.quantize(colors, dither=Image.Dither.NONE)
+    options = {"duration": 1000 / rate, "transparency": colors, "disposal": 1}
+
+    def pictures() -> Iterator[Any]:
+        before = None
+        for frame in frames:
+            image = Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+            now = np.asarray(image)
+            changed = now if before is None else np.where(now == before, np.uint8(colors), now)
+            before = now
+            picture = Image.fromarray(changed, "P")
+            picture.putpalette(palette.getpalette() or [])
+            picture.info["transparency"] = colors
+            yield picture
+
+    film, drawn = io.BytesIO(), pictures()
     # To optimise is to look for colours that a picture lacks: it takes four times as long.
-    next(pictures).save(film, "GIF", append_images=pictures, optimize=False, **options)
+    next(drawn).save(
+        *(film, "GIF"), save_all=True, append_images=drawn, loop=0, optimize=False, **options
+    )
     return film.getvalue()
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from mjx_reinforce.checks import check_type
 from mjx_reinforce.export.policy_files import SavedPolicy, read_policy
+from mjx_reinforce.export.pretrained import FOLDER, is_pretrained, provenance
 from mjx_reinforce.export.run_files import (
     Run,
     Seed,
@@ -79,16 +80,31 @@ def load(run: str | Path, seed: Seed = "best", *, which: Which = "last") -> Play
     """Loads a trained policy to play, in Gymnasium or elsewhere.
 
     Args:
-      run: the run directory that training left.
+      run: the run directory that training left, or the id of a task whose trained policy comes with
+        the package, such as "HalfCheetah-v5"; ``pretrained()`` lists them. A directory of that name
+        goes first.
       seed: "best", "worst" or "median" in the run's final evaluation, or a number.
       which: "last" for the policy at the end of training, "best" for the one that did best on
         the way, where the run kept it.
 
     Raises:
-      ValueError: there is no such run or seed, the run has not ended, or a file is damaged.
+      ValueError: there is no such run, task or seed, the run has not ended, or a file is damaged.
     """
     check_type("run", run, str | Path)
+    if is_pretrained(run):
+        return load_pretrained(str(run), seed, which)
     return load_seed(read_run(run), seed, which)[0]
+
+
+def load_pretrained(name: str, seed: Seed = "best", which: Which = "last") -> Player:
+    """Loads the policy for a task that comes with the package, as ``load``."""
+    if (seed, which) != ("best", "last"):
+        raise ValueError(
+            f"the package has one policy for {name}, of the best seed; leave seed and which out, "
+            "or give a run directory"
+        )
+    saved = read_policy(FOLDER / name, 0)
+    return Player(name, provenance(name)["seed"], saved.policy, saved.actor)
 
 
 def load_seed(run: Run, seed: Seed, which: Which = "last") -> tuple[Player, SavedPolicy]:

@@ -15,6 +15,7 @@ Which = Literal["last", "best"]
 
 #: Where the policies are in the run directory, and their returns in summary.json.
 _PLACES = {"last": ("policy", "final_returns"), "best": ("policy/best", "best_test_returns")}
+_PACKAGED = ", and no trained policy of that name comes with the package"
 _NOT_YET = "its training goes on, or was killed, and then train --resume goes on with it"
 
 
@@ -51,7 +52,10 @@ def read_run(directory: str | Path) -> Run:
     directory = Path(directory)
     path = directory / "config.json"
     if not path.is_file():
-        raise ValueError(f"{directory} is no run directory: there is no {path}")
+        raise ValueError(
+            f"{directory} is no run directory: there is no {path}"
+            f"{'' if directory.is_dir() else _PACKAGED}"
+        )
     settings = read_json(path)
     env_id, horizon = settings.get("env"), settings.get("horizon")
     if not isinstance(env_id, str):

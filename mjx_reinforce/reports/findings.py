@@ -1,6 +1,5 @@
 """The figures of a report: what an experiment's numbers say, best configuration first."""
 
-import functools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -9,12 +8,15 @@ import numpy as np
 
 from mjx_reinforce.reports.curves import on_grid
 from mjx_reinforce.reports.experiment import Configuration, Experiment
+from mjx_reinforce.reports.learning import Learning, compare_learning
+from mjx_reinforce.reports.results import COMPARED, Result, Solving, shared_seeds
 from mjx_reinforce.reports.statistics import Estimate, iqm, iqm_interval
 from mjx_reinforce.reports.statistics.aggregates import interval, wilson
 from mjx_reinforce.reports.statistics.comparisons import Comparison, compare_all
 from mjx_reinforce.reports.statistics.power import seeds_needed, wrong_winner
 from mjx_reinforce.reports.statistics.survival import (
     collapses,
+    mean_while_training,
     median_steps,
     restricted_mean,
     time_to_threshold,
@@ -24,55 +26,8 @@ from mjx_reinforce.reports.statistics.survival import (
 _GRID_POINTS = 60
 #: Ends that are so close are those of one budget.
 _ALIKE = 0.9
-#: So many configurations are compared pair by pair: the best.
-COMPARED = 16
 #: Seeds with which people compare, and of which the page says how often they err.
 FEW = (3, 5, 10)
-
-
-class Solving(NamedTuple):
-    """How the seeds of a configuration reached the threshold, and whether they kept it.
-
-    at_end, ever: how many seeds did
-    rate: the share at the end, Wilson's interval
-    fell: [S] who reached it and was below it at the end
-    steps: [S] env steps until the first time, or all of them
-    solved: [S] who ever did
-    median, mean: env steps until half of the seeds have; on average, each counted up to the
-      shortest training of any seed of the experiment
-    """
-
-    at_end: int
-    ever: int
-    rate: Estimate
-    fell: np.ndarray
-    steps: np.ndarray
-    solved: np.ndarray
-    median: Estimate
-    mean: Estimate
-
-
-class Result(NamedTuple):
-    """What a configuration's final returns [S] say.
-
-    final: the last evaluation of each seed, NaN where not finite
-    scores: the same, with the worst finite one of the experiment in place of those
-    mean, tail: of the scores; the tail is the mean of the worst tenth
-    iqm: of the final returns, see ``statistics.iqm``
-    band: the interquartile mean over ``Findings.grid``, arrays [K]; NaN beyond its budget
-    seeds: [K, S] the curves on the grid
-    solving: None where the task has no threshold
-    """
-
-    configuration: Configuration
-    final: np.ndarray
-    scores: np.ndarray
-    mean: Estimate
-    tail: Estimate
-    iqm: Estimate
-    band: Estimate
-    seeds: np.ndarray
-    solving: Solving | None
 
 
 class Few(NamedTuple):
@@ -93,6 +48,7 @@ class Findings(NamedTuple):
     order: of each result, the place of its configuration in the experiment
     grid: [K] env steps
     comparisons: of all pairs of the best results, which are numbered by their places here
+    learning: how fast the configurations learn, and what each setting does
     """
 
     experiment: Experiment
@@ -101,6 +57,7 @@ class Findings(NamedTuple):
     grid: np.ndarray
     comparisons: list[Comparison]
     few: Few | None
+    learning: Learning
 
 
 def find(experiment: Experiment) -> Findings:
@@ -117,13 +74,16 @@ def find(experiment: Experiment) -> Findings:
     finals = np.concatenate([part.eval_return[-1] for part in parts])
     worst = min(finals[np.isfinite(finals)], default=math.nan)
     results = [
-        _result(part, band, seeds, worst)._replace(solving=_solving(part, experiment, min(ends)))
+        _result(part, band, seeds, worst, min(ends))._replace(
+            solving=_solving(part, experiment, min(ends))
+        )
         for part, band, seeds in zip(parts, bands, curves, strict=True)
     ]
     order = sorted(range(len(results)), key=lambda i: _rank(results[i]))
     ranked = [results[i] for i in order]
     comparisons = _compare(ranked[:COMPARED])
-    return Findings(experiment, ranked, order, grid, comparisons, _few(ranked))
+    learning = compare_learning(ranked, min(ends))
+    return Findings(experiment, ranked, order, grid, comparisons, _few(ranked), learning)
 
 
 def _grid(parts: Sequence[Configuration], end: int) -> np.ndarray:
@@ -149,9 +109,14 @@ def _bands(curves: Sequence[np.ndarray]) -> list[Estimate]:
     return [bands[i] for i in range(len(curves))]
 
 
-def _result(part: Configuration, band: Estimate, seeds: np.ndarray, worst: float) -> Result:
+def _result(
+    part: Configuration, band: Estimate, seeds: np.ndarray, worst: float, until: int
+) -> Result:
     final = part.eval_return[-1]
     scores = np.where(np.isfinite(final), final, worst)
+    areas = mean_while_training(
+        np.where(np.isfinite(part.eval_return), part.eval_return, worst), part.env_steps, until
+    )
     return Result(
         configuration=part,
         final=final,
@@ -161,6 +126,8 @@ def _result(part: Configuration, band: Estimate, seeds: np.ndarray, worst: float
         iqm=Estimate(iqm(final), *iqm_interval(final)),
         band=band,
         seeds=seeds,
+        areas=areas,
+        area=interval("mean", areas),
         solving=None,
     )
 
@@ -192,10 +159,8 @@ def _rank(result: Result) -> tuple[float, float]:
 
 def _compare(results: Sequence[Result]) -> list[Comparison]:
     """Compares all pairs on the seeds that all of them have."""
-    if len(results) < 2:
-        return []
-    shared = functools.reduce(np.intersect1d, [each.configuration.seed for each in results])
-    if len(shared) < 2:
+    shared = shared_seeds(results)
+    if len(results) < 2 or len(shared) < 2:
         return []
     return compare_all([each.scores[np.isin(each.configuration.seed, shared)] for each in results])
 

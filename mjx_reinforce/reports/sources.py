@@ -40,15 +40,34 @@ def read(sources: Sequence[Path]) -> Experiment:
             f"these are of different tasks ({', '.join(envs)}), whose returns cannot be compared; "
             "make a report of each"
         )
+    return _experiment(found)
+
+
+def read_tasks(sources: Sequence[Path]) -> list[Experiment]:
+    """Reads run and sweep directories as one experiment for each task, in their order.
+
+    Raises:
+      ValueError: as ``read`` does, but not for different tasks.
+    """
+    if not sources:
+        raise ValueError("there is nothing to report on: name a run or a sweep directory")
+    found = [_read_source(Path(source)) for source in dict.fromkeys(sources)]
+    envs = dict.fromkeys(source.env for source in found)
+    return [_experiment([source for source in found if source.env == env]) for env in envs]
+
+
+def _experiment(found: Sequence[Source]) -> Experiment:
+    """Returns the experiment of sources of one task."""
     configurations = _told_apart(found)
     thresholds = [source.threshold for source in found if source.threshold is not None]
     provenance, disagree = _side_by_side(found)
     timings = sum((Counter(source.timings) for source in found), Counter())
+    env = found[0].env
     return Experiment(
-        title=f"{envs[0]}, {count(len(configurations), 'configuration')}",
-        env=envs[0],
+        title=f"{env}, {count(len(configurations), 'configuration')}",
+        env=env,
         threshold=thresholds[0] if thresholds else None,
-        asked=asked(envs[0], configurations),
+        asked=asked(env, configurations),
         configurations=configurations,
         settings=_in_common([source.settings for source in found]),
         provenance=provenance,
@@ -65,7 +84,7 @@ def _read_source(directory: Path) -> Source:
     if (directory / "config.json").is_file():
         return run_source.read(directory)
     if not directory.is_dir():
-        raise ValueError(f"there is no directory {directory}")
+        raise ValueError(f"there is no directory {directory}; name that of a run or a sweep")
     raise ValueError(
         f"{directory} is neither a run nor a sweep: it has no config.json and no sweep.json"
     )

@@ -7,20 +7,21 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any, NoReturn
 
-import tyro
-
 from mjx_reinforce import envs
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs import resume
+from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import for_arguments, named, named_task
 from mjx_reinforce.runs.files import remove_empty
-from mjx_reinforce.runs.flags import read
+from mjx_reinforce.runs.flags import asks_brief_help, read
+from mjx_reinforce.runs.hints import about_word
+from mjx_reinforce.runs.lines import say_error
 from mjx_reinforce.runs.own_code import check_named
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.processes import ProcessSettings, check_processes
 from mjx_reinforce.runs.relevance import check_read
-from mjx_reinforce.runs.settings import GROUPS
+from mjx_reinforce.runs.settings import GROUPS, MAIN
 
 #: What a run leaves in its directory.
 _FILES = (
@@ -31,6 +32,13 @@ _FILES = (
     "learning_curve.png",
     "policy/",
     "checkpoint/",
+)
+_DESCRIPTION = (
+    "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. "
+    f"Leaves {', '.join(_FILES)} in the run directory.\n\n"
+    "Defaults depend on the task and on the budget: --help shows those of InvertedPendulum-v5, "
+    "--help --env ID those of another, for about a minute of training here, and with "
+    "--env-steps N those for N env steps."
 )
 
 
@@ -50,7 +58,7 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
         given would do nothing, or the run to resume is not there, has other settings, was stopped,
         or is of the user's own environment, which is to be named again.
     """
-    default, preset, flags, prog = start(arguments, "python -m mjx_reinforce.train")
+    default, preset, flags, prog = start(arguments, command("train"))
     config, processes = _read(flags, default, prog)
     if config.minutes is not None and named(flags, "--env-steps"):
         raise ValueError(
@@ -101,6 +109,8 @@ def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequ
     if not arguments or arguments[0].startswith("-"):
         return _default(arguments), None, arguments, f"{prog} [PRESET]"
     preset, *flags = arguments
+    if preset not in PRESETS and (said := about_word(preset, trains=True, prog=prog)):
+        raise ValueError(said)
     check_name("preset", preset, PRESETS)
     return PRESETS[preset][1], preset, flags, f"{prog} {preset}"
 
@@ -119,7 +129,8 @@ def _default(arguments: Sequence[str]) -> Config:
 def _read(arguments: Sequence[str], default: Config, prog: str) -> tuple[Config, ProcessSettings]:
     """Returns the settings that flags ask for, with others as given; --help exits."""
     groups = {**GROUPS, "hosts": ProcessSettings}
-    parsed = read_groups(groups, arguments, default, prog, _description())
+    said = _DESCRIPTION if asks_brief_help(arguments) else f"{_DESCRIPTION}\n\n{_names()}"
+    parsed = read_groups(groups, arguments, default, prog, said, MAIN)
     processes = parsed.pop("hosts")
     config = join_groups(parsed)
     check_read(config, default)
@@ -132,6 +143,7 @@ def read_groups(
     default: Config,
     prog: str,
     description: str,
+    main: Sequence[str],
 ) -> dict[str, Any]:
     """Returns each group of settings as flags ask for it; --help exits.
 
@@ -141,6 +153,7 @@ def read_groups(
       default: holds for the settings of a run that no flag names.
       prog: the name of the program, for --help.
       description: of the program, likewise.
+      main: the settings that --help alone shows.
 
     Raises:
       ValueError: see ``flags.read``.
@@ -150,8 +163,8 @@ def read_groups(
         (title, group, group(**{f.name: known[f.name] for f in fields(group) if f.name in known}))
         for title, group in groups.items()
     ]
-    form = tyro.conf.OmitArgPrefixes[dataclasses.make_dataclass("Arguments", forms, frozen=True)]
-    return dict(vars(read(form, arguments, prog, description)))
+    form = dataclasses.make_dataclass("Arguments", forms, frozen=True)
+    return dict(vars(read(form, arguments, prog, description, main)))
 
 
 def join_groups(groups: Mapping[str, Any]) -> Config:
@@ -159,20 +172,12 @@ def join_groups(groups: Mapping[str, Any]) -> Config:
     return Config(**{name: x for group in groups.values() for name, x in vars(group).items()})
 
 
-def presets() -> str:
-    """Returns the presets, a line each, for --help."""
+def _names() -> str:
+    """Returns the presets and the tasks, for --help all."""
     width = max(map(len, PRESETS))
-    return "\n".join(f"  {name:{width}}  {line}" for name, (line, _) in PRESETS.items())
-
-
-def _description() -> str:
+    presets = "\n".join(f"  {name:{width}}  {line}" for name, (line, _) in PRESETS.items())
     return (
-        "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. "
-        f"Leaves {', '.join(_FILES)} in the run directory.\n\n"
-        "Defaults depend on the task and on the budget: --help shows those of InvertedPendulum-v5, "
-        "--help --env ID those of another, for about a minute of training here, and with "
-        "--env-steps N those for N env steps.\n\n"
-        f"Presets, published programs whose settings replace the defaults:\n{presets()}\n\n"
+        f"Presets, published programs whose settings replace the defaults:\n{presets}\n\n"
         f"Environments: {', '.join(envs.names())}."
     )
 
@@ -180,5 +185,5 @@ def _description() -> str:
 def refuse(message: str, made: Sequence[Path], status: int = 2) -> NoReturn:
     """Says in one line what is wrong, removes the empty folders that were made, and exits."""
     remove_empty(made)
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    say_error(message)
     sys.exit(status)

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mjx_reinforce import envs
+from mjx_reinforce.checks import whole_number
 from mjx_reinforce.runs import measured
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.memory import cpu_factor, has_gpu
@@ -303,17 +304,15 @@ def named(arguments: Sequence[str], flag: str) -> str | None:
     """Returns what a command line gives a flag, the last time that it does; None if nothing."""
     found = None
     for name, following in itertools.zip_longest(arguments, arguments[1:]):
-        if name == flag and following:
-            found = following
-        elif name.startswith(f"{flag}="):
-            found = name.removeprefix(f"{flag}=")
+        name, equals, value = name.partition("=")
+        if name.replace("_", "-") == flag:
+            found = value if equals else following or found
     return found
 
 
 def for_arguments(arguments: Sequence[str]) -> Config:
     """Returns the default settings for what a command line names: the task, seeds and budget."""
-    counts = [named(arguments, flag) for flag in ("--env-steps", "--num-seeds")]
-    env_steps, num_seeds = (int(x) if x and x.isdecimal() else None for x in counts)
+    env_steps, num_seeds = (_count(named(arguments, f)) for f in ("--env-steps", "--num-seeds"))
     minutes = named(arguments, "--minutes") or ""
     try:
         seconds = 60 * float(minutes)
@@ -321,3 +320,12 @@ def for_arguments(arguments: Sequence[str]) -> Config:
         seconds = None
     known = seconds if seconds and 0 < seconds < float("inf") else None
     return of_task(named_task(arguments), env_steps, num_seeds or Config.num_seeds, known)
+
+
+def _count(text: str | None) -> int | None:
+    """Returns a number from a command line; None for none, and for what the parser refuses."""
+    try:
+        number = whole_number(text or "")
+    except ValueError:
+        return None
+    return number if number > 0 else None

@@ -3,7 +3,7 @@
 import datetime
 import math
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext, suppress
 from decimal import ROUND_DOWN, Decimal
 from pathlib import Path
@@ -18,6 +18,7 @@ from rich.text import Text
 
 from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.runs import nonfinite, progress
+from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.heartbeat import heartbeat
 from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.plan import duration
@@ -71,13 +72,19 @@ class Display:
         self._bar.stop()
 
     def say(self, text: str, style: str | None = None) -> None:
-        """Prints a line above the bar, in one of rich's styles.
+        """Prints a sentence above the bar, in one of rich's styles; without a terminal, as a line.
 
         A line that the screen does not take is lost: it may be a file on a full disk, or a pipe
         that nobody reads, which is no reason to end a run.
         """
         with suppress(OSError):
-            self.console.print(text, style=style, highlight=False, soft_wrap=True)
+            whole = not self.console.is_terminal
+            self.console.print(text, style=style, highlight=False, soft_wrap=whole)
+
+    def show_commands(self, commands: Mapping[str, str]) -> None:
+        """Prints command lines after what they do; each is one line, to be copied."""
+        with suppress(OSError):
+            print_commands(self.console, commands)
 
     def compiling(self, expected: float | None) -> AbstractContextManager[None]:
         """Returns a ``with`` block that shows that its contents go on.
@@ -168,8 +175,21 @@ def print_summary(console: Console, summary: dict[str, Any], directory: Path) ->
     table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")
     table.add_row("training and evaluating", f"{summary['run_seconds']:.1f} s")
     console.print(table)
-    said = f"Files in {directory}; python -m mjx_reinforce.report {shlex.quote(str(directory))}"
-    said += " makes a page of them"
     if summary["status"] == "interrupted":
         said = f"Interrupted: go on with --resume {directory}{env_flag(summary['env'])}"
-    console.print(said, markup=False, highlight=False, soft_wrap=True)
+        console.print(said, markup=False, highlight=False, soft_wrap=True)
+        return
+    said = f"Files in {directory}; the picture is learning_curve.png."
+    console.print(said, markup=False, highlight=False, soft_wrap=not console.is_terminal)
+    where = shlex.quote(str(directory))
+    commands = {
+        "To see the best seed play": f"{command('watch')} {where}{env_flag(summary['env'])}",
+        "For a page of all figures": f"{command('report')} {where}",
+    }
+    print_commands(console, commands)
+
+
+def print_commands(console: Console, commands: Mapping[str, str]) -> None:
+    """Prints command lines after what they do; each is one line, to be copied."""
+    for purpose, line in commands.items():
+        console.print(f"{purpose}:  {line}", markup=False, highlight=False, soft_wrap=True)

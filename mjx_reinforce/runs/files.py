@@ -3,7 +3,6 @@
 import contextlib
 import csv
 import datetime
-import fcntl
 import io
 import os
 import platform
@@ -15,6 +14,14 @@ from pathlib import Path
 from typing import Any
 
 from mjx_reinforce.export.files import write_bytes
+
+try:
+    import fcntl
+except ImportError as error:
+    raise ImportError(
+        "training and reports need Linux or macOS; on Windows, install mjx_reinforce in WSL 2 "
+        "(wsl --install)"
+    ) from error
 
 #: A disk with less room (bytes) is full: the files of a small run take about as much.
 _ROOM = 2**20

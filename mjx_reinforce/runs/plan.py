@@ -101,8 +101,7 @@ def make_plan(ready: Any, config: Config, num_processes: int = 1) -> Plan:
     else:
         seconds, bounded = run_seconds(config, task, machine, speed)
         compiling = speed.compiling
-        time = f"Compiling takes {_range(compiling)}, or much less if this was compiled before; "
-        time += f"training {_training(seconds, bounded)}"
+        time = said_time(compiling, seconds, bounded)
         if not bounded and useful_part(task, speed) < 1:
             time += ", more if some seeds' episodes stay short, since all wait for the last"
     memory = gigabytes(base + needed(config, task))
@@ -193,6 +192,14 @@ def duration(seconds: float) -> str:
         if number < 100 or unit == "h":
             break
     return f"{float(f'{max(number, 1):.2g}'):g} {unit}"
+
+
+def said_time(compiling: float, training: float, bounded: bool) -> str:
+    """Returns how long a run takes in words; the times are in s, see ``run_seconds``."""
+    return (
+        f"Compiling takes {_range(compiling)}, or much less if this was compiled before; "
+        f"training {_training(training, bounded)}"
+    )
 
 
 def _training(seconds: float, bounded: bool) -> str:

@@ -106,6 +106,11 @@ READ: tuple[tuple[str, Callable[[Config], bool], str], ...] = (
 )
 
 
+def is_read(name: str, config: Config) -> bool:
+    """Returns whether anything reads a setting in a run."""
+    return all(holds(config) for names, holds, _ in READ if name in names.split())
+
+
 def check_read(config: Config, default: Config) -> None:
     """Raises ValueError for settings that a user changed and that nothing would read.
 
@@ -114,10 +119,10 @@ def check_read(config: Config, default: Config) -> None:
       default: those that hold where the user gave none: our own, or a preset's.
     """
     given = changed(config, default)
-    for names, is_read, condition in READ:
+    for names, holds, condition in READ:
         idle = [name for name in given if name in names.split()]
-        if idle and not is_read(config):
-            flags = " ".join(_given(name, getattr(config, name)) for name in idle)
+        if idle and not holds(config):
+            flags = " ".join(as_flag(name, getattr(config, name)) for name in idle)
             raise ValueError(
                 f"{flags} would do nothing: only {condition} reads that; "
                 f"{'leave it out' if len(idle) == 1 else 'leave them out'}, or choose {condition}"
@@ -144,7 +149,7 @@ def changed(config: Config, default: Config) -> tuple[str, ...]:
     return tuple(name for name in names if getattr(config, name) != getattr(default, name))
 
 
-def _given(name: str, value: Any) -> str:
+def as_flag(name: str, value: Any) -> str:
     """Returns a setting as it stands on the command line."""
     if isinstance(value, bool):
         return flag(name) if value else flag(f"no_{name}")

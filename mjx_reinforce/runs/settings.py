@@ -155,9 +155,9 @@ class UpdateSettings:
     optimizer: Literal["adam", "adamw", "sgd"] = "adam"
     """The rule that turns a gradient into a step."""
     learning_rate: float = 1e-2
-    """Its learning rate at the start."""
+    """The learning rate of the optimizer at the start."""
     momentum: float = 0.9
-    """Adam's b1: how much of the last mean gradient the next one keeps."""
+    """Of adam, its b1: how much of the last mean gradient the next one keeps."""
     final_learning_rate: float | None = None
     """Learning rate after the decay, which is linear; a tenth of the first if not given."""
     decay_steps: int | Literal["budget"] | None = "budget"
@@ -255,3 +255,8 @@ GROUPS = {
     "checkpoints": CheckpointSettings,
     "logs": LogSettings,
 }
+#: The settings that --help alone shows: those that most runs change.
+MAIN = (
+    *("env", "env_steps", "minutes", "num_seeds", "output", "resume"),
+    *("estimator", "num_episodes", "learning_rate", "hidden_sizes"),
+)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mjx_reinforce.runs.command_line import check_resumed, join_groups, read_groups, start
+from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.processes import ProcessSettings
 from mjx_reinforce.runs.relevance import changed
@@ -12,13 +13,18 @@ from mjx_reinforce.runs.settings import GROUPS
 from mjx_reinforce.sweeps import grid
 from mjx_reinforce.sweeps.design import Design, SweepSettings, read_design
 
-_PROG = "python -m mjx_reinforce.sweep"
 _DESCRIPTION = (
     "Train many configurations, many seeds of each, side by side. Leaves sweep.json, results.csv "
     "(a row for each configuration and seed), curves.npz, report.html and policies/ (those of the "
     "best and the worst seed of each configuration) in the output directory. "
     "All settings of python -m mjx_reinforce.train may be given, with its presets, and most may be "
     "swept. Seed 3 of a configuration is seed 3 of train with these settings, up to rounding."
+)
+
+#: What --help alone shows.
+_MAIN = (
+    *("over", "search", "budget", "chunk_runs", "exact"),
+    *("env", "env_steps", "num_seeds", "output", "resume"),
 )
 
 
@@ -31,7 +37,7 @@ def parse(arguments: Sequence[str]) -> Design:
     Raises:
       ValueError: see ``runs.command_line.parse`` and ``grid.read_over``.
     """
-    default, preset, flags, prog = start(arguments, _PROG)
+    default, preset, flags, prog = start(arguments, command("sweep"))
     base, settings, processes = _read(flags, default, prog)
     if base.resume is None:
         return Design(
@@ -54,7 +60,7 @@ def _read(
 ) -> tuple[Config, SweepSettings, ProcessSettings]:
     """Returns the settings of the runs, of the sweep, and of its processes; --help exits."""
     groups = {"sweep": SweepSettings, "hosts": ProcessSettings, **GROUPS}
-    parsed = read_groups(groups, flags, default, prog, _DESCRIPTION)
+    parsed = read_groups(groups, flags, default, prog, _DESCRIPTION, _MAIN)
     settings, processes = parsed.pop("sweep"), parsed.pop("hosts")
     return join_groups(parsed), settings, processes
 

@@ -7,8 +7,11 @@ import typing
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
-from mjx_reinforce.registry import check_name
+from mjx_reinforce.checks import whole_number
+from mjx_reinforce.registry import check_name, nearest
+from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.config import Config, check, flag
+from mjx_reinforce.runs.hints import other_names
 from mjx_reinforce.runs.relevance import check_read
 
 #: Settings that a sweep has once, and why.
@@ -26,6 +29,8 @@ _ONCE = {
     **dict.fromkeys(("tensorboard", "wandb", "jsonl"), "its rows are in results.csv"),
 }
 
+_EXAMPLE = "such as --over learning-rate 1e-3 1e-2"
+
 
 def read_over(given: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
     """Returns the values of each setting from ``--over NAME VALUE VALUE ...``, in that order.
@@ -40,13 +45,23 @@ def read_over(given: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
     over: dict[str, list[Any]] = {}
     for words in given:
         if not words:
-            raise ValueError("--over needs the name of a setting and its values")
+            raise ValueError(f"--over needs a setting and its values, {_EXAMPLE}")
         name = words[0].removeprefix("--").replace("-", "_")
-        check_name("setting", name, hints)
+        if name not in hints:
+            raise ValueError(_unknown(words[0].removeprefix("--"), hints))
         if name in over:
             raise ValueError(f"--over {words[0]} is given twice: put all values behind one of them")
         over[name] = [_value(name, word, hints[name]) for word in words[1:]]
     return over
+
+
+def _unknown(word: str, names: Iterable[str]) -> str:
+    """Returns the message about a word that is no setting."""
+    meant = [flag[2:] for flag in other_names(f"--{word.replace('_', '-')}")]
+    known = [_spoken(name) for name in names]
+    near = next((each for each in meant if each in known), None) or nearest(word, known)
+    hint = f" Did you mean {near!r}?" if near else ""
+    return f"unknown setting {word!r} after --over.{hint} (--help all lists the settings.)"
 
 
 def grid(over: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
@@ -66,15 +81,15 @@ def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
             raise ValueError(f"{flag(name)} logs a run; leave it out: a sweep writes results.csv")
     if not over:
         raise ValueError(
-            "nothing is swept: give --over a setting and its values, or train with "
-            "python -m mjx_reinforce.train"
+            f"nothing is swept: give --over a setting and its values, {_EXAMPLE}, or train one "
+            f"configuration by {command('train')}"
         )
     for name, values in over.items():
         check_name("setting", name, {field.name: None for field in dataclasses.fields(Config)})
         if name in _ONCE:
             raise ValueError(f"a sweep cannot go over {_spoken(name)}: {_ONCE[name]}")
         if len(values) < 2:
-            one = f"; for one value pass {flag(name)}" if values else ""
+            one = f"; for one value pass {flag(name)}" if values else f", {_EXAMPLE}"
             raise ValueError(f"--over {_spoken(name)} needs two values or more{one}")
         twice = [x for i, x in enumerate(values) if x in values[:i]]
         if twice:
@@ -133,7 +148,10 @@ def _value(name: str, word: str, hint: Any) -> Any:
             return _as(kind, word)
         except ValueError:
             continue
-    raise ValueError(f"--over {_spoken(name)} has the value {word!r}, which is no {_kind(kinds)}")
+    spaces = "; write spaces between values" if "," in word else ""
+    raise ValueError(
+        f"--over {_spoken(name)} has the value {word!r}, which is no {_kind(kinds)}{spaces}"
+    )
 
 
 def _is_union(hint: Any) -> bool:
@@ -152,7 +170,7 @@ def _as(kind: Any, word: str) -> Any:
     if typing.get_origin(kind) is tuple:
         inner = typing.get_args(kind)[0]
         return tuple(_as(inner, part) for part in word.split(",")) if word != "none" else ()
-    return kind(word)
+    return whole_number(word) if kind is int else kind(word)
 
 
 def _no(word: str) -> Any:

@@ -2,12 +2,12 @@
 
 import contextlib
 import shlex
-import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.export.files import read_json, write_json
+from mjx_reinforce.runs.commands import command, typed
 from mjx_reinforce.runs.files import choose_directory, locked, prepare, versions
 from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
 from mjx_reinforce.runs.interrupt import Interrupt
@@ -16,6 +16,14 @@ from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.processes import Processes, joined
 from mjx_reinforce.runs.resume import check_same_program
 from mjx_reinforce.sweeps.design import Design, as_record, check_design, flat
+
+if TYPE_CHECKING:
+    from mjx_reinforce.report import Written
+
+#: Not every terminal has the page's quotation marks.
+_PLAIN_QUOTES = dict.fromkeys(
+    map(ord, "\N{LEFT DOUBLE QUOTATION MARK}\N{RIGHT DOUBLE QUOTATION MARK}"), '"'
+)
 
 
 def perform(
@@ -57,8 +65,8 @@ def _finish_again(directory: Path, known: Mapping[str, Any]) -> None:
     """Writes the report of a sweep that was stopped before it, if it was."""
     with locked(directory):
         if known.get("statistics_seconds") is None:
-            seconds = _report(directory)
-            write_json(directory / "sweep.json", {**known, "statistics_seconds": seconds})
+            written = _report(directory)
+            write_json(directory / "sweep.json", {**known, "statistics_seconds": written.seconds})
     print(f"the sweep in {directory} is finished")
 
 
@@ -114,11 +122,17 @@ def _perform(
         }
         if first:
             _finish(design, prepared, files, contents)
+            written = None
             if ended and report:
                 display.say("writing the report")
-                contents["statistics_seconds"] = _report(directory)
+                written = _report(directory)
+                contents["statistics_seconds"] = written.seconds
                 files.write(contents)
+                for sentence in written.answer:
+                    display.say(sentence.translate(_PLAIN_QUOTES))
             display.say(_ending(directory, contents))
+            if written is not None:
+                display.show_commands(_watch(directory, written.best, design.base.env))
     return ended
 
 
@@ -141,11 +155,11 @@ def _finish(design: Design, prepared: Any, files: Any, contents: dict[str, Any])
     files.write(contents)
 
 
-def _report(directory: Path) -> float:
-    """Writes the report of a sweep; returns how long that took (s)."""
+def _report(directory: Path) -> "Written":
+    """Writes the report of a sweep."""
     from mjx_reinforce import report
 
-    return report.write([directory], directory / "report.html")
+    return report.write_sweep(directory, directory / "report.html")
 
 
 def _contents(design: Design, prepared: Any, known: Mapping[str, Any]) -> dict[str, Any]:
@@ -168,7 +182,7 @@ def _contents(design: Design, prepared: Any, known: Mapping[str, Any]) -> dict[s
         "compile_seconds": known.get("compile_seconds", 0.0),
         "run_seconds": known.get("run_seconds", 0.0),
         "statistics_seconds": None,
-        "command": known.get("command", shlex.join(sys.argv)),
+        "command": known.get("command", typed("sweep")),
         **provenance(),
     }
 
@@ -181,6 +195,12 @@ def _check_same(directory: Path, known: Mapping[str, Any], present: Mapping[str,
         raise ValueError(
             f"{directory} was begun on {old} devices, and here are {new}; go on with as many"
         )
+
+
+def _watch(directory: Path, number: int, env: str) -> dict[str, str]:
+    """Returns the command that plays the best policy of a configuration, after what it does."""
+    place = shlex.quote(str(directory / "policies" / f"{number:03d}"))
+    return {"To see the best of it play": f"{command('watch')} {place}{env_flag(env)}"}
 
 
 def _ending(directory: Path, contents: Mapping[str, Any]) -> str:

@@ -62,22 +62,24 @@ def curves(labels: Sequence[str], threshold: float | None, end: float) -> Chart:
     return alt.layer(*layers, *threshold_line(threshold, "y"), height=_HEIGHT)
 
 
-def final(labels: Sequence[str], threshold: float | None) -> Chart:
-    """The final return of each configuration, a row each, best first.
+def final(
+    labels: Sequence[str], threshold: float | None, title: str = "return at the end"
+) -> Chart:
+    """The final return, or what the title says, of each configuration, a row each, best first.
 
     Data: ``final`` (configuration, place, value, low, high, tenth, ninetieth).
     """
     rows = alt.Chart(alt.NamedData("final"))
     y = alt.Y("place:Q", axis=None, scale=alt.Scale(domain=[len(labels) - 0.4, -0.6]))
-    x = alt.X("value:Q", title="return at the end", scale=alt.Scale(zero=False, padding=12))
+    x = alt.X("value:Q", title=title, scale=alt.Scale(zero=False, padding=12))
     colours = series(labels, legend=False)
     tips = [
         "configuration:N",
-        alt.Tooltip("value:Q", title="mean over seeds", format=",.1f"),
-        alt.Tooltip("low:Q", title="95 % from", format=",.1f"),
-        alt.Tooltip("high:Q", title="to", format=",.1f"),
-        alt.Tooltip("tenth:Q", title="a tenth of the seeds below", format=",.1f"),
-        alt.Tooltip("ninetieth:Q", title="a tenth above", format=",.1f"),
+        alt.Tooltip("value:Q", title="mean over seeds", format=",.4~g"),
+        alt.Tooltip("low:Q", title="95 % from", format=",.4~g"),
+        alt.Tooltip("high:Q", title="to", format=",.4~g"),
+        alt.Tooltip("tenth:Q", title="a tenth of the seeds below", format=",.4~g"),
+        alt.Tooltip("ninetieth:Q", title="a tenth above", format=",.4~g"),
     ]
     layers = [
         rows.mark_rule(strokeWidth=9, opacity=0.22, strokeCap="butt").encode(

@@ -10,13 +10,17 @@ from typing import Any, NamedTuple
 import jinja2
 from markupsafe import Markup
 
-from mjx_reinforce.reports.experiment import count, say, spoken
-from mjx_reinforce.reports.findings import COMPARED, Findings, Result
-from mjx_reinforce.reports.page import charts, palette, tables, vega, words
+from mjx_reinforce.reports.experiment import Experiment, count, say, spoken
+from mjx_reinforce.reports.film import Film
+from mjx_reinforce.reports.findings import Findings
+from mjx_reinforce.reports.page import charts, learning, palette, vega, words
+from mjx_reinforce.reports.page.citation import bibtex
 from mjx_reinforce.reports.page.columns import Table, short
 from mjx_reinforce.reports.page.distributions import moments
 from mjx_reinforce.reports.page.figures import SHOWN, Figure
-from mjx_reinforce.reports.page.words import interval, number, percent, steps
+from mjx_reinforce.reports.page.listings import Listing, key_figures, listings
+from mjx_reinforce.reports.page.listings import matrix as pairs_matrix
+from mjx_reinforce.reports.page.words import steps
 
 _FILES = resources.files("mjx_reinforce.reports.page") / "files"
 _METHODS = (
@@ -29,7 +33,12 @@ _METHODS = (
     "al. 2021, arXiv:2108.13264); a seed that is not finite is worse than every other.",
     "Env steps to solve are those of the first evaluation at or above the threshold; a seed that "
     "never got there is censored, not left out (Kaplan and Meier 1958).",
-    "Pairs are compared seed by seed, and p values corrected for their number (Holm 1979).",
+    "The times to solve are compared by the log-rank test on those curves (Mantel 1966). It takes "
+    "configurations for independent; where they have the same seeds, p is a little too large.",
+    "The return while training is the area under a seed's learning curve, by its width in env "
+    "steps.",
+    "Returns of pairs are compared seed by seed. The p values of each table are corrected for the "
+    "number of pairs (Holm 1979).",
     "Curves are read off, by linear interpolation, at the same env steps for all seeds, up to the "
     "end of the shortest.",
 )
@@ -48,6 +57,7 @@ def render(
     chart_tables: Mapping[str, Table],
     files: Mapping[str, str],
     watch: Watch,
+    film: Film | None,
     version: str,
     seconds: float,
 ) -> str:
@@ -59,34 +69,57 @@ def render(
       chart_tables: their data, by name.
       files: texts that can be downloaded, by name.
       watch: how to see the worst seed.
+      film: of a run, for its first screen.
       version: of this program.
       seconds: how long the report has taken so far.
     """
-    import vl_convert
-
-    loader = jinja2.Environment(
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        finalize=_unbroken,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    template = loader.from_string(_read("page.html"))
     content = {
         "labels": _labels(findings),
         "specs": {figure.name: figure.spec for figure in drawn},
         "tables": {**chart_tables, **vega.ONE},
         "moments": short(findings.grid[moments(findings)], 7),
         "files": files,
-        "row": charts.ROW,
-        "light": palette.LIGHT,
     }
-    return template.render(
+    return fill(
+        "page.html",
+        content,
         **_text(findings, drawn),
-        **_provenance(findings),
+        **provenance(findings.experiment),
         watch=watch,
-        files=[(name, _size(text)) for name, text in files.items()],
+        film=film,
         moments=content["moments"],
+        version=version,
+        seconds=seconds,
+    )
+
+
+def fill(
+    name: str, content: Mapping[str, Any], *, version: str, seconds: float, **text: Any
+) -> str:
+    """Returns the page that a template makes.
+
+    Args:
+      name: of the template.
+      content: what page.js draws: ``labels``, ``specs``, ``tables``, ``moments`` and ``files``.
+      version: of this program.
+      seconds: how long the report has taken so far.
+      text: what the template says.
+    """
+    import vl_convert
+
+    loader = jinja2.Environment(
+        loader=jinja2.FunctionLoader(_read),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        finalize=_unbroken,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return loader.get_template(name).render(
+        **text,
+        bibtex=bibtex(version),
+        date=f"{datetime.date.today():%d %B %Y}".lstrip("0"),
+        files=[(name, _size(text)) for name, text in content["files"].items()],
         version=version,
         seconds=f"{seconds:.1f} s",
         light=palette.LIGHT,
@@ -96,7 +129,7 @@ def render(
         css=Markup(_read("page.css")),
         script=Markup(_read("page.js")),
         vega_bundle=Markup(vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")),
-        content=Markup(_json(content)),
+        content=Markup(_json({**content, "row": charts.ROW, "light": palette.LIGHT})),
     )
 
 
@@ -137,10 +170,12 @@ def _text(findings: Findings, drawn: list[Figure]) -> dict[str, Any]:
     """Returns what the template says, but for where it comes from."""
     figures = {figure.name: figure for figure in drawn}
     sensitivity = [figure for figure in drawn if figure.name.startswith("sensitivity-")]
-    matrix = _matrix(findings)
+    listed, matrix = listings(findings), pairs_matrix(findings)
     contents = [
         *(("answer", "Answer"), ("distrust", "What to distrust"), ("results", "Results")),
-        *(("curves", "Learning curves"), ("distribution", "All seeds")),
+        *([("curves", "Learning curves")]),
+        *([("speed", "Who learns faster")] if "speed" in listed else []),
+        *([("distribution", "All seeds")]),
         *([("pairs", "Pair by pair")] if matrix else []),
         *([("settings", "Each setting")] if sensitivity else []),
         *(("worst", "The worst seeds"), ("source", "Where this comes from"), ("data", "Data")),
@@ -150,128 +185,33 @@ def _text(findings: Findings, drawn: list[Figure]) -> dict[str, Any]:
     return {
         "title": findings.experiment.title,
         "asked": findings.experiment.asked,
-        "date": datetime.date.today().strftime("%-d %B %Y"),
         "contents": contents,
-        "answer": words.answer(findings),
-        "key_figures": _key_figures(findings),
+        "answer": learning.answer(findings),
+        "key_figures": key_figures(findings),
         "distrust": words.distrust(findings),
         "figures": {name: figures.get(name) for name in names},
         "failures": failures,
-        "summary": _summary(findings),
         "labels": _labels(findings),
         "first_shown": SHOWN,
         "matrix": matrix,
         "pairs": count(len(findings.comparisons), "pair"),
         "level": words.LEVEL,
-        "against": _against(findings),
+        "listed": listed,
+        "until": steps(findings.learning.until),
+        "numbers": _numbers(listed),
         "sensitivity": sensitivity,
-        "worst": [_fate(findings, findings.results[0], s) for s in _worst(findings.results[0])],
-        "others_worst": [
-            _fate(findings, each, tables.worst_seeds(each)[0])
-            for each in findings.results[1:COMPARED]
-        ],
         "methods": _METHODS,
     }
 
 
-def _worst(result: Result) -> list[int]:
-    return tables.worst_seeds(result).tolist()
+def _numbers(listed: Mapping[str, Listing]) -> dict[str, int]:
+    """Returns the number on the page of each table; who beats whom stands before "against"."""
+    names = [x for name in listed for x in (["matrix"] if name == "against" else []) + [name]]
+    return {name: place for place, name in enumerate(names, start=1)}
 
 
-def _key_figures(findings: Findings) -> list[tuple[str, str, str]]:
-    """Returns the few numbers that stand out: name, value, what is below."""
-    best = findings.results[0]
-    seeds = sum(len(each.final) for each in findings.results)
-    ends = max(int(each.configuration.env_steps[-1].max()) for each in findings.results)
-    found = [
-        ("seeds trained", f"{seeds:,}", count(len(findings.results), "configuration")),
-        ("return of the best", number(best.mean.value), interval(best.mean)),
-    ]
-    if (solving := best.solving) is not None:
-        said = f"of {len(best.final):,}; {interval(solving.rate, percent)}"
-        found.append(("its seeds solved", f"{solving.at_end:,}", said))
-        until = steps(solving.median.value)
-        found.append(("env steps until half", until, interval(solving.median, steps)))
-    else:
-        found.append(("worst tenth", number(best.tail.value), interval(best.tail)))
-    found.append(("env steps a seed", f"{ends:,}", "at most"))
-    return found
-
-
-def _summary(findings: Findings) -> dict[str, Any]:
-    """Returns table 1."""
-    header = ["", "configuration", "seeds", "mean", "interquartile mean", "worst tenth"]
-    solving = findings.experiment.threshold is not None
-    if solving:
-        header += ["solved at the end", "steps until half solved", "fell back"]
-    header += ["not finite"]
-    listed = []
-    for each in findings.results:
-        cells = [(f"{len(each.final):,}", "")]
-        for estimate in (each.mean, each.iqm, each.tail):
-            cells.append((number(float(estimate.value)), interval(estimate)))
-        if each.solving is not None:
-            share = f"{each.solving.at_end:,} of {len(each.final):,}"
-            median = each.solving.median
-            cells.append((share, interval(each.solving.rate, percent)))
-            cells.append((steps(median.value), interval(median, steps)))
-            cells.append((f"{int(each.solving.fell.sum()):,}", ""))
-        cells.append((f"{sum(not math.isfinite(x) for x in each.final):,}", ""))
-        listed.append({"label": each.configuration.label, "cells": cells})
-    return {"header": header, "rows": listed}
-
-
-def _matrix(findings: Findings) -> list[dict[str, Any]]:
-    """Returns table 2: a row for each configuration, a cell for each, None on the diagonal."""
-    if not findings.comparisons:
-        return []
-    labels = _labels(findings)[:COMPARED]
-    cells: list[list[Any]] = [[None] * len(labels) for _ in labels]
-    for pair in findings.comparisons:
-        sure = pair.adjusted < words.LEVEL
-        for i, j, share in (
-            (pair.first, pair.second, float(pair.improvement.value)),
-            (pair.second, pair.first, 1 - float(pair.improvement.value)),
-        ):
-            cells[i][j] = {
-                "text": f"{100 * share:.0f}",
-                "sure": sure,
-                "tint": 0 if share >= 0.5 else 1,
-                "strength": f"{min(0.45, 0.9 * abs(share - 0.5)):.2f}",
-                "title": f"{labels[i]} against {labels[j]}: {percent(share)}; "
-                f"{words.p_value(pair.adjusted)}",
-            }
-    return [{"label": label, "cells": row} for label, row in zip(labels, cells, strict=True)]
-
-
-def _against(findings: Findings) -> list[dict[str, Any]]:
-    """Returns table 3."""
-    return [
-        {
-            "label": findings.results[pair.second].configuration.label,
-            "cells": [
-                (number(float(pair.difference.value)), interval(pair.difference)),
-                (percent(float(pair.improvement.value)), interval(pair.improvement, percent)),
-                (words.p_value(pair.p_value).removeprefix("p = ").removeprefix("p "), ""),
-                (words.p_value(pair.adjusted).removeprefix("p = ").removeprefix("p "), ""),
-            ],
-        }
-        for pair in words.of_best(findings)
-    ]
-
-
-def _fate(findings: Findings, result: Result, s: int) -> dict[str, Any]:
-    return {
-        "seed": int(result.configuration.seed[s]),
-        "label": result.configuration.label,
-        "value": number(float(result.final[s])) if math.isfinite(result.final[s]) else "not finite",
-        "fate": words.fate(findings, result, s),
-    }
-
-
-def _provenance(findings: Findings) -> dict[str, Any]:
+def provenance(experiment: Experiment) -> dict[str, Any]:
     """Returns where the numbers come from, as pairs of names and values."""
-    experiment = findings.experiment
     directories = list(dict.fromkeys(map(str, experiment.directories)))
     facts = [("read from", ", ".join(directories))]
     facts += [

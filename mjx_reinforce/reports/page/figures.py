@@ -6,11 +6,12 @@ from mjx_reinforce.reports.experiment import count, ordered, spoken
 from mjx_reinforce.reports.findings import Findings, swept, values_of
 from mjx_reinforce.reports.page import charts, tables
 from mjx_reinforce.reports.page.distributions import edges, moments
-from mjx_reinforce.reports.page.vega import specification
+from mjx_reinforce.reports.page.vega import renamed, specification
 from mjx_reinforce.reports.page.words import interval, number
 
 #: So many configurations are shown at first, the best.
 SHOWN = 4
+_SLIDER = " The dotted line is the slider's time below."
 
 
 class Figure(NamedTuple):
@@ -42,6 +43,25 @@ def figures(findings: Findings) -> list[Figure]:
     for build in (_final, _curves, _solved, _distribution, _profile, _sensitivity, _worst):
         built = build(findings, made[-1].number + 1 if made else 1)
         made += built
+    return made
+
+
+def of_task(findings: Findings, task: int, place: int) -> list[Figure]:
+    """Returns the figures of one of several tasks; their names, and their data's, end in -TASK."""
+    made = []
+    for build in (_curves, _solved):
+        for figure in build(findings, place + len(made)):
+            names = [*figure.tables, *figure.hidden]
+            made.append(
+                figure._replace(
+                    name=f"{figure.name}-{task}",
+                    title=f"{findings.experiment.env}: {figure.title[0].lower()}{figure.title[1:]}",
+                    caption=figure.caption.replace(_SLIDER, "").replace("table 1", "the table"),
+                    spec=renamed(figure.spec, {name: f"{name}-{task}" for name in names}),
+                    tables=[f"{name}-{task}" for name in figure.tables],
+                    listed=f"{figure.listed}-{task}",
+                )
+            )
     return made
 
 
@@ -94,7 +114,7 @@ def _curves(findings: Findings, place: int) -> list[Figure]:
             title="Learning curves",
             caption=(
                 "The interquartile mean over seeds of the return without exploration, and its 95 % "
-                f"bootstrap interval{drawn}. The dotted line is the slider's time below. Point at "
+                f"bootstrap interval{drawn}.{_SLIDER} Point at "
                 "a curve to read it."
             ),
             alt="Return over env steps, a line and a band for each configuration that is shown.",

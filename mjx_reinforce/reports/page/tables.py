@@ -6,9 +6,10 @@ from typing import Literal
 import numpy as np
 
 from mjx_reinforce.reports.experiment import ordered, say
-from mjx_reinforce.reports.findings import Findings, Result, swept, values_of
+from mjx_reinforce.reports.findings import Findings, swept, values_of
 from mjx_reinforce.reports.page.columns import Table, join, short
 from mjx_reinforce.reports.page.distributions import distributions
+from mjx_reinforce.reports.results import Result
 from mjx_reinforce.reports.statistics.profiles import performance_profile
 from mjx_reinforce.reports.statistics.survival import kaplan_meier
 
@@ -32,6 +33,15 @@ def chart_tables(findings: Findings) -> dict[str, Table]:
         "profile": _profile(findings),
         **worst_curves(findings),
         **{f"sensitivity-{n}": sensitivity(findings, s) for n, s in enumerate(swept(findings))},
+    }
+
+
+def task_tables(findings: Findings) -> dict[str, Table]:
+    """Returns the data of the charts that the page of several tasks shows of each task."""
+    return {
+        "curves": _curves(findings),
+        "seeds": _seeds(findings),
+        "solved": _solved(findings),
     }
 
 

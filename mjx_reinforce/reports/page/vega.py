@@ -1,7 +1,7 @@
 """What the report's charts share: their look, their scales, and how they are drawn."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import altair as alt
@@ -73,13 +73,31 @@ def specification(
     return spec | {"config": config(), "autosize": {"type": "fit-x", "contains": "padding"}}
 
 
-def draw(spec: dict[str, Any], datasets: dict[str, Any], title: str) -> bytes:
-    """Returns a specification and its data as a PNG file."""
+def draw(spec: dict[str, Any], datasets: dict[str, Any], title: str) -> dict[str, bytes]:
+    """Returns a specification and its data as pictures, by the endings of their files."""
     import vl_convert
 
     whole = spec | {"datasets": datasets, "width": 720, "background": "var(--paper)"}
     whole["title"] = {"text": title, "anchor": "start", "color": "var(--ink)", "offset": 14}
-    return vl_convert.vegalite_to_png(json.loads(in_light(json.dumps(whole))), scale=2)
+    svg = vl_convert.vegalite_to_svg(json.loads(in_light(json.dumps(whole))))
+    return {
+        "png": vl_convert.svg_to_png(svg, scale=2),
+        "svg": svg.encode(),
+        "pdf": vl_convert.svg_to_pdf(svg),
+    }
+
+
+def renamed(spec: Any, names: Mapping[str, str]) -> Any:
+    """Returns a specification whose data have other names."""
+    if isinstance(spec, list):
+        return [renamed(part, names) for part in spec]
+    if not isinstance(spec, dict):
+        return spec
+    found = {key: renamed(part, names) for key, part in spec.items()}
+    data = found.get("data")
+    if isinstance(data, dict) and data.get("name") in names:
+        found["data"] = data | {"name": names[data["name"]]}
+    return found
 
 
 def named(data: str) -> alt.Chart:

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.reports.experiment import count, ordered, say, spoken
-from mjx_reinforce.reports.findings import COMPARED, Findings, Result
+from mjx_reinforce.reports.findings import Findings
+from mjx_reinforce.reports.results import COMPARED, Result
 from mjx_reinforce.reports.statistics import Estimate
 from mjx_reinforce.reports.statistics.comparisons import Comparison
 
@@ -74,12 +75,30 @@ def _headline(findings: Findings) -> str:
     mean = f"a mean return of {number(best.mean.value)} (95 % interval {interval(best.mean)})"
     mean = mean.replace("(95 % interval no interval)", "(one seed, so there is no interval)")
     if len(findings.results) == 1:
-        return f"{count(len(best.final), 'seed')} of {env} ended with {mean}."
+        return _learned(findings, env, mean)
     name = best.configuration.label
     ties = unsure(findings)
     if not ties and findings.comparisons:
         return f"The best is {name}: it ended with {mean}."
     return f"The greatest mean is that of {name}, which ended with {mean}."
+
+
+def _learned(findings: Findings, env: str, mean: str) -> str:
+    """Returns what the seeds of one configuration learned."""
+    best = findings.results[0]
+    returns, at = best.configuration.eval_return, best.configuration.env_steps
+    seeds = count(len(best.final), "seed")
+    untrained = returns[0][np.isfinite(returns[0])]
+    if at[0].any() or not len(untrained) or len(returns) < 2:
+        return f"{seeds} of {env} ended with {mean}."
+    change = f"from {number(float(untrained.mean()))} before training to {mean}"
+    if best.solving is None or not best.solving.ever:
+        moved = "rose" if best.mean.value > untrained.mean() else "did not rise: it went"
+        return f"{seeds} of {env} were trained. The return {moved} {change}."
+    ever = "All" if best.solving.ever == len(best.final) else f"{best.solving.ever:,} of"
+    if len(best.final) == 1:
+        return f"{env} was learned: the return went {change}."
+    return f"{ever} {seeds} learned to solve {env}. The return went {change}."
 
 
 def _ahead(findings: Findings) -> Iterator[str]:
@@ -120,9 +139,10 @@ def _solving(findings: Findings) -> Iterator[str]:
         return
     solving, seeds = best.solving, len(best.final)
     fell = int(solving.fell.sum())
+    whose = "its " if len(findings.results) > 1 else ""
     kept = f"; {fell:,} had solved it and fell back" if fell else ""
     yield (
-        f"{solving.at_end:,} of its {count(seeds, 'seed')} solve the task at the end "
+        f"{solving.at_end:,} of {whose}{count(seeds, 'seed')} solve the task at the end "
         f"({percent(float(solving.rate.value))}, 95 % interval {interval(solving.rate, percent)}; "
         f"solved is a return of {number(findings.experiment.threshold or 0.0)}){kept}."
     )

@@ -1,4 +1,4 @@
-"""How many env steps seeds need to reach a threshold, where some never do; and who falls again."""
+"""How fast seeds learn: env steps to a threshold, where some never do, and areas under curves."""
 
 import warnings
 from typing import NamedTuple
@@ -137,6 +137,79 @@ def restricted_mean(
     error = np.sqrt(terms.sum() * num_seeds / (num_seeds - 1))
     half = float(stats.t.isf((1 - confidence) / 2, num_seeds - 1) * error)
     return Estimate(value, max(value - half, 0.0), min(value + half, until))
+
+
+class LogRank(NamedTuple):
+    """The log-rank test of two groups.
+
+    statistic: standard normal where both solve the task equally soon; above 0 where the first group
+      solves it sooner. 0 where no seed solves it, or all at the same env step.
+    p_value: two-sided.
+    """
+
+    statistic: float
+    p_value: float
+
+
+def log_rank(
+    steps: ArrayLike, solved: ArrayLike, other_steps: ArrayLike, other_solved: ArrayLike
+) -> LogRank:
+    """Tests whether two groups of seeds solve a task equally soon.
+
+    The test compares the whole Kaplan-Meier curves (Mantel 1966, Cancer Chemotherapy Reports 50;
+    Peto and Peto 1972), so that seeds that never solved the task count as censored. It takes the
+    groups for independent: where both have the same seeds, p is a little too large.
+
+    Args:
+      steps: [S] of one group, as for ``kaplan_meier``.
+      solved: [S] of the same.
+      other_steps: [S'] of the other.
+      other_solved: [S'] of the same.
+    """
+    groups = []
+    for some, done in ((steps, solved), (other_steps, other_solved)):
+        some, done = np.asarray(some, float), np.asarray(done, bool)
+        groups.append(stats.CensoredData(uncensored=some[done], right=some[~done]))
+    with np.errstate(invalid="ignore"):  # without a difference to see, the statistic is 0 / 0
+        test = stats.logrank(*groups)
+    known = np.isfinite(test.statistic)
+    return LogRank(float(test.statistic), float(test.pvalue)) if known else LogRank(0.0, 1.0)
+
+
+def combined(statistics: ArrayLike) -> float:
+    """Returns the p value, two-sided, of independent tests together (Stouffer et al. 1949).
+
+    Args:
+      statistics: [T] standard normal under the hypothesis, such as of ``log_rank`` on T tasks.
+    """
+    statistics = np.asarray(statistics, float)
+    return float(2 * stats.norm.sf(abs(statistics.sum()) / np.sqrt(len(statistics))))
+
+
+def mean_while_training(eval_return: np.ndarray, env_steps: np.ndarray, until: float) -> np.ndarray:
+    """Returns each seed's mean return over its training [S]: the area under its learning curve.
+
+    The curve is the straight lines between evaluations, and the area is divided by its width.
+
+    Args:
+      eval_return: [E, S] the return at each evaluation.
+      env_steps: [E, S] the env steps trained until then.
+      until: env steps at which the area ends; a curve that ends before counts up to its end.
+
+    Returns:
+      In the unit of the return; NaN where a return in the area is not finite.
+    """
+    means = []
+    for returns, steps in zip(eval_return.T, np.asarray(env_steps, float).T, strict=True):
+        moved = np.diff(steps, prepend=-1) > 0  # a seed that stands still keeps its value
+        returns, steps = returns[moved], steps[moved]
+        end = min(max(until, steps[0]), steps[-1])
+        inside = steps < end
+        at = np.append(steps[inside], end)
+        heights = np.append(returns[inside], np.interp(end, steps, returns))
+        width = at[-1] - at[0]
+        means.append(np.trapezoid(heights, at) / width if width else heights[0])
+    return np.array(means)
 
 
 def _half(steps: np.ndarray, share: np.ndarray) -> float:

@@ -112,7 +112,7 @@
     ? [Object.keys(listed[0]), ...listed.map(Object.values)].map((row) => row.map(quoted).join(","))
       .join("\n") + "\n"
     : "";
-  const savePicture = async (name) => {
+  const savePicture = async (name, kind) => {
     const light = content.light;
     const text = JSON.stringify(specs[name]).replace(/var\(--([\w-]+)\)/g, (_, key) => light[key]);
     const spec = {...JSON.parse(text), width: 720, background: light.paper};
@@ -122,8 +122,8 @@
     await set(made.view, name === "distribution"
       ? {...state(), height: Math.max(1, shown().length) * content.row} : state());
     const link = document.createElement("a");
-    link.download = `${name}.png`;
-    link.href = await made.view.toImageURL("png", 2);
+    link.download = `${name}.${kind}`;
+    link.href = await made.view.toImageURL(kind, 2);
     link.click();
     made.finalize();
   };
@@ -154,7 +154,9 @@
   each("[data-csv]", (button) => button.addEventListener("click", () =>
     save(`${button.dataset.csv}.csv`, csv(rows(button.dataset.csv)), "text/csv")));
   each("[data-png]", (button) => button.addEventListener("click", () =>
-    savePicture(button.dataset.png)));
+    savePicture(button.dataset.png, "png")));
+  each("[data-svg]", (button) => button.addEventListener("click", () =>
+    savePicture(button.dataset.svg, "svg")));
   each("[data-file]", (button) => button.addEventListener("click", () =>
     save(button.dataset.file, files[button.dataset.file], "text/csv")));
   const refill = () => each("details.data[open] .numbers", fill);

@@ -1,0 +1,143 @@
+"""Episodes as pictures: one, or several side by side, with their returns and the time in them."""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_reinforce.export.films import Renderer
+
+#: Frames a second at most: what a film shows, and what GIF viewers play.
+MAX_RATE = 30
+#: How long a push, which lasts a few frames, is drawn (s).
+_PUSH_SHOWN = 0.4
+#: Frames, spread over a film, whose colours it has.
+_SAMPLES = 4
+#: Heights of the strip that the words stand in, and of the words, in heights of the picture.
+_STRIP, _WORDS, _LEAST = 1 / 13, 1 / 19, 10
+_INK, _PAPER = (235, 240, 245), (28, 38, 48)
+
+
+class Take(NamedTuple):
+    """An episode to be filmed.
+
+    label: what is seen
+    model: what is drawn, an ``MjModel``
+    dt: the duration of an env step (s)
+    qpos: [L, nq] generalised positions (m, rad), the start's first
+    rewards: [T] of each env step
+    pushes: [T] the force along x in each env step (N), if there was one
+    pushed: the number of the body that it pushed
+    """
+
+    label: str
+    model: Any
+    dt: float
+    qpos: np.ndarray
+    rewards: np.ndarray
+    pushes: np.ndarray | None = None
+    pushed: int = 0
+
+
+class Film(NamedTuple):
+    """Pictures that are drawn when they are asked for.
+
+    rate: frames a second
+    length: how many frames
+    samples: numbers of frames that together show its colours
+    draw: number of the frame -> picture [height, width, 3] uint8
+    """
+
+    rate: float
+    length: int
+    samples: Sequence[int]
+    draw: Callable[[int], np.ndarray]
+
+
+def side_by_side(
+    takes: Sequence[Take],
+    width: int,
+    height: int,
+    *,
+    seconds: float,
+    columns: int | None = None,
+    max_rate: float = MAX_RATE,
+) -> Film:
+    """Returns a film of several takes that begin together; one that ends earlier stands still.
+
+    Args:
+      takes: one or more, of any models.
+      width: of each take (pixels).
+      height: of each take (pixels).
+      seconds: length at most (simulated s); it ends with the longest take.
+      columns: takes in a row; by default all.
+      max_rate: frames a second at most.
+
+    Raises:
+      ValueError: there is no take, or no OpenGL.
+    """
+    if not takes:
+        raise ValueError("a film needs at least one take")
+    columns = columns or len(takes)
+    dt = max(take.dt for take in takes)
+    interval = dt * max(1, math.ceil(1 / (dt * max_rate) - 1e-9))
+    lasting = max(min(len(take.qpos) * take.dt, seconds) for take in takes)
+    renderers = [Renderer(take.model, width, height) for take in takes]
+    blank = np.full((height, width, 3), _PAPER, np.uint8)
+
+    def draw(frame: int) -> np.ndarray:
+        pictures = [
+            _picture(take, renderer, frame * interval)
+            for take, renderer in zip(takes, renderers, strict=True)
+        ]
+        pictures += [blank] * (-len(pictures) % columns)
+        rows = [pictures[i : i + columns] for i in range(0, len(pictures), columns)]
+        return np.concatenate([np.concatenate(row, axis=1) for row in rows])
+
+    length = max(1, math.ceil(lasting / interval - 1e-6))
+    samples = [*range(0, length, -(-length // _SAMPLES))]
+    for take in takes:
+        if take.pushes is not None and take.pushes.any():
+            first = 1 + int(np.flatnonzero(take.pushes)[0])
+            samples.append(min(length - 1, math.ceil(first * take.dt / interval)))
+    return Film(1 / interval, length, samples, draw)
+
+
+def _picture(take: Take, renderer: Renderer, seconds: float) -> np.ndarray:
+    """Returns a take's picture at a time (s)."""
+    step = min(int(seconds / take.dt + 1e-6), len(take.qpos) - 1)
+    arrow = 0.0
+    if take.pushes is not None:
+        shown = take.pushes[max(0, step - round(_PUSH_SHOWN / take.dt)) : step]
+        arrow = float(shown[np.flatnonzero(shown)[-1]]) if shown.any() else 0.0
+    picture = renderer.draw(take.qpos[step], arrow, take.pushed)
+    total, time = np.sum(take.rewards[:step]), step * take.dt
+    earned = f"{total:,.0f}" if abs(total) >= 100 else f"{total:.1f}"
+    return caption(picture, take.label, f"return {earned}   {time:4.1f} s")
+
+
+def caption(picture: np.ndarray, left: str, right: str) -> np.ndarray:
+    """Returns a picture [H, W, 3] uint8 with a strip at its foot that says two things."""
+    from PIL import Image, ImageDraw
+
+    height, width = picture.shape[:2]
+    strip = max(_LEAST + 2, round(height * _STRIP))
+    font, small = (_font(max(_LEAST, round(height * x))) for x in (_WORDS, _WORDS * 0.8))
+    image = Image.fromarray(picture)
+    draw = ImageDraw.Draw(image)
+    if draw.textlength(left + right, font) > width - 3 * strip // 2:
+        font = small
+    middle = height - strip // 2
+    draw.rectangle((0, height - strip, width, height), fill=_PAPER)
+    draw.text((strip // 3, middle), left, fill=_INK, font=font, anchor="lm")
+    draw.text((width - strip // 3, middle), right, fill=_INK, font=font, anchor="rm")
+    return np.asarray(image)
+
+
+@functools.cache
+def _font(size: int) -> Any:
+    from PIL import ImageFont
+
+    return ImageFont.load_default(size)

@@ -1,0 +1,214 @@
+"""What a report says of how fast configurations learn, and of each setting on average."""
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from mjx_reinforce.reports.experiment import count, say, spoken
+from mjx_reinforce.reports.findings import Findings
+from mjx_reinforce.reports.learning import Level, fastest
+from mjx_reinforce.reports.page import words
+from mjx_reinforce.reports.page.words import LEVEL, interval, number, p_value, steps
+from mjx_reinforce.reports.results import COMPARED, Result
+
+#: The measures of a setting's effect, as the page calls them.
+MEASURES = {
+    "return": "return at the end",
+    "area": "return while training",
+    "steps": "env steps to solve",
+}
+
+
+def answer(findings: Findings) -> list[str]:
+    """Returns the page's answer: what was reached, and who got there faster.
+
+    Where the returns at the end cannot be told apart, and one configuration is surely the fastest,
+    that comes first.
+    """
+    said, first = words.answer(findings), soonest(findings)
+    tied = len(words.unsure(findings)) == len(findings.results[:COMPARED]) - 1
+    lead = []
+    if first is not None and tied:
+        lead = [f"Fastest is {first.configuration.label}; the returns at the end are a tie."]
+    return [*lead, *said, *sentences(findings)]
+
+
+def sentences(findings: Findings) -> list[str]:
+    """Returns who learns faster and how sure that is; nothing of one configuration."""
+    if not findings.comparisons:
+        return []
+    return [*_of_speed(findings), *_of_area(findings), *_of_levels(findings)]
+
+
+def soonest(findings: Findings) -> Result | None:
+    """Returns the configuration that surely solves the task sooner than all others, if one does."""
+    compared = findings.results[:COMPARED]
+    if not findings.learning.speeds:
+        return None
+    first = fastest(compared)
+    tests = [each for each in findings.learning.speeds if first in (each.first, each.second)]
+    return compared[first] if all(each.adjusted < LEVEL for each in tests) else None
+
+
+def _of_speed(findings: Findings) -> Iterator[str]:
+    compared, speeds = findings.results[:COMPARED], findings.learning.speeds
+    if not speeds or not any(each.solving.solved.any() for each in compared if each.solving):
+        return
+    first = fastest(compared)
+    tests = [each for each in speeds if first in (each.first, each.second)]
+    slower = [each for each in tests if each.adjusted < LEVEL]
+    pairs = count(len(speeds), "pair")
+    half = f": {_half(compared[first])}" if first else ""  # the best's is said already
+    yield f"The task is solved soonest by {compared[first].configuration.label}{half}."
+    if slower:
+        worst = p_value(max(each.adjusted for each in slower))
+        which = (
+            "each of the others" if len(slower) == len(tests) else f"{len(slower)} of the others"
+        )
+        which = f"the other, {_other(findings, first)}" if len(tests) == 1 else which
+        yield (
+            f"It is faster than {which} by the log-rank test ({worst}{_at_most(slower, worst)} "
+            f"after Holm's correction for {pairs})."
+        )
+    if len(slower) < len(tests):
+        unsure = [each for each in tests if each.adjusted >= LEVEL]
+        least = p_value(min(each.adjusted for each in unsure))
+        places = [each.second if each.first == first else each.first for each in unsure]
+        names = [f"“{compared[i].configuration.label}”" for i in places[:3]]
+        more = f" and {len(places) - 3} more" if len(places) > 3 else ""
+        yield (
+            f"The log-rank test does not tell its speed from that of {', '.join(names)}{more} "
+            f"({least}{'' if len(unsure) == 1 or least == 'p = 1' else ' or more'})."
+        )
+
+
+def _at_most(slower: Sequence[Any], worst: str) -> str:
+    return " or less" if len(slower) > 1 and not worst.startswith("p <") else ""
+
+
+def _other(findings: Findings, first: int) -> str:
+    (other,) = [each for i, each in enumerate(findings.results[:COMPARED]) if i != first]
+    return other.configuration.label
+
+
+def _half(result: Result) -> str:
+    solving = result.solving
+    if solving is None or math.isnan(solving.median.value):
+        return "fewer than half of its seeds solve it"
+    bounds = interval(solving.median, steps)
+    bounds = "" if bounds == "no interval" else f" (95 % interval {bounds})"
+    return f"half of its seeds have after {steps(solving.median.value)} env steps{bounds}"
+
+
+def _of_area(findings: Findings) -> Iterator[str]:
+    compared, pairs = findings.results[:COMPARED], findings.learning.areas
+    if not pairs:
+        return
+    order = sorted(range(len(compared)), key=lambda i: -float(compared[i].area.value))
+    first, second = order[:2]
+    pair = next(each for each in pairs if {each.first, each.second} == {first, second})
+    difference = pair.difference
+    low, high = float(difference.low), float(difference.high)
+    value = float(difference.value)
+    if pair.first == second:
+        value, low, high = -value, -high, -low
+    bounds = "" if math.isnan(low) else f"95 % interval {number(low)} to {number(high)}; "
+    yield (
+        f"Over the first {steps(findings.learning.until)} env steps of its training, "
+        f"{compared[first].configuration.label} has the greatest mean return, "
+        f"{number(float(compared[first].area.value))}: {number(value)} above the next, "
+        f"{compared[second].configuration.label} ({bounds}{p_value(pair.adjusted)} after Holm's "
+        "correction)."
+    )
+
+
+def _of_levels(findings: Findings) -> Iterator[str]:
+    """Yields the best value of each setting by the speed, or the area, and how sure it is."""
+    levels = findings.learning.levels
+    for setting in dict.fromkeys(each.setting for each in levels):
+        own = [each for each in levels if each.setting == setting]
+        measure = "steps" if "steps" in own[0].means else "area"
+        best = next(each for each in own if each.adjusted[measure] is None)
+        others = [float(each.adjusted[measure] or 0.0) for each in own if each is not best]
+        sure = sum(p < LEVEL for p in others)
+        what = "needs the fewest env steps to solve" if measure == "steps" else "learns most"
+        told = (
+            "all other values" if sure == len(others) else f"{sure} of {len(others)} other values"
+        )
+        told = "no other value" if not sure else told
+        yield (
+            f"Averaged over the other settings, {spoken(setting)} {say(best.value)} {what}; that "
+            f"is sure (p below {LEVEL}) against {told}."
+        )
+
+
+def speed_table(findings: Findings) -> dict[str, Any]:
+    """Returns the table of who learns faster: the fastest first, as ``document._summary``."""
+    compared = findings.results[:COMPARED]
+    if len(compared) < 2:
+        return {}
+    solving = findings.experiment.threshold is not None
+    header = ["", "configuration"]
+    if solving:
+        header += ["steps until half solved", "mean steps to solve", "log-rank p, Holm"]
+    header += ["return while training", "p of it, Holm"]
+    best_area = max(range(len(compared)), key=lambda i: float(compared[i].area.value))
+    order = sorted(range(len(compared)), key=lambda i: _slowness(compared[i]))
+    speeds = {frozenset((e.first, e.second)): e.adjusted for e in findings.learning.speeds}
+    areas = {frozenset((e.first, e.second)): e.adjusted for e in findings.learning.areas}
+    listed = []
+    for i in order:
+        each, cells = compared[i], []
+        if each.solving is not None:
+            median, mean = each.solving.median, each.solving.mean
+            cells.append((steps(median.value), interval(median, steps)))
+            cells.append((steps(float(mean.value)), interval(mean, steps)))
+            cells.append((_against(speeds, i, order[0], "fastest"), ""))
+        cells.append((number(float(each.area.value)), interval(each.area)))
+        cells.append((_against(areas, i, best_area, "greatest"), ""))
+        listed.append({"label": each.configuration.label, "cells": cells})
+    return {"header": header, "rows": listed}
+
+
+def _slowness(result: Result) -> float:
+    """Returns what orders results, fastest first: steps to solve, or else the falling area."""
+    return float(result.solving.mean.value if result.solving else -result.area.value)
+
+
+def _against(adjusted: dict[frozenset[int], float], i: int, best: int, said: str) -> str:
+    """Returns the p value of a result against the best, or what the best is."""
+    if i == best:
+        return said
+    pair = frozenset((i, best))
+    return short_p(adjusted[pair]) if pair in adjusted else "none"
+
+
+def short_p(value: float) -> str:
+    """Returns a p value without its name: "0.012", "< 0.001", "1"."""
+    return p_value(value).removeprefix("p = ").removeprefix("p ")
+
+
+def effects_table(findings: Findings) -> dict[str, Any]:
+    """Returns the table of main effects: a row for each value of each setting, or nothing."""
+    levels = findings.learning.levels
+    if not levels:
+        return {}
+    measures = list(levels[0].means)
+    header = ["setting", "averaged over"]
+    for measure in measures:
+        header += [MEASURES[measure], "p, Holm"]
+    listed = []
+    for level in levels:
+        cells = [(count(level.number, "configuration"), "")]
+        for measure in measures:
+            form = steps if measure == "steps" else number
+            estimate = level.means[measure]
+            cells.append((form(float(estimate.value)), interval(estimate, form)))
+            cells.append((_p_of(level, measure), ""))
+        listed.append({"label": f"{spoken(level.setting)} {say(level.value)}", "cells": cells})
+    return {"header": header, "rows": listed}
+
+
+def _p_of(level: Level, measure: str) -> str:
+    adjusted = level.adjusted[measure]
+    return "best" if adjusted is None else short_p(adjusted)

@@ -1,0 +1,134 @@
+"""The report's tables, as the page shows them and as LaTeX files hold them."""
+
+import math
+from typing import Any
+
+from mjx_reinforce.reports.experiment import count
+from mjx_reinforce.reports.findings import Findings
+from mjx_reinforce.reports.page import learning, tables, words
+from mjx_reinforce.reports.page.words import interval, number, percent, steps
+from mjx_reinforce.reports.results import COMPARED, Result
+
+#: A table: its ``header``, and ``rows`` of a ``label`` and ``cells``, pairs of a value and what
+#: stands below it. Where the header has a column more, the first is the rank of the row.
+Listing = dict[str, Any]
+
+
+def listings(findings: Findings) -> dict[str, Listing]:
+    """Returns the tables of a report by name, in the order of the page."""
+    found = {
+        "results": _results(findings),
+        "speed": learning.speed_table(findings),
+        "against": _against(findings),
+        "effects": learning.effects_table(findings),
+        "worst": _worst(findings),
+    }
+    return {name: listing for name, listing in found.items() if listing}
+
+
+def _worst(findings: Findings) -> Listing:
+    """Returns the fates of the best configuration's worst seeds and of the others' worst one."""
+    best, *others = findings.results
+    rows = [_fate(findings, best, s) for s in tables.worst_seeds(best).tolist()]
+    rows += [_fate(findings, each, tables.worst_seeds(each)[0]) for each in others[: COMPARED - 1]]
+    return {"header": ["configuration", "seed", "return at the end", "what happened"], "rows": rows}
+
+
+def key_figures(findings: Findings) -> list[tuple[str, str, str]]:
+    """Returns the few numbers that stand out: name, value, what is below."""
+    best = findings.results[0]
+    seeds = sum(len(each.final) for each in findings.results)
+    ends = max(int(each.configuration.env_steps[-1].max()) for each in findings.results)
+    found = [
+        ("seeds trained", f"{seeds:,}", count(len(findings.results), "configuration")),
+        (
+            "return of the best" if findings.comparisons else "mean return",
+            number(best.mean.value),
+            interval(best.mean),
+        ),
+    ]
+    if (solving := best.solving) is not None:
+        said = f"of {len(best.final):,}; {interval(solving.rate, percent)}"
+        found.append(("seeds that solve it", f"{solving.at_end:,}", said))
+        until = steps(solving.median.value)
+        found.append(("env steps until half", until, interval(solving.median, steps)))
+    else:
+        found.append(("worst tenth", number(best.tail.value), interval(best.tail)))
+    found.append(("env steps a seed", f"{ends:,}", "at most"))
+    return found
+
+
+def _results(findings: Findings) -> dict[str, Any]:
+    """Returns the table of all configurations."""
+    header = ["", "configuration", "seeds", "mean", "interquartile mean", "worst tenth"]
+    solving = findings.experiment.threshold is not None
+    if solving:
+        header += ["solved at the end", "steps until half solved", "fell back"]
+    header += ["not finite"]
+    listed = []
+    for each in findings.results:
+        cells = [(f"{len(each.final):,}", "")]
+        for estimate in (each.mean, each.iqm, each.tail):
+            cells.append((number(float(estimate.value)), interval(estimate)))
+        if each.solving is not None:
+            share = f"{each.solving.at_end:,} of {len(each.final):,}"
+            median = each.solving.median
+            cells.append((share, interval(each.solving.rate, percent)))
+            cells.append((steps(median.value), interval(median, steps)))
+            cells.append((f"{int(each.solving.fell.sum()):,}", ""))
+        cells.append((f"{sum(not math.isfinite(x) for x in each.final):,}", ""))
+        listed.append({"label": each.configuration.label, "cells": cells})
+    return {"header": header, "rows": listed}
+
+
+def matrix(findings: Findings) -> list[dict[str, Any]]:
+    """Returns who beats whom: a row and a cell for each configuration, None on the diagonal."""
+    if not findings.comparisons:
+        return []
+    labels = [each.configuration.label for each in findings.results[:COMPARED]]
+    cells: list[list[Any]] = [[None] * len(labels) for _ in labels]
+    for pair in findings.comparisons:
+        sure = pair.adjusted < words.LEVEL
+        for i, j, share in (
+            (pair.first, pair.second, float(pair.improvement.value)),
+            (pair.second, pair.first, 1 - float(pair.improvement.value)),
+        ):
+            cells[i][j] = {
+                "text": f"{100 * share:.0f}",
+                "sure": sure,
+                "tint": 0 if share >= 0.5 else 1,
+                "strength": f"{min(0.45, 0.9 * abs(share - 0.5)):.2f}",
+                "title": f"{labels[i]} against {labels[j]}: {percent(share)}; "
+                f"{words.p_value(pair.adjusted)}",
+            }
+    return [{"label": label, "cells": row} for label, row in zip(labels, cells, strict=True)]
+
+
+def _against(findings: Findings) -> Listing:
+    """Returns the comparisons of the best configuration with each other one."""
+    if not findings.comparisons:
+        return {}
+    listed = [
+        {
+            "label": findings.results[pair.second].configuration.label,
+            "cells": [
+                (number(float(pair.difference.value)), interval(pair.difference)),
+                (percent(float(pair.improvement.value)), interval(pair.improvement, percent)),
+                (learning.short_p(pair.p_value), ""),
+                (learning.short_p(pair.adjusted), ""),
+            ],
+        }
+        for pair in words.of_best(findings)
+    ]
+    header = ["against", "difference", "best is better", "p", "p, Holm"]
+    return {"header": header, "rows": listed}
+
+
+def _fate(findings: Findings, result: Result, s: int) -> dict[str, Any]:
+    final = float(result.final[s])
+    cells = [
+        (str(int(result.configuration.seed[s])), ""),
+        (number(final) if math.isfinite(final) else "not finite", ""),
+        (words.fate(findings, result, s), ""),
+    ]
+    return {"label": result.configuration.label, "cells": cells}

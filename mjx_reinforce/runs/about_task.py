@@ -1,0 +1,89 @@
+"""What a task is, for people: its sizes, its rules, its default settings, and how long it takes."""
+
+import inspect
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce import envs
+from mjx_reinforce.runs import measured, plan
+from mjx_reinforce.runs.commands import command
+from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.runs.relevance import as_flag, changed, is_read
+
+#: Settings of the defaults that a sentence of their own says.
+_SAID = ("env", "num_seeds", "env_steps")
+
+
+def about_task(id: str) -> str:
+    """Returns a page about a task, of paragraphs and lists.
+
+    Args:
+      id: of ours, or module:Class.
+
+    Raises:
+      ValueError: there is none, or it cannot be built.
+    """
+    env, config = envs.make(id), of_task(id)
+    doc = inspect.cleandoc(type(env).__doc__ or "").replace("``", "`")
+    said = (" ".join(paragraph.split()) for paragraph in doc.split("\n\n") if paragraph)
+    return "\n\n".join([id, _facts(id, env), *said, *_training(config)])
+
+
+def _facts(id: str, env: Any) -> str:
+    """Returns the sizes of a task, a line each."""
+    from mjx_reinforce.types import observation_size
+
+    known = measured.TASKS.get(id)
+    observation = observation_size(env) if known is None else known.observation
+    limit = getattr(env, "max_episode_steps", None)
+    threshold = getattr(env, "reward_threshold", None)
+    seconds = f", of {env.dt:g} s each" if hasattr(env, "dt") else ""
+    facts = {
+        "observation": f"{observation} numbers",
+        "action": _action(env),
+        "episode": f"at most {limit:,} env steps{seconds}" if limit else "give --horizon a number",
+        "solved": "the task names no return"
+        if threshold is None
+        else f"at a return of {threshold:,g}",
+    }
+    return "\n".join(f"  {name:11}  {fact}" for name, fact in facts.items())
+
+
+def _action(env: Any) -> str:
+    from mjx_reinforce.types import Discrete, action_space
+
+    space = action_space(env)
+    if isinstance(space, Discrete):
+        return f"one of {space.num_actions}"
+    bounds = np.unique(np.stack([space.low, space.high], axis=1), axis=0)
+    ranges = " or ".join(f"[{low:g}, {high:g}]" for low, high in bounds)
+    count = len(space.low)
+    return f"{count} number{'s' * (count > 1)} in {ranges}"
+
+
+def _training(config: Config) -> list[str]:
+    """Returns how to train on a task, how long that takes here, and with which settings."""
+    said = [
+        f"To train {config.num_seeds} seeds for {config.env_steps:,} env steps each:",
+        f"  {command('train')} --env {config.env}",
+        _time(config),
+    ]
+    differing = (name for name in changed(config, Config()) if name not in _SAID)
+    names = [name for name in differing if is_read(name, config)]
+    if names:
+        flags = "\n".join(f"  {as_flag(name, getattr(config, name))}" for name in names)
+        said.append(f"Its default settings, where other tasks have others:\n{flags}")
+    return said
+
+
+def _time(config: Config) -> str:
+    """Returns how long a run takes on this machine, as the run itself says."""
+    machine = plan.this_machine()
+    task, speed = measured.TASKS.get(config.env), machine.speeds.get(config.env)
+    if task is None or speed is None:
+        return f"How long that takes on {machine.name} is not known; --minutes M sets a time."
+    seconds, bounded = plan.run_seconds(config, task, machine, speed)
+    said = plan.said_time(speed.compiling, seconds, bounded)
+    return f"On {machine.name}: {said[0].lower()}{said[1:]}."

@@ -1,0 +1,44 @@
+"""The commands of ``mjx-reinforce``, and how a user calls them."""
+
+import shlex
+import sys
+from pathlib import Path
+
+SCRIPT = "mjx-reinforce"
+#: Command -> (the module whose ``main`` it is, what it does).
+COMMANDS = {
+    "train": ("mjx_reinforce.train", "train policies, many seeds at once"),
+    "watch": ("mjx_reinforce.watch", "make a film of a trained policy, by default of the last run"),
+    "sweep": ("mjx_reinforce.sweep", "train many configurations side by side, and compare them"),
+    "report": ("mjx_reinforce.report", "make a page of figures of runs and sweeps"),
+    "export": ("mjx_reinforce.export.__main__", "write a policy as NumPy or ONNX"),
+    "new": ("mjx_reinforce.new", "write the class of a task from a MuJoCo model"),
+    "envs": ("mjx_reinforce.envs.__main__", "list the tasks, or describe one"),
+}
+
+
+def command(name: str) -> str:
+    """Returns how to call a command, in the way in which this program was called."""
+    return f"{SCRIPT} {name}" if _by_script() else f"python -m mjx_reinforce.{name}"
+
+
+def typed(name: str) -> str:
+    """Returns the command line of this process, whose command it is, to be typed again."""
+    return f"{command(name)} {shlex.join(sys.argv[1:])}" if _by_script() else shlex.join(sys.argv)
+
+
+def _by_script() -> bool:
+    """Returns whether the script took the name of the command from the command line."""
+    called = Path(sys.argv[0])
+    return called.stem == SCRIPT or called.parts[-2:] == ("mjx_reinforce", "__main__.py")
+
+
+def menu(version: str) -> str:
+    """Returns what the script alone prints."""
+    width = max(map(len, COMMANDS))
+    lines = (f"  {SCRIPT} {name:{width}}  {line}" for name, (_, line) in COMMANDS.items())
+    return (
+        f"{SCRIPT} {version}: REINFORCE on MuJoCo, many seeds in one compiled program\n\n"
+        + "\n".join(lines)
+        + f"\n\nTo begin: {SCRIPT} train. For all about a command: {SCRIPT} COMMAND --help."
+    )

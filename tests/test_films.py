@@ -1,0 +1,264 @@
+"""Films of policies of the package, side by side and pushed, in C MuJoCo."""
+
+import dataclasses
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+from saved_runs import make_run
+
+from mjx_reinforce import envs, load, pretrained, watch
+from mjx_reinforce.envs import models
+from mjx_reinforce.envs.base import MujocoEnv
+from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.export import films, takes
+from mjx_reinforce.export.pretrained import FOLDER
+from mjx_reinforce.export.scenery import dress
+from mjx_reinforce.runs import mujoco_playing, playing
+
+ASSETS = sorted(path.name for path in (FOLDER.parents[2] / "envs" / "assets").glob("*.xml"))
+
+
+def pictures(path):
+    with Image.open(path) as film:
+        for i in range(film.n_frames):
+            film.seek(i)
+            yield np.asarray(film.convert("RGB"), float)
+
+
+def test_every_policy_of_the_package_is_of_its_task():
+    known = pretrained()
+    assert "HalfCheetah-v5" in known
+    for name, facts in known.items():
+        player = load(name)
+        assert player.env == facts["task"] == name
+        assert player.seed == facts["seed"]
+        action = player.act(np.zeros(player.observation_size))
+        assert np.isfinite(action).all()
+        low, high = facts["interval"]
+        assert low <= facts["return"] <= high
+        assert facts["command"].startswith(f"python -m mjx_reinforce.train --env {name} ")
+        assert facts["env_steps"] > 0 < facts["seconds"]
+        assert len(facts["git_commit"]) >= 40
+    files = [path for path in FOLDER.rglob("*") if path.is_file()]
+    assert {path.suffix for path in files} == {".json", ".npz"}
+    assert sum(path.stat().st_size for path in files) < 400_000
+
+
+@pytest.mark.parametrize("name", ["InvertedPendulum-v5", "HalfCheetah-v5"])
+def test_the_package_says_what_its_policies_earn(name):
+    """Of a few episodes, in another simulation than the one that measured it."""
+    facts, player = pretrained()[name], load(name)
+    play = mujoco_playing.mujoco_simulator(envs.make(name), player, facts["horizon"])
+    returns = [play(episode, False).total for episode in range(3)]
+    assert np.mean(returns) == pytest.approx(facts["return"], rel=0.1)
+
+
+def test_a_directory_of_a_tasks_name_goes_first(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make_run(tmp_path / "CartPole-v1")
+    assert load("CartPole-v1").seed == 1
+    monkeypatch.chdir(tmp_path.parent)
+    assert load("CartPole-v1").seed == pretrained()["CartPole-v1"]["seed"]
+
+
+@pytest.mark.parametrize("options", [{"seed": 1}, {"seed": "worst"}, {"which": "best"}])
+def test_there_is_one_policy_of_a_task(options):
+    with pytest.raises(ValueError, match="one policy for HalfCheetah-v5"):
+        load("HalfCheetah-v5", **options)
+
+
+def test_a_task_without_a_policy_is_named():
+    with pytest.raises(ValueError, match=r"HalfCheeta-v5 is no run .* comes with the package"):
+        load("HalfCheeta-v5")
+
+
+@pytest.mark.parametrize("name", ["InvertedPendulum-v5", "Reacher-v5"])
+def test_c_mujoco_plays_the_same_episode(name):
+    """Until rounding shows: float32 there, float64 here."""
+    player, env = load(name), envs.make(name)
+    ours = playing.simulator(env, player, 20)(3, False)
+    theirs = mujoco_playing.mujoco_simulator(env, player, 20)(3, False)
+    assert theirs.pushes is None
+    np.testing.assert_allclose(theirs.qpos, ours.qpos, atol=1e-4)
+    np.testing.assert_allclose(theirs.rewards, ours.rewards, atol=1e-4)
+
+
+def test_an_episode_in_c_mujoco_ends_as_the_task_says():
+    player, env = load("InvertedPendulum-v5"), envs.make("InvertedPendulum-v5")
+    standing = mujoco_playing.mujoco_simulator(env, player, 30)(0, False)
+    falling = mujoco_playing.mujoco_simulator(env, player, 1000, 400.0)(0, False)
+    assert len(standing.rewards) == 30 == len(standing.qpos) - 1
+    first = round(mujoco_playing.FIRST / env.dt)
+    assert first < len(falling.rewards) < first + 20
+    assert falling.rewards[-1] == 0
+    assert np.all(falling.pushes[:first] == 0)
+    assert np.any(falling.pushes[first:] == 400)
+
+
+def test_pushes_alternate():
+    at = [mujoco_playing.push_at(seconds, 7.0) for seconds in (0.0, 1.99, 2.05, 2.2, 5.05, 8.05)]
+    assert at == [0.0, 0.0, 7.0, 0.0, -7.0, 7.0]
+
+
+def test_a_pushed_policy_still_stands():
+    player, env = load("InvertedPendulum-v5"), envs.make("InvertedPendulum-v5")
+    assert env.mj_model.body(mujoco_playing.pushed_body(env.mj_model)).name == "pole"
+    calm, pushed = (
+        mujoco_playing.mujoco_simulator(env, player, 300, push)(0, False) for push in (0.0, 10.0)
+    )
+    assert len(calm.rewards) == len(pushed.rewards) == 300
+    assert np.ptp(pushed.qpos[100:, 0]) > 0.2 > 4 * np.ptp(calm.qpos[100:, 0])
+
+
+class Contacts(MujocoEnv):
+    """Reads what C MuJoCo keeps in an array whose size changes."""
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(MujocoEnv.Settings):
+        """Arguments of the task."""
+
+        xml_file: str = "hopper.xml"
+        frame_skip: int = 1
+        max_episode_steps: int = 5
+        reward_threshold: float | None = None
+
+    def initial(self, rng):
+        return jnp.asarray(self.mj_model.qpos0), jnp.zeros(self.mj_model.nv)
+
+    def outcome(self, before, data, action):
+        return jnp.sum(data.efc_force), False, {}
+
+
+class Stepping(Contacts):
+    """Has a step of its own."""
+
+    def step(self, state, action):
+        return state
+
+
+def test_what_c_mujoco_cannot_play_is_named():
+    with pytest.raises(ValueError, match="reads efc_force, whose size in MuJoCo changes"):
+        InMujoco(Contacts())
+    with pytest.raises(ValueError, match="Stepping has steps of its own"):
+        InMujoco(Stepping())
+    with pytest.raises(ValueError, match="CartPole has steps of its own"):
+        InMujoco(envs.make("CartPole-v1"))
+
+
+@pytest.mark.parametrize("replace", [False, True])
+@pytest.mark.parametrize("name", ASSETS)
+def test_scenery_moves_nothing(name, replace):
+    """The drawn model has the same positions, at the same places, and a floor and a sky."""
+    plain, drawn = models.load(name), dress(models.spec(name), replace=replace)
+    places = []
+    for model in (plain, drawn):
+        data = mujoco.MjData(model)
+        data.qpos[:] = plain.qpos0 + 0.1
+        mujoco.mj_forward(model, data)
+        places.append((data.xpos, data.xquat))
+    np.testing.assert_array_equal(places[0][0], places[1][0])
+    np.testing.assert_array_equal(places[0][1], places[1][1])
+    assert mujoco.mjtGeom.mjGEOM_PLANE in drawn.geom_type
+    assert mujoco.mjtTexture.mjTEXTURE_SKYBOX in drawn.tex_type
+
+
+def test_takes_stand_side_by_side(monkeypatch):
+    class Flat:
+        """Draws the first position as a shade."""
+
+        def __init__(self, model, width, height):
+            self.shape = height, width, 3
+
+        def draw(self, qpos, push, body):
+            return np.full(self.shape, qpos[0] + 100 * (push > 0), np.uint8)
+
+    monkeypatch.setattr(takes, "Renderer", Flat)
+    slow = takes.Take("slow", None, 0.1, np.arange(11.0)[:, None], np.ones(10))
+    quick = takes.Take("quick", None, 0.05, 50 + np.arange(9.0)[:, None], np.ones(8))
+    quick = quick._replace(pushes=np.array([0, 0, 0, 0, 9, 0, 0, 0.0]))
+    film = takes.side_by_side([slow, quick, slow], 40, 30, seconds=5.0, columns=2)
+    assert (film.rate, film.length) == (pytest.approx(10.0), 11)
+    shades = [[film.draw(i)[0, x] for x in (0, 40)] for i in range(film.length)]
+    assert [int(left[0]) for left, _ in shades] == [*range(11)]
+    # It ends after 0.4 s, and then stands still; the push of its fifth step shows from then on.
+    assert [int(right[0]) for _, right in shades] == [50, 52, 54, 156, *[158] * 7]
+    assert film.draw(0).shape == (60, 80, 3)
+    assert takes.side_by_side([slow], 40, 30, seconds=0.5).length == 5
+    assert set(film.samples) >= {0, 3}
+    with pytest.raises(ValueError, match="at least one take"):
+        takes.side_by_side([], 40, 30, seconds=1.0)
+
+
+def test_return_and_time_stand_in_the_picture(monkeypatch):
+    said = []
+    monkeypatch.setattr(takes, "caption", lambda picture, *words: said.append(words) or picture)
+    monkeypatch.setattr(takes, "Renderer", lambda *_: type("", (), {"draw": lambda *_: None})())
+    take = takes.Take("mine", None, 0.5, np.zeros((5, 1)), np.array([1.0, 2.0, 400.0, 1000.0]))
+    for step in range(5):
+        takes._picture(take, takes.Renderer(), 0.5 * step)
+    assert said[0] == ("mine", "return 0.0    0.0 s")
+    assert said[3:] == [("mine", "return 403    1.5 s"), ("mine", "return 1,403    2.0 s")]
+
+
+def test_a_small_gif_is_small_and_whole(tmp_path):
+    rng = np.random.default_rng(0)
+    still = rng.integers(0, 256, (40, 60, 3), np.uint8)
+    frames = [still.copy() for _ in range(6)]
+    for i, frame in enumerate(frames):
+        frame[:8, 8 * i : 8 * i + 8] = 255 * (i % 2)
+    path = tmp_path / "film.gif"
+    films.write_film(path, iter(frames), 10.0, frames[:2])
+    large = path.stat().st_size
+    shown = [*pictures(path)]
+    assert len(shown) == 6
+    for got, frame in zip(shown, frames, strict=True):  # what is transparent is what was there
+        assert np.abs(got - frame).mean() < 25
+        assert np.abs(got - frame)[:8, :48].max() < 120
+    films.write_small_gif(path, frames, 10.0, large - 1000)
+    assert path.stat().st_size <= large - 1000
+    assert len([*pictures(path)]) == 6
+    with pytest.raises(ValueError, match="make it shorter or smaller"):
+        films.write_small_gif(path, frames, 10.0, 100)
+
+
+def test_watch_plays_a_policy_of_the_package(tmp_path):
+    """From its name to a film of it before and after training; it draws, so in its own process."""
+    options = ["--beside", "untrained", "--push", "10", "--seconds", "3"]
+    options += ["--width", "120", "--height", "90"]
+    command = [sys.executable, "-m", "mjx_reinforce.watch", "InvertedPendulum-v5", *options]
+    ran = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path)
+    before, after, frames = (line for line in ran.stdout.splitlines() if line.strip())
+    assert before.startswith("InvertedPendulum-v5, untrained: return ")
+    assert after == (
+        "InvertedPendulum-v5, the package's policy: return 1000.0 in 1000 steps in mujoco"
+    )
+    assert frames == "75 frames in InvertedPendulum-v5.gif"
+    shown = [*pictures(tmp_path / "InvertedPendulum-v5.gif")]
+    assert shown[0].shape == (90, 240, 3)
+    assert np.abs(shown[48] - shown[54])[:, 120:].max() > 50  # the push moves it
+    sky = shown[0][2]
+    assert np.all(sky[:, 2] > sky[:, 0] + 10)
+
+
+def test_a_policy_of_the_package_has_no_other_seeds(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("an environment was built"))
+    for options in (["--seed", "worst"], ["--which", "best"], ["--beside", "2"]):
+        monkeypatch.setattr(sys, "argv", ["watch", "HalfCheetah-v5", *options])
+        with pytest.raises(SystemExit, match="2"):
+            watch.main()
+        assert "the package has one policy for HalfCheetah-v5" in capsys.readouterr().err
+
+
+def test_starts_are_those_of_the_environment():
+    env = envs.make("Hopper-v5")
+    key = jax.random.key(5)
+    simulation = InMujoco(env)
+    observation = simulation.reset(key)
+    np.testing.assert_allclose(observation, env.reset(key).obs, atol=1e-6)
