@@ -19,7 +19,7 @@ from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export import films, takes
 from mjx_reinforce.export.pretrained import FOLDER
 from mjx_reinforce.export.scenery import dress
-from mjx_reinforce.runs import mujoco_playing, playing
+from mjx_reinforce.runs import live, mujoco_playing, playing
 
 ASSETS = sorted(path.name for path in (FOLDER.parents[2] / "envs" / "assets").glob("*.xml"))
 
@@ -262,3 +262,42 @@ def test_starts_are_those_of_the_environment():
     simulation = InMujoco(env)
     observation = simulation.reset(key)
     np.testing.assert_allclose(observation, env.reset(key).obs, atol=1e-6)
+
+
+def test_live_plays_on_until_the_window_closes(monkeypatch, capsys):
+    """The window is made up: it shows where the bodies are, and its mouse pulls once."""
+    viewer = pytest.importorskip("mujoco.viewer")
+    seen = []
+
+    class Window:
+        perturb = mujoco.MjvPerturb()
+
+        def __init__(self, model, data, **_):
+            self.data = data
+            self.perturb.select, self.perturb.active = 1, 0
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            seen.append("closed")
+
+        def is_running(self):
+            return len(seen) < 120
+
+        def sync(self):
+            seen.append(self.data.qpos.copy())
+
+    monkeypatch.setattr(viewer, "launch_passive", Window)
+    monkeypatch.setattr(live.time, "sleep", lambda seconds: None)
+    env, player = envs.make("Reacher-v5"), load("Reacher-v5")
+    settings = watch.Settings("Reacher-v5", live=True, episode=3)
+    live.live(env, env.mj_model, player, 50, settings)
+    assert seen[-1] == "closed"
+    for number, first in ((3, 0), (4, 51)):
+        episode = mujoco_playing.mujoco_simulator(env, player, 50)(number, False)
+        np.testing.assert_array_equal(seen[first : first + 51], episode.qpos)
+        assert f"episode {number}: return {episode.total:.1f}\n" in capsys.readouterr().out or first
+    monkeypatch.setattr(viewer, "launch_passive", lambda *_, **__: 1 / 0)
+    with pytest.raises(ValueError, match="viewer does not open"):
+        live.live(env, env.mj_model, player, 50, settings)
