@@ -1,8 +1,8 @@
 """Budgets: those of the defaults, in time, and of runs that begin where others ended."""
 
 import dataclasses
-import math
 import json
+import math
 import re
 import sys
 
