@@ -1,8 +1,9 @@
-"""Your own robot: an arm that learns to reach for a ball, its MJCF in my_arm.xml.
+r"""Your own robot: an arm that learns to reach for a ball, its MJCF in my_arm.xml.
 
-Two commands in this folder, the first of half a minute on two cores, train it and film it:
+Two commands in this folder, the first of half a minute on two cores, train and film it:
 
-    python -m mjx_reinforce.train --env my_arm:Arm --num-episodes 64 --env-steps 2000000 --output arm
+    python -m mjx_reinforce.train --env my_arm:Arm --output arm --num-episodes 64 \
+        --env-steps 2000000
     python -m mjx_reinforce.watch arm --env my_arm:Arm --backend mujoco
 """
 
