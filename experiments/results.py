@@ -10,7 +10,7 @@ another machine: what the stages after ``train`` need of them, to be unpacked in
     python experiments/results.py play DIR          # DIR/play/TASK.csv, docs/films
     python experiments/results.py seconds DIR       # reads runs, DIR/NAME, that were given a time
     python experiments/results.py page DIR          # experiments/results, docs/results.md
-    python experiments/results.py readme            # README.md, its part on results
+    python experiments/results.py readme            # README.md, its table of results
     python experiments/results.py pretrained DIR    # the package's policies, of all runs in DIR
     python experiments/results.py films             # docs/films, of the package's policies
 
@@ -57,7 +57,7 @@ def main() -> None:
     play.add_argument("--episodes", type=int, default=100, help="of each policy, in both")
     films = commands.add_parser("films", help="of the package's policies, side by side")
     films.add_argument("--arm", type=Path, help="a run directory of my_arm:Arm, for arm.gif")
-    for command in (play, page, films):
+    for command in (play, page, films, readme):
         command.add_argument("--docs", type=Path, default=ROOT / "docs", help="of page and films")
     kept = ROOT / "experiments" / "results"
     for command in (clock, page, readme):
@@ -111,12 +111,14 @@ def _page(arguments: argparse.Namespace) -> int:
     import results_clock
     import results_files
     import results_page
+    import results_seconds
 
     if arguments.directory is not None:
         results_files.gather(TASKS.values(), arguments.directory, arguments.results)
     parts = results_files.load(TASKS.values(), arguments.results)
     clock = results_clock.sections(arguments.results, arguments.docs)
-    results_page.write(parts, arguments.docs, clock)
+    filmed = results_seconds.played(arguments.results)
+    results_page.write(parts, arguments.docs, clock, filmed)
     return 0
 
 
@@ -129,12 +131,11 @@ def _seconds(arguments: argparse.Namespace) -> int:
 
 
 def _readme(arguments: argparse.Namespace) -> int:
-    import results_files
     import results_readme
+    import results_seconds
 
-    parts = results_files.load(TASKS.values(), arguments.results)
-    results = [part for part in parts if isinstance(part, results_files.Result)]
-    results_readme.write(results, arguments.readme)
+    groups = results_seconds.load(arguments.results)
+    results_readme.write(groups, arguments.docs, arguments.readme)
     return 0
 
 

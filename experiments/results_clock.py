@@ -8,7 +8,7 @@ import numpy as np
 import results_seconds as kept
 from mjx_reinforce.reports.statistics.aggregates import interval
 from results_figures import panels
-from results_tables import estimate, number, seconds
+from results_tables import estimate, number, play_table, seconds
 from seeds_markdown import listed, table
 
 _PEERS = ("Stable-Baselines3 PPO", "Stable-Baselines3 SAC")
@@ -26,17 +26,26 @@ def sections(results: Path, docs: Path) -> list[str]:
     groups = kept.load(results)
     if not groups:
         return []
-    gpu, cpu = ([x for x in groups if _is_gpu(x.device) == wanted] for wanted in (True, False))
+    gpu, cpu = ([x for x in groups if is_gpu(x.device) == wanted] for wanted in (True, False))
     parts = ["## Against the clock", _words(groups)]
     if gpu:
         parts += [f"### On one {listed(dict.fromkeys(x.device for x in gpu))}", _gpu(gpu, docs)]
     if cpu:
         parts += ["### On two threads of a processor", _cpu_words(), _cpu(cpu, docs)]
     _draw(groups, results, docs)
-    return [*parts, "![Return against seconds of training](results/seconds.png)"]
+    parts.append("![Return against seconds of training](results/seconds.png)")
+    if played := kept.played(results):
+        films = {task: Path("films") / task for task in played}
+        words = (
+            "The best and the median seed of those runs by their last evaluation, without noise,\n"
+            "here and in plain Gymnasium, from starts that were used nowhere else:"
+        )
+        parts += ["### In Gymnasium, and films", words, play_table(played, films, docs)]
+    return parts
 
 
-def _is_gpu(device: str) -> bool:
+def is_gpu(device: str) -> bool:
+    """Returns whether a device, in words, is a GPU."""
     return "threads" not in device
 
 
@@ -134,7 +143,7 @@ def _draw(groups: Sequence[kept.Group], results: Path, docs: Path) -> None:
         for (name, device), curve in found.items():
             if name != task:
                 continue
-            colour = _COLOURS["GPU" if _is_gpu(device) else "CPU"]
+            colour = _COLOURS["GPU" if is_gpu(device) else "CPU"]
             ax.fill_between(curve["seconds"], curve["low"], curve["high"], color=colour, alpha=0.25)
             ax.plot(curve["seconds"], curve["mean"], color=colour)
         for algorithm, style in (("PPO", "--"), ("SAC", ":")):

@@ -197,8 +197,13 @@ def _load(task: Task, folder: Path) -> Result:
             folder / f"{task.name}-curve.csv", dict.fromkeys(_CURVE_COLUMNS, np.float64)
         ),
         moved=read_columns(moved, kinds) if moved.exists() else None,
-        played=read_columns(played, _PLAYED) if played.exists() else None,
+        played=read_played(played),
     )
+
+
+def read_played(path: Path) -> Columns | None:
+    """Returns the returns of episodes by column; None if there is no file."""
+    return read_columns(path, _PLAYED) if path.exists() else None
 
 
 def write_played(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:

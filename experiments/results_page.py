@@ -1,6 +1,6 @@
 """docs/results.md, with its pictures: every number and word of it follows from the small files."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import results_figures
@@ -19,13 +19,19 @@ _VERDICTS = {
 }
 
 
-def write(parts: Sequence[Result | Task], docs: Path, clock: Sequence[str] = ()) -> None:
+def write(
+    parts: Sequence[Result | Task],
+    docs: Path,
+    clock: Sequence[str] = (),
+    filmed: Collection[str] = (),
+) -> None:
     """Writes results.md, and its pictures into the folder results.
 
     Args:
       parts: what is kept of each task, or the task where nothing is.
       docs: the folder.
       clock: the sections on returns by seconds.
+      filmed: the tasks of which those sections have the films.
 
     Raises:
       ValueError: nothing is kept of any task.
@@ -34,10 +40,15 @@ def write(parts: Sequence[Result | Task], docs: Path, clock: Sequence[str] = ())
     if not results:
         raise ValueError("there is no result yet: run the stage train, then page DIR")
     results_figures.draw(results, docs / "results")
-    (docs / "results.md").write_text(page(parts, docs, clock), encoding="utf-8")
+    (docs / "results.md").write_text(page(parts, docs, clock, filmed), encoding="utf-8")
 
 
-def page(parts: Sequence[Result | Task], docs: Path, clock: Sequence[str] = ()) -> str:
+def page(
+    parts: Sequence[Result | Task],
+    docs: Path,
+    clock: Sequence[str] = (),
+    filmed: Collection[str] = (),
+) -> str:
     """Returns the page's text; films and pictures are linked where they are in ``docs``."""
     results = [part for part in parts if isinstance(part, Result)]
     sections = [
@@ -53,7 +64,7 @@ def page(parts: Sequence[Result | Task], docs: Path, clock: Sequence[str] = ()) 
         *_pendulum(results),
         "## Learning curves",
         "![Learning curves of every task](results/curves.png)",
-        *_played(results, docs),
+        *_played(results, docs, filmed),
         *_moved(results),
         "## How to do it again",
         _commands(results),
@@ -185,11 +196,12 @@ def _episodes(played: Sequence[Result]) -> str:
     return f"{most:,} episodes" + (f" ({', '.join(fewer)})" if fewer else "")
 
 
-def _played(results: Sequence[Result], docs: Path) -> list[str]:
+def _played(results: Sequence[Result], docs: Path, filmed: Collection[str]) -> list[str]:
+    """Returns the section; films of the tasks in ``filmed`` are of other runs."""
     played = [result for result in results if result.played is not None]
     if not played:
         return []
-    pairs = [tables.comparison(result, policy) for result in played for policy in POLICIES]
+    pairs = [tables.comparison(result.played, policy) for result in played for policy in POLICIES]
     found = [pair for pair in pairs if pair is not None]
     first = played[0].played
     assert first is not None
@@ -208,7 +220,9 @@ def _played(results: Sequence[Result], docs: Path) -> list[str]:
     )
     missing = [result.task.name for result in results if result.played is None]
     words += f" Not played yet: {listed(missing)}." if missing else ""
-    return ["## In Gymnasium, and films", words, tables.play_table(played, docs)]
+    columns = {x.task.name: x.played for x in played if x.played is not None}
+    films = {name: Path("films") / name for name in columns if name not in filmed}
+    return ["## In Gymnasium, and films", words, tables.play_table(columns, films, docs)]
 
 
 def _moved(results: Sequence[Result]) -> list[str]:

@@ -2,11 +2,13 @@
 
 ``gather`` reads directories of runs (DIR/ANY-NAME, each of ``mjx_reinforce.train``) and adds them
 to two small files: seconds.csv has a row for each seed, seconds-curves.csv the mean over the seeds
-of a task on a machine, at times on a logarithmic grid.
+of a task on a machine, at times on a logarithmic grid. What ``results.py play DIR`` played of them
+goes to seconds-play-TASK.csv.
 """
 
 import csv
 import itertools
+import shutil
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,10 +19,11 @@ from mjx_reinforce.export.files import read_json, write_bytes
 from mjx_reinforce.reports.run_source import read_columns, read_metrics
 from mjx_reinforce.reports.statistics.aggregates import interval
 from mjx_reinforce.runs.files import csv_bytes
+from results_files import Columns, read_played
 
 #: A budget of everybody (s).
 MINUTE = 60.0
-_SEEDS, _CURVES = "seconds.csv", "seconds-curves.csv"
+_SEEDS, _CURVES, _PLAYED = "seconds.csv", "seconds-curves.csv", "seconds-play-"
 _NUMBERS = ("minute", "final", "best", "seconds", "env_steps", "compile_seconds")
 _KEYS = ("task", "device", "root", "seed", "status", "commit")
 _CURVE_NUMBERS = ("seconds", "mean", "low", "high")
@@ -85,6 +88,8 @@ def gather(directory: Path, folder: Path) -> list[str]:
         returns.setdefault((known["task"], known["device"]), []).append((times, evaluated))
     _replace(folder / _SEEDS, (*_KEYS, *_NUMBERS), rows)
     _replace(folder / _CURVES, ("task", "device", *_CURVE_NUMBERS), list(_curve_rows(returns)))
+    for path in directory.glob("play/*.csv"):
+        shutil.copyfile(path, folder / f"{_PLAYED}{path.name}")
     return [f"{task} on {device}: {len(found)} runs" for (task, device), found in returns.items()]
 
 
@@ -163,6 +168,13 @@ def curves(folder: Path) -> dict[tuple[str, str], dict[str, np.ndarray]]:
         key: {name: np.array([float(row[name]) for row in rows]) for name in _CURVE_NUMBERS}
         for key, rows in found.items()
     }
+
+
+def played(folder: Path) -> dict[str, Columns]:
+    """Returns by task what was played of its runs."""
+    paths = {path.stem.removeprefix(_PLAYED): path for path in sorted(folder.glob(f"{_PLAYED}*"))}
+    found = {task: read_played(path) for task, path in paths.items()}
+    return {task: columns for task, columns in found.items() if columns is not None}
 
 
 def peers(path: Path) -> dict[tuple[str, str], dict[float, list[float]]]:

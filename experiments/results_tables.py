@@ -1,7 +1,7 @@
 """The tables of docs/results.md."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +10,7 @@ import numpy as np
 from mjx_reinforce.reports.experiment import spoken
 from mjx_reinforce.reports.statistics import Estimate
 from mjx_reinforce.reports.statistics.aggregates import interval
-from results_files import POLICIES, STAY_SOLVED, Result, tested_returns
+from results_files import POLICIES, STAY_SOLVED, Columns, Result, tested_returns
 from results_measures import (
     Comparison,
     compare,
@@ -59,13 +59,13 @@ def verdict_of(result: Result) -> str:
     return verdict(mean_of(result), result.task.published)
 
 
-def comparison(result: Result, policy: str) -> Comparison | None:
+def comparison(played: Columns | None, policy: str) -> Comparison | None:
     """Returns a policy's returns here and in Gymnasium, None if it was not played."""
-    if result.played is None:
+    if played is None:
         return None
-    chosen = result.played["policy"] == policy
-    ours = result.played["simulation"] == "ours"
-    returns = result.played["return"]
+    chosen = played["policy"] == policy
+    ours = played["simulation"] == "ours"
+    returns = played["return"]
     return compare(returns[chosen & ours], returns[chosen & ~ours])
 
 
@@ -91,7 +91,7 @@ def _result_row(result: Result) -> list[str]:
     if threshold is not None:
         solved = f"{int(np.sum(tested >= threshold)):,} of {len(tested):,} ({threshold:,g})"
     theirs = "none" if published is None else estimate(published_interval(*published))
-    played = [comparison(result, policy) for policy in POLICIES]
+    played = [comparison(result.played, policy) for policy in POLICIES]
     return [
         result.task.name,
         f"{len(tested):,}",
@@ -105,47 +105,6 @@ def _result_row(result: Result) -> list[str]:
         f"{seconds(facts['run_seconds'])}, {seconds(facts['compile_seconds'])}",
         machine(facts),
         ", ".join(number(one.gymnasium.value) for one in played if one) or "not played",
-    ]
-
-
-def readme_table(results: Sequence[Result]) -> str:
-    """Returns the table of README.md."""
-    header = ["task", "seeds", "env steps a seed", "ours", "worst seed"]
-    return table([*header, "Tianshou, 10 million steps"], map(_readme_row, results))
-
-
-def _readme_row(result: Result) -> list[str]:
-    tested, published = tested_returns(result), result.task.published
-    return [
-        result.task.name,
-        f"{len(tested):,}",
-        f"{result.facts['settings']['env_steps']:,}",
-        estimate(mean_of(result)),
-        number(worst(tested)),
-        "" if published is None else estimate(published_interval(*published)),
-    ]
-
-
-def readme_pendulum_table(results: Sequence[Result]) -> str:
-    """Returns the same as ``pendulum_table`` in fewer columns."""
-    limits, (start, stop) = " / ".join(f"{limit:,}" for limit in WITHIN), STAY_SOLVED
-    header = ["policy", f"solved within {limits} steps"]
-    header += [f"least share solved at once, {start:,} to {stop / 1e6:g} million"]
-    return table([*header, "median steps to solve", "training"], map(_readme_pendulum_row, results))
-
-
-def _readme_pendulum_row(result: Result) -> list[str]:
-    steps, sizes = result.seeds["env_steps_to_solve"], result.facts["settings"]["hidden_sizes"]
-    flags = " ".join(map(str, sizes))
-    shares = [percent(solved_within(steps, limit) / len(steps), 2) for limit in WITHIN]
-    return [
-        f"{' and '.join(map(str, sizes))} units (`--hidden-sizes {flags}`)"
-        if sizes
-        else "linear (the default)",
-        " / ".join(shares),
-        _least_share(result),
-        _steps(steps_quantile(steps, 0.5)),
-        seconds(result.facts["run_seconds"]),
     ]
 
 
@@ -185,18 +144,24 @@ def _steps(x: float) -> str:
     return f"{x:,.0f}" if math.isfinite(x) else "never"
 
 
-def play_table(results: Sequence[Result], docs: Path) -> str:
-    """Returns the returns of policies here and in Gymnasium, with links to films that exist."""
+def play_table(played: Mapping[str, Columns], films: Mapping[str, Path], docs: Path) -> str:
+    """Returns the returns of policies here and in Gymnasium, with links to films that exist.
+
+    Args:
+      played: by a name, what was played.
+      films: by that name, what the names of its films begin with, below ``docs``.
+      docs: the folder.
+    """
     rows = []
-    for result in results:
+    for name, columns in played.items():
         for policy in POLICIES:
-            if (found := comparison(result, policy)) is None or result.played is None:
+            if (found := comparison(columns, policy)) is None:
                 continue
-            film = Path("films") / f"{result.task.name}-{policy}.gif"
-            seed = result.played["seed"][result.played["policy"] == policy][0]
+            film = Path(f"{films.get(name, '')}-{policy}.gif")
+            seed = columns["seed"][columns["policy"] == policy][0]
             rows.append(
                 [
-                    *(result.task.name, f"{policy} ({seed})"),
+                    *(name, f"{policy} ({seed})"),
                     *map(estimate, (found.ours, found.gymnasium, found.difference)),
                     "yes" if found.within else "no",
                     f"[film]({film.as_posix()})" if (docs / film).exists() else "none",

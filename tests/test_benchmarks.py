@@ -49,7 +49,7 @@ def test_c_mujoco_stands_beside_its_own_precision_of_the_same_call():
     line = next(line for line in tables.cpu(raw).splitlines() if line.startswith("| Hopper"))
     cells = [cell.strip() for cell in line.split("|")[1:-1]]
     assert cells == ["Hopper-v5", "512 x 20", "2.00e6", "4.00e5", "1.00e5", "4.0", "20", ""]
-    sentence = " ".join(tables.readme(raw).splitlines()[-4:])
+    sentence = " ".join(tables.words(raw).splitlines())
     assert "4.0 (Hopper) to 4.0 (Hopper) times the speed of C MuJoCo in equal precision" in sentence
 
 

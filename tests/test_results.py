@@ -11,9 +11,7 @@ import pytest
 
 import results_files
 import results_page
-import results_readme
 import results_runs
-import results_tables
 import tuning
 from mjx_reinforce.export.files import read_json
 from mjx_reinforce.export.run_files import read_run
@@ -278,33 +276,6 @@ def test_what_is_packed_elsewhere_gives_the_same_page(kept, tmp_path):
     assert len(list((tmp_path / "again").iterdir())) == 6
 
 
-def test_the_part_of_the_readme_on_results(kept, tmp_path):
-    loaded = results_files.load(TASKS.values(), kept)
-    results = [part for part in loaded if isinstance(part, results_files.Result)]
-    readme = tmp_path / "README.md"
-    readme.write_text("Before.\n\n## Results\n\nold\n\nSolved is a return of 950 in an evaluation.")
-    results_readme.write(results, readme)
-    text = readme.read_text("utf-8")
-    assert text.startswith("Before.\n\n## Results\n\nWith the default")
-    assert text.endswith("\n\nSolved is a return of 950 in an evaluation.")
-    assert "old" not in text
-    words = " ".join(text.split())
-    assert "each of 16 to 256 episodes from starts of the seed's own, used nowhere else" in words
-    assert (
-        "Ours lie above theirs, intervals apart, in Reacher; not apart in InvertedPendulum;"
-        in words
-    )
-    assert "with 10 to 10 % of the env steps" in words
-    assert "(among 2,029 configurations for InvertedPendulum-v5, 9 to 42 for each of 8 " in words
-    ours = results_tables.estimate(results_tables.mean_of(results[0]))
-    row = f"| {PENDULUM.name} | 10 | 1,000,000 | {ours} | 490.0 | 1,000.0 (1,000.0 to 1,000.0) |\n"
-    assert row in text
-    assert " | -4.30 | -5.50 (-5.64 to -5.36) |\n" in text
-    assert "| linear (the default) | 0.00 % / 90.00 % | 90.00 % | 100,000 | 10.0 min |\n" in text
-    with pytest.raises(ValueError, match="has no part"):
-        results_readme.write(results, kept / f"{PENDULUM.name}.json")
-
-
 def test_results_from_before_seeds_had_starts_of_their_own_say_so(kept, tmp_path):
     path = kept / f"{REACHER.name}.json"
     facts = json.loads(path.read_text())
@@ -313,9 +284,6 @@ def test_results_from_before_seeds_had_starts_of_their_own_say_so(kept, tmp_path
     results = results_files.load((PENDULUM, REACHER), kept)
     said = "the choice of the starts out: "
     assert f"{said}{REACHER.name}.\n" in results_page.page(results, tmp_path)
-    assert "own (but for Reacher, whose seeds share theirs)" in " ".join(
-        results_readme.part(results).split()
-    )
 
 
 def test_the_page_without_sweeps_and_games(kept, tmp_path):

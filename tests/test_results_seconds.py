@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import results_clock
+import results_readme
 import results_seconds
 from mjx_reinforce.export.files import write_json
 
@@ -86,3 +87,20 @@ def test_the_page_sets_others_beside_ours(folder):
     assert "| 6.00 (5.00, 7.00) | 7.75 (6.50, 9.00) after 90.0 s | 3.00, 5.00 | not run |" in page
     assert (docs / "results" / "seconds.png").exists()
     assert results_clock.sections(folder / "nothing", docs) == []
+
+
+def test_the_table_of_the_readme(folder):
+    docs = folder / "docs"
+    docs.mkdir()
+    (docs / "published.csv").write_text(
+        "algorithm,implementation,task,mean,env_steps\nPPO,A,Hopper,3000.4,1000000\n"
+    )
+    readme = folder / "README.md"
+    readme.write_text("Before.\n<!-- results -->\nold\n<!-- end -->\nAfter.\n")
+    results_readme.write(results_seconds.load(folder / "kept"), docs, readme)
+    text = readme.read_text()
+    assert text.startswith("Before.\n<!-- results -->\n| task |")
+    assert "| Hopper-v5 | 6.0 | 6.0 | 16.0 in 90.0 s | 3,000 |\n" in text
+    assert "| Ant-v5 |  |  |  |  |\n" in text
+    assert text.endswith("<!-- end -->\nAfter.\n")
+    assert "old" not in text
