@@ -34,6 +34,8 @@ def sections(results: Path, docs: Path) -> list[str]:
         parts += ["### On two threads of a processor", _cpu_words(), _cpu(cpu, docs)]
     _draw(groups, results, docs)
     parts.append("![Return against seconds of training](results/seconds.png)")
+    if rows := [row for row in kept.noise(results) if is_gpu(row["device"])]:
+        parts += ["### How many episodes an update needs", _noise_words(), _noise(rows)]
     if played := kept.played(results):
         films = {task: Path("films") / task for task in played}
         words = (
@@ -119,6 +121,24 @@ def _cpu(groups: Sequence[kept.Group], docs: Path) -> str:
         )
     header = ["task", "on", "runs", "after a minute: median (worst, best)", "at the end"]
     return table([*header, "PPO: 1, 10 minutes", "SAC: 1, 10 minutes"], rows)
+
+
+def _noise_words() -> str:
+    return (
+        "The noise scale of the gradient, in episodes ([statistics.md](statistics.md)): with so many\n"
+        "an update has as much noise as signal. By quarters of the updates of the runs above, the\n"
+        "median over evaluations and seeds."
+    )
+
+
+def _noise(rows: Sequence[dict[str, str]]) -> str:
+    tasks: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        scale = float(row["episodes"]) / max(float(row["snr"]), 1e-9)
+        cell = f"{scale:,.0f}" if scale < 1e6 else "not seen"
+        tasks.setdefault((row["task"], row["episodes"]), []).append(cell)
+    header = ["task", "episodes an update", *(f"quarter {i + 1}" for i in range(kept.PARTS))]
+    return table(header, [[task, played, *cells] for (task, played), cells in tasks.items()])
 
 
 def _spread(values: np.ndarray) -> str:

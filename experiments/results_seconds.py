@@ -24,6 +24,9 @@ from results_files import Columns, read_played
 #: A budget of everybody (s).
 MINUTE = 60.0
 _SEEDS, _CURVES, _PLAYED = "seconds.csv", "seconds-curves.csv", "seconds-play-"
+_NOISE = "seconds-noise.csv"
+#: Parts of a run, by updates, over which the gradient's noise is summed up.
+PARTS = 4
 _NUMBERS = ("minute", "final", "best", "seconds", "env_steps", "compile_seconds")
 _KEYS = ("task", "device", "root", "seed", "status", "commit")
 _CURVE_NUMBERS = ("seconds", "mean", "low", "high")
@@ -61,6 +64,7 @@ def gather(directory: Path, folder: Path) -> list[str]:
       folder: of the small files. What they have of the same task and machine is replaced.
     """
     rows: list[dict[str, Any]] = []
+    noise: list[dict[str, Any]] = []
     returns: dict[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]] = {}
     for run in sorted(directory.iterdir()):
         if not (run / "summary.json").exists() or not (run / "metrics.csv").exists():
@@ -85,9 +89,11 @@ def gather(directory: Path, folder: Path) -> list[str]:
             known | {"seed": seed, "minute": a, "final": b, "best": c, "env_steps": d}
             for seed, (a, b, c, d) in enumerate(zip(minute, final, best, steps[-1], strict=True))
         ]
+        noise += _noise_rows(run / "metrics.csv", known, config["num_episodes"])
         returns.setdefault((known["task"], known["device"]), []).append((times, evaluated))
     _replace(folder / _SEEDS, (*_KEYS, *_NUMBERS), rows)
     _replace(folder / _CURVES, ("task", "device", *_CURVE_NUMBERS), list(_curve_rows(returns)))
+    _replace(folder / _NOISE, ("task", "device", "root", "episodes", "part", "snr"), noise)
     for path in directory.glob("play/*.csv"):
         shutil.copyfile(path, folder / f"{_PLAYED}{path.name}")
     return [f"{task} on {device}: {len(found)} runs" for (task, device), found in returns.items()]
@@ -99,6 +105,19 @@ def _evaluations(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     returns = found["eval_return"]
     seconds = read_columns(path, {"wall_seconds": np.float64})["wall_seconds"]
     return seconds[: returns.size].reshape(returns.shape)[:, 0], found["env_steps"], returns
+
+
+def _noise_rows(path: Path, known: dict[str, Any], episodes: int | str) -> list[dict[str, Any]]:
+    """Returns of each part of a run the median ``gradient_snr`` over evaluations and seeds."""
+    snr = [float(row["gradient_snr"]) for row in _read(path) if row.get("gradient_snr")]
+    shared = {name: known[name] for name in ("task", "device", "root")} | {"episodes": episodes}
+    parts = np.array_split(np.array(snr), PARTS) if len(snr) >= PARTS else []
+    return [shared | {"part": i, "snr": float(np.median(x))} for i, x in enumerate(parts)]
+
+
+def noise(folder: Path) -> list[dict[str, str]]:
+    """Returns the rows on the gradient's noise: ``episodes`` of an update, ``part``, ``snr``."""
+    return _read(folder / _NOISE)
 
 
 def _device(config: dict[str, Any]) -> str:
