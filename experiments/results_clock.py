@@ -125,9 +125,9 @@ def _cpu(groups: Sequence[kept.Group], docs: Path) -> str:
 
 def _noise_words() -> str:
     return (
-        "The noise scale of the gradient, in episodes ([statistics.md](statistics.md)): with so many\n"
-        "an update has as much noise as signal. By quarters of the updates of the runs above, the\n"
-        "median over evaluations and seeds."
+        "The noise scale of the gradient, in episodes ([statistics.md](statistics.md)): with so\n"
+        "many an update has as much noise as signal. By quarters of the updates of the runs\n"
+        "above, the median over evaluations and seeds."
     )
 
 

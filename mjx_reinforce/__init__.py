@@ -6,7 +6,42 @@ is loaded before an environment is made.
 """
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:  # what type checkers and editors read in place of __getattr__
+    from mjx_reinforce.engines.rollouts import rollout
+    from mjx_reinforce.export.player import Player, load
+    from mjx_reinforce.export.policy_files import load_policy, save_policy
+    from mjx_reinforce.export.pretrained import pretrained
+    from mjx_reinforce.learners.ars import ars
+    from mjx_reinforce.learners.estimators import (
+        Estimator,
+        discount_weights,
+        leave_one_out,
+        mean_log_prob,
+        normalized_returns,
+        reward_to_go,
+        shift_rewards,
+        standardize,
+        total_return,
+    )
+    from mjx_reinforce.learners.learner import Learner, TrainState, train_step
+    from mjx_reinforce.learners.natural_gradient import natural_gradient
+    from mjx_reinforce.learners.pace import AutoEpisodes
+    from mjx_reinforce.learners.reinforce import reinforce
+    from mjx_reinforce.learners.updates import each_step, full_batch, make_optimizer, minibatches
+    from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
+    from mjx_reinforce.policies.actor import Actor, act
+    from mjx_reinforce.policies.categorical import categorical
+    from mjx_reinforce.policies.clipped_normal import clipped_normal
+    from mjx_reinforce.policies.deterministic import deterministic
+    from mjx_reinforce.policies.distribution import Distribution
+    from mjx_reinforce.policies.normal import normal
+    from mjx_reinforce.policies.policy import Policy, mlp_policy
+    from mjx_reinforce.policies.tanh_normal import tanh_normal
+    from mjx_reinforce.policies.truncated_normal import truncated_normal
+    from mjx_reinforce.runs.evaluation import evaluate
+    from mjx_reinforce.types import Box, Discrete, Environment, Trajectory
 
 _HOME = {
     "Learner": "learners.learner",
@@ -62,7 +97,53 @@ _MODULES = (
 )
 
 __version__: str
-__all__ = [*_HOME, "__version__"]
+__all__ = [
+    "Actor",
+    "AutoEpisodes",
+    "Box",
+    "Discrete",
+    "Distribution",
+    "Environment",
+    "Estimator",
+    "Learner",
+    "Player",
+    "Policy",
+    "TrainState",
+    "Trajectory",
+    "__version__",
+    "act",
+    "ars",
+    "categorical",
+    "clipped_normal",
+    "deterministic",
+    "discount_weights",
+    "each_step",
+    "evaluate",
+    "full_batch",
+    "full_batch_value_baseline",
+    "leave_one_out",
+    "load",
+    "load_policy",
+    "make_optimizer",
+    "mean_log_prob",
+    "minibatches",
+    "mlp_policy",
+    "natural_gradient",
+    "normal",
+    "normalized_returns",
+    "pretrained",
+    "reinforce",
+    "reward_to_go",
+    "rollout",
+    "save_policy",
+    "shift_rewards",
+    "standardize",
+    "tanh_normal",
+    "total_return",
+    "train_step",
+    "truncated_normal",
+    "value_baseline",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from saved_runs import make_run
 
+import mjx_reinforce
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "mjx_reinforce"
 #: Folders and root modules from the ground up; a file imports from its own folder and those before.
@@ -109,6 +111,20 @@ def test_readme_python_runs(tmp_path):
     assert blocks
     code = "\n".join(blocks)
     subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, cwd=tmp_path)
+
+
+def test_type_checkers_see_the_public_names():
+    """What a checker imports is what is imported on first use, and all of it is public."""
+    tree = ast.parse((ROOT / "mjx_reinforce" / "__init__.py").read_text("utf-8"))
+    (checked,) = (node for node in tree.body if isinstance(node, ast.If))
+    seen = {
+        alias.name: node.module.removeprefix("mjx_reinforce.")
+        for node in checked.body
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    }
+    assert seen == mjx_reinforce._HOME
+    assert sorted(mjx_reinforce.__all__) == sorted([*seen, "__version__"])
 
 
 def test_slow_tests_are_tests():
