@@ -5,7 +5,9 @@ An environment is a ``brax.envs.base.Env`` whose ``reset`` and ``step`` call MJX
 directly. Nothing heavy is imported before ``make``.
 """
 
+import os
 import re
+import sys
 from collections.abc import Callable
 from typing import Any
 
@@ -76,6 +78,8 @@ def make(id: str, /, **kwargs: Any) -> Any:
 
 def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
     """Returns the class or function of an entry of the table, or of "module:Class"."""
+    if ":" in id and not {"", os.getcwd()} & set(sys.path):  # python -m has it, a script has not
+        sys.path.insert(0, os.getcwd())
     try:
         build = load(entry)
     except (Exception, SystemExit) as error:  # an import runs the user's code

@@ -11,6 +11,10 @@ from results_figures import panels
 from results_tables import estimate, number, play_table, seconds
 from seeds_markdown import listed, table
 
+#: Commit -> what its settings were that have changed since.
+_SINCE = {
+    "e6f8e08c5022": "since then Swimmer has shorter steps, and Pusher the natural gradient",
+}
 _PEERS = ("Stable-Baselines3 PPO", "Stable-Baselines3 SAC")
 #: Blue and vermilion for the machines, black and grey for others.
 _COLOURS = {"GPU": "#0072b2", "CPU": "#d55e00"}
@@ -52,14 +56,19 @@ def is_gpu(device: str) -> bool:
 
 
 def _words(groups: Sequence[kept.Group]) -> str:
-    roots = listed(dict.fromkeys(row["root"] for group in groups for row in group.rows))
+    rows = [row for group in groups for row in group.rows]
+    roots, commits = (
+        listed(dict.fromkeys(row[name] for row in rows)) for name in ("root", "commit")
+    )
+    changed = "".join(f"; {words}" for commit, words in _SINCE.items() if commit in commits)
     return (
-        "The settings are those that a budget of that size selects (`runs/defaults.py`). Time is\n"
-        "that of training with its evaluations, of all seeds together; compiling is apart. After\n"
-        "a minute: the last evaluation until then, of a run that goes on; a run that is given one\n"
-        "minute has faster schedules. At the end: episodes from starts that were used nowhere\n"
-        "else. There is no critic, no importance weight, no replayed step: an update is one\n"
-        "gradient of the episodes just played. No search used these seeds\n"
+        "The settings are those that a budget of that size selected (`runs/defaults.py`), at\n"
+        f"commit {commits}{changed}.\n"
+        "Time is that of training with its evaluations, of all seeds together; compiling is\n"
+        "apart. After a minute: the last evaluation until then. At the end: episodes from starts\n"
+        "that were used nowhere else; where a run was stopped, its last evaluation. There is no\n"
+        "critic, no importance weight, no replayed step: an update is one gradient of the\n"
+        "episodes just played. No search used these seeds\n"
         f"(roots {roots}).\n"
         "Published figures are the best of each algorithm in [published.csv](published.csv),\n"
         "whatever the version of the task, with the env steps of a seed."
@@ -78,7 +87,7 @@ def _gpu(groups: Sequence[kept.Group], docs: Path) -> str:
                 estimate(final),
                 number(group.final.min()),
                 number(group.final.max()),
-                seconds(group.seconds) + (" (stopped)" if group.stopped else ""),
+                seconds(group.seconds) + _stopped(group),
                 f"{group.env_steps:.2g}".replace("e+0", "e").replace("e+", "e"),
                 _published(docs, group.task, "PPO"),
                 _published(docs, group.task, "SAC"),
@@ -98,10 +107,10 @@ def _published(docs: Path, task: str, algorithm: str) -> str:
 
 def _cpu_words() -> str:
     return (
-        "One seed a run, with the default command. Beside it Stable-Baselines3 on Gymnasium's\n"
-        "tasks, one seed, after a minute and after ten, with the settings of its zoo\n"
-        "([peers.csv](peers.csv)), on two threads of the same processor as the rows of 2 of 32\n"
-        "threads."
+        "The default command with `--num-seeds 1`, a run for each root. Beside it, where it ran\n"
+        "on two threads of the same processor, Stable-Baselines3 on Gymnasium's tasks, after a\n"
+        "minute and after ten: one seed (the minute: two runs), with the settings of its zoo\n"
+        "([peers.csv](peers.csv))."
     )
 
 
@@ -115,8 +124,8 @@ def _cpu(groups: Sequence[kept.Group], docs: Path) -> str:
                 group.device,
                 str(len(group.final)),
                 _spread(group.minute),
-                f"{_spread(group.final)} after {seconds(group.seconds)}",
-                *(_peer(others.get((group.task, peer))) for peer in _PEERS),
+                f"{_spread(group.final)} after {seconds(group.seconds)}{_stopped(group)}",
+                *(_peer(others.get((group.task, peer, _threads(group.device)))) for peer in _PEERS),
             ]
         )
     header = ["task", "on", "runs", "after a minute: median (worst, best)", "at the end"]
@@ -139,6 +148,15 @@ def _noise(rows: Sequence[dict[str, str]]) -> str:
         tasks.setdefault((row["task"], row["episodes"]), []).append(cell)
     header = ["task", "episodes an update", *(f"quarter {i + 1}" for i in range(kept.PARTS))]
     return table(header, [[task, played, *cells] for (task, played), cells in tasks.items()])
+
+
+def _stopped(group: kept.Group) -> str:
+    return " (stopped)" if group.stopped else ""
+
+
+def _threads(words: str) -> str:
+    """Returns "2 of 32 threads" of a machine in words."""
+    return words.rpartition(", ")[2]
 
 
 def _spread(values: np.ndarray) -> str:
@@ -170,8 +188,10 @@ def _draw(groups: Sequence[kept.Group], results: Path, docs: Path) -> None:
             if best := kept.published(docs / "published.csv", task, algorithm):
                 ax.axhline(best.mean, color="black", linestyle=style, linewidth=1)
         for peer, marker in zip(_PEERS, ("o", "s"), strict=True):
-            for at, values in others.get((task, peer), {}).items():
-                ax.plot(at, np.mean(values), marker, color="#777777", markersize=5)
+            for (name, other, _), budgets in others.items():
+                if (name, other) == (task, peer):
+                    means = [np.mean(values) for values in budgets.values()]
+                    ax.plot(list(budgets), means, marker, color="#777777", markersize=5)
         ax.set(title=task, xscale="log", xlabel="seconds of training")
     axes[0].set_ylabel("return without noise")
     figure.legend(*_legend(), loc="outside lower center", ncols=6, frameon=False)

@@ -196,11 +196,12 @@ def played(folder: Path) -> dict[str, Columns]:
     return {task: columns for task, columns in found.items() if columns is not None}
 
 
-def peers(path: Path) -> dict[tuple[str, str], dict[float, list[float]]]:
-    """Returns by task and peer, by budget (s), the mean return of each of its runs."""
-    found: dict[tuple[str, str], dict[float, list[float]]] = {}
+def peers(path: Path) -> dict[tuple[str, str, str], dict[float, list[float]]]:
+    """Returns by task, peer and threads, by budget (s), the mean return of each of its runs."""
+    found: dict[tuple[str, str, str], dict[float, list[float]]] = {}
     for row in _read(path):
-        budgets = found.setdefault((row["task"], row["peer"]), {})
+        threads = row["machine"].rpartition(", ")[2]
+        budgets = found.setdefault((row["task"], row["peer"], threads), {})
         budgets.setdefault(float(row["budget_seconds"]), []).append(float(row["mean_return"]))
     return found
 

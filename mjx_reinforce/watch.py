@@ -215,7 +215,8 @@ def check(settings: Settings, source: Source) -> Path:
     if output.suffix.lower() not in (".gif", ".mp4"):
         raise ValueError(f"{output} is no film; end --output in .gif or .mp4")
     if not (output.parent.is_dir() and os.access(output.parent, os.W_OK)):
-        raise ValueError(f"cannot write to {output.parent}; choose another --output")
+        missing = "" if output.parent.exists() else ", which does not exist"
+        raise ValueError(f"cannot write to {output.parent}{missing}; choose another --output")
     if output.is_dir() or (output.exists() and not settings.overwrite):
         raise ValueError(f"{output} exists; pass --overwrite or another --output")
     if output.suffix.lower() == ".mp4":

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -291,3 +292,18 @@ def test_a_mistake_gets_the_remedy(call, typed):
     assert err.startswith("error: ")
     assert err.count("\n") == 1
     assert MISTAKES[typed] in err
+
+
+def test_a_script_sees_modules_of_the_current_folder():
+    """Python leaves that folder out for scripts, as -P does for modules."""
+    place = Path(__file__).parents[1]
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "mjx_reinforce.envs", "my_arm:Arm"],
+        cwd=place / "experiments",
+        env=os.environ | {"PYTHONPATH": str(place)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "action       3 numbers" in done.stdout

@@ -123,6 +123,14 @@ def test_names_in_files_stay_text(tmp_path, monkeypatch):
     assert name == import_file(run / "seed_1.py").ENVIRONMENT
 
 
+def test_a_policy_of_the_package_can_be_exported(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run_export(monkeypatch, "Swimmer-v5", "--to", "numpy")
+    observation = np.linspace(-1, 1, 8)
+    theirs = import_file(tmp_path / "Swimmer_v5.py").act(observation)
+    np.testing.assert_allclose(theirs, load("Swimmer-v5").act(observation), atol=2e-6)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

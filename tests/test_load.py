@@ -293,3 +293,13 @@ def test_a_policy_file_without_a_checksum_is_read(tmp_path):
     change_arrays(tmp_path / "policy" / "actor.npz", checksum=None)
     change(tmp_path / "policy" / "policy.json", rescale=False)
     assert load(tmp_path).seed == 1
+
+
+def test_what_somebody_meant_is_named(tmp_path):
+    with pytest.raises(
+        ValueError, match=r"Did you mean 'Hopper-v5'\? Policies of the package: Ant"
+    ):
+        load("Hoper-v5")
+    (tmp_path / "sweep.json").write_text("{}")
+    with pytest.raises(ValueError, match="is a sweep: name the policies of one of its config"):
+        load(tmp_path)

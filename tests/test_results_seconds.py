@@ -15,7 +15,7 @@ CPU = {"device": "cpu", "cpu": "zen, 8 lanes", "cores": 2, "cpu_count": 8, "git_
 def _run(place, config, times, returns, status="finished", test=None):
     """Makes a run up whose evaluations [E, S] were at so many seconds [E]."""
     place.mkdir(parents=True)
-    write_json(place / "config.json", {"env": "Hopper-v5", "seed": 7} | config)
+    write_json(place / "config.json", {"env": "Hopper-v5", "seed": 7, "num_episodes": 16} | config)
     summary = {"status": status, "compile_seconds": 3.0}
     write_json(place / "summary.json", summary | ({"final_test_returns": test} if test else {}))
     lines = ["seed,env_steps,wall_seconds,eval_return"]
@@ -77,14 +77,19 @@ def test_the_page_sets_others_beside_ours(folder):
         "PPO,A,Hopper,10,1000000\nPPO (asynchronous),B,Hopper,12,3000000\nSAC,C,Ant,1,1\n"
     )
     (docs / "peers.csv").write_text(
-        "task,peer,budget_seconds,mean_return\n"
-        "Hopper-v5,Stable-Baselines3 PPO,60,2\nHopper-v5,Stable-Baselines3 PPO,60,4\n"
-        "Hopper-v5,Stable-Baselines3 PPO,600,5\n"
+        "task,peer,machine,budget_seconds,mean_return\n"
+        'Hopper-v5,Stable-Baselines3 PPO,"z, 2 of 8 threads",60,2\n'
+        'Hopper-v5,Stable-Baselines3 PPO,"z, 2 of 8 threads",60,4\n'
+        'Hopper-v5,Stable-Baselines3 PPO,"z, 2 of 8 threads",600,5\n'
+        'Hopper-v5,Stable-Baselines3 SAC,"other, 4 of 8 threads",60,9\n'
     )
     page = "\n\n".join(results_clock.sections(folder / "kept", docs))
     assert "| Hopper-v5 | 2 | 6.00, 4.00 | 16.0 (" in page
     assert "| 12.0 (B, 3 million) | none |" in page
-    assert "| 6.00 (5.00, 7.00) | 7.75 (6.50, 9.00) after 90.0 s | 3.00, 5.00 | not run |" in page
+    assert (
+        "| 6.00 (5.00, 7.00) | 7.75 (6.50, 9.00) after 90.0 s (stopped) | 3.00, 5.00 | not run |"
+        in page
+    )
     assert (docs / "results" / "seconds.png").exists()
     assert results_clock.sections(folder / "nothing", docs) == []
 

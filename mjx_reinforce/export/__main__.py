@@ -9,6 +9,7 @@ from typing import Literal
 
 import tyro
 
+from mjx_reinforce.export.pretrained import is_pretrained
 from mjx_reinforce.export.run_files import Seed, Which, read_run
 from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.flags import one_line_errors, read
@@ -20,7 +21,7 @@ class Settings:
     """Write the deterministic action of a trained policy as a file that needs no JAX."""
 
     run: tyro.conf.Positional[Path]
-    """The run directory that training left."""
+    """The run directory that training left, or a task whose policy comes with the package."""
     to: Literal["numpy", "onnx"]
     """"numpy": an archive .npz and a short .py beside it that needs NumPy alone. "onnx": a model
     from observation, float32 [N, O], to action [N, A]; needs pip install onnx."""
@@ -29,7 +30,8 @@ class Settings:
     which: Which = "last"
     """The policy at the end of training, or the one that did best on the way, if it was kept."""
     output: Path | None = None
-    """The file, .npz or .onnx. By default seed_NUMBER in the run directory."""
+    """The file, .npz or .onnx. By default seed_NUMBER in the run directory; of a policy of the
+    package, the name of its task in the current folder."""
     overwrite: bool = False
     """Replace files that exist."""
 
@@ -50,14 +52,15 @@ def export(settings: Settings) -> list[Path]:
       ValueError: a setting is out of range, the run is damaged, or a package is missing.
       OSError: a file cannot be written.
     """
-    run = read_run(settings.run)
+    if not is_pretrained(settings.run):
+        read_run(settings.run)
     from mjx_reinforce.export.arithmetic import arithmetic
     from mjx_reinforce.export.files import write_arrays, write_bytes
     from mjx_reinforce.export.numpy_source import numpy_source
     from mjx_reinforce.export.onnx_model import import_onnx, onnx_model
-    from mjx_reinforce.export.player import load_seed
+    from mjx_reinforce.export.player import load_saved
 
-    player, saved = load_seed(run, settings.seed, settings.which)
+    player, saved = load_saved(settings.run, settings.seed, settings.which)
     outputs = check(settings, player.seed)
     if settings.to == "onnx":
         import_onnx()
@@ -78,7 +81,9 @@ def check(settings: Settings, seed: int) -> list[Path]:
       ValueError: their name does not fit, they exist, or they cannot be written.
     """
     suffix = {"numpy": ".npz", "onnx": ".onnx"}[settings.to]
-    output = settings.output or settings.run / f"seed_{seed}{suffix}"
+    in_run = settings.run / f"seed_{seed}{suffix}"
+    of_package = Path(str(settings.run).replace("-", "_") + suffix)
+    output = settings.output or (of_package if is_pretrained(settings.run) else in_run)
     if output.suffix != suffix:
         raise ValueError(f"--to {settings.to} writes {suffix}, got --output {output}")
     if not (output.parent.is_dir() and os.access(output.parent, os.W_OK)):

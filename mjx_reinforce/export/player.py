@@ -90,21 +90,30 @@ def load(run: str | Path, seed: Seed = "best", *, which: Which = "last") -> Play
     Raises:
       ValueError: there is no such run, task or seed, the run has not ended, or a file is damaged.
     """
+    return load_saved(run, seed, which)[0]
+
+
+def load_saved(
+    run: str | Path, seed: Seed = "best", which: Which = "last"
+) -> tuple[Player, SavedPolicy]:
+    """Loads a policy, as ``load``, with what its files say."""
     check_type("run", run, str | Path)
     if is_pretrained(run):
         return load_pretrained(str(run), seed, which)
-    return load_seed(read_run(run), seed, which)[0]
+    return load_seed(read_run(run), seed, which)
 
 
-def load_pretrained(name: str, seed: Seed = "best", which: Which = "last") -> Player:
-    """Loads the policy for a task that comes with the package, as ``load``."""
+def load_pretrained(
+    name: str, seed: Seed = "best", which: Which = "last"
+) -> tuple[Player, SavedPolicy]:
+    """Loads the policy for a task that comes with the package, as ``load_saved``."""
     if (seed, which) != ("best", "last"):
         raise ValueError(
             f"the package has one policy for {name}, of the best seed; leave seed and which out, "
             "or give a run directory"
         )
     saved = read_policy(FOLDER / name, 0)
-    return Player(name, provenance(name)["seed"], saved.policy, saved.actor)
+    return Player(name, provenance(name)["seed"], saved.policy, saved.actor), saved
 
 
 def load_seed(run: Run, seed: Seed, which: Which = "last") -> tuple[Player, SavedPolicy]:

@@ -7,6 +7,8 @@ import numpy as np
 
 from mjx_reinforce.export.files import read_json
 from mjx_reinforce.export.policy_checks import is_number
+from mjx_reinforce.export.pretrained import pretrained
+from mjx_reinforce.registry import nearest
 
 #: A seed by its rank in the run's final evaluation, or by its number.
 Seed = Literal["best", "worst", "median"] | int
@@ -15,7 +17,6 @@ Which = Literal["last", "best"]
 
 #: Where the policies are in the run directory, and their returns in summary.json.
 _PLACES = {"last": ("policy", "final_returns"), "best": ("policy/best", "best_test_returns")}
-_PACKAGED = ", and no trained policy of that name comes with the package"
 _NOT_YET = "its training goes on, or was killed, and then train --resume goes on with it"
 
 
@@ -52,9 +53,14 @@ def read_run(directory: str | Path) -> Run:
     directory = Path(directory)
     path = directory / "config.json"
     if not path.is_file():
+        if (directory / "sweep.json").is_file():
+            raise ValueError(
+                f"{directory} is a sweep: name the policies of one of its configurations, such as "
+                f"{directory / 'policies' / '000'}"
+            )
         raise ValueError(
             f"{directory} is no run directory: there is no {path}"
-            f"{'' if directory.is_dir() else _PACKAGED}"
+            f"{'' if directory.is_dir() else _packaged(directory.name)}"
         )
     settings = read_json(path)
     env_id, horizon = settings.get("env"), settings.get("horizon")
@@ -72,6 +78,14 @@ def read_run(directory: str | Path) -> Run:
     ):
         raise ValueError(f"{path} is damaged: seeds must be whole numbers, got {seeds!r}")
     return Run(directory, env_id, horizon, None if seeds is None else tuple(seeds))
+
+
+def _packaged(name: str) -> str:
+    """Returns which tasks the package has policies for, the one that was meant first."""
+    known = sorted(pretrained())
+    near = nearest(name, known)
+    hint = f". Did you mean {near!r}?" if near else "."
+    return f"{hint} Policies of the package: {', '.join(known)}"
 
 
 def seeds_in(directory: Path) -> tuple[int, ...]:

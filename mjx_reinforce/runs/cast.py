@@ -85,7 +85,7 @@ def _role(seed: Any, settings: Any, source: Source) -> Role:
     from mjx_reinforce.export.player import load_pretrained, load_seed
 
     if source.run is None:
-        return Role(source.env, "the package's policy", load_pretrained(source.env))
+        return Role(source.env, "the package's policy", load_pretrained(source.env)[0])
     player, _ = load_seed(source.run, seed, settings.which)
     rank = f" ({seed})" if isinstance(seed, str) else ""
     return Role(f"seed {player.seed}{rank}", f"seed {player.seed}", player)

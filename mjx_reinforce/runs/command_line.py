@@ -76,7 +76,10 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
     asked, _ = _read(flags, known, prog)
     resume.check_settings(known, asked)
     if resume.is_done(known, asked):
-        print(f"{known.resume} is finished; to go on, give a larger --env-steps or --max-updates")
+        print(
+            f"{known.resume} is finished; to go on, give a larger --env-steps or --max-updates, or "
+            "--minutes"
+        )
         sys.exit(0)
     check_resumed(known.env, arguments, config.resume)
     return asked, processes

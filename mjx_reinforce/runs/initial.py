@@ -32,10 +32,16 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
 
     assert config.init_from is not None
     directory = Path(config.init_from)
-    read_run(directory)
+    run = read_run(directory)
     saved = read_policy(directory / "policy")
-    for name, value in policy.items():
-        old = saved.settings.get(name, value)
+    settings = {field.name for field in dataclasses.fields(Config)}
+    for name in sorted(policy, key=lambda name: name in settings):  # what no flag sets goes first
+        value, old = policy[name], saved.settings.get(name, policy[name])
+        if name not in settings and old != value:
+            raise ValueError(
+                f"the policies in {directory} are for {run.env}, with {name} {old}, and "
+                f"{config.env} has {value}; leave --init-from out, or give a run of {config.env}"
+            )
         if name not in _DRAWN and old != value:
             flag = f"--{name.replace('_', '-')}"
             raise ValueError(

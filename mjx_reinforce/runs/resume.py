@@ -32,6 +32,11 @@ def read_record(directory: Path) -> dict[str, Any]:
     try:
         recorded = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
+        if (directory / "sweep.json").is_file():
+            raise ValueError(
+                f"{directory} is a sweep: python -m mjx_reinforce.sweep --resume {directory} goes "
+                "on with it"
+            ) from error
         raise ValueError(
             f"cannot resume {directory}: there is no {path} ({error.strerror}), so nothing was "
             "begun there; start it anew with --output"

@@ -29,6 +29,12 @@ class Results(NamedTuple):
 
 def read_results(directory: Path) -> Results:
     """Returns what a finished sweep measured, or raises ValueError."""
-    listed = read_json(directory / "sweep.json")["configurations"]
+    record = read_json(directory / "sweep.json")
+    if not (directory / "curves.npz").exists():
+        raise ValueError(
+            f"{directory} has no results yet: the sweep is {record.get('status', 'unfinished')}; "
+            f"go on with it by --resume {directory}"
+        )
+    listed = record["configurations"]
     values = [{k: x for k, x in one.items() if k != "configuration"} for one in listed]
     return Results(directory, values, **read_arrays(directory / "curves.npz"))
