@@ -74,7 +74,7 @@ def test_there_is_one_policy_of_a_task(options):
 
 
 def test_a_task_without_a_policy_is_named():
-    with pytest.raises(ValueError, match=r"HalfCheeta-v5 is no run .* Did you mean 'HalfCheetah-v5'"):
+    with pytest.raises(ValueError, match=r"HalfCheeta-v5 is no run .* mean 'HalfCheetah-v5'"):
         load("HalfCheeta-v5")
 
 
