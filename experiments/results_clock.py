@@ -64,6 +64,8 @@ def _words(groups: Sequence[kept.Group]) -> str:
     return (
         "The settings are those that a budget of that size selected (`runs/defaults.py`), at\n"
         f"commit {commits}{changed}.\n"
+        "On a GPU that is `python -m mjx_reinforce.train --env TASK --num-seeds 16 --seed ROOT\n"
+        "--env-steps N` with the seeds and env steps of the table.\n"
         "Time is that of training with its evaluations, of all seeds together; compiling is\n"
         "apart. After a minute: the last evaluation until then. At the end: episodes from starts\n"
         "that were used nowhere else; where a run was stopped, its last evaluation. There is no\n"
