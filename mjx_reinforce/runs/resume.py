@@ -32,7 +32,7 @@ def read_record(directory: Path) -> dict[str, Any]:
     try:
         recorded = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        if (directory / "sweep.json").is_file():
+        if isinstance(error, FileNotFoundError) and (directory / "sweep.json").is_file():
             raise ValueError(
                 f"{directory} is a sweep: python -m mjx_reinforce.sweep --resume {directory} goes "
                 "on with it"
