@@ -1,7 +1,6 @@
 """Ant: a torso on four legs that walks along x without falling or jumping."""
 
 import dataclasses
-from typing import Any
 
 import jax.numpy as jnp
 
@@ -56,7 +55,7 @@ class Ant(Healthy):
     carried = ("xpos",)
     contact_forces = True
 
-    def __init__(self, **arguments: Any):
+    def __init__(self, **arguments: float | bool):
         """Builds the task; see ``MujocoEnv``.
 
         Raises:

@@ -60,7 +60,7 @@ class Before(Simulation):
         )
 
 
-def _carried(state: Any) -> dict[str, jax.Array]:
+def _carried(state: "Physics | mjx.Data") -> dict[str, jax.Array]:
     """Returns what MuJoCo carries from step to step, of a state or a simulation."""
     return {name: getattr(state, name) for name in models.CARRIED}
 
@@ -107,7 +107,7 @@ class MujocoEnv(Env):
     #: episode, as in Gymnasium.
     contact_forces = False
 
-    def __init__(self, **arguments: Any):
+    def __init__(self, **arguments: object):
         """Compiles the model.
 
         Args:

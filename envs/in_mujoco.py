@@ -16,6 +16,7 @@ from mujoco import (  # a C extension
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
 from mjx_reinforce.physics.mjx_internals import Simulation
+from mjx_reinforce.types import Environment
 
 _REMEDY = "leave --backend mujoco out"
 
@@ -43,7 +44,7 @@ class InMujoco:
     data: the simulation, an ``MjData``; forces in ``data.xfrc_applied`` act in the next step
     """
 
-    def __init__(self, env: MujocoEnv):
+    def __init__(self, env: Environment):
         """Finds out which fields of mjData the task reads; simulates nothing.
 
         Raises:

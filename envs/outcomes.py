@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from mjx_reinforce.checks import BadEnvironmentError
 
 
-def check_start(name: str, start: Any, sizes: tuple[int, int]) -> tuple[Any, Any]:
+def check_start(name: str, start: object, sizes: tuple[int, int]) -> tuple[Any, Any]:
     """Returns what ``initial`` returned, if it is positions and velocities.
 
     Args:
@@ -32,13 +32,13 @@ def check_start(name: str, start: Any, sizes: tuple[int, int]) -> tuple[Any, Any
     return qpos, qvel
 
 
-def check_shape(name: str, value: Any, expected: tuple[int, ...]) -> None:
+def check_shape(name: str, value: object, expected: tuple[int, ...]) -> None:
     """Raises ValueError for an array of another shape."""
     if _shape(value) != expected:
         raise ValueError(f"{name} must be {list(expected)}, got {_described(value)}")
 
 
-def check_outcome(name: str, outcome: Any) -> tuple[Any, Any, dict[str, Any]]:
+def check_outcome(name: str, outcome: object) -> tuple[Any, Any, dict[str, Any]]:
     """Returns what ``outcome`` returned, if it is a reward, a termination, and terms.
 
     Args:
@@ -76,7 +76,7 @@ def _shape(value: Any) -> tuple[int, ...] | None:
     return tuple(value.shape) if hasattr(value, "shape") else None
 
 
-def _described(value: Any) -> str:
+def _described(value: object) -> str:
     if isinstance(value, tuple | list):
         return f"a {type(value).__name__} of {len(value)}"
     shape = _shape(value)

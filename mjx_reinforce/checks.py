@@ -9,7 +9,10 @@ import traceback
 import types
 import typing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 _HERE = Path(__file__).resolve().parent
 #: Code that no user wrote: Python's, installed packages, and ours.
@@ -54,7 +57,7 @@ def _in_library(file: Path) -> bool:
     return any(file.is_relative_to(folder) for folder in _LIBRARIES)
 
 
-def check_type(name: str, value: Any, kind: Any) -> None:
+def check_type(name: str, value: object, kind: object) -> None:
     """Raises ValueError for a value that is not of its annotation.
 
     Args:
@@ -67,7 +70,7 @@ def check_type(name: str, value: Any, kind: Any) -> None:
         raise ValueError(f"{name} must be {_spoken(kind)}, got {value!r}")
 
 
-def _fits(value: Any, kind: Any) -> bool:
+def _fits(value: object, kind: object) -> bool:
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
         return any(_fits(value, each) for each in inner)
@@ -84,7 +87,7 @@ def _fits(value: Any, kind: Any) -> bool:
     return isinstance(value, expected) if isinstance(expected, type) else True
 
 
-def _spoken(kind: Any) -> str:
+def _spoken(kind: object) -> str:
     """Returns an annotation in words."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin in (typing.Union, types.UnionType):
@@ -98,7 +101,7 @@ def _spoken(kind: Any) -> str:
     return _KINDS[kind][1] if kind in _KINDS else getattr(kind, "__name__", str(kind))
 
 
-def check_kind(name: str, value: Any, kind: type, example: str) -> None:
+def check_kind(name: str, value: object, kind: type, example: str) -> None:
     """Raises ValueError for an object of another class.
 
     Args:
@@ -113,7 +116,7 @@ def check_kind(name: str, value: Any, kind: type, example: str) -> None:
         raise ValueError(f"{name} must be of type {kind.__name__}, such as {example}, got {got}")
 
 
-def changed(settings: Any) -> str:
+def changed(settings: "DataclassInstance") -> str:
     """Returns the fields of a dataclass that have other values than their defaults, as code."""
     given = (
         f"{field.name}={value!r}"
@@ -138,12 +141,12 @@ def whole_number(text: str) -> int:
     return int(number)
 
 
-def is_nan(value: Any) -> bool:
+def is_nan(value: object) -> bool:
     """Returns whether a value is a number that is none."""
     return isinstance(value, numbers.Real) and math.isnan(value)
 
 
-def check_parts(env: Any) -> None:
+def check_parts(env: object) -> None:
     """Raises ValueError for an object that has not the methods of an environment."""
     name = type(env).__name__
     if isinstance(env, type):

@@ -7,13 +7,18 @@ import re
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import tyro
 
 from mjx_reinforce.export.files import write_bytes
 from mjx_reinforce.runs.flags import one_line_errors, read
 from mjx_reinforce.runs.streams import accept_everything
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from mjx_reinforce.types import MjModel
 
 #: What is named in the class, by mjData's arrays whose rows it numbers.
 _NAMED = {"site": "site_xpos", "body": "xpos"}
@@ -122,7 +127,7 @@ def write(settings: Settings) -> Path:
     return output
 
 
-def source(model: Any, xml: str, module: str) -> str:
+def source(model: "MjModel", xml: str, module: str) -> str:
     """Returns the text of the class.
 
     Args:
@@ -160,7 +165,7 @@ def _title(module: str) -> str:
     return title if title.isidentifier() else f"Robot{title}"
 
 
-def _constants(model: Any) -> Iterable[str]:
+def _constants(model: "MjModel") -> Iterable[str]:
     """Yields a line for each named site and body: its number, by which outcome finds it."""
     taken = set()
     for kind, array in _NAMED.items():
@@ -173,7 +178,7 @@ def _constants(model: Any) -> Iterable[str]:
                 yield f"{constant} = {number}  # data.{array}[{constant}] is where it is (m)\n"
 
 
-def _about(model: Any) -> str:
+def _about(model: "MjModel") -> str:
     """Returns the docstring of the class: what its positions and actions are."""
     joints = _listed(
         f"{_name(model.joint(i).name, 'joint', i)} at qpos[{int(model.jnt_qposadr[i])}]"
@@ -194,10 +199,8 @@ def _name(name: str, kind: str, number: int) -> str:
     return re.sub(r'["\\\n]', "_", name) or f"{kind} {number}"
 
 
-def _moved(model: Any, number: int) -> str:
+def _moved(model: "MjModel", number: int) -> str:
     """Returns the name of an actuator, or of the joint that it moves."""
-    import mujoco
-
     kinds: Any = mujoco
     joints = int(kinds.mjtTrn.mjTRN_JOINT), int(kinds.mjtTrn.mjTRN_JOINTINPARENT)
     name = model.actuator(number).name
@@ -206,7 +209,7 @@ def _moved(model: Any, number: int) -> str:
     return name
 
 
-def _range(model: Any, number: int) -> str:
+def _range(model: "MjModel", number: int) -> str:
     low, high = model.actuator_ctrlrange[number]
     return f" in [{low:g}, {high:g}]" if model.actuator_ctrllimited[number] else ", unlimited"
 

@@ -296,7 +296,7 @@ def _flags(settings: Mapping[str, Any]) -> str:
     return " ".join(flags)
 
 
-def _items(value: Any) -> Sequence[Any]:
+def _items(value: object) -> Sequence[Any]:
     return value if isinstance(value, list | tuple) else (value,)
 
 

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce import envs
 from mjx_reinforce.runs import resume
@@ -36,6 +36,14 @@ from mjx_reinforce.runs.plan import Plan, make_plan
 from mjx_reinforce.runs.processes import Processes, joined
 from mjx_reinforce.runs.sinks.sink import check_installed, open_sinks
 from mjx_reinforce.runs.streams import accept_everything
+
+if TYPE_CHECKING:
+    from mjx_reinforce.runs.checkpoint import Checkpoint
+    from mjx_reinforce.runs.display import Display
+    from mjx_reinforce.runs.ready import Ready
+    from mjx_reinforce.runs.session import Session
+    from mjx_reinforce.runs.state import Programs, RunState
+    from mjx_reinforce.types import Environment
 
 
 def main() -> None:
@@ -116,8 +124,8 @@ def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
 
 
 def _start(
-    env: Any, config: Config, default: Config, processes: Processes, share: slice
-) -> tuple[Any, Any]:
+    env: "Environment | None", config: Config, default: Config, processes: Processes, share: slice
+) -> "tuple[Ready, Checkpoint | None]":
     """Returns a run that is ready, and the checkpoint from which it goes on, if any.
 
     Args:
@@ -154,7 +162,7 @@ def _start(
     return ready, found
 
 
-def _serve(ready: Any, config: Config, processes: Processes, interrupt: Interrupt) -> int:
+def _serve(ready: "Ready", config: Config, processes: Processes, interrupt: Interrupt) -> int:
     """Trains seeds for process 0, which has the run's files; returns the exit status."""
     from mjx_reinforce.runs.shares import serve
     from mjx_reinforce.runs.state import compile_parts
@@ -173,8 +181,8 @@ def _end(processes: Processes, status: int) -> None:
 
 
 def train(
-    ready: Any,
-    found: Any,
+    ready: "Ready",
+    found: "Checkpoint | None",
     config: Config,
     plan: Plan,
     directory: Path,
@@ -223,8 +231,13 @@ def train(
 
 
 def _compile(
-    ready: Any, found: Any, config: Config, directory: Path, display: Any, processes: Processes
-) -> tuple[Any, float]:
+    ready: "Ready",
+    found: "Checkpoint | None",
+    config: Config,
+    directory: Path,
+    display: "Display",
+    processes: Processes,
+) -> "tuple[Session, float]":
     """Returns a run before its first update, and how long it took to compile, in seconds.
 
     Arguments are those of ``train``.
@@ -258,7 +271,9 @@ def _compile(
     return session, seconds
 
 
-def _with_budget(config: Config, programs: Any, state: Any, display: Any) -> Config:
+def _with_budget(
+    config: Config, programs: "Programs", state: "RunState", display: "Display"
+) -> Config:
     """Returns the settings with env steps in place of minutes, from a state on."""
     from mjx_reinforce.runs.minutes import env_steps_in
 
@@ -269,7 +284,7 @@ def _with_budget(config: Config, programs: Any, state: Any, display: Any) -> Con
     return dataclasses.replace(config, env_steps=env_steps, minutes=None)
 
 
-def _begin(session: Any, found: Any, num_processes: int) -> None:
+def _begin(session: "Session", found: "Checkpoint | None", num_processes: int) -> None:
     """Writes the first files, or takes the run and its files back to where it goes on."""
     config, log = session.config, session.log
     if config.resume is None:
@@ -289,7 +304,7 @@ def _begin(session: Any, found: Any, num_processes: int) -> None:
     session.display.say(f"going on after {updates} updates{again}")
 
 
-def _loop(session: Any, interrupt: Interrupt) -> None:
+def _loop(session: "Session", interrupt: Interrupt) -> None:
     """Trains until the budget is used or nothing is finite, or a signal came.
 
     Policies are evaluated with the updates that follow; where their returns decide whether any do,
@@ -313,7 +328,7 @@ def _loop(session: Any, interrupt: Interrupt) -> None:
 
 
 def _finish(
-    session: Any, engine: str, compile_seconds: float, test: dict[str, Any]
+    session: "Session", engine: str, compile_seconds: float, test: dict[str, Any]
 ) -> dict[str, Any]:
     """Writes the last files; returns the contents of summary.json.
 

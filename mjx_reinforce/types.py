@@ -4,12 +4,19 @@ Axes are named throughout: S seeds, T time steps, N episodes, O observation
 entries, A action entries.
 """
 
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+
+#: A tree of arrays, as ``jax.tree`` sees it: dataclasses, tuples, lists and dicts, nested at will.
+#: Type checkers have no name for that.
+PyTree: TypeAlias = Any
+#: A ``mujoco.MjModel`` or ``mujoco.MjSpec``; MuJoCo's extension module comes without stubs.
+MjModel: TypeAlias = Any
+MjSpec: TypeAlias = Any
 
 
 class Box(NamedTuple):

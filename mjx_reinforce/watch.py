@@ -6,7 +6,7 @@ import sys
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import tyro
@@ -32,6 +32,11 @@ from mjx_reinforce.runs.lines import say_error
 from mjx_reinforce.runs.newest import RUNS, choose_run
 from mjx_reinforce.runs.own_code import check_named
 from mjx_reinforce.runs.streams import accept_everything
+
+if TYPE_CHECKING:
+    from mjx_reinforce.envs.base import MujocoEnv
+    from mjx_reinforce.export.takes import Take
+    from mjx_reinforce.types import MjModel
 
 #: Positions that change by less do not show (m, rad).
 _STILL = 0.05
@@ -143,7 +148,9 @@ def film(settings: Settings) -> None:
         print("It hardly moves, since it is held; --push 10 shows what holds it.")
 
 
-def _take(settings: Settings, source: Source, env: Any, model: Any, role: Role) -> Any:
+def _take(
+    settings: Settings, source: Source, env: "MujocoEnv", model: "MjModel", role: Role
+) -> Any:
     """Returns the episode of one policy, and says what it earned."""
     from mjx_reinforce.export.takes import Take
     from mjx_reinforce.runs.mujoco_playing import pushed_body
@@ -162,7 +169,7 @@ def _take(settings: Settings, source: Source, env: Any, model: Any, role: Role) 
     return Take(role.label, model, env.dt, episode.qpos, episode.rewards, pushes, body)
 
 
-def _stands_still(take: Any) -> bool:
+def _stands_still(take: "Take") -> bool:
     """Returns whether the film shows nothing after its first tenth."""
     later = take.qpos[len(take.qpos) // 10 :]
     return len(later) * take.dt > 5 and float(np.ptp(later, axis=0).max()) < _STILL
@@ -243,7 +250,7 @@ def _check_together(settings: Settings) -> None:
         )
 
 
-def scene(env: Any) -> Any:
+def scene(env: "MujocoEnv") -> Any:
     """Returns the MuJoCo model that an environment's ``qpos`` moves, with a floor and a sky.
 
     Raises:

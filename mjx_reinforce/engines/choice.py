@@ -16,12 +16,13 @@ import jax
 
 from mjx_reinforce import fused
 from mjx_reinforce.checks import explain
+from mjx_reinforce.engines.episode import Act
 from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.engines.rollouts import rollout
 from mjx_reinforce.fused.vmap import MAX_OPERATIONS
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.registry import check_name
-from mjx_reinforce.types import Environment, Trajectory, null_action
+from mjx_reinforce.types import Environment, PyTree, Trajectory, null_action
 
 #: Each entry of an observation is an array of its own; XLA takes longer and longer for more.
 MAX_ENTRIES = 200
@@ -125,7 +126,12 @@ def _against_native(
 
 
 def _from_any_key(
-    env: Environment, act: Any, actor: Any, distribution: Any, key: jax.Array, **options: Any
+    env: Environment,
+    act: Act,
+    actor: PyTree,
+    distribution: Distribution,
+    key: jax.Array,
+    **options: Any,
 ) -> Trajectory:
     """Plays in machine code, or as ``vmap`` where that cannot draw the noise of the key."""
     against = native.against_key(key)
@@ -135,7 +141,7 @@ def _from_any_key(
     return play(env, act, actor, distribution, key, **options)
 
 
-def unsupported_by_fused(env: Environment, step: Any) -> str | None:
+def unsupported_by_fused(env: Environment, step: Callable[..., PyTree]) -> str | None:
     """Returns why an environment does not run, or not well, on the fused engine; None if it does.
 
     Nothing is compiled: the step is traced and written out, about a second.

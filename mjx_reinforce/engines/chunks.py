@@ -11,6 +11,7 @@ from jax import lax
 from mjx_reinforce.engines.episode import draw_noise
 from mjx_reinforce.fused import any_lane
 from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.types import PyTree
 
 Carry = TypeVar("Carry")
 
@@ -43,8 +44,8 @@ def play_chunks(
     play: Callable[[jax.Array, Any], tuple[Any, Any]],
     distribution: Distribution,
     keys: jax.Array,
-    progress: Any,
-    records: Any,
+    progress: PyTree,
+    records: PyTree,
 ) -> tuple[Any, Any, jax.Array]:
     """Plays chunk after chunk until every episode is over or the time is up.
 

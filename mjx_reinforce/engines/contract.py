@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.checks import BadEnvironmentError, check_parts, explain, is_nan
-from mjx_reinforce.types import Box, Discrete, action_space
+from mjx_reinforce.types import Box, Discrete, Environment, PyTree, action_space
 
 #: What JAX raises where Python or NumPy asks for the value of a traced array.
 _NEED_VALUES = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
 _TRACED = "; it is compiled by JAX: write jnp.where for `if`, and jnp for numpy, math and float()"
 
 
-def check_environment(env: Any) -> None:
+def check_environment(env: Environment) -> None:
     """Raises ValueError for an environment that cannot be played, in one line that says why.
 
     Args:
@@ -32,7 +32,7 @@ def check_environment(env: Any) -> None:
     _check_same(name, start, after)
 
 
-def _check_limits(name: str, env: Any) -> None:
+def _check_limits(name: str, env: object) -> None:
     """Raises ValueError for a time limit or threshold that is none."""
     limit = _declared(name, env, "max_episode_steps")
     if limit is not None and not _is_count(limit):
@@ -46,7 +46,7 @@ def _check_limits(name: str, env: Any) -> None:
         )
 
 
-def _check_action_space(name: str, env: Any) -> None:
+def _check_action_space(name: str, env: Environment) -> None:
     """Raises ValueError for actions that cannot be drawn."""
     size, declared = env.action_size, _declared(name, env, "action_space")
     if not _is_count(size):
@@ -70,7 +70,7 @@ def _check_action_space(name: str, env: Any) -> None:
         )
 
 
-def _declared(name: str, env: Any, what: str) -> Any:
+def _declared(name: str, env: object, what: str) -> Any:
     """Returns what an environment says of itself, None if it says nothing."""
     try:
         return getattr(env, what, None)
@@ -78,7 +78,7 @@ def _declared(name: str, env: Any, what: str) -> Any:
         raise BadEnvironmentError(f"{name}.{what} fails: {explain(error)}") from error
 
 
-def _is_count(value: Any) -> bool:
+def _is_count(value: object) -> bool:
     """Returns whether a value is a whole number, 1 or more; True is none."""
     return isinstance(value, numbers.Integral) and not isinstance(value, bool) and int(value) >= 1
 
@@ -92,7 +92,7 @@ def _are_bounds(space: Box, size: int) -> bool:
     return low.shape == high.shape == (size,) and bool(np.all(low < high))
 
 
-def _shapes(name: str, what: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def _shapes(name: str, what: str, function: Callable[..., Any], *arguments: PyTree) -> Any:
     """Returns the shapes of what a method returns."""
     try:
         return jax.eval_shape(function, *arguments)
@@ -103,13 +103,13 @@ def _shapes(name: str, what: str, function: Callable[..., Any], *arguments: Any)
         raise BadEnvironmentError(f"{name}.{what} fails: {explain(error)}{remedy}") from error
 
 
-def _action(env: Any) -> jax.ShapeDtypeStruct:
+def _action(env: Environment) -> jax.ShapeDtypeStruct:
     if isinstance(action_space(env), Discrete):
         return jax.ShapeDtypeStruct((), jnp.int32)
     return jax.ShapeDtypeStruct((env.action_size,), jnp.result_type(float))
 
 
-def _check_state(name: str, start: Any) -> None:
+def _check_state(name: str, start: PyTree) -> None:
     """Raises ValueError for a state without a vector ``obs``, a scalar ``reward`` and ``done``."""
     for field, axes, shape, remedy in (
         ("obs", 1, "a vector [O]", "concatenate its parts"),
@@ -134,7 +134,7 @@ def _check_state(name: str, start: Any) -> None:
             )
 
 
-def _check_same(name: str, start: Any, after: Any) -> None:
+def _check_same(name: str, start: PyTree, after: PyTree) -> None:
     """Raises ValueError if ``step`` returns a state of another kind than ``reset``."""
     if jax.tree.structure(start) != jax.tree.structure(after):
         before, now = _paths(start), _paths(after)
@@ -152,18 +152,18 @@ def _check_same(name: str, start: Any, after: Any) -> None:
             )
 
 
-def _paths(tree: Any) -> dict[str, Any]:
+def _paths(tree: PyTree) -> dict[str, Any]:
     """Returns the leaves by where they are."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in leaves}
 
 
-def _holds(old: Any, new: Any) -> bool:
+def _holds(old: PyTree, new: PyTree) -> bool:
     """Returns whether a new value may be kept in place of an old one, as ``hold`` does."""
     return old == new or jnp.promote_types(old, new) == old
 
 
-def _described(value: Any) -> str:
+def _described(value: jax.Array) -> str:
     if hasattr(value, "shape"):
         return f"{value.dtype}{list(value.shape)}"
     return f"a {type(value).__name__}"

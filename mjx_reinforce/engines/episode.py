@@ -10,9 +10,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.types import Environment
+from mjx_reinforce.types import Environment, PyTree
 
 Act = Callable[[Any, jax.Array], jax.Array]
 
@@ -36,7 +37,7 @@ class Step(NamedTuple):
     state: Any
 
 
-def check_shapes(*shapes: tuple[int, ...], **arguments: Any) -> None:
+def check_shapes(*shapes: tuple[int, ...], **arguments: ArrayLike) -> None:
     """Raises ValueError for an argument of a rollout whose shape is none of ``shapes``."""
     for name, value in arguments.items():
         if jnp.shape(value) not in shapes:
@@ -81,8 +82,8 @@ def step(
     env_step: Callable[[Any, jax.Array], Any],
     act: Act,
     distribution: Distribution,
-    actor: Any,
-    state: Any,
+    actor: PyTree,
+    state: PyTree,
     noise: jax.Array,
     alive: jax.Array,
     deterministic: jax.Array | None = None,
@@ -118,7 +119,7 @@ def step(
     )
 
 
-def hold(alive: jax.Array, after: Any, before: Any) -> Any:
+def hold(alive: jax.Array, after: PyTree, before: PyTree) -> Any:
     """Returns ``after`` where an episode is running, and ``before`` where it is over.
 
     So a finished episode keeps its last state. Otherwise its state could run off to infinity,

@@ -13,7 +13,7 @@ from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.chunks import play_chunks
 from mjx_reinforce.policies.arguments import check_count, check_key
 from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.types import Environment, Trajectory
+from mjx_reinforce.types import Environment, PyTree, Trajectory
 
 
 class _Progress(NamedTuple):
@@ -32,7 +32,7 @@ class _Progress(NamedTuple):
 def rollout(
     env: Environment,
     act: episode.Act,
-    actor: Any,
+    actor: PyTree,
     distribution: Distribution,
     key: jax.Array,
     *,
@@ -105,7 +105,7 @@ def _step(
     env_step: Callable[[Any, jax.Array], Any],
     act: episode.Act,
     distribution: Distribution,
-    actor: Any,
+    actor: PyTree,
     deterministic: jax.Array | None,
     progress: _Progress,
     noise: jax.Array,

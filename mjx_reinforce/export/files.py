@@ -154,7 +154,7 @@ def members(content: bytes, *, stored: bool) -> dict[str, Header]:
     return found
 
 
-def finite(value: Any) -> Any:
+def finite(value: object) -> Any:
     """Returns a value for JSON: numbers that are not finite are None."""
     if isinstance(value, Mapping):
         return {key: finite(item) for key, item in value.items()}

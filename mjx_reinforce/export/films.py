@@ -7,11 +7,14 @@ import tempfile
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mjx_reinforce.export.files import write_bytes
+
+if TYPE_CHECKING:
+    from mjx_reinforce.types import MjModel
 
 #: Colours of a .gif, beside the one that is transparent, and fewer of them for a small file.
 _COLORS, _FEWER_COLORS = 255, (128, 64, 32, 16, 8)
@@ -24,7 +27,7 @@ _ARROW = (0.95, 0.35, 0.1, 1.0)
 class Renderer:
     """Draws a model at given positions, through its camera "track" if it has one."""
 
-    def __init__(self, model: Any, width: int, height: int):
+    def __init__(self, model: "MjModel", width: int, height: int):
         """Opens MuJoCo's renderer for pictures of so many pixels.
 
         Raises:

@@ -82,7 +82,7 @@ def check_finite(arrays: Mapping[str, np.ndarray], seed: int | None) -> None:
             raise ValueError(f"{name} of seed {bad[0]} has numbers that are not finite")
 
 
-def _is_size(value: Any) -> bool:
+def _is_size(value: object) -> bool:
     return type(value) is int and 1 <= value <= _MAX_SIZE
 
 
@@ -91,7 +91,7 @@ def is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < 1e300 and math.isfinite(value)
 
 
-def _are_bounds(value: Any) -> bool:
+def _are_bounds(value: object) -> bool:
     return isinstance(value, list) and bool(value) and all(x is None or is_number(x) for x in value)
 
 

@@ -1,9 +1,14 @@
 """A floor, a sky and a light for a model that is only drawn; what moves in it is not changed."""
 
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from mjx_reinforce.types import MjModel, MjSpec
 
 #: Colours from 0 to 1: the sky overhead and at the horizon, and the two kinds of tiles.
 _SKY, _HORIZON = (0.30, 0.50, 0.72), (0.86, 0.91, 0.95)
@@ -16,7 +21,7 @@ _ENDLESS, _UNCOLORED = (0, 0, 0.1), (0.5, 0.5, 0.5, 1)
 _TILE, _GAP = 0.5, 0.25
 
 
-def dress(spec: Any, *, replace: bool) -> Any:
+def dress(spec: "MjSpec", *, replace: bool) -> Any:
     """Returns a compiled model with a sky, a floor and a light.
 
     Args:
@@ -24,8 +29,6 @@ def dress(spec: Any, *, replace: bool) -> Any:
       replace: whether they take the place of the model's own sky and lights and of the colours of
         its planes; otherwise the model gets only what it lacks.
     """
-    import mujoco
-
     kinds: Any = mujoco
     lowest, length, middle = _extent(_compile(spec))
     skies = [x for x in spec.textures if x.type == kinds.mjtTexture.mjTEXTURE_SKYBOX]
@@ -65,13 +68,13 @@ def dress(spec: Any, *, replace: bool) -> Any:
     return _compile(spec)
 
 
-def _compile(spec: Any) -> Any:
+def _compile(spec: "MjSpec") -> Any:
     with warnings.catch_warnings():  # what MuJoCo deprecates in a model
         warnings.simplefilter("ignore")
         return spec.compile()
 
 
-def _add_light(spec: Any, kinds: Any, length: float) -> None:
+def _add_light(spec: "MjSpec", kinds: Any, length: float) -> None:
     """Adds a light that goes with the first body, so that its shadow does not end on the way."""
     body = spec.worldbody.first_body() or spec.worldbody
     light = body.add_light(pos=(0, 0, 2 * length), dir=(0, 0, -1))
@@ -82,7 +85,7 @@ def _add_light(spec: Any, kinds: Any, length: float) -> None:
     light.diffuse = _LIGHT
 
 
-def _add_tiles(spec: Any, kinds: Any, length: float) -> None:
+def _add_tiles(spec: "MjSpec", kinds: Any, length: float) -> None:
     """Adds the material of a chequered floor to a model of a length (m)."""
     spec.add_texture(
         name="mjx_reinforce_tiles",
@@ -100,13 +103,11 @@ def _add_tiles(spec: Any, kinds: Any, length: float) -> None:
     tiles.textures[kinds.mjtTextureRole.mjTEXROLE_RGB] = "mjx_reinforce_tiles"
 
 
-def _extent(model: Any) -> tuple[float, float, np.ndarray | None]:
+def _extent(model: "MjModel") -> tuple[float, float, np.ndarray | None]:
     """Returns of a model in its pose, planes apart, the lowest point (m) and the length (m).
 
     The third value is the middle [3] (m) of what moves, if that is higher than wide.
     """
-    import mujoco
-
     kinds: Any = mujoco
     data = kinds.MjData(model)
     kinds.mj_forward(model, data)

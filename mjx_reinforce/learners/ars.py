@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from optax import Params
 
 from mjx_reinforce.checks import check_type
 from mjx_reinforce.engines import choice
@@ -175,7 +176,7 @@ class _Search:
             estimator_state=(),
         )
 
-    def play(self, state: TrainState, key: jax.Array, active: Any = True) -> Trial:
+    def play(self, state: TrainState, key: jax.Array, active: bool | jax.Array = True) -> Trial:
         directions_key, episodes_key = jax.random.split(key)
         keys = jax.random.split(episodes_key)
         keys = keys[jnp.array([0, 0])] if self.shared_starts else keys
@@ -235,11 +236,11 @@ class _Search:
 
         return jax.vmap(act_one)(actor.params, observation)
 
-    def _tie(self, params: Any) -> Any:
+    def _tie(self, params: Params) -> Any:
         """Returns the params as the update ties them; the paper's does not."""
         return params if self.update == "paper" else overwrite_bias(params)
 
-    def _perturb(self, params: Any, directions: Any) -> Any:
+    def _perturb(self, params: Params, directions: Params) -> Any:
         """Returns the params of all policies, [2, D, ...], the forward ones first."""
         moves = jax.tree.map(
             lambda d: jnp.stack([self.noise_std * d, -self.noise_std * d]), directions
@@ -247,7 +248,7 @@ class _Search:
         return jax.vmap(jax.vmap(self._tie))(jax.tree.map(jnp.add, params, moves))
 
 
-def _draw(key: jax.Array, params: Any, num_directions: int) -> Any:
+def _draw(key: jax.Array, params: Params, num_directions: int) -> Any:
     """Returns standard Normal directions, like the params with a leading axis [D]."""
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(key, len(leaves))
@@ -258,7 +259,7 @@ def _draw(key: jax.Array, params: Any, num_directions: int) -> Any:
     return jax.tree.unflatten(tree, drawn)
 
 
-def _signal_to_noise(directions: Any, returns: jax.Array) -> jax.Array:
+def _signal_to_noise(directions: Params, returns: jax.Array) -> jax.Array:
     """Returns the signal-to-noise ratio [] over all directions [D] of the mean step.
 
     See ``diagnostics.signal_to_noise``; a direction's share is (r_plus - r_minus) delta. Where only
@@ -299,7 +300,9 @@ def _zero_policy(env: Environment, size: int) -> Policy:
     return policy._replace(init=init)
 
 
-def _check(num_directions: int, top: int, step_size: Any, noise_std: Any, update: str) -> None:
+def _check(
+    num_directions: int, top: int, step_size: object, noise_std: object, update: str
+) -> None:
     """Raises ValueError for numbers that make no sense; traced ones are taken on trust."""
     if not 1 <= top <= num_directions:
         raise ValueError(f"top_directions must lie in [1, {num_directions}], got {top}")

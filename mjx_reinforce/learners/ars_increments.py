@@ -4,11 +4,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
+from optax import Params
 
 from mjx_reinforce.policies.policy import Policy
+from mjx_reinforce.types import PyTree
 
 
-def paper_increment(directions: Any, returns: jax.Array, top: int) -> Any:
+def paper_increment(directions: Params, returns: jax.Array, top: int) -> Any:
     """Returns the sum in the module's formula over b sigma; zero where sigma is.
 
     Args:
@@ -21,7 +24,7 @@ def paper_increment(directions: Any, returns: jax.Array, top: int) -> Any:
     return jax.tree.map(lambda d: _weighted_sum(gain, d[best]), directions)
 
 
-def document_increment(directions: Any, returns: jax.Array, noise_std: Any) -> Any:
+def document_increment(directions: Params, returns: jax.Array, noise_std: ArrayLike) -> Any:
     """Returns the increment of a published notebook, mistakes included, for reproducing it.
 
     Its ``np.sum`` without an axis adds up the entries of the direction too, so all parameters move
@@ -34,7 +37,7 @@ def document_increment(directions: Any, returns: jax.Array, noise_std: Any) -> A
     return jax.tree.map(lambda d: jnp.full(d.shape[1:], increment, d.dtype), directions)
 
 
-def overwrite_bias(params: Any) -> Any:
+def overwrite_bias(params: PyTree) -> Any:
     """Returns a linear policy's params with the first A weights in place of the bias [A].
 
     The notebook writes the same first entries of its flat vector into every parameter.

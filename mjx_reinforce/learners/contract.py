@@ -5,6 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jax.typing import DTypeLike
 
 from mjx_reinforce.checks import check_kind, explain
 from mjx_reinforce.learners import updates
@@ -16,12 +17,12 @@ from mjx_reinforce.types import Environment, Trajectory, null_action
 _STEPS = 5
 
 
-def check_optimizer(name: str, value: Any) -> None:
+def check_optimizer(name: str, value: optax.GradientTransformation) -> None:
     """Raises ValueError for what is no optimiser."""
     check_kind(name, value, optax.GradientTransformation, "optax.adam(1e-2)")
 
 
-def check_update(update: Any) -> None:
+def check_update(update: updates.Update) -> None:
     """Raises ValueError for what is no update, or a function that makes one."""
     makers = updates.full_batch, updates.minibatches, updates.each_step, natural_gradient
     if update in makers or not callable(update):
@@ -30,7 +31,7 @@ def check_update(update: Any) -> None:
 
 
 def check_estimator(
-    estimator: Any, env: Environment, observation_size: int, num_episodes: int
+    estimator: Estimator, env: Environment, observation_size: int, num_episodes: int
 ) -> None:
     """Raises ValueError for an estimator whose weights are not [T, N], in one line that says why.
 
@@ -82,5 +83,5 @@ def check_estimator(
         )
 
 
-def _shaped(shape: tuple[int, ...], dtype: Any) -> Any:
+def _shaped(shape: tuple[int, ...], dtype: DTypeLike) -> Any:
     return jax.ShapeDtypeStruct(shape, dtype)

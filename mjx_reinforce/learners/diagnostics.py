@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from optax import Params
 
 from mjx_reinforce.learners.pace import Noise
 from mjx_reinforce.policies.actor import Actor, act
@@ -95,7 +96,7 @@ def policy_metrics(policy: Policy, before: Actor, after: Actor, visited: Visited
 
 
 def within_kl(
-    policy: Policy, actor: Actor, params: Any, visited: Visited, max_kl: float | jax.Array
+    policy: Policy, actor: Actor, params: Params, visited: Visited, max_kl: float | jax.Array
 ) -> Any:
     """Returns the parameters on the straight way to ``params`` at which KL is about ``max_kl``.
 
@@ -139,7 +140,7 @@ def kl_divergence(
     return jnp.expm1(log_ratio) - log_ratio
 
 
-def signal_to_noise(mean: Any, each: Any, num_episodes: int) -> jax.Array:
+def signal_to_noise(mean: Params, each: Params, num_episodes: int) -> jax.Array:
     """Returns an estimate [] of |E g|^2 / tr Cov(g), where g is the mean of N episodes' gradients.
 
     It is |g|^2 / noise - 1, and the noise is (1 / M) sum_m |g_m - g|^2 / (N - 1): unbiased for
@@ -163,7 +164,7 @@ def signal_to_noise(mean: Any, each: Any, num_episodes: int) -> jax.Array:
     return optax.tree.norm(mean, squared=True) / noise - 1
 
 
-def noise_of_groups(sums: Any, counts: jax.Array) -> Noise:
+def noise_of_groups(sums: Params, counts: jax.Array) -> Noise:
     """Estimates the noise and the signal of a gradient from sums over groups of episodes.
 
     The noise is the mean square between groups of an analysis of variance, sum_k n_k |g_k - g|^2 /

@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from optax import Params
 
 from mjx_reinforce.engines.chunks import largest_divisor, while_any
 
@@ -19,7 +20,7 @@ MAX_STEPS = 128
 
 def accumulate_gradient(
     loss: Callable[[Any, Any], tuple[jax.Array, Any]],
-    params: Any,
+    params: Params,
     data: tuple[Any, ...],
     *,
     groups: int | None = None,

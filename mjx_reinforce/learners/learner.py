@@ -18,7 +18,7 @@ from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.pace import Pace
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.policy import Policy
-from mjx_reinforce.types import Environment, Trajectory
+from mjx_reinforce.types import Environment, PyTree, Trajectory
 
 Metrics = dict[str, jax.Array]
 
@@ -83,7 +83,7 @@ class Host:
     alone: Callable[[TrainState, jax.Array, Any], Any]
     with_guests: Callable[[TrainState, jax.Array, Any, Guests], tuple[Any, Trajectory]]
 
-    def __call__(self, state: TrainState, key: jax.Array, active: Any = True) -> Any:
+    def __call__(self, state: TrainState, key: jax.Array, active: bool | jax.Array = True) -> Any:
         """Plays without guests."""
         return self.alone(state, key, active)
 
@@ -150,7 +150,9 @@ class Learner(NamedTuple):
             after = jax.tree.map(lambda new, old: jnp.where(active, new, old), after, state)
         return after, metrics, looked
 
-    def _in_room(self, state: TrainState, active: Any, step: "Callable[[Learner], Any]") -> Any:
+    def _in_room(
+        self, state: TrainState, active: bool | jax.Array, step: "Callable[[Learner], Any]"
+    ) -> Any:
         """Makes a step with the first learner that has enough room, for all seeds that go on."""
         assert state.pace is not None
         number = jnp.where(active, state.pace.num_episodes, 0)
@@ -202,7 +204,7 @@ def check_horizon(env: Environment, horizon: int | None) -> int:
     return horizon
 
 
-def keep_finite(learned: Any, before: Any) -> tuple[Any, jax.Array]:
+def keep_finite(learned: PyTree, before: PyTree) -> tuple[Any, jax.Array]:
     """Returns ``learned`` and 0 if all of it is finite, else ``before`` and 1.
 
     So an update that breaks costs its seed that one update.
@@ -220,7 +222,7 @@ def keep_finite(learned: Any, before: Any) -> tuple[Any, jax.Array]:
     return kept, jnp.where(finite, 0, 1)
 
 
-def _floats(tree: Any) -> list[jax.Array]:
+def _floats(tree: PyTree) -> list[jax.Array]:
     return [x for x in jax.tree.leaves(tree) if _is_float(x)]
 
 

@@ -5,7 +5,7 @@ of one episode (McCandlish et al. 2018, arXiv:1812.06162, equation 2.9). Far few
 give steps that are mostly noise, and far more cost time that further steps would use better.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -69,7 +69,7 @@ class Pace:
     noise: jax.Array
 
 
-def check_auto(auto: AutoEpisodes, update: Any) -> None:
+def check_auto(auto: AutoEpisodes, update: object) -> None:
     """Raises ValueError for bounds that make no sense, or an update that measures no noise."""
     check_count("AutoEpisodes.least", auto.least, 2)
     check_count("AutoEpisodes.most", auto.most, auto.least)

@@ -265,7 +265,7 @@ class _Reinforce:
         )
 
     def _play(
-        self, engine: Engine, state: TrainState, key: jax.Array, active: Any = True
+        self, engine: Engine, state: TrainState, key: jax.Array, active: bool | jax.Array = True
     ) -> Trajectory:
         return engine.rollout(
             self.env if state.start_key is None else _OneStart(self.env, state.start_key),
@@ -278,14 +278,19 @@ class _Reinforce:
             active=self._chosen(state, active),
         )
 
-    def _chosen(self, state: TrainState, active: Any) -> Any:
+    def _chosen(self, state: TrainState, active: bool | jax.Array) -> Any:
         """Returns which episodes are played, [] or [N]."""
         if state.pace is None:
             return active
         return (jnp.arange(self.num_episodes) < state.pace.num_episodes) & active
 
     def _play_with(
-        self, engine: Engine, state: TrainState, key: jax.Array, active: Any, guests: Guests
+        self,
+        engine: Engine,
+        state: TrainState,
+        key: jax.Array,
+        active: bool | jax.Array,
+        guests: Guests,
     ) -> tuple[Trajectory, Trajectory]:
         """Plays as ``_play``, with guests before its own episodes."""
         count, own = len(guests.keys), jnp.zeros(self.num_episodes, bool)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from jax import lax
+from optax import Params
 
 from mjx_reinforce.engines.chunks import while_any
 from mjx_reinforce.learners.diagnostics import noise_of_groups, signal_to_noise
@@ -100,7 +101,7 @@ def whole_rollout(turn: Turn) -> Update:
     return update
 
 
-def _signal_to_noise(problem: Problem, params: Any, grads: Any) -> jax.Array:
+def _signal_to_noise(problem: Problem, params: Params, grads: Params) -> jax.Array:
     """Returns the signal-to-noise ratio [] of the gradients summed over all episodes."""
     num_episodes = problem.samples[-1].shape[1]
     few = min(max(1, num_episodes // _NOISE_SHARE), _NOISE_EPISODES)
@@ -114,7 +115,7 @@ def _signal_to_noise(problem: Problem, params: Any, grads: Any) -> jax.Array:
     return signal_to_noise(mean, each, num_episodes)
 
 
-def _by_groups(problem: Problem, params: Any) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+def _by_groups(problem: Problem, params: Params) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """Returns the gradient and the metrics of the surrogate, summed, and their noise."""
     assert problem.played is not None
     beyond = -problem.played.size % _GROUPS
@@ -214,10 +215,10 @@ def each_step() -> Update:
 
 def _descend(
     problem: Problem,
-    grads: Any,
+    grads: Params,
     divisor: int | jax.Array,
-    params: Any,
-    opt_state: Any,
+    params: Params,
+    opt_state: optax.OptState,
     turn: Callable[[Any], Any] = lambda gradient: gradient,
 ) -> tuple[Any, Any, dict[str, jax.Array]]:
     """Makes one optimiser step on summed gradients; also returns the metrics of that step.
@@ -259,7 +260,7 @@ def clip_by_norm(max_norm: float | jax.Array) -> optax.GradientTransformation:
 
 def make_optimizer(
     name: str = "adam",
-    learning_rate: Any = 1e-2,
+    learning_rate: optax.ScalarOrSchedule = 1e-2,
     *,
     weight_decay: float = 0.0,
     max_grad_norm: float | jax.Array | None = 1.0,

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from flax import linen as nn
 from jax import lax
 
 from mjx_reinforce.learners.estimators import Estimator, explained_variance, reward_to_go
@@ -43,7 +44,7 @@ def value_baseline(
     discount: float | jax.Array = 0.99,
     *,
     horizon: int = 1000,
-    network: Any = None,
+    network: nn.Module | None = None,
     optimizer: optax.GradientTransformation | None = None,
     num_fits: int = 32,
     batch_size: int = 256,
@@ -76,7 +77,7 @@ def value_baseline(
     def value(params, observation, time):
         share = jnp.asarray(time, observation.dtype) / horizon
         seen = jnp.concatenate([observation, share[..., None]], axis=-1)
-        return network.apply(params, seen)[..., 0]
+        return jnp.asarray(network.apply(params, seen))[..., 0]
 
     def init(key, observation_size):
         network_key, key = jax.random.split(key)
@@ -128,7 +129,7 @@ class FullBatchCritic(NamedTuple):
 def full_batch_value_baseline(
     discount: float | jax.Array = 0.99,
     *,
-    network: Any = None,
+    network: nn.Module | None = None,
     optimizer: optax.GradientTransformation | None = None,
     num_fits: int = 10,
 ) -> Estimator:
@@ -151,7 +152,7 @@ def full_batch_value_baseline(
     to_go, network, fitter = _parts(discount, network, optimizer)
 
     def value(params, observation):
-        return network.apply(params, observation)[..., 0]
+        return jnp.asarray(network.apply(params, observation))[..., 0]
 
     def squared_error(params, chunk):
         observation, returns, mask = chunk
@@ -180,13 +181,17 @@ def full_batch_value_baseline(
     return Estimator(init, update)
 
 
-def _parts(discount: Any, network: Any, optimizer: Any) -> tuple[Estimator, Any, Any]:
+def _parts(
+    discount: float | jax.Array,
+    network: nn.Module | None,
+    optimizer: optax.GradientTransformation | None,
+) -> tuple[Estimator, nn.Module, optax.GradientTransformation]:
     """Returns what gives the returns to go, the network, and the optimiser."""
     network = MLP((64, 64), 1) if network is None else network
     return reward_to_go(discount), network, optax.adam(3e-3) if optimizer is None else optimizer
 
 
-def _first_params(network: Any, key: jax.Array, inputs: int) -> Any:
+def _first_params(network: nn.Module, key: jax.Array, inputs: int) -> Any:
     """Returns the network's first parameters; raises ValueError if it returns no values."""
     params = network.init(key, jnp.zeros(inputs))
     shape = jax.eval_shape(network.apply, params, jnp.zeros(inputs)).shape

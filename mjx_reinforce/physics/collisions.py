@@ -1,14 +1,17 @@
 """Which bodies of a model can meet, for those who want fewer contacts."""
 
 from collections import Counter
-from typing import Any
+from typing import TYPE_CHECKING
 
 from mjx_reinforce.physics.mjx_internals import geom_pairs
+
+if TYPE_CHECKING:
+    from mujoco import mjx
 
 _NAMED = 3
 
 
-def advice(model: Any) -> str:
+def advice(model: "mjx.Model") -> str:
     """Returns how to make a compiled model's contacts fewer; empty where no geoms can meet."""
     pairs = [pair[:2] for pair in geom_pairs(model)]
     if not pairs:

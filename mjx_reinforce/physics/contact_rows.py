@@ -5,10 +5,11 @@ for one episode (`fused`) skips such a contact by a branch. Where XLA computes m
 once both sides of a branch would be computed, and there these are products of whole matrices.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from mjx_reinforce.physics.by_engine import UNROLL, by_engine
@@ -27,7 +28,7 @@ class Blocks(NamedTuple):
     unroll: int
 
 
-def blocks(others: int, dims: Any, unroll: int = UNROLL) -> Blocks:
+def blocks(others: int, dims: np.ndarray, unroll: int = UNROLL) -> Blocks:
     """Returns the division for contacts [C] of these dimensions under pyramidal cones."""
     kinds = [dim for dim in (1, 3, 4, 6) if (dims == dim).any()]
     rows = {dim: 1 if dim == 1 else 2 * (dim - 1) for dim in kinds}

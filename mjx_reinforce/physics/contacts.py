@@ -15,8 +15,6 @@ every pair of capsules would pay for a second row (a fifth of Humanoid's time on
 `fwd_position` is MJX's with these three in the table of collision functions.
 """
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 from mujoco import mjx
@@ -71,7 +69,7 @@ def _closest_points(first: GeomInfo, second: GeomInfo) -> tuple[jax.Array, jax.A
     axis1, axis2 = first.mat[:, 2] * first.size[1], second.mat[:, 2] * second.size[1]
     offset = first.pos - second.pos
 
-    def meet(along1: Any) -> jax.Array:
+    def meet(along1: float | jax.Array) -> jax.Array:
         """Returns a place on the first axis and the closest on the second, in half lengths."""
         free = jnp.dot(offset + along1 * axis1, axis2) / jnp.dot(axis2, axis2)
         along2 = jnp.clip(free, -1, 1)

@@ -34,6 +34,7 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from mujoco import mjx
 from mujoco.mjx._src import collision_driver, collision_sdf, scan
 from mujoco.mjx._src.collision_driver import geom_pairs
@@ -180,7 +181,7 @@ def _descend(objective: Callable[..., Any], x: jax.Array, niter: int) -> tuple[A
 
 
 @contextlib.contextmanager
-def _swapped(module: types.ModuleType, name: str, value: Any) -> Iterator[None]:
+def _swapped(module: types.ModuleType, name: str, value: object) -> Iterator[None]:
     """Gives a module's name another meaning for a while."""
     before = getattr(module, name)
     setattr(module, name, value)
@@ -229,7 +230,7 @@ def with_rows(data: mjx.Data, rows: list[jax.Array]) -> mjx.Data:
     return cast(mjx.Data, data.tree_replace(dict(zip(names, rows, strict=True))))
 
 
-def with_contact(data: mjx.Data, contact: Any, dim: Any) -> mjx.Data:
+def with_contact(data: mjx.Data, contact: Any, dim: np.ndarray) -> mjx.Data:
     """Returns the data with other contacts, of these dimensions."""
     return cast(mjx.Data, data.tree_replace({"_impl.contact": contact.replace(dim=dim)}))
 
@@ -251,6 +252,6 @@ class Simulation:
         raise AttributeError(f"mjx.Data has no field {name!r}; see mjData in MuJoCo's reference")
 
 
-def num_contacts(data: Any) -> int:
+def num_contacts(data: mjx.Data) -> int:
     """Returns the most contacts that a model can have at once, from its ``mjx.Data``."""
     return int(jax_fields(data).ncon)

@@ -20,7 +20,7 @@ def known_number(value: Any) -> float | None:
         return math.nan
 
 
-def check_number(name: str, value: Any, *, positive: bool = False, finite: bool = True) -> None:
+def check_number(name: str, value: object, *, positive: bool = False, finite: bool = True) -> None:
     """Raises ValueError for what is no number, or one that is negative."""
     number = known_number(value)
     if number is None:
@@ -31,14 +31,14 @@ def check_number(name: str, value: Any, *, positive: bool = False, finite: bool 
         raise ValueError(f"{name} must be {kind}{' and finite' * finite}, got {value!r}")
 
 
-def check_count(name: str, value: Any, least: int = 1) -> None:
+def check_count(name: str, value: int, least: int = 1) -> None:
     """Raises ValueError for what is no whole number, or one that is less than ``least``."""
     check_type(name, value, int)
     if value < least:
         raise ValueError(f"{name} must be at least {least}, got {value}")
 
 
-def check_key(key: Any) -> None:
+def check_key(key: object) -> None:
     """Raises ValueError for what is no random key."""
     dtype = getattr(key, "dtype", None)
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)

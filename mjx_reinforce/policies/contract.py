@@ -1,5 +1,6 @@
 """Does a policy do what a policy must? Found from shapes: nothing is compiled."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -8,11 +9,11 @@ import jax.numpy as jnp
 from mjx_reinforce.checks import check_kind, explain
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.policies.policy import Policy
-from mjx_reinforce.types import Environment, null_action
+from mjx_reinforce.types import Environment, PyTree, null_action
 
 
 def check_policy(
-    policy: Any, env: Environment, observation_size: int, *, likelihood: bool = False
+    policy: Policy, env: Environment, observation_size: int, *, likelihood: bool = False
 ) -> None:
     """Raises ValueError for a policy that cannot play an environment, in one line that says why.
 
@@ -55,7 +56,7 @@ def check_policy(
         _shapes("policy.distribution.log_prob", distribution.log_prob, outputs, action)
 
 
-def _shapes(name: str, function: Any, *arguments: Any) -> Any:
+def _shapes(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> Any:
     """Returns the shapes of what a user's function returns."""
     try:
         return jax.eval_shape(function, *arguments)

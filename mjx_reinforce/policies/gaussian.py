@@ -6,6 +6,7 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from mjx_reinforce.policies.action_range import continuous_box, middle_and_half_range
 from mjx_reinforce.policies.arguments import check_number, known_number
@@ -97,7 +98,7 @@ def gaussian_outputs(
     return GaussianOutputs(size, std, initial_std, middle, half)
 
 
-def _log(x: Any) -> Any:
+def _log(x: ArrayLike) -> Any:
     """Returns a logarithm, rounded once where the number is known."""
     return jnp.log(x) if isinstance(x, jax.core.Tracer) else float(np.log(x))
 

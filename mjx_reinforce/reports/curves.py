@@ -1,11 +1,14 @@
 """Pictures of how seeds learned."""
 
 import io
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mjx_reinforce.reports.statistics import iqm, iqm_interval, smooth
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 #: Training returns are drawn as means over so many episodes.
 _SMOOTHED_EPISODES = 50
@@ -68,7 +71,9 @@ def draw_learning_curve(
     return picture.getvalue()
 
 
-def _draw_training(axes: Any, grid: np.ndarray, training: dict[str, np.ndarray], axis: str) -> None:
+def _draw_training(
+    axes: "Axes", grid: np.ndarray, training: dict[str, np.ndarray], axis: str
+) -> None:
     """Draws the smoothed training returns, as ``draw_learning_curve`` says."""
     episodes = training["episodes"][0, 0]  # an update
     window = min(-(-_SMOOTHED_EPISODES // episodes), len(training[axis]))
@@ -79,7 +84,7 @@ def _draw_training(axes: Any, grid: np.ndarray, training: dict[str, np.ndarray],
 
 
 def _draw_mean(
-    axes: Any, grid: np.ndarray, steps: np.ndarray, returns: np.ndarray, color: str, label: str
+    axes: "Axes", grid: np.ndarray, steps: np.ndarray, returns: np.ndarray, color: str, label: str
 ) -> None:
     """Draws the interquartile mean over seeds of curves [E, S] on a grid of steps, and its band.
 

@@ -77,7 +77,7 @@ def spoken(name: str) -> str:
     return name.replace("_", " ")
 
 
-def say(value: Any) -> str:
+def say(value: object) -> str:
     """Returns the value of a setting in words; sizes of layers as 32-32."""
     if isinstance(value, list | tuple):
         return "-".join(map(say, value)) or "none"

@@ -1,7 +1,7 @@
 """What a task is, for people: its sizes, its rules, its default settings, and how long it takes."""
 
 import inspect
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +11,10 @@ from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.relevance import as_flag, changed, is_read
+from mjx_reinforce.types import Environment
+
+if TYPE_CHECKING:
+    from mjx_reinforce.envs.base import MujocoEnv
 
 #: Settings of the defaults that a sentence of their own says.
 _SAID = ("env", "num_seeds", "env_steps")
@@ -31,7 +35,7 @@ def about_task(id: str) -> str:
     return "\n\n".join([id, _facts(id, env), *said, *_training(config)])
 
 
-def _facts(id: str, env: Any) -> str:
+def _facts(id: str, env: "MujocoEnv") -> str:
     """Returns the sizes of a task, a line each."""
     from mjx_reinforce.types import observation_size
 
@@ -51,7 +55,7 @@ def _facts(id: str, env: Any) -> str:
     return "\n".join(f"  {name:11}  {fact}" for name, fact in facts.items())
 
 
-def _action(env: Any) -> str:
+def _action(env: Environment) -> str:
     from mjx_reinforce.types import Discrete, action_space
 
     space = action_space(env)

@@ -1,12 +1,25 @@
 """From settings to a learner."""
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.runs.config import Config, check_step_count
 
+if TYPE_CHECKING:
+    import jax
+    import optax
 
-def build(env: Any, config: Config, policy: Any = None) -> tuple[Any, int]:
+    from mjx_reinforce.learners.estimators import Estimator
+    from mjx_reinforce.learners.learner import Learner
+    from mjx_reinforce.learners.updates import Update
+    from mjx_reinforce.policies.policy import Policy
+    from mjx_reinforce.types import Environment
+
+
+def build(
+    env: "Environment", config: Config, policy: "Policy | None" = None
+) -> "tuple[Learner, int]":
     """Builds the learner that the settings describe.
 
     Args:
@@ -43,7 +56,7 @@ def build(env: Any, config: Config, policy: Any = None) -> tuple[Any, int]:
     return build_learner(env, config, shared), horizon
 
 
-def policy_settings(env: Any, config: Config) -> dict[str, Any]:
+def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
     """Returns what ``policy_files.build_policy`` needs to build the policy without the env."""
     from mjx_reinforce.types import Discrete, action_space, observation_size
 
@@ -66,7 +79,7 @@ def policy_settings(env: Any, config: Config) -> dict[str, Any]:
     }
 
 
-def _build_reinforce(env: Any, config: Config, shared: dict[str, Any]) -> Any:
+def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
     from mjx_reinforce.engines.native import outlook
     from mjx_reinforce.learners.pace import AutoEpisodes
     from mjx_reinforce.learners.reinforce import reinforce
@@ -91,7 +104,7 @@ def _build_reinforce(env: Any, config: Config, shared: dict[str, Any]) -> Any:
     )
 
 
-def _build_ars(env: Any, config: Config, shared: dict[str, Any]) -> Any:
+def _build_ars(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
     from mjx_reinforce.learners.ars import ars
 
     return ars(
@@ -106,7 +119,9 @@ def _build_ars(env: Any, config: Config, shared: dict[str, Any]) -> Any:
     )
 
 
-def _build_estimator(config: Config, horizon: int) -> Any:
+def _build_estimator(
+    config: Config, horizon: int
+) -> "Estimator | Callable[[jax.Array], Estimator]":
     """Returns an estimator; where its discount changes, a function from the used share to one."""
     from mjx_reinforce.learners.schedules import look_further
 
@@ -116,7 +131,7 @@ def _build_estimator(config: Config, horizon: int) -> Any:
     return lambda progress: _estimator(config, horizon, look_further(first, last, progress))
 
 
-def _estimator(config: Config, horizon: int, discount: Any) -> Any:
+def _estimator(config: Config, horizon: int, discount: "float | jax.Array") -> "Estimator":
     from mjx_reinforce.learners import estimators
     from mjx_reinforce.policies.arguments import known_number
     from mjx_reinforce.registry import ESTIMATORS, load
@@ -135,7 +150,9 @@ def _estimator(config: Config, horizon: int, discount: Any) -> Any:
     return estimator
 
 
-def _build_value_baseline(config: Config, horizon: int, discount: Any) -> Any:
+def _build_value_baseline(
+    config: Config, horizon: int, discount: "float | jax.Array"
+) -> "Estimator":
     import optax
 
     from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
@@ -151,7 +168,7 @@ def _build_value_baseline(config: Config, horizon: int, discount: Any) -> Any:
     return value_baseline(discount, horizon=horizon, batch_size=config.value_batch_size, **shared)
 
 
-def _build_optimizer(config: Config) -> Any:
+def _build_optimizer(config: Config) -> "optax.GradientTransformation":
     import optax
 
     from mjx_reinforce.learners import schedules
@@ -183,7 +200,7 @@ def _build_optimizer(config: Config) -> Any:
     return optax.chain(optimizer, schedules.shrink_std(ratio, length))
 
 
-def _build_update(config: Config, policy: Any) -> Any:
+def _build_update(config: Config, policy: "Policy") -> "Update":
     from mjx_reinforce.learners import updates
     from mjx_reinforce.learners.natural_gradient import natural_gradient
 

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mjx_reinforce.export.player import Player
 from mjx_reinforce.export.pretrained import is_pretrained, provenance
 from mjx_reinforce.export.run_files import Run, choose_seed, read_run
 
@@ -91,7 +92,7 @@ def _role(seed: Any, settings: Any, source: Source) -> Role:
     return Role(f"seed {player.seed}{rank}", f"seed {player.seed}", player)
 
 
-def untrained(player: Any) -> Any:
+def untrained(player: Player) -> Any:
     """Returns a player whose policy has random parameters, as training begins with."""
     import jax
 

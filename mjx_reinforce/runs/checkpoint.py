@@ -20,6 +20,7 @@ import numpy as np
 
 from mjx_reinforce.export.files import members, write_bytes
 from mjx_reinforce.runs.keys import is_key, plain
+from mjx_reinforce.types import PyTree
 
 Arrays = dict[str, np.ndarray]
 
@@ -81,7 +82,7 @@ def save(folder: Path, checkpoint: Checkpoint, *, even: bool) -> None:
             path.unlink()
 
 
-def load(folder: Path, like: Any, say: Callable[[str], None]) -> Iterator[Checkpoint]:
+def load(folder: Path, like: PyTree, say: Callable[[str], None]) -> Iterator[Checkpoint]:
     """Yields the checkpoints of a folder, the newest first, without those that are damaged.
 
     Args:
@@ -151,7 +152,7 @@ def _encode(checkpoint: Checkpoint) -> bytes:
     return archive.getvalue()
 
 
-def _decode(content: bytes, path: Path, like: Any) -> Checkpoint:
+def _decode(content: bytes, path: Path, like: PyTree) -> Checkpoint:
     """Reads what ``_encode`` returned; see ``load``."""
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
@@ -171,14 +172,14 @@ def _decode(content: bytes, path: Path, like: Any) -> Checkpoint:
         ) from error
 
 
-def _flatten(tree: Any) -> Arrays:
+def _flatten(tree: PyTree) -> Arrays:
     """Returns the leaves of a pytree on the host under the names of their paths; keys as data."""
     leaves, _ = jax.tree.flatten_with_path(plain(tree))
     raw = {_name(path): leaf for path, leaf in leaves}
     return {name: np.asarray(value) for name, value in jax.device_get(raw).items()}
 
 
-def _unflatten(arrays: Arrays, like: Any) -> Any:
+def _unflatten(arrays: Arrays, like: PyTree) -> Any:
     """Returns a pytree like another, from what ``_flatten`` returned.
 
     Raises:
@@ -200,7 +201,7 @@ def _name(path: Any) -> str:
     return "state/" + jax.tree_util.keystr(path, simple=True, separator="/")
 
 
-def _leaf(values: np.ndarray, old: Any) -> jax.Array:
+def _leaf(values: np.ndarray, old: jax.Array) -> jax.Array:
     """Returns values in memory of the device's own, which may be donated; a key where it was."""
     array = jax.numpy.array(values)
     return jax.random.wrap_key_data(array) if is_key(old) else array

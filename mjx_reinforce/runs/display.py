@@ -67,7 +67,7 @@ class Display:
         self._bar.start()
         return self
 
-    def __exit__(self, *_: Any) -> None:
+    def __exit__(self, *_: object) -> None:
         """Leaves the last state on the screen."""
         self._bar.stop()
 

@@ -37,7 +37,7 @@ class Interrupt:
         _start(self._listen)
         return self
 
-    def __exit__(self, *_: Any) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(self._descriptor)
@@ -106,5 +106,5 @@ def _start(action: Callable[[], Any]) -> threading.Thread:
     return thread
 
 
-def _nothing(number: int, frame: Any) -> None:
+def _nothing(number: int, frame: object) -> None:
     """Handles a signal, so that Python tells the thread of it."""

@@ -29,6 +29,7 @@ from mjx_reinforce.runs.keys import plain
 from mjx_reinforce.runs.resume import recordable
 from mjx_reinforce.runs.state import Budget, Parts, eval_keys_shape
 from mjx_reinforce.runs.trees import describe, rebuild
+from mjx_reinforce.types import PyTree
 
 #: Settings that change no program. Of the budgets, ``block_length`` says what does.
 _INPUTS = (
@@ -127,7 +128,7 @@ def _export(
     return _program(content)
 
 
-def _leaves(tree: Any) -> list[jax.ShapeDtypeStruct]:
+def _leaves(tree: PyTree) -> list[jax.ShapeDtypeStruct]:
     """Returns the shapes of the leaves, with the data of keys in their place."""
     return jax.tree.leaves(jax.eval_shape(plain, tree))
 

@@ -2,14 +2,18 @@
 
 import itertools
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export.player import Player
 from mjx_reinforce.runs.mujoco_playing import moments
 
+if TYPE_CHECKING:
+    from mjx_reinforce.envs.base import MujocoEnv
+    from mjx_reinforce.types import MjModel
 
-def live(env: Any, model: Any, player: Player, horizon: int, settings: Any) -> None:
+
+def live(env: "MujocoEnv", model: "MjModel", player: Player, horizon: int, settings: Any) -> None:
     """Plays episode after episode in MuJoCo's viewer, at the speed of life, until it is closed.
 
     The mouse pulls at bodies: a double click selects one, Ctrl and a drag pulls.
@@ -24,7 +28,6 @@ def live(env: Any, model: Any, player: Player, horizon: int, settings: Any) -> N
     Raises:
       ValueError: the viewer does not open, or C MuJoCo cannot play the task.
     """
-    import mujoco
     import mujoco.viewer
 
     kinds: Any = mujoco

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -10,6 +10,11 @@ import numpy as np
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export.player import Player
 from mjx_reinforce.runs.playing import Episode
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from mjx_reinforce.types import Environment, MjModel
 
 #: A push: when the first begins, how often another does, and how long it lasts (s).
 FIRST, EVERY, LASTING = 2.0, 3.0, 0.1
@@ -29,7 +34,7 @@ class Moment(NamedTuple):
 
 
 def mujoco_simulator(
-    env: Any, player: Player, horizon: int, push: float = 0.0
+    env: "Environment", player: Player, horizon: int, push: float = 0.0
 ) -> Callable[[int, bool], Episode]:
     """Returns a function that plays in C MuJoCo.
 
@@ -88,10 +93,8 @@ def push_at(seconds: float, push: float) -> float:
     return push if number % 2 == 0 else -push
 
 
-def pushed_body(model: Any) -> int:
+def pushed_body(model: "MjModel") -> int:
     """Returns the number of the body that is pushed: the highest in the model's pose."""
-    import mujoco
-
     kinds: Any = mujoco
     data = kinds.MjData(model)
     kinds.mj_kinematics(model, data)

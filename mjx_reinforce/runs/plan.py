@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mjx_reinforce.runs import measured, operations
 from mjx_reinforce.runs.config import Config
@@ -17,6 +17,9 @@ from mjx_reinforce.runs.memory import (
     num_cores,
     num_parameters,
 )
+
+if TYPE_CHECKING:
+    from mjx_reinforce.runs.ready import Ready
 
 #: The figures are good to this factor.
 _ACCURACY = 2.0
@@ -74,7 +77,7 @@ class Plan(NamedTuple):
         return f"training takes about {duration(seconds)} in all, not {said} as was said"
 
 
-def make_plan(ready: Any, config: Config, num_processes: int = 1) -> Plan:
+def make_plan(ready: "Ready", config: Config, num_processes: int = 1) -> Plan:
     """Returns the plan of a run on this machine.
 
     Args:

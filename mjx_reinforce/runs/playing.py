@@ -3,7 +3,7 @@
 import functools
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,9 @@ from mjx_reinforce.engines.episode import begin, hold, step
 from mjx_reinforce.export.films import import_gymnasium
 from mjx_reinforce.export.player import Player
 from mjx_reinforce.policies.actor import act
+
+if TYPE_CHECKING:
+    from mjx_reinforce.types import Environment
 
 
 class Episode(NamedTuple):
@@ -33,7 +36,7 @@ class Episode(NamedTuple):
         return float(self.rewards.sum())
 
 
-def simulator(env: Any, player: Player, horizon: int) -> Callable[[int, bool], Episode]:
+def simulator(env: "Environment", player: Player, horizon: int) -> Callable[[int, bool], Episode]:
     """Returns a function that plays in our simulation.
 
     The program depends neither on the seed nor on the start, so it is compiled once and found

@@ -9,6 +9,7 @@ from mjx_reinforce.runs.build import build, policy_settings
 from mjx_reinforce.runs.config import Config, check_step_count
 from mjx_reinforce.runs.relevance import check_read_by_policy
 from mjx_reinforce.runs.state import Parts, parts_of
+from mjx_reinforce.types import Environment
 
 
 class Ready(NamedTuple):
@@ -32,7 +33,9 @@ class Ready(NamedTuple):
     parts: Parts
 
 
-def prepare(config: Config, default: Config, env: Any = None, share: slice = slice(None)) -> Ready:
+def prepare(
+    config: Config, default: Config, env: Environment | None = None, share: slice = slice(None)
+) -> Ready:
     """Returns what the settings come to; from disk, if they did before.
 
     Args:
@@ -73,7 +76,7 @@ def _found(key: str, config: Config, share: slice) -> Ready | None:
     return Ready(**facts, engine_seconds=0.0, parts=parts)
 
 
-def made(env: Any, config: Config, share: slice = slice(None)) -> Ready:
+def made(env: Environment, config: Config, share: slice = slice(None)) -> Ready:
     """Returns what the settings come to in an environment, for all seeds or a share of them.
 
     Raises:

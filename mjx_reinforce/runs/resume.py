@@ -6,9 +6,13 @@ import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from mjx_reinforce.runs.config import Config
+
+if TYPE_CHECKING:
+    from mjx_reinforce.runs.checkpoint import Checkpoint
+    from mjx_reinforce.runs.state import RunState
 
 #: What may change when a run goes on: when it ends, and how often it is saved.
 BUDGETS = ("env_steps", "max_updates", "minutes", "stop_when_solved", "checkpoint_every")
@@ -173,7 +177,7 @@ def check_same_program(
             )
 
 
-def find(like: Any, config: Config, say: Callable[[str], None]) -> Any:
+def find(like: "RunState", config: Config, say: Callable[[str], None]) -> Any:
     """Returns the newest checkpoint that serves, or None: then the run starts again.
 
     Args:
@@ -220,7 +224,7 @@ def _size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
-def _serves(found: Any, config: Config) -> bool:
+def _serves(found: "Checkpoint", config: Config) -> bool:
     """Returns whether a run with this budget passes through a checkpoint.
 
     One with a budget in time goes on from any: it is no other run's equal.

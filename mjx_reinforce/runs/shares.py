@@ -7,7 +7,6 @@ process. All wait for the slowest after each block, as the seeds of one process 
 
 import io
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +16,7 @@ from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.runs.keys import plain
 from mjx_reinforce.runs.processes import Processes
 from mjx_reinforce.runs.state import Arrays, Budget, Looked, Programs, RunState, restored
+from mjx_reinforce.types import PyTree
 
 #: What a process is asked for, besides the names of ``Programs``.
 _END = "end"
@@ -45,7 +45,7 @@ def lead(
         assert others is not None, "a process left a run that had not ended"
         return [mine, *(_decode(content)[1] for content in others)]
 
-    def ask(name: str, tree: Any, **common: np.ndarray) -> list[Arrays]:
+    def ask(name: str, tree: PyTree, **common: np.ndarray) -> list[Arrays]:
         leaves = _leaves(tree)
         parts = [{k: x[each] for k, x in leaves.items()} | common for each in shares]
         processes.tell(*(_encode(name, part) for part in parts[1:]))
@@ -123,7 +123,7 @@ def _state(leaves: Arrays, like: RunState) -> RunState:
     return restored([leaves[str(i)] for i in range(len(leaves))], like)
 
 
-def _leaves(tree: Any) -> Arrays:
+def _leaves(tree: PyTree) -> Arrays:
     """Returns the leaves of a pytree on the host by their numbers; keys as data."""
     leaves = jax.device_get(jax.tree.leaves(plain(tree)))
     return {str(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}

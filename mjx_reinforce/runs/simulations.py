@@ -1,7 +1,7 @@
 """Which simulation plays a policy."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 from mjx_reinforce.envs.base import MujocoEnv
 from mjx_reinforce.export.player import Player
@@ -10,9 +10,12 @@ from mjx_reinforce.runs.mujoco_playing import mujoco_simulator
 from mjx_reinforce.runs.playing import Episode, gymnasium_simulator, simulator
 from mjx_reinforce.types import observation_size
 
+if TYPE_CHECKING:
+    from mjx_reinforce.types import Environment
+
 
 def simulators(
-    backend: str | None, env: Any, player: Player, source: Source, push: float
+    backend: str | None, env: "Environment", player: Player, source: Source, push: float
 ) -> dict[str, Callable[[int, bool], Episode]]:
     """Returns what plays an episode, by name; the last is filmed, others are compared with it.
 
@@ -39,7 +42,7 @@ def simulators(
     return found
 
 
-def check_size(env: Any, player: Player, source: Source) -> None:
+def check_size(env: "Environment", player: Player, source: Source) -> None:
     """Raises ValueError for a policy of a run whose observations are not the environment's."""
     if source.run is None:
         return

@@ -19,9 +19,11 @@ from mjx_reinforce.runs.blocks import block_length
 from mjx_reinforce.runs.config import MAX_COUNT, Config
 from mjx_reinforce.runs.evaluation import evaluate, guests_of, measure
 from mjx_reinforce.runs.keys import plain, with_keys
-from mjx_reinforce.types import Environment
+from mjx_reinforce.types import Environment, PyTree
 
 Arrays = dict[str, np.ndarray]
+#: A root of randomness; traced inside of programs.
+Seed = int | np.uint32 | jax.Array
 #: Returns the learner of settings that may be traced, of one seed each.
 BuildLearner = Callable[[dict[str, jax.Array]], Learner]
 
@@ -119,7 +121,7 @@ def seed_keys(config: Config) -> jax.Array:
     return _seed_keys(config.seed, config.num_seeds)
 
 
-def _seed_keys(seed: Any, num_seeds: int) -> jax.Array:
+def _seed_keys(seed: Seed, num_seeds: int) -> jax.Array:
     return jax.random.split(_key(seed, domain=0), num_seeds)
 
 
@@ -164,7 +166,7 @@ def parts_of(
     """
 
     # One program, whatever the seeds are: a program for each operation on keys takes longer.
-    def first(seed: Any, eval_seed: Any) -> tuple[RunState, jax.Array]:
+    def first(seed: Seed, eval_seed: Seed) -> tuple[RunState, jax.Array]:
         roots = _seed_keys(seed, config.num_seeds), _eval_keys(eval_seed, config.num_seeds)
         state = beginning(lambda _: learner)(*(keys[share] for keys in roots), {})
         return state, _test_keys(eval_seed, config)[:, share]
@@ -175,11 +177,11 @@ def parts_of(
     evaluate = evaluation(env, learner, horizon, config)
     like = jax.eval_shape(first, np.uint32(0), np.uint32(0))[0]
 
-    def start(seed: Any, eval_seed: Any) -> Any:
+    def start(seed: Seed, eval_seed: Seed) -> Any:
         state, test_keys = plain(first(seed, eval_seed))
         return jax.tree.leaves(state), test_keys
 
-    def advance(leaves: list[jax.Array], budget: Sequence[jax.Array], look: Any) -> Any:
+    def advance(leaves: list[jax.Array], budget: Sequence[jax.Array], look: jax.Array) -> Any:
         before = restored(leaves, like)
         state, block = updates(before, Budget(*budget), look)
         present = before.train_states.actor, before.train_states.num_updates
@@ -204,11 +206,11 @@ def compile_parts(
     """
     like, budget = parts.like, budget_of(config)
 
-    def start(*seeds: Any) -> tuple[RunState, jax.Array]:
+    def start(*seeds: Seed) -> tuple[RunState, jax.Array]:
         leaves, test_keys = parts.start()(*seeds)
         return restored(leaves, like), test_keys
 
-    def advance(state: RunState, budget: Budget, look: Any) -> Any:
+    def advance(state: RunState, budget: Budget, look: jax.Array) -> Any:
         leaves, block, present = parts.advance()(jax.tree.leaves(plain(state)), tuple(budget), look)
         return restored(leaves, like), Block(*block), present
 
@@ -251,12 +253,12 @@ def compile_parts(
     return first, Programs(advanced, evaluated, tested)
 
 
-def restored(leaves: Sequence[jax.Array | np.ndarray], like: Any) -> Any:
+def restored(leaves: Sequence[jax.Array | np.ndarray], like: PyTree) -> Any:
     """Returns a pytree like another of plain leaves; its keys are keys again."""
     return with_keys(jax.tree.unflatten(jax.tree.structure(like), leaves), like)
 
 
-def _key(seed: Any, domain: int) -> jax.Array:
+def _key(seed: Seed, domain: int) -> jax.Array:
     """Returns the root of the keys of training (domain 0), evaluation (1), or the last test (2).
 
     The domains share no key, whatever seeds the user chooses.
@@ -274,11 +276,11 @@ def eval_keys(config: Config) -> jax.Array:
     return _eval_keys(config.eval_seed, config.num_seeds)
 
 
-def _eval_keys(eval_seed: Any, num_seeds: int) -> jax.Array:
+def _eval_keys(eval_seed: Seed, num_seeds: int) -> jax.Array:
     return _for_each_seed(_key(eval_seed, domain=1), num_seeds)
 
 
-def _test_keys(eval_seed: Any, config: Config) -> jax.Array:
+def _test_keys(eval_seed: Seed, config: Config) -> jax.Array:
     """Returns the keys [K, S] of the last test, which plays the episodes of K evaluations."""
     rounds = -(-(config.test_episodes or config.eval_episodes) // config.eval_episodes)
     keys = jax.random.split(_key(eval_seed, domain=2), rounds)
@@ -399,7 +401,7 @@ def evaluation(
     ``evaluation.evaluate``.
     """
 
-    def one(actor: Actor, key: jax.Array, active: Any = True) -> dict[str, jax.Array]:
+    def one(actor: Actor, key: jax.Array, active: bool | jax.Array = True) -> dict[str, jax.Array]:
         size = {"num_episodes": config.eval_episodes, "horizon": horizon}
         return evaluate(env, learner, actor, key, **size, active=active, sampled=sampled)
 

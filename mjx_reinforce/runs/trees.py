@@ -8,12 +8,13 @@ import jax
 import numpy as np
 
 from mjx_reinforce.runs.keys import is_key
+from mjx_reinforce.types import PyTree
 
 #: The packages whose classes a description may name.
 _PACKAGES = ("mjx_reinforce", "optax")
 
 
-def describe(tree: Any) -> Any:
+def describe(tree: PyTree) -> Any:
     """Returns what JSON can hold of a pytree: its structure, and its leaves' shapes and dtypes.
 
     Args:
@@ -65,7 +66,7 @@ def rebuild(described: Any) -> Any:
     return {"tuple": tuple, "list": list}[kind](map(rebuild, parts))
 
 
-def _fields(tree: Any) -> tuple[str, ...] | None:
+def _fields(tree: PyTree) -> tuple[str, ...] | None:
     """Returns the names of the fields of a dataclass or NamedTuple; None of anything else."""
     if dataclasses.is_dataclass(tree):
         return tuple(field.name for field in dataclasses.fields(tree))

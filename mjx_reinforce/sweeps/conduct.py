@@ -4,12 +4,13 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from mjx_reinforce.learners import counts
 from mjx_reinforce.runs.config import MAX_COUNT
+from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.plan import duration, is_wrong
 from mjx_reinforce.runs.processes import Processes
@@ -61,7 +62,7 @@ class Conductor:
         design: Design,
         processes: Processes,
         files: SweepFiles,
-        display: Any,
+        display: Display,
         interrupt: Interrupt | None,
         ready: Callable[[float], None],
     ):

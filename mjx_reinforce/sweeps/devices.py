@@ -10,6 +10,8 @@ from typing import Any
 import jax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from mjx_reinforce.types import PyTree
+
 _AXIS = "runs"
 #: The first axis is that of the runs; none is.
 RUNS, NONE = PartitionSpec(_AXIS), PartitionSpec()
@@ -41,11 +43,11 @@ class Devices:
         shardings = jax.tree.map(lambda spec: NamedSharding(self.mesh, spec), out_specs)
         return jax.jit(mapped, out_shardings=shardings, **options)
 
-    def put(self, tree: Any, spec: PartitionSpec) -> Any:
+    def put(self, tree: PyTree, spec: PartitionSpec) -> Any:
         """Returns arrays divided among the devices."""
         return jax.device_put(tree, NamedSharding(self.mesh, spec))
 
-    def shapes(self, tree: Any, spec: PartitionSpec) -> Any:
+    def shapes(self, tree: PyTree, spec: PartitionSpec) -> Any:
         """Returns the shapes of arrays that are divided among the devices."""
         sharding = NamedSharding(self.mesh, spec)
         return jax.tree.map(

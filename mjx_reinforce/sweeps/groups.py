@@ -8,6 +8,7 @@ import numpy as np
 
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.relevance import FREE_STD
+from mjx_reinforce.types import Environment
 
 _REINFORCE = (
     "learning_rate",
@@ -84,7 +85,7 @@ def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, fl
     }
 
 
-def learner_builder(env: Any, config: Config) -> Callable[[dict[str, Any]], Any]:
+def learner_builder(env: Environment, config: Config) -> Callable[[dict[str, Any]], Any]:
     """Returns the function from the traced settings of a run to its learner.
 
     Args:

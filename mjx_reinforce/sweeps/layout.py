@@ -11,11 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from mjx_reinforce.types import PyTree
+
 
 class Layout:
     """Writes the states of runs as rows [R, B] of bytes, and reads them; no bit changes."""
 
-    def __init__(self, like: Any):
+    def __init__(self, like: PyTree):
         """Takes the states of any number of runs, or their shapes, with the data of keys."""
         leaves, self._structure = jax.tree.flatten(like)
         self._shapes = [leaf.shape[1:] for leaf in leaves]
@@ -26,7 +28,7 @@ class Layout:
         ]
         self._ends = np.cumsum(sizes)[:-1].tolist()
 
-    def rows(self, states: Any) -> np.ndarray:
+    def rows(self, states: PyTree) -> np.ndarray:
         """Returns the rows of states on the host."""
         leaves = [np.ascontiguousarray(leaf) for leaf in jax.tree.leaves(states)]
         return np.concatenate([_flat(leaf).view(np.uint8) for leaf in leaves], axis=1)
@@ -38,7 +40,7 @@ class Layout:
             part.view(kind) for part, kind in zip(parts, self._types, strict=True)
         )
 
-    def traced_rows(self, states: Any) -> jax.Array:
+    def traced_rows(self, states: PyTree) -> jax.Array:
         """Returns what ``rows`` does, in a program."""
 
         def as_bytes(leaf: jax.Array) -> jax.Array:
@@ -69,6 +71,6 @@ class Layout:
         return jax.tree.unflatten(self._structure, shaped)
 
 
-def _flat(leaf: Any) -> Any:
+def _flat(leaf: PyTree) -> Any:
     """Returns a leaf as [R, numbers]."""
     return leaf.reshape(len(leaf), int(np.prod(leaf.shape[1:])))

@@ -19,6 +19,8 @@ from mjx_reinforce.sweeps.design import Design, as_record, check_design, flat
 
 if TYPE_CHECKING:
     from mjx_reinforce.report import Written
+    from mjx_reinforce.sweeps.prepare import Prepared
+    from mjx_reinforce.sweeps.results import SweepFiles
 
 #: Not every terminal has the page's quotation marks.
 _PLAIN_QUOTES = dict.fromkeys(
@@ -136,7 +138,9 @@ def _perform(
     return ended
 
 
-def _finish(design: Design, prepared: Any, files: Any, contents: dict[str, Any]) -> None:
+def _finish(
+    design: Design, prepared: "Prepared", files: "SweepFiles", contents: dict[str, Any]
+) -> None:
     """Writes the last files of a sweep, or those of one that was interrupted."""
     from mjx_reinforce.runs.build import policy_settings
     from mjx_reinforce.sweeps.grid import configure
@@ -162,7 +166,7 @@ def _report(directory: Path) -> "Written":
     return report.write_sweep(directory, directory / "report.html")
 
 
-def _contents(design: Design, prepared: Any, known: Mapping[str, Any]) -> dict[str, Any]:
+def _contents(design: Design, prepared: "Prepared", known: Mapping[str, Any]) -> dict[str, Any]:
     """Returns what sweep.json says while the sweep goes on."""
     from mjx_reinforce.runs.files import provenance
 

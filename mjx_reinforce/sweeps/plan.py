@@ -8,6 +8,7 @@ from mjx_reinforce.runs.build import policy_settings
 from mjx_reinforce.runs.memory import gigabytes, needed, num_cores
 from mjx_reinforce.runs.plan import duration, run_seconds, task_of, this_machine
 from mjx_reinforce.sweeps.groups import Group
+from mjx_reinforce.types import Environment
 
 #: Chunks take up to this part of the memory that is there.
 _MEMORY = 0.6
@@ -49,7 +50,12 @@ def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> Part:
 
 
 def chunk_limit(
-    env: Any, horizon: int, group: Group, asked: int | None, num_devices: int, num_processes: int
+    env: Environment,
+    horizon: int,
+    group: Group,
+    asked: int | None,
+    num_devices: int,
+    num_processes: int,
 ) -> int:
     """Returns how many runs of a group a chunk may have.
 
@@ -69,7 +75,7 @@ def chunk_limit(
     return min(limit, -(-total // num_processes))
 
 
-def _capacity(env: Any, horizon: int, group: Group, num_devices: int) -> int:
+def _capacity(env: Environment, horizon: int, group: Group, num_devices: int) -> int:
     """Returns how many runs memory holds side by side."""
     one = dataclasses.replace(group.config, num_seeds=1)
     task, machine = task_of(policy_settings(env, one), horizon, one), this_machine()
@@ -84,7 +90,7 @@ def _capacity(env: Any, horizon: int, group: Group, num_devices: int) -> int:
 
 
 def describe(
-    env: Any,
+    env: Environment,
     horizon: int,
     learners: Sequence[Any],
     groups: Sequence[Group],
@@ -129,7 +135,7 @@ def describe(
 
 
 def _time(
-    env: Any,
+    env: Environment,
     horizon: int,
     learners: Sequence[Any],
     groups: Sequence[Group],
@@ -148,7 +154,7 @@ def _time(
 
 
 def group_seconds(
-    env: Any, horizon: int, engine: str, group: Group, num_devices: int
+    env: Environment, horizon: int, engine: str, group: Group, num_devices: int
 ) -> float | None:
     """Returns about how long all runs of a group train (s), None where that is not known.
 

@@ -35,6 +35,7 @@ from mjx_reinforce.sweeps.devices import NONE, RUNS, Devices
 from mjx_reinforce.sweeps.history import Measured
 from mjx_reinforce.sweeps.layout import Layout
 from mjx_reinforce.sweeps.packing import pack
+from mjx_reinforce.types import Environment, PyTree
 
 #: What ``history.Measured`` has of a run's counts since the start.
 _COUNTS = ("updates", "env_steps")
@@ -135,7 +136,7 @@ class Programs(NamedTuple):
         lanes = pack(chosen, lengths, list(self.movers), self.devices.count)
         return lanes, self.clock.wait(self.movers[lanes.shape[1]])
 
-    def _put(self, slot: Any) -> Any:
+    def _put(self, slot: PyTree) -> Any:
         return self.devices.put(slot, RUNS)
 
 
@@ -164,7 +165,7 @@ def _joined(lanes: np.ndarray, slots: Sequence[Any]) -> Measured:
 
 
 def compile_programs(
-    env: Any,
+    env: Environment,
     build_learner: BuildLearner,
     horizon: int,
     config: Config,
@@ -240,7 +241,7 @@ def _begin(
 ) -> Callable[..., np.ndarray]:
     """Compiles ``Programs.begin``, which begins ``width`` runs at once."""
 
-    def first(keys: jax.Array, eval_keys: jax.Array, settings: Any) -> jax.Array:
+    def first(keys: jax.Array, eval_keys: jax.Array, settings: dict[str, jax.Array]) -> jax.Array:
         typed = map(jax.random.wrap_key_data, (keys, eval_keys))
         return layout.traced_rows(plain(beginning(build_learner)(*typed, settings)))
 
@@ -262,7 +263,7 @@ def _begin(
 
 
 def _movers(
-    env: Any,
+    env: Environment,
     build_learner: BuildLearner,
     horizon: int,
     config: Config,

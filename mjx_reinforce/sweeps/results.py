@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.export.files import read_arrays, write_arrays, write_bytes, write_json
+from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.reports.statistics import steps_to_solve
 from mjx_reinforce.runs import checkpoint, files
 from mjx_reinforce.sweeps import policies
@@ -92,7 +93,7 @@ class SweepFiles:
         """Returns the folder of a chunk's checkpoints."""
         return self.parts / chunk
 
-    def keep_policies(self, runs: Runs, history: History, actors: Any) -> None:
+    def keep_policies(self, runs: Runs, history: History, actors: Actor) -> None:
         """Keeps the best and the worst policies of a chunk [R, ...], before its part."""
         policies.write_part(self.parts, runs, history.now["eval_return"], actors)
 

@@ -11,11 +11,14 @@ import tempfile
 import warnings
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 
 from mjx_reinforce.engines.native.ownership import distrust, is_trusted, make_folder
+
+if TYPE_CHECKING:
+    from importlib.abc import Traversable
 
 #: Where a folder holds more bytes than this, what was used longest ago goes.
 LIMIT = 256 * 2**20
@@ -83,7 +86,7 @@ def source_digest(*packages: str) -> str:
     return digest.hexdigest()
 
 
-def _files(folder: Any) -> list[Any]:
+def _files(folder: "Traversable") -> list[Any]:
     """Returns the files of a package that are part of the program, in order of their names."""
     found = []
     for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):

@@ -6,13 +6,16 @@ with Humanoid-v5 (1.9 million operations), 54 s with dm_control's humanoid (2.7 
 19 s and 116 s with observations of 500 and 2,000 entries, of which some 8 s are XLA's.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 
 from mjx_reinforce.engines.native import available
 from mjx_reinforce.fused import TooLarge, jaxprs, size
 from mjx_reinforce.types import Environment, null_action
+
+if TYPE_CHECKING:
+    from mjx_reinforce.types import MjModel
 
 #: Nobody waits longer for what `jax.vmap` compiles in less.
 MAX_SECONDS = 80
@@ -41,7 +44,7 @@ def check_seconds(env: Environment, traced: jaxprs.Program, entries: int) -> Non
         )
 
 
-def _fewer_contacts(model: Any) -> str:
+def _fewer_contacts(model: "MjModel") -> str:
     from mjx_reinforce.physics.collisions import advice  # imports MJX, which takes a second
 
     return advice(model)

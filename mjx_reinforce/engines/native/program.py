@@ -15,7 +15,7 @@ from mjx_reinforce.engines.native.gpu import ptx, scratch
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.types import Environment
+from mjx_reinforce.types import Environment, PyTree
 
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
 LOOPS = {"unrolled": 1, "unrolled_arrays": 1, "unrolled_on_request": 1}
@@ -37,7 +37,7 @@ class Program(NamedTuple):
 
 
 def build(
-    env: Environment, act: episode.Act, actor: Any, distribution: Distribution, length: int
+    env: Environment, act: episode.Act, actor: PyTree, distribution: Distribution, length: int
 ) -> Program:
     """Returns the program of an environment and a policy, compiled unless memory or disk has it.
 

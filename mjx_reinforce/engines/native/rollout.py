@@ -6,7 +6,6 @@ as everywhere, noise from the same keys, so the same key gives the same episodes
 
 import functools
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,7 @@ from mjx_reinforce.engines.native.program import Program, build
 from mjx_reinforce.engines.native.step import stored
 from mjx_reinforce.fused import TooLarge, UnsupportedPrimitive
 from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.types import Environment, Trajectory
+from mjx_reinforce.types import Environment, PyTree, Trajectory
 
 _REMEDY = f'make keys with jax.random.key(seed, impl="{available.GENERATOR}"), or choose auto'
 
@@ -32,7 +31,7 @@ _REMEDY = f'make keys with jax.random.key(seed, impl="{available.GENERATOR}"), o
 def rollout(
     env: Environment,
     act: episode.Act,
-    actor: Any,
+    actor: PyTree,
     distribution: Distribution,
     key: jax.Array,
     *,
@@ -101,7 +100,7 @@ def _episodes_before_numbers(results: Sequence[jax.Array]) -> Sequence[jax.Array
 
 
 def unsupported(
-    env: Environment, act: episode.Act, actor: Any, distribution: Distribution, horizon: int
+    env: Environment, act: episode.Act, actor: PyTree, distribution: Distribution, horizon: int
 ) -> str | None:
     """Returns why machine code cannot play this here, or None; it is compiled if it can."""
     reason = available.unavailable()

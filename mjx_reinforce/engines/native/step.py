@@ -13,7 +13,7 @@ from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.native.counter import at_counter, split
 from mjx_reinforce.engines.unit_by_unit import unit_by_unit
 from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.types import Environment
+from mjx_reinforce.types import Environment, PyTree
 
 #: A branch of more scalar operations is skipped where no lane needs it.
 BRANCH_COST = 40
@@ -90,7 +90,7 @@ def stored(x: jax.Array) -> jax.Array:
     return x.astype(jnp.int32) if x.dtype == bool else x
 
 
-def examples(env: Environment, actor: Any) -> tuple[Any, ...]:
+def examples(env: Environment, actor: PyTree) -> tuple[Any, ...]:
     """Returns the shapes of the arguments of a step."""
     shape = jax.ShapeDtypeStruct
     state = jax.eval_shape(

@@ -134,7 +134,7 @@ def _csv(lines: Sequence[Sequence[Any]]) -> str:
     return text.getvalue()
 
 
-def _no_formula(cell: Any) -> Any:
+def _no_formula(cell: object) -> Any:
     """Returns a cell with an apostrophe before a name that a spreadsheet would compute.
 
     Run directories may be called "=HYPERLINK(1)". Numbers stay, also those that are texts.

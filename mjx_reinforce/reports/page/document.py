@@ -94,7 +94,7 @@ def render(
 
 
 def fill(
-    name: str, content: Mapping[str, Any], *, version: str, seconds: float, **text: Any
+    name: str, content: Mapping[str, Any], *, version: str, seconds: float, **text: object
 ) -> str:
     """Returns the page that a template makes.
 
@@ -137,7 +137,7 @@ def _read(name: str) -> str:
     return (_FILES / name).read_text(encoding="utf-8")
 
 
-def _unbroken(value: Any) -> Any:
+def _unbroken(value: object) -> Any:
     """Returns a text in which no line breaks "95 %" and "p = 0.01", and anything else as it is."""
     if type(value) is not str:
         return value
@@ -146,7 +146,7 @@ def _unbroken(value: Any) -> Any:
     return value
 
 
-def _json(value: Any) -> str:
+def _json(value: object) -> str:
     """Returns JSON that cannot end the script element that it is in."""
     text = json.dumps(value, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
@@ -227,7 +227,7 @@ def provenance(experiment: Experiment) -> dict[str, Any]:
     return {"facts": facts, "settings": settings}
 
 
-def _plain(value: Any) -> str:
+def _plain(value: object) -> str:
     """Returns an entry of the provenance in words."""
     if isinstance(value, Mapping):
         listed = ((spoken(key), _plain(x)) for key, x in value.items() if x is not None)

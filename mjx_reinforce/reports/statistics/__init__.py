@@ -94,7 +94,7 @@ def _expanded_percentiles(
     return low[()], high[()]
 
 
-def finite_or_nan(values: Any) -> Any:
+def finite_or_nan(values: ArrayLike) -> Any:
     """Returns the values, NaN for those that are not finite."""
     return np.where(np.isfinite(values), values, np.nan)[()]
 

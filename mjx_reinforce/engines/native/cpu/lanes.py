@@ -4,6 +4,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+from jax.typing import DTypeLike
 
 #: The bytes of the widest lane vector, 16 numbers of 8 bytes: a vector begins at a multiple of its
 #: size, as LLVM takes for granted.
@@ -98,7 +99,7 @@ def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> Layout:
             raise TypeError(f"its state has numbers of {leaf.dtype}, not of 32 or 64 bits")
     end = 0
 
-    def field(dtype: Any, count: int) -> Field:
+    def field(dtype: DTypeLike, count: int) -> Field:
         nonlocal end
         vector = np.dtype(dtype).itemsize * lanes
         begin = -(-end // vector) * vector

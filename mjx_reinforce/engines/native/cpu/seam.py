@@ -24,7 +24,9 @@ from mjx_reinforce.engines.native.cpu.machine import Code
 _WAYS: dict[str, str] = {}
 
 
-def call(code: Code, results: Sequence[jax.ShapeDtypeStruct], *args: Any) -> Sequence[jax.Array]:
+def call(
+    code: Code, results: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
+) -> Sequence[jax.Array]:
     """Calls machine code under any transformation but differentiation.
 
     Args:
@@ -80,7 +82,9 @@ def _register(code: Code) -> bool:
     return True
 
 
-def _play(code: Code, results: Sequence[jax.ShapeDtypeStruct], *args: Any) -> list[np.ndarray]:
+def _play(
+    code: Code, results: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
+) -> list[np.ndarray]:
     """Plays without XLA: on threads of its own, from NumPy arrays."""
     given = [np.asarray(x, order="C") for x in args]
     threads, keys = given[handler.THREADS], given[handler.KEYS]

@@ -5,9 +5,8 @@ arrays of Humanoid's contacts, 48 kB a thread, would take 12.5 GB of an H200. A 
 threads that run takes 1.6 GB.
 """
 
-from typing import Any
-
 import numpy as np
+from jax.typing import DTypeLike
 
 from mjx_reinforce.fused.backends.llvm_text import Text
 
@@ -38,7 +37,7 @@ class ScratchText(Text):
         self._reserved[:0] = self._place_of_thread()
         return f"@scratch = constant i32 {self.words}\n{super().function(signature)}"
 
-    def reserve_long(self, dtype: Any, count: int) -> str:
+    def reserve_long(self, dtype: DTypeLike, count: int) -> str:
         """Returns what `reserve` does, in the buffer if the array is long; `at` finds entries."""
         if count <= WRITTEN_OUT or np.dtype(dtype).itemsize > _WORD:
             return self.reserve(dtype, count)
@@ -49,7 +48,7 @@ class ScratchText(Text):
         self._apart.add(name)
         return name
 
-    def at(self, pointer: str, dtype: Any, index: int | str) -> str:
+    def at(self, pointer: str, dtype: DTypeLike, index: int | str) -> str:
         """Returns the pointer to an entry of an array."""
         if pointer not in self._apart:
             return super().at(pointer, dtype, index)

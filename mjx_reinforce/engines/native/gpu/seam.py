@@ -90,7 +90,7 @@ def this_machine() -> str:
 
 
 def launch(
-    kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: Any
+    kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: jax.Array
 ) -> Sequence[jax.Array]:
     """Runs a kernel on a GPU; vmapped, it remains one launch.
 
@@ -121,7 +121,7 @@ def launch(
 
 
 def _launch(
-    kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: Any
+    kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: jax.Array
 ) -> Sequence[jax.Array]:
     seeds, episodes = args[0].shape
     shape = jax.ShapeDtypeStruct
