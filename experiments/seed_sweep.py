@@ -6,9 +6,7 @@ configuration. The command line does the same and more: ``python -m mjx_reinforc
 
 import dataclasses
 
-from mjx_reinforce.reports.statistics import iqm, iqm_interval
-from mjx_reinforce.runs.defaults import of_task
-from mjx_reinforce.sweep import sweep
+from mjx_reinforce import iqm, iqm_interval, of_task, sweep
 
 results = sweep(
     dataclasses.replace(of_task("InvertedPendulum-v5"), num_seeds=256),

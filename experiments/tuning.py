@@ -25,7 +25,7 @@ from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.files import csv_bytes
 from mjx_reinforce.sweeps.design import Design
 from mjx_reinforce.sweeps.perform import perform
-from mjx_reinforce.sweeps.reading import Results, read_results
+from mjx_reinforce.sweeps.reading import SweepResults, read_results
 from results_measures import least_share_solved, solved_within
 
 KEPT = Path(__file__).parent / "tuning"
@@ -91,12 +91,13 @@ def _names(search: dict[str, Any]) -> list[str]:
     return list(search["configurations"][0])
 
 
-def keep(results: Results, path: Path) -> None:
+def keep(results: SweepResults, path: Path) -> None:
     """Writes a row for each configuration, by the mean over its seeds of the last return.
 
     Of a task with a threshold also the share of seeds solved within ``_SOLVED`` env steps, the
     least share solved at once from ``_STAYS`` on, and the median env steps to solve.
     """
+    assert results.directory is not None  # it was given one
     threshold = read_json(results.directory / "sweep.json")["threshold"]
     rows = [
         values | _measure(results, results.configuration == number, threshold)
@@ -106,7 +107,7 @@ def keep(results: Results, path: Path) -> None:
     write_bytes(path, csv_bytes(tuple(rows[0]), rows))
 
 
-def _measure(results: Results, mine: np.ndarray, threshold: float | None) -> dict[str, str]:
+def _measure(results: SweepResults, mine: np.ndarray, threshold: float | None) -> dict[str, str]:
     returns, steps = results.eval_return[:, mine], results.env_steps[:, mine]
     last = returns[-1]
     found = {

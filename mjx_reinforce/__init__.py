@@ -40,10 +40,38 @@ if TYPE_CHECKING:  # what type checkers and editors read in place of __getattr__
     from mjx_reinforce.policies.policy import Policy, mlp_policy
     from mjx_reinforce.policies.tanh_normal import tanh_normal
     from mjx_reinforce.policies.truncated_normal import truncated_normal
+    from mjx_reinforce.reports.statistics import iqm, iqm_interval, mean_interval
+    from mjx_reinforce.reports.statistics.comparisons import (
+        compare_all,
+        paired_difference,
+        probability_of_improvement,
+    )
+    from mjx_reinforce.reports.statistics.survival import kaplan_meier, log_rank
+    from mjx_reinforce.runs.config import Config
+    from mjx_reinforce.runs.defaults import of_task
+    from mjx_reinforce.runs.driver import Evaluation
     from mjx_reinforce.runs.evaluation import evaluate
+    from mjx_reinforce.runs.run import RunResults, run
+    from mjx_reinforce.sweeps.reading import SweepResults
+    from mjx_reinforce.sweeps.run import sweep
     from mjx_reinforce.types import Box, Discrete, Environment, Trajectory
 
 _HOME = {
+    "Config": "runs.config",
+    "of_task": "runs.defaults",
+    "run": "runs.run",
+    "RunResults": "runs.run",
+    "Evaluation": "runs.driver",
+    "sweep": "sweeps.run",
+    "SweepResults": "sweeps.reading",
+    "iqm": "reports.statistics",
+    "iqm_interval": "reports.statistics",
+    "mean_interval": "reports.statistics",
+    "compare_all": "reports.statistics.comparisons",
+    "paired_difference": "reports.statistics.comparisons",
+    "probability_of_improvement": "reports.statistics.comparisons",
+    "kaplan_meier": "reports.statistics.survival",
+    "log_rank": "reports.statistics.survival",
     "Learner": "learners.learner",
     "TrainState": "learners.learner",
     "reinforce": "learners.reinforce",
@@ -101,13 +129,17 @@ __all__ = [
     "Actor",
     "AutoEpisodes",
     "Box",
+    "Config",
     "Discrete",
     "Distribution",
     "Environment",
     "Estimator",
+    "Evaluation",
     "Learner",
     "Player",
     "Policy",
+    "RunResults",
+    "SweepResults",
     "TrainState",
     "Trajectory",
     "__version__",
@@ -115,29 +147,40 @@ __all__ = [
     "ars",
     "categorical",
     "clipped_normal",
+    "compare_all",
     "deterministic",
     "discount_weights",
     "each_step",
     "evaluate",
     "full_batch",
     "full_batch_value_baseline",
+    "iqm",
+    "iqm_interval",
+    "kaplan_meier",
     "leave_one_out",
     "load",
     "load_policy",
+    "log_rank",
     "make_optimizer",
+    "mean_interval",
     "mean_log_prob",
     "minibatches",
     "mlp_policy",
     "natural_gradient",
     "normal",
     "normalized_returns",
+    "of_task",
+    "paired_difference",
     "pretrained",
+    "probability_of_improvement",
     "reinforce",
     "reward_to_go",
     "rollout",
+    "run",
     "save_policy",
     "shift_rewards",
     "standardize",
+    "sweep",
     "tanh_normal",
     "total_return",
     "train_step",

@@ -10,10 +10,9 @@ import dataclasses
 import gc
 import sys
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mjx_reinforce import envs
 from mjx_reinforce.runs import resume
@@ -34,15 +33,12 @@ from mjx_reinforce.runs.memory import check_size
 from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.plan import Plan, make_plan
 from mjx_reinforce.runs.processes import Processes, joined
-from mjx_reinforce.runs.sinks.sink import check_installed, open_sinks
+from mjx_reinforce.runs.sinks.sink import check_installed
 from mjx_reinforce.runs.streams import accept_everything
 
 if TYPE_CHECKING:
     from mjx_reinforce.runs.checkpoint import Checkpoint
-    from mjx_reinforce.runs.display import Display
     from mjx_reinforce.runs.ready import Ready
-    from mjx_reinforce.runs.session import Session
-    from mjx_reinforce.runs.state import Programs, RunState
     from mjx_reinforce.types import Environment
 
 
@@ -192,7 +188,7 @@ def train(
     """Trains to the budget, a signal, or until nothing is finite, and writes the run's files.
 
     Args:
-      ready: the run, a ``ready.Ready``.
+      ready: the run.
       found: the checkpoint from which the run goes on, if any.
       config: the settings of the run.
       plan: what is said of it beforehand.
@@ -209,155 +205,34 @@ def train(
     with Display() as display:
         interrupt.restore_screen(display.console.show_cursor)
         display.say(plan.text)
-        with display.compiling(plan.compiling):
-            session, compile_seconds = _compile(ready, found, config, directory, display, processes)
+        with display.compiling(plan.compiling), _collection_paused():
+            from mjx_reinforce.reports.curves import load_libraries
+            from mjx_reinforce.runs.log import RunLog
+            from mjx_reinforce.runs.observers import RunFiles, Screen
+            from mjx_reinforce.runs.training import compile_driver, draw, summarize
+
+            loading = threading.Thread(target=load_libraries, daemon=True)
+            driver, seconds = compile_driver(
+                ready, config, found, display.say, processes, loading.start
+            )
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
         interrupt.defer(display.say)
-        _begin(session, found, processes.count)
-        session.correction = plan.correction
-        display.start(compile_seconds)
-        _loop(session, interrupt)
-    if not session.saved:
-        session.save()
+        files = RunFiles(RunLog(directory), ready.policy, display.say)
+        files.begin(driver, found, processes.count)
+        driver.observers += [files, Screen(display, plan.correction)]
+        display.start(seconds)
+        driver.drive(lambda: interrupt.number is not None)
+    files.end(driver)
     # A signal after that changes nothing: what is left takes a second or two.
-    test = session.test(lambda: interrupt.number is not None)
-    summary = _finish(session, ready.engine, compile_seconds, test)
+    test = driver.test(lambda: interrupt.number is not None)
+    summary = summarize(driver, ready.engine, seconds, test)
+    files.finish(driver, draw(driver), summary)
     with contextlib.suppress(OSError):  # as ``Display.say``
         print_summary(display.console, summary, directory)
     if summary["status"] == "stopped":
         display.say(f"stopped: {summary['reason']}", "red")
         return 1
     return 0 if interrupt.number is None or test else 128 + interrupt.number
-
-
-def _compile(
-    ready: "Ready",
-    found: "Checkpoint | None",
-    config: Config,
-    directory: Path,
-    display: "Display",
-    processes: Processes,
-) -> "tuple[Session, float]":
-    """Returns a run before its first update, and how long it took to compile, in seconds.
-
-    Arguments are those of ``train``.
-    """
-    with _collection_paused():
-        from mjx_reinforce.reports.curves import load_libraries
-        from mjx_reinforce.runs.best import first_best
-        from mjx_reinforce.runs.initial import begin_with, last_actors
-        from mjx_reinforce.runs.log import RunLog
-        from mjx_reinforce.runs.record import Record
-        from mjx_reinforce.runs.session import Session
-        from mjx_reinforce.runs.state import compile_parts
-
-    loading = threading.Thread(target=load_libraries, daemon=True)
-    started = time.perf_counter()
-    with _collection_paused():
-        state, programs = compile_parts(ready.parts, config, loading.start)
-        if processes.count > 1:
-            from mjx_reinforce.runs.shares import lead
-
-            state, programs = lead(processes, programs, state, config.num_seeds)
-    seconds = ready.engine_seconds + time.perf_counter() - started
-    if config.init_from is not None and found is None:
-        state = begin_with(state, last_actors(config, ready.policy))
-    if config.minutes is not None:
-        first = state if found is None else found.state[0]
-        config = _with_budget(config, programs, first, display)
-    record, best = Record(config, ready.threshold), first_best(state.train_states)
-    known, log = dataclasses.replace(config, horizon=ready.horizon), RunLog(directory)
-    session = Session(known, ready.policy, programs, record, log, display, state, best)
-    return session, seconds
-
-
-def _with_budget(
-    config: Config, programs: "Programs", state: "RunState", display: "Display"
-) -> Config:
-    """Returns the settings with env steps in place of minutes, from a state on."""
-    from mjx_reinforce.runs.minutes import env_steps_in
-
-    minutes = config.minutes
-    assert minutes is not None
-    env_steps = env_steps_in(60 * minutes, programs, state, config.max_updates)
-    display.say(f"{minutes:g} min are about {env_steps:,} env steps of a seed in all here")
-    return dataclasses.replace(config, env_steps=env_steps, minutes=None)
-
-
-def _begin(session: "Session", found: "Checkpoint | None", num_processes: int) -> None:
-    """Writes the first files, or takes the run and its files back to where it goes on."""
-    config, log = session.config, session.log
-    if config.resume is None:
-        where = {"output": str(log.directory), "num_processes": num_processes}
-        settings = dataclasses.asdict(config) | where
-        del settings["resume"]
-        log.begin(settings)
-        session.sinks = open_sinks(config, log.directory, None)
-        return
-    budget = {name: getattr(config, name) for name in resume.BUDGETS}
-    log.resume(resume.read_record(config.resume), budget, found)
-    if found is not None:
-        session.restore(found)
-    updates = session.record.updates.max()
-    session.sinks = open_sinks(config, log.directory, None if found is None else int(updates))
-    again = "" if updates else ": no checkpoint serves, so it begins again, to the same numbers"
-    session.display.say(f"going on after {updates} updates{again}")
-
-
-def _loop(session: "Session", interrupt: Interrupt) -> None:
-    """Trains until the budget is used or nothing is finite, or a signal came.
-
-    Policies are evaluated with the updates that follow; where their returns decide whether any do,
-    before. A block that was interrupted is not evaluated, which may take minutes: the resumed run
-    does that.
-    """
-    record = session.record
-
-    def over() -> bool:
-        if session.config.stop_when_solved and not record.evaluated():
-            session.evaluate()
-        return record.finished() or record.hopeless()
-
-    while interrupt.number is None and not over():
-        session.advance()
-        if not record.finished():  # else it is saved with its evaluation
-            session.save_if_due()
-    if not record.evaluated() and (interrupt.number is None or not record.begun()):
-        session.evaluate()
-    session.save_if_due()
-
-
-def _finish(
-    session: "Session", engine: str, compile_seconds: float, test: dict[str, Any]
-) -> dict[str, Any]:
-    """Writes the last files; returns the contents of summary.json.
-
-    Args:
-      session: the run.
-      engine: the name of the engine that played.
-      compile_seconds: wall time of compiling.
-      test: from ``Session.test``, empty if the run was interrupted.
-    """
-    from mjx_reinforce.learners import counts
-    from mjx_reinforce.reports.curves import draw_learning_curve
-    from mjx_reinforce.runs.nonfinite import HOPELESS
-
-    config, record = session.config, session.record
-    run_seconds = session.seconds()
-    end = {"status": "stopped", "reason": HOPELESS} if record.hopeless() else {"status": "finished"}
-    summary = {
-        **(end if test else {"status": "interrupted"}),
-        **record.summary(engine, compile_seconds, run_seconds),
-        "best_updates": counts.to_int(session.best.num_updates).tolist(),
-        **test,
-    }
-    history, training = record.history(), record.training()
-    axis = "episodes" if config.env_steps is None else "env_steps"
-    picture = draw_learning_curve(history, training, config.env, record.threshold, axis)
-    session.save_policies()
-    session.log.finish(training, picture, summary)
-    session.close_sinks()
-    return summary
 
 
 @contextlib.contextmanager

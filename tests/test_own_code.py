@@ -9,17 +9,17 @@ from fake_sweeps import make_sweep
 from saved_runs import change, change_arrays, make_run, write
 
 from mjx_reinforce import load, report, watch
-from mjx_reinforce import sweep as sweep_module
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export import __main__ as export
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.resume import recordable
+from mjx_reinforce.sweeps import main as sweep_command
 from mjx_reinforce.sweeps.design import Design, as_record
 
 ENV = "evil_module:Task"
 MAINS = {
     "train": train_module.main,
-    "sweep": sweep_module.main,
+    "sweep": sweep_command.main,
     "watch": watch.main,
     "report": report.main,
     "export": export.main,

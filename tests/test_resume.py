@@ -30,10 +30,11 @@ from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.runs import checkpoint, files
 from mjx_reinforce.runs.best import first_best, keep_best
 from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.driver import Driver
 from mjx_reinforce.runs.files import locked
 from mjx_reinforce.runs.log import RunLog
+from mjx_reinforce.runs.observers import RunFiles
 from mjx_reinforce.runs.record import Record
-from mjx_reinforce.runs.session import Session
 from mjx_reinforce.runs.state import Looked
 from trainings import results
 
@@ -248,12 +249,12 @@ def signalled(method, when):
     ("owner", "name", "when", "status", "rows"),
     [
         (RunLog, "begin", 1, 143, 1),
-        (Session, "advance", 2, 143, 2),  # whose evaluation is left to the run that goes on
-        (Session, "advance", 4, 143, 4),
-        (Session, "save_if_due", 2, 143, 2),
+        (Driver, "advance", 2, 143, 2),  # whose evaluation is left to the run that goes on
+        (Driver, "advance", 4, 143, 4),
+        (RunFiles, "save_if_due", 2, 143, 2),
         (Record, "add_test", 1, 143, 5),
         (Record, "add_test", 2, 0, 5),  # nothing is left to stop
-        (Session, "save_policies", 5, 0, 5),
+        (RunFiles, "save_policies", 5, 0, 5),
     ],
 )
 def test_a_signal_anywhere_costs_nothing(

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from toys import Drift
 
+import mjx_reinforce
 from mjx_reinforce import envs
-from mjx_reinforce import sweep as sweep_module
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export.player import load_seed
 from mjx_reinforce.export.run_files import choose_seed, read_run
@@ -25,6 +25,7 @@ from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.state import eval_keys, evaluation
 from mjx_reinforce.sweeps import chunks, conduct, perform, plan, programs, rungs, search
+from mjx_reinforce.sweeps import main as sweep_command
 from mjx_reinforce.sweeps.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.groups import learner_builder, make_groups
 from mjx_reinforce.sweeps.packing import pack
@@ -47,7 +48,7 @@ def run(monkeypatch, tmp_path):
     monkeypatch.setattr(perform, "_report", lambda directory: nothing)
     monkeypatch.chdir(tmp_path)
 
-    def run(command, module=sweep_module):
+    def run(command, module=sweep_command):
         monkeypatch.setattr(sys, "argv", ["sweep", *command.split()])
         with pytest.raises(SystemExit) as stop:
             module.main()
@@ -315,7 +316,7 @@ def test_a_crash_among_runs_that_ended_changes_nothing(run, monkeypatch):
         patch.setattr(conduct.Saver, "save", crash)
         patch.setattr(sys, "argv", ["sweep", *command.split(), "--output", "crashed"])
         with pytest.raises(CrashError):
-            sweep_module.main()
+            sweep_command.main()
     assert run("--resume crashed") == 0
     assert same(curves(Path("whole")), curves(Path("crashed")))
 
@@ -358,7 +359,7 @@ def test_a_sweep_that_crashed_goes_on(run, monkeypatch, where):
         patch.setattr(owner, name, crash)
         patch.setattr(sys, "argv", ["sweep", *command.split(), "--output", "crashed"])
         with pytest.raises(CrashError):
-            sweep_module.main()
+            sweep_command.main()
     assert json.loads(Path("crashed/sweep.json").read_text())["status"] == "running"
     assert len(list(Path("crashed/parts").glob("[0-9]*.npz"))) == 1
     assert run("--resume crashed") == 0
@@ -582,7 +583,7 @@ def test_from_python_a_report_can_be_left_out(monkeypatch, tmp_path, capsys, rep
     base = Config(
         env="Drift-v0", num_seeds=2, num_episodes=4, eval_episodes=2, env_steps=None, max_updates=2
     )
-    results = sweep_module.sweep(
+    results = mjx_reinforce.sweep(
         base, {"learning_rate": [1e-2, 3e-2]}, output=tmp_path / "out", report=report
     )
     assert results.eval_return.shape[1] == 4

@@ -9,7 +9,10 @@ SCRIPT = "mjx-reinforce"
 COMMANDS = {
     "train": ("mjx_reinforce.train", "train policies, many seeds at once"),
     "watch": ("mjx_reinforce.watch", "make a film of a trained policy, by default of the last run"),
-    "sweep": ("mjx_reinforce.sweep", "train many configurations side by side, and compare them"),
+    "sweep": (
+        "mjx_reinforce.sweeps.main",
+        "train many configurations at once, and compare them",
+    ),
     "report": ("mjx_reinforce.report", "make a page of figures of runs and sweeps"),
     "export": ("mjx_reinforce.export.__main__", "write a policy as NumPy or ONNX"),
     "new": ("mjx_reinforce.new", "write the class of a task from a MuJoCo model"),

@@ -11,6 +11,7 @@ import numpy as np
 
 from mjx_reinforce.reports.statistics import summarize
 from mjx_reinforce.runs import nonfinite, rows
+from mjx_reinforce.runs.budget import used
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.progress import BLOCKS, Progress, measure
 from mjx_reinforce.runs.table import Table
@@ -170,7 +171,7 @@ class Record:
         Raises:
           KeyError: solved seeds were to end it, and there is no evaluation.
         """
-        if self._used(self.env_steps, self.updates).min() >= 1.0:
+        if used(self._config, self.env_steps, self.updates).min() >= 1.0:
             return True
         if not self._config.stop_when_solved or self.threshold is None:
             return False
@@ -179,23 +180,14 @@ class Record:
 
     def hopeless(self) -> bool:
         """Returns whether all seeds that still train were broken throughout a block of updates."""
-        used = self._used(self.env_steps, self.updates)
-        return nonfinite.hopeless(self._broken_in_a_row, used, self._config.eval_every)
-
-    def _used(self, env_steps: np.ndarray, updates: np.ndarray) -> np.ndarray:
-        """Returns the fraction of its budget that each seed has used, of counts [..., S]."""
-        used = np.zeros(env_steps.shape)
-        if self._config.env_steps is not None:
-            used = env_steps / self._config.env_steps
-        if self._config.max_updates is not None:
-            used = np.maximum(used, updates / self._config.max_updates)
-        return used
+        share = used(self._config, self.env_steps, self.updates)
+        return nonfinite.hopeless(self._broken_in_a_row, share, self._config.eval_every)
 
     def progress(self) -> Progress:
         """Returns how far the run is, as of its last evaluation."""
         names = ("eval_return", "env_steps", "updates", "seconds")
         past = self._tables["evaluations"].latest(BLOCKS + 1, *names)
-        fractions = self._used(past["env_steps"], past["updates"]).min(axis=-1)
+        fractions = used(self._config, past["env_steps"], past["updates"]).min(axis=-1)
         return measure(past, fractions)
 
     def history(self) -> Arrays:

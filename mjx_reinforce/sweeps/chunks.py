@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_reinforce.runs import checkpoint
+from mjx_reinforce.runs.budget import SaveDue, not_written
 from mjx_reinforce.runs.checkpoint import Checkpoint
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.state import RunState
@@ -16,8 +17,6 @@ from mjx_reinforce.sweeps.history import History
 from mjx_reinforce.sweeps.layout import Layout
 from mjx_reinforce.sweeps.programs import Programs
 
-#: Between checkpoints, where the user has not said how many updates.
-_CHECKPOINT_SECONDS = 60.0
 #: The host need not look at a sweep more often than this. Between short blocks the devices would
 #: wait for it.
 _SECONDS = 0.25
@@ -68,20 +67,34 @@ def begin(programs: Programs, group: Group, runs: Runs) -> np.ndarray:
 class Saver:
     """Keeps a chunk in progress in checkpoints, and finds it again."""
 
-    def __init__(self, folder: Path, config: Config, layout: Layout):
-        """Takes the folder of the chunk's checkpoints, and the settings and states of its group."""
-        self._folder, self._config, self._layout = folder, config, layout
-        self._saved_at, self._saved_updates = time.perf_counter(), 0
+    def __init__(self, folder: Path, config: Config, layout: Layout, say: Callable[[str], None]):
+        """Takes what a chunk is kept in.
+
+        Args:
+          folder: of the chunk's checkpoints.
+          config: the settings of its group.
+          layout: of its group's states.
+          say: shows a line to the user.
+        """
+        self._folder, self._config, self._layout, self._say = folder, config, layout, say
+        self._due = SaveDue(config.checkpoint_every)
+        self._failing = False
 
     def save_if_due(self, states: np.ndarray, history: History) -> None:
-        """Saves once there were enough updates, or about a minute, since the last time."""
-        every, updates = self._config.checkpoint_every, int(history.now["updates"].max())
-        if every is None:
-            due = time.perf_counter() - self._saved_at >= _CHECKPOINT_SECONDS
-        else:
-            due = updates - self._saved_updates >= every
-        if due:
+        """Saves once there were enough updates, or about a minute, since the last time.
+
+        A checkpoint that cannot be written is a warning, and is tried again when one is due.
+        """
+        if not self._due.is_due(_updates(history)):
+            return
+        try:
             self.save(states, history)
+            self._failing = False
+        except OSError as error:
+            self._due.saved(_updates(history))
+            if not self._failing:
+                self._say(not_written("a checkpoint", error))
+            self._failing = True
 
     def save(self, states: np.ndarray, history: History) -> None:
         """Writes a checkpoint, or raises OSError."""
@@ -94,23 +107,26 @@ class Saver:
             max_updates=self._config.max_updates,
         )
         checkpoint.save(self._folder, content, even=False)
-        self._saved_at = time.perf_counter()
-        self._saved_updates = int(history.now["updates"].max())
+        self._due.saved(_updates(history))
 
-    def find(
-        self, like: Callable[[], RunState], history: History, say: Callable[[str], None]
-    ) -> np.ndarray | None:
+    def find(self, like: Callable[[], RunState], history: History) -> np.ndarray | None:
         """Returns the newest states that were saved, with their history restored, or None."""
         if not self._folder.exists():
             return None
-        for found in checkpoint.load(self._folder, like(), say):
+        for found in checkpoint.load(self._folder, like(), self._say):
             history.restore(found.record)
+            self._due.saved(_updates(history))
             return self._layout.rows(found.state)
         return None
 
     def remove(self) -> None:
         """Removes the checkpoints."""
         checkpoint.remove(self._folder)
+
+
+def _updates(history: History) -> int:
+    """Returns how many updates the run with the most has made."""
+    return int(history.now["updates"].max())
 
 
 def train(

@@ -207,9 +207,9 @@ class Conductor:
         """
         config = dataclasses.replace(stage.group.config, num_seeds=len(runs.seed))
         history, layout = History(config), programs.layout
-        saver = Saver(self._files.checkpoints(runs.name), config, layout)
+        saver = Saver(self._files.checkpoints(runs.name), config, layout, self._display.say)
         like = functools.partial(programs.shape_of, len(runs.seed))
-        states = saver.find(like, history, self._display.say)
+        states = saver.find(like, history)
         if states is None:
             states = self._begin(rung, stage, programs, runs, history)
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.runs.budget import used
 from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.progress import Progress, measure
 from mjx_reinforce.runs.table import Table
@@ -99,12 +100,7 @@ class History:
 
     def _used(self) -> np.ndarray:
         """Returns the fraction of its budget that each run has used."""
-        used = np.zeros(self._config.num_seeds)
-        if self._config.env_steps is not None:
-            used = self.now["env_steps"] / self._config.env_steps
-        if self._config.max_updates is not None:
-            used = np.maximum(used, self.now["updates"] / self._config.max_updates)
-        return used
+        return used(self._config, self.now["env_steps"], self.now["updates"])
 
     def progress(self) -> Progress:
         """Returns how far the runs are; its fraction is that of all budgets, as ``used``."""

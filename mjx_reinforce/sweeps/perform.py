@@ -29,7 +29,12 @@ _PLAIN_QUOTES = dict.fromkeys(
 
 
 def perform(
-    design: Design, interrupt: Interrupt | None, made: list[Path], *, report: bool = True
+    design: Design,
+    interrupt: Interrupt | None,
+    made: list[Path],
+    *,
+    report: bool = True,
+    quiet: bool = False,
 ) -> tuple[Path, bool]:
     """Trains all runs of a sweep, or goes on with it, and writes its files.
 
@@ -38,6 +43,7 @@ def perform(
       interrupt: what listens to signals, if anything does.
       made: takes in the folders that are made for it.
       report: whether its page is written at its end.
+      quiet: show no progress.
 
     Returns:
       The directory of its files, and whether all runs ended: else it was interrupted.
@@ -60,7 +66,8 @@ def perform(
             held.enter_context(locked(directory))  # a folder in which another trains stays
             made += new
         configure_jax()
-        return directory, _perform(design, directory, known, processes, interrupt, report)
+        going = _perform(design, directory, known, processes, interrupt, report, quiet)
+        return directory, going
 
 
 def _finish_again(directory: Path, known: Mapping[str, Any]) -> None:
@@ -79,6 +86,7 @@ def _perform(
     processes: Processes,
     interrupt: Interrupt | None,
     report: bool,
+    quiet: bool,
 ) -> bool:
     """Does what ``perform`` says, in a directory that is ours; ``known`` is its sweep.json."""
     from mjx_reinforce.runs.display import Display
@@ -86,7 +94,7 @@ def _perform(
     from mjx_reinforce.sweeps.prepare import prepare
     from mjx_reinforce.sweeps.results import SweepFiles
 
-    with heartbeat(to_screen, None, "writing the simulation out"):
+    with heartbeat((lambda text: None) if quiet else to_screen, None, "writing the simulation out"):
         prepared = prepare(design, known.get("chunk_runs"), processes.count)
     contents = _contents(design, prepared, known)
     if known:
@@ -95,7 +103,7 @@ def _perform(
     first = processes.index == 0
     files = SweepFiles(directory, configurations, threshold, going_on=bool(known), first=first)
     with Display() as display, contextlib.ExitStack() as compiling:
-        display.console.quiet = not first
+        display.console.quiet = quiet or not first
         display.say(prepared.plan)
         compiling.enter_context(display.compiling(None))
 

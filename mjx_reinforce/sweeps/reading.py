@@ -8,10 +8,10 @@ import numpy as np
 from mjx_reinforce.export.files import read_arrays, read_json
 
 
-class Results(NamedTuple):
+class SweepResults(NamedTuple):
     """What a sweep measured, of R runs in E evaluations.
 
-    directory: of its files
+    directory: of its files, None where none were asked for
     configurations: the values of what was swept, in each
     configuration: [R] the number of each run's
     seed: [R]
@@ -19,7 +19,7 @@ class Results(NamedTuple):
     env_steps: [E, R] trained until then
     """
 
-    directory: Path
+    directory: Path | None
     configurations: list[dict[str, Any]]
     configuration: np.ndarray
     seed: np.ndarray
@@ -27,7 +27,7 @@ class Results(NamedTuple):
     env_steps: np.ndarray
 
 
-def read_results(directory: Path) -> Results:
+def read_results(directory: Path) -> SweepResults:
     """Returns what a finished sweep measured, or raises ValueError."""
     record = read_json(directory / "sweep.json")
     if not (directory / "curves.npz").exists():
@@ -37,4 +37,4 @@ def read_results(directory: Path) -> Results:
         )
     listed = record["configurations"]
     values = [{k: x for k, x in one.items() if k != "configuration"} for one in listed]
-    return Results(directory, values, **read_arrays(directory / "curves.npz"))
+    return SweepResults(directory, values, **read_arrays(directory / "curves.npz"))

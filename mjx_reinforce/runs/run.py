@@ -1,0 +1,164 @@
+"""A run from Python: ``mjx_reinforce.run``."""
+
+import contextlib
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from mjx_reinforce import envs
+from mjx_reinforce.checks import check_kind
+from mjx_reinforce.export.player import Player
+from mjx_reinforce.export.policy_files import build_policy
+from mjx_reinforce.export.run_files import Which
+from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.policies.policy import Policy
+from mjx_reinforce.reports.statistics import worst_if_not_finite
+from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.runs.display import Display
+from mjx_reinforce.runs.driver import Driver, Evaluation
+from mjx_reinforce.runs.files import locked, prepare, remove_empty
+from mjx_reinforce.runs.jax_setup import configure_jax
+from mjx_reinforce.runs.log import RunLog
+from mjx_reinforce.runs.memory import check_size
+from mjx_reinforce.runs.observers import Callbacks, RunFiles, Screen
+from mjx_reinforce.runs.plan import make_plan
+from mjx_reinforce.runs.ready import prepare as make_ready
+from mjx_reinforce.runs.sinks.sink import check_installed
+from mjx_reinforce.runs.training import compile_driver, draw, summarize
+
+
+class RunResults(NamedTuple):
+    """What a run of S seeds learned and measured, in E evaluations and U updates.
+
+    config: its settings, its horizon and its budget among them
+    directory: of its files, None where none were asked for
+    eval_return: [E, S] mean return of the policy's mode; NaN where it was not finite
+    env_steps: [E, S] trained until then
+    training: [U, S] each: ``episode_return``, the mean of an update's episodes, and the
+      ``env_steps`` and ``episodes`` after it
+    test_returns: [S] of the last policies, on starts that nothing else is played on
+    best_test_returns: [S] likewise, of the policies with the best evaluations
+    policy: the network and its distribution
+    actor: [S, ...] the last policies
+    best: [S, ...] the policies with the best evaluations
+    summary: the contents of summary.json
+    """
+
+    config: Config
+    directory: Path | None
+    eval_return: np.ndarray
+    env_steps: np.ndarray
+    training: dict[str, np.ndarray]
+    test_returns: np.ndarray
+    best_test_returns: np.ndarray
+    policy: Policy
+    actor: Actor
+    best: Actor
+    summary: dict[str, Any]
+
+    def __repr__(self) -> str:
+        mean = float(np.mean(self.test_returns))
+        return f"RunResults({self.config.env}, {len(self.test_returns)} seeds, return {mean:.4g})"
+
+    def player(self, seed: int | None = None, which: Which = "last") -> Player:
+        """Returns the policy of a seed, to play in Gymnasium or elsewhere.
+
+        Args:
+          seed: its number; by default the seed with the best return in the test.
+          which: "last" for the policy at the end of training, "best" for the one with the best
+            evaluation.
+        """
+        returns = self.test_returns if which == "last" else self.best_test_returns
+        if seed is None:
+            seed = int(np.argmax(worst_if_not_finite(returns)))
+        if not 0 <= seed < len(returns):
+            raise ValueError(f"seed must be in [0, {len(returns)}), got {seed}")
+        actors = self.actor if which == "last" else self.best
+        actor = jax.tree.map(lambda x: x[seed], actors)
+        return Player(self.config.env, seed, self.policy, actor)
+
+
+def run(
+    config: Config,
+    *,
+    output: Path | str | None = None,
+    observers: Sequence[Callable[[Evaluation], Any]] = (),
+    quiet: bool = False,
+) -> RunResults:
+    """Trains the seeds of a run, to the same numbers as ``python -m mjx_reinforce.train``.
+
+    Args:
+      config: the settings, such as ``mjx_reinforce.of_task("Hopper-v5")``; others by
+        ``dataclasses.replace``.
+      output: the directory of the run's files. None, with ``config.output`` None too, writes none.
+      observers: functions that are called with each evaluation. One that returns a true value
+        ends the run after the present block of updates.
+      quiet: show no progress.
+
+    Returns:
+      What was learned and measured.
+
+    Raises:
+      ValueError: a setting makes no sense, or the directory is not empty.
+      OSError: the last files of the run cannot be written.
+    """
+    check_kind("config", config, Config, 'mjx_reinforce.of_task("Hopper-v5")')
+    if config.resume is not None:
+        raise ValueError(
+            f"run() begins a run: go on with {config.resume} by python -m mjx_reinforce.train "
+            f"--resume {config.resume}"
+        )
+    if output is not None:
+        config = dataclasses.replace(config, output=Path(output))
+    check(config)
+    check_size(config)
+    check_installed(config)
+    configure_jax()
+    with contextlib.ExitStack() as held:
+        if config.output is not None:
+            held.callback(remove_empty, prepare(config.output, config.overwrite))
+            held.enter_context(locked(config.output))
+        ready = make_ready(config, config, envs.make(config.env))
+        plan = make_plan(ready, config)
+        display = Display()
+        display.console.quiet = quiet
+        held.enter_context(display)
+        display.say(plan.text)
+        with display.compiling(plan.compiling):
+            driver, seconds = compile_driver(ready, config, say=display.say)
+        files = None
+        if config.output is not None:
+            files = RunFiles(RunLog(config.output), ready.policy, display.say)
+            files.begin(driver, None, 1)
+            driver.observers.append(files)
+        driver.observers += [Screen(display, plan.correction), Callbacks(observers)]
+        display.start(seconds)
+        driver.drive(lambda: False)
+        if files is not None:
+            files.end(driver)
+        test = driver.test(lambda: False)
+        summary = summarize(driver, ready.engine, seconds, test)
+        if files is not None:
+            files.finish(driver, draw(driver), summary)
+    return _results(driver, build_policy(ready.policy), summary)
+
+
+def _results(driver: Driver, policy: Policy, summary: dict[str, Any]) -> RunResults:
+    history = driver.record.history()
+    return RunResults(
+        config=driver.config,
+        directory=driver.config.output,
+        eval_return=history["eval_return"],
+        env_steps=history["env_steps"],
+        training=driver.record.training(),
+        test_returns=np.asarray(summary["final_test_returns"]),
+        best_test_returns=np.asarray(summary["best_test_returns"]),
+        policy=policy,
+        actor=jax.device_get(driver.state.train_states.actor),
+        best=driver.best.actor,
+        summary=summary,
+    )

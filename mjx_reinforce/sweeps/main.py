@@ -1,0 +1,45 @@
+"""The command line ``python -m mjx_reinforce.sweep``, from its arguments to its exit status."""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from mjx_reinforce.runs.alarms import silence_alarms
+from mjx_reinforce.runs.command_line import refuse
+from mjx_reinforce.runs.files import remove_empty
+from mjx_reinforce.runs.interrupt import Interrupt
+from mjx_reinforce.runs.streams import accept_everything
+from mjx_reinforce.sweeps.command_line import parse
+from mjx_reinforce.sweeps.perform import perform
+
+
+def main() -> None:
+    """Reads the command line, sweeps, and exits, with the statuses of ``train.main``."""
+    accept_everything()
+    silence_alarms()
+    with Interrupt() as interrupt:
+        status = _main(sys.argv[1:], interrupt)
+        if interrupt.number is not None:  # not at the end of a compiler's thread
+            sys.stdout.flush()
+            os._exit(status)
+    sys.exit(status)
+
+
+def _main(arguments: Sequence[str], interrupt: Interrupt) -> int:
+    """Returns the exit status of a command line."""
+    made: list[Path] = []
+    interrupt.on_exit(lambda: remove_empty(made))
+    try:
+        _, ended = perform(parse(arguments), interrupt, made)
+    except ValueError as error:
+        refuse(str(error), made)
+    except RuntimeError as error:  # XLA's
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        remedy = "lower --chunk-runs, --num-episodes, --eval-episodes or --horizon"
+        refuse(f"a chunk does not fit into memory ({error}); {remedy}", made)
+    except OSError as error:
+        remedy = "make room, then go on with --resume"
+        refuse(f"cannot write the files of this sweep ({error}); {remedy}", made, status=1)
+    return 0 if ended or interrupt.number is None else 128 + interrupt.number
