@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import errno
 import json
 import os
 import subprocess
@@ -319,6 +320,48 @@ def test_a_crash_among_runs_that_ended_changes_nothing(run, monkeypatch):
             sweep_command.main()
     assert run("--resume crashed") == 0
     assert same(curves(Path("whole")), curves(Path("crashed")))
+
+
+def test_a_full_disk_costs_no_training(run, monkeypatch, capsys):
+    """As in a run: a checkpoint that cannot be written is a warning, and the next one is tried."""
+    command = f"{STEPS} --num-seeds 2 --checkpoint-every 1"
+    assert run(f"{command} --output whole") == 0
+    save, tried = chunks.checkpoint.save, []
+
+    def full(*arguments, **options):
+        tried.append(None)
+        if len(tried) in (1, 2, 4):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(*arguments, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(chunks.checkpoint, "save", full)
+        assert run(f"{command} --output full") == 0
+    assert len(tried) > 4
+    assert same(curves(Path("whole")), curves(Path("full")))
+    said = capsys.readouterr().out
+    assert said.count("warning: cannot write a checkpoint (No space left on device)") == 2
+
+
+def test_a_chunk_that_goes_on_saves_when_it_is_due(run, monkeypatch):
+    """Not at its first look: the checkpoint that it was found in counts."""
+    monkeypatch.setattr(chunks, "_SECONDS", 0.0)
+    command = f"{SMALL} --num-seeds 2 --eval-every 1 --checkpoint-every 4 {RATES}"
+    save, saved = conduct.Saver.save, []
+
+    def crash(self, states, history):
+        save(self, states, history)
+        saved.append(int(history.now["updates"].max()))
+        if saved == [4]:
+            raise CrashError
+
+    monkeypatch.setattr(conduct.Saver, "save", crash)
+    monkeypatch.setattr(sys, "argv", ["sweep", *command.split(), "--max-updates", "9"])
+    monkeypatch.setattr(sys, "argv", [*sys.argv, "--output", "crashed"])
+    with pytest.raises(CrashError):
+        sweep_command.main()
+    assert run("--resume crashed") == 0
+    assert saved == [4, 8]
 
 
 def start(count, command, folder):
