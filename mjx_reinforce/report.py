@@ -1,7 +1,6 @@
 """``python -m mjx_reinforce.report RUN_OR_SWEEP`` makes a page of what runs and sweeps found."""
 
 import dataclasses
-import os
 import re
 import shlex
 import sys
@@ -12,7 +11,7 @@ from typing import Any, NamedTuple
 
 import tyro
 
-from mjx_reinforce.export.files import write_bytes
+from mjx_reinforce.export.files import check_folder, write_bytes
 from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
@@ -103,8 +102,7 @@ def check_output(output: Path, overwrite: bool) -> None:
     """Raises ValueError if the report cannot be written there, or would replace files unasked."""
     if output.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"{output} is no page; end --output in .html")
-    if not os.access(output.parent, os.W_OK):
-        raise ValueError(f"cannot write to {output.parent}; choose another --output")
+    check_folder(output.parent)
     if output.is_dir() or output.is_symlink():
         raise ValueError(f"{output} is a directory or a link; choose another --output")
     beside = _beside(output)

@@ -211,6 +211,7 @@ def test_a_simulator_that_is_not_there_is_named(tmp_path, monkeypatch):
         (["--width", 5000], "--width must be in [1, 4096], got 5000"),
         (["--episode", -1], "--episode must be in [0, 2147483647], got -1"),
         (["--output", "nowhere/film.gif"], "cannot write to nowhere"),
+        (["--output", "/proc/film.gif"], "cannot write to /proc; choose another --output"),
         (["--output", "film"], "film is no film"),
         (["--output", "policy.gif", "--overwrite"], "policy.gif exists"),
         (["--output", "config.json", "--overwrite"], "config.json is no film"),
