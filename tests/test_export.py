@@ -149,7 +149,7 @@ def test_a_policy_of_the_package_can_be_exported(tmp_path, monkeypatch):
         (["numpy", "--output", "mine.npz"], "mine.py exists; pass --overwrite"),
         (["numpy", "--output", "folder.npz", "--overwrite"], "folder.npz exists"),
         (["onnx"], "pip install onnx"),
-        (["numpy", "--seed", "9"], "seed 9 is not among the 3"),
+        (["numpy", "--seed", "9"], "has no seed 9: its seeds are 0 to 2"),
         (["numpy", "--which", "best"], "has no policy/best"),
     ],
 )

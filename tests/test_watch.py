@@ -204,7 +204,7 @@ def test_a_simulator_that_is_not_there_is_named(tmp_path, monkeypatch):
         (["--backend", "gymnasium"], "pip install 'gymnasium[mujoco]'"),
         (["--sed", 3], "error: unknown flag '--sed'. Did you mean '--seed'?"),
         (["--width", "wide"], "--width takes a whole number, such as 4 or 2e6, got 'wide'"),
-        (["--seed", 3], "seed 3 is not among the 3"),
+        (["--seed", 3], "has no seed 3: its seeds are 0 to 2"),
         (["--which", "best"], "has no policy/best"),
         (["--episodes", 0], "--episodes must be in [1, 10000], got 0"),
         (["--seconds", 0], "--seconds must be positive and finite, got 0"),
