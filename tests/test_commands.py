@@ -187,7 +187,8 @@ def test_tasks_are_listed_as_ever():
     [
         *(("hopper", "Hopper-v5"), ("Hopper-v4", "Hopper-v5"), ("cheetah", "HalfCheetah-v5")),
         *(("walker", "Walker2d-v5"), ("Hoper-v5", "Hopper-v5"), ("HUMANOID-V5", "Humanoid-v5")),
-        *(("cartpole-v1", "CartPole-v1"), ("xyz", None)),
+        *(("cartpole-v1", "CartPole-v1"), ("cartpol-v0", "CartPole-v0"), ("xyz", None)),
+        *(("Pong-v5", None), ("nope", None), ("InvertedPendulum", "InvertedPendulum-v5")),
     ],
 )
 def test_the_nearest_name_is_found(typed, meant):
@@ -226,6 +227,8 @@ MISTAKES = {
     "train hopper": "unknown task 'hopper'. Did you mean --env Hopper-v5?",
     "train --env Hoper-v5": "unknown environment 'Hoper-v5'. Did you mean 'Hopper-v5'?",
     "train --env cheetah": "Did you mean 'HalfCheetah-v5'?",
+    "train --env nope": "unknown environment 'nope'. Known: Ant-v5,",
+    "train --no-such": "unknown flag '--no-such'. (See mjx-reinforce train --help.)",
     "train --env my_arm": "Your own is named module:Class.",
     "train my_arm:Arm": "'my_arm:Arm' is a task: write --env my_arm:Arm",
     "train my_arm.py": "'my_arm.py' is a file; a task is a class in one: write --env module:Class",
@@ -254,6 +257,7 @@ MISTAKES = {
     "train env=Hopper-v5": "'env=Hopper-v5' lacks its dashes: write --env Hopper-v5",
     "train --no-learning-rate": "--learning-rate is no switch but takes a value",
     "train --version": "mjx-reinforce --version says it",
+    "train --config mine.json": "config.json; mjx-reinforce train --like RUN repeats them",
     "train --device cuda": "JAX_PLATFORMS=cuda before the command",
     "train --over discount 0.9 1": "unknown flag '--over': it is one of mjx-reinforce sweep",
     "watch --run runs/first": "unknown flag '--run': leave it out",
