@@ -272,7 +272,10 @@ MISTAKES = {
     "train --hidden-sizes 64,64": "takes whole numbers with spaces between them, such as 32 32",
     "train --standardize False": "it takes no value, got 'False'; --no-standardize switches it off",
     "train --num-seeds 3 4": "no flag takes '4': --num-seeds takes one value",
-    "train --algorithm PPO": "invalid choice 'PPO' for argument '--algorithm'. Expected one of",
+    "train --algorithm PPO": "--algorithm takes ars or reinforce, got 'PPO'",
+    "watch Hopper-v5 --backend isaac": "--backend takes gymnasium or mjx or mujoco, got 'isaac'",
+    "watch Hopper-v5 --beside x": "or None or untrained or best or worst or median, got 'x'",
+    "train --output=": "--output takes a path or None, got ''",
     "train --estimator value_baseline": "Did you mean 'value-baseline'?",
     "watch --seed first": "--seed takes a whole number, such as 4 or 2e6, or best or worst or",
     "watch --output film.avi runs/first": "runs/first is no run directory",
@@ -285,7 +288,7 @@ MISTAKES = {
     "report": "there is nothing to report on: name a run or a sweep directory",
     "report nowhere": "there is no directory nowhere; name that of a run or a sweep",
     "export": "mjx-reinforce export needs RUN and --to",
-    "export runs/first --to torch": "invalid choice 'torch' for argument '--to'",
+    "export runs/first --to torch": "--to takes numpy or onnx, got 'torch'",
 }
 
 
@@ -296,6 +299,11 @@ def test_a_mistake_gets_the_remedy(call, typed):
     assert err.startswith("error: ")
     assert err.count("\n") == 1
     assert MISTAKES[typed] in err
+
+
+@pytest.mark.parametrize("command", ["watch", "report", "new", "export --to numpy"])
+def test_nothing_is_no_path(call, command):
+    assert "'' is no path" in call(*command.split(), "")[2]
 
 
 def test_a_script_sees_modules_of_the_current_folder():
