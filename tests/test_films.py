@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -149,6 +150,18 @@ def test_what_c_mujoco_cannot_play_is_named():
         InMujoco(Stepping())
     with pytest.raises(ValueError, match="CartPole has steps of its own"):
         InMujoco(envs.make("CartPole-v1"))
+
+
+@pytest.mark.parametrize(("name", "needs"), [("GLFW", "a screen"), ("osmesa", "the library OSMe")])
+def test_a_renderer_that_is_not_here_is_answered_with_egl(monkeypatch, name, needs):
+    def fail(*arguments):
+        warnings.warn("GLFW is not initialised", UserWarning, stacklevel=1)
+        raise RuntimeError("an OpenGL platform library has not been loaded")
+
+    monkeypatch.setenv("MUJOCO_GL", name)
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    with pytest.raises(ValueError, match=f"={name.lower()} needs {needs}.* set MUJOCO_GL=egl "):
+        films.Renderer(envs.make("Hopper-v5").mj_model, 8, 8)
 
 
 @pytest.mark.parametrize("replace", [False, True])
