@@ -17,12 +17,11 @@ from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
 from mjx_reinforce.reports.film import Film, make
 from mjx_reinforce.reports.findings import Findings, find
-from mjx_reinforce.reports.page import columns, document, latex, tables, tasks_page
+from mjx_reinforce.reports.page import columns, document, latex, learning, tables, tasks_page
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.listings import listings
 from mjx_reinforce.reports.page.vega import ONE, draw
-from mjx_reinforce.reports.page.words import answer
 from mjx_reinforce.reports.tasks import find_tasks, rename
 from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.defaults import check_task, of_task
@@ -132,7 +131,7 @@ def write_sweep(directory: Path, output: Path) -> Written:
     started = time.perf_counter()
     findings = find(sources.read([directory]))
     _write(findings, output, started)
-    return Written(time.perf_counter() - started, answer(findings), findings.order[0])
+    return Written(time.perf_counter() - started, learning.headline(findings), findings.order[0])
 
 
 def write(chosen: Sequence[Path], output: Path) -> float:
