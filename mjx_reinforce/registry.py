@@ -28,8 +28,8 @@ ESTIMATORS = {
     "normalized-returns": "mjx_reinforce.learners.estimators:normalized_returns",
 }
 
-#: How alike a typing mistake leaves two names, from 0 to 1 (all), as ``difflib`` counts.
-_ALIKE = 0.7
+#: How alike names are, as ``difflib`` counts, of which a third of the letters differ.
+_ALIKE = 0.66
 
 
 def check_name(kind: str, name: str, known: Mapping[str, Any]) -> None:
