@@ -2,6 +2,7 @@
 
 import difflib
 import importlib
+import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
@@ -27,6 +28,9 @@ ESTIMATORS = {
     "normalized-returns": "mjx_reinforce.learners.estimators:normalized_returns",
 }
 
+#: How alike names are, as ``difflib`` counts, of which a third of the letters differ.
+_ALIKE = 0.66
+
 
 def check_name(kind: str, name: str, known: Mapping[str, Any]) -> None:
     """Raises ValueError for a name that is not known, with the known ones and the nearest.
@@ -38,24 +42,30 @@ def check_name(kind: str, name: str, known: Mapping[str, Any]) -> None:
     """
     if name in known:
         return
-    near = nearest(name, known, cutoff=0.4)
+    near = nearest(name, known)
     hint = f" Did you mean {near!r}?" if near else ""
     raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(known))}.")
 
 
-def nearest(name: str, known: Iterable[str], cutoff: float = 0.6) -> str | None:
+def nearest(name: str, known: Iterable[str]) -> str | None:
     """Returns the known name that somebody meant, whatever the case of the letters, if any is near.
 
     Args:
-      name: what the user typed; a known name that contains it is near.
-      known: the names.
-      cutoff: how alike names must be, from 0 to 1 (all).
+      name: what the user typed; a known name that contains it is near. A version, such as -v5,
+        makes no two names alike.
+      known: the names; of versions of one name the last is meant, unless the user typed another.
     """
-    plain = {each.lower(): each for each in sorted(known)}
-    typed = name.lower()
-    inside = [each for each in plain if len(typed) > 2 and typed in each]
-    near = difflib.get_close_matches(typed, inside or plain, n=1, cutoff=0 if inside else cutoff)
-    return plain[near[0]] if near else None
+    typed, versions = _plain(name), {}
+    for each in sorted(known):
+        versions.setdefault(_plain(each), []).append(each)
+    inside = [each for each in versions if len(typed) > 2 and typed in each]
+    near = difflib.get_close_matches(typed, inside or versions, n=1, cutoff=0 if inside else _ALIKE)
+    return difflib.get_close_matches(name, versions[near[0]], n=1, cutoff=0)[0] if near else None
+
+
+def _plain(name: str) -> str:
+    """Returns a name in small letters, without the version of a task."""
+    return re.sub(r"-v\d+$", "", name.lower())
 
 
 def load(entry: str | Callable[..., Any]) -> Callable[..., Any]:

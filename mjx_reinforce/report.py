@@ -1,7 +1,6 @@
 """``python -m mjx_reinforce.report RUN_OR_SWEEP`` makes a page of what runs and sweeps found."""
 
 import dataclasses
-import os
 import re
 import shlex
 import sys
@@ -12,18 +11,17 @@ from typing import Any, NamedTuple
 
 import tyro
 
-from mjx_reinforce.export.files import write_bytes
+from mjx_reinforce.export.files import check_folder, write_bytes
 from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
 from mjx_reinforce.reports.film import Film, make
 from mjx_reinforce.reports.findings import Findings, find
-from mjx_reinforce.reports.page import columns, document, latex, tables, tasks_page
+from mjx_reinforce.reports.page import columns, document, latex, learning, tables, tasks_page
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.listings import listings
 from mjx_reinforce.reports.page.vega import ONE, draw
-from mjx_reinforce.reports.page.words import answer
 from mjx_reinforce.reports.tasks import find_tasks, rename
 from mjx_reinforce.runs.commands import command
 from mjx_reinforce.runs.defaults import check_task, of_task
@@ -103,8 +101,7 @@ def check_output(output: Path, overwrite: bool) -> None:
     """Raises ValueError if the report cannot be written there, or would replace files unasked."""
     if output.suffix.lower() not in (".html", ".htm"):
         raise ValueError(f"{output} is no page; end --output in .html")
-    if not os.access(output.parent, os.W_OK):
-        raise ValueError(f"cannot write to {output.parent}; choose another --output")
+    check_folder(output.parent)
     if output.is_dir() or output.is_symlink():
         raise ValueError(f"{output} is a directory or a link; choose another --output")
     beside = _beside(output)
@@ -134,7 +131,7 @@ def write_sweep(directory: Path, output: Path) -> Written:
     started = time.perf_counter()
     findings = find(sources.read([directory]))
     _write(findings, output, started)
-    return Written(time.perf_counter() - started, answer(findings), findings.order[0])
+    return Written(time.perf_counter() - started, learning.headline(findings), findings.order[0])
 
 
 def write(chosen: Sequence[Path], output: Path) -> float:

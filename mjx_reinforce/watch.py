@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import track
 
 from mjx_reinforce import envs
+from mjx_reinforce.export.files import check_folder
 from mjx_reinforce.export.films import (
     Renderer,
     import_gymnasium,
@@ -221,9 +222,7 @@ def check(settings: Settings, source: Source) -> Path:
         return output
     if output.suffix.lower() not in (".gif", ".mp4"):
         raise ValueError(f"{output} is no film; end --output in .gif or .mp4")
-    if not (output.parent.is_dir() and os.access(output.parent, os.W_OK)):
-        missing = "" if output.parent.exists() else ", which does not exist"
-        raise ValueError(f"cannot write to {output.parent}{missing}; choose another --output")
+    check_folder(output.parent)
     if output.is_dir() or (output.exists() and not settings.overwrite):
         raise ValueError(f"{output} exists; pass --overwrite or another --output")
     if output.suffix.lower() == ".mp4":

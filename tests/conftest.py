@@ -38,13 +38,32 @@ SLOW = Path(__file__).with_name("slow.txt")
 jax.config.update("jax_default_matmul_precision", "highest")
 
 
-def pytest_collection_modifyitems(items):
-    """Marks what slow.txt lists, and puts it first: no worker is left alone with it at the end."""
+def pytest_collection_modifyitems(config, items):
+    """Marks what slow.txt lists, and puts it first: no worker is left alone with it at the end.
+
+    Raises:
+      UsageError: a line names nothing in a file that was collected whole, or no file.
+    """
     slow = {line for line in SLOW.read_text().splitlines() if not line.startswith("#")}
+    found = set()
     for item in items:
         case = f"{item.path.name}::{item.name}"
-        if not slow.isdisjoint({case, case.partition("[")[0]}):
+        if lines := slow & {case, case.partition("[")[0]}:
             item.add_marker("slow")
+            found |= lines
         if item.get_closest_marker("cpu") and jax.default_backend() != "cpu":
             item.add_marker(pytest.mark.skip(reason="it is for CPUs"))
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+    whole = not (any("::" in each for each in config.args) or config.getoption("lf", False))
+    if whole and (stale := _stale(slow - found, {item.path.name for item in items})):
+        raise pytest.UsageError(f"slow.txt lists what is no test: {', '.join(stale)}")
+
+
+def _stale(lines, collected):
+    """Returns those of some lines whose file is among the collected ones, or is not there."""
+    files = {line: line.partition("::")[0] for line in lines}
+    return sorted(
+        line
+        for line, file in files.items()
+        if file in collected or not SLOW.with_name(file).exists()
+    )

@@ -187,7 +187,8 @@ def test_tasks_are_listed_as_ever():
     [
         *(("hopper", "Hopper-v5"), ("Hopper-v4", "Hopper-v5"), ("cheetah", "HalfCheetah-v5")),
         *(("walker", "Walker2d-v5"), ("Hoper-v5", "Hopper-v5"), ("HUMANOID-V5", "Humanoid-v5")),
-        *(("cartpole-v1", "CartPole-v1"), ("xyz", None)),
+        *(("cartpole-v1", "CartPole-v1"), ("cartpol-v0", "CartPole-v0"), ("xyz", None)),
+        *(("Pong-v5", None), ("nope", None), ("InvertedPendulum", "InvertedPendulum-v5")),
     ],
 )
 def test_the_nearest_name_is_found(typed, meant):
@@ -226,6 +227,8 @@ MISTAKES = {
     "train hopper": "unknown task 'hopper'. Did you mean --env Hopper-v5?",
     "train --env Hoper-v5": "unknown environment 'Hoper-v5'. Did you mean 'Hopper-v5'?",
     "train --env cheetah": "Did you mean 'HalfCheetah-v5'?",
+    "train --env nope": "unknown environment 'nope'. Known: Ant-v5,",
+    "train --no-such": "unknown flag '--no-such'. (See mjx-reinforce train --help.)",
     "train --env my_arm": "Your own is named module:Class.",
     "train my_arm:Arm": "'my_arm:Arm' is a task: write --env my_arm:Arm",
     "train my_arm.py": "'my_arm.py' is a file; a task is a class in one: write --env module:Class",
@@ -254,6 +257,7 @@ MISTAKES = {
     "train env=Hopper-v5": "'env=Hopper-v5' lacks its dashes: write --env Hopper-v5",
     "train --no-learning-rate": "--learning-rate is no switch but takes a value",
     "train --version": "mjx-reinforce --version says it",
+    "train --config mine.json": "config.json; mjx-reinforce train --like RUN repeats them",
     "train --device cuda": "JAX_PLATFORMS=cuda before the command",
     "train --over discount 0.9 1": "unknown flag '--over': it is one of mjx-reinforce sweep",
     "watch --run runs/first": "unknown flag '--run': leave it out",
@@ -268,7 +272,10 @@ MISTAKES = {
     "train --hidden-sizes 64,64": "takes whole numbers with spaces between them, such as 32 32",
     "train --standardize False": "it takes no value, got 'False'; --no-standardize switches it off",
     "train --num-seeds 3 4": "no flag takes '4': --num-seeds takes one value",
-    "train --algorithm PPO": "invalid choice 'PPO' for argument '--algorithm'. Expected one of",
+    "train --algorithm PPO": "--algorithm takes ars or reinforce, got 'PPO'",
+    "watch Hopper-v5 --backend isaac": "--backend takes gymnasium or mjx or mujoco, got 'isaac'",
+    "watch Hopper-v5 --beside x": "or None or untrained or best or worst or median, got 'x'",
+    "train --output=": "--output takes a path or None, got ''",
     "train --estimator value_baseline": "Did you mean 'value-baseline'?",
     "watch --seed first": "--seed takes a whole number, such as 4 or 2e6, or best or worst or",
     "watch --output film.avi runs/first": "runs/first is no run directory",
@@ -281,7 +288,7 @@ MISTAKES = {
     "report": "there is nothing to report on: name a run or a sweep directory",
     "report nowhere": "there is no directory nowhere; name that of a run or a sweep",
     "export": "mjx-reinforce export needs RUN and --to",
-    "export runs/first --to torch": "invalid choice 'torch' for argument '--to'",
+    "export runs/first --to torch": "--to takes numpy or onnx, got 'torch'",
 }
 
 
@@ -292,6 +299,11 @@ def test_a_mistake_gets_the_remedy(call, typed):
     assert err.startswith("error: ")
     assert err.count("\n") == 1
     assert MISTAKES[typed] in err
+
+
+@pytest.mark.parametrize("command", ["watch", "report", "new", "export --to numpy"])
+def test_nothing_is_no_path(call, command):
+    assert "'' is no path" in call(*command.split(), "")[2]
 
 
 def test_a_script_sees_modules_of_the_current_folder():

@@ -1,20 +1,20 @@
 """Films of policies of the package, side by side and pushed, in C MuJoCo."""
 
-import dataclasses
 import subprocess
 import sys
+import warnings
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from bad_envs import Pole
 from PIL import Image
 from saved_runs import make_run
 
 from mjx_reinforce import envs, load, pretrained, watch
 from mjx_reinforce.envs import models
-from mjx_reinforce.envs.base import MujocoEnv
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export import films, takes
 from mjx_reinforce.export.pretrained import FOLDER
@@ -116,26 +116,14 @@ def test_a_pushed_policy_still_stands():
     assert np.ptp(pushed.qpos[100:, 0]) > 0.2 > 4 * np.ptp(calm.qpos[100:, 0])
 
 
-class Contacts(MujocoEnv):
+class Contacts(Pole):
     """Reads what C MuJoCo keeps in an array whose size changes."""
-
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Settings(MujocoEnv.Settings):
-        """Arguments of the task."""
-
-        xml_file: str = "hopper.xml"
-        frame_skip: int = 1
-        max_episode_steps: int = 5
-        reward_threshold: float | None = None
-
-    def initial(self, rng):
-        return jnp.asarray(self.mj_model.qpos0), jnp.zeros(self.mj_model.nv)
 
     def outcome(self, before, data, action):
         return jnp.sum(data.efc_force), False, {}
 
 
-class Stepping(Contacts):
+class Stepping(Pole):
     """Has a step of its own."""
 
     def step(self, state, action):
@@ -149,6 +137,18 @@ def test_what_c_mujoco_cannot_play_is_named():
         InMujoco(Stepping())
     with pytest.raises(ValueError, match="CartPole has steps of its own"):
         InMujoco(envs.make("CartPole-v1"))
+
+
+@pytest.mark.parametrize(("name", "needs"), [("GLFW", "a screen"), ("osmesa", "the library OSMe")])
+def test_a_renderer_that_is_not_here_is_answered_with_egl(monkeypatch, name, needs):
+    def fail(*arguments):
+        warnings.warn("GLFW is not initialised", UserWarning, stacklevel=1)
+        raise RuntimeError("an OpenGL platform library has not been loaded")
+
+    monkeypatch.setenv("MUJOCO_GL", name)
+    monkeypatch.setattr(mujoco, "Renderer", fail)
+    with pytest.raises(ValueError, match=f"={name.lower()} needs {needs}.* set MUJOCO_GL=egl "):
+        films.Renderer(envs.make("Hopper-v5").mj_model, 8, 8)
 
 
 @pytest.mark.parametrize("replace", [False, True])

@@ -271,8 +271,8 @@ def test_a_family_with_the_same_shapes_is_not_taken_for_another(tmp_path):
 @pytest.mark.parametrize(
     ("seed", "message"),
     [
-        (3, "seed 3 is not among the 3"),
-        (-1, "seed -1 is not among the 3"),
+        (3, "has no seed 3: its seeds are 0 to 2"),
+        (-1, "has no seed -1: its seeds are 0 to 2"),
         ("first", "seed must be best, worst, median or a number, got 'first'"),
         (1.5, "got 1.5"),
     ],

@@ -125,9 +125,3 @@ def test_type_checkers_see_the_public_names():
     }
     assert seen == mjx_reinforce._HOME
     assert sorted(mjx_reinforce.__all__) == sorted([*seen, "__version__"])
-
-
-def test_slow_tests_are_tests():
-    lines = Path(__file__).with_name("slow.txt").read_text().splitlines()
-    for file, _, case in (line.partition("::") for line in lines if not line.startswith("#")):
-        assert f"def {case.partition('[')[0]}(" in (ROOT / "tests" / file).read_text(), case

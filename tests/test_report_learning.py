@@ -17,7 +17,7 @@ from test_sources import make_run
 
 from mjx_reinforce import report
 from mjx_reinforce.reports import findings, sources, tasks
-from mjx_reinforce.reports.page import latex, learning, listings
+from mjx_reinforce.reports.page import latex, learning, listings, tasks_page
 from mjx_reinforce.reports.page.citation import AUTHORS, TITLE, bibtex
 
 RATES = {"learning_rate": [1e-3, 3e-3, 1e-2]}
@@ -71,9 +71,27 @@ def test_equal_speeds_are_not_told_apart(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=24, over=RATES)
     all_solve(directory, [4, 4, 4])
     found = findings.find(sources.read([directory]))
-    assert learning.soonest(found) is None
+    assert learning.pace(found)[1] == []
     assert "does not tell its speed from that of" in " ".join(learning.answer(found))
     assert {each.adjusted for each in found.learning.speeds} == {1.0}
+
+
+def test_what_is_surely_slower_is_named_where_two_are_equally_fast(tmp_path):
+    """Of one task, and of several together."""
+    for env in ("InvertedPendulum-v5", "Other-v0"):
+        all_solve(make_sweep(tmp_path / env, num_seeds=24, over=RATES, env=env), [6, 2, 2])
+    said = learning.answer(findings.find(sources.read([tmp_path / "Other-v0"])))
+    slower = "faster than learning rate 0.001"
+    assert said[0] == f"learning rate 0.01 is surely {slower}; the returns at the end are a tie."
+    experiments = sources.read_tasks([tmp_path / "InvertedPendulum-v5", tmp_path / "Other-v0"])
+    said = tasks_page.answer(tasks.find_tasks(tasks.rename(experiments, {})))
+    corrected = "(p < 0.001 after Holm's correction for 3 pairs)"
+    assert said[2:] == [
+        f"By the log-rank tests of all tasks together, learning rate 0.01 is {slower} {corrected},"
+        " and no configuration is surely the fastest of all.",
+        f"In InvertedPendulum-v5, learning rate 0.01 is surely {slower}.",
+        f"In Other-v0, learning rate 0.01 is surely {slower}.",
+    ]
 
 
 def test_nobody_solves_it_is_no_race(tmp_path):

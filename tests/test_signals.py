@@ -40,6 +40,15 @@ with Interrupt() as interrupt:
     time.sleep(60)
 """
 
+QUICK_EXIT = """
+import time
+from mjx_reinforce.runs.interrupt import Interrupt
+with Interrupt():
+    print("listening", flush=True)
+    time.sleep(60)
+"""
+UNBEGUN = "stopped before training began; nothing was written\n"
+
 
 @pytest.fixture(autouse=True)
 def ctrl_c_is_heard():
@@ -118,9 +127,22 @@ def test_a_signal_while_compiling_leaves_nothing(tmp_path, number, status):
     time.sleep(1)
     process.send_signal(number)
     begun = time.monotonic()
-    assert finish(process) == status
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == status
+    assert "Traceback" not in output
+    assert errors == UNBEGUN
     assert time.monotonic() - begun < 5
     assert not (tmp_path / "out").exists()
+
+
+def test_a_signal_before_training_is_answered(tmp_path):
+    command = [sys.executable, "-c", QUICK_EXIT]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(command, cwd=tmp_path, **pipes, text=True)
+    assert process.stdout.readline() == "listening\n"
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=30) == ("", UNBEGUN)
+    assert process.returncode == 130
 
 
 def test_files_are_cleaned_up_however_long_it_takes_but_the_screen_is_not_waited_for(tmp_path):

@@ -135,7 +135,7 @@ def test_the_saved_policy_plays_like_the_trained_one(run, tmp_path):
     survives = bool(jnp.abs(policy.distribution.mode(outputs)[0]) <= 0.5)
     final = read(tmp_path / "out")[1]["final_returns"][1]
     assert final == (20.0 if survives else 1.0)
-    with pytest.raises(ValueError, match="seed 3 is not among the 3"):
+    with pytest.raises(ValueError, match="has no seed 3: its seeds are 0 to 2"):
         load_policy(tmp_path / "out" / "policy", seed=3)
 
 

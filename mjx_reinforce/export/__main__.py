@@ -2,13 +2,13 @@
 
 import dataclasses
 import keyword
-import os
 import sys
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
+from mjx_reinforce.export.files import check_folder
 from mjx_reinforce.export.pretrained import is_pretrained
 from mjx_reinforce.export.run_files import Seed, Which, read_run
 from mjx_reinforce.runs.commands import command
@@ -86,8 +86,7 @@ def check(settings: Settings, seed: int) -> list[Path]:
     output = settings.output or (of_package if is_pretrained(settings.run) else in_run)
     if output.suffix != suffix:
         raise ValueError(f"--to {settings.to} writes {suffix}, got --output {output}")
-    if not (output.parent.is_dir() and os.access(output.parent, os.W_OK)):
-        raise ValueError(f"cannot write to {output.parent}; choose another --output")
+    check_folder(output.parent)
     if settings.to == "numpy":
         _check_module(output.stem)
     outputs = [output, output.with_suffix(".py")] if settings.to == "numpy" else [output]

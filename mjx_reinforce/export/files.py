@@ -6,6 +6,7 @@ import json
 import math
 import os
 import secrets
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -42,6 +43,15 @@ def write_bytes(path: Path, content: bytes) -> None:
         raise
     with contextlib.suppress(OSError):  # not every file system can; the file is whole without it
         _sync(path.parent)
+
+
+def check_folder(folder: Path) -> None:
+    """Raises ValueError if no file can be made in a folder; /proc says that it could."""
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        missing = "" if folder.exists() else ", which does not exist"
+        raise ValueError(f"cannot write to {folder}{missing}; choose another --output") from error
 
 
 def _sync(folder: Path) -> None:

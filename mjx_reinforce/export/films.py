@@ -4,6 +4,7 @@ import ctypes.util
 import io
 import os
 import tempfile
+import warnings
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
 #: Colours of a .gif, beside the one that is transparent, and fewer of them for a small file.
 _COLORS, _FEWER_COLORS = 255, (128, 64, 32, 16, 8)
+#: What MuJoCo's backends need that are not EGL.
+_NEEDS = {"glfw": "a screen", "osmesa": "the library OSMesa"}
 #: Pictures, spread over a film, whose colours it has.
 _SAMPLES = 4
 #: The colour of an arrow: red, green, blue, opacity.
@@ -46,7 +49,8 @@ class Renderer:
         self._model, self._data = model, mujoco.MjData(model)
         self._forward = mujoco.mj_forward
         try:
-            self._renderer = mujoco.Renderer(model, height, width)
+            with warnings.catch_warnings(action="ignore"):  # GLFW's, before it fails
+                self._renderer = mujoco.Renderer(model, height, width)
         except Exception as error:  # each of MuJoCo's backends has its own
             raise _no_drawing(error) from error
         # Without this it closes itself when Python ends, too late for its own modules.
@@ -102,6 +106,13 @@ def import_mujoco() -> Any:
 
 
 def _no_drawing(error: Exception) -> ValueError:
+    """Returns what is said where MuJoCo's own error would be, and what to do."""
+    chosen = os.environ.get("MUJOCO_GL", "").lower()
+    if chosen in _NEEDS:
+        return ValueError(
+            f"MUJOCO_GL={chosen} needs {_NEEDS[chosen]}, which is not here; set MUJOCO_GL=egl "
+            "(Debian: apt install libegl1)"
+        )
     return ValueError(
         f"MuJoCo cannot draw here ({error}); install EGL (Debian: apt install libegl1) "
         "or set MUJOCO_GL to egl, osmesa or glfw, whichever this machine has"

@@ -97,7 +97,8 @@ def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
     arrays = read_arrays(actor_path, check, stored=True)
     num_seeds, checksum = check(arrays), arrays.pop(_CHECKSUM, None)
     if seed is not None and not 0 <= seed < num_seeds:
-        raise ValueError(f"seed {seed} is not among the {num_seeds} of {directory}")
+        seeds = f"its seeds are 0 to {num_seeds - 1}" if num_seeds > 1 else "it has seed 0 alone"
+        raise ValueError(f"{directory} has no seed {seed}: {seeds}")
     with _damage_in(actor_path):
         check_finite(arrays, seed)
     # Files from before there was a checksum have none. It finds damage, not ill will: who changes

@@ -8,6 +8,7 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Annotated, Any, TextIO, TypeVar, get_type_hints
 
 import docstring_parser
@@ -24,6 +25,7 @@ Form = TypeVar("Form")
 _LEAST_WIDTH = 60
 #: What tyro says of a value -> what we say.
 _PLAIN = {
+    r"Error parsing (PATH|\[.*\]): .*": "'' is no path",  # without a flag
     r"Missing value for argument '(\S+)'.*": r"\1 needs a value after it",
     r"Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]": (
         r"\1 takes whole numbers with spaces between them, such as 32 32, got \2"
@@ -31,16 +33,22 @@ _PLAIN = {
     r"Error parsing (\S+): (takes .*)": r"\1 \2",
 }
 #: Of a value that is of none of several types.
-_NO_TYPE = r"Error parsing (\S+): no type matching (\S+) could be instantiated from \[(.*?)\]\..*"
-_TYPES = {"INT": "a whole number, such as 4 or 2e6,", "FLOAT": "a number, such as 0.5,"}
-#: How numbers are read, everywhere.
-_NUMBERS = ConstructorRegistry()
+_NO_TYPE = r"Error parsing (\S+): no type matching (.+?) could be instantiated from \[(.*?)\]\..*"
+#: Of a value that is none of some names.
+_NO_CHOICE = r"invalid choice (\S+) for argument '(\S+)'\. Expected one of \((.*)\)"
+_TYPES = {
+    "INT": "a whole number, such as 4 or 2e6,",
+    "FLOAT": "a number, such as 0.5,",
+    "PATH": "a path",
+}
+#: How numbers and paths are read, everywhere.
+_READERS = ConstructorRegistry()
 
 
-@_NUMBERS.primitive_rule
-def _number(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    """Returns how a number is read: 1e6 is a whole one."""
-    readers = {int: ("INT", whole_number), float: ("FLOAT", _real_number)}
+@_READERS.primitive_rule
+def _reader(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """Returns how a number or a path is read: 1e6 is a whole number, and "" is no path."""
+    readers = {int: ("INT", whole_number), float: ("FLOAT", _real_number), Path: ("PATH", _path)}
     if kind.type not in readers:
         return None
     metavar, reader = readers[kind.type]
@@ -48,7 +56,7 @@ def _number(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
         nargs=1,
         metavar=metavar,
         instance_from_str=lambda words: reader(words[0]),
-        is_instance=lambda value: type(value) is kind.type,
+        is_instance=lambda value: isinstance(value, kind.type) and type(value) is not bool,
         str_from_instance=lambda value: [str(value)],
     )
 
@@ -58,6 +66,12 @@ def _real_number(text: str) -> float:
         return float(text)
     except ValueError:
         raise ValueError(f"takes a number, such as 0.5, got {text!r}") from None
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise ValueError("takes a path, got ''")
+    return Path(text)
 
 
 def read(
@@ -83,7 +97,7 @@ def read(
     box, page = io.StringIO(), _Page(sys.stdout)
     brief = bool(main) and asks_brief_help(arguments)
     asked = _only(form, main) if brief else _with_help(form)
-    options: dict[str, Any] = {"prog": prog, "description": "", "registry": _NUMBERS}
+    options: dict[str, Any] = {"prog": prog, "description": "", "registry": _READERS}
     options["config"] = (tyro.conf.OmitArgPrefixes,)
     try:
         with _room_for_help(), contextlib.redirect_stdout(page), contextlib.redirect_stderr(box):
@@ -198,10 +212,15 @@ def _plain(box: str, form: type, prog: str) -> str:
         return f"{prog} needs {' and '.join(required(form))}"
     if found := re.match(_NO_TYPE, text):
         flag, kinds, value = found.groups()
-        spoken = [_TYPES.get(kind) or kind.strip("{}").split(",") for kind in kinds.split("|")]
+        kinds = kinds.replace(" ", "").split("|")  # tyro's box breaks long lines
+        spoken = [_TYPES.get(kind) or kind.strip("{}").split(",") for kind in kinds]
         numbers = [each for each in spoken if isinstance(each, str)]
         names = [name for each in spoken if isinstance(each, list) for name in each]
         return f"{flag} takes {' or '.join([*numbers, *names])}, got {value}"
+    if found := re.match(_NO_CHOICE, text):
+        value, flag, choices = found.groups()
+        names = sorted(set(re.findall(r"'(.*?)'", choices)) - {"None"})
+        return f"{flag} takes {' or '.join(names)}, got {value}"
     for pattern, replacement in _PLAIN.items():
         text = re.sub(pattern, replacement, text)
     return text

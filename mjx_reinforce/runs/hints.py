@@ -1,7 +1,6 @@
 """What a command line that cannot be read was probably meant to say."""
 
 import dataclasses
-import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple, get_args, get_type_hints
@@ -63,6 +62,7 @@ for _flag, _words in _OTHERS.items():
         _MEANT.setdefault(f"--{_word}", []).append(_flag)
 
 _GPU = "a GPU is used where JAX finds one; JAX_PLATFORMS=cuda before the command insists on it"
+_CONFIG = f"the settings of a run are in its config.json; {SCRIPT} train --like RUN repeats them"
 #: Flags that are none here, and what to do in their place.
 _NONE = {
     "--version": f"{SCRIPT} --version says it",
@@ -71,6 +71,7 @@ _NONE = {
     "--cuda": _GPU,
     "--cpu": "write JAX_PLATFORMS=cpu before the command",
     "--render": f"train first, then {SCRIPT} watch makes a film",
+    **dict.fromkeys(("--config", "--config-file", "--cfg", "--settings"), _CONFIG),
     "--verbose": "there is one amount of output; > /dev/null drops it",
     "--quiet": "there is one amount of output; > /dev/null drops it",
 }
@@ -176,9 +177,8 @@ def _about_flag(flag: str, flags: Mapping[str, Known], prog: str) -> str:
         other = _ELSEWHERE[plain]
         return f"unknown flag {flag!r}: it is one of {command(other)}"
     meant = [each for each in other_names(plain) if each in flags]
-    alike = difflib.get_close_matches(plain, flags, n=1) if len(plain) > len("--xy") else []
-    near = next(iter([*meant, *alike]), None)
-    hint = f" Did you mean {near!r}?" if near else ""
+    near = nearest(plain[2:], [each[2:] for each in flags])
+    hint = f" Did you mean {(meant or [f'--{near}'])[0]!r}?" if meant or near else ""
     return f"unknown flag {flag!r}.{hint} (See {prog.removesuffix(' [PRESET]')} --help.)"
 
 

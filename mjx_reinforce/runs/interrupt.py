@@ -14,7 +14,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Interrupt:
-    """Ends the process at Ctrl-C or SIGTERM, without a traceback; after ``defer`` it first asks.
+    """Ends the process at Ctrl-C or SIGTERM, in one line; after ``defer`` it first asks.
 
     It listens inside a ``with`` block, in a thread of its own: Python runs signal handlers in the
     main thread only, which may be inside a compiler for minutes. The process ends with
@@ -87,7 +87,9 @@ class Interrupt:
                     self._act(heard[0])
 
     def _act(self, number: int) -> None:
-        if self._say is None or self.number is not None:
+        if self._say is None:
+            self.leave(128 + number, _say_unbegun)
+        if self.number is not None:
             self.leave(128 + number)
         self.number = number
         said = "stopping after the present block of updates or test; Ctrl-C again stops at once"
@@ -104,6 +106,12 @@ def _start(action: Callable[[], Any]) -> threading.Thread:
     thread = threading.Thread(target=action, daemon=True)
     thread.start()
     return thread
+
+
+def _say_unbegun() -> None:
+    """Says that there is no run; on a terminal below the bar, on whose line the cursor stands."""
+    said = "stopped before training began; nothing was written"
+    print("\n" * sys.stderr.isatty() + said, file=sys.__stderr__, flush=True)
 
 
 def _nothing(number: int, frame: object) -> None:

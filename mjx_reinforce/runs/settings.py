@@ -24,7 +24,8 @@ class RunSettings:
     minutes: float | None = None
     """In place of --env-steps, about how long to train, all seeds together: the first updates show
     how many env steps that is. The number goes into config.json, so that --like RUN repeats the
-    run to the last bit."""
+    run to the last bit. Where episodes grow, later steps come faster, above all on a GPU, and the
+    run ends early."""
     max_updates: int | None = None
     """Stop every seed after this many updates; with --num-episodes 1, as many episodes."""
     stop_when_solved: bool = False

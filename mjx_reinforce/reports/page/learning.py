@@ -22,15 +22,20 @@ MEASURES = {
 def answer(findings: Findings) -> list[str]:
     """Returns the page's answer: what was reached, and who got there faster.
 
-    Where the returns at the end cannot be told apart, and one configuration is surely the fastest,
-    that comes first.
+    Where the returns at the end cannot be told apart, and one configuration is surely faster than
+    others, that comes first.
     """
-    said, first = words.answer(findings), soonest(findings)
-    tied = len(words.unsure(findings)) == len(findings.results[:COMPARED]) - 1
-    lead = []
-    if first is not None and tied:
-        lead = [f"Fastest is {first.configuration.label}; the returns at the end are a tie."]
-    return [*lead, *said, *sentences(findings)]
+    return [*headline(findings), *sentences(findings)]
+
+
+def headline(findings: Findings) -> list[str]:
+    """Returns the answer without what follows of the speed."""
+    said, (first, slower) = words.answer(findings), pace(findings)
+    others = len(findings.results[:COMPARED]) - 1
+    if not slower or len(words.unsure(findings)) < others:
+        return said
+    who = f"Fastest is {first}" if len(slower) == others else f"{first} is surely {faster(slower)}"
+    return [f"{who}; the returns at the end are a tie.", *said]
 
 
 def sentences(findings: Findings) -> list[str]:
@@ -40,14 +45,19 @@ def sentences(findings: Findings) -> list[str]:
     return [*_of_speed(findings), *_of_area(findings), *_of_levels(findings)]
 
 
-def soonest(findings: Findings) -> Result | None:
-    """Returns the configuration that surely solves the task sooner than all others, if one does."""
-    compared = findings.results[:COMPARED]
-    if not findings.learning.speeds:
-        return None
-    first = fastest(compared)
+def pace(findings: Findings) -> tuple[str, list[str]]:
+    """Returns what solves the task soonest, and what is surely slower: names of configurations."""
+    names = [each.configuration.label for each in findings.results[:COMPARED]]
+    first = fastest(findings.results[:COMPARED])
     tests = [each for each in findings.learning.speeds if first in (each.first, each.second)]
-    return compared[first] if all(each.adjusted < LEVEL for each in tests) else None
+    slower = [each for each in tests if each.adjusted < LEVEL]
+    return names[first], [names[each.first + each.second - first] for each in slower]
+
+
+def faster(slower: Sequence[str]) -> str:
+    """Returns "faster than" and names, the first three of many."""
+    more = f" and {len(slower) - 3} more" if len(slower) > 3 else ""
+    return f"faster than {', '.join(slower[:3])}{more}"
 
 
 def _of_speed(findings: Findings) -> Iterator[str]:

@@ -13,6 +13,7 @@ from mjx_reinforce.reports.page.figures import SHOWN, Figure, of_task
 from mjx_reinforce.reports.page.listings import Listing, listings
 from mjx_reinforce.reports.page.tables import task_tables
 from mjx_reinforce.reports.page.words import LEVEL, interval, number, p_value, percent
+from mjx_reinforce.reports.results import COMPARED
 from mjx_reinforce.reports.tasks import Faster, Tasks, in_order
 
 _SCORE = "A score of 0 is that of untrained policies; table 1 says what 1 is in each task."
@@ -187,26 +188,39 @@ def _of_speed(tasks: Tasks) -> Iterator[str]:
         wins[each.first if sum(each.statistics) > 0 else each.second] += 1
     first = max(wins, key=lambda i: wins[i])
     own = [each for each in tasks.faster if first in (each.first, each.second)]
-    sure = [each for each in own if each.adjusted < LEVEL]
-    worst = p_value(max(each.adjusted for each in own))
-    if len(sure) == len(own) and wins[first] == len(own):
-        bound = " or less" if len(own) > 1 and not worst.startswith("p <") else ""
+    slower = {
+        each.first + each.second - first: each.adjusted
+        for each in own
+        if each.adjusted < LEVEL and _sooner(names, each, sum(each.statistics)) == names[first]
+    }
+    if not slower:
+        yield "By the log-rank tests of all tasks together, no configuration is surely the fastest."
+        return
+    worst = p_value(max(slower.values()))
+    bound = " or less" if len(slower) > 1 and not worst.startswith("p <") else ""
+    how = f"{worst}{bound} after Holm's correction for {count(len(tasks.faster), 'pair')}"
+    if len(slower) == len(own):
         yield (
             f"The tasks are solved soonest by {names[first]}: sooner than by "
             f"{'the other' if len(own) == 1 else 'any other'}, by the log-rank tests of all tasks "
-            f"together ({worst}{bound} after Holm's correction for "
-            f"{count(len(tasks.faster), 'pair')})."
+            f"together ({how})."
         )
     else:
-        yield "By the log-rank tests of all tasks together, no configuration is surely the fastest."
+        said = learning.faster([names[i] for i in sorted(slower)])
+        yield (
+            f"By the log-rank tests of all tasks together, {names[first]} is {said} ({how}), and "
+            "no configuration is surely the fastest of all."
+        )
 
 
 def _of_tasks(tasks: Tasks) -> Iterator[str]:
     for findings in tasks.findings:
         env = findings.experiment.env
-        first = learning.soonest(findings)
-        if first is not None:
-            yield f"In {env}, the fastest is surely {first.configuration.label}."
+        first, slower = learning.pace(findings)
+        if len(slower) == len(findings.results[:COMPARED]) - 1 > 0:
+            yield f"In {env}, the fastest is surely {first}."
+        elif slower:
+            yield f"In {env}, {first} is surely {learning.faster(slower)}."
         elif findings.learning.speeds:
             yield f"In {env}, no configuration is surely the fastest of all."
 
