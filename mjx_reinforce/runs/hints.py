@@ -11,6 +11,7 @@ import tyro
 from mjx_reinforce import envs
 from mjx_reinforce.registry import nearest
 from mjx_reinforce.runs.commands import COMMANDS, SCRIPT, command
+from mjx_reinforce.runs.config import flag
 from mjx_reinforce.runs.presets import PRESETS
 
 #: Flags of other libraries, and short forms -> ours.
@@ -119,14 +120,14 @@ def _known(form: type) -> Iterator[tuple[str, Known]]:
             yield from _known(kind)
         else:
             positional = tyro.conf.Positional in get_args(kind)
-            yield f"--{field.name.replace('_', '-')}", Known(kind is bool, positional)
+            yield flag(field.name), Known(kind is bool, positional)
 
 
 def required(form: type) -> list[str]:
     """Returns what a command line must have, as --help calls it."""
     flags = known(form)
     needed = (f for f in dataclasses.fields(form) if f.default is dataclasses.MISSING)
-    names = (f"--{field.name.replace('_', '-')}" for field in needed)
+    names = (flag(field.name) for field in needed)
     return [name[2:].upper() if flags[name].positional else name for name in names]
 
 
