@@ -55,7 +55,7 @@ def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, fl
         # Others have ``initial_std`` in their actions, which an engine may compile.
         names.discard("initial_std")
     settings = {name: getattr(config, name) for name in sorted(names) if exact or name in swept}
-    if config.decay_steps is None and config.decay_updates is None:
+    if not Reader.DECAY.holds(config):
         settings.pop("final_learning_rate", None)
     elif "learning_rate" in settings and config.final_learning_rate is None:
         settings["final_learning_rate"] = config.learning_rate / 10
