@@ -4,6 +4,7 @@ import dataclasses
 import math
 
 from failures_runs import Setting
+from mjx_reinforce.runs.config import flag
 
 #: The mended settings: those that differ from the base's.
 _MENDED = {
@@ -16,7 +17,7 @@ _MENDED = {
 }
 MENDED = Setting(**_MENDED, decay_updates=math.inf, env_steps=200_000, max_updates=200)
 #: The same as flags.
-MENDED_FLAGS = " ".join(f"--{k.replace('_', '-')} {v:g}" for k, v in _MENDED.items())
+MENDED_FLAGS = " ".join(f"{flag(k)} {v:g}" for k, v in _MENDED.items())
 #: The first is the base; the others, down to ``linear``, change one thing of it.
 ARMS = {
     "base": Setting(),

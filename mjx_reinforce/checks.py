@@ -66,32 +66,39 @@ def check_type(name: str, value: object, kind: object) -> None:
       kind: the annotation. Of those that are neither numbers, text, None, Literal, tuples nor
         unions of these, only classes are checked.
     """
-    if not _fits(value, kind):
+    if not fits(value, kind):
         raise ValueError(f"{name} must be {_spoken(kind)}, got {value!r}")
 
 
-def _fits(value: object, kind: object) -> bool:
+def fits(value: object, kind: object) -> bool:
+    """Returns whether a value is of an annotation, see ``check_type``."""
+    if len(kinds := alternatives(kind)) > 1:
+        return any(fits(value, each) for each in kinds)
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (typing.Union, types.UnionType):
-        return any(_fits(value, each) for each in inner)
     if origin is typing.Literal:
         return any(type(value) is type(each) and value == each for each in inner)
     if origin is tuple:
         if not isinstance(value, tuple | list):
             return False
         kinds = inner[:1] * len(value) if inner[-1] is ... else inner
-        return len(kinds) == len(value) and all(map(_fits, value, kinds))
+        return len(kinds) == len(value) and all(map(fits, value, kinds))
     if kind in (int, float) and isinstance(value, bool):
         return False
     expected = _KINDS[kind][0] if kind in _KINDS else kind
     return isinstance(value, expected) if isinstance(expected, type) else True
 
 
+def alternatives(kind: object) -> tuple[Any, ...]:
+    """Returns the annotations of a union, or the one that is given."""
+    union = typing.get_origin(kind) in (typing.Union, types.UnionType)
+    return typing.get_args(kind) if union else (kind,)
+
+
 def _spoken(kind: object) -> str:
     """Returns an annotation in words."""
+    if len(kinds := alternatives(kind)) > 1:
+        return " or ".join(map(_spoken, kinds))
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
-    if origin in (typing.Union, types.UnionType):
-        return " or ".join(map(_spoken, inner))
     if origin is typing.Literal:
         return f"one of {', '.join(map(repr, inner))}"
     if origin is tuple and inner[-1] is ...:

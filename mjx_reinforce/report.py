@@ -29,16 +29,14 @@ from mjx_reinforce.runs.files import version
 from mjx_reinforce.runs.flags import read
 from mjx_reinforce.runs.lines import say_error
 from mjx_reinforce.runs.own_code import env_flag
+from mjx_reinforce.runs.relevance import as_words
+from mjx_reinforce.runs.resume import recordable
 from mjx_reinforce.runs.streams import accept_everything
 
 _ABOUT = (
     "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG, "
     "SVG, PDF) and tables (CSV, LaTeX) in a folder beside it."
 )
-
-
-#: Settings of a sweep that training a seed again does not take over.
-_NOT_AGAIN = ("env", "num_seeds", "output", "overwrite", "resume")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -277,24 +275,14 @@ def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
 
 
 def _flags(settings: Mapping[str, Any]) -> str:
-    """Returns the flags of settings that are not the defaults of their task."""
-    defaults = dataclasses.asdict(of_task(settings["env"], settings.get("env_steps")))
-    given = {k: v for k, v in settings.items() if k in defaults and k not in _NOT_AGAIN}
-    changed = {
-        k: v for k, v in given.items() if v != defaults[k] and v != list(_items(defaults[k]))
-    }
-    flags = [f"--env {shlex.quote(str(settings['env']))}"]
-    for name, value in changed.items():
-        flag = f"--{name.replace('_', '-')}"
-        if isinstance(value, bool):
-            flags.append(flag if value else flag.replace("--", "--no-", 1))
-        else:
-            flags.append(shlex.join([flag, *map(str, _items(value))]))
-    return " ".join(flags)
-
-
-def _items(value: object) -> Sequence[Any]:
-    return value if isinstance(value, list | tuple) else (value,)
+    """Returns the flags of settings that are not the defaults of their task; not --num-seeds."""
+    defaults = recordable(of_task(settings["env"], settings.get("env_steps")))
+    del defaults["env"], defaults["num_seeds"]
+    words = ["--env", str(settings["env"])]
+    for name in (name for name in settings if name in defaults):
+        if settings[name] != defaults[name]:
+            words += as_words(name, settings[name])
+    return shlex.join(words)
 
 
 if __name__ == "__main__":

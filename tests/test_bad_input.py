@@ -29,9 +29,11 @@ from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS
 from mjx_reinforce.runs import display, jax_setup
 from mjx_reinforce.runs.build import build
 from mjx_reinforce.runs.command_line import parse
-from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.runs.config import Config, check, marked
+from mjx_reinforce.runs.declare import Mark
 from mjx_reinforce.runs.presets import PRESETS
-from mjx_reinforce.runs.relevance import READ, check_read
+from mjx_reinforce.runs.relevance import changed, check_read
+from mjx_reinforce.runs.settings import Reader
 
 
 @pytest.fixture
@@ -448,7 +450,7 @@ def test_settings_of_the_wrong_type_are_refused(wrong):
 # What is read.
 
 
-class Reader:
+class Watched:
     """Settings that remember which of them were looked at."""
 
     def __init__(self, config):
@@ -469,16 +471,18 @@ class Reader:
         {"standardize": False, "estimator": "value-baseline"},
     ],
 )
-def test_the_table_says_what_is_read(changes):
-    """The settings of the table that building looks at are those whose conditions hold."""
+def test_the_marks_say_what_is_read(changes):
+    """Of the settings with readers, building looks at those whose readers' conditions hold."""
     config = Config(env="Survive-v0", engine="vmap", **changes)
-    reader = Reader(config)
-    build(Survive(), reader)
-    listed = {name for names, _, _ in READ for name in names.split()}
-    idle = {name for names, is_read, _ in READ if not is_read(config) for name in names.split()}
+    watched = Watched(config)
+    build(Survive(), watched)
+    listed = {name for reader in Reader for name in marked(reader)}
+    idle = {name for reader in Reader if not reader.holds(config) for name in marked(reader)}
     # These three are always handed on; the policy or the update does not look at them.
     handed = {"initial_std", "rescale", "loss_per"}
-    assert (listed - idle) - handed == (listed & reader.read) - handed
+    assert (listed - idle) - handed == (listed & watched.read) - handed
+    # What programs on disk do not depend on is not built into them: budgets are only checked.
+    assert watched.read.isdisjoint({*marked(Mark.NOT_COMPILED)} - {"env_steps", "max_updates"})
 
 
 @pytest.mark.parametrize("name", [None, *PRESETS])
@@ -697,7 +701,7 @@ def test_settings_that_make_sense_alone_build_or_are_refused(others):
     config = Config(**{"engine": "vmap", **others})
 
     def read():
-        check_read(config, Config())
+        check_read(config, changed(config, Config()))
         check(config)
         build(Survive(), config)
 

@@ -22,11 +22,12 @@ from mjx_reinforce.export.run_files import choose_seed, read_run
 from mjx_reinforce.report import Written
 from mjx_reinforce.runs import plan as runs_plan
 from mjx_reinforce.runs.build import build
-from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.config import Config, check
 from mjx_reinforce.runs.defaults import of_task
 from mjx_reinforce.runs.state import eval_keys, evaluation
 from mjx_reinforce.sweeps import chunks, conduct, perform, plan, programs, rungs, search
 from mjx_reinforce.sweeps import main as sweep_command
+from mjx_reinforce.sweeps.design import Design, check_design
 from mjx_reinforce.sweeps.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.groups import learner_builder, make_groups
 from mjx_reinforce.sweeps.packing import pack
@@ -487,6 +488,11 @@ def test_values_are_read_as_their_settings_are():
         ("--over learning-rate 1e-2 1e-3 --chunk-runs 0", "--chunk-runs must be at least 1"),
         ("--over learning-rate 1e-2 1e-3 --jsonl", "--jsonl logs a run"),
         ("--over tensorboard True False", "cannot go over tensorboard"),
+        ("--over minutes 1 2", "cannot go over minutes"),
+        ("--over init-from a b", "cannot go over init-from"),
+        ("--over like a b", "cannot go over like"),
+        ("--update natural-gradient --over max-kl None 0.1", "from --max-kl, which is None"),
+        ("--min-episodes 9 --max-episodes 4 --over num-episodes 2 auto", "--min-episodes must be"),
         ("--over learning-rate 1 2 --num-seeds 2000000000", "results of 4,000,000,000 runs do not"),
         (
             "--over discount 0 1 --search random --budget 2000000000",
@@ -503,6 +509,31 @@ def test_bad_sweeps_are_refused(run, capsys, tmp_path, monkeypatch, arguments, m
     assert printed.err.count("\n") == 1
     assert printed.out == ""
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("base", "over"),
+    [
+        ({"update": "natural-gradient"}, {"max_kl": [0.01, 0.1]}),
+        ({"env_steps": None}, {"max_updates": [1, 2]}),
+        ({"num_episodes": 1}, {"estimator": ["reward-to-go", "total-return"]}),
+    ],
+)
+def test_what_every_configuration_sets_need_not_be_given_besides(base, over):
+    config = Config(env="CartPole-v1", **base)
+    with pytest.raises(ValueError, match=r"--max-kl|nothing would end|leave-one-out"):
+        check(config)
+    check_design(Design(base=config, over=over))
+
+
+def test_a_sweep_over_the_length_of_natural_gradients(run):
+    """As one over configurations that each have it from the command line."""
+    shared = f"{SMALL} --num-seeds 2 --max-updates 3 --update natural-gradient"
+    assert run(f"{shared} --over max-kl 0.01 0.1 --output swept") == 0
+    assert run(f"{shared} --max-kl 1.0 --over max-kl 0.01 0.1 --output given") == 0
+    swept, given = curves(Path("swept")), curves(Path("given"))
+    assert same(swept, given)
+    assert not same({"": swept["eval_return"][:, :2]}, {"": swept["eval_return"][:, 2:]})
 
 
 def test_a_flag_that_one_configuration_reads_is_accepted():

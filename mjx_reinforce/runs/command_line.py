@@ -20,7 +20,7 @@ from mjx_reinforce.runs.lines import say_error
 from mjx_reinforce.runs.own_code import check_named
 from mjx_reinforce.runs.presets import PRESETS
 from mjx_reinforce.runs.processes import ProcessSettings, check_processes
-from mjx_reinforce.runs.relevance import check_read
+from mjx_reinforce.runs.relevance import changed, check_read
 from mjx_reinforce.runs.settings import GROUPS, MAIN
 
 #: What a run leaves in its directory.
@@ -136,7 +136,7 @@ def _read(arguments: Sequence[str], default: Config, prog: str) -> tuple[Config,
     parsed = read_groups(groups, arguments, default, prog, said, MAIN)
     processes = parsed.pop("hosts")
     config = join_groups(parsed)
-    check_read(config, default)
+    check_read(config, changed(config, default))
     return config, processes
 
 

@@ -1,14 +1,14 @@
 """All settings of a run side by side, as config.json shows them, and the rules they obey."""
 
 import dataclasses
-import math
+import enum
+import functools
 import reprlib
-from collections.abc import Callable
-from typing import Any
 
 from mjx_reinforce import envs
 from mjx_reinforce.checks import changed, check_type
 from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS, check_name
+from mjx_reinforce.runs.declare import MAX_COUNT, MAX_OF_UPDATE, Range
 from mjx_reinforce.runs.settings import (
     CheckpointSettings,
     EstimatorSettings,
@@ -19,20 +19,6 @@ from mjx_reinforce.runs.settings import (
     SearchSettings,
     UpdateSettings,
 )
-
-#: What is counted exactly up to 2^53, as a double does; see ``learners.counts``.
-COUNTED = ("env_steps", "max_updates", "decay_steps")
-MAX_COUNT = 2**53
-#: The greatest of what an update counts, such as its env steps: they are int32.
-MAX_OF_UPDATE = 2**31 - 1
-#: The greatest learning rate.
-_MAX_RATE = 1000
-#: The greatest of other numbers, and one over the least: float32 holds their cubes.
-_MAX_SIZE = 1e12
-#: The most steps that an update may make one after the other, besides those of the episodes.
-_MAX_STEPS = 1_000_000
-#: The greatest number of layers: each is a matrix of its own in the program.
-_MAX_LAYERS = 100
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -65,19 +51,35 @@ class Config(
         return self.min_episodes if auto else self.episodes_per_update
 
 
+@functools.cache
+def marked(mark: enum.Enum) -> tuple[str, ...]:
+    """Returns the names of the settings that are declared with a mark."""
+    fields = dataclasses.fields(Config)
+    return tuple(field.name for field in fields if mark in field.metadata.get("marks", ()))
+
+
 def check(config: Config) -> None:
     """Raises ValueError for settings that make no sense: what, the value, the remedy."""
+    check_each(config)
+    check_together(config)
+
+
+def check_each(config: Config) -> None:
+    """Raises ValueError for a setting that makes no sense whatever the others are."""
     for field in dataclasses.fields(Config):
         check_type(flag(field.name), getattr(config, field.name), field.type)
     envs.check_id(config.env)
     check_name("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
     check_name("estimator", config.estimator, ESTIMATORS)
-    for names, holds, rule in _RULES:
-        for name in names.split():
+    for rule in Range:
+        for name in marked(rule):
             value = getattr(config, name)
-            spoken = isinstance(value, str) or (value is None and name in _OPTIONAL)
-            if not (spoken or holds(value)):
-                raise ValueError(f"{flag(name)} must be {rule}, got {reprlib.repr(value)}")
+            if not (value is None or isinstance(value, str) or rule.holds(value)):
+                raise ValueError(f"{flag(name)} must be {rule.said}, got {reprlib.repr(value)}")
+
+
+def check_together(config: Config) -> None:
+    """Raises ValueError for settings that do not go together."""
     if config.env_steps is None and config.max_updates is None:
         raise ValueError("nothing would end this run: give --env-steps or --max-updates a number")
     (_check_reinforce if config.algorithm == "reinforce" else _check_ars)(config)
@@ -85,7 +87,12 @@ def check(config: Config) -> None:
 
 def flag(name: str) -> str:
     """Returns the flag of a setting."""
-    return f"--{name.replace('_', '-')}"
+    return f"--{spoken(name)}"
+
+
+def spoken(name: str) -> str:
+    """Returns the name of a setting as people write it, such as learning-rate."""
+    return name.replace("_", "-")
 
 
 def check_step_count(config: Config, horizon: int) -> None:
@@ -115,82 +122,6 @@ def check_step_count(config: Config, horizon: int) -> None:
             f"a seed may play {min(bounds):,} env steps ({each}), more than the 2^53 that can be "
             "counted; give --env-steps, or lower --max-updates or --horizon"
         )
-
-
-_OPTIONAL = {field.name for field in dataclasses.fields(Config) if "None" in str(field.type)}
-
-#: Names of settings, what must hold of a value that is given, and how to say it.
-_RULES: tuple[tuple[str, Callable[[Any], bool], str], ...] = (
-    (
-        "num_seeds num_episodes env_steps max_updates horizon decay_steps decay_updates eval_every "
-        "checkpoint_every eval_episodes test_episodes value_fits value_batch_size "
-        "natural_iterations minibatch_updates minibatch_size num_directions top_directions",
-        lambda x: x >= 1,
-        "at least 1",
-    ),
-    ("min_episodes max_episodes", lambda x: x >= 2, "at least 2: one alone shows no noise"),
-    ("normalize_steps", lambda x: x >= 0, "at least 0"),
-    (
-        " ".join(COUNTED),
-        lambda x: x <= MAX_COUNT,
-        "at most 2^53, for no more is counted exactly",
-    ),
-    (
-        "num_episodes min_episodes max_episodes horizon decay_updates eval_every eval_episodes "
-        "test_episodes normalize_steps minibatch_size value_batch_size num_directions "
-        "checkpoint_every",
-        lambda x: x <= MAX_OF_UPDATE,
-        "less than 2^31",
-    ),
-    (
-        "value_fits natural_iterations minibatch_updates",
-        lambda x: x <= _MAX_STEPS,
-        f"at most {_MAX_STEPS:,}, for an update makes so many steps one after the other",
-    ),
-    ("seed eval_seed", lambda x: 0 <= x < 2**32, "in [0, 2^32)"),
-    ("discount final_discount", lambda x: 0 <= x <= 1, "in [0, 1]"),
-    ("momentum", lambda x: 0 <= x <= 1 - 2**-24, "in [0, 1 - 2^-24], the last float32 below 1"),
-    (
-        "hidden_sizes value_hidden_sizes",
-        lambda x: all(n >= 1 for n in x),
-        "positive in every layer",
-    ),
-    (
-        "hidden_sizes value_hidden_sizes",
-        lambda x: all(n <= MAX_OF_UPDATE for n in x),
-        "less than 2^31 in every layer",
-    ),
-    (
-        "hidden_sizes value_hidden_sizes",
-        lambda x: len(x) <= _MAX_LAYERS,
-        f"at most {_MAX_LAYERS} layers",
-    ),
-    (
-        "initial_std final_std learning_rate final_learning_rate max_grad_norm max_kl "
-        "value_learning_rate natural_damping "
-        "step_size noise_std minutes",
-        lambda x: math.isfinite(x) and x > 0,
-        "positive and finite",
-    ),
-    (
-        "standardize_floor entropy_cost weight_decay normalize_min_std",
-        lambda x: math.isfinite(x) and x >= 0,
-        "finite and not negative",
-    ),
-    ("reward_shift", lambda x: math.isfinite(x) and abs(x) <= _MAX_SIZE, "finite, in float32"),
-    # Weights are about 1, and most optimisers move each of them by about the rate.
-    (
-        "learning_rate final_learning_rate value_learning_rate step_size",
-        lambda x: 1 / _MAX_SIZE <= x <= _MAX_RATE,
-        f"in [{1 / _MAX_SIZE:g}, {_MAX_RATE}], for a step moves a weight by about that",
-    ),
-    (
-        "initial_std final_std noise_std max_grad_norm max_kl standardize_floor entropy_cost "
-        "weight_decay normalize_min_std natural_damping",
-        lambda x: x == 0 or 1 / _MAX_SIZE <= x <= _MAX_SIZE,
-        f"in [{1 / _MAX_SIZE:g}, {_MAX_SIZE:g}], for runs compute in float32",
-    ),
-)
 
 
 def _check_reinforce(config: Config) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 from mjx_reinforce import envs
 from mjx_reinforce.checks import whole_number
 from mjx_reinforce.runs import measured
-from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.config import Config, spoken
 from mjx_reinforce.runs.memory import cpu_factor, has_gpu
 
 #: Found by searches, random draws at first, then 768 to 1,536 seeds of each of the best; for the
@@ -305,7 +305,7 @@ def named(arguments: Sequence[str], flag: str) -> str | None:
     found = None
     for name, following in itertools.zip_longest(arguments, arguments[1:]):
         name, equals, value = name.partition("=")
-        if name.replace("_", "-") == flag:
+        if spoken(name) == flag:
             found = value if equals else following or found
     return found
 

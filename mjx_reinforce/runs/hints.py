@@ -10,6 +10,7 @@ import tyro
 from mjx_reinforce import envs
 from mjx_reinforce.registry import nearest
 from mjx_reinforce.runs.commands import COMMANDS, SCRIPT, command
+from mjx_reinforce.runs.config import flag, spoken
 from mjx_reinforce.runs.presets import PRESETS
 
 #: Flags of other libraries, and short forms -> ours.
@@ -120,14 +121,14 @@ def _known(form: type) -> Iterator[tuple[str, Known]]:
             yield from _known(kind)
         else:
             positional = tyro.conf.Positional in get_args(kind)
-            yield f"--{field.name.replace('_', '-')}", Known(kind is bool, positional)
+            yield flag(field.name), Known(kind is bool, positional)
 
 
 def required(form: type) -> list[str]:
     """Returns what a command line must have, as --help calls it."""
     flags = known(form)
     needed = (f for f in dataclasses.fields(form) if f.default is dataclasses.MISSING)
-    names = (f"--{field.name.replace('_', '-')}" for field in needed)
+    names = (flag(field.name) for field in needed)
     return [name[2:].upper() if flags[name].positional else name for name in names]
 
 
@@ -137,7 +138,7 @@ def unknown_flags(arguments: Sequence[str], form: type) -> list[str]:
     switches = {flag.replace("--", "--no-", 1) for flag, known in flags.items() if known.switch}
     named = {flag for flag, known in flags.items() if not known.positional}
     words = [word for word in arguments if word.startswith("--") and word != "--"]
-    return [x for x in words if x.partition("=")[0].replace("_", "-") not in named | switches]
+    return [x for x in words if spoken(x.partition("=")[0]) not in named | switches]
 
 
 def about_unknown(unknown: Sequence[str], arguments: Sequence[str], form: type, prog: str) -> str:
@@ -155,7 +156,7 @@ def about_unknown(unknown: Sequence[str], arguments: Sequence[str], form: type, 
             return _about_flag(word.partition("=")[0], flags, prog)
     before = arguments[: arguments.index(unknown[0])]
     last = next((word for word in reversed(before) if word.startswith("--")), "")
-    return _about_value(unknown, last.replace("_", "-"), flags, prog)
+    return _about_value(unknown, spoken(last), flags, prog)
 
 
 def _about_flag(flag: str, flags: Mapping[str, Known], prog: str) -> str:
@@ -163,7 +164,7 @@ def _about_flag(flag: str, flags: Mapping[str, Known], prog: str) -> str:
         return f"{flag} stands after --, which ends the flags: leave -- out"
     if " " in flag:
         return f"{flag!r} is one word: leave the quotes out"
-    plain = "--" + flag.strip("".join(_DASHES)).replace("_", "-").lower()
+    plain = f"--{spoken(flag.strip(''.join(_DASHES))).lower()}"
     if plain in flags and flags[plain].positional:
         return f"unknown flag {flag!r}: leave it out, and write what follows it alone"
     if plain in flags:
@@ -224,7 +225,7 @@ def about_word(word: str, trains: bool, prog: str) -> str | None:
     train = f"{command('train')} " if prog == SCRIPT else ""
     name, equals, value = word.partition("=")
     if equals:
-        return f"{word!r} lacks its dashes: write {train}--{name.replace('_', '-')} {value}"
+        return f"{word!r} lacks its dashes: write {train}{flag(name)} {value}"
     if word in envs.names() or ":" in word:
         return f"{word!r} is a task: write {train}--env {word}"
     if Path(word).suffix == ".xml":

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.config import Config, flag
 from mjx_reinforce.runs.state import RunState
 
 #: Settings of a policy that only say how its first parameters were drawn.
@@ -43,10 +43,9 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
                 f"{config.env} has {value}; leave --init-from out, or give a run of {config.env}"
             )
         if name not in _DRAWN and old != value:
-            flag = f"--{name.replace('_', '-')}"
             raise ValueError(
                 f"the policies in {directory} have {name} {old}, and this run {value}; give "
-                f"{flag} that value, or leave --init-from out"
+                f"{flag(name)} that value, or leave --init-from out"
             )
     seeds = np.arange(config.num_seeds) % saved.num_seeds
     return jax.tree.map(lambda x: x[seeds], saved.actor)

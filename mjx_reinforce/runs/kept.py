@@ -23,7 +23,8 @@ from mjx_reinforce.engines.native.available import made_for, platform
 from mjx_reinforce.engines.native.cpu import seam
 from mjx_reinforce.engines.native.gpu.seam import PTX
 from mjx_reinforce.runs.blocks import block_length
-from mjx_reinforce.runs.config import Config
+from mjx_reinforce.runs.config import Config, marked
+from mjx_reinforce.runs.declare import Mark
 from mjx_reinforce.runs.files import provenance, version
 from mjx_reinforce.runs.keys import plain
 from mjx_reinforce.runs.resume import recordable
@@ -31,11 +32,6 @@ from mjx_reinforce.runs.state import Budget, Parts, eval_keys_shape
 from mjx_reinforce.runs.trees import describe, rebuild
 from mjx_reinforce.types import PyTree
 
-#: Settings that change no program. Of the budgets, ``block_length`` says what does.
-_INPUTS = (
-    *("seed", "eval_seed", "env_steps", "max_updates", "minutes", "checkpoint_every", "init_from"),
-    *("tensorboard", "wandb", "jsonl"),
-)
 _NAMES = ("start", "advance", "look")
 
 
@@ -52,7 +48,9 @@ def key_of(config: Config, share: slice = slice(None)) -> str | None:
         return None
     made_by = provenance()
     del made_by["git_commit"]  # the sources say it better
-    settings = {k: v for k, v in recordable(config).items() if k not in _INPUTS}
+    # Of the budgets, ``block_length`` says what changes a program.
+    inputs = marked(Mark.NOT_COMPILED)
+    settings = {k: v for k, v in recordable(config).items() if k not in inputs}
     known = {
         "settings": settings | {"block": block_length(config)},
         "share": (share.start, share.stop),

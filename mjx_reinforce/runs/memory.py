@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mjx_reinforce.runs.blocks import block_length
-from mjx_reinforce.runs.config import COUNTED, MAX_OF_UPDATE, Config, flag
+from mjx_reinforce.runs.config import MAX_OF_UPDATE, Config, flag, marked
+from mjx_reinforce.runs.declare import Range
 from mjx_reinforce.runs.measured import TASKS, Task
 
 _FLOAT = 4  # bytes
@@ -138,11 +139,11 @@ def check_size(config: Config) -> None:
     What is not known yet is taken to be small: the sizes of a task of the user's own, and the
     memory of an accelerator.
     """
+    large = (*marked(Range.COUNTED), *marked(Range.SEED))
     for name, value in vars(config).items():
         numbers = value if isinstance(value, tuple) else (value,)
         counts = [x for x in numbers if isinstance(x, int)]
-        small = name not in COUNTED and not name.endswith("seed")
-        if small and max(counts, default=0) > MAX_OF_UPDATE:
+        if name not in large and max(counts, default=0) > MAX_OF_UPDATE:
             raise ValueError(f"{flag(name)} must be less than 2^31, got {max(counts)}")
     if not _may_have_accelerator():
         task = TASKS.get(config.env, Task(1, 1, 1, 1.0, 0.0))

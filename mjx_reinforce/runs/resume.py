@@ -2,22 +2,23 @@
 
 import dataclasses
 import json
-import types
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mjx_reinforce.runs.config import Config
+from mjx_reinforce.checks import fits
+from mjx_reinforce.runs.config import Config, flag, marked
+from mjx_reinforce.runs.declare import Mark
 
 if TYPE_CHECKING:
     from mjx_reinforce.runs.checkpoint import Checkpoint
     from mjx_reinforce.runs.state import RunState
 
 #: What may change when a run goes on: when it ends, and how often it is saved.
-BUDGETS = ("env_steps", "max_updates", "minutes", "stop_when_solved", "checkpoint_every")
+BUDGETS = marked(Mark.BUDGET)
 #: Settings that say where a run is, not what it does.
-PLACES = ("output", "overwrite", "resume", "like")
+PLACES = marked(Mark.PLACE)
 #: Entries of config.json on which every number of a run depends, besides its settings.
 _PROGRAM = (
     *("packages", "git_commit", "device", "cpu", "cores", "machine_code", "jax_settings"),
@@ -64,7 +65,6 @@ def read_settings(directory: Path) -> Config:
 
 def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
     """Returns the settings that a file recorded, or raises ValueError, which names the file."""
-    hints = typing.get_type_hints(Config)
     settings = {}
     for field in dataclasses.fields(Config):
         if field.name in PLACES:
@@ -73,9 +73,9 @@ def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
             raise ValueError(f"{path} does not say {field.name}: it is {_OTHER}")
         value = recorded[field.name]
         value = tuple(value) if isinstance(value, list) else value
-        if not _fits(value, hints[field.name]):
+        if not fits(value, field.type):
             says = f"{path} says {field.name} is {value!r}"
-            raise ValueError(f"{says}{_choices(hints[field.name])}: it is {_OTHER}")
+            raise ValueError(f"{says}{_choices(field.type)}: it is {_OTHER}")
         settings[field.name] = value
     return Config(**settings)
 
@@ -83,20 +83,6 @@ def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
 def _choices(hint: Any) -> str:
     names = typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
     return f", not one of {', '.join(names)}" if names else ""
-
-
-def _fits(value: Any, hint: Any) -> bool:
-    """Returns whether a value is of a type that a setting has."""
-    kind, arguments = typing.get_origin(hint), typing.get_args(hint)
-    if kind is Literal:
-        return value in arguments
-    if kind in (typing.Union, types.UnionType):
-        return any(_fits(value, argument) for argument in arguments)
-    if kind is tuple:
-        return isinstance(value, tuple) and all(_fits(item, arguments[0]) for item in value)
-    if hint is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    return type(value) is hint
 
 
 def recordable(config: Config) -> dict[str, Any]:
@@ -119,9 +105,8 @@ def check_settings(known: Config, asked: Config) -> None:
     for field in dataclasses.fields(Config):
         old, new = getattr(known, field.name), getattr(asked, field.name)
         if old != new and field.name not in (*BUDGETS, *PLACES):
-            flag = "--" + field.name.replace("_", "-")
             raise ValueError(
-                f"{flag} is {old} in {known.resume} and cannot become {new}: only "
+                f"{flag(field.name)} is {old} in {known.resume} and cannot become {new}: only "
                 "its budget may change; leave it out, or start another run"
             )
 
@@ -133,7 +118,8 @@ def is_done(known: Config, asked: Config) -> bool:
       ValueError: it is asked for no more, and was stopped because nothing was finite any more.
     """
     assert known.resume is not None
-    if any(getattr(known, name) != getattr(asked, name) for name in BUDGETS[:-1]):
+    ends = (name for name in BUDGETS if name != "checkpoint_every")
+    if any(getattr(known, name) != getattr(asked, name) for name in ends):
         return False
     try:
         summary = json.loads((known.resume / "summary.json").read_text(encoding="utf-8"))
@@ -234,12 +220,13 @@ def _serves(found: "Checkpoint", config: Config) -> bool:
     """
     if (found.env_steps, found.max_updates) == (config.env_steps, config.max_updates):
         return True
-    for flag, budget, used in (
-        ("--env-steps", config.env_steps, found.record["env_steps"].max()),
-        ("--max-updates", config.max_updates, found.record["updates"].max()),
+    for name, budget, used in (
+        ("env_steps", config.env_steps, found.record["env_steps"].max()),
+        ("max_updates", config.max_updates, found.record["updates"].max()),
     ):
         if budget is not None and budget < used:
             raise ValueError(
-                f"{flag} {budget} is less than the {used} of the run so far; give at least that"
+                f"{flag(name)} {budget} is less than the {used} of the run so far; give at least "
+                "that"
             )
     return config.minutes is not None or found.is_even(config.eval_every)

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from mjx_reinforce.export.files import read_json
-from mjx_reinforce.runs.config import Config, check, flag
+from mjx_reinforce.runs.config import Config, check_each, flag
 from mjx_reinforce.runs.memory import check_size, gigabytes, host_memory
 from mjx_reinforce.runs.processes import ProcessSettings, check_processes
 from mjx_reinforce.runs.resume import PLACES, as_config
@@ -117,7 +117,7 @@ def read_design(directory: Path) -> Design:
 
 def check_design(design: Design) -> None:
     """Raises ValueError for a sweep that makes no sense, before anything heavy is imported."""
-    check(design.base)
+    check_each(design.base)
     for name in ("minutes", "init_from"):
         if getattr(design.base, name) is not None:
             raise ValueError(f"{flag(name)} is for one run, not for a sweep: leave it out")

@@ -2,33 +2,19 @@
 
 import dataclasses
 import itertools
-import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from mjx_reinforce.checks import whole_number
+from mjx_reinforce.checks import alternatives, whole_number
 from mjx_reinforce.registry import check_name, nearest
 from mjx_reinforce.runs.commands import command
-from mjx_reinforce.runs.config import Config, check, flag
+from mjx_reinforce.runs.config import Config, check, flag, spoken
 from mjx_reinforce.runs.hints import other_names
 from mjx_reinforce.runs.relevance import check_read
+from mjx_reinforce.runs.settings import LogSettings
 
-#: Settings that a sweep has once, and why.
-_ONCE = {
-    "env": "its results are of one task; make a sweep for each",
-    "num_seeds": "every configuration has as many seeds",
-    "seed": "every configuration has the same seeds; raise --num-seeds",
-    "stop_when_solved": "a run would end when others beside it are solved",
-    "engine": "it changes no result but by rounding",
-    "output": "it has one directory",
-    "overwrite": "it has one directory",
-    "resume": "it goes on as a whole",
-    "checkpoint_every": "it is saved as a whole",
-    "test_episodes": "it has no test",
-    **dict.fromkeys(("tensorboard", "wandb", "jsonl"), "its rows are in results.csv"),
-}
-
+_FIELDS = {field.name: field for field in dataclasses.fields(Config)}
 _EXAMPLE = "such as --over learning-rate 1e-3 1e-2"
 
 
@@ -41,24 +27,23 @@ def read_over(given: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
     Raises:
       ValueError: a setting does not exist or stands twice, or a value is not of its type.
     """
-    hints = typing.get_type_hints(Config)
     over: dict[str, list[Any]] = {}
     for words in given:
         if not words:
             raise ValueError(f"--over needs a setting and its values, {_EXAMPLE}")
         name = words[0].removeprefix("--").replace("-", "_")
-        if name not in hints:
-            raise ValueError(_unknown(words[0].removeprefix("--"), hints))
+        if name not in _FIELDS:
+            raise ValueError(_unknown(words[0].removeprefix("--")))
         if name in over:
             raise ValueError(f"--over {words[0]} is given twice: put all values behind one of them")
-        over[name] = [_value(name, word, hints[name]) for word in words[1:]]
+        over[name] = [_value(name, word) for word in words[1:]]
     return over
 
 
-def _unknown(word: str, names: Iterable[str]) -> str:
+def _unknown(word: str) -> str:
     """Returns the message about a word that is no setting."""
-    meant = [flag[2:] for flag in other_names(f"--{word.replace('_', '-')}")]
-    known = [_spoken(name) for name in names]
+    meant = [x[2:] for x in other_names(flag(word))]
+    known = [spoken(name) for name in _FIELDS]
     near = next((each for each in meant if each in known), None) or nearest(word, known)
     hint = f" Did you mean {near!r}?" if near else ""
     return f"unknown setting {word!r} after --over.{hint} (--help all lists the settings.)"
@@ -76,24 +61,26 @@ def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
             "--stop-when-solved is not for sweeps: a run would end when others beside it are "
             "solved; leave it out"
         )
-    for name in ("tensorboard", "wandb", "jsonl"):
-        if getattr(base, name):
-            raise ValueError(f"{flag(name)} logs a run; leave it out: a sweep writes results.csv")
+    for field in dataclasses.fields(LogSettings):
+        if getattr(base, field.name):
+            raise ValueError(
+                f"{flag(field.name)} logs a run; leave it out: a sweep writes results.csv"
+            )
     if not over:
         raise ValueError(
             f"nothing is swept: give --over a setting and its values, {_EXAMPLE}, or train one "
             f"configuration by {command('train')}"
         )
     for name, values in over.items():
-        check_name("setting", name, {field.name: None for field in dataclasses.fields(Config)})
-        if name in _ONCE:
-            raise ValueError(f"a sweep cannot go over {_spoken(name)}: {_ONCE[name]}")
+        check_name("setting", name, _FIELDS)
+        if why := _FIELDS[name].metadata.get("once"):
+            raise ValueError(f"a sweep cannot go over {spoken(name)}: {why}")
         if len(values) < 2:
             one = f"; for one value pass {flag(name)}" if values else f", {_EXAMPLE}"
-            raise ValueError(f"--over {_spoken(name)} needs two values or more{one}")
+            raise ValueError(f"--over {spoken(name)} needs two values or more{one}")
         twice = [x for i, x in enumerate(values) if x in values[:i]]
         if twice:
-            raise ValueError(f"--over {_spoken(name)} has the value {twice[0]} twice")
+            raise ValueError(f"--over {spoken(name)} has the value {twice[0]} twice")
 
 
 def configure(
@@ -113,7 +100,7 @@ def configure(
     configs = [dataclasses.replace(base, **values) for values in configurations]
     for config, values in zip(configs, configurations, strict=True):
         check(config)
-        _check_all_read(config, values)
+        check_read(config, values)
     for name in set(given).difference(*configurations[:1]):
         idle = [error for config in configs if (error := _not_read(config, name))]
         if len(idle) == len(configs):
@@ -121,28 +108,18 @@ def configure(
     return configs
 
 
-def _check_all_read(config: Config, names: Iterable[str]) -> None:
-    """Raises ValueError if a configuration does not read a setting."""
-    # They count as chosen by the user also where they are the default.
-    check_read(config, dataclasses.replace(config, **dict.fromkeys(names, object())))
-
-
 def _not_read(config: Config, name: str) -> ValueError | None:
     """Returns the error of a configuration that does not read a setting."""
     try:
-        _check_all_read(config, [name])
+        check_read(config, [name])
     except ValueError as error:
         return error
     return None
 
 
-def _spoken(name: str) -> str:
-    return name.replace("_", "-")
-
-
-def _value(name: str, word: str, hint: Any) -> Any:
+def _value(name: str, word: str) -> Any:
     """Returns a word of the command line as a value of a setting's type."""
-    kinds = typing.get_args(hint) if _is_union(hint) else (hint,)
+    kinds = alternatives(_FIELDS[name].type)
     for kind in kinds:
         try:
             return _as(kind, word)
@@ -150,12 +127,8 @@ def _value(name: str, word: str, hint: Any) -> Any:
             continue
     spaces = "; write spaces between values" if "," in word else ""
     raise ValueError(
-        f"--over {_spoken(name)} has the value {word!r}, which is no {_kind(kinds)}{spaces}"
+        f"--over {spoken(name)} has the value {word!r}, which is no {_kind(kinds)}{spaces}"
     )
-
-
-def _is_union(hint: Any) -> bool:
-    return typing.get_origin(hint) in (typing.Union, types.UnionType)
 
 
 def _as(kind: Any, word: str) -> Any:

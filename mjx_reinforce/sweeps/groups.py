@@ -6,29 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.relevance import FREE_STD
+from mjx_reinforce.runs.config import Config, marked
+from mjx_reinforce.runs.declare import Mark
+from mjx_reinforce.runs.settings import Reader
 from mjx_reinforce.types import Environment
-
-_REINFORCE = (
-    "learning_rate",
-    "final_learning_rate",
-    "decay_steps",
-    "discount",
-    "final_discount",
-    "reward_shift",
-    "entropy_cost",
-    "standardize_floor",
-    "max_grad_norm",
-    "max_kl",
-    "natural_damping",
-    "normalize_min_std",
-    "momentum",
-    "value_learning_rate",
-    "initial_std",
-    "final_std",
-)
-_ARS = ("step_size", "noise_std", "normalize_min_std")
 
 
 class Group(NamedTuple):
@@ -69,12 +50,13 @@ def make_groups(configs: Sequence[Config], swept: Collection[str], *, exact: boo
 
 def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, float]:
     """Returns the numbers of a configuration that its programs take as arguments."""
-    names = _REINFORCE if config.algorithm == "reinforce" else _ARS
-    if config.policy not in ("auto", *FREE_STD):
+    other = Reader.ARS if config.algorithm == "reinforce" else Reader.REINFORCE
+    names = set(marked(Mark.TRACED)).difference(marked(other))
+    if not (Reader.REINFORCE.holds(config) and Reader.FREE_STD.holds(config)):
         # Others have ``initial_std`` in their actions, which an engine may compile.
-        names = tuple(name for name in names if name != "initial_std")
-    settings = {name: getattr(config, name) for name in names if exact or name in swept}
-    if config.decay_steps is None and config.decay_updates is None:
+        names.discard("initial_std")
+    settings = {name: getattr(config, name) for name in sorted(names) if exact or name in swept}
+    if not Reader.DECAY.holds(config):
         settings.pop("final_learning_rate", None)
     elif "learning_rate" in settings and config.final_learning_rate is None:
         settings["final_learning_rate"] = config.learning_rate / 10

@@ -6,12 +6,9 @@ from typing import Any
 
 import numpy as np
 
-#: Drawn evenly in their logarithm.
-_LOGARITHMIC = (
-    *("learning_rate", "final_learning_rate", "value_learning_rate", "step_size"),
-    *("noise_std", "initial_std", "final_std", "standardize_floor", "max_grad_norm", "max_kl"),
-    "normalize_min_std",
-)
+from mjx_reinforce.runs.config import marked, spoken
+from mjx_reinforce.runs.declare import Mark
+
 #: Digits that are kept of what is drawn.
 _DIGITS = 4
 #: So many times as many draws as configurations are made to find different ones.
@@ -57,13 +54,14 @@ def is_range(values: Sequence[Any]) -> bool:
 def _check_range(name: str, values: Sequence[Any]) -> None:
     if not is_range(values):
         return
-    spoken = name.replace("_", "-")
     if values[0] > values[1]:
-        raise ValueError(f"--over {spoken} {values[0]} {values[1]}: give the lower end first")
-    if name == "discount" and values[1] >= 1:
-        raise ValueError(f"--over discount: a range ends below 1, got {values[1]}; try 0.9999")
-    if name in _LOGARITHMIC and values[0] <= 0:
-        raise ValueError(f"--over {spoken}: a range begins above 0, got {values[0]}")
+        raise ValueError(f"--over {spoken(name)} {values[0]} {values[1]}: give the lower end first")
+    if name in marked(Mark.LOG_OF_REST) and values[1] >= 1:
+        raise ValueError(
+            f"--over {spoken(name)}: a range ends below 1, got {values[1]}; try 0.9999"
+        )
+    if name in marked(Mark.LOG) and values[0] <= 0:
+        raise ValueError(f"--over {spoken(name)}: a range begins above 0, got {values[0]}")
 
 
 def _draw(name: str, values: Sequence[Any], generator: np.random.Generator) -> Any:
@@ -73,10 +71,10 @@ def _draw(name: str, values: Sequence[Any], generator: np.random.Generator) -> A
     low, high = values
     if isinstance(low, int) and isinstance(high, int):
         return int(generator.integers(low, high + 1))
-    if name == "discount":
+    if name in marked(Mark.LOG_OF_REST):
         rest = math.exp(generator.uniform(math.log(1 - high), math.log(1 - low)))
         return round(1 - _round(rest), 12)
-    if name in _LOGARITHMIC:
+    if name in marked(Mark.LOG):
         return _round(math.exp(generator.uniform(math.log(low), math.log(high))))
     return _round(generator.uniform(low, high))
 

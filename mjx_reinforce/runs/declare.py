@@ -1,0 +1,98 @@
+"""How a setting is declared: marks stand with its type, its default and its help.
+
+They say what must hold of its value, what reads it, and what sweeps and resumed runs may do with
+it. Every table of settings is an answer of ``config.marked``.
+"""
+
+import dataclasses
+import enum
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+Value = TypeVar("Value")
+
+#: What is counted exactly, as a double does; see ``learners.counts``.
+MAX_COUNT = 2**53
+#: The greatest of what an update counts, such as its env steps: they are int32.
+MAX_OF_UPDATE = 2**31 - 1
+#: The greatest learning rate.
+_MAX_RATE = 1000
+#: The greatest of other numbers, and one over the least: float32 holds their cubes.
+_MAX_SIZE = 1e12
+#: The most steps that an update may make one after the other, besides those of the episodes.
+_MAX_STEPS = 1_000_000
+#: The greatest number of layers: each is a matrix of its own in the program.
+_MAX_LAYERS = 100
+
+
+class Range(enum.Enum):
+    """What must hold of a value that is a number or numbers; checked in this order.
+
+    said: the range in words
+    holds: whether a value is in it
+    """
+
+    def __init__(self, said: str, holds: Callable[[Any], bool]):
+        self.said, self.holds = said, holds
+
+    AT_LEAST_1 = "at least 1", lambda x: x >= 1
+    AT_LEAST_2 = "at least 2: one alone shows no noise", lambda x: x >= 2
+    AT_LEAST_0 = "at least 0", lambda x: x >= 0
+    COUNTED = "at most 2^53, for no more is counted exactly", lambda x: x <= MAX_COUNT
+    INT32 = "less than 2^31", lambda x: x <= MAX_OF_UPDATE
+    IN_A_ROW = (
+        f"at most {_MAX_STEPS:,}, for an update makes so many steps one after the other",
+        lambda x: x <= _MAX_STEPS,
+    )
+    SEED = "in [0, 2^32)", lambda x: 0 <= x < 2**32
+    SHARE = "in [0, 1]", lambda x: 0 <= x <= 1
+    BELOW_1 = "in [0, 1 - 2^-24], the last float32 below 1", lambda x: 0 <= x <= 1 - 2**-24
+    LAYERS = "positive in every layer", lambda x: all(n >= 1 for n in x)
+    LAYERS_INT32 = "less than 2^31 in every layer", lambda x: all(n <= MAX_OF_UPDATE for n in x)
+    FEW_LAYERS = f"at most {_MAX_LAYERS} layers", lambda x: len(x) <= _MAX_LAYERS
+    POSITIVE = "positive and finite", lambda x: math.isfinite(x) and x > 0
+    NOT_NEGATIVE = "finite and not negative", lambda x: math.isfinite(x) and x >= 0
+    FINITE = "finite, in float32", lambda x: math.isfinite(x) and abs(x) <= _MAX_SIZE
+    # Weights are about 1, and most optimisers move each of them by about the rate.
+    RATE = (
+        f"in [{1 / _MAX_SIZE:g}, {_MAX_RATE}], for a step moves a weight by about that",
+        lambda x: 1 / _MAX_SIZE <= x <= _MAX_RATE,
+    )
+    FLOAT32 = (
+        f"in [{1 / _MAX_SIZE:g}, {_MAX_SIZE:g}], for runs compute in float32",
+        lambda x: x == 0 or 1 / _MAX_SIZE <= x <= _MAX_SIZE,
+    )
+
+
+#: What holds of numbers of a kind.
+COUNT = (Range.AT_LEAST_1, Range.INT32)
+SEVERAL = (Range.AT_LEAST_2, Range.INT32)
+TOTAL = (Range.AT_LEAST_1, Range.COUNTED)
+STEPS = (Range.AT_LEAST_1, Range.IN_A_ROW)
+LAYERS = (Range.LAYERS, Range.LAYERS_INT32, Range.FEW_LAYERS)
+POSITIVE = (Range.POSITIVE, Range.FLOAT32)
+NOT_NEGATIVE = (Range.NOT_NEGATIVE, Range.FLOAT32)
+RATE = (Range.POSITIVE, Range.RATE)
+
+
+class Mark(enum.Enum):
+    """What else a setting may be."""
+
+    TRACED = "a sweep may hand it to a program as an argument"
+    LOG = "a search draws it evenly in its logarithm"
+    LOG_OF_REST = "a search draws it evenly in the logarithm of 1 - x"
+    BUDGET = "it may change when a run goes on"
+    PLACE = "it says where a run is, not what it does"
+    NOT_COMPILED = "no program on disk depends on it: it is an input, or of no concern"
+
+
+def setting(default: Value, *marks: enum.Enum, once: str | None = None) -> Value:
+    """Returns the field of a setting.
+
+    Args:
+      default: its value where the user gives none.
+      marks: what holds of it: members of ``Range``, ``settings.Reader`` and ``Mark``.
+      once: why a sweep cannot go over it; None if it can.
+    """
+    return dataclasses.field(default=default, metadata={"marks": marks, "once": once})
