@@ -6,10 +6,10 @@ import sys
 import tyro
 
 from mjx_reinforce import envs
-from mjx_reinforce.runs.commands import command
-from mjx_reinforce.runs.flags import one_line_errors, read
-from mjx_reinforce.runs.lines import for_stream
-from mjx_reinforce.runs.streams import accept_everything
+from mjx_reinforce.console.commands import command
+from mjx_reinforce.console.lines import for_stream
+from mjx_reinforce.console.streams import accept_everything
+from mjx_reinforce.settings.flags import one_line_errors, read
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,8 +29,8 @@ def main() -> None:
             print("\n".join(envs.names()))
             return
         envs.check_id(settings.env)
+        from mjx_reinforce.console.jax_setup import configure_jax
         from mjx_reinforce.runs.about_task import about_task
-        from mjx_reinforce.runs.jax_setup import configure_jax
 
         configure_jax()
         print(for_stream(about_task(settings.env), sys.stdout))

@@ -24,14 +24,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce import envs
-from mjx_reinforce.export.files import write_bytes
+from mjx_reinforce.files import csv_bytes, write_bytes
 from mjx_reinforce.learners import reinforce as builder
 from mjx_reinforce.learners.pace import AutoEpisodes
-from mjx_reinforce.runs.build import build
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.defaults import of_task
-from mjx_reinforce.runs.evaluation import evaluate
-from mjx_reinforce.runs.files import csv_bytes
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.store.build import build
+from mjx_reinforce.training.evaluation import evaluate
 
 ARMS = ("auto:1", "16", "64", "256", "1024")
 #: Task -> what suits larger batches, found by hand, where it differs from the task's defaults.

@@ -48,7 +48,7 @@ def main() -> None:
 
 def train_all(arms: Sequence[str], runs: Path) -> None:
     """Trains the parts of arms that have no file yet."""
-    from mjx_reinforce.runs.jax_setup import configure_jax
+    from mjx_reinforce.console.jax_setup import configure_jax
 
     configure_jax()
     runs.mkdir(parents=True, exist_ok=True)

@@ -4,7 +4,7 @@ import dataclasses
 import math
 
 from failures_runs import Setting
-from mjx_reinforce.runs.config import flag
+from mjx_reinforce.settings.config import flag
 
 #: The mended settings: those that differ from the base's.
 _MENDED = {

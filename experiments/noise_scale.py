@@ -24,15 +24,15 @@ from rich.console import Console
 from rich.table import Table
 
 from mjx_reinforce import envs
+from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, shift_rewards
 from mjx_reinforce.learners.learner import Learner, TrainState
 from mjx_reinforce.learners.value_baseline import value_baseline
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.policy import Policy
-from mjx_reinforce.runs.build import build
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.defaults import of_task
-from mjx_reinforce.runs.jax_setup import configure_jax
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.store.build import build
 from mjx_reinforce.types import Trajectory
 
 #: Episodes whose gradients are computed at once.

@@ -32,7 +32,7 @@ from rich.table import Table
 from scipy import stats
 
 from mjx_reinforce import envs
-from mjx_reinforce.runs.files import provenance, version
+from mjx_reinforce.store.provenance import provenance, version
 from mjx_reinforce.types import Discrete
 from parity_native import Native
 from parity_sides import Ours, Outcome, Peer, make_peer, stack

@@ -99,7 +99,7 @@ def _sb3(arguments: argparse.Namespace) -> dict[str, tuple[dict[str, Any], Calla
 
 
 def _brax() -> dict[str, tuple[dict[str, Any], Callable[..., None]]]:
-    from mjx_reinforce.runs.jax_setup import configure_jax
+    from mjx_reinforce.console.jax_setup import configure_jax
 
     configure_jax()
     import peers_brax

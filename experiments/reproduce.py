@@ -24,10 +24,10 @@ from rich.table import Table
 
 from mjx_reinforce import envs
 from mjx_reinforce.export.policy_files import build_policy
-from mjx_reinforce.runs.build import build, policy_settings
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.presets import PRESETS
-from mjx_reinforce.runs.state import budget_of, compile_parts, parts_of
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.presets import PRESETS
+from mjx_reinforce.store.build import build, policy_settings
+from mjx_reinforce.training.state import budget_of, compile_parts, parts_of
 from reproduce_cases import CASES, Case, limit, load_reference
 from reproduce_figures import draw
 from reproduce_mistakes import STALE, clamped, stale_starts

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.runs.presets import PRESETS
+from mjx_reinforce.settings.presets import PRESETS
 from reproduce_cases import Case
 from reproduce_mistakes import STALE
 from reproduce_statistics import spread, windowed

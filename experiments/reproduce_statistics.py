@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from mjx_reinforce.runs.presets import PRESETS
+from mjx_reinforce.settings.presets import PRESETS
 from reproduce_cases import Case
 
 LEVEL = 0.05  # of the tests; the range over seeds holds 95 % likewise

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 from mjx_reinforce import Player, envs, load
+from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.export.films import import_mujoco, write_small_gif
 from mjx_reinforce.export.takes import Film, Take, side_by_side
-from mjx_reinforce.runs.cast import untrained
-from mjx_reinforce.runs.jax_setup import configure_jax
+from mjx_reinforce.playing.cast import untrained
 from mjx_reinforce.watch import scene
 
 #: The tasks side by side, and the size of their file and of any other at most (bytes).
@@ -43,7 +43,7 @@ def save(path: Path, film: Film, most_bytes: int = LARGEST) -> None:
 
 def _take(player: Player, label: str, push: float = 0.0, episode: int = 0) -> Take:
     """Returns an episode of a policy without noise."""
-    from mjx_reinforce.runs.mujoco_playing import mujoco_simulator, pushed_body
+    from mjx_reinforce.playing.mujoco_playing import mujoco_simulator, pushed_body
 
     env = envs.make(player.env)
     played = mujoco_simulator(env, player, env.max_episode_steps, push)(episode, False)

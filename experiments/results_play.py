@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce import Player, envs, load
+from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.export.films import import_mujoco
 from mjx_reinforce.export.run_files import Run, read_run
 from mjx_reinforce.export.takes import Take, side_by_side
-from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.watch import scene
 from results_files import POLICIES, write_played
 from results_films import save
@@ -91,7 +91,7 @@ def own_simulation(run: Run, player: Player, num_episodes: int) -> Any:
 def _play(run: Run, policy: Any, num_episodes: int, ours: Any, film: Path) -> list[dict[str, Any]]:
     """Plays one policy, films it, and returns a row for each episode."""
     from mjx_reinforce.export.player import load_seed
-    from mjx_reinforce.runs.playing import gymnasium_simulator
+    from mjx_reinforce.playing.mjx_playing import gymnasium_simulator
 
     player, _ = load_seed(run, policy)
     version, simulate = gymnasium_simulator(player, run.horizon)

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mjx_reinforce.export.files import read_json
-from mjx_reinforce.runs.config import Config, flag
-from mjx_reinforce.runs.interrupt import Interrupt
-from mjx_reinforce.sweeps.design import Design, read_design
+from mjx_reinforce.console.interrupt import Interrupt
+from mjx_reinforce.files import read_json
+from mjx_reinforce.settings.config import Config, flag
+from mjx_reinforce.sweeps.designs.design import Design, read_design
 from mjx_reinforce.sweeps.perform import perform
 from results_tasks import Task, settings_of, sweep_settings_of
 

@@ -15,10 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.export.files import read_json, write_bytes
+from mjx_reinforce.files import csv_bytes, read_json, write_bytes
 from mjx_reinforce.reports.run_source import read_columns, read_metrics
 from mjx_reinforce.reports.statistics.aggregates import interval
-from mjx_reinforce.runs.files import csv_bytes
 from results_files import Columns, read_played
 
 #: A budget of everybody (s).

@@ -3,9 +3,9 @@
 import dataclasses
 from typing import Any, NamedTuple
 
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.defaults import of_task
-from mjx_reinforce.runs.measured import TASKS as MEASURED
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.settings.measured import TASKS as MEASURED
 
 #: Roots of all randomness of the results. No tuning used them. The second and the third are of
 #: tasks whose settings were chosen anew after a run with the first.

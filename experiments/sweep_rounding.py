@@ -31,14 +31,14 @@ def train(width: int, output: Path) -> None:
     import jax
 
     from mjx_reinforce import envs
-    from mjx_reinforce.runs.defaults import of_task
-    from mjx_reinforce.runs.jax_setup import configure_jax
-    from mjx_reinforce.sweeps.ahead import Clock
+    from mjx_reinforce.console.jax_setup import configure_jax
+    from mjx_reinforce.settings.defaults import of_task
     from mjx_reinforce.sweeps.chunks import begin, split
-    from mjx_reinforce.sweeps.devices import Devices
-    from mjx_reinforce.sweeps.grid import configure, grid
-    from mjx_reinforce.sweeps.groups import learner_builder, make_groups
-    from mjx_reinforce.sweeps.programs import compile_programs
+    from mjx_reinforce.sweeps.designs.grid import configure, grid
+    from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
+    from mjx_reinforce.sweeps.slots.ahead import Clock
+    from mjx_reinforce.sweeps.slots.devices import Devices
+    from mjx_reinforce.sweeps.slots.programs import compile_programs
 
     configure_jax()
     base = dataclasses.replace(

@@ -19,11 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.export.files import read_json, write_bytes
+from mjx_reinforce.files import csv_bytes, read_json, write_bytes
 from mjx_reinforce.reports.statistics import steps_to_solve
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.files import csv_bytes
-from mjx_reinforce.sweeps.design import Design
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.perform import perform
 from mjx_reinforce.sweeps.reading import SweepResults, read_results
 from results_measures import least_share_solved, solved_within

@@ -47,21 +47,21 @@ if TYPE_CHECKING:  # what type checkers and editors read in place of __getattr__
         probability_of_improvement,
     )
     from mjx_reinforce.reports.statistics.survival import kaplan_meier, log_rank
-    from mjx_reinforce.runs.config import Config
-    from mjx_reinforce.runs.defaults import of_task
-    from mjx_reinforce.runs.driver import Evaluation
-    from mjx_reinforce.runs.evaluation import evaluate
     from mjx_reinforce.runs.run import RunResults, run
+    from mjx_reinforce.settings.config import Config
+    from mjx_reinforce.settings.defaults import of_task
     from mjx_reinforce.sweeps.reading import SweepResults
     from mjx_reinforce.sweeps.run import sweep
+    from mjx_reinforce.training.driver import Evaluation
+    from mjx_reinforce.training.evaluation import evaluate
     from mjx_reinforce.types import Box, Discrete, Environment, Trajectory
 
 _HOME = {
-    "Config": "runs.config",
-    "of_task": "runs.defaults",
+    "Config": "settings.config",
+    "of_task": "settings.defaults",
     "run": "runs.run",
     "RunResults": "runs.run",
-    "Evaluation": "runs.driver",
+    "Evaluation": "training.driver",
     "sweep": "sweeps.run",
     "SweepResults": "sweeps.reading",
     "iqm": "reports.statistics",
@@ -105,7 +105,7 @@ _HOME = {
     "act": "policies.actor",
     "Policy": "policies.policy",
     "mlp_policy": "policies.policy",
-    "evaluate": "runs.evaluation",
+    "evaluate": "training.evaluation",
     "rollout": "engines.rollouts",
     "Box": "types",
     "Discrete": "types",
@@ -120,8 +120,9 @@ _HOME = {
 
 #: Folders and files that are attributes too, also imported on first use.
 _MODULES = (
-    *("engines", "envs", "export", "fused", "learners", "physics", "policies"),
-    *("registry", "reports", "runs", "sweeps", "types"),
+    *("console", "engines", "envs", "export", "files", "fused", "hosts", "learners", "physics"),
+    *("playing", "policies", "registry", "reports", "runs", "settings", "store", "sweeps"),
+    *("training", "types"),
 )
 
 __version__: str

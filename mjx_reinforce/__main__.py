@@ -12,7 +12,7 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     import importlib
 
-    from mjx_reinforce.runs.commands import COMMANDS
+    from mjx_reinforce.console.commands import COMMANDS
 
     name, sys.argv[1:] = _command(sys.argv[1:])
     module = importlib.import_module(COMMANDS[name][0])
@@ -25,14 +25,14 @@ def main() -> None:
 
 def _command(arguments: list[str]) -> tuple[str, list[str]]:
     """Returns a command and its own arguments; or prints what is asked for, or wrong, and exits."""
-    from mjx_reinforce.runs.commands import COMMANDS, SCRIPT, menu
+    from mjx_reinforce.console.commands import COMMANDS, SCRIPT, menu
 
     first = arguments[0] if arguments else "--help"
     if first in COMMANDS:
         return first, arguments[1:]
-    from mjx_reinforce.runs.files import version
-    from mjx_reinforce.runs.lines import for_stream, say_error
-    from mjx_reinforce.runs.streams import accept_everything
+    from mjx_reinforce.console.lines import for_stream, say_error
+    from mjx_reinforce.console.streams import accept_everything
+    from mjx_reinforce.store.provenance import version
 
     accept_everything()
     ours = version("mjx-reinforce") or "not installed"
@@ -43,8 +43,8 @@ def _command(arguments: list[str]) -> tuple[str, list[str]]:
         print(SCRIPT, ours)
         sys.exit(0)
     from mjx_reinforce.registry import nearest
-    from mjx_reinforce.runs.hints import about_word
-    from mjx_reinforce.runs.presets import PRESETS
+    from mjx_reinforce.settings.hints import about_word
+    from mjx_reinforce.settings.presets import PRESETS
 
     if first.startswith("-") or first in PRESETS:
         return "train", arguments

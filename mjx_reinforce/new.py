@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from mjx_reinforce.export.files import write_bytes
-from mjx_reinforce.runs.flags import one_line_errors, read
-from mjx_reinforce.runs.streams import accept_everything
+from mjx_reinforce.console.streams import accept_everything
+from mjx_reinforce.files import write_bytes
+from mjx_reinforce.settings.flags import one_line_errors, read
 
 if TYPE_CHECKING:
     import mujoco

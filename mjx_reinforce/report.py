@@ -11,8 +11,11 @@ from typing import Any, NamedTuple
 
 import tyro
 
-from mjx_reinforce.export.files import check_folder, write_bytes
+from mjx_reinforce.console.commands import command
+from mjx_reinforce.console.lines import say_error
+from mjx_reinforce.console.streams import accept_everything
 from mjx_reinforce.export.run_files import seeds_in
+from mjx_reinforce.files import check_folder, write_bytes
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
 from mjx_reinforce.reports.film import Film, make
@@ -23,15 +26,12 @@ from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.listings import listings
 from mjx_reinforce.reports.page.vega import ONE, draw
 from mjx_reinforce.reports.tasks import find_tasks, rename
-from mjx_reinforce.runs.commands import command
-from mjx_reinforce.runs.defaults import check_task, of_task
-from mjx_reinforce.runs.files import version
-from mjx_reinforce.runs.flags import read
-from mjx_reinforce.runs.lines import say_error
-from mjx_reinforce.runs.own_code import env_flag
-from mjx_reinforce.runs.relevance import as_words
-from mjx_reinforce.runs.resume import recordable
-from mjx_reinforce.runs.streams import accept_everything
+from mjx_reinforce.settings.defaults import check_task, of_task
+from mjx_reinforce.settings.flags import read
+from mjx_reinforce.settings.own_code import env_flag
+from mjx_reinforce.settings.relevance import as_words
+from mjx_reinforce.store.provenance import version
+from mjx_reinforce.training.resume import recordable
 
 _ABOUT = (
     "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG, "

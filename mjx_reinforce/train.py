@@ -15,30 +15,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mjx_reinforce import envs
-from mjx_reinforce.runs import resume
-from mjx_reinforce.runs.alarms import silence_alarms
+from mjx_reinforce.console.heartbeat import heartbeat, to_screen
+from mjx_reinforce.console.interrupt import Interrupt
+from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce.console.streams import accept_everything, silence_alarms
+from mjx_reinforce.hosts.processes import Processes, joined
 from mjx_reinforce.runs.command_line import parse_all, refuse, start
-from mjx_reinforce.runs.config import MAX_COUNT, Config, check
-from mjx_reinforce.runs.files import (
+from mjx_reinforce.runs.directory import (
     check_writable,
     choose_directory,
-    prepare,
+    make_directory,
     remove_empty,
-    versions,
 )
-from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
-from mjx_reinforce.runs.interrupt import Interrupt
-from mjx_reinforce.runs.jax_setup import configure_jax
-from mjx_reinforce.runs.memory import check_size
-from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.plan import Plan, make_plan
-from mjx_reinforce.runs.processes import Processes, joined
 from mjx_reinforce.runs.sinks.sink import check_installed
-from mjx_reinforce.runs.streams import accept_everything
+from mjx_reinforce.settings.config import MAX_COUNT, Config, check
+from mjx_reinforce.settings.memory import check_size
+from mjx_reinforce.settings.own_code import env_flag
+from mjx_reinforce.store.provenance import versions
+from mjx_reinforce.training import resume
 
 if TYPE_CHECKING:
-    from mjx_reinforce.runs.checkpoint import Checkpoint
-    from mjx_reinforce.runs.ready import Ready
+    from mjx_reinforce.store.ready import Ready
+    from mjx_reinforce.training.checkpoint import Checkpoint
     from mjx_reinforce.types import Environment
 
 
@@ -57,7 +56,7 @@ def main() -> None:
 
 def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitStack) -> int:
     """Returns the exit status of a command line; ``held`` keeps what is released at its end."""
-    from mjx_reinforce.runs.files import locked
+    from mjx_reinforce.runs.directory import locked
 
     made: Sequence[Path] = ()
     try:
@@ -82,7 +81,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
                 default = start(arguments, "train")[0]
                 ready, found = _start(env, config, default, processes, share)
             if config.init_from is not None and found is None:
-                from mjx_reinforce.runs.initial import last_actors
+                from mjx_reinforce.training.initial import last_actors
 
                 last_actors(config, ready.policy)  # refused before anything is compiled
             plan = make_plan(ready, config, processes.count)
@@ -116,7 +115,7 @@ def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
         check_writable(config.resume)
         return config.resume, ()
     directory = choose_directory(config.output, config.env)
-    return directory, prepare(directory, config.overwrite)
+    return directory, make_directory(directory, config.overwrite)
 
 
 def _start(
@@ -134,10 +133,10 @@ def _start(
     Raises:
       ValueError: the settings do not fit the environment, or the run cannot go on here.
     """
-    from mjx_reinforce.runs.files import provenance
-    from mjx_reinforce.runs.ready import prepare
+    from mjx_reinforce.store.provenance import provenance
+    from mjx_reinforce.store.ready import get_ready
 
-    ready = prepare(config, default, env, share)
+    ready = get_ready(config, default, env, share)
     if config.resume is None or processes.index:
         return ready, None
     present = {**provenance(), "num_processes": processes.count}
@@ -146,7 +145,7 @@ def _start(
     if config.minutes is not None:  # more than any checkpoint has used
         config = dataclasses.replace(config, env_steps=MAX_COUNT)
     if processes.count > 1:
-        from mjx_reinforce.runs.shares import shape_of_all
+        from mjx_reinforce.hosts.shares import shape_of_all
 
         like = shape_of_all(like, config.num_seeds)
     found = resume.find(like, config, print)
@@ -160,8 +159,8 @@ def _start(
 
 def _serve(ready: "Ready", config: Config, processes: Processes, interrupt: Interrupt) -> int:
     """Trains seeds for process 0, which has the run's files; returns the exit status."""
-    from mjx_reinforce.runs.shares import serve
-    from mjx_reinforce.runs.state import compile_parts
+    from mjx_reinforce.hosts.shares import serve
+    from mjx_reinforce.training.state import compile_parts
 
     state, programs = compile_parts(ready.parts, config)
     interrupt.defer(lambda _: processes.stop(interrupt.number or 0))
@@ -171,7 +170,7 @@ def _serve(ready: "Ready", config: Config, processes: Processes, interrupt: Inte
 def _end(processes: Processes, status: int) -> None:
     """Lets the other processes of a run end, as this one does."""
     if processes.count > 1:
-        from mjx_reinforce.runs.shares import end
+        from mjx_reinforce.hosts.shares import end
 
         end(processes, status)
 

@@ -14,7 +14,11 @@ from rich.console import Console
 from rich.progress import track
 
 from mjx_reinforce import envs
-from mjx_reinforce.export.files import check_folder
+from mjx_reinforce.console.commands import command
+from mjx_reinforce.console.heartbeat import heartbeat
+from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce.console.lines import say_error
+from mjx_reinforce.console.streams import accept_everything, silence_alarms
 from mjx_reinforce.export.films import (
     Renderer,
     import_gymnasium,
@@ -23,16 +27,11 @@ from mjx_reinforce.export.films import (
     write_film,
 )
 from mjx_reinforce.export.run_files import Seed, Which
-from mjx_reinforce.runs.alarms import silence_alarms
-from mjx_reinforce.runs.cast import Role, Source, cast, main_seed, read_source
-from mjx_reinforce.runs.commands import command
-from mjx_reinforce.runs.flags import read
-from mjx_reinforce.runs.heartbeat import heartbeat
-from mjx_reinforce.runs.jax_setup import configure_jax
-from mjx_reinforce.runs.lines import say_error
-from mjx_reinforce.runs.newest import RUNS, choose_run
-from mjx_reinforce.runs.own_code import check_named
-from mjx_reinforce.runs.streams import accept_everything
+from mjx_reinforce.files import check_folder
+from mjx_reinforce.playing.cast import Role, Source, cast, main_seed, read_source
+from mjx_reinforce.playing.newest import RUNS, choose_run
+from mjx_reinforce.settings.flags import read
+from mjx_reinforce.settings.own_code import check_named
 
 if TYPE_CHECKING:
     from mjx_reinforce.envs.base import MujocoEnv
@@ -125,13 +124,13 @@ def film(settings: Settings) -> None:
         import_gymnasium()
     import_mujoco()
     configure_jax()
-    from mjx_reinforce.runs.simulations import check_size
+    from mjx_reinforce.playing.simulations import check_size
 
     roles = cast(settings, source)
     env = envs.make(source.env)
     check_size(env, roles[-1].player, source)
     if settings.live:
-        from mjx_reinforce.runs.live import live
+        from mjx_reinforce.playing.live import live
 
         live(env, scene(env), roles[-1].player, source.horizon, settings)
         return
@@ -154,8 +153,8 @@ def _take(
 ) -> Any:
     """Returns the episode of one policy, and says what it earned."""
     from mjx_reinforce.export.takes import Take
-    from mjx_reinforce.runs.mujoco_playing import pushed_body
-    from mjx_reinforce.runs.simulations import simulators
+    from mjx_reinforce.playing.mujoco_playing import pushed_body
+    from mjx_reinforce.playing.simulations import simulators
 
     by_name = simulators(settings.backend, env, role.player, source, settings.push)
     name, play = list(by_name.items())[-1]

@@ -25,15 +25,16 @@ from toys import Survive
 
 from mjx_reinforce import ars, envs, reinforce
 from mjx_reinforce import train as train_module
+from mjx_reinforce.console import jax_setup
 from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS
-from mjx_reinforce.runs import display, jax_setup
-from mjx_reinforce.runs.build import build
+from mjx_reinforce.runs import display
 from mjx_reinforce.runs.command_line import parse
-from mjx_reinforce.runs.config import Config, check, marked
-from mjx_reinforce.runs.declare import Mark
-from mjx_reinforce.runs.presets import PRESETS
-from mjx_reinforce.runs.relevance import changed, check_read
-from mjx_reinforce.runs.settings import Reader
+from mjx_reinforce.settings.config import Config, check, marked
+from mjx_reinforce.settings.declare import Mark
+from mjx_reinforce.settings.groups import Reader
+from mjx_reinforce.settings.presets import PRESETS
+from mjx_reinforce.settings.relevance import changed, check_read
+from mjx_reinforce.store.build import build
 
 
 @pytest.fixture
@@ -526,7 +527,7 @@ def test_a_run_in_a_folder_with_brackets_names_it(monkeypatch, tmp_path, capsys)
 def test_an_ascii_terminal_shows_escapes(tmp_path, accent):
     code = (
         "from pathlib import Path\n"
-        "from mjx_reinforce.runs.streams import accept_everything\n"
+        "from mjx_reinforce.console.streams import accept_everything\n"
         "from mjx_reinforce.runs.display import Display\n"
         "accept_everything()\n"
         f"Display().say({accent!r})\n"
@@ -730,7 +731,7 @@ def test_a_machine_without_the_chosen_device_is_named(monkeypatch):
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="it needs a JAX without CUDA")
 def test_a_platform_without_its_plugin_is_named():
-    code = "from mjx_reinforce.runs.jax_setup import configure_jax as f\ntry: f()\n"
+    code = "from mjx_reinforce.console.jax_setup import configure_jax as f\ntry: f()\n"
     code += "except ValueError as error: print(error)"
     where = os.environ | {"JAX_PLATFORMS": "cuda"}
     said = subprocess.run([sys.executable, "-c", code], env=where, capture_output=True, text=True)

@@ -13,10 +13,10 @@ from toys import Drift
 from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export.policy_files import load_policy
-from mjx_reinforce.runs import defaults
 from mjx_reinforce.runs.command_line import parse
-from mjx_reinforce.runs.config import Config, check
-from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.settings import defaults
+from mjx_reinforce.settings.config import Config, check
+from mjx_reinforce.settings.defaults import of_task
 from trainings import results
 
 SMALL = ["--env", "Drift-v0", "--num-seeds", "3", "--eval-episodes", "2", "--num-episodes", "4"]

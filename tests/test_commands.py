@@ -12,12 +12,12 @@ import pytest
 from mjx_reinforce import __main__ as script
 from mjx_reinforce import envs, registry
 from mjx_reinforce.checks import whole_number
+from mjx_reinforce.console import commands, lines
 from mjx_reinforce.envs.__main__ import main as envs_main
-from mjx_reinforce.runs import commands, lines
+from mjx_reinforce.playing.newest import choose_run
 from mjx_reinforce.runs.command_line import parse
-from mjx_reinforce.runs.defaults import of_task
-from mjx_reinforce.runs.newest import choose_run
-from mjx_reinforce.runs.settings import MAIN
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.settings.groups import MAIN
 
 
 @pytest.fixture

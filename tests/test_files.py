@@ -4,7 +4,7 @@ import os
 
 import pytest
 
-from mjx_reinforce.export import files
+from mjx_reinforce import files
 
 
 def test_contents_are_on_the_disk_before_the_name_and_then_the_name(tmp_path, monkeypatch):

@@ -19,7 +19,8 @@ from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export import films, takes
 from mjx_reinforce.export.pretrained import FOLDER
 from mjx_reinforce.export.scenery import dress
-from mjx_reinforce.runs import live, mujoco_playing, playing
+from mjx_reinforce.playing import live, mujoco_playing
+from mjx_reinforce.playing import mjx_playing as playing
 
 ASSETS = sorted(path.name for path in (FOLDER.parents[2] / "envs" / "assets").glob("*.xml"))
 

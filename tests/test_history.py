@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mjx_reinforce.runs.config import Config
+from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps.history import History, Measured
 
 CONFIG = Config(num_seeds=4, env_steps=100, max_updates=10)

@@ -17,14 +17,14 @@ from jax.experimental.compilation_cache import compilation_cache
 from toys import Survive
 
 from mjx_reinforce import envs
+from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.engines.native import objects
 from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.gpu import seam as gpu
-from mjx_reinforce.runs import kept, ready, trees
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.defaults import of_task
-from mjx_reinforce.runs.jax_setup import configure_jax
-from mjx_reinforce.runs.state import budget_of, compile_parts
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.store import kept, ready, trees
+from mjx_reinforce.training.state import budget_of, compile_parts
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
 SETTINGS = {
@@ -62,11 +62,11 @@ def numbers(prepared, config):
 def test_a_second_start_traces_nothing_and_gives_the_same(name, monkeypatch):
     config = dataclasses.replace(CONFIG, **SETTINGS[name])
     plain = ready.made(envs.make(config.env), config)
-    first = ready.prepare(config, config)
+    first = ready.get_ready(config, config)
     expected = numbers(first, config)
     with monkeypatch.context() as patch:
         patch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
-        second = ready.prepare(config, config)
+        second = ready.get_ready(config, config)
         assert second.engine_seconds == 0
         assert jax.tree.structure(second.parts.like) == jax.tree.structure(plain.parts.like)
         for prepared in (first, second):
@@ -125,19 +125,19 @@ def test_a_commit_that_changes_no_source_changes_nothing(monkeypatch):
 
 def test_a_resumed_run_finds_its_programs(monkeypatch):
     """Its config.json has the time limit, which the command line had left out."""
-    numbers(ready.prepare(CONFIG, CONFIG), CONFIG)
+    numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
     monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
     resumed = dataclasses.replace(CONFIG, horizon=500, resume=Path("run"), env_steps=999)
-    assert ready.prepare(resumed, CONFIG).horizon == 500
+    assert ready.get_ready(resumed, CONFIG).horizon == 500
     with pytest.raises(pytest.fail.Exception, match="was built"):
-        ready.prepare(dataclasses.replace(resumed, horizon=400), CONFIG)
+        ready.get_ready(dataclasses.replace(resumed, horizon=400), CONFIG)
 
 
 def test_another_seed_finds_the_programs_and_differs(monkeypatch):
-    first = numbers(ready.prepare(CONFIG, CONFIG), CONFIG)
+    first = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
     monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
     other = dataclasses.replace(CONFIG, seed=1)
-    assert not np.array_equal(numbers(ready.prepare(other, other), other)[2][0], first[2][0])
+    assert not np.array_equal(numbers(ready.get_ready(other, other), other)[2][0], first[2][0])
 
 
 @pytest.mark.parametrize(
@@ -146,32 +146,32 @@ def test_another_seed_finds_the_programs_and_differs(monkeypatch):
 )
 def test_what_is_damaged_is_made_again(name, folder, monkeypatch):
     monkeypatch.setattr(machine, "_LOADED", {})  # as in a process that has loaded nothing
-    expected = numbers(ready.prepare(CONFIG, CONFIG), CONFIG)
+    expected = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
     (path,) = (path for path in folder.iterdir() if path.stem.partition("-")[2] == name)
     path.write_bytes(path.read_bytes()[:-1])
     monkeypatch.setattr(machine, "_LOADED", {})
     assert kept.read(kept.key_of(CONFIG)) is None
-    again = numbers(ready.prepare(CONFIG, CONFIG), CONFIG)
+    again = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
     jax.tree.map(np.testing.assert_array_equal, again, expected)
     assert kept.read(kept.key_of(CONFIG)) is not None
 
 
 def test_bad_input_is_refused_of_what_is_kept_too():
-    numbers(ready.prepare(CONFIG, CONFIG), CONFIG)
+    numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
     many = dataclasses.replace(CONFIG, env_steps=None, max_updates=10**14)
     with pytest.raises(ValueError, match="more than the 2\\^53"):
-        ready.prepare(many, CONFIG)
+        ready.get_ready(many, CONFIG)
     idle = dataclasses.replace(CONFIG, initial_std=2.0)
     for _ in range(2):
         with pytest.raises(ValueError, match=r"--initial-std 2\.0 would do nothing"):
-            ready.prepare(idle, CONFIG)
+            ready.get_ready(idle, CONFIG)
 
 
 def test_programs_need_no_code_of_others(monkeypatch):
     """A process that plays other tasks has their code in memory too."""
     own = kept.seam.targets
     monkeypatch.setattr(kept.seam, "targets", lambda: [*own(), "mjx_reinforce_" + 64 * "0"])
-    numbers(ready.prepare(CONFIG, CONFIG), CONFIG)
+    numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
     assert kept.read(kept.key_of(CONFIG)) is not None
 
 
@@ -290,15 +290,15 @@ def test_a_tree_of_other_classes_is_neither_described_nor_rebuilt():
 _SECOND = """
 import jax, numpy, sys
 from mjx_reinforce import envs
-from mjx_reinforce.runs import ready
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.jax_setup import configure_jax
-from mjx_reinforce.runs.state import budget_of, compile_parts
+from mjx_reinforce.store import ready
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce.training.state import budget_of, compile_parts
 configure_jax()
 if sys.argv[1] == "second":
     envs.make = None
 config = Config(env="InvertedPendulum-v5", num_seeds=2, num_episodes=2, eval_episodes=2)
-prepared = ready.prepare(config, config)
+prepared = ready.get_ready(config, config)
 state, programs = compile_parts(prepared.parts, config)
 state, metrics, looked = programs.advance(state, True, budget_of(config))
 print(prepared.engine, metrics["episode_return"].tolist(), looked.measured["eval_return"])

@@ -19,8 +19,8 @@ from mjx_reinforce.learners.updates import Problem, full_batch
 from mjx_reinforce.policies.categorical import categorical
 from mjx_reinforce.policies.normal import normal
 from mjx_reinforce.policies.tanh_normal import tanh_normal
-from mjx_reinforce.runs.build import build
-from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.settings.config import Config, check
+from mjx_reinforce.store.build import build
 from mjx_reinforce.types import Box, Discrete
 
 MASK = np.arange(6)[:, None] < np.array([6, 1, 0, 4])

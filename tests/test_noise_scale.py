@@ -14,7 +14,7 @@ from mjx_reinforce.learners.gradients import accumulate_gradient
 from mjx_reinforce.learners.reinforce import _surrogate
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
-from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.settings.defaults import of_task
 from noise_scale import Settings, episode_gradients, noise_scale, rows
 
 

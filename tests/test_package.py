@@ -17,22 +17,17 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "mjx_reinforce"
 #: Folders and root modules from the ground up; a file imports from its own folder and those before.
 ORDER = (
-    *("checks", "types", "registry", "fused", "physics", "envs", "policies", "engines", "learners"),
-    *(
-        "export",
-        "reports",
-        "runs",
-        "report",
-        "sweeps",
-        "sweep",
-        "train",
-        "watch",
-        "new",
-        "__main__",
-    ),
+    *("checks", "types", "registry", "files", "fused", "physics", "envs", "policies", "engines"),
+    *("learners", "console", "settings", "export", "reports", "training", "hosts", "store", "runs"),
+    *("playing", "report", "sweeps", "sweep", "train", "watch", "new", "__main__"),
 )
+#: Commands of folders, found where ``python -m`` looks for them. They use what comes later.
+COMMANDS = {"envs.__main__"}
 #: Who may know that our environments exist; all others take any environment as an argument.
-MAY_IMPORT_ENVS = {"envs", "runs", "sweeps", "sweep", "train", "watch", "new", "__main__"}
+MAY_IMPORT_ENVS = {
+    *("envs", "settings", "training", "store", "runs", "playing", "sweeps"),
+    *("train", "watch", "new", "__main__"),
+}
 
 
 def modules(root, parent):
@@ -47,8 +42,8 @@ FILES = dict([*modules(PACKAGE, ()), *modules(ROOT / "envs", ("envs",))])
 
 
 def folder(module):
-    """The first part of a name; the command lines of folders, their ``__main__``, are one."""
-    return "__main__" if module.endswith("__main__") else module.partition(".")[0]
+    """The first part of a name."""
+    return "__main__" if module in COMMANDS else module.partition(".")[0]
 
 
 def imported(path):
@@ -94,7 +89,7 @@ def run(code):
 
 def test_import_is_light():
     loaded = run(
-        "import sys, mjx_reinforce, mjx_reinforce.envs, mjx_reinforce.runs.config\n"
+        "import sys, mjx_reinforce, mjx_reinforce.envs, mjx_reinforce.settings.config\n"
         "print([m for m in ('jax', 'brax', 'mujoco', 'flax', 'scipy') if m in sys.modules])"
     )
     assert loaded.strip() == "[]"

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.sweeps.ahead import Clock, started
-from mjx_reinforce.sweeps.layout import Layout
-from mjx_reinforce.sweeps.packing import pack
+from mjx_reinforce.sweeps.slots.ahead import Clock, started
+from mjx_reinforce.sweeps.slots.layout import Layout
+from mjx_reinforce.sweeps.slots.packing import pack
 
 
 @pytest.mark.parametrize("num_devices", [1, 2, 8])

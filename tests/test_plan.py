@@ -13,13 +13,14 @@ from toys import Survive
 
 from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
-from mjx_reinforce.runs import command_line, measured, memory, operations, plan, ready
-from mjx_reinforce.runs.blocks import block_length
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.defaults import of_task
-from mjx_reinforce.runs.heartbeat import heartbeat
-from mjx_reinforce.runs.measured import Speed, Task
-from mjx_reinforce.runs.presets import PRESETS
+from mjx_reinforce.console.heartbeat import heartbeat
+from mjx_reinforce.runs import command_line, plan
+from mjx_reinforce.settings import measured, memory, operations
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.settings.measured import Speed, Task
+from mjx_reinforce.settings.presets import PRESETS
+from mjx_reinforce.store import ready
 
 
 @pytest.fixture
@@ -366,11 +367,11 @@ def test_half_cheetah_warns_of_nothing(capfd):
 
 def test_a_block_has_room_for_what_the_budget_can_need():
     config = Config(num_episodes=10, env_steps=2005, eval_every=10**6)
-    assert block_length(config) == 201  # an episode has one step at least
-    assert block_length(dataclasses.replace(config, max_updates=150)) == 150
+    assert config.block_length == 201  # an episode has one step at least
+    assert (dataclasses.replace(config, max_updates=150)).block_length == 150
     # The budget does not show in a block that is short anyway.
     short = dataclasses.replace(config, eval_every=100)
-    assert block_length(short) == block_length(dataclasses.replace(short, max_updates=1)) == 100
+    assert short.block_length == (dataclasses.replace(short, max_updates=1)).block_length == 100
 
 
 def test_a_block_ends_with_the_budget(run, tmp_path):

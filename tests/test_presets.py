@@ -18,11 +18,11 @@ from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.runs import command_line
-from mjx_reinforce.runs.build import build, policy_settings
-from mjx_reinforce.runs.config import check
-from mjx_reinforce.runs.defaults import of_task
-from mjx_reinforce.runs.presets import PRESETS
-from mjx_reinforce.runs.relevance import check_read_by_policy
+from mjx_reinforce.settings.config import check
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.settings.presets import PRESETS
+from mjx_reinforce.settings.relevance import check_read_by_policy
+from mjx_reinforce.store.build import build, policy_settings
 
 TINY = ["--num-seeds", "2", "--max-updates", "2", "--horizon", "8"]
 TINY += ["--eval-every", "1", "--eval-episodes", "1"]

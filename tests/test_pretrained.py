@@ -10,9 +10,9 @@ from saved_runs import change, change_arrays, make_run
 
 import results_pretrained
 from mjx_reinforce import load_policy
-from mjx_reinforce.export.files import read_json
+from mjx_reinforce.files import read_json
 from mjx_reinforce.runs import command_line
-from mjx_reinforce.runs.defaults import of_task
+from mjx_reinforce.settings.defaults import of_task
 
 
 def finished(directory, **config):

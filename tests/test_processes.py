@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mjx_reinforce.runs import processes as module
-from mjx_reinforce.runs.processes import ProcessSettings, check_processes, joined
-from mjx_reinforce.runs.shares import _together_in_time
+from mjx_reinforce.hosts import processes as module
+from mjx_reinforce.hosts.processes import ProcessSettings, check_processes, joined
+from mjx_reinforce.hosts.shares import _together_in_time
 
 PENDULUM = "--env InvertedPendulum-v5 --num-episodes 4 --eval-episodes 2 --hidden-sizes 4"
 PENDULUM += " --env-steps None --max-updates 6"

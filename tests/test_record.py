@@ -11,11 +11,12 @@ import pytest
 from rich.console import Console
 
 from mjx_reinforce.reports.statistics import summarize
-from mjx_reinforce.runs import display, nonfinite
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.evaluation import evaluate
-from mjx_reinforce.runs.progress import Progress
-from mjx_reinforce.runs.record import Record
+from mjx_reinforce.runs import display
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training import nonfinite
+from mjx_reinforce.training.evaluation import evaluate
+from mjx_reinforce.training.progress import Progress
+from mjx_reinforce.training.record import Record
 from mjx_reinforce.types import Trajectory
 
 

@@ -12,8 +12,8 @@ import reproduce
 from mjx_reinforce import Box, reinforce
 from mjx_reinforce.learners.estimators import reward_to_go
 from mjx_reinforce.policies.truncated_normal import truncated_normal
-from mjx_reinforce.runs.config import check
-from mjx_reinforce.runs.presets import PRESETS
+from mjx_reinforce.settings.config import check
+from mjx_reinforce.settings.presets import PRESETS
 from reproduce_cases import CASES, load_reference
 from reproduce_mistakes import clamped_log_prob, stale_starts
 from reproduce_statistics import compare, rank_test, reached, windowed

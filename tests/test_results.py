@@ -13,12 +13,12 @@ import results_files
 import results_page
 import results_runs
 import tuning
-from mjx_reinforce.export.files import read_json
 from mjx_reinforce.export.run_files import read_run
+from mjx_reinforce.files import read_json
 from mjx_reinforce.reports.statistics import Estimate, iqm
 from mjx_reinforce.runs import command_line
-from mjx_reinforce.runs.config import Config, check
-from mjx_reinforce.sweeps.design import check_design
+from mjx_reinforce.settings.config import Config, check
+from mjx_reinforce.sweeps.designs.design import check_design
 from results_measures import (
     compare,
     curves,

@@ -6,7 +6,7 @@ import pytest
 import results_clock
 import results_readme
 import results_seconds
-from mjx_reinforce.export.files import write_json
+from mjx_reinforce.files import write_json
 
 GPU = {"device": "NVIDIA X", "git_commit": "0123456789abcdef", "cpu": None, "cores": None}
 CPU = {"device": "cpu", "cpu": "zen, 8 lanes", "cores": 2, "cpu_count": 8, "git_commit": None}

@@ -19,23 +19,23 @@ import numpy as np
 import pytest
 from toys import Drift
 
-from mjx_reinforce import envs
+from mjx_reinforce import envs, files
+from mjx_reinforce import files as export_files
 from mjx_reinforce import train as train_module
 from mjx_reinforce.engines.native.cpu import machine
-from mjx_reinforce.export import files as export_files
 from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.learner import TrainState
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.runs import checkpoint, files
-from mjx_reinforce.runs.best import first_best, keep_best
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.driver import Driver
-from mjx_reinforce.runs.files import locked
+from mjx_reinforce.runs.directory import locked, make_directory
 from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.observers import RunFiles
-from mjx_reinforce.runs.record import Record
-from mjx_reinforce.runs.state import Looked
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training import checkpoint
+from mjx_reinforce.training.best import first_best, keep_best
+from mjx_reinforce.training.driver import Driver
+from mjx_reinforce.training.record import Record
+from mjx_reinforce.training.state import Looked
 from trainings import results
 
 SIZE = ["--num-seeds", "3", "--eval-episodes", "2", "--hidden-sizes", "4"]
@@ -401,7 +401,7 @@ def test_the_folder_of_a_run_that_begins_elsewhere_stays(run, tmp_path, monkeypa
             other.enter_context(locked(directory))
             return locked(directory)
 
-        monkeypatch.setattr(files, "locked", quicker)
+        monkeypatch.setattr("mjx_reinforce.runs.directory.locked", quicker)
         assert run("--output", "out/in") == 2
     assert "another process trains in out/in" in capsys.readouterr().err
     assert (tmp_path / "out" / "in").is_dir()
@@ -415,9 +415,12 @@ def test_a_folder_that_another_process_makes_is_not_ours(tmp_path, monkeypatch):
         return mkdir(folder, *arguments)
 
     monkeypatch.setattr(Path, "mkdir", late)
-    assert files.prepare(tmp_path / "a" / "b", False) == []
+    assert make_directory(tmp_path / "a" / "b", False) == []
     monkeypatch.undo()
-    assert files.prepare(tmp_path / "c" / "d", False) == [tmp_path / "c" / "d", tmp_path / "c"]
+    assert make_directory(tmp_path / "c" / "d", False) == [
+        tmp_path / "c" / "d",
+        tmp_path / "c",
+    ]
 
 
 def test_a_finished_run_has_nothing_to_do(run, tmp_path, capsys):

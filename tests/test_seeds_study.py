@@ -229,7 +229,7 @@ def test_what_is_kept_comes_back(tasks, tmp_path):
 
 def test_runs_are_measured(tmp_path):
     """Two seeds of two configurations, by hand; one return is not finite."""
-    from mjx_reinforce.export.files import write_arrays, write_json
+    from mjx_reinforce.files import write_arrays, write_json
 
     runs = {
         "configuration": np.array([0, 0, 1, 1]),

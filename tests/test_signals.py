@@ -32,7 +32,7 @@ HEAVY = ["--env", "Humanoid-v5", "--engine", "vmap", "--output", "out"]
 #: What it does before it ends takes longer than the screen is waited for.
 SLOW_EXIT = """
 import pathlib, time
-from mjx_reinforce.runs.interrupt import Interrupt
+from mjx_reinforce.console.interrupt import Interrupt
 with Interrupt() as interrupt:
     interrupt.on_exit(lambda: (time.sleep(2), pathlib.Path("cleaned").touch()))
     interrupt.restore_screen(lambda: time.sleep(60))
@@ -42,7 +42,7 @@ with Interrupt() as interrupt:
 
 QUICK_EXIT = """
 import time
-from mjx_reinforce.runs.interrupt import Interrupt
+from mjx_reinforce.console.interrupt import Interrupt
 with Interrupt():
     print("listening", flush=True)
     time.sleep(60)

@@ -13,14 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from toys import Survive
 
-from mjx_reinforce import envs
+from mjx_reinforce import envs, files
 from mjx_reinforce import train as train_module
 from mjx_reinforce.reports.statistics import iqm, iqm_interval
-from mjx_reinforce.runs import files, rows
-from mjx_reinforce.runs.config import Config
 from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.sinks import over_seeds, sink, tensorboard
 from mjx_reinforce.runs.sinks.sink import Queue
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training import rows
 
 
 def evaluation(update, num_seeds=20, first=False):

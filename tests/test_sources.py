@@ -10,7 +10,7 @@ from fake_sweeps import make_sweep
 
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import describe, ordered
-from mjx_reinforce.runs.rows import COLUMNS
+from mjx_reinforce.training.rows import COLUMNS
 
 ONE = {"learning_rate": [1e-3, 3e-3]}
 

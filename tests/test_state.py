@@ -11,10 +11,10 @@ from toys import Toy
 from mjx_reinforce import envs
 from mjx_reinforce.learners import counts
 from mjx_reinforce.reports.statistics.aggregates import interval
-from mjx_reinforce.runs import ready
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.keys import plain, with_keys
-from mjx_reinforce.runs.state import budget_of, compile_parts
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.store import ready
+from mjx_reinforce.training.state import budget_of, compile_parts
+from mjx_reinforce.types import plain, with_keys
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
 

@@ -21,18 +21,20 @@ from mjx_reinforce.export.player import load_seed
 from mjx_reinforce.export.run_files import choose_seed, read_run
 from mjx_reinforce.report import Written
 from mjx_reinforce.runs import plan as runs_plan
-from mjx_reinforce.runs.build import build
-from mjx_reinforce.runs.config import Config, check
-from mjx_reinforce.runs.defaults import of_task
-from mjx_reinforce.runs.state import eval_keys, evaluation
-from mjx_reinforce.sweeps import chunks, conduct, perform, plan, programs, rungs, search
+from mjx_reinforce.settings.config import Config, check
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.store.build import build
+from mjx_reinforce.sweeps import chunks, conduct, perform
 from mjx_reinforce.sweeps import main as sweep_command
-from mjx_reinforce.sweeps.design import Design, check_design
-from mjx_reinforce.sweeps.grid import configure, grid, read_over
-from mjx_reinforce.sweeps.groups import learner_builder, make_groups
-from mjx_reinforce.sweeps.packing import pack
+from mjx_reinforce.sweeps.designs import plan, rungs, search
+from mjx_reinforce.sweeps.designs.design import Design, check_design
+from mjx_reinforce.sweeps.designs.grid import configure, grid, read_over
+from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
 from mjx_reinforce.sweeps.reading import read_results
 from mjx_reinforce.sweeps.results import join
+from mjx_reinforce.sweeps.slots import programs
+from mjx_reinforce.sweeps.slots.packing import pack
+from mjx_reinforce.training.state import eval_keys, evaluation
 
 
 class CrashError(Exception):

@@ -18,13 +18,13 @@ from toys import Survive
 
 from mjx_reinforce import envs, load_policy
 from mjx_reinforce import train as train_module
+from mjx_reinforce.files import append_csv, create_csv
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.reports.statistics import smooth
-from mjx_reinforce.runs.build import build
-from mjx_reinforce.runs.config import MAX_OF_UPDATE, Config, check_step_count
-from mjx_reinforce.runs.files import append_csv, create_csv
-from mjx_reinforce.runs.nonfinite import as_events
-from mjx_reinforce.runs.record import Record
+from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, check_step_count
+from mjx_reinforce.store.build import build
+from mjx_reinforce.training.nonfinite import as_events
+from mjx_reinforce.training.record import Record
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
 
@@ -247,9 +247,9 @@ def test_the_garbage_collector_runs_after_every_way_out(run, arguments):
 )
 def test_env_steps_that_cannot_be_counted_are_refused(monkeypatch, settings, most):
     config = Config(num_episodes=16, **settings)
-    monkeypatch.setattr("mjx_reinforce.runs.config.MAX_COUNT", most)
+    monkeypatch.setattr("mjx_reinforce.settings.config.MAX_COUNT", most)
     check_step_count(config, horizon=20)
-    monkeypatch.setattr("mjx_reinforce.runs.config.MAX_COUNT", most - 1)
+    monkeypatch.setattr("mjx_reinforce.settings.config.MAX_COUNT", most - 1)
     with pytest.raises(ValueError, match=f"a seed may play {most:,} env steps"):
         check_step_count(config, horizon=20)
 

@@ -14,8 +14,8 @@ from toys import Late, Survive, Target
 from mjx_reinforce import mlp_policy, normal, reinforce, train_step
 from mjx_reinforce.learners import counts, estimators, schedules, updates
 from mjx_reinforce.learners.updates import Problem
-from mjx_reinforce.runs.build import _build_optimizer
-from mjx_reinforce.runs.config import Config
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.store.build import _build_optimizer
 from mjx_reinforce.types import action_space
 
 LENGTHS = np.array([4, 1, 3])

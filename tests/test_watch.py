@@ -20,7 +20,7 @@ from toys import Survive, ToyState
 from mjx_reinforce import act, envs, load, load_policy, watch
 from mjx_reinforce.engines.rollouts import rollout
 from mjx_reinforce.export import takes
-from mjx_reinforce.runs import playing
+from mjx_reinforce.playing import mjx_playing as playing
 
 
 def watch_run(monkeypatch, *arguments):

@@ -8,12 +8,12 @@ from typing import Literal
 
 import tyro
 
-from mjx_reinforce.export.files import check_folder
+from mjx_reinforce.console.commands import command
+from mjx_reinforce.console.streams import accept_everything
 from mjx_reinforce.export.pretrained import is_pretrained
 from mjx_reinforce.export.run_files import Seed, Which, read_run
-from mjx_reinforce.runs.commands import command
-from mjx_reinforce.runs.flags import one_line_errors, read
-from mjx_reinforce.runs.streams import accept_everything
+from mjx_reinforce.files import check_folder
+from mjx_reinforce.settings.flags import one_line_errors, read
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -55,10 +55,10 @@ def export(settings: Settings) -> list[Path]:
     if not is_pretrained(settings.run):
         read_run(settings.run)
     from mjx_reinforce.export.arithmetic import arithmetic
-    from mjx_reinforce.export.files import write_arrays, write_bytes
     from mjx_reinforce.export.numpy_source import numpy_source
     from mjx_reinforce.export.onnx_model import import_onnx, onnx_model
     from mjx_reinforce.export.player import load_saved
+    from mjx_reinforce.files import write_arrays, write_bytes
 
     player, saved = load_saved(settings.run, settings.seed, settings.which)
     outputs = check(settings, player.seed)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mjx_reinforce.export.files import write_bytes
+from mjx_reinforce.files import write_bytes
 
 if TYPE_CHECKING:
     from mjx_reinforce.types import MjModel

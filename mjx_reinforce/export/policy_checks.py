@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.export.files import Header
+from mjx_reinforce.files import Header
 
 #: No layer, observation or action of a policy has more entries.
 _MAX_SIZE = 2**20

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import serialization, traverse_util
 
-from mjx_reinforce.export.files import (
+from mjx_reinforce.export.policy_checks import check_arrays, check_finite, check_settings
+from mjx_reinforce.files import (
     Header,
     finite,
     read_arrays,
@@ -20,7 +21,6 @@ from mjx_reinforce.export.files import (
     write_arrays,
     write_json,
 )
-from mjx_reinforce.export.policy_checks import check_arrays, check_finite, check_settings
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.policies.policy import Policy, mlp_policy

@@ -6,7 +6,7 @@
 from pathlib import Path
 from typing import Any
 
-from mjx_reinforce.export.files import read_json
+from mjx_reinforce.files import read_json
 
 FOLDER = Path(__file__).parent / "trained"
 PROVENANCE = "provenance.json"

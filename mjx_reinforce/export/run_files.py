@@ -5,9 +5,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.export.files import read_json
 from mjx_reinforce.export.policy_checks import is_number
 from mjx_reinforce.export.pretrained import pretrained
+from mjx_reinforce.files import read_json
 from mjx_reinforce.registry import nearest
 
 #: A seed by its rank in the run's final evaluation, or by its number.

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.export.files import read_json
+from mjx_reinforce.files import read_json
 from mjx_reinforce.reports.experiment import Configuration, Source
 
 #: What config.json says besides the settings.

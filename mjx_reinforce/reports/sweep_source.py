@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.export.files import Header, read_arrays, read_json
+from mjx_reinforce.files import Header, read_arrays, read_json
 from mjx_reinforce.reports.experiment import Configuration, Source, describe
 from mjx_reinforce.reports.run_source import number, read_columns, timings
 

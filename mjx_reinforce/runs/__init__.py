@@ -1,1 +1,1 @@
-"""Runs: settings, the programs that train many seeds, and what they leave on disk."""
+"""A run from its settings to its files: the plan, the directory, the screen, logs, results."""

@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mjx_reinforce import envs
-from mjx_reinforce.runs import measured, plan
-from mjx_reinforce.runs.commands import command
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.defaults import of_task
-from mjx_reinforce.runs.relevance import as_flag, changed, is_read
+from mjx_reinforce.console.commands import command
+from mjx_reinforce.runs import plan
+from mjx_reinforce.settings import measured
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.settings.relevance import as_flag, changed, is_read
 from mjx_reinforce.types import Environment
 
 if TYPE_CHECKING:

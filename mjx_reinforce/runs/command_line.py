@@ -8,20 +8,20 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from mjx_reinforce import envs
+from mjx_reinforce.console.commands import command
+from mjx_reinforce.console.lines import say_error
+from mjx_reinforce.hosts.processes import ProcessSettings, check_processes
 from mjx_reinforce.registry import check_name
-from mjx_reinforce.runs import resume
-from mjx_reinforce.runs.commands import command
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.defaults import for_arguments, named, named_task
-from mjx_reinforce.runs.files import remove_empty
-from mjx_reinforce.runs.flags import asks_brief_help, read
-from mjx_reinforce.runs.hints import about_word
-from mjx_reinforce.runs.lines import say_error
-from mjx_reinforce.runs.own_code import check_named
-from mjx_reinforce.runs.presets import PRESETS
-from mjx_reinforce.runs.processes import ProcessSettings, check_processes
-from mjx_reinforce.runs.relevance import changed, check_read
-from mjx_reinforce.runs.settings import GROUPS, MAIN
+from mjx_reinforce.runs.directory import remove_empty
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import for_arguments, named, named_task
+from mjx_reinforce.settings.flags import asks_brief_help, read
+from mjx_reinforce.settings.groups import GROUPS, MAIN
+from mjx_reinforce.settings.hints import about_word
+from mjx_reinforce.settings.own_code import check_named
+from mjx_reinforce.settings.presets import PRESETS
+from mjx_reinforce.settings.relevance import changed, check_read
+from mjx_reinforce.training import resume
 
 #: What a run leaves in its directory.
 _FILES = (

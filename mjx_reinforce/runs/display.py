@@ -16,12 +16,12 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeEl
 from rich.table import Table
 from rich.text import Text
 
+from mjx_reinforce.console.commands import command
+from mjx_reinforce.console.heartbeat import heartbeat
 from mjx_reinforce.reports.statistics import iqm
-from mjx_reinforce.runs import nonfinite, progress
-from mjx_reinforce.runs.commands import command
-from mjx_reinforce.runs.heartbeat import heartbeat
-from mjx_reinforce.runs.own_code import env_flag
 from mjx_reinforce.runs.plan import duration
+from mjx_reinforce.settings.own_code import env_flag
+from mjx_reinforce.training import nonfinite, progress
 
 
 class _Bar(Progress):

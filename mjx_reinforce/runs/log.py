@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.export.files import write_arrays, write_bytes, write_json
+from mjx_reinforce import files
 from mjx_reinforce.export.policy_files import save_policy
+from mjx_reinforce.files import write_arrays, write_bytes, write_json
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.runs import checkpoint, files, rows
-from mjx_reinforce.runs.checkpoint import Checkpoint
 from mjx_reinforce.runs.sinks import sink
+from mjx_reinforce.store.provenance import provenance
+from mjx_reinforce.training import checkpoint, rows
+from mjx_reinforce.training.checkpoint import Checkpoint
 
 #: The files of a run, besides those in ``checkpoint/``.
 _POLICY = ("policy/actor.npz", "policy/policy.json")
@@ -41,7 +43,7 @@ class RunLog:
             (self.directory / name).unlink(missing_ok=True)
         checkpoint.remove(self.directory / "checkpoint")
         sink.remove(self.directory)
-        write_json(self.directory / "config.json", {**settings, **files.provenance()})
+        write_json(self.directory / "config.json", {**settings, **provenance()})
         files.create_csv(self._metrics, rows.COLUMNS)
 
     def resume(

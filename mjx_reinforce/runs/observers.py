@@ -5,16 +5,16 @@ import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from mjx_reinforce.runs import resume
-from mjx_reinforce.runs.budget import SaveDue, not_written
-from mjx_reinforce.runs.checkpoint import Checkpoint
 from mjx_reinforce.runs.display import Display
-from mjx_reinforce.runs.driver import Driver, Evaluation
 from mjx_reinforce.runs.log import RunLog
-from mjx_reinforce.runs.resume import recordable
-from mjx_reinforce.runs.rows import Cells
 from mjx_reinforce.runs.sinks.sink import Queue, open_sinks
-from mjx_reinforce.runs.state import Arrays
+from mjx_reinforce.training import resume
+from mjx_reinforce.training.budget import SaveDue, not_written
+from mjx_reinforce.training.checkpoint import Checkpoint
+from mjx_reinforce.training.driver import Driver, Evaluation
+from mjx_reinforce.training.resume import recordable
+from mjx_reinforce.training.rows import Cells
+from mjx_reinforce.training.state import Arrays
 
 #: Once so much of the budget is used, the time that is left can be trusted: before, episodes may be
 #: much shorter than later, so that each takes longer for its steps.

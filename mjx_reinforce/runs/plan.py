@@ -4,11 +4,11 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mjx_reinforce.runs import measured, operations
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.defaults import of_task
-from mjx_reinforce.runs.measured import Speed, Task
-from mjx_reinforce.runs.memory import (
+from mjx_reinforce.settings import measured, operations
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.settings.measured import Speed, Task
+from mjx_reinforce.settings.memory import (
     check_fits,
     cpu_factor,
     gigabytes,
@@ -19,7 +19,7 @@ from mjx_reinforce.runs.memory import (
 )
 
 if TYPE_CHECKING:
-    from mjx_reinforce.runs.ready import Ready
+    from mjx_reinforce.store.ready import Ready
 
 #: The figures are good to this factor.
 _ACCURACY = 2.0

@@ -11,24 +11,24 @@ import numpy as np
 
 from mjx_reinforce import envs
 from mjx_reinforce.checks import check_kind
+from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.export.player import Player
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.export.run_files import Which
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.policies.policy import Policy
 from mjx_reinforce.reports.statistics import worst_if_not_finite
-from mjx_reinforce.runs.config import Config, check
+from mjx_reinforce.runs.directory import locked, make_directory, remove_empty
 from mjx_reinforce.runs.display import Display
-from mjx_reinforce.runs.driver import Driver, Evaluation
-from mjx_reinforce.runs.files import locked, prepare, remove_empty
-from mjx_reinforce.runs.jax_setup import configure_jax
 from mjx_reinforce.runs.log import RunLog
-from mjx_reinforce.runs.memory import check_size
 from mjx_reinforce.runs.observers import Callbacks, RunFiles, Screen
 from mjx_reinforce.runs.plan import make_plan
-from mjx_reinforce.runs.ready import prepare as make_ready
 from mjx_reinforce.runs.sinks.sink import check_installed
 from mjx_reinforce.runs.training import compile_driver, draw, summarize
+from mjx_reinforce.settings.config import Config, check
+from mjx_reinforce.settings.memory import check_size
+from mjx_reinforce.store.ready import get_ready
+from mjx_reinforce.training.driver import Driver, Evaluation
 
 
 class RunResults(NamedTuple):
@@ -120,9 +120,9 @@ def run(
     configure_jax()
     with contextlib.ExitStack() as held:
         if config.output is not None:
-            held.callback(remove_empty, prepare(config.output, config.overwrite))
+            held.callback(remove_empty, make_directory(config.output, config.overwrite))
             held.enter_context(locked(config.output))
-        ready = make_ready(config, config, envs.make(config.env))
+        ready = get_ready(config, config, envs.make(config.env))
         plan = make_plan(ready, config)
         display = Display()
         display.console.quiet = quiet

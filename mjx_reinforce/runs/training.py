@@ -5,21 +5,21 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from mjx_reinforce.hosts.processes import Processes
 from mjx_reinforce.learners import counts
 from mjx_reinforce.reports.curves import draw_learning_curve
-from mjx_reinforce.runs.best import first_best
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.driver import Driver
-from mjx_reinforce.runs.initial import begin_with, last_actors
-from mjx_reinforce.runs.minutes import env_steps_in
-from mjx_reinforce.runs.nonfinite import HOPELESS
-from mjx_reinforce.runs.processes import Processes
-from mjx_reinforce.runs.record import Record
-from mjx_reinforce.runs.state import compile_parts
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training.best import first_best
+from mjx_reinforce.training.driver import Driver
+from mjx_reinforce.training.initial import begin_with, last_actors
+from mjx_reinforce.training.minutes import env_steps_in
+from mjx_reinforce.training.nonfinite import HOPELESS
+from mjx_reinforce.training.record import Record
+from mjx_reinforce.training.state import compile_parts
 
 if TYPE_CHECKING:
-    from mjx_reinforce.runs.checkpoint import Checkpoint
-    from mjx_reinforce.runs.ready import Ready
+    from mjx_reinforce.store.ready import Ready
+    from mjx_reinforce.training.checkpoint import Checkpoint
 
 
 def compile_driver(
@@ -43,7 +43,7 @@ def compile_driver(
     started = time.perf_counter()
     state, programs = compile_parts(ready.parts, config, meanwhile)
     if processes is not None and processes.count > 1:
-        from mjx_reinforce.runs.shares import lead
+        from mjx_reinforce.hosts.shares import lead
 
         state, programs = lead(processes, programs, state, config.num_seeds)
     seconds = ready.engine_seconds + time.perf_counter() - started

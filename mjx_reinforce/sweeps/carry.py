@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 import jax
 import numpy as np
 
-from mjx_reinforce.runs import checkpoint
-from mjx_reinforce.runs.state import RunState
 from mjx_reinforce.sweeps.chunks import Runs
 from mjx_reinforce.sweeps.results import SweepFiles
+from mjx_reinforce.training import checkpoint
+from mjx_reinforce.training.state import RunState
 
 
 def last_states(

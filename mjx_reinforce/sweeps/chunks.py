@@ -7,15 +7,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.runs import checkpoint
-from mjx_reinforce.runs.budget import SaveDue, not_written
-from mjx_reinforce.runs.checkpoint import Checkpoint
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.state import RunState
-from mjx_reinforce.sweeps.groups import Group
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.sweeps.designs.groups import Group
 from mjx_reinforce.sweeps.history import History
-from mjx_reinforce.sweeps.layout import Layout
-from mjx_reinforce.sweeps.programs import Programs
+from mjx_reinforce.sweeps.slots.layout import Layout
+from mjx_reinforce.sweeps.slots.programs import Programs
+from mjx_reinforce.training import checkpoint
+from mjx_reinforce.training.budget import SaveDue, not_written
+from mjx_reinforce.training.checkpoint import Checkpoint
+from mjx_reinforce.training.state import RunState
 
 #: The host need not look at a sweep more often than this. Between short blocks the devices would
 #: wait for it.

@@ -4,14 +4,14 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
+from mjx_reinforce.console.commands import command
+from mjx_reinforce.hosts.processes import ProcessSettings
 from mjx_reinforce.runs.command_line import check_resumed, join_groups, read_groups, start
-from mjx_reinforce.runs.commands import command
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.processes import ProcessSettings
-from mjx_reinforce.runs.relevance import changed
-from mjx_reinforce.runs.settings import GROUPS
-from mjx_reinforce.sweeps import grid
-from mjx_reinforce.sweeps.design import Design, SweepSettings, read_design
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.groups import GROUPS
+from mjx_reinforce.settings.relevance import changed
+from mjx_reinforce.sweeps.designs import grid
+from mjx_reinforce.sweeps.designs.design import Design, SweepSettings, read_design
 
 _DESCRIPTION = (
     "Train many configurations, many seeds of each, side by side. Leaves sweep.json, results.csv "

@@ -8,24 +8,25 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.console.interrupt import Interrupt
+from mjx_reinforce.hosts.processes import Processes
 from mjx_reinforce.learners import counts
-from mjx_reinforce.runs.config import MAX_COUNT
 from mjx_reinforce.runs.display import Display
-from mjx_reinforce.runs.interrupt import Interrupt
 from mjx_reinforce.runs.plan import duration, is_wrong
-from mjx_reinforce.runs.processes import Processes
-from mjx_reinforce.runs.progress import Progress
-from mjx_reinforce.sweeps import carry, chunks, rungs
-from mjx_reinforce.sweeps.ahead import Clock, one_ahead
+from mjx_reinforce.settings.config import MAX_COUNT
+from mjx_reinforce.sweeps import carry, chunks
 from mjx_reinforce.sweeps.chunks import Runs, Saver
-from mjx_reinforce.sweeps.design import Design
-from mjx_reinforce.sweeps.groups import Group, learner_builder
+from mjx_reinforce.sweeps.designs import rungs
+from mjx_reinforce.sweeps.designs.design import Design
+from mjx_reinforce.sweeps.designs.groups import Group, learner_builder
+from mjx_reinforce.sweeps.designs.plan import Part, divide, group_seconds
+from mjx_reinforce.sweeps.designs.prepare import Prepared
+from mjx_reinforce.sweeps.designs.rungs import Rung
 from mjx_reinforce.sweeps.history import History
-from mjx_reinforce.sweeps.plan import Part, divide, group_seconds
-from mjx_reinforce.sweeps.prepare import Prepared
-from mjx_reinforce.sweeps.programs import Programs, compile_programs, shape_of_states
 from mjx_reinforce.sweeps.results import SweepFiles
-from mjx_reinforce.sweeps.rungs import Rung
+from mjx_reinforce.sweeps.slots.ahead import Clock, one_ahead
+from mjx_reinforce.sweeps.slots.programs import Programs, compile_programs, shape_of_states
+from mjx_reinforce.training.progress import Progress
 
 #: More than this of a sweep is all of it, but for rounding.
 _ALL = 1 - 1e-6

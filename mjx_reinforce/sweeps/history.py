@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.runs.budget import used
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.progress import Progress, measure
-from mjx_reinforce.runs.table import Table
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training.budget import used
+from mjx_reinforce.training.progress import Progress, measure
+from mjx_reinforce.training.record import Table
 
 Arrays = dict[str, np.ndarray]
 

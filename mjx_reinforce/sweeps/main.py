@@ -5,11 +5,10 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from mjx_reinforce.runs.alarms import silence_alarms
+from mjx_reinforce.console.interrupt import Interrupt
+from mjx_reinforce.console.streams import accept_everything, silence_alarms
 from mjx_reinforce.runs.command_line import refuse
-from mjx_reinforce.runs.files import remove_empty
-from mjx_reinforce.runs.interrupt import Interrupt
-from mjx_reinforce.runs.streams import accept_everything
+from mjx_reinforce.runs.directory import remove_empty
 from mjx_reinforce.sweeps.command_line import parse
 from mjx_reinforce.sweeps.perform import perform
 

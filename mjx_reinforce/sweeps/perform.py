@@ -6,20 +6,21 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mjx_reinforce.export.files import read_json, write_json
-from mjx_reinforce.runs.commands import command, typed
-from mjx_reinforce.runs.files import choose_directory, locked, prepare, versions
-from mjx_reinforce.runs.heartbeat import heartbeat, to_screen
-from mjx_reinforce.runs.interrupt import Interrupt
-from mjx_reinforce.runs.jax_setup import configure_jax
-from mjx_reinforce.runs.own_code import env_flag
-from mjx_reinforce.runs.processes import Processes, joined
-from mjx_reinforce.runs.resume import check_same_program
-from mjx_reinforce.sweeps.design import Design, as_record, check_design, flat
+from mjx_reinforce.console.commands import command, typed
+from mjx_reinforce.console.heartbeat import heartbeat, to_screen
+from mjx_reinforce.console.interrupt import Interrupt
+from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce.files import read_json, write_json
+from mjx_reinforce.hosts.processes import Processes, joined
+from mjx_reinforce.runs.directory import choose_directory, locked, make_directory
+from mjx_reinforce.settings.own_code import env_flag
+from mjx_reinforce.store.provenance import versions
+from mjx_reinforce.sweeps.designs.design import Design, as_record, check_design, flat
+from mjx_reinforce.training.resume import check_same_program
 
 if TYPE_CHECKING:
     from mjx_reinforce.report import Written
-    from mjx_reinforce.sweeps.prepare import Prepared
+    from mjx_reinforce.sweeps.designs.prepare import Prepared
     from mjx_reinforce.sweeps.results import SweepFiles
 
 #: Not every terminal has the page's quotation marks.
@@ -62,7 +63,7 @@ def perform(
         common = {**flat(design), **versions()}
         processes = held.enter_context(joined(design.processes, interrupt, common))
         if processes.index == 0:
-            new = prepare(directory, design.base.overwrite) if design.resume is None else []
+            new = make_directory(directory, design.base.overwrite) if design.resume is None else []
             held.enter_context(locked(directory))  # a folder in which another trains stays
             made += new
         configure_jax()
@@ -91,11 +92,11 @@ def _perform(
     """Does what ``perform`` says, in a directory that is ours; ``known`` is its sweep.json."""
     from mjx_reinforce.runs.display import Display
     from mjx_reinforce.sweeps.conduct import Conductor
-    from mjx_reinforce.sweeps.prepare import prepare
+    from mjx_reinforce.sweeps.designs.prepare import prepare_sweep
     from mjx_reinforce.sweeps.results import SweepFiles
 
     with heartbeat((lambda text: None) if quiet else to_screen, None, "writing the simulation out"):
-        prepared = prepare(design, known.get("chunk_runs"), processes.count)
+        prepared = prepare_sweep(design, known.get("chunk_runs"), processes.count)
     contents = _contents(design, prepared, known)
     if known:
         _check_same(directory, known, contents)
@@ -150,9 +151,9 @@ def _finish(
     design: Design, prepared: "Prepared", files: "SweepFiles", contents: dict[str, Any]
 ) -> None:
     """Writes the last files of a sweep, or those of one that was interrupted."""
-    from mjx_reinforce.runs.build import policy_settings
-    from mjx_reinforce.sweeps.grid import configure
-    from mjx_reinforce.sweeps.rungs import winner
+    from mjx_reinforce.store.build import policy_settings
+    from mjx_reinforce.sweeps.designs.grid import configure
+    from mjx_reinforce.sweeps.designs.rungs import winner
 
     def settings(number: int) -> tuple[dict[str, Any], int]:
         [config] = configure(design.base, [prepared.configurations[number]])
@@ -176,7 +177,7 @@ def _report(directory: Path) -> "Written":
 
 def _contents(design: Design, prepared: "Prepared", known: Mapping[str, Any]) -> dict[str, Any]:
     """Returns what sweep.json says while the sweep goes on."""
-    from mjx_reinforce.runs.files import provenance
+    from mjx_reinforce.store.provenance import provenance
 
     return {
         "status": "running",

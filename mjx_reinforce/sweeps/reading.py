@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.export.files import read_arrays, read_json
+from mjx_reinforce.files import read_arrays, read_json
 
 
 class SweepResults(NamedTuple):

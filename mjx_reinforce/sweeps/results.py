@@ -11,13 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.export.files import read_arrays, write_arrays, write_bytes, write_json
+from mjx_reinforce import files
+from mjx_reinforce.files import read_arrays, write_arrays, write_bytes, write_json
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.reports.statistics import steps_to_solve
-from mjx_reinforce.runs import checkpoint, files
 from mjx_reinforce.sweeps import policies
 from mjx_reinforce.sweeps.chunks import Runs
 from mjx_reinforce.sweeps.history import History
+from mjx_reinforce.training import checkpoint
 
 Arrays = dict[str, np.ndarray]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from mjx_reinforce.checks import check_kind
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.sweeps.design import Design
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.perform import perform
 from mjx_reinforce.sweeps.reading import SweepResults, read_results
 

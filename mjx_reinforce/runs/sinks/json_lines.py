@@ -4,9 +4,8 @@ import csv
 import json
 from pathlib import Path
 
-from mjx_reinforce.export.files import finite, write_bytes
-from mjx_reinforce.runs.files import append
-from mjx_reinforce.runs.rows import Cells, number
+from mjx_reinforce.files import append, finite, write_bytes
+from mjx_reinforce.training.rows import Cells, number
 
 NAME = "metrics.jsonl"
 

@@ -4,8 +4,8 @@ import importlib.util
 from pathlib import Path
 from typing import Protocol
 
-from mjx_reinforce.runs.config import Config
-from mjx_reinforce.runs.rows import Cells
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training.rows import Cells
 
 #: Settings that need a package, and the package.
 _PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb"}

@@ -1,0 +1,1 @@
+"""Playing policies of runs to look at them: in MJX, C MuJoCo, Gymnasium, or a viewer."""

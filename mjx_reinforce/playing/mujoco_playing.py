@@ -1,0 +1,102 @@
+"""Episodes of a trained policy in C MuJoCo, which starts in seconds, and pushes in them."""
+
+import itertools
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import numpy as np
+
+from mjx_reinforce.envs.in_mujoco import InMujoco
+from mjx_reinforce.export.player import Player
+from mjx_reinforce.playing.mjx_playing import Episode
+
+if TYPE_CHECKING:
+    import mujoco
+
+    from mjx_reinforce.types import Environment, MjModel
+
+#: A push: when the first begins, how often another does, and how long it lasts (s).
+FIRST, EVERY, LASTING = 2.0, 3.0, 0.1
+
+
+class Moment(NamedTuple):
+    """What one env step left.
+
+    reward: nan where the simulation left the finite numbers
+    ended: whether the episode is over by its own rule
+    push: the force along x that acted (N)
+    """
+
+    reward: float
+    ended: bool
+    push: float
+
+
+def mujoco_simulator(
+    env: "Environment", player: Player, horizon: int, push: float = 0.0
+) -> Callable[[int, bool], Episode]:
+    """Returns a function that plays in C MuJoCo.
+
+    Args:
+      env: a task of ``MujocoEnv``.
+      player: the policy.
+      horizon: T, the time limit in steps.
+      push: the force of the pushes (N), see ``push_at``.
+
+    Returns:
+      As ``playing.simulator``.
+
+    Raises:
+      ValueError: C MuJoCo cannot play the task, see ``InMujoco``.
+    """
+    simulation = InMujoco(env)
+
+    def play(episode: int, noise: bool) -> Episode:
+        steps = moments(simulation, player, episode, noise, push)
+        played, qpos = [], []
+        for moment in itertools.islice(steps, 1 + horizon):
+            if moment is not None:
+                played.append(moment)
+            if moment is None or np.isfinite(moment.reward):
+                qpos.append(simulation.data.qpos.copy())
+        rewards, _, pushes = map(np.array, zip(*played, strict=True))
+        return Episode(np.stack(qpos), rewards, pushes if push else None)
+
+    return play
+
+
+def moments(
+    simulation: InMujoco, player: Player, episode: int, noise: bool, push: float
+) -> Iterator[Moment | None]:
+    """Plays an episode until it ends by its own rule; yields None at its start, then each step."""
+    rng = np.random.default_rng(episode) if noise else None
+    start, _ = jax.random.split(jax.random.fold_in(jax.random.key(0), episode))
+    observation, ended = simulation.reset(start), False
+    body = pushed_body(simulation.env.mj_model)
+    yield None
+    while not ended:
+        force = push_at(simulation.data.time, push)
+        simulation.data.xfrc_applied[body, 0] += force
+        observation, reward, ended = simulation.step(np.asarray(player.act(observation, rng)))
+        simulation.data.xfrc_applied[:] = 0
+        broken = not (np.isfinite(observation).all() and np.isfinite(reward))
+        ended = ended or broken
+        yield Moment(np.nan if broken else reward, ended, force)
+
+
+def push_at(seconds: float, push: float) -> float:
+    """Returns the force at a time of an episode (N): pushes of ``push``, now left, now right."""
+    number, phase = divmod(seconds - FIRST, EVERY)
+    if number < 0 or phase >= LASTING:
+        return 0.0
+    return push if number % 2 == 0 else -push
+
+
+def pushed_body(model: "MjModel") -> int:
+    """Returns the number of the body that is pushed: the highest in the model's pose."""
+    kinds: Any = mujoco
+    data = kinds.MjData(model)
+    kinds.mj_kinematics(model, data)
+    kinds.mj_comPos(model, data)
+    return 1 + int(np.argmax(data.xipos[1:, 2]))

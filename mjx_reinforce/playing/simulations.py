@@ -1,0 +1,54 @@
+"""Which simulation plays a policy."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from mjx_reinforce.envs.base import MujocoEnv
+from mjx_reinforce.export.player import Player
+from mjx_reinforce.playing.cast import Source
+from mjx_reinforce.playing.mjx_playing import Episode, gymnasium_simulator, simulator
+from mjx_reinforce.playing.mujoco_playing import mujoco_simulator
+from mjx_reinforce.types import observation_size
+
+if TYPE_CHECKING:
+    from mjx_reinforce.types import Environment
+
+
+def simulators(
+    backend: str | None, env: "Environment", player: Player, source: Source, push: float
+) -> dict[str, Callable[[int, bool], Episode]]:
+    """Returns what plays an episode, by name; the last is filmed, others are compared with it.
+
+    Args:
+      backend: as in ``watch.Settings``.
+      env: what is played.
+      player: the policy.
+      source: of the policy.
+      push: the force of the pushes (N), 0 for none.
+
+    Raises:
+      ValueError: the simulation cannot play it.
+    """
+    horizon = source.horizon
+    if backend is None:
+        quick = source.run is None and isinstance(env, MujocoEnv)
+        backend = "mujoco" if quick or push else "mjx"
+    if backend == "mujoco":
+        return {"mujoco": mujoco_simulator(env, player, horizon, push)}
+    found: dict[str, Callable[[int, bool], Episode]] = {"mjx": simulator(env, player, horizon)}
+    if backend == "gymnasium":
+        version, play = gymnasium_simulator(player, horizon)
+        found[f"gymnasium {version}"] = play
+    return found
+
+
+def check_size(env: "Environment", player: Player, source: Source) -> None:
+    """Raises ValueError for a policy of a run whose observations are not the environment's."""
+    if source.run is None:
+        return
+    if (size := observation_size(env)) != player.observation_size:
+        raise ValueError(
+            f"the policy in {source.run.directory} takes observations of "
+            f"{player.observation_size} entries, {source.env} has {size}: config.json and policy/ "
+            "are of different runs"
+        )

@@ -1,0 +1,218 @@
+"""All settings of a run side by side, as config.json shows them, and the rules they obey."""
+
+import dataclasses
+import enum
+import functools
+import reprlib
+
+from mjx_reinforce import envs
+from mjx_reinforce.checks import changed, check_type
+from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS, check_name
+from mjx_reinforce.settings.declare import MAX_COUNT, MAX_OF_UPDATE, Range
+from mjx_reinforce.settings.groups import (
+    CheckpointSettings,
+    EstimatorSettings,
+    EvaluationSettings,
+    LogSettings,
+    PolicySettings,
+    RunSettings,
+    SearchSettings,
+    UpdateSettings,
+)
+
+#: A block of so many updates has room for them whatever the budget is; it takes little memory.
+_ALWAYS_ROOM = 100
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Config(
+    LogSettings,
+    CheckpointSettings,
+    EvaluationSettings,
+    SearchSettings,
+    UpdateSettings,
+    EstimatorSettings,
+    PolicySettings,
+    RunSettings,
+):
+    """Train policies, many seeds at once, and report over the seeds."""
+
+    def __repr__(self) -> str:
+        return f"Config({changed(self)})"
+
+    @property
+    def episodes_per_update(self) -> int:
+        """Episodes that a seed plays for an update, at most."""
+        if self.algorithm == "ars":
+            return 2 * self.num_directions
+        return self.max_episodes if self.num_episodes == "auto" else self.num_episodes
+
+    @property
+    def fewest_episodes(self) -> int:
+        """Episodes that a seed plays for an update, at least."""
+        auto = self.algorithm == "reinforce" and self.num_episodes == "auto"
+        return self.min_episodes if auto else self.episodes_per_update
+
+    @property
+    def block_length(self) -> int:
+        """How many updates a block between two evaluations has room for.
+
+        That is ``eval_every``, but where it is great no more than the budget can need, at one step
+        an episode. A block that is shorter anyway does not depend on the budget, so that a run with
+        another budget finds its programs in the compilation cache.
+        """
+        bounds = [self.eval_every]
+        if self.max_updates is not None:
+            bounds.append(self.max_updates)
+        if self.env_steps is not None:
+            bounds.append(-(-self.env_steps // self.fewest_episodes))
+        return min(self.eval_every, max(_ALWAYS_ROOM, min(bounds)))
+
+
+@functools.cache
+def marked(mark: enum.Enum) -> tuple[str, ...]:
+    """Returns the names of the settings that are declared with a mark."""
+    fields = dataclasses.fields(Config)
+    return tuple(field.name for field in fields if mark in field.metadata.get("marks", ()))
+
+
+def check(config: Config) -> None:
+    """Raises ValueError for settings that make no sense: what, the value, the remedy."""
+    check_each(config)
+    check_together(config)
+
+
+def check_each(config: Config) -> None:
+    """Raises ValueError for a setting that makes no sense whatever the others are."""
+    for field in dataclasses.fields(Config):
+        check_type(flag(field.name), getattr(config, field.name), field.type)
+    envs.check_id(config.env)
+    check_name("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
+    check_name("estimator", config.estimator, ESTIMATORS)
+    for rule in Range:
+        for name in marked(rule):
+            value = getattr(config, name)
+            if not (value is None or isinstance(value, str) or rule.holds(value)):
+                raise ValueError(f"{flag(name)} must be {rule.said}, got {reprlib.repr(value)}")
+
+
+def check_together(config: Config) -> None:
+    """Raises ValueError for settings that do not go together."""
+    if config.env_steps is None and config.max_updates is None:
+        raise ValueError("nothing would end this run: give --env-steps or --max-updates a number")
+    (_check_reinforce if config.algorithm == "reinforce" else _check_ars)(config)
+
+
+def flag(name: str) -> str:
+    """Returns the flag of a setting."""
+    return f"--{spoken(name)}"
+
+
+def spoken(name: str) -> str:
+    """Returns the name of a setting as people write it, such as learning-rate."""
+    return name.replace("_", "-")
+
+
+def check_step_count(config: Config, horizon: int) -> None:
+    """Raises ValueError if a seed may play more env steps than are counted.
+
+    A seed stops after the update that reaches its budget, so it may pass ``env_steps`` by
+    one update of full episodes.
+
+    Args:
+      config: the settings; at least one of the two budgets is given.
+      horizon: the time limit of an episode in steps.
+    """
+    an_update = config.episodes_per_update * horizon
+    bounds = []
+    if config.env_steps is not None:
+        bounds.append(config.env_steps - 1 + an_update)
+    if config.max_updates is not None:
+        bounds.append(config.max_updates * an_update)
+    each = f"{config.episodes_per_update:,} episodes an update, up to {horizon:,} steps each"
+    if an_update > MAX_OF_UPDATE:
+        raise ValueError(
+            f"an update may play {an_update:,} env steps of a seed ({each}), more than the "
+            "2^31 - 1 that can be counted; lower --num-episodes or --horizon"
+        )
+    if min(bounds) > MAX_COUNT:
+        raise ValueError(
+            f"a seed may play {min(bounds):,} env steps ({each}), more than the 2^53 that can be "
+            "counted; give --env-steps, or lower --max-updates or --horizon"
+        )
+
+
+def _check_reinforce(config: Config) -> None:
+    """Raises ValueError for settings that do not go together."""
+    if config.num_episodes == "auto":
+        _check_auto(config)
+    elif config.estimator == "leave-one-out" and config.num_episodes < 2:
+        raise ValueError(
+            f"leave-one-out needs at least two episodes an update, got --num-episodes "
+            f"{config.num_episodes}; raise it or choose --estimator reward-to-go"
+        )
+    if config.policy == "deterministic":
+        raise ValueError(
+            "--policy deterministic has no log-probability for --algorithm reinforce to follow; "
+            "choose --policy auto or --algorithm ars"
+        )
+    if config.final_discount is not None and max(config.discount, config.final_discount) == 1:
+        raise ValueError(
+            f"--discount {config.discount} and --final-discount {config.final_discount}: one that "
+            "changes must be less than 1, such as 0.9999"
+        )
+    if config.update == "natural-gradient" and config.max_kl is None:
+        raise ValueError(
+            "--update natural-gradient has the length of its steps from --max-kl, which is None: "
+            "give a number, such as 0.01"
+        )
+    if config.decay_steps is not None and config.decay_updates is not None:
+        raise ValueError(
+            f"the learning rate decays over --decay-steps {config.decay_steps} or over "
+            f"--decay-updates {config.decay_updates}, not both: pass --decay-steps None"
+        )
+    if config.update == "each-step" and config.decay_updates is not None:
+        raise ValueError(
+            "--update each-step makes as many optimiser steps as an episode has, so a decay over "
+            f"--decay-updates {config.decay_updates} has no length; choose --decay-steps"
+        )
+    steps = (config.decay_updates or 0) * config.minibatch_updates
+    if config.update == "minibatches" and steps > MAX_OF_UPDATE:
+        raise ValueError(
+            f"the learning rate would decay over {steps:,} optimiser steps, more than the 2^31 - 1 "
+            "that can be counted; lower --decay-updates or --minibatch-updates"
+        )
+
+
+def _check_auto(config: Config) -> None:
+    """Raises ValueError for settings that do not go with a number of episodes that changes."""
+    if config.min_episodes > config.max_episodes:
+        raise ValueError(
+            f"--min-episodes must be at most --max-episodes {config.max_episodes}, got "
+            f"{config.min_episodes}"
+        )
+    if config.update not in ("full-batch", "natural-gradient"):
+        raise ValueError(
+            "--num-episodes auto needs --update full-batch or natural-gradient, for "
+            f"{config.update} does not measure the gradient's noise; choose one, or a number"
+        )
+
+
+def _check_ars(config: Config) -> None:
+    """Raises ValueError for settings that do not go together."""
+    if config.one_start:
+        raise ValueError(
+            "--one-start is for --algorithm reinforce; for ars, --shared-starts compares the two "
+            "episodes of a direction from one start"
+        )
+    top = config.top_directions
+    if top is not None and top > config.num_directions:
+        raise ValueError(
+            f"--top-directions must be at most --num-directions {config.num_directions}, got {top}"
+        )
+    if config.ars_update == "document" and (config.hidden_sizes or top is not None):
+        raise ValueError(
+            "--ars-update document is for linear policies and all directions, got --hidden-sizes "
+            f"{' '.join(map(str, config.hidden_sizes))} and --top-directions {top}; "
+            "pass --hidden-sizes alone and --top-directions None"
+        )

@@ -1,0 +1,251 @@
+"""Reading a command line, and refusing in one line."""
+
+import contextlib
+import dataclasses
+import io
+import os
+import re
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, Any, TextIO, TypeVar, get_type_hints
+
+import docstring_parser
+import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from mjx_reinforce.checks import whole_number
+from mjx_reinforce.console.lines import columns_of, say_error, wrapped
+from mjx_reinforce.settings.hints import about_unknown, known, required, unknown_flags
+
+Form = TypeVar("Form")
+
+#: Columns that --help is written for at least: of 20 columns tyro makes thousands of lines.
+_LEAST_WIDTH = 60
+#: What tyro says of a value -> what we say.
+_PLAIN = {
+    r"Error parsing (PATH|\[.*\]): .*": "'' is no path",  # without a flag
+    r"Missing value for argument '(\S+)'.*": r"\1 needs a value after it",
+    r"Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]": (
+        r"\1 takes whole numbers with spaces between them, such as 32 32, got \2"
+    ),
+    r"Error parsing (\S+): (takes .*)": r"\1 \2",
+}
+#: Of a value that is of none of several types.
+_NO_TYPE = r"Error parsing (\S+): no type matching (.+?) could be instantiated from \[(.*?)\]\..*"
+#: Of a value that is none of some names.
+_NO_CHOICE = r"invalid choice (\S+) for argument '(\S+)'\. Expected one of \((.*)\)"
+_TYPES = {
+    "INT": "a whole number, such as 4 or 2e6,",
+    "FLOAT": "a number, such as 0.5,",
+    "PATH": "a path",
+}
+#: How numbers and paths are read, everywhere.
+_READERS = ConstructorRegistry()
+
+
+@_READERS.primitive_rule
+def _reader(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """Returns how a number or a path is read: 1e6 is a whole number, and "" is no path."""
+    readers = {int: ("INT", whole_number), float: ("FLOAT", _real_number), Path: ("PATH", _path)}
+    if kind.type not in readers:
+        return None
+    metavar, reader = readers[kind.type]
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=metavar,
+        instance_from_str=lambda words: reader(words[0]),
+        is_instance=lambda value: isinstance(value, kind.type) and type(value) is not bool,
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
+def _real_number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise ValueError(f"takes a number, such as 0.5, got {text!r}") from None
+
+
+def _path(text: str) -> Path:
+    if not text:
+        raise ValueError("takes a path, got ''")
+    return Path(text)
+
+
+def read(
+    form: type[Form],
+    arguments: Sequence[str],
+    prog: str,
+    description: str,
+    main: Sequence[str] = (),
+) -> Form:
+    """Returns what a command line says; --help exits.
+
+    Args:
+      form: the dataclass that is filled in; its fields may be dataclasses.
+      arguments: the flags and their values.
+      prog: the name of the program, for --help.
+      description: of the program, for --help.
+      main: the fields that --help alone shows, where --help all shows all; all if not given.
+
+    Raises:
+      ValueError: a flag is unknown, or its value is not of its type; in one line, where tyro
+        prints a box of a dozen.
+    """
+    box, page = io.StringIO(), _Page(sys.stdout)
+    brief = bool(main) and asks_brief_help(arguments)
+    asked = _only(form, main) if brief else _with_help(form)
+    options: dict[str, Any] = {"prog": prog, "description": "", "registry": _READERS}
+    options["config"] = (tyro.conf.OmitArgPrefixes,)
+    try:
+        with _room_for_help(), contextlib.redirect_stdout(page), contextlib.redirect_stderr(box):
+            parsed, unknown = tyro.cli(asked, args=arguments, return_unknown_args=True, **options)
+    except SystemExit as stop:
+        if not stop.code:
+            print(_described(page.getvalue(), description), end="")
+            if brief:
+                print(f"\n--help all shows all {len(known(form))} settings.")
+            raise
+        if wrong := unknown_flags(arguments, form):
+            raise ValueError(about_unknown(wrong, arguments, form, prog)) from stop
+        raise ValueError(f"{_plain(box.getvalue(), form, prog)} (see --help)") from stop
+    if unknown:
+        raise ValueError(about_unknown(unknown, arguments, form, prog))
+    return _as(form, parsed)
+
+
+def asks_brief_help(arguments: Sequence[str]) -> bool:
+    """Returns whether a command line asks for --help, and not for --help all."""
+    after = [(*arguments, "")[i + 1] for i, x in enumerate(arguments) if x in ("-h", "--help")]
+    return bool(after) and "all" not in after
+
+
+class _Page(io.StringIO):
+    """Text that is laid out for a stream on which it is printed later."""
+
+    def __init__(self, stream: TextIO):
+        super().__init__()
+        self._stream = stream
+
+    @property
+    def encoding(self) -> str:
+        """Returns that of the stream, which may have no frames."""
+        return self._stream.encoding
+
+    def isatty(self) -> bool:
+        """Returns whether the stream shows colours."""
+        return self._stream.isatty()
+
+
+@contextlib.contextmanager
+def _room_for_help() -> Iterator[None]:
+    """Lets a terminal that is narrower than ``_LEAST_WIDTH`` wrap lines itself."""
+    given = os.environ.get("COLUMNS")
+    if shutil.get_terminal_size().columns < _LEAST_WIDTH:
+        os.environ["COLUMNS"] = str(_LEAST_WIDTH)
+    try:
+        yield
+    finally:
+        if given is None:
+            os.environ.pop("COLUMNS", None)
+        else:
+            os.environ["COLUMNS"] = given
+
+
+def _with_help(form: type) -> type:
+    """Returns a dataclass like another whose fields say their help in one paragraph.
+
+    Tyro would end its lines where those of the docstrings end, and wrap them besides.
+    """
+    said = {
+        x.arg_name: x.description or "" for x in docstring_parser.parse_from_object(form).params
+    }
+    hints, made = get_type_hints(form, include_extras=True), []
+    for field in dataclasses.fields(form):
+        kind, default = hints[field.name], field.default
+        if dataclasses.is_dataclass(kind) and isinstance(kind, type):
+            kind = _with_help(kind)
+            default = kind(**vars(default))
+        elif field.name in said:
+            kind = Annotated[kind, tyro.conf.arg(help=" ".join(said[field.name].split()))]
+        made.append((field.name, kind, dataclasses.field(default=default)))
+    return dataclasses.make_dataclass(
+        form.__name__, made, frozen=True, kw_only=True, namespace={"__doc__": form.__doc__}
+    )
+
+
+def _only(form: type, names: Sequence[str]) -> type:
+    """Returns a dataclass with a few fields of the dataclasses in another, for --help."""
+    groups = [field.default for field in dataclasses.fields(_with_help(form))]
+    hints = {
+        name: (kind, getattr(group, name))
+        for group in groups
+        for name, kind in get_type_hints(type(group), include_extras=True).items()
+    }
+    made = [(name, hints[name][0], dataclasses.field(default=hints[name][1])) for name in names]
+    return dataclasses.make_dataclass(form.__name__, made, frozen=True, kw_only=True)
+
+
+def _as(form: type[Form], parsed: Any) -> Form:
+    """Returns what was read as the dataclass that was asked for."""
+    hints = get_type_hints(form)
+    values = {
+        name: _as(hints[name], value) if dataclasses.is_dataclass(value) else value
+        for name, value in vars(parsed).items()
+    }
+    return form(**values)
+
+
+def _described(page: str, description: str) -> str:
+    """Returns tyro's help with a description after its first line, which says the usage."""
+    usage, _, rest = page.partition("\n\n")
+    columns = max(columns_of(sys.stdout), _LEAST_WIDTH)
+    return "\n\n".join([usage, wrapped(description, columns), rest])
+
+
+def _plain(box: str, form: type, prog: str) -> str:
+    """Returns a message of tyro's in our words."""
+    text = _first_section(box)
+    if text.startswith("Missing from"):
+        return f"{prog} needs {' and '.join(required(form))}"
+    if found := re.match(_NO_TYPE, text):
+        flag, kinds, value = found.groups()
+        kinds = kinds.replace(" ", "").split("|")  # tyro's box breaks long lines
+        spoken = [_TYPES.get(kind) or kind.strip("{}").split(",") for kind in kinds]
+        numbers = [each for each in spoken if isinstance(each, str)]
+        names = [name for each in spoken if isinstance(each, list) for name in each]
+        return f"{flag} takes {' or '.join([*numbers, *names])}, got {value}"
+    if found := re.match(_NO_CHOICE, text):
+        value, flag, choices = found.groups()
+        names = sorted(set(re.findall(r"'(.*?)'", choices)) - {"None"})
+        return f"{flag} takes {' or '.join(names)}, got {value}"
+    for pattern, replacement in _PLAIN.items():
+        text = re.sub(pattern, replacement, text)
+    return text
+
+
+def _first_section(box: str) -> str:
+    """Returns the first paragraph of a message of tyro's, without its frame and title."""
+    lines = [line.strip("│ ") for line in box.splitlines()[1:]]
+    said: list[str] = []
+    for line in lines:
+        if line and not line.strip("─-╭╮╰╯"):
+            if said:
+                break
+        else:
+            said.append(line)
+    return " ".join(said)
+
+
+@contextlib.contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Ends the program with one line and status 2 for bad input, with 130 after Ctrl-C."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        say_error(str(error))
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)

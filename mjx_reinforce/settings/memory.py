@@ -1,0 +1,187 @@
+"""How much memory a run needs, from its settings alone, and whether it is there.
+
+The factors were read off XLA's own account of its programs (``memory_analysis``), for 100 seeds of
+toys with 4 and 300 observations and 1,000 seeds of InvertedPendulum.
+"""
+
+import importlib.util
+import itertools
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, flag, marked
+from mjx_reinforce.settings.declare import Range
+from mjx_reinforce.settings.measured import TASKS, Task
+
+_FLOAT = 4  # bytes
+#: Copies of the episodes that a gradient needs: as played, scaled, and by time.
+_COPIES = 3
+#: The values of the hidden units, and what the gradient adds to them.
+_ACTIVATIONS = 2
+#: Parameters, gradient, two moments, and all that again while a seed's update is proposed.
+_PARAMETERS = 8
+#: The same of a value network: parameters, gradient, two moments.
+_CRITIC_PARAMETERS = 4
+#: Steps of an episode whose hidden units are held at once, see ``learners.gradients``.
+_CHUNK = 128
+#: Bytes of an env step that an evaluation plays: the reward, the mask, and copies.
+_EVALUATED = 10
+#: Numbers that a seed's update reports.
+_METRICS = 20
+
+
+#: CPU cores that make a run faster; it was not tried with more.
+_USEFUL_CORES = 4
+
+
+class Part(NamedTuple):
+    """A part of what a run needs.
+
+    size: bytes
+    lower: the settings that make it smaller
+    """
+
+    size: float
+    lower: str
+
+
+def parts(config: Config, task: Task) -> list[Part]:
+    """Returns what the arrays of a run need, wherever they lie.
+
+    Args:
+      config: the settings.
+      task: the sizes of the task; ``config.horizon`` goes over its time limit.
+    """
+    horizon = config.horizon or task.horizon
+    seeds, episodes = config.num_seeds, config.episodes_per_update
+    steps = seeds * horizon * episodes
+    values = task.observation + task.action + 3
+    evaluated = seeds * horizon * 2 * config.eval_episodes
+    follows = config.algorithm == "reinforce"  # a gradient; else it searches with many policies
+    room = "--max-episodes" if config.num_episodes == "auto" else "--num-episodes"
+    fewer = room if follows else "--num-directions"
+    held = seeds * (min(horizon, _CHUNK) if follows else 1) * episodes * sum(config.hidden_sizes)
+    policies = seeds if follows else seeds * 2 * config.num_directions
+    network = _ACTIVATIONS * held + _PARAMETERS * policies * num_parameters(config, task)
+    critic = config.value_hidden_sizes if config.estimator == "value-baseline" else ()
+    critics = _CRITIC_PARAMETERS * seeds * critic_parameters(config, task)
+    valued, fitted = steps, 0
+    if config.value_fit == "minibatches" and critic:
+        fitted = seeds * config.value_batch_size
+        valued = seeds * min(horizon, _CHUNK) * episodes
+    widest = max([values, *config.hidden_sizes])
+    drawn = seeds * config.minibatch_size if config.update == "minibatches" else 0
+    return [
+        Part(_FLOAT * drawn * widest, "--minibatch-size or --num-seeds"),
+        Part(
+            _FLOAT * fitted * (config.value_fits + values + _ACTIVATIONS * sum(critic)),
+            "--value-batch-size, --value-fits or --num-seeds",
+        ),
+        Part(_FLOAT * _COPIES * steps * values, f"--num-seeds, {fewer} or --horizon"),
+        Part(_FLOAT * network, f"--hidden-sizes, --num-seeds or {fewer}"),
+        Part(
+            _FLOAT * (_ACTIVATIONS * valued * sum(critic) + critics),
+            "--value-hidden-sizes, --num-seeds or --horizon",
+        ),
+        Part(_EVALUATED * evaluated, "--eval-episodes, --num-seeds or --horizon"),
+        Part(_FLOAT * _METRICS * seeds * config.block_length, "--eval-every or --num-seeds"),
+    ]
+
+
+def num_parameters(config: Config, task: Task) -> int:
+    """Returns how many parameters the policy has, about: mean and std have outputs of their own."""
+    return _weights([task.observation, *config.hidden_sizes, 2 * task.action])
+
+
+def critic_parameters(config: Config, task: Task) -> int:
+    """Returns how many parameters the value network has, 0 where there is none."""
+    if config.algorithm != "reinforce" or config.estimator != "value-baseline":
+        return 0
+    return _weights([task.observation, *config.value_hidden_sizes, 1])
+
+
+def _weights(widths: Sequence[int]) -> int:
+    """Returns how many parameters a network has whose layers are so wide, the input first."""
+    return sum((n + 1) * m for n, m in itertools.pairwise(widths))
+
+
+def needed(config: Config, task: Task) -> float:
+    """Returns the bytes that all arrays of a run need."""
+    return math.fsum(part.size for part in parts(config, task))
+
+
+def check_fits(config: Config, task: Task, available: float, base: float) -> None:
+    """Raises ValueError if a run needs more memory than there is; nothing is compiled.
+
+    Args:
+      config: the settings.
+      task: the sizes of the task.
+      available: bytes that are there.
+      base: bytes that are needed besides the arrays.
+    """
+    total = base + needed(config, task)
+    if total <= available:
+        return
+    greatest = max(parts(config, task))
+    raise ValueError(
+        f"this run does not fit into memory: it needs about {gigabytes(total)}, "
+        f"{gigabytes(available)} are here;\nlower {greatest.lower}"
+    )
+
+
+def check_size(config: Config) -> None:
+    """Raises ValueError for a run that cannot be, before anything heavy is imported.
+
+    What is not known yet is taken to be small: the sizes of a task of the user's own, and the
+    memory of an accelerator.
+    """
+    large = (*marked(Range.COUNTED), *marked(Range.SEED))
+    for name, value in vars(config).items():
+        numbers = value if isinstance(value, tuple) else (value,)
+        counts = [x for x in numbers if isinstance(x, int)]
+        if name not in large and max(counts, default=0) > MAX_OF_UPDATE:
+            raise ValueError(f"{flag(name)} must be less than 2^31, got {max(counts)}")
+    if not _may_have_accelerator():
+        task = TASKS.get(config.env, Task(1, 1, 1, 1.0, 0.0))
+        check_fits(config, task, host_memory(), task.base_memory)
+
+
+def host_memory() -> float:
+    """Returns the bytes of main memory that this process may use."""
+    memory = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    limit = Path("/sys/fs/cgroup/memory.max")  # of a container
+    text = limit.read_text(encoding="ascii").strip() if limit.is_file() else "max"
+    return memory if text == "max" else min(memory, float(text))
+
+
+def num_cores() -> int:
+    """Returns how many CPU cores this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)  # not on every system
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def gigabytes(size: float) -> str:
+    """Returns a number of bytes for people: in GB, or where that is nearly none, in MB."""
+    if size < 5e7:
+        return f"{max(1, round(size / 1e6))} MB"
+    return f"{size / 1e9:,.1f} GB" if size < 1e10 else f"{size / 1e9:,.0f} GB"
+
+
+def has_gpu() -> bool:
+    """Returns whether JAX is likely to find an NVIDIA GPU; JAX is not imported."""
+    return _may_have_accelerator() and any(Path("/dev").glob("nvidia[0-9]*"))
+
+
+def cpu_factor() -> float:
+    """Returns how many times as fast as two cores this machine's are together."""
+    return min(num_cores(), _USEFUL_CORES) / 2
+
+
+def _may_have_accelerator() -> bool:
+    """Returns whether JAX may find a GPU: without a plugin it has the CPU alone."""
+    if os.environ.get("JAX_PLATFORMS") == "cpu":
+        return False
+    return importlib.util.find_spec("jax_plugins") is not None

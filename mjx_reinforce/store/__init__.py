@@ -1,0 +1,1 @@
+"""Programs ready to run, built from settings or read from disk, and where results come from."""

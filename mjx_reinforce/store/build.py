@@ -1,0 +1,217 @@
+"""From settings to a learner."""
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from mjx_reinforce.settings.config import Config, check_step_count
+
+if TYPE_CHECKING:
+    import jax
+    import optax
+
+    from mjx_reinforce.learners.estimators import Estimator
+    from mjx_reinforce.learners.learner import Learner
+    from mjx_reinforce.learners.updates import Update
+    from mjx_reinforce.policies.policy import Policy
+    from mjx_reinforce.types import Environment
+
+
+def build(
+    env: "Environment", config: Config, policy: "Policy | None" = None
+) -> "tuple[Learner, int]":
+    """Builds the learner that the settings describe.
+
+    Args:
+      env: what it learns on.
+      config: the settings.
+      policy: a ready policy, in place of the one that the settings describe.
+
+    Returns:
+      The learner, and the horizon in env steps.
+
+    Raises:
+      ValueError: the settings do not fit the environment.
+    """
+    from mjx_reinforce.engines.contract import check_environment
+    from mjx_reinforce.export.policy_files import build_policy
+    from mjx_reinforce.learners.learner import check_horizon
+
+    check_environment(env)
+    if config.stop_when_solved and getattr(env, "reward_threshold", None) is None:
+        raise ValueError(
+            f"{config.env} names no return at which it is solved: leave --stop-when-solved out"
+        )
+    horizon = check_horizon(env, config.horizon)
+    check_step_count(config, horizon)
+    forever = config.normalize_steps is None
+    shared = {
+        "policy": build_policy(policy_settings(env, config)) if policy is None else policy,
+        "horizon": horizon,
+        "normalize_steps": math.inf if forever else config.normalize_steps,
+        "normalize_min_std": config.normalize_min_std,
+        "engine": config.engine,
+    }
+    build_learner = _build_ars if config.algorithm == "ars" else _build_reinforce
+    return build_learner(env, config, shared), horizon
+
+
+def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
+    """Returns what ``policy_files.build_policy`` needs to build the policy without the env."""
+    from mjx_reinforce.types import Discrete, action_space, observation_size
+
+    space = action_space(env)
+    if isinstance(space, Discrete):
+        family, described = "categorical", {"num_actions": space.num_actions}
+    else:
+        family = "normal" if config.algorithm == "reinforce" else "deterministic"
+        described = {"action_low": space.low.tolist(), "action_high": space.high.tolist()}
+    return {
+        "env": config.env,
+        "policy": family if config.policy == "auto" else config.policy,
+        "hidden_sizes": list(config.hidden_sizes),
+        "shared_trunk": config.shared_trunk,
+        "initializer": config.initializer,
+        "initial_std": config.initial_std,
+        "rescale": config.rescale,
+        "observation_size": observation_size(env),
+        **described,
+    }
+
+
+def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
+    from mjx_reinforce.console.heartbeat import to_screen
+    from mjx_reinforce.engines.native import outlook
+    from mjx_reinforce.learners.pace import AutoEpisodes
+    from mjx_reinforce.learners.reinforce import reinforce
+
+    if config.engine in ("auto", "native") and (said := outlook.announcement(env)):
+        to_screen(said)
+    return reinforce(
+        env,
+        estimator=_build_estimator(config, shared["horizon"]),
+        optimizer=_build_optimizer(config),
+        update=_build_update(config, shared["policy"]),
+        num_episodes=AutoEpisodes(config.min_episodes, config.max_episodes)
+        if config.num_episodes == "auto"
+        else config.num_episodes,
+        entropy_cost=config.entropy_cost,
+        loss_per=config.loss_per,
+        max_kl=config.max_kl,
+        one_start=config.one_start,
+        num_seeds=config.num_seeds,
+        **shared,
+    )
+
+
+def _build_ars(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
+    from mjx_reinforce.learners.ars import ars
+
+    return ars(
+        env,
+        num_directions=config.num_directions,
+        top_directions=config.top_directions,
+        step_size=config.step_size,
+        noise_std=config.noise_std,
+        shared_starts=config.shared_starts,
+        update=config.ars_update,
+        **shared,
+    )
+
+
+def _build_estimator(
+    config: Config, horizon: int
+) -> "Estimator | Callable[[jax.Array], Estimator]":
+    """Returns an estimator; where its discount changes, a function from the used share to one."""
+    from mjx_reinforce.learners.schedules import look_further
+
+    first, last = config.discount, config.final_discount
+    if last is None:
+        return _estimator(config, horizon, first)
+    return lambda progress: _estimator(config, horizon, look_further(first, last, progress))
+
+
+def _estimator(config: Config, horizon: int, discount: "float | jax.Array") -> "Estimator":
+    from mjx_reinforce.learners import estimators
+    from mjx_reinforce.policies.arguments import known_number
+    from mjx_reinforce.registry import ESTIMATORS, load
+
+    if config.estimator == "value-baseline":
+        estimator = _build_value_baseline(config, horizon, discount)
+    else:
+        settings = {"ended": config.ended_episodes} if config.estimator == "leave-one-out" else {}
+        estimator = load(ESTIMATORS[config.estimator])(discount, **settings)
+    if known_number(config.reward_shift) != 0:
+        estimator = estimators.shift_rewards(estimator, config.reward_shift)
+    if config.standardize:
+        estimator = estimators.standardize(estimator, floor=config.standardize_floor)
+    if config.discount_weights:
+        estimator = estimators.discount_weights(estimator, discount)
+    return estimator
+
+
+def _build_value_baseline(
+    config: Config, horizon: int, discount: "float | jax.Array"
+) -> "Estimator":
+    import optax
+
+    from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
+    from mjx_reinforce.policies.networks import MLP
+
+    shared = {
+        "network": MLP(config.value_hidden_sizes, 1, initializer=config.initializer),
+        "optimizer": optax.adam(config.value_learning_rate),
+        "num_fits": config.value_fits,
+    }
+    if config.value_fit == "full-batch":
+        return full_batch_value_baseline(discount, **shared)
+    return value_baseline(discount, horizon=horizon, batch_size=config.value_batch_size, **shared)
+
+
+def _build_optimizer(config: Config) -> "optax.GradientTransformation":
+    import optax
+
+    from mjx_reinforce.learners import schedules
+    from mjx_reinforce.learners.updates import make_optimizer
+
+    rate: Any = config.learning_rate
+    final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
+    if config.decay_updates is not None:
+        # The schedule counts optimiser steps.
+        each = config.minibatch_updates if config.update == "minibatches" else 1
+        rate = optax.linear_schedule(rate, final, config.decay_updates * each)
+    optimizer = make_optimizer(
+        config.optimizer,
+        rate,
+        weight_decay=config.weight_decay,
+        max_grad_norm=config.max_grad_norm,
+        momentum=config.momentum,
+    )
+    if config.update == "natural-gradient":
+        # Its steps have their length from max_kl; of that a decaying rate leaves a share.
+        optimizer = optax.chain(optax.sgd(rate), optax.scale(1 / config.learning_rate))
+    if config.decay_steps is None:
+        return optimizer
+    length = None if config.decay_steps == "budget" else config.decay_steps
+    optimizer = optax.chain(optimizer, schedules.decay_rate(final / config.learning_rate, length))
+    if config.final_std is None:
+        return optimizer
+    ratio = config.final_std / config.initial_std
+    return optax.chain(optimizer, schedules.shrink_std(ratio, length))
+
+
+def _build_update(config: Config, policy: "Policy") -> "Update":
+    from mjx_reinforce.learners import updates
+    from mjx_reinforce.learners.natural_gradient import natural_gradient
+
+    if config.update == "natural-gradient":
+        assert config.max_kl is not None  # checked
+        return natural_gradient(
+            policy,
+            config.max_kl,
+            damping=config.natural_damping,
+            iterations=config.natural_iterations,
+        )
+    if config.update == "minibatches":
+        return updates.minibatches(config.minibatch_updates, config.minibatch_size)
+    return updates.full_batch() if config.update == "full-batch" else updates.each_step()

@@ -1,0 +1,60 @@
+"""What a result depends on besides its settings: versions, the commit, the device."""
+
+import contextlib
+import os
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+_PACKAGES = ("mjx-reinforce", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "optax", "flax")
+
+
+def provenance() -> dict[str, Any]:
+    """Returns what a result depends on besides its settings."""
+    import jax
+
+    from mjx_reinforce.engines.native import available
+    from mjx_reinforce.settings.memory import num_cores
+
+    return {
+        "python": platform.python_version(),
+        "packages": versions(),
+        "git_commit": _git_commit(),
+        "device": str(jax.local_devices()[0].device_kind),
+        **available.known_by(),
+        "num_devices": jax.device_count(),
+        "cpu_count": os.cpu_count(),
+        # Among so many threads XLA divides sums on a CPU, which decides their rounding.
+        "cores": num_cores() if available.platform() == "cpu" else None,
+        "x64": jax.numpy.zeros(()).dtype == "float64",
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
+    }
+
+
+def versions() -> dict[str, str | None]:
+    """Returns the versions of the packages that compute."""
+    return {name: version(name) for name in _PACKAGES}
+
+
+def version(package: str) -> str | None:
+    """Returns the version of an installed package, None if it is not installed."""
+    with contextlib.suppress(metadata.PackageNotFoundError):
+        return metadata.version(package)
+    return None
+
+
+def _git_commit() -> str | None:
+    """Returns the commit this package runs from, or None outside a checkout."""
+    here = Path(__file__).parent
+    command = ["git", "-C", str(here), "rev-parse", "HEAD"]
+    with contextlib.suppress(OSError, subprocess.CalledProcessError):
+        tracked = subprocess.run(
+            ["git", "-C", str(here), "ls-files", "--error-unmatch", Path(__file__).name],
+            capture_output=True,
+        )
+        if tracked.returncode == 0:
+            done = subprocess.run(command, capture_output=True, check=True, text=True)
+            return done.stdout.strip()
+    return None

@@ -1,0 +1,95 @@
+"""A run made ready: what its settings come to, and its programs before they are compiled."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+from mjx_reinforce import envs
+from mjx_reinforce.settings.config import Config, check_step_count
+from mjx_reinforce.settings.relevance import check_read_by_policy
+from mjx_reinforce.store import kept
+from mjx_reinforce.store.build import build, policy_settings
+from mjx_reinforce.training.state import Parts, parts_of
+from mjx_reinforce.types import Environment
+
+
+class Ready(NamedTuple):
+    """What a run is made of.
+
+    horizon: the time limit of an episode in steps
+    threshold: the return that counts as solved, if any
+    policy: how to rebuild its policy, see ``policy_files.save_policy``
+    engine: the name of what plays the episodes
+    why: the reason it was chosen, for people
+    engine_seconds: wall time that making it took
+    parts: its programs
+    """
+
+    horizon: int
+    threshold: float | None
+    policy: dict[str, Any]
+    engine: str
+    why: str
+    engine_seconds: float
+    parts: Parts
+
+
+def get_ready(
+    config: Config, default: Config, env: Environment | None = None, share: slice = slice(None)
+) -> Ready:
+    """Returns what the settings come to; from disk, if they did before.
+
+    Args:
+      config: the settings.
+      default: those that hold where the user gave none.
+      env: the environment; by default the one that the settings name, built if it is needed.
+      share: which of the seeds are trained here, see ``shares``.
+
+    Raises:
+      ValueError: the settings do not fit the environment.
+    """
+    key = kept.key_of(config, share)
+    ready = None if key is None else _found(key, config, share)
+    if ready is None:
+        ready = made(envs.make(config.env) if env is None else env, config, share)
+        if key is not None:
+            facts = ready._asdict()
+            del facts["parts"], facts["engine_seconds"]
+            ready = ready._replace(parts=kept.keep(key, facts, ready.parts))
+    if config.resume is None and config.policy == "auto":
+        check_read_by_policy(config, default, ready.policy["policy"])
+    return ready
+
+
+def _found(key: str, config: Config, share: slice) -> Ready | None:
+    """Returns what is on disk of the settings; None if nothing is."""
+    found = kept.read(key)
+    if found is None and config.resume is not None:
+        # A run that is resumed has its time limit from config.json, also one that was not given.
+        first = kept.key_of(dataclasses.replace(config, horizon=None), share)
+        found = None if first is None else kept.read(first)
+        if found is not None and found[0]["horizon"] != config.horizon:
+            return None
+    if found is None:
+        return None
+    facts, parts = found
+    check_step_count(config, facts["horizon"])
+    return Ready(**facts, engine_seconds=0.0, parts=parts)
+
+
+def made(env: Environment, config: Config, share: slice = slice(None)) -> Ready:
+    """Returns what the settings come to in an environment, for all seeds or a share of them.
+
+    Raises:
+      ValueError: the settings do not fit the environment.
+    """
+    learner, horizon = build(env, config)
+    threshold = getattr(env, "reward_threshold", None)
+    return Ready(
+        horizon=horizon,
+        threshold=None if threshold is None else float(threshold),
+        policy=policy_settings(env, config),
+        engine=learner.engine.name,
+        why=learner.engine.why,
+        engine_seconds=learner.engine.seconds,
+        parts=parts_of(env, learner, horizon, config, share),
+    )

@@ -1,0 +1,158 @@
+"""What a sweep is to do: the settings that all runs share, those that are swept, and how."""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from mjx_reinforce.files import read_json
+from mjx_reinforce.hosts.processes import ProcessSettings, check_processes
+from mjx_reinforce.settings.config import Config, check_each, flag
+from mjx_reinforce.settings.memory import check_size, gigabytes, host_memory
+from mjx_reinforce.sweeps.designs.grid import check_over, configure, grid
+from mjx_reinforce.sweeps.designs.search import draw
+from mjx_reinforce.training.resume import PLACES, as_config
+
+#: What writing results.csv and curves.npz needs for a run with two evaluations (bytes).
+_RESULT = 760
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SweepSettings:
+    """What is swept, and how its runs are spread."""
+
+    over: tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]] = ()
+    """A setting and its values, such as `learning-rate 1e-3 3e-3`; again for further settings: all
+    combinations are trained. Layers are written 32,32 (none: no layer)."""
+    search: Literal["grid", "random", "halving"] = "grid"
+    """grid: all combinations of the values. random: --budget of them, drawn: two numbers are the
+    ends of a range; names, and three values or more, are choices. halving: so many, all trained for
+    a part of the budget; the better half (by the interquartile mean over seeds) goes on to twice
+    that, until one has all of it. The choice flatters the winner's figure, so random and halving
+    train it again on fresh seeds, those of the next --seed."""
+    budget: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """How many configurations random and halving begin with."""
+    chunk_runs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
+    """Runs that are under way at once at most; as many as memory holds if not given."""
+    exact: bool = False
+    """Move every run by itself, on one device of each process, so that no result depends in any bit
+    on the runs beside it, on chunks, or on how many devices there are. It takes many times as
+    long."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Design:
+    """A sweep, its values read.
+
+    base: the settings of all runs but those that are swept, and where its directory is
+    over: the values of each setting that is swept
+    search: "grid", "random" or "halving"
+    budget: how many configurations are drawn, None for a grid
+    given: other settings that the user chose; at least one configuration must read each
+    exact: see ``SweepSettings``
+    chunk_runs: likewise
+    processes: those that train it
+    resume: the directory of a sweep that goes on
+    """
+
+    base: Config
+    over: Mapping[str, Sequence[Any]]
+    search: str = "grid"
+    budget: int | None = None
+    given: Sequence[str] = ()
+    exact: bool = False
+    chunk_runs: int | None = None
+    processes: ProcessSettings = dataclasses.field(default_factory=ProcessSettings)
+    resume: Path | None = None
+
+    def count(self) -> int:
+        """Returns how many configurations it begins with."""
+        return self.budget or math.prod(map(len, self.over.values()))
+
+    def configurations(self) -> list[dict[str, Any]]:
+        """Returns the values of what is swept, in each configuration."""
+        if self.budget is None:
+            return grid(self.over)
+        return draw(self.over, self.budget, self.base.seed)
+
+
+def as_record(design: Design) -> dict[str, Any]:
+    """Returns what sweep.json says of a design: all that decides its numbers."""
+    settings = dataclasses.asdict(design.base)
+    for name in PLACES:
+        del settings[name]
+    over = {name: list(values) for name, values in design.over.items()}
+    names = ("exact", "search", "budget")
+    return {"settings": settings, "over": over, **{name: getattr(design, name) for name in names}}
+
+
+def flat(design: Design) -> dict[str, Any]:
+    """Returns what ``as_record`` does, the settings among the rest."""
+    record = as_record(design)
+    return record.pop("settings") | record
+
+
+def read_design(directory: Path) -> Design:
+    """Returns the design of the sweep in a directory.
+
+    Raises:
+      ValueError: there is none, or its sweep.json is damaged or of another version.
+    """
+    path = directory / "sweep.json"
+    record = read_json(path)
+    try:
+        over = {
+            name: [tuple(x) if isinstance(x, list) else x for x in values]
+            for name, values in record["over"].items()
+        }
+        names = ("exact", "search", "budget")
+        chosen = {name: record[name] for name in names}
+        return Design(base=as_config(record["settings"], path), over=over, **chosen)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is damaged: {error!r}") from error
+
+
+def check_design(design: Design) -> None:
+    """Raises ValueError for a sweep that makes no sense, before anything heavy is imported."""
+    check_each(design.base)
+    for name in ("minutes", "init_from"):
+        if getattr(design.base, name) is not None:
+            raise ValueError(f"{flag(name)} is for one run, not for a sweep: leave it out")
+    if design.chunk_runs is not None and design.chunk_runs < 1:
+        raise ValueError(f"--chunk-runs must be at least 1, got {design.chunk_runs}")
+    check_over(design.base, design.over)
+    _check_search(design)
+    _check_results(design)
+    check_processes(design.processes)
+    if design.processes.distributed and design.base.output is None and design.resume is None:
+        raise ValueError("--distributed needs --output, a directory that all processes see")
+    configs = configure(design.base, design.configurations(), design.given)
+    for config in configs:
+        check_size(dataclasses.replace(config, num_seeds=1))
+
+
+def _check_results(design: Design) -> None:
+    """Raises ValueError where memory does not hold what results.csv is made of."""
+    runs = design.count() * design.base.num_seeds
+    if runs * _RESULT > host_memory():
+        raise ValueError(
+            f"the results of {runs:,} runs do not fit into memory: they need about "
+            f"{gigabytes(runs * _RESULT)}, {gigabytes(host_memory())} are here; lower --num-seeds "
+            f"or {'--budget' if design.budget else 'the number of values after --over'}"
+        )
+
+
+def _check_search(design: Design) -> None:
+    """Raises ValueError where the search and its budget do not go together."""
+    if design.search == "grid":
+        if design.budget is not None:
+            raise ValueError("--budget is of --search random and halving: leave it out, or add one")
+    elif design.search not in ("random", "halving"):
+        raise ValueError(f"--search must be grid, random or halving, got {design.search!r}")
+    elif design.budget is None:
+        raise ValueError(f"--search {design.search} needs --budget, the number of configurations")
+    elif design.budget < 2:
+        raise ValueError(f"--budget must be at least 2, got {design.budget}")

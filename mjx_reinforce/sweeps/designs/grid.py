@@ -1,0 +1,161 @@
+"""The configurations of a grid: every combination of the values of its settings."""
+
+import dataclasses
+import itertools
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+from mjx_reinforce.checks import alternatives, whole_number
+from mjx_reinforce.console.commands import command
+from mjx_reinforce.registry import check_name, nearest
+from mjx_reinforce.settings.config import Config, check, flag, spoken
+from mjx_reinforce.settings.groups import LogSettings
+from mjx_reinforce.settings.hints import other_names
+from mjx_reinforce.settings.relevance import check_read
+
+_FIELDS = {field.name: field for field in dataclasses.fields(Config)}
+_EXAMPLE = "such as --over learning-rate 1e-3 1e-2"
+
+
+def read_over(given: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
+    """Returns the values of each setting from ``--over NAME VALUE VALUE ...``, in that order.
+
+    Args:
+      given: the words after each ``--over``.
+
+    Raises:
+      ValueError: a setting does not exist or stands twice, or a value is not of its type.
+    """
+    over: dict[str, list[Any]] = {}
+    for words in given:
+        if not words:
+            raise ValueError(f"--over needs a setting and its values, {_EXAMPLE}")
+        name = words[0].removeprefix("--").replace("-", "_")
+        if name not in _FIELDS:
+            raise ValueError(_unknown(words[0].removeprefix("--")))
+        if name in over:
+            raise ValueError(f"--over {words[0]} is given twice: put all values behind one of them")
+        over[name] = [_value(name, word) for word in words[1:]]
+    return over
+
+
+def _unknown(word: str) -> str:
+    """Returns the message about a word that is no setting."""
+    meant = [x[2:] for x in other_names(flag(word))]
+    known = [spoken(name) for name in _FIELDS]
+    near = next((each for each in meant if each in known), None) or nearest(word, known)
+    hint = f" Did you mean {near!r}?" if near else ""
+    return f"unknown setting {word!r} after --over.{hint} (--help all lists the settings.)"
+
+
+def grid(over: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """Returns every combination of the values; the last setting changes fastest."""
+    return [dict(zip(over, values, strict=True)) for values in itertools.product(*over.values())]
+
+
+def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
+    """Raises ValueError for settings that cannot be swept, or values that make no choice."""
+    if base.stop_when_solved:
+        raise ValueError(
+            "--stop-when-solved is not for sweeps: a run would end when others beside it are "
+            "solved; leave it out"
+        )
+    for field in dataclasses.fields(LogSettings):
+        if getattr(base, field.name):
+            raise ValueError(
+                f"{flag(field.name)} logs a run; leave it out: a sweep writes results.csv"
+            )
+    if not over:
+        raise ValueError(
+            f"nothing is swept: give --over a setting and its values, {_EXAMPLE}, or train one "
+            f"configuration by {command('train')}"
+        )
+    for name, values in over.items():
+        check_name("setting", name, _FIELDS)
+        if why := _FIELDS[name].metadata.get("once"):
+            raise ValueError(f"a sweep cannot go over {spoken(name)}: {why}")
+        if len(values) < 2:
+            one = f"; for one value pass {flag(name)}" if values else f", {_EXAMPLE}"
+            raise ValueError(f"--over {spoken(name)} needs two values or more{one}")
+        twice = [x for i, x in enumerate(values) if x in values[:i]]
+        if twice:
+            raise ValueError(f"--over {spoken(name)} has the value {twice[0]} twice")
+
+
+def configure(
+    base: Config, configurations: Sequence[Mapping[str, Any]], given: Sequence[str] = ()
+) -> list[Config]:
+    """Returns the settings of each configuration.
+
+    Args:
+      base: what they share.
+      configurations: the values of what is swept.
+      given: settings of the base that the user chose.
+
+    Raises:
+      ValueError: the settings of a configuration make no sense; it does not read a setting that is
+        swept; or none of them reads one that was given.
+    """
+    configs = [dataclasses.replace(base, **values) for values in configurations]
+    for config, values in zip(configs, configurations, strict=True):
+        check(config)
+        check_read(config, values)
+    for name in set(given).difference(*configurations[:1]):
+        idle = [error for config in configs if (error := _not_read(config, name))]
+        if len(idle) == len(configs):
+            raise idle[0]
+    return configs
+
+
+def _not_read(config: Config, name: str) -> ValueError | None:
+    """Returns the error of a configuration that does not read a setting."""
+    try:
+        check_read(config, [name])
+    except ValueError as error:
+        return error
+    return None
+
+
+def _value(name: str, word: str) -> Any:
+    """Returns a word of the command line as a value of a setting's type."""
+    kinds = alternatives(_FIELDS[name].type)
+    for kind in kinds:
+        try:
+            return _as(kind, word)
+        except ValueError:
+            continue
+    spaces = "; write spaces between values" if "," in word else ""
+    raise ValueError(
+        f"--over {spoken(name)} has the value {word!r}, which is no {_kind(kinds)}{spaces}"
+    )
+
+
+def _as(kind: Any, word: str) -> Any:
+    """Returns a word as a value of a type, or raises ValueError."""
+    if kind is type(None):
+        return {"none": None}[word.lower()] if word.lower() == "none" else _no(word)
+    if kind is bool:
+        words = {"true": True, "false": False}
+        return words[word.lower()] if word.lower() in words else _no(word)
+    if typing.get_origin(kind) is Literal:
+        return word if word in typing.get_args(kind) else _no(word)
+    if typing.get_origin(kind) is tuple:
+        inner = typing.get_args(kind)[0]
+        return tuple(_as(inner, part) for part in word.split(",")) if word != "none" else ()
+    return whole_number(word) if kind is int else kind(word)
+
+
+def _no(word: str) -> Any:
+    raise ValueError(word)
+
+
+def _kind(kinds: Sequence[Any]) -> str:
+    names = {int: "whole number", float: "number", bool: "True or False", type(None): "None"}
+    spoken = [
+        " or ".join(typing.get_args(kind))
+        if typing.get_origin(kind) is Literal
+        else names.get(kind, "list of numbers such as 32,32 (or none)")
+        for kind in kinds
+    ]
+    return " or ".join(spoken)

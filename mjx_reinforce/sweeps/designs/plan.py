@@ -1,0 +1,179 @@
+"""How a sweep is divided: groups, chunks that fit into memory, and what that means for people."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from mjx_reinforce.runs.plan import duration, run_seconds, task_of, this_machine
+from mjx_reinforce.settings.memory import gigabytes, needed, num_cores
+from mjx_reinforce.store.build import policy_settings
+from mjx_reinforce.sweeps.designs.groups import Group
+from mjx_reinforce.types import Environment
+
+#: Chunks take up to this part of the memory that is there.
+_MEMORY = 0.6
+#: Episodes side by side in a slot of a device; the widest slot first. On two CPU cores a run costs
+#: the same beside 7 others or 255, and narrow slots waste less on runs of other lengths. An H200
+#: needs 65,536 episodes for most of its speed; for few runs a narrow slot answers sooner.
+_CPU_EPISODES = (128,)
+_GPU_EPISODES = (65_536, 8_192)
+
+
+class Part(NamedTuple):
+    """How the runs of a group are divided.
+
+    num_chunks: of about the same size
+    widths: runs that a compiled program moves at once, the most first
+    """
+
+    num_chunks: int
+    widths: tuple[int, ...]
+
+
+def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> Part:
+    """Returns how the runs of a group are divided.
+
+    Args:
+      group: whose configurations have ``group.config.num_seeds`` runs each.
+      limit: runs in a chunk at most.
+      num_devices: among which a chunk is divided.
+      exact: one run a slot.
+    """
+    total = len(group.members) * group.config.num_seeds
+    num_chunks = -(-total // limit)
+    if exact:
+        return Part(num_chunks, (num_devices,))
+    most = -(-total // (num_chunks * num_devices))
+    side = _CPU_EPISODES if this_machine().shared else _GPU_EPISODES
+    each = {min(most, -(-count // group.config.episodes_per_update)) for count in side}
+    return Part(num_chunks, tuple(num_devices * width for width in sorted(each, reverse=True)))
+
+
+def chunk_limit(
+    env: Environment,
+    horizon: int,
+    group: Group,
+    asked: int | None,
+    num_devices: int,
+    num_processes: int,
+) -> int:
+    """Returns how many runs of a group a chunk may have.
+
+    Args:
+      env: what is trained on.
+      horizon: the time limit of an episode in steps.
+      group: whose runs are divided.
+      asked: what the user said, or None for what memory holds.
+      num_devices: of each process.
+      num_processes: each of which is to have a chunk.
+
+    Raises:
+      ValueError: not even one run for each device fits into memory.
+    """
+    total = len(group.members) * group.config.num_seeds
+    limit = _capacity(env, horizon, group, num_devices) if asked is None else asked
+    return min(limit, -(-total // num_processes))
+
+
+def _capacity(env: Environment, horizon: int, group: Group, num_devices: int) -> int:
+    """Returns how many runs memory holds side by side."""
+    one = dataclasses.replace(group.config, num_seeds=1)
+    task, machine = task_of(policy_settings(env, one), horizon, one), this_machine()
+    memory = machine.memory - task.base_memory if machine.shared else machine.memory * num_devices
+    capacity = int(_MEMORY * memory / needed(one, task))
+    if capacity < num_devices:
+        raise ValueError(
+            f"not even one run for each of {num_devices} devices fits into memory: a run needs "
+            f"{gigabytes(needed(one, task))}; lower --num-episodes, --eval-episodes or --horizon"
+        )
+    return capacity
+
+
+def describe(
+    env: Environment,
+    horizon: int,
+    learners: Sequence[Any],
+    groups: Sequence[Group],
+    parts: Sequence[Part],
+    num_devices: int,
+    part_trained: float,
+) -> str:
+    """Returns a paragraph on what a sweep will do.
+
+    Args:
+      env: what is trained on.
+      horizon: the time limit of an episode in steps.
+      learners: one of each group.
+      groups: of configurations.
+      parts: how the runs of each are divided.
+      num_devices: on which they are.
+      part_trained: of the budgets of all runs, see ``rungs.part_trained``.
+    """
+    first, machine = groups[0].config, this_machine()
+    configurations = sum(len(group.members) for group in groups)
+    runs, chunks = configurations * first.num_seeds, sum(part.num_chunks for part in parts)
+    at_once = num_cores() if machine.shared else 1  # slots
+    side = max(
+        -(-len(group.members) * group.config.num_seeds // part.num_chunks)
+        for group, part in zip(groups, parts, strict=True)
+    )
+    memory = max(
+        needed(dataclasses.replace(group.config, num_seeds=at_once * part.widths[0]), task)
+        for group, part in zip(groups, parts, strict=True)
+        for task in (task_of(policy_settings(env, group.config), horizon, group.config),)
+    )
+    where = machine.name
+    if num_devices > 1:
+        where = f"{num_devices} devices" + (f" ({where} each)" if not machine.shared else "")
+    return (
+        f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
+        f"of {first.env}, on {where}, with the engine {learners[0].engine.name}: "
+        f"{_count(len(groups), 'compiled program')}, {_count(chunks, 'chunk')} of up to {side:,} "
+        f"runs. {_time(env, horizon, learners, groups, num_devices, part_trained)}. "
+        f"It needs about {gigabytes(memory)} of memory beside the programs."
+    )
+
+
+def _time(
+    env: Environment,
+    horizon: int,
+    learners: Sequence[Any],
+    groups: Sequence[Group],
+    num_devices: int,
+    part_trained: float,
+) -> str:
+    """Returns about how long the training takes, where that is known."""
+    total = 0.0
+    for learner, group in zip(learners, groups, strict=True):
+        seconds = group_seconds(env, horizon, learner.engine.name, group, num_devices)
+        if seconds is None:
+            return "How long this takes here is not known"
+        total += part_trained * seconds
+    compiling = duration(this_machine().speeds[groups[0].config.env].compiling)
+    return f"Compiling takes about {compiling} each, training about {duration(total)}"
+
+
+def group_seconds(
+    env: Environment, horizon: int, engine: str, group: Group, num_devices: int
+) -> float | None:
+    """Returns about how long all runs of a group train (s), None where that is not known.
+
+    Args:
+      env: what is trained on.
+      horizon: the time limit of an episode in steps.
+      engine: the name of what plays.
+      group: of configurations, with their budget.
+      num_devices: on which they are.
+    """
+    machine, num_seeds = this_machine(), len(group.members) * group.config.num_seeds
+    config = dataclasses.replace(group.config, num_seeds=num_seeds)
+    speed = machine.speeds.get(config.env)
+    if speed is None or engine != speed.engine:
+        return None
+    task = task_of(policy_settings(env, config), horizon, config)
+    seconds, _ = run_seconds(config, task, machine, speed)
+    return seconds / (1 if machine.shared else num_devices)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number:,} {noun}{'s' * (number > 1)}"

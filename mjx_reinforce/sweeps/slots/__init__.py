@@ -1,0 +1,1 @@
+"""How runs of a chunk move on side by side: bytes of their states, packing, programs."""

@@ -1,0 +1,206 @@
+"""Checkpoints: a run between two blocks of updates, as NumPy archives in RUN/checkpoint/.
+
+Each archive is written whole, under a name that ends in the beginning of its SHA-256: a file that
+was cut off or changed is noticed, and the one before it serves. The newest two are kept, and the
+newest one that is even, for runs whose budget is raised.
+"""
+
+import contextlib
+import hashlib
+import io
+import json
+import re
+import zipfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from mjx_reinforce.files import members, write_bytes
+from mjx_reinforce.types import PyTree, is_key, plain
+
+Arrays = dict[str, np.ndarray]
+
+_KEPT = 2
+_NAME = re.compile(r"\d{6,}-(even-)?[0-9a-f]{16}\.npz")
+
+
+class Checkpoint(NamedTuple):
+    """All that a run needs to go on as if it had not stopped.
+
+    state: the pytree that its programs move on, every leaf an array
+    record: what ``Record.content`` returns
+    seconds: wall time since the run began, without that of compiling
+    metrics_bytes: length of metrics.csv
+    env_steps: the budget of a seed, or None
+    max_updates: the other budget, or None
+    settings: all settings of the run, as config.json has them; None in a sweep's
+    number: its place among the run's checkpoints, once it is saved
+    """
+
+    state: Any
+    record: Arrays
+    seconds: float
+    metrics_bytes: int
+    env_steps: int | None
+    max_updates: int | None
+    settings: dict[str, Any] | None = None
+    number: int = 0
+
+    def is_even(self, eval_every: int) -> bool:
+        """Returns whether no budget has stopped a seed yet, nor cut a block short.
+
+        A run with a larger budget passes through the same state.
+        """
+        updates = self.record["updates"]
+        return bool(np.all(updates == updates[0]) and updates[0] % eval_every == 0)
+
+
+def save(folder: Path, checkpoint: Checkpoint, *, even: bool) -> None:
+    """Writes a checkpoint beside those that are there, and removes what it makes superfluous.
+
+    Args:
+      folder: made if it does not exist.
+      checkpoint: what is written.
+      even: what ``is_even`` says.
+
+    Raises:
+      OSError: it cannot be written; those that are there stay.
+    """
+    folder.mkdir(exist_ok=True)
+    content = _encode(checkpoint)
+    number = max((_number(path) for path in _files(folder)), default=0) + 1
+    name = f"{number:06d}-{'even-' if even else ''}{_digest(content)}.npz"
+    write_bytes(folder / name, content)
+    files = _files(folder)
+    kept = files[:_KEPT] + [path for path in files if "-even-" in path.name][:1]
+    for path in files:
+        if path not in kept:
+            path.unlink()
+
+
+def load(folder: Path, like: PyTree, say: Callable[[str], None]) -> Iterator[Checkpoint]:
+    """Yields the checkpoints of a folder, the newest first, without those that are damaged.
+
+    Args:
+      folder: what ``save`` wrote to; it need not exist.
+      like: a state of the run, for its structure, shapes and types.
+      say: shows a line about each damaged file.
+
+    Raises:
+      ValueError: a checkpoint is whole, but its state is not like that.
+    """
+    for path in _files(folder):
+        content = _read(path)
+        if content is None:
+            say(f"checkpoint {path.name} is damaged; trying the one before")
+        else:
+            yield _decode(content, path, like)
+
+
+def settings_of(folder: Path) -> dict[str, Any]:
+    """Returns the settings with which the newest whole checkpoint was written; {} if none has."""
+    for content in filter(None, map(_read, _files(folder))):
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            return json.loads(str(archive["rest"])).get("settings") or {}
+    return {}
+
+
+def remove(folder: Path, after: int = 0) -> None:
+    """Removes the checkpoints after a number, parts of unwritten ones, and a folder left empty."""
+    parts = folder.glob(".*.npz.*")
+    for path in [*parts, *(path for path in _files(folder) if _number(path) > after)]:
+        path.unlink()
+    with contextlib.suppress(OSError):
+        folder.rmdir()
+
+
+def _files(folder: Path) -> list[Path]:
+    """Returns the checkpoints in a folder, the newest first."""
+    paths = folder.iterdir() if folder.is_dir() else ()
+    return sorted(filter(lambda path: _NAME.fullmatch(path.name), paths), key=_number, reverse=True)
+
+
+def _number(path: Path) -> int:
+    return int(path.name.partition("-")[0])
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def _read(path: Path) -> bytes | None:
+    """Returns the contents of a checkpoint, or None if they are not those that were written."""
+    try:
+        content = path.read_bytes()
+        members(content, stored=True)
+    except Exception:  # OSError, and what ``members`` raises, which has no common class
+        return None
+    return content if _digest(content) == path.stem.rpartition("-")[2] else None
+
+
+def _encode(checkpoint: Checkpoint) -> bytes:
+    """Returns a NumPy archive: the state's leaves by their path, the record's arrays, the rest."""
+    state, rest = _flatten(checkpoint.state), checkpoint._asdict()
+    record = {f"record/{name}": values for name, values in rest.pop("record").items()}
+    del rest["state"], rest["number"]
+    archive = io.BytesIO()
+    np.savez(archive, allow_pickle=False, rest=np.array(json.dumps(rest)), **state, **record)
+    return archive.getvalue()
+
+
+def _decode(content: bytes, path: Path, like: PyTree) -> Checkpoint:
+    """Reads what ``_encode`` returned; see ``load``."""
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        rest = json.loads(str(arrays.pop("rest")))
+        record = {
+            name.removeprefix("record/"): arrays.pop(name)
+            for name in list(arrays)
+            if name.startswith("record/")
+        }
+        state = _unflatten(arrays, like)
+        return Checkpoint(state=state, record=record, number=_number(path), **rest)
+    except (KeyError, TypeError, zipfile.BadZipFile, ValueError) as error:
+        raise ValueError(
+            f"{path} does not fit this version of the program ({error}); "
+            "resume with the version that wrote it"
+        ) from error
+
+
+def _flatten(tree: PyTree) -> Arrays:
+    """Returns the leaves of a pytree on the host under the names of their paths; keys as data."""
+    leaves, _ = jax.tree.flatten_with_path(plain(tree))
+    raw = {_name(path): leaf for path, leaf in leaves}
+    return {name: np.asarray(value) for name, value in jax.device_get(raw).items()}
+
+
+def _unflatten(arrays: Arrays, like: PyTree) -> Any:
+    """Returns a pytree like another, from what ``_flatten`` returned.
+
+    Raises:
+      ValueError: an array is missing, or superfluous, or has another shape or type.
+    """
+    leaves, structure = jax.tree.flatten_with_path(like)
+    shapes, _ = jax.tree.flatten_with_path(jax.eval_shape(plain, like))
+    expected = {_name(path): shape for path, shape in shapes}
+    if wrong := sorted(expected.keys() ^ arrays.keys()):
+        raise ValueError(f"{wrong[0]} is in one of the two only")
+    for name, shape in expected.items():
+        here, there = (shape.shape, shape.dtype), (arrays[name].shape, arrays[name].dtype)
+        if here != there:
+            raise ValueError(f"{name} is {there[1]} {there[0]} there, {here[1]} {here[0]} here")
+    return jax.tree.unflatten(structure, [_leaf(arrays[_name(path)], old) for path, old in leaves])
+
+
+def _name(path: Any) -> str:
+    return "state/" + jax.tree_util.keystr(path, simple=True, separator="/")
+
+
+def _leaf(values: np.ndarray, old: jax.Array) -> jax.Array:
+    """Returns values in memory of the device's own, which may be donated; a key where it was."""
+    array = jax.numpy.array(values)
+    return jax.random.wrap_key_data(array) if is_key(old) else array

@@ -1,0 +1,178 @@
+"""A run as it goes on: its programs move its state on, and observers see what it measures."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from mjx_reinforce.learners import counts
+from mjx_reinforce.learners.learner import TrainState
+from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training.best import Best, keep_best
+from mjx_reinforce.training.checkpoint import Checkpoint
+from mjx_reinforce.training.record import Record
+from mjx_reinforce.training.rows import Cells
+from mjx_reinforce.training.state import Arrays, Looked, Programs, RunState, budget_of
+
+
+class Evaluation(NamedTuple):
+    """What an evaluation of the policies of S seeds measured.
+
+    updates: [S] int64, how many updates had made the policies
+    env_steps: [S] int64, how many env steps these had played
+    seconds: wall time since the end of compilation (s)
+    measured: [S] each, what ``mjx_reinforce.evaluate`` returns, such as ``eval_return``
+    actor: [S, ...] the policies that were evaluated, on the host
+    train_states: [S, ...] the newest states of training, on the device; at most one block of
+      updates further than ``actor``. The next block uses their memory again: copy what is to stay.
+    """
+
+    updates: np.ndarray
+    env_steps: np.ndarray
+    seconds: float
+    measured: Arrays
+    actor: Actor
+    train_states: TrainState
+
+
+class Observer(Protocol):
+    """Sees a run go on; it changes nothing of it."""
+
+    def updated(self, driver: "Driver", met: Arrays) -> None:
+        """Called after each block of updates.
+
+        Args:
+          driver: of the run.
+          met: the updates in it that met numbers which are not finite, as
+            ``Record.add_updates`` returns them.
+        """
+        ...
+
+    def evaluated(self, driver: "Driver", evaluation: Evaluation, rows: Cells) -> None:
+        """Called after each evaluation, with what it measured and its rows in metrics.csv."""
+        ...
+
+
+class Driver:
+    """Moves a run on, block by block.
+
+    config: the settings of the run, its horizon among them
+    record: what it has measured
+    state: of training
+    best: the best policies so far
+    ended: whether an observer asked for the end
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        programs: Programs,
+        record: Record,
+        state: RunState,
+        best: Best,
+        observers: Sequence[Observer] = (),
+    ):
+        """Takes what a run is made of, before its first update.
+
+        Args:
+          config: its settings.
+          programs: what moves it on.
+          record: what it measures.
+          state: of training.
+          best: the best policies so far.
+          observers: who sees it go on, in this order.
+        """
+        self.config, self.programs, self.record = config, programs, record
+        self.state, self.best, self.observers = state, best, list(observers)
+        self.ended = False
+        self._began = time.perf_counter()
+        self._budget = budget_of(config)
+        #: Wall time at which the present policies were there (s).
+        self._reached = 0.0
+
+    def restore(self, found: Checkpoint) -> None:
+        """Goes back to a checkpoint."""
+        self.state, self.best = found.state
+        self.record.restore(found.record)
+        self._began = time.perf_counter() - found.seconds
+        self._reached = found.seconds
+
+    def seconds(self) -> float:
+        """Returns the wall time since the run began, without that of compiling."""
+        return time.perf_counter() - self._began
+
+    def updates(self) -> int:
+        """Returns how many updates the seed with the most has made."""
+        return int(self.record.updates.max())
+
+    def drive(self, interrupted: Callable[[], bool]) -> None:
+        """Trains until the budget is used, nothing is finite, or someone asks for the end.
+
+        Policies are evaluated with the updates that follow. Where their returns decide whether any
+        do, they are evaluated before. A block that was interrupted is not evaluated, which may take
+        minutes: the resumed run does that.
+
+        Args:
+          interrupted: whether the run is to end soon.
+        """
+        while not interrupted() and not self._over():
+            self.advance()
+        if not self.record.evaluated() and (not interrupted() or not self.record.begun()):
+            self.evaluate()
+
+    def _over(self) -> bool:
+        if self.config.stop_when_solved and not self.record.evaluated():
+            self.evaluate()
+        return self.ended or self.record.finished() or self.record.hopeless()
+
+    def advance(self) -> None:
+        """Evaluates the present policies unless they were, and makes a block of updates."""
+        look = not self.record.evaluated()
+        self.state, metrics, looked = self.programs.advance(self.state, look, self._budget)
+        if looked is not None:
+            self._take(looked)
+        met = self.record.add_updates(metrics)
+        self._reached = self.seconds()
+        for observer in self.observers:
+            observer.updated(self, met)
+
+    def evaluate(self) -> None:
+        """Evaluates the present policies."""
+        self._take(self.programs.evaluate(self.state))
+
+    def _take(self, looked: Looked) -> None:
+        """Takes in an evaluation, and keeps the best policies."""
+        self.best = keep_best(self.best, looked)
+        rows = self.record.add_evaluation(looked.measured, self._reached)
+        evaluation = Evaluation(
+            updates=counts.to_int(looked.num_updates),
+            env_steps=self.record.env_steps,
+            seconds=self._reached,
+            measured=looked.measured,
+            actor=looked.actor,
+            train_states=self.state.train_states,
+        )
+        for observer in self.observers:
+            observer.evaluated(self, evaluation, rows)
+
+    def test(self, interrupted: Callable[[], bool]) -> dict[str, Any]:
+        """Plays the last and the best policies on starts used nowhere else, for summary.json.
+
+        Choosing the best by its evaluations flatters these evaluations, but not the test.
+
+        Args:
+          interrupted: whether the run is to end soon; it is tested when it has been resumed.
+
+        Returns:
+          The returns of both, or nothing if it was interrupted.
+        """
+        returns = {}
+        for name, actor in (("final", self.state.train_states.actor), ("best", self.best.actor)):
+            if interrupted():
+                return {}
+            result = self.programs.test(actor)
+            self.record.add_test(result)
+            returns[f"{name}_test_returns"] = result["eval_return"].tolist()
+        return returns

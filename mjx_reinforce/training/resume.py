@@ -1,0 +1,232 @@
+"""Going on with a run: its own settings, the same program, and the checkpoint that serves."""
+
+import dataclasses
+import json
+import typing
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from mjx_reinforce.checks import fits
+from mjx_reinforce.settings.config import Config, flag, marked
+from mjx_reinforce.settings.declare import Mark
+
+if TYPE_CHECKING:
+    from mjx_reinforce.training.checkpoint import Checkpoint
+    from mjx_reinforce.training.state import RunState
+
+#: What may change when a run goes on: when it ends, and how often it is saved.
+BUDGETS = marked(Mark.BUDGET)
+#: Settings that say where a run is, not what it does.
+PLACES = marked(Mark.PLACE)
+#: Entries of config.json on which every number of a run depends, besides its settings.
+_PROGRAM = (
+    *("packages", "git_commit", "device", "cpu", "cores", "machine_code", "jax_settings"),
+    *("x64", "xla_flags", "num_processes"),
+)
+_OTHER = "damaged, or of another version of the program; resume with the version that wrote it"
+
+
+def read_record(directory: Path) -> dict[str, Any]:
+    """Returns what config.json of a run says.
+
+    Raises:
+      ValueError: there is no such run, or the file is damaged.
+    """
+    path = directory / "config.json"
+    try:
+        recorded = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        if isinstance(error, FileNotFoundError) and (directory / "sweep.json").is_file():
+            raise ValueError(
+                f"{directory} is a sweep: python -m mjx_reinforce.sweep --resume {directory} goes "
+                "on with it"
+            ) from error
+        raise ValueError(
+            f"cannot resume {directory}: there is no {path} ({error.strerror}), so nothing was "
+            "begun there; start it anew with --output"
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    if not isinstance(recorded, dict):
+        raise ValueError(f"{path} is damaged: it is no object of names and values")
+    return recorded
+
+
+def read_settings(directory: Path) -> Config:
+    """Returns the settings of a run, for going on with it in its directory.
+
+    Raises:
+      ValueError: there is no such run, or its config.json is damaged or of another version.
+    """
+    recorded = read_record(directory)
+    return dataclasses.replace(as_config(recorded, directory / "config.json"), resume=directory)
+
+
+def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
+    """Returns the settings that a file recorded, or raises ValueError, which names the file."""
+    settings = {}
+    for field in dataclasses.fields(Config):
+        if field.name in PLACES:
+            continue
+        if field.name not in recorded:
+            raise ValueError(f"{path} does not say {field.name}: it is {_OTHER}")
+        value = recorded[field.name]
+        value = tuple(value) if isinstance(value, list) else value
+        if not fits(value, field.type):
+            says = f"{path} says {field.name} is {value!r}"
+            raise ValueError(f"{says}{_choices(field.type)}: it is {_OTHER}")
+        settings[field.name] = value
+    return Config(**settings)
+
+
+def _choices(hint: Any) -> str:
+    names = typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
+    return f", not one of {', '.join(names)}" if names else ""
+
+
+def recordable(config: Config) -> dict[str, Any]:
+    """Returns the settings as config.json has them, but for where the run is."""
+    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in PLACES}
+    return json.loads(json.dumps(settings))
+
+
+def check_settings(known: Config, asked: Config) -> None:
+    """Raises ValueError if more than the budget of a run is to change.
+
+    Args:
+      known: the run's settings.
+      asked: those that the command line asks for.
+    """
+    if asked.output is not None or asked.overwrite:
+        raise ValueError("--resume goes on in the run's own directory: leave --output out")
+    if asked.like is not None:
+        raise ValueError("--resume goes on with the run's own settings: leave --like out")
+    for field in dataclasses.fields(Config):
+        old, new = getattr(known, field.name), getattr(asked, field.name)
+        if old != new and field.name not in (*BUDGETS, *PLACES):
+            raise ValueError(
+                f"{flag(field.name)} is {old} in {known.resume} and cannot become {new}: only "
+                "its budget may change; leave it out, or start another run"
+            )
+
+
+def is_done(known: Config, asked: Config) -> bool:
+    """Returns whether a run has finished and is asked for no more than it did.
+
+    Raises:
+      ValueError: it is asked for no more, and was stopped because nothing was finite any more.
+    """
+    assert known.resume is not None
+    ends = (name for name in BUDGETS if name != "checkpoint_every")
+    if any(getattr(known, name) != getattr(asked, name) for name in ends):
+        return False
+    try:
+        summary = json.loads((known.resume / "summary.json").read_text(encoding="utf-8"))
+        status = summary["status"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    if status == "stopped":
+        raise ValueError(f"{known.resume} was stopped and would be again: {summary.get('reason')}")
+    return status == "finished"
+
+
+def check_program(directory: Path, present: Mapping[str, Any]) -> None:
+    """Raises ValueError if a run was begun by a program whose numbers may differ.
+
+    Args:
+      directory: the run's.
+      present: what ``files.provenance`` returns.
+    """
+    check_same_program(directory, read_record(directory), present)
+
+
+def check_same_program(
+    directory: Path, recorded: Mapping[str, Any], present: Mapping[str, Any]
+) -> None:
+    """Raises ValueError as ``check_program``, of what a file in the directory recorded."""
+    for name in (name for name in _PROGRAM if name in present):
+        old, new = recorded.get(name), present[name]
+        if isinstance(old, dict) and isinstance(new, dict):
+            changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+            if changed:
+                name, old, new = changed[0], old.get(changed[0]), new.get(changed[0])
+        if old != new and name == "num_processes":
+            raise ValueError(
+                f"{directory} was begun on {old or 1} processes, and here there are {new}; resume "
+                "it with --distributed on as many, wherever they are"
+            )
+        if old != new:
+            raise ValueError(
+                f"{directory} was begun with {name} {old}, and here it is {new}, so its numbers "
+                "would change; resume where it was begun, or start another run"
+            )
+
+
+def find(like: "RunState", config: Config, say: Callable[[str], None]) -> Any:
+    """Returns the newest checkpoint that serves, or None: then the run starts again.
+
+    Args:
+      like: the shapes of its ``RunState``.
+      config: its settings, with the budget that it is to have.
+      say: shows a line about each file that does not serve.
+
+    Raises:
+      ValueError: the budget is smaller than what the run did, config.json was changed by hand, or
+        a checkpoint is of another version.
+    """
+    from mjx_reinforce.training import checkpoint
+    from mjx_reinforce.training.best import shape_of_best
+
+    assert config.resume is not None
+    _check_unchanged(config, checkpoint.settings_of(config.resume / "checkpoint"))
+    states = like, shape_of_best(like.train_states)
+    length = _size(config.resume / "metrics.csv")
+    for found in checkpoint.load(config.resume / "checkpoint", states, say):
+        if found.metrics_bytes > length:
+            say(f"metrics.csv is shorter than at checkpoint {found.number}; trying the one before")
+        elif _serves(found, config):
+            return found
+    return None
+
+
+def _check_unchanged(config: Config, trained: Mapping[str, Any]) -> None:
+    """Raises ValueError if config.json was changed by hand since a checkpoint was written.
+
+    Args:
+      config: what config.json says now, but for the budget.
+      trained: the settings in the checkpoint.
+    """
+    said = recordable(config)
+    for name, value in trained.items():
+        if name not in BUDGETS and said.get(name) != value:
+            raise ValueError(
+                f"{config.resume}/config.json says that {name} is {said.get(name)}, but the run "
+                f"was trained with {value}; put that back, or start another run"
+            )
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
+
+
+def _serves(found: "Checkpoint", config: Config) -> bool:
+    """Returns whether a run with this budget passes through a checkpoint.
+
+    One with a budget in time goes on from any: it is no other run's equal.
+
+    Raises:
+      ValueError: the budget is smaller than what it has used.
+    """
+    if (found.env_steps, found.max_updates) == (config.env_steps, config.max_updates):
+        return True
+    for name, budget, used in (
+        ("env_steps", config.env_steps, found.record["env_steps"].max()),
+        ("max_updates", config.max_updates, found.record["updates"].max()),
+    ):
+        if budget is not None and budget < used:
+            raise ValueError(
+                f"{flag(name)} {budget} is less than the {used} of the run so far; give at least "
+                "that"
+            )
+    return config.minutes is not None or found.is_even(config.eval_every)
