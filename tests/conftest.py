@@ -34,16 +34,13 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parent))
 
 SLOW = Path(__file__).with_name("slow.txt")
+_STALE = pytest.StashKey[list[str]]()
 
 jax.config.update("jax_default_matmul_precision", "highest")
 
 
 def pytest_collection_modifyitems(config, items):
-    """Marks what slow.txt lists, and puts it first: no worker is left alone with it at the end.
-
-    Raises:
-      UsageError: a line names nothing in a file that was collected whole, or no file.
-    """
+    """Marks what slow.txt lists, and puts it first: no worker is left alone with it at the end."""
     slow = {line for line in SLOW.read_text().splitlines() if not line.startswith("#")}
     found = set()
     for item in items:
@@ -55,8 +52,14 @@ def pytest_collection_modifyitems(config, items):
             item.add_marker(pytest.mark.skip(reason="it is for CPUs"))
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
     whole = not (any("::" in each for each in config.args) or config.getoption("lf", False))
-    if whole and (stale := _stale(slow - found, {item.path.name for item in items})):
-        raise pytest.UsageError(f"slow.txt lists what is no test: {', '.join(stale)}")
+    collected = {item.path.name for item in items} if whole else set()
+    config.stash[_STALE] = _stale(slow - found, collected)
+
+
+@pytest.fixture
+def stale_lines(request):
+    """The lines of slow.txt that name no file, or nothing in a file that was collected whole."""
+    return request.config.stash[_STALE]
 
 
 def _stale(lines, collected):

@@ -120,3 +120,7 @@ def test_type_checkers_see_the_public_names():
     }
     assert seen == mjx_reinforce._HOME
     assert sorted(mjx_reinforce.__all__) == sorted([*seen, "__version__"])
+
+
+def test_slow_tests_are_tests(stale_lines):
+    assert not stale_lines

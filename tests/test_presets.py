@@ -121,7 +121,7 @@ def test_first_weights_are_pytorchs(name):
 @pytest.mark.parametrize("name", ["auto", "vmap", "fused", "native"])
 def test_engines_have_names(name):
     assert command_line.parse(["--engine", name]).engine == name
-    with pytest.raises(ValueError, match="'vmap'"):
+    with pytest.raises(ValueError, match="or vmap, got 'mjx'"):
         command_line.parse(["--engine", "mjx"])
 
 

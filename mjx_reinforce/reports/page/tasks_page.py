@@ -163,7 +163,7 @@ def _sooner(names: list[str], pair: Faster, statistic: float) -> str:
 
 
 def answer(tasks: Tasks) -> list[str]:
-    """Returns the answer in a few sentences."""
+    """Returns the answer in a few sentences; the speed first, where the best scores are equal."""
     best = tasks.overall[0]
     envs = count(len(tasks.findings), "task")
     mean = f"{number(float(best.mean.value))} (95 % interval {interval(best.mean)})"
@@ -175,7 +175,9 @@ def answer(tasks: Tasks) -> list[str]:
         f"Over {envs}, the greatest mean score is that of {best.label}: {mean}.",
         f"The next is {second.label}: {next_mean}. {_SCORE}",
     ]
-    return [*said, *_of_speed(tasks), *_of_tasks(tasks)]
+    speed = list(_of_speed(tasks))
+    said = [*speed, *said] if mean == next_mean else [*said, *speed]
+    return [*said, *_of_tasks(tasks)]
 
 
 def _of_speed(tasks: Tasks) -> Iterator[str]:
