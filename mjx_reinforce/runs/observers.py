@@ -9,11 +9,11 @@ from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.sinks.sink import Queue, open_sinks
 from mjx_reinforce.training import resume
-from mjx_reinforce.training.budget import SaveDue, not_written
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.driver import Driver, Evaluation
 from mjx_reinforce.training.resume import recordable
 from mjx_reinforce.training.rows import Cells
+from mjx_reinforce.training.saving import Attempts, SaveDue
 from mjx_reinforce.training.state import Arrays
 
 #: Once so much of the budget is used, the time that is left can be trusted: before, episodes may be
@@ -36,10 +36,10 @@ class RunFiles:
           say: shows a line to the user.
         """
         self._log, self._policy, self._say = log, policy, say
+        self._attempt = Attempts(say).attempt
         self._due = SaveDue(None)
         #: Whether the newest checkpoint is of the present state.
         self._saved = False
-        self._failing: set[str] = set()
         #: Where rows go besides metrics.csv.
         self._sinks: list[Queue] = []
 
@@ -132,19 +132,6 @@ class RunFiles:
         self._log.finish(driver.record.training(), picture, summary)
         for sink in self._sinks:
             self._attempt(sink.name, sink.close)
-
-    def _attempt(self, what: str, write: Callable[[], None]) -> bool:
-        """Returns whether something could be written; the first failure in a row is shown."""
-        try:
-            write()
-            self._failing.discard(what)
-            return True
-        except OSError as error:
-            if what in self._failing:
-                return False
-            self._failing.add(what)
-            self._say(not_written(what, error))
-            return False
 
 
 class Screen:

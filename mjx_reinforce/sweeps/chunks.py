@@ -1,7 +1,7 @@
 """Chunks: as many runs of a group as are under way at once."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,12 +9,12 @@ import numpy as np
 
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps.designs.groups import Group
-from mjx_reinforce.sweeps.history import History
+from mjx_reinforce.sweeps.history import History, Measured
 from mjx_reinforce.sweeps.slots.layout import Layout
 from mjx_reinforce.sweeps.slots.programs import Programs
 from mjx_reinforce.training import checkpoint
-from mjx_reinforce.training.budget import SaveDue, not_written
 from mjx_reinforce.training.checkpoint import Checkpoint
+from mjx_reinforce.training.saving import Attempts, SaveDue
 from mjx_reinforce.training.state import RunState
 
 #: The host need not look at a sweep more often than this. Between short blocks the devices would
@@ -78,7 +78,7 @@ class Saver:
         """
         self._folder, self._config, self._layout, self._say = folder, config, layout, say
         self._due = SaveDue(config.checkpoint_every)
-        self._failing = False
+        self._attempt = Attempts(say).attempt
 
     def save_if_due(self, states: np.ndarray, history: History) -> None:
         """Saves once there were enough updates, or about a minute, since the last time.
@@ -87,14 +87,8 @@ class Saver:
         """
         if not self._due.is_due(_updates(history)):
             return
-        try:
-            self.save(states, history)
-            self._failing = False
-        except OSError as error:
+        if not self._attempt("a checkpoint", lambda: self.save(states, history)):
             self._due.saved(_updates(history))
-            if not self._failing:
-                self._say(not_written("a checkpoint", error))
-            self._failing = True
 
     def save(self, states: np.ndarray, history: History) -> None:
         """Writes a checkpoint, or raises OSError."""
@@ -129,36 +123,51 @@ def _updates(history: History) -> int:
     return int(history.now["updates"].max())
 
 
-def train(
-    programs: Programs,
-    states: np.ndarray,
-    history: History,
-    after: Callable[[], bool],
-    most: int,
-) -> bool:
-    """Trains a chunk to its budget.
+class Chunk:
+    """A chunk as it goes on, for ``training.driver.drive``."""
 
-    Args:
-      programs: of its group.
-      states: [R, B] of its runs, before the first update or from a checkpoint; changed.
-      history: of its runs; changed.
-      after: is called after every evaluation, or where these take milliseconds after several;
-        where it returns False the chunk is left.
-      most: evaluations between two calls at most.
+    def __init__(
+        self,
+        programs: Programs,
+        states: np.ndarray,
+        history: History,
+        observers: Sequence[Callable[[], None]],
+        most: int,
+    ):
+        """Takes what a chunk is made of.
 
-    Returns:
-      Whether it ended, or was left.
-    """
-    began = time.perf_counter() - history.seconds
-    blocks = 1
-    while (training := history.training()).any():
-        measured = programs.advance(states, training, history.now["eval_steps"], blocks)
-        last = history.seconds
-        history.keep(measured, time.perf_counter() - began)
-        if not after():
+        Args:
+          programs: of its group.
+          states: [R, B] of its runs, before the first update or from a checkpoint; changed.
+          history: of its runs; changed.
+          observers: are called after every evaluation, or where these take milliseconds after
+            several.
+          most: evaluations between two calls at most.
+        """
+        self._programs, self._states, self._history = programs, states, history
+        self._observers, self._most = observers, most
+        self._began = time.perf_counter() - history.seconds
+        self._blocks = 1
+
+    def over(self) -> bool:
+        """Returns whether all runs used their budgets; then evaluates the last policies."""
+        if self._history.training().any():
             return False
+        if not self._history.evaluated():
+            self._keep([self._programs.evaluate(self._states)])
+        return True
+
+    def advance(self) -> None:
+        """Evaluates the runs that still train and makes a block of updates, or several blocks."""
+        history, last = self._history, self._history.seconds
+        lengths = history.now["eval_steps"]
+        measured = self._programs.advance(self._states, history.training(), lengths, self._blocks)
+        assert measured, "runs that have not used their budgets made no update"
+        self._keep(measured)
         enough = len(measured) * _SECONDS / (history.seconds - last)
-        blocks = max(1, min(int(enough), 2 * len(measured), most))
-    if not history.evaluated():
-        history.keep([programs.evaluate(states)], time.perf_counter() - began)
-    return True
+        self._blocks = max(1, min(int(enough), 2 * len(measured), self._most))
+        for observer in self._observers:
+            observer()
+
+    def _keep(self, measured: Sequence[Measured]) -> None:
+        self._history.keep(measured, time.perf_counter() - self._began)

@@ -26,6 +26,7 @@ from mjx_reinforce.sweeps.history import History
 from mjx_reinforce.sweeps.results import SweepFiles
 from mjx_reinforce.sweeps.slots.ahead import Clock, one_ahead
 from mjx_reinforce.sweeps.slots.programs import Programs, compile_programs, shape_of_states
+from mjx_reinforce.training.driver import drive
 from mjx_reinforce.training.progress import Progress
 
 #: More than this of a sweep is all of it, but for rounding.
@@ -214,16 +215,14 @@ class Conductor:
         if states is None:
             states = self._begin(rung, stage, programs, runs, history)
 
-        def after() -> bool:
+        def show() -> None:
             self._display.show_progress(self._progress(history, each))
-            if self._interrupt is not None and self._interrupt.number is not None:
-                saver.save(states, history)
-                return False
-            saver.save_if_due(states, history)
-            return True
 
+        observers = [show, lambda: saver.save_if_due(states, history)]
         most = (config.checkpoint_every or MAX_COUNT) // config.eval_every
-        if not chunks.train(programs, states, history, after, most):
+        chunk = chunks.Chunk(programs, states, history, observers, most)
+        if not drive(chunk, self._interrupted):
+            saver.save(states, history)
             return False
         keep = self._design.search == "halving"
         if keep:  # for the next rung
@@ -233,6 +232,9 @@ class Conductor:
         if not keep:
             saver.remove()
         return True
+
+    def _interrupted(self) -> bool:
+        return self._interrupt is not None and self._interrupt.number is not None
 
     def _begin(
         self, rung: Rung, stage: Stage, programs: Programs, runs: Runs, history: History

@@ -55,6 +55,27 @@ class Observer(Protocol):
         ...
 
 
+class Training(Protocol):
+    """What goes on block by block: a run, or a chunk of a sweep."""
+
+    def over(self) -> bool:
+        """Returns whether nothing is left to train."""
+        ...
+
+    def advance(self) -> None:
+        """Makes a block of updates."""
+        ...
+
+
+def drive(training: Training, interrupted: Callable[[], bool]) -> bool:
+    """Trains block by block; returns whether that ended, or was interrupted."""
+    while not interrupted():
+        if training.over():
+            return True
+        training.advance()
+    return False
+
+
 class Driver:
     """Moves a run on, block by block.
 
@@ -117,12 +138,12 @@ class Driver:
         Args:
           interrupted: whether the run is to end soon.
         """
-        while not interrupted() and not self._over():
-            self.advance()
-        if not self.record.evaluated() and (not interrupted() or not self.record.begun()):
+        ended = drive(self, interrupted)
+        if not self.record.evaluated() and (ended or not self.record.begun()):
             self.evaluate()
 
-    def _over(self) -> bool:
+    def over(self) -> bool:
+        """Returns whether the budget is used, nothing is finite, or an observer wants the end."""
         if self.config.stop_when_solved and not self.record.evaluated():
             self.evaluate()
         return self.ended or self.record.finished() or self.record.hopeless()
