@@ -13,8 +13,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.core
 import numpy as np
+from jax import lax
 from jax.extend import core
 from jax.interpreters import partial_eval
+
+from mjx_reinforce.fused.ops import FACTS
 
 # The parameter under which a call-like primitive keeps the jaxpr that it calls.
 _CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
@@ -178,6 +181,11 @@ def source(eqn: Any) -> str:
         return source_info_util.summarize(eqn.source_info)
     except (ImportError, AttributeError):
         return "an unknown line"
+
+
+def operation(name: str) -> Callable[..., Any]:
+    """Returns JAX's function for an operation of the scalar graph."""
+    return getattr(lax, FACTS[name].in_jax or name)
 
 
 def evaluate(function: Callable, params: dict, operands: Sequence[Any]) -> list[np.ndarray]:

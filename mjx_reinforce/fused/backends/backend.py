@@ -19,7 +19,7 @@ class Backend(abc.ABC, Generic[Value]):
 
     Attributes:
         OPERATIONS: what the backend makes of each operation, by name, with an entry for every
-            name of `ops.FACTS`; None for a backend that treats all alike.
+            name of `ops.FACTS`; None for a backend without a table of its own.
     """
 
     OPERATIONS: ClassVar[Mapping[str, Any] | None] = None

@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.fused.backends.backend import Backend
-from mjx_reinforce.fused.backends.xla_operations import OPERATIONS
+from mjx_reinforce.fused.jaxprs import operation
 from mjx_reinforce.fused.lanes import any_lane
 from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
@@ -20,8 +20,6 @@ Values = dict[Node, Any]
 
 class XLA(Backend[Any]):
     """Emits JAX operations; a value is a lane, a value that all lanes share, or a constant."""
-
-    OPERATIONS = OPERATIONS
 
     def __init__(self, read: Callable[[tuple[int, int]], Any], batch_shape: tuple[int, ...]):
         """Says where the program runs.
@@ -54,7 +52,7 @@ class XLA(Backend[Any]):
             value if is_constant(arg) and mixes else self._spread(value, node.varying)
             for arg, value in zip(node.args, operands, strict=True)
         ]
-        return OPERATIONS[op.name](*values, **dict(op.params))
+        return operation(op.name)(*values, **dict(op.params))
 
     def gate(self, gate: LiveGate, values: Values) -> Sequence[Any]:
         """Emits a `cond`."""
