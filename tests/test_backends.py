@@ -17,7 +17,7 @@ from mjx_reinforce.fused.backends.backend import Backend
 from mjx_reinforce.fused.backends.llvm import LLVM, Input
 from mjx_reinforce.fused.backends.llvm_text import Text
 from mjx_reinforce.fused.backends.xla import XLA
-from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import is_constant
 from mjx_reinforce.registry import load
 
@@ -100,8 +100,7 @@ def test_a_load_says_how_its_place_is_aligned(align):
         pairs = x[:4].reshape(2, 2)
         return lax.scan(lambda sums, row: (sums * row[0], None), x[5], pairs)[0]
 
-    counts = {"unrolled": 1, "unrolled_arrays": 1, "unrolled_on_request": 1}
-    written = scalarized.build(total, (jnp.ones(6),), [True], 400, **counts)
+    written = scalarized.build(total, (jnp.ones(6),), [True], 400, Limits(1, 1, 1))
     text = Text(1)
     backend = LLVM(text, lambda number: Input("%input", np.dtype(np.float32), align))
     backend.compile(written.schedule, written.outputs)
@@ -122,7 +121,7 @@ def test_constants_fold_to_what_jax_computes(name):
     assert np.isfinite(folded)
     _, *mixes = itertools.product([False, True], repeat=len(operands))
     for mix in mixes:
-        graph = Graph(branch_cost=0, unrolled=0, unrolled_arrays=0, unrolled_on_request=0)
+        graph = Graph(0, Limits())
         leaves = [graph.leaf(x.dtype, True, position=(0, i)) for i, x in enumerate(operands)]
         mixed = [leaf if lane else x for leaf, x, lane in zip(leaves, operands, mix, strict=True)]
         backend = XLA(lambda place: jnp.full(2, operands[place[1]]), (2,))
@@ -134,7 +133,7 @@ def test_constants_fold_to_what_jax_computes(name):
 
 @pytest.mark.parametrize("name", [n for n, facts in ops.FACTS.items() if facts.commutes])
 def test_operations_that_commute_are_shared(name):
-    graph = Graph(branch_cost=0, unrolled=0, unrolled_arrays=0, unrolled_on_request=0)
+    graph = Graph(0, Limits())
     x, y = (graph.leaf(operands_of(name)[0].dtype, True) for _ in range(2))
     assert graph.call(name, x, y) is graph.call(name, y, x)
 

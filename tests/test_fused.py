@@ -1,6 +1,5 @@
 """The fused evaluator against `jax.vmap`, primitive by primitive and loop by loop."""
 
-import functools
 from typing import Any
 
 import jax
@@ -11,6 +10,7 @@ from jax import lax
 
 from mjx_reinforce import fused
 from mjx_reinforce.fused import graph, jaxprs, scalarized, size
+from mjx_reinforce.fused.graph import Limits
 
 BATCH = 6
 
@@ -418,31 +418,11 @@ def test_short_loops_can_stay_loops():
     step = lambda _, x: jnp.sin(x) + x  # noqa: E731
     counts = [
         scalarized.build(
-            lambda x: lax.fori_loop(0, 3, step, x), (jnp.ones(()),), [True], 400, unrolled
+            lambda x: lax.fori_loop(0, 3, step, x), (jnp.ones(()),), [True], 400, Limits(plain)
         ).operations["sin"]
-        for unrolled in (4, 1)
+        for plain in (4, 1)
     ]
     assert counts == [3, 1]
-
-
-def test_a_scan_that_asks_to_be_unrolled_is_written_out_up_to_a_length():
-    def total(x, unroll):
-        step = lambda carry, row: (carry + jnp.sin(row), None)  # noqa: E731
-        return lax.scan(step, 0.0, x, unroll=unroll)[0]
-
-    def sines(unroll, on_request):
-        written = scalarized.build(
-            functools.partial(total, unroll=unroll),
-            (jnp.ones(7),),
-            [True],
-            400,
-            unrolled=1,
-            unrolled_arrays=1,
-            unrolled_on_request=on_request,
-        )
-        return written.operations["sin"]
-
-    assert [sines(1, 7), sines(2, 6), sines(2, 7), sines(7, 1)] == [1, 1, 7, 7]
 
 
 def test_pruned_functions_keep_only_what_they_return():

@@ -184,7 +184,7 @@ def kernel_text(env, sizes):
         examples,
         [True] * len(jax.tree.leaves(examples)),
         step.BRANCH_COST,
-        **program.GPU_LOOPS,
+        program.GPU_LOOPS,
     )
     return player.kernel_text(written, len(jax.tree.leaves(actor)))
 

@@ -25,6 +25,7 @@ What to know before using it:
 - A primitive without a rule raises `UnsupportedPrimitive`, which names the line it came from.
 """
 
+from mjx_reinforce.fused.by_engine import by_engine
 from mjx_reinforce.fused.errors import TooLarge, UnsupportedPrimitive
 from mjx_reinforce.fused.jaxprs import prune
 from mjx_reinforce.fused.lanes import any_lane
@@ -36,6 +37,7 @@ __all__ = [
     "TooLarge",
     "UnsupportedPrimitive",
     "any_lane",
+    "by_engine",
     "prune",
     "scalarize",
     "vmap",

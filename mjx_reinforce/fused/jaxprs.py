@@ -108,10 +108,29 @@ def callee(eqn: Any) -> Program | None:
     return None
 
 
-def default_platform(eqn: Any) -> int:
-    """Returns which branch of `platform_dependent` is the default; its branches agree."""
+def default_platform(eqn: Any) -> int | None:
+    """Returns which branch of `platform_dependent` is the default; None if it has no default.
+
+    The default is taken because what is written out does not depend on where it will run, and the
+    default alone is right on every platform.
+    """
     platforms = list(eqn.params["platforms"])
-    return platforms.index(None) if None in platforms else 0
+    return platforms.index(None) if None in platforms else None
+
+
+def depends(closed: Any, given: Iterable[bool]) -> list[bool]:
+    """Returns which results of a program may depend on some of its arguments.
+
+    Args:
+        closed: a closed jaxpr.
+        given: for each argument, whether it is one of them.
+    """
+    jaxpr = program(closed).jaxpr
+    found = {variable for variable, is_given in zip(jaxpr.invars, given, strict=True) if is_given}
+    for eqn in jaxpr.eqns:
+        if any(_named(atom) and atom in found for atom in eqn.invars):
+            found.update(eqn.outvars)
+    return [_named(out) and out in found for out in jaxpr.outvars]
 
 
 def scan_parts(eqn: Any) -> ScanParts:

@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_reinforce.fused import arrays, evaluate, jaxprs, liveness, loops, size
+from mjx_reinforce.fused import arrays, evaluate, jaxprs, liveness, size
 from mjx_reinforce.fused.backends import BACKENDS
-from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import Scalar
 from mjx_reinforce.registry import check_name, load
 
@@ -68,9 +68,7 @@ def build(
     examples: Sequence[Any],
     varying: Sequence[bool],
     branch_cost: int,
-    unrolled: int = loops.UNROLLED_LENGTH,
-    unrolled_arrays: int = loops.UNROLLED_LENGTH,
-    unrolled_on_request: int = loops.UNROLLED_LENGTH,
+    limits: Limits = Limits(),  # noqa: B008 (a tuple of numbers)
 ) -> Scalarized:
     """Writes a function out.
 
@@ -79,9 +77,7 @@ def build(
         examples: its arguments, or their shapes.
         varying: which of their leaves differ from lane to lane.
         branch_cost: as in `scalarize`.
-        unrolled: a scan that reads and makes no arrays is written out up to this length.
-        unrolled_arrays: one that reads or makes arrays is written out up to this length.
-        unrolled_on_request: one whose `unroll` is more than 1 is, up to this length.
+        limits: up to which length scans are written out.
 
     Raises:
         TooLarge: it is more than is written out.
@@ -89,7 +85,7 @@ def build(
     """
     program, out_shape = jaxprs.trace(fn, *examples)
     size.check_size(program)
-    graph = Graph(branch_cost, unrolled, unrolled_arrays, unrolled_on_request)
+    graph = Graph(branch_cost, limits)
     inputs = [
         _inputs(graph, number, variable.aval, varies)
         for number, (variable, varies) in enumerate(zip(program.jaxpr.invars, varying, strict=True))

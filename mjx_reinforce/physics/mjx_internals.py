@@ -43,7 +43,7 @@ from mujoco.mjx._src.forward import _advance as advance
 from mujoco.mjx._src.math import make_frame
 from mujoco.mjx._src.smooth import solve_m
 
-from mjx_reinforce.physics.by_engine import by_engine
+from mjx_reinforce.fused import by_engine
 
 __all__ = [
     "Collision",

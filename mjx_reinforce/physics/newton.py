@@ -22,7 +22,6 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from mjx_reinforce.physics import contact_rows
-from mjx_reinforce.physics.by_engine import UNROLL
 from mjx_reinforce.physics.mjx_internals import jax_fields
 
 # mjMINVAL: what C takes for zero.
@@ -101,7 +100,7 @@ def supports(model: mjx.Model, data: mjx.Data) -> bool:
 
 
 def solve(
-    model: mjx.Model, data: mjx.Data, unroll: int = UNROLL
+    model: mjx.Model, data: mjx.Data, may_unroll: bool = True
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds the acceleration under constraints, from the start that costs less.
 
@@ -110,7 +109,7 @@ def solve(
     Args:
         model: a model that `supports` accepts; `iterations` and `ls_iterations` bound the loops.
         data: with its constraint rows made.
-        unroll: of loops over contacts, see `by_engine`.
+        may_unroll: whether loops over contacts may be written out, see `fused.by_engine`.
 
     Returns:
         The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
@@ -119,7 +118,7 @@ def solve(
     equality = jnp.arange(fields.efc_D.shape[0]) < fields.ne
     rows = _Rows(fields.efc_J, fields.efc_aref, fields.efc_D, equality)
     num_others = fields.ne + fields.nf + fields.nl
-    division = contact_rows.blocks(num_others, fields.contact.dim, unroll)
+    division = contact_rows.blocks(num_others, fields.contact.dim, may_unroll)
     # A NaN counts as touching, so that it gets to the acceleration.
     touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
     inertia = mjx.full_m(model, data)
