@@ -366,6 +366,47 @@ def test_unsupported_primitive_names_itself_and_its_line():
         fused.vmap(lambda x: lax.linalg.eigh(x)[0])(jnp.ones((2, 3, 3)))
 
 
+@jax.jit
+def through_jit(x):
+    return jnp.fft.fft(x).real  # itself a jitted function of JAX
+
+
+UNSUPPORTED = {
+    "inside of a jitted function": ("fft", "through_jit", through_jit),
+    "inside of a loop": ("fft", "through_jit", lambda x: lax.map(through_jit, x[None])),
+    "inside of random numbers": (
+        *("threefry2x32", "<lambda>"),
+        lambda x: jax.random.normal(jax.random.wrap_key_data(x[:2].astype(jnp.uint32)), (2,)),
+    ),
+    "inside of a choice by engine": (
+        *("fft", "through_jit"),
+        lambda x: fused.by_engine(through_jit, jnp.sin, x),
+    ),
+}
+
+
+@pytest.mark.parametrize("where", UNSUPPORTED)
+def test_unsupported_primitives_name_the_line_of_the_user(where):
+    name, function, fn = UNSUPPORTED[where]
+    words = rf"primitive '{name}', used at \S*test_fused\.py:\S* \({function}"
+    with pytest.raises(fused.UnsupportedPrimitive, match=words):
+        fused.vmap(fn)(jnp.ones((2, 4)))
+
+
+def test_typed_keys_are_refused_in_words():
+    keys = jax.random.split(jax.random.key(0), 3)
+    draw = lambda key: jax.random.normal(key, (2,))  # noqa: E731
+    for fn, args in [
+        (draw, (keys,)),
+        (lambda key, x: x, (keys, jnp.ones(3))),
+        (lambda x: x + draw(keys[0]), (jnp.ones(3),)),
+    ]:
+        with pytest.raises(fused.UnsupportedPrimitive, match=r"typed PRNG keys .* jax\.vmap"):
+            fused.vmap(fn)(*args)
+    with pytest.raises(fused.UnsupportedPrimitive, match=r"'random_seed'.*test_fused\.py"):
+        fused.vmap(lambda x: x + draw(jax.random.key(0)))(jnp.ones(3))
+
+
 SIZES = {
     "elementwise": (lambda x: jnp.sin(x) + x, 12),
     "product": (lambda x: x @ x.T, 2 * 9 * 4),

@@ -154,7 +154,7 @@ def unsupported_by_fused(env: Environment, step: Any) -> str | None:
         return f"its observation has {entries:,} entries, more than {MAX_ENTRIES:,}"
     try:
         written = step.write(*jax.eval_shape(one))
-    except (fused.TooLarge, fused.UnsupportedPrimitive, TypeError) as error:
+    except (fused.TooLarge, fused.UnsupportedPrimitive) as error:
         return " ".join(str(error).split())
     except Exception as error:  # whatever it is, another engine may play this
         return f"it cannot be written out ({explain(error)})"

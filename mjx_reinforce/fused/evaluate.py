@@ -72,9 +72,10 @@ def _apply(graph: Graph, eqn: Any, used: list[bool], operands: list[np.ndarray])
     if program is not None:
         with graph.evaluating(eqn):
             return run(graph, program, operands, used, graph.may_unroll)
-    if all(map(arrays.is_numeric, operands)):
+    makes_keys = any(jaxprs.is_key(out.aval) for out in eqn.outvars)
+    if all(map(arrays.is_numeric, operands)) and not makes_keys:
         return jaxprs.evaluate(eqn.primitive.bind, eqn.params, operands)
-    raise no_rule(name, jaxprs.source(eqn))
+    raise no_rule(name, graph.source(eqn))
 
 
 def _settled(eqn: Any, results: list[np.ndarray]) -> list[np.ndarray]:

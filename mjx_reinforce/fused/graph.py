@@ -87,6 +87,14 @@ class Graph:
         finally:
             self.path = before
 
+    def source(self, eqn: Any) -> str:
+        """Returns the user's line that an equation is from, or else the innermost call around it.
+
+        Inside of a jitted function of JAX no line is the user's.
+        """
+        around = [eqn, *(self._evaluated[number] for number in reversed(self.path))]
+        return next(filter(None, map(jaxprs.source, around)), "an unknown line")
+
     @contextlib.contextmanager
     def loop_body(self) -> Iterator[Scope]:
         """Opens the scope of a loop's body; nodes that do not depend on it are placed outside."""

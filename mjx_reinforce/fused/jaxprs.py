@@ -8,6 +8,7 @@ import functools
 import hashlib
 import re
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -17,6 +18,7 @@ from jax import lax
 from jax.extend import core
 from jax.interpreters import partial_eval
 
+from mjx_reinforce.fused.errors import no_keys
 from mjx_reinforce.fused.ops import FACTS
 
 # The parameter under which a call-like primitive keeps the jaxpr that it calls.
@@ -155,6 +157,8 @@ def as_numpy(value: Any) -> np.ndarray | None:
     """Returns a constant's value, or None for a tracer, which has none yet."""
     if isinstance(value, jax.core.Tracer):
         return None
+    if is_key(jax.typeof(value)):
+        raise no_keys()
     return np.asarray(value)
 
 
@@ -193,13 +197,22 @@ def live_equations(jaxpr: core.Jaxpr, used: Iterable[bool]) -> list[Any]:
 
 
 def source(eqn: Any) -> str:
-    """Returns 'file:line (function)' of the user's code that an equation came from."""
+    """Returns 'file:line (function)' of the user's code that an equation came from.
+
+    It is "" where the equation came from inside of a jitted function of JAX, or from here.
+    """
     try:
         from jax._src import source_info_util  # no public equivalent
 
-        return source_info_util.summarize(eqn.source_info)
+        line = source_info_util.summarize(eqn.source_info)
     except (ImportError, AttributeError):
-        return "an unknown line"
+        return ""
+    return "" if line.startswith(str(Path(__file__).parent)) else line
+
+
+def is_key(aval: Any) -> bool:
+    """Returns whether an abstract value is an array of typed PRNG keys."""
+    return jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key)
 
 
 def operation(name: str) -> Callable[..., Any]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from mjx_reinforce.fused import arrays, evaluate, jaxprs, liveness, size
 from mjx_reinforce.fused.backends import BACKENDS
+from mjx_reinforce.fused.errors import no_keys
 from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import Scalar
 from mjx_reinforce.registry import check_name, load
@@ -84,6 +85,8 @@ def build(
         UnsupportedPrimitive: it uses a primitive that has no rule.
     """
     program, out_shape = jaxprs.trace(fn, *examples)
+    if any(jaxprs.is_key(variable.aval) for variable in program.jaxpr.invars):
+        raise no_keys()
     size.check_size(program)
     graph = Graph(branch_cost, limits)
     inputs = [

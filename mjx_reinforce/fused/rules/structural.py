@@ -88,7 +88,7 @@ def _empty(graph: Graph, eqn: Any) -> list[np.ndarray]:
 def _platform_index(graph: Graph, eqn: Any) -> list[np.ndarray]:
     default = jaxprs.default_platform(eqn)
     if default is None:
-        raise no_rule("platform_dependent without a default", jaxprs.source(eqn))
+        raise no_rule("platform_dependent without a default", graph.source(eqn))
     return [np.asarray(default, eqn.outvars[0].aval.dtype)]
 
 
