@@ -335,6 +335,21 @@ def test_known_deviation_of_a_constant_zero():
     assert fused.vmap(lambda x: x * 0.0)(jnp.array([jnp.nan]))[0] == 0
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("function", [lax.div, lax.rem])
+@pytest.mark.parametrize("dtype", [jnp.int8, jnp.int32, jnp.uint32])
+def test_division_by_a_constant_zero_is_that_by_an_input(function, dtype):
+    """By integers -1, and the dividend remains. XLA itself stops the process at such a constant."""
+    x, zero = jnp.array([7, 0, 1], dtype), jnp.zeros(3, dtype)
+    expected = jax.vmap(function)(x, zero)
+    np.testing.assert_array_equal(fused.vmap(function)(x, zero), expected)
+    constant = fused.vmap(lambda x: function(x, dtype(0)))
+    np.testing.assert_array_equal(constant(x), expected)
+    for number, result in zip(np.asarray(x), np.asarray(expected), strict=True):
+        both = fused.vmap(lambda x, number=number: function(number, dtype(0)) + 0 * x)
+        np.testing.assert_array_equal(both(x), result)
+
+
 def test_wiring_costs_nothing():
     def fn(x):
         padded = jnp.pad(x.reshape(3, 2).T, ((1, 1), (0, 0)))[1:-1]

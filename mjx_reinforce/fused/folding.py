@@ -33,10 +33,21 @@ def fold(op: Op, operands: Sequence[Any], dtype: np.dtype) -> Any:
 
 
 def _divide(x: Any, y: Any) -> Any:
-    """Division as XLA does it: integers round towards zero."""
-    if np.issubdtype(np.asarray(x).dtype, np.integer):
-        return np.where(y == 0, -1, (x - np.fmod(x, y)) // np.where(y == 0, 1, y))
-    return np.true_divide(x, y)
+    """Division as XLA does it: integers round towards zero, and by zero it is -1."""
+    if not _are_integers(x):
+        return np.true_divide(x, y)
+    return np.where(y == 0, -1, (x - _remainder(x, y)) // np.where(y == 0, 1, y))
+
+
+def _remainder(x: Any, y: Any) -> Any:
+    """The rest of that division: an integer divided by zero is what remains."""
+    if not _are_integers(x):
+        return np.fmod(x, y)
+    return np.where(y == 0, x, np.fmod(x, np.where(y == 0, 1, y)))
+
+
+def _are_integers(x: Any) -> bool:
+    return np.issubdtype(np.asarray(x).dtype, np.integer)
 
 
 def _select(predicate: Any, *cases: Any) -> Any:
@@ -60,7 +71,7 @@ def _rsqrt(x: Any) -> Any:
 _EXCEPTIONS: dict[str, Callable[..., Any]] = {
     "select_n": _select,
     "div": _divide,
-    "rem": np.fmod,
+    "rem": _remainder,
     "rsqrt": _rsqrt,
     "logistic": _logistic,
 }
