@@ -9,7 +9,7 @@ import pytest
 from jax import lax
 
 from mjx_reinforce import fused
-from mjx_reinforce.fused import graph, jaxprs, scalarized, size
+from mjx_reinforce.fused import graph, jaxprs, scalarized, simplify, size
 from mjx_reinforce.fused.graph import Limits
 
 BATCH = 6
@@ -330,9 +330,41 @@ def test_a_nan_stays_in_its_lane(fn):
         np.testing.assert_array_equal(np.delete(dirty, 2, 0), np.delete(reference, 2, 0))
 
 
-def test_known_deviation_of_a_constant_zero():
-    """Documented: a product with a constant zero is zero, whatever the other factor is."""
-    assert fused.vmap(lambda x: x * 0.0)(jnp.array([jnp.nan]))[0] == 0
+NUMBERS = jnp.array([jnp.nan, jnp.inf, -jnp.inf, -0.0, 0.0, 1.0])
+#: The exceptions that the docstring of `fused` lists, and what each makes of `NUMBERS`.
+EXCEPTIONS = {
+    "x * 0": (lambda x: x * 0.0, [0, 0, 0, 0, 0, 0]),
+    "0 / x": (lambda x: 0.0 / x, [0, 0, 0, 0, 0, 0]),
+    "x - x": (lambda x: x - x, [0, 0, 0, 0, 0, 0]),
+    "x times a bool": (lambda x: x * (x == 1), [0, 0, 0, 0, 0, 1]),
+    "x + 0": (lambda x: 1 / (x + 0.0), [np.nan, 0, -0.0, -np.inf, np.inf, 1]),
+    "0 - x": (lambda x: 1 / (0.0 - x), [np.nan, -0.0, 0, np.inf, -np.inf, -1]),
+    "-(x - y)": (lambda x: 1 / -(x - 1.0), [np.nan, -0.0, 0, 1, 1, np.inf]),
+}
+
+
+@pytest.mark.parametrize("name", EXCEPTIONS)
+def test_exceptions_of_floating_point_are_listed(name):
+    function, expected = EXCEPTIONS[name]
+    np.testing.assert_array_equal(jax.jit(fused.vmap(function))(NUMBERS), np.float32(expected))
+    assert name in (fused.__doc__ or "")
+
+
+def test_the_algebra_quotes_the_list_of_exceptions():
+    listed = (fused.__doc__ or "").partition("are constants:\n\n")[2].partition("- Sums")[0]
+    assert listed.count("\n- ") == 3
+    assert listed in (simplify.__doc__ or "")
+
+
+def test_a_factor_is_nan_from_the_column_on_that_shows_it_is_none():
+    factor = fused.vmap(lax.linalg.cholesky)(jnp.array([[[1.0, 2.0], [2.0, 1.0]]]))
+    np.testing.assert_array_equal(factor, [[[1, 0], [2, np.nan]]])
+
+
+def test_infinite_terms_of_a_sum_of_exponentials():
+    x = jnp.array([[-jnp.inf, -jnp.inf, 1.0], [jnp.inf, jnp.inf, 1], [jnp.inf, -jnp.inf, 1]])
+    x = jnp.concatenate([x, jnp.array([[jnp.nan, 1.0, 2.0], [1.0, 2.0, 3.0]])])
+    assert_same(lambda x: lax.cumlogsumexp(x, 0), x)
 
 
 @pytest.mark.filterwarnings("error")
@@ -345,6 +377,8 @@ def test_division_by_a_constant_zero_is_that_by_an_input(function, dtype):
     np.testing.assert_array_equal(fused.vmap(function)(x, zero), expected)
     constant = fused.vmap(lambda x: function(x, dtype(0)))
     np.testing.assert_array_equal(constant(x), expected)
+    constant = fused.vmap(lambda x: function(dtype(0), x))
+    np.testing.assert_array_equal(constant(x), jax.vmap(function)(zero, x))
     for number, result in zip(np.asarray(x), np.asarray(expected), strict=True):
         both = fused.vmap(lambda x, number=number: function(number, dtype(0)) + 0 * x)
         np.testing.assert_array_equal(both(x), result)

@@ -1,8 +1,11 @@
 """Algebra on scalars: what need not be computed.
 
-Everything here keeps IEEE results, but for two deviations that the speed comes from:
-  - x * 0, 0 / x and x - x are 0, also where x is infinite or NaN;
-  - the sign of a zero is not kept (x + 0 is x, 0 - x is -x, a masked product is +0).
+Results are those of IEEE arithmetic, with the exceptions that the package's docstring lists:
+
+- x * 0, 0 / x and x - x are 0, also where x is infinite or NaN.
+- x times a bool is 0 where the bool is false, also where x is infinite or NaN.
+- The sign of a zero is not kept: x + 0 is x, 0 - x is -x, and -(x - y) is y - x.
+- A power with a constant integer exponent up to 8 is a product, which rounds otherwise.
 
 A division by a constant becomes a product only where the reciprocal is exact.
 """
@@ -126,7 +129,7 @@ def _mask(graph: Builder, mask: Scalar, value: Scalar) -> Scalar | None:
 
 
 def _div(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
-    if _is(x, 0):
+    if _is(x, 0) and np.issubdtype(x.dtype, np.floating):  # an integer 0 / 0 is -1
         return x
     if is_constant(y) and np.issubdtype(y.dtype, np.floating):
         mantissa, exponent = np.frexp(y)
