@@ -24,14 +24,6 @@ from mjx_reinforce.registry import load
 #: Operands of which every float operation is finite.
 FLOATS = np.float32([0.25, 0.5, 0.75])
 BITS = np.int32([6, 3, 0])
-#: What an operation takes, if it is not one or two floats.
-ARITY = {"select_n": 3, "regularized_incomplete_beta": 3}
-TWO = {
-    *("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne", "lt", "le", "gt", "ge", "sub"),
-    *("div", "rem", "pow", "atan2", "nextafter", "shift_left", "shift_right_arithmetic"),
-    *("shift_right_logical", "igamma", "igamma_grad_a", "igammac", "polygamma", "zeta"),
-    "random_gamma_grad",
-}
 ON_BITS = {
     *("and", "or", "xor", "not", "shift_left", "shift_right_arithmetic", "shift_right_logical"),
     *("clz", "population_count"),
@@ -54,7 +46,7 @@ PARAMS = {
 
 def operands_of(name):
     values = BITS if name in ON_BITS else FLOATS
-    operands = list(values[: 2 if name in TWO else ARITY.get(name, 1)])
+    operands = list(values[: ops.FACTS[name].arity])
     if name == "select_n":
         operands[0] = np.True_
     if name == "acosh":

@@ -29,6 +29,7 @@ class Facts(NamedTuple):
         in_numpy: operands -> result; None where NumPy has no one function for it.
         in_jax: the name of a function of `jax.lax`, (operands, **parameters) -> result; "" where
             that is the name of the operation.
+        arity: how many operands it takes; `select_n` takes a number of a case and the cases.
         commutes: whether two operands may change places.
         is_predicate: whether the result is a bool whatever the operands are.
         has_params: whether the parameters of the JAX primitive are part of the operation.
@@ -36,6 +37,7 @@ class Facts(NamedTuple):
 
     in_numpy: Callable[..., Any] | None = None
     in_jax: str = ""
+    arity: int = 1
     commutes: bool = False
     is_predicate: bool = False
     has_params: bool = False
@@ -43,28 +45,28 @@ class Facts(NamedTuple):
 
 #: Every operation that a rule can make.
 FACTS: dict[str, Facts] = {
-    "add": Facts(np.add, commutes=True),
-    "mul": Facts(np.multiply, commutes=True),
-    "max": Facts(np.maximum, commutes=True),
-    "min": Facts(np.minimum, commutes=True),
-    "and": Facts(np.bitwise_and, in_jax="bitwise_and", commutes=True),
-    "or": Facts(np.bitwise_or, in_jax="bitwise_or", commutes=True),
-    "xor": Facts(np.bitwise_xor, in_jax="bitwise_xor", commutes=True),
-    "eq": Facts(np.equal, is_predicate=True),
-    "ne": Facts(np.not_equal, is_predicate=True),
-    "lt": Facts(np.less, is_predicate=True),
-    "le": Facts(np.less_equal, is_predicate=True),
-    "gt": Facts(np.greater, is_predicate=True),
-    "ge": Facts(np.greater_equal, is_predicate=True),
+    "add": Facts(np.add, arity=2, commutes=True),
+    "mul": Facts(np.multiply, arity=2, commutes=True),
+    "max": Facts(np.maximum, arity=2, commutes=True),
+    "min": Facts(np.minimum, arity=2, commutes=True),
+    "and": Facts(np.bitwise_and, in_jax="bitwise_and", arity=2, commutes=True),
+    "or": Facts(np.bitwise_or, in_jax="bitwise_or", arity=2, commutes=True),
+    "xor": Facts(np.bitwise_xor, in_jax="bitwise_xor", arity=2, commutes=True),
+    "eq": Facts(np.equal, arity=2, is_predicate=True),
+    "ne": Facts(np.not_equal, arity=2, is_predicate=True),
+    "lt": Facts(np.less, arity=2, is_predicate=True),
+    "le": Facts(np.less_equal, arity=2, is_predicate=True),
+    "gt": Facts(np.greater, arity=2, is_predicate=True),
+    "ge": Facts(np.greater_equal, arity=2, is_predicate=True),
     "is_finite": Facts(np.isfinite, is_predicate=True),
-    "select_n": Facts(),
-    "sub": Facts(np.subtract),
-    "div": Facts(),
-    "rem": Facts(),
-    "pow": Facts(np.power),
-    "atan2": Facts(np.arctan2),
-    "nextafter": Facts(np.nextafter),
-    "shift_left": Facts(np.left_shift),
+    "select_n": Facts(arity=3),
+    "sub": Facts(np.subtract, arity=2),
+    "div": Facts(arity=2),
+    "rem": Facts(arity=2),
+    "pow": Facts(np.power, arity=2),
+    "atan2": Facts(np.arctan2, arity=2),
+    "nextafter": Facts(np.nextafter, arity=2),
+    "shift_left": Facts(np.left_shift, arity=2),
     "neg": Facts(np.negative),
     "not": Facts(np.invert, in_jax="bitwise_not"),
     "abs": Facts(np.abs),
@@ -101,19 +103,19 @@ FACTS: dict[str, Facts] = {
     "erf": Facts(has_params=True),
     "erf_inv": Facts(has_params=True),
     "erfc": Facts(has_params=True),
-    "igamma": Facts(has_params=True),
-    "igamma_grad_a": Facts(has_params=True),
-    "igammac": Facts(has_params=True),
+    "igamma": Facts(arity=2, has_params=True),
+    "igamma_grad_a": Facts(arity=2, has_params=True),
+    "igammac": Facts(arity=2, has_params=True),
     "lgamma": Facts(has_params=True),
-    "polygamma": Facts(has_params=True),
+    "polygamma": Facts(arity=2, has_params=True),
     "population_count": Facts(has_params=True),
     "round": Facts(has_params=True),
-    "zeta": Facts(has_params=True),
-    "random_gamma_grad": Facts(has_params=True),
+    "zeta": Facts(arity=2, has_params=True),
+    "random_gamma_grad": Facts(arity=2, has_params=True),
     "reduce_precision": Facts(has_params=True),
-    "regularized_incomplete_beta": Facts(in_jax="betainc", has_params=True),
-    "shift_right_arithmetic": Facts(has_params=True),
-    "shift_right_logical": Facts(has_params=True),
+    "regularized_incomplete_beta": Facts(in_jax="betainc", arity=3, has_params=True),
+    "shift_right_arithmetic": Facts(arity=2, has_params=True),
+    "shift_right_logical": Facts(arity=2, has_params=True),
 }
 
 SELECT = Op("select_n")

@@ -15,6 +15,9 @@ from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import Scalar
 from mjx_reinforce.registry import check_name, load
 
+#: Looks at every program that is written out, before anyone uses it. The tests set it to `verify`.
+inspect: Callable[["Scalarized"], None] | None = None
+
 
 @dataclasses.dataclass(frozen=True)
 class Scalarized:
@@ -97,7 +100,7 @@ def build(
         results = evaluate.run(graph, program, inputs)
     outputs = [arrays.elements(result) for result in results]
     out_avals, out_tree = jax.tree.flatten(out_shape)
-    return Scalarized(
+    written = Scalarized(
         in_avals=[variable.aval for variable in program.jaxpr.invars],
         out_tree=out_tree,
         out_avals=out_avals,
@@ -105,6 +108,9 @@ def build(
         schedule=liveness.schedule(graph.scope, (x for leaf in outputs for x in leaf)),
         captures=graph.captures,
     )
+    if inspect is not None:
+        inspect(written)
+    return written
 
 
 def _inputs(graph: Graph, number: int, aval: Any, varying: bool) -> np.ndarray:
