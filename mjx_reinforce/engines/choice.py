@@ -18,7 +18,7 @@ from mjx_reinforce import fused
 from mjx_reinforce.checks import explain
 from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.engines.rollouts import rollout
-from mjx_reinforce.fused.vmap import MAX_OPERATIONS
+from mjx_reinforce.fused.vmap import MAX_OPERATIONS, Mapped
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Environment, Trajectory, null_action
@@ -135,7 +135,7 @@ def _from_any_key(
     return play(env, act, actor, distribution, key, **options)
 
 
-def unsupported_by_fused(env: Environment, step: Any) -> str | None:
+def unsupported_by_fused(env: Environment, step: Mapped) -> str | None:
     """Returns why an environment does not run, or not well, on the fused engine; None if it does.
 
     Nothing is compiled: the step is traced and written out, about a second.

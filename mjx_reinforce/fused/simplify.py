@@ -139,7 +139,7 @@ def _div(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
 
 
 def _pow(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
-    if is_constant(y) and y == int(y if np.isfinite(y) else 0.5) and abs(y) <= _LARGEST_POWER:
+    if is_constant(y) and float(y).is_integer() and abs(y) <= _LARGEST_POWER:
         return power(graph, x, int(y))
     return None
 
@@ -248,7 +248,7 @@ def _through_select(
 ) -> Scalar | None:
     """Folds an operation whose operands are constants and selections among constants."""
     nodes = [arg for arg in args if not is_constant(arg)]
-    if op.name == "convert_element_type" and nodes[0].dtype == np.bool_ != dtype:
+    if op.name == "convert_element_type" and nodes[0].dtype == np.bool_ and dtype != np.bool_:
         return graph.select(nodes[0], dtype.type(1), dtype.type(0))
     choices: list[tuple] = [_args(node, "select_n") or () for node in nodes]
     for choice in choices:
