@@ -72,7 +72,7 @@ def choose(
       name: one of ``NAMES``.
       env: what is played.
       player: who plays it; None where every episode has parameters of its own, which
-        machine code cannot hold.
+      machine code cannot hold.
       horizon: T, the time limit in steps, for machine code.
 
     Raises:

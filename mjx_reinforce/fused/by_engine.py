@@ -1,7 +1,8 @@
-"""`by_engine`: one result computed in two ways, for an engine that writes out and for XLA.
+"""``by_engine``: one result computed in two ways, for an engine that writes out and for XLA.
 
-The choice is a primitive of our own, `by_engine`, which carries both programs. XLA compiles
-`many` and never sees `one`; `fused` writes `one` out. No other code chooses between the two.
+The choice is a primitive of our own, ``by_engine``, which carries both programs. XLA compiles
+``many`` and never sees ``one``; ``fused`` writes ``one`` out. No other code chooses between the
+two.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,19 +22,19 @@ _CHOICE.multiple_results = True
 
 
 def by_engine(one: Callable, many: Callable, *args: Any, may_unroll: bool = False) -> Any:
-    """Computes `many` where XLA compiles it, and `one` where `fused` writes it out.
+    """Computes ``many`` where XLA compiles it, and ``one`` where ``fused`` writes it out.
 
-    The derivative is that of `many`, for all engines.
+    The derivative is that of ``many``, for all engines.
 
     Args:
-        one: best where an episode takes its own branches.
-        many: best where many episodes are computed at once; it returns the same.
-        *args: arguments of both.
-        may_unroll: whether the scans of `one` may be written out, those outside of its loops and
-            branches. Up to which length they are is the engine's `Limits.unrollable`.
+      one: best where an episode takes its own branches.
+      many: best where many episodes are computed at once; it returns the same.
+      *args: arguments of both.
+      may_unroll: whether the scans of ``one`` may be written out, those outside of its loops and
+        branches. Up to which length they are is the engine's ``Limits.unrollable``.
 
     Raises:
-        TypeError: the results of `one` and `many` differ in structure, shape or dtype.
+      TypeError: the results of ``one`` and ``many`` differ in structure, shape or dtype.
     """
     leaves, tree = jax.tree.flatten(args)
     (first, shapes), (second, others) = (
@@ -59,7 +60,7 @@ def _described(shapes: Any) -> tuple[Any, list[tuple]]:
 
 
 def _without_consts(jaxpr: Any, consts: slice, end: int, operands: Sequence[Any]) -> Any:
-    """Returns a program of all operands, of which the first `end` are constants of programs."""
+    """Returns a program of all operands, of which the first ``end`` are constants of programs."""
     return jax.make_jaxpr(lambda *xs: jax.core.eval_jaxpr(jaxpr, xs[consts], *xs[end:]))(*operands)
 
 

@@ -35,11 +35,11 @@ def run(
     """Returns a program's outputs.
 
     Args:
-        graph: where nodes are made.
-        program: what is evaluated.
-        args: its arguments.
-        used: which of its outputs are; others are zeros, and nothing is computed for them.
-        may_unroll: whether its scans may be written out; see `by_engine`.
+      graph: where nodes are made.
+      program: what is evaluated.
+      args: its arguments.
+      used: which of its outputs are; others are zeros, and nothing is computed for them.
+      may_unroll: whether its scans may be written out; see ``by_engine``.
     """
     jaxpr = program.jaxpr
     used = [True] * len(jaxpr.outvars) if used is None else used

@@ -13,12 +13,12 @@ def fold(op: Op, operands: Sequence[Any], dtype: np.dtype) -> Any:
     """Applies an operation to constants, scalars or arrays.
 
     Args:
-        op: the operation.
-        operands: NumPy scalars or arrays of one shape.
-        dtype: that of the result.
+      op: the operation.
+      operands: NumPy scalars or arrays of one shape.
+      dtype: that of the result.
 
     Returns:
-        A NumPy array, or a NumPy scalar where the operands are scalars.
+      A NumPy array, or a NumPy scalar where the operands are scalars.
     """
     name = op.name
     if name == "convert_element_type":

@@ -1,8 +1,8 @@
 """The scalar graph: a program as elementwise operations on scalars.
 
-`nodes` has the parts; here they are made. Equal nodes are one object, so common subexpressions are
-shared. A node that needs nothing of a loop's body is placed before the loop. Nothing is moved out
-of a branch, because then it would run also where the branch is skipped.
+``nodes`` has the parts; here they are made. Equal nodes are one object, so common subexpressions
+are shared. A node that needs nothing of a loop's body is placed before the loop. Nothing is moved
+out of a branch, because then it would run also where the branch is skipped.
 """
 
 import contextlib
@@ -23,12 +23,11 @@ class Limits(NamedTuple):
     """Up to which length a scan is written out.
 
     Constants fold iteration by iteration in a scan that is written out, and a loop is shorter. A
-    scan whose own `unroll` is its whole length is always written out, as JAX does.
+    scan whose own ``unroll`` is its whole length is always written out, as JAX does.
 
-    Attributes:
-        plain: of a scan that reads and makes no arrays.
-        arrays: of one that reads or makes arrays, which a loop keeps in memory.
-        unrollable: of one for which `by_engine` says that it may be, instead of the other two.
+    plain: of a scan that reads and makes no arrays.
+    arrays: of one that reads or makes arrays, which a loop keeps in memory.
+    unrollable: of one for which ``by_engine`` says that it may be, instead of the other two.
     """
 
     plain: int = 4
@@ -36,23 +35,22 @@ class Limits(NamedTuple):
     unrollable: int = 4
 
 
-#: `size` foresees what is written; where it errs, writing ends here.
+#: ``size`` foresees what is written; where it errs, writing ends here.
 _MOST = 3 * MAX_SCALARS
 
 
 class Graph:
     """Makes nodes, folding constants and sharing equal ones.
 
-    Attributes:
-        branch_cost: a branch of more scalar operations than this is skipped where no element of
-            the batch needs it.
-        limits: up to which length scans are written out.
-        may_unroll: whether `limits.unrollable` is that of a scan that is evaluated now.
-        path: the equations that are being evaluated, from the outermost one, by their ids.
-        learned: what was found out on a path. The body of a loop is evaluated again and again, each
-            time with less assumed of what never changes, and what was found out inside still holds.
-        certain: predicates of the branches and loops around the present scope. Its code runs only
-            if each of them is true for at least one element of the batch.
+    branch_cost: a branch of more scalar operations than this is skipped where no element of
+      the batch needs it.
+    limits: up to which length scans are written out.
+    may_unroll: whether ``limits.unrollable`` is that of a scan that is evaluated now.
+    path: the equations that are being evaluated, from the outermost one, by their ids.
+    learned: what was found out on a path. The body of a loop is evaluated again and again, each
+      time with less assumed of what never changes, and what was found out inside still holds.
+    certain: predicates of the branches and loops around the present scope. Its code runs only
+      if each of them is true for at least one element of the batch.
     """
 
     def __init__(self, branch_cost: int, limits: Limits):

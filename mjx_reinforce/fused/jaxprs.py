@@ -28,9 +28,8 @@ _CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 class Program(NamedTuple):
     """A jaxpr with the values of its constant variables.
 
-    Attributes:
-        jaxpr: the equations.
-        consts: one array for each constant variable; may be tracers.
+    jaxpr: the equations.
+    consts: one array for each constant variable; may be tracers.
     """
 
     jaxpr: core.Jaxpr
@@ -38,11 +37,10 @@ class Program(NamedTuple):
 
 
 class ScanParts(NamedTuple):
-    """How the operands and results of a `scan` equation divide.
+    """How the operands and results of a ``scan`` equation divide.
 
-    Attributes:
-        num_consts: the leading operands, the same in every iteration.
-        num_carry: the operands after them, and the leading results; the rest are xs and ys.
+    num_consts: the leading operands, the same in every iteration.
+    num_carry: the operands after them, and the leading results; the rest are xs and ys.
     """
 
     num_consts: int
@@ -111,7 +109,7 @@ def callee(eqn: Any) -> Program | None:
 
 
 def default_platform(eqn: Any) -> int | None:
-    """Returns which branch of `platform_dependent` is the default; None if it has no default.
+    """Returns which branch of ``platform_dependent`` is the default; None if it has no default.
 
     The default is taken because what is written out does not depend on where it will run, and the
     default alone is right on every platform.
@@ -124,8 +122,8 @@ def depends(closed: Any, given: Iterable[bool]) -> list[bool]:
     """Returns which results of a program may depend on some of its arguments.
 
     Args:
-        closed: a closed jaxpr.
-        given: for each argument, whether it is one of them.
+      closed: a closed jaxpr.
+      given: for each argument, whether it is one of them.
     """
     jaxpr = program(closed).jaxpr
     found = {variable for variable, is_given in zip(jaxpr.invars, given, strict=True) if is_given}
@@ -136,7 +134,7 @@ def depends(closed: Any, given: Iterable[bool]) -> list[bool]:
 
 
 def scan_parts(eqn: Any) -> ScanParts:
-    """Returns how a `scan` equation's operands divide."""
+    """Returns how a ``scan`` equation's operands divide."""
     if "num_consts" in eqn.params:  # JAX 0.10
         return ScanParts(eqn.params["num_consts"], eqn.params["num_carry"])
     consts, carry, _ = eqn.params["ft_in"].update(list(eqn.invars)).unpack()
@@ -163,9 +161,9 @@ def as_numpy(value: Any) -> np.ndarray | None:
 
 
 def prune(fn: Callable) -> Callable:
-    """Returns fn without the operations that its results do not need; to be called under `jax.jit`.
+    """Returns fn without the operations that its results do not need; call it under ``jax.jit``.
 
-    Simulators compute much that one task does not read, and `jax.vmap` and the compiler pay for
+    Simulators compute much that one task does not read, and ``jax.vmap`` and the compiler pay for
     all of it.
     """
 

@@ -1,4 +1,4 @@
-"""Rules for `while` and `scan`: loops that end when no lane needs another iteration."""
+"""Rules for ``while`` and ``scan``: loops that end when no lane needs another iteration."""
 
 from collections.abc import Callable
 from typing import Any

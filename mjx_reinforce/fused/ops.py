@@ -1,6 +1,6 @@
 """The operations of the scalar graph: the one table of their names, and of how each is computed.
 
-JAX computes an operation on lanes, NumPy computes it on constants. `folding` lists what NumPy has
+JAX computes an operation on lanes, NumPy computes it on constants. ``folding`` lists what NumPy has
 no one function for, and a backend that does not go through JAX lists what it writes instead.
 """
 
@@ -13,9 +13,8 @@ import numpy as np
 class Op(NamedTuple):
     """An elementwise operation. Equal operations are equal tuples.
 
-    Attributes:
-        name: a name of `FACTS`; mostly that of a JAX primitive.
-        params: its parameters by name, sorted; few operations have any.
+    name: a name of ``FACTS``; mostly that of a JAX primitive.
+    params: its parameters by name, sorted; few operations have any.
     """
 
     name: str
@@ -25,14 +24,13 @@ class Op(NamedTuple):
 class Facts(NamedTuple):
     """What is known of a name.
 
-    Attributes:
-        in_numpy: operands -> result; None where NumPy has no one function for it.
-        in_jax: the name of a function of `jax.lax`, (operands, **parameters) -> result; "" where
-            that is the name of the operation.
-        arity: how many operands it takes; `select_n` takes a number of a case and the cases.
-        commutes: whether two operands may change places.
-        is_predicate: whether the result is a bool whatever the operands are.
-        has_params: whether the parameters of the JAX primitive are part of the operation.
+    in_numpy: operands -> result; None where NumPy has no one function for it.
+    in_jax: the name of a function of ``jax.lax``, (operands, **parameters) -> result; "" where
+      that is the name of the operation.
+    arity: how many operands it takes; ``select_n`` takes a number of a case and the cases.
+    commutes: whether two operands may change places.
+    is_predicate: whether the result is a bool whatever the operands are.
+    has_params: whether the parameters of the JAX primitive are part of the operation.
     """
 
     in_numpy: Callable[..., Any] | None = None

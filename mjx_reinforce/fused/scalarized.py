@@ -1,4 +1,4 @@
-"""`scalarize`: a function of one example, written out in scalars."""
+"""``scalarize``: a function of one example, written out in scalars."""
 
 import dataclasses
 from collections import Counter
@@ -15,7 +15,7 @@ from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import Scalar
 from mjx_reinforce.registry import check_name, load
 
-#: Looks at every program that is written out, before anyone uses it. The tests set it to `verify`.
+#: Looks at every program that was written out. The tests set it to ``verify``; users leave it.
 inspect: Callable[["Scalarized"], None] | None = None
 
 
@@ -23,13 +23,12 @@ inspect: Callable[["Scalarized"], None] | None = None
 class Scalarized:
     """A function written out in scalars.
 
-    Attributes:
-        in_avals: shape and dtype of each leaf of the arguments.
-        out_tree: the structure of its result.
-        out_avals: shape and dtype of each leaf of the result.
-        outputs: the scalars of each leaf of the result.
-        schedule: the steps that compute them.
-        captures: whether it closes over an array that an outer transformation traces.
+    in_avals: shape and dtype of each leaf of the arguments.
+    out_tree: the structure of its result.
+    out_avals: shape and dtype of each leaf of the result.
+    outputs: the scalars of each leaf of the result.
+    schedule: the steps that compute them.
+    captures: whether it closes over an array that an outer transformation traces.
     """
 
     in_avals: list[Any]
@@ -43,8 +42,8 @@ class Scalarized:
         """Returns what a backend makes of the function.
 
         Args:
-            backend: a name of `backends.BACKENDS`.
-            **settings: what the backend takes.
+          backend: a name of ``backends.BACKENDS``.
+          **settings: what the backend takes.
         """
         check_name("backend", backend, BACKENDS)
         return load(BACKENDS[backend])(**settings).compile(self.schedule, self.outputs)
@@ -59,10 +58,10 @@ def scalarize(fn: Callable, *examples: Any, branch_cost: int = 400) -> Scalarize
     """Writes a function out in scalars, for a backend.
 
     Args:
-        fn: a function of one example.
-        *examples: its arguments, or their `jax.ShapeDtypeStruct`s.
-        branch_cost: a branch of `cond` with more operations than this, or with a loop, is skipped
-            where no lane needs it; others are computed for every lane.
+      fn: a function of one example.
+      *examples: its arguments, or their ``jax.ShapeDtypeStruct``s.
+      branch_cost: a branch of ``cond`` with more operations than this, or with a loop, is skipped
+        where no lane needs it; others are computed for every lane.
     """
     return build(fn, examples, [True] * len(jax.tree.leaves(examples)), branch_cost)
 
@@ -77,15 +76,15 @@ def build(
     """Writes a function out.
 
     Args:
-        fn: a function of one example.
-        examples: its arguments, or their shapes.
-        varying: which of their leaves differ from lane to lane.
-        branch_cost: as in `scalarize`.
-        limits: up to which length scans are written out.
+      fn: a function of one example.
+      examples: its arguments, or their shapes.
+      varying: which of their leaves differ from lane to lane.
+      branch_cost: as in ``scalarize``.
+      limits: up to which length scans are written out.
 
     Raises:
-        TooLarge: it is more than is written out.
-        UnsupportedPrimitive: it uses a primitive that has no rule.
+      TooLarge: it is more than is written out.
+      UnsupportedPrimitive: it uses a primitive that has no rule.
     """
     program, out_shape = jaxprs.trace(fn, *examples)
     if any(jaxprs.is_key(variable.aval) for variable in program.jaxpr.invars):

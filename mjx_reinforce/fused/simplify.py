@@ -19,7 +19,7 @@ from mjx_reinforce.fused import folding
 from mjx_reinforce.fused.nodes import Node, Scalar, is_constant
 from mjx_reinforce.fused.ops import Op
 
-# Greater powers are not faster as products than as `pow`.
+# Greater powers are not faster as products than as ``pow``.
 _LARGEST_POWER = 8
 
 
@@ -178,7 +178,7 @@ def _or(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
 
 
 def _bitwise(x: Scalar, y: Scalar, absorbing: bool) -> Scalar | None:
-    """Simplifies `and` (absorbing False) and `or` (absorbing True) of bools."""
+    """Simplifies ``and`` (absorbing False) and ``or`` (absorbing True) of bools."""
     if x.dtype != np.bool_:
         return None
     for left, right in ((x, y), (y, x)):

@@ -1,4 +1,4 @@
-"""`verify`: whether a program that was written out is well formed. The tests ask, users do not.
+"""``verify``: whether a program that was written out is well formed. The tests ask, users do not.
 
 What graph, algebra, loops and liveness must keep is checked by walking through the schedule as a
 backend does: every operand is there before it is used, dtypes and numbers of operands fit, what a
@@ -25,7 +25,7 @@ def verify(written: Scalarized) -> None:
     """Checks a program.
 
     Raises:
-        AssertionError: it is not well formed; the message says where.
+      AssertionError: it is not well formed; the message says where.
     """
     for aval, scalars in zip(written.out_avals, written.outputs, strict=True):
         _check(len(scalars) == np.prod(aval.shape, dtype=int), "a result has too few scalars")

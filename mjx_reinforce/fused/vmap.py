@@ -1,4 +1,4 @@
-"""`vmap`: a drop-in for `jax.vmap` that leaves only elementwise work."""
+"""``vmap``: a drop-in for ``jax.vmap`` that leaves only elementwise work."""
 
 import functools
 import warnings
@@ -17,37 +17,37 @@ MAX_OPERATIONS = 20_000
 
 
 def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 32) -> "Mapped":
-    """Maps a function over a batch, like `jax.vmap`, one array over the batch for each scalar.
+    """Maps a function over a batch, like ``jax.vmap``, one array over the batch for each scalar.
 
     The function is traced for one example and evaluated element by element; see the package's
     docstring for what that costs and which floating-point promises it loosens. Call the result
-    under `jax.jit`. The fastest layout keeps the batch last (axes of -1): then each scalar's lane
+    under ``jax.jit``. The fastest layout keeps the batch last (axes of -1): then each scalar's lane
     is one contiguous row.
 
     Args:
-        fn: a function of one example; pytrees in and out.
-        in_axes: for each argument an axis, None for one that all lanes share, or a pytree prefix.
-        out_axes: the same for the result; None only for what does not depend on the lane.
-        branch_cost: a branch of `cond` with more scalar operations than this, or with a loop, is
-            skipped where no lane needs it; others are computed for every lane. XLA's CPU backend
-            computes shared values again in each fusion, and a real branch also stops that.
+      fn: a function of one example; pytrees in and out.
+      in_axes: for each argument an axis, None for one that all lanes share, or a pytree prefix.
+      out_axes: the same for the result; None only for what does not depend on the lane.
+      branch_cost: a branch of ``cond`` with more scalar operations than this, or with a loop, is
+        skipped where no lane needs it; others are computed for every lane. XLA's CPU backend
+        computes shared values again in each fusion, and a real branch also stops that.
 
     Returns:
-        The mapped function. Keyword arguments are mapped over their first axis.
+      The mapped function. Keyword arguments are mapped over their first axis.
 
     Raises:
-        ValueError: if no argument is mapped, the mapped sizes differ, or an axis does not fit.
-        TooLarge: if fn is more than is written out.
-        UnsupportedPrimitive: if fn uses a primitive that has no rule, or reads typed PRNG keys.
+      ValueError: if no argument is mapped, the mapped sizes differ, or an axis does not fit.
+      TooLarge: if fn is more than is written out.
+      UnsupportedPrimitive: if fn uses a primitive that has no rule, or reads typed PRNG keys.
     """
     return Mapped(fn, in_axes, out_axes, branch_cost)
 
 
 class Mapped:
-    """What `vmap` returns: a function that is written out once for each kind of arguments."""
+    """What ``vmap`` returns: a function that is written out once for each kind of arguments."""
 
     def __init__(self, fn: Callable, in_axes: Any, out_axes: Any, branch_cost: int):
-        """Takes the arguments of `vmap`."""
+        """Takes the arguments of ``vmap``."""
         functools.update_wrapper(self, fn)
         self._fn = fn
         self._in_axes, self._out_axes = in_axes, out_axes

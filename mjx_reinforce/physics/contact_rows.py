@@ -1,7 +1,7 @@
 """Products with the Jacobian of the constraint rows, where few contacts touch.
 
 A contact that does not touch has rows of zeros, and of those that touch not all push. Machine code
-for one episode (`fused`) skips such a contact by a branch. Where XLA computes many episodes at
+for one episode (``fused``) skips such a contact by a branch. Where XLA computes many episodes at
 once both sides of a branch would be computed, and there these are products of whole matrices.
 """
 
@@ -19,7 +19,7 @@ class Blocks(NamedTuple):
 
     others: the leading rows, which belong to no contact
     groups: contacts with equally many rows: how many contacts, and how many rows each
-    may_unroll: whether loops over contacts may be written out, see `fused.by_engine`
+    may_unroll: whether loops over contacts may be written out, see ``fused.by_engine``
     """
 
     others: int
@@ -41,11 +41,11 @@ def weighted(
     """Returns start [nv, nv] + J' diag(mass) J, and J' force [nv].
 
     Args:
-        division: of the rows.
-        start: [nv, nv] what the first product is added to.
-        jacobian: [rows, nv]
-        mass: [rows]; where all of a contact's are zero, its forces are zero too.
-        force: [rows]
+      division: of the rows.
+      start: [nv, nv] what the first product is added to.
+      jacobian: [rows, nv]
+      mass: [rows]; where all of a contact's are zero, its forces are zero too.
+      force: [rows]
     """
 
     def whole(start: jax.Array, *rows: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -75,10 +75,10 @@ def along(
     """Returns J direction, [rows].
 
     Args:
-        division: of the rows.
-        jacobian: [rows, nv]
-        direction: [nv]
-        touching: [C] whether a contact's rows may be other than zero.
+      division: of the rows.
+      jacobian: [rows, nv]
+      direction: [nv]
+      touching: [C] whether a contact's rows may be other than zero.
     """
 
     def whole(jacobian: jax.Array, direction: jax.Array, touching: jax.Array) -> jax.Array:

@@ -5,13 +5,13 @@ The acceleration a minimises (MuJoCo's documentation, "Computation", "Constraint
     (a - a_s)' M (a - a_s) / 2 + \sum_i D_i min(0, J_i a - r_i)^2 / 2
 
 with the unconstrained acceleration a_s, the inertia matrix M and, of the constraint rows, the
-Jacobian J, reference r and constraint mass D (`efc_J`, `efc_aref`, `efc_D`); rows of equality
+Jacobian J, reference r and constraint mass D (``efc_J``, ``efc_aref``, ``efc_D``); rows of equality
 constraints count on both sides of zero. The cost is convex, and quadratic for a given set of active
 rows, so that Newton's method, with an exact line search, ends after finitely many steps: when a
 full step leaves the set as it is, that step led to the minimum.
 
 MJX's own solver does the same steps, but its line search evaluates three points in each of
-`ls_iterations` (50) rounds, which `jax.vmap` carries out for every episode until the slowest is
+``ls_iterations`` (50) rounds, which ``jax.vmap`` carries out for every episode until the slowest is
 done; here a round evaluates one point, and the search ends when no row changes any more.
 """
 
@@ -91,7 +91,7 @@ class _LineSearch(NamedTuple):
 
 
 def supports(model: mjx.Model, data: mjx.Data) -> bool:
-    """Returns whether `solve` is for this model: Newton, pyramidal cones, no friction loss."""
+    """Returns whether ``solve`` is for this model: Newton, pyramidal cones, no friction loss."""
     return (
         model.opt.solver == mjx.SolverType.NEWTON
         and model.opt.cone == mjx.ConeType.PYRAMIDAL
@@ -107,12 +107,13 @@ def solve(
     The starts are the unconstrained acceleration and, unless the model disables it, the warm start.
 
     Args:
-        model: a model that `supports` accepts; `iterations` and `ls_iterations` bound the loops.
-        data: with its constraint rows made.
-        may_unroll: whether loops over contacts may be written out, see `fused.by_engine`.
+      model: a model that ``supports`` accepts; ``iterations`` and ``ls_iterations`` bound the
+        loops.
+      data: with its constraint rows made.
+      may_unroll: whether loops over contacts may be written out, see ``fused.by_engine``.
 
     Returns:
-        The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
+      The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
     fields = jax_fields(data)
     equality = jnp.arange(fields.efc_D.shape[0]) < fields.ne
@@ -214,12 +215,12 @@ def _line_search(
     is zero, and the length is 1.
 
     Args:
-        rows: the constraints.
-        point: where the step starts.
-        change: [rows] how the residual changes along it.
-        slope: [] the derivative there, without rows.
-        curvature: [] how that derivative changes along the step.
-        max_rounds: lengths to evaluate at most.
+      rows: the constraints.
+      point: where the step starts.
+      change: [rows] how the residual changes along it.
+      slope: [] the derivative there, without rows.
+      curvature: [] how that derivative changes along the step.
+      max_rounds: lengths to evaluate at most.
     """
     row_slope = rows.constraint_mass * change * point.residual
     row_curvature = rows.constraint_mass * change**2

@@ -1,7 +1,7 @@
 """Pairs of geoms one after the other, and only where their bounding spheres meet, as in C.
 
 MJX collides all pairs of one kind at once, which is best where XLA computes many episodes. Machine
-code for one episode (`fused`) is a loop over the pairs: short, and quick where geoms are apart.
+code for one episode (``fused``) is a loop over the pairs: short, and quick where geoms are apart.
 """
 
 import types
@@ -26,7 +26,7 @@ def one_by_one(collide: Collide) -> Collide:
     Of contacts between geoms that are apart only the sign of the distance is right.
 
     Args:
-        collide: made by MJX's `collider`, for geoms with a bounding sphere.
+      collide: made by MJX's ``collider``, for geoms with a bounding sphere.
     """
 
     def together(model: mjx.Model, data: mjx.Data, key: Any, geoms: Any) -> Any:

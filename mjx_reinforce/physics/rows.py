@@ -25,10 +25,10 @@ _NO_OTHERS = mjx.DisableBit.EQUALITY | mjx.DisableBit.FRICTIONLOSS | mjx.Disable
 
 
 def make_constraint(model: mjx.Model, data: mjx.Data, may_unroll: bool = True) -> mjx.Data:
-    """Makes the constraint rows, as `mjx.make_constraint`.
+    """Makes the constraint rows, as ``mjx.make_constraint``.
 
     Of a contact that does not touch only the Jacobian and the reference, both zero, are right.
-    ``may_unroll`` is that of loops over contacts, see `fused.by_engine`.
+    ``may_unroll`` is that of loops over contacts, see ``fused.by_engine``.
     """
     contact = jax_fields(data).contact
     if model.opt.disableflags & mjx.DisableBit.CONSTRAINT or not contact.dim.size:

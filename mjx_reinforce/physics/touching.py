@@ -35,9 +35,9 @@ def solve(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
     0.8 of the speed, 0.7 with a trained policy), and all are solved with.
 
     Args:
-        solver: what solves; it takes fewer contacts than the model has.
-        model: an MJX model.
-        data: with its constraint rows made.
+      solver: what solves; it takes fewer contacts than the model has.
+      model: an MJX model.
+      data: with its constraint rows made.
     """
     contact = jax_fields(data).contact
     kinds = [k for dim in (1, 3, 4, 6) if (k := np.flatnonzero(contact.dim == dim)).size]
@@ -105,12 +105,12 @@ def _pack(contacts: Any, touching: jax.Array, room: int) -> tuple[Any, jax.Array
     """Brings the first contacts that touch together, in their order.
 
     Args:
-        contacts: [C, ...]
-        touching: [C] which of them touch.
-        room: for how many there is room.
+      contacts: [C, ...]
+      touching: [C] which of them touch.
+      room: for how many there is room.
 
     Returns:
-        Contacts [room, ...], those that do not touch in the places left, and how many touch [].
+      Contacts [room, ...], those that do not touch in the places left, and how many touch [].
     """
     if touching.size <= room:
         return contacts, jnp.int32(0)

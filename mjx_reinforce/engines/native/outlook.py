@@ -14,7 +14,7 @@ from mjx_reinforce.engines.native import available
 from mjx_reinforce.fused import TooLarge, jaxprs, size
 from mjx_reinforce.types import Environment, null_action
 
-#: Nobody waits longer for what `jax.vmap` compiles in less.
+#: Nobody waits longer for what ``jax.vmap`` compiles in less.
 MAX_SECONDS = 80
 #: People are told beforehand of what takes longer.
 _WORTH_SAYING = 15

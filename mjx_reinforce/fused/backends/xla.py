@@ -25,8 +25,8 @@ class XLA(Backend[Any]):
         """Says where the program runs.
 
         Args:
-            read: returns the lane of an input from (number of the argument, position in it).
-            batch_shape: the shape of one lane.
+          read: returns the lane of an input from (number of the argument, position in it).
+          batch_shape: the shape of one lane.
         """
         self._read = read
         self._batch_shape = batch_shape
@@ -55,7 +55,7 @@ class XLA(Backend[Any]):
         return operation(op.name)(*values, **dict(op.params))
 
     def gate(self, gate: LiveGate, values: Values) -> Sequence[Any]:
-        """Emits a `cond`."""
+        """Emits a ``cond``."""
         predicate = self._any_of(self.value(gate.predicate, values))
         before = dict(values)
         cold = [self._materialize(out.cold, out.leaf.varying, before) for out in gate.outs]
@@ -67,7 +67,7 @@ class XLA(Backend[Any]):
         return lax.cond(predicate, hot, lambda: cold)
 
     def loop(self, loop: LiveLoop, values: Values) -> tuple[list[Any], list[Any]]:
-        """Emits a `fori_loop`, a `scan` or a `while_loop`."""
+        """Emits a ``fori_loop``, a ``scan`` or a ``while_loop``."""
         init = [self._materialize(c.init, c.out.varying, values) for c in loop.carries]
         body = functools.partial(self._iteration, loop, values)
         if loop.records or loop.elements:
