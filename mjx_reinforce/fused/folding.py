@@ -36,7 +36,8 @@ def _divide(x: Any, y: Any) -> Any:
     """Division as XLA does it: integers round towards zero, and by zero it is -1."""
     if not _are_integers(x):
         return np.true_divide(x, y)
-    return np.where(y == 0, -1, (x - _remainder(x, y)) // np.where(y == 0, 1, y))
+    ones = ~np.zeros_like(y)  # -1, in an unsigned integer the greatest
+    return np.where(y == 0, ones, (x - _remainder(x, y)) // np.where(y == 0, 1, y))
 
 
 def _remainder(x: Any, y: Any) -> Any:
