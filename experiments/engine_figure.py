@@ -112,7 +112,7 @@ def operations(task: str, on_cpu: bool) -> int:
         function, examples = program.while_running(function), examples[:-1]
         loops = program.GPU_LOOPS
     varying = [True] * len(jax.tree.leaves(examples))
-    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **loops)
+    written = scalarized.build(function, examples, varying, step.BRANCH_COST, loops)
     return sum(written.operations.values())
 
 

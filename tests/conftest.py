@@ -31,11 +31,15 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 import jax
 import pytest
 
+from mjx_reinforce.fused import scalarized
+from mjx_reinforce.fused.verify import verify
+
 sys.path.insert(0, str(Path(__file__).parent))
 
 SLOW = Path(__file__).with_name("slow.txt")
 _STALE = pytest.StashKey[list[str]]()
 
+scalarized.inspect = verify
 jax.config.update("jax_default_matmul_precision", "highest")
 
 

@@ -17,21 +17,13 @@ from mjx_reinforce.fused.backends.backend import Backend
 from mjx_reinforce.fused.backends.llvm import LLVM, Input
 from mjx_reinforce.fused.backends.llvm_text import Text
 from mjx_reinforce.fused.backends.xla import XLA
-from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import is_constant
 from mjx_reinforce.registry import load
 
 #: Operands of which every float operation is finite.
 FLOATS = np.float32([0.25, 0.5, 0.75])
 BITS = np.int32([6, 3, 0])
-#: What an operation takes, if it is not one or two floats.
-ARITY = {"select_n": 3, "regularized_incomplete_beta": 3}
-TWO = {
-    *("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne", "lt", "le", "gt", "ge", "sub"),
-    *("div", "rem", "pow", "atan2", "nextafter", "shift_left", "shift_right_arithmetic"),
-    *("shift_right_logical", "igamma", "igamma_grad_a", "igammac", "polygamma", "zeta"),
-    "random_gamma_grad",
-}
 ON_BITS = {
     *("and", "or", "xor", "not", "shift_left", "shift_right_arithmetic", "shift_right_logical"),
     *("clz", "population_count"),
@@ -54,7 +46,7 @@ PARAMS = {
 
 def operands_of(name):
     values = BITS if name in ON_BITS else FLOATS
-    operands = list(values[: 2 if name in TWO else ARITY.get(name, 1)])
+    operands = list(values[: ops.FACTS[name].arity])
     if name == "select_n":
         operands[0] = np.True_
     if name == "acosh":
@@ -100,8 +92,7 @@ def test_a_load_says_how_its_place_is_aligned(align):
         pairs = x[:4].reshape(2, 2)
         return lax.scan(lambda sums, row: (sums * row[0], None), x[5], pairs)[0]
 
-    counts = {"unrolled": 1, "unrolled_arrays": 1, "unrolled_on_request": 1}
-    written = scalarized.build(total, (jnp.ones(6),), [True], 400, **counts)
+    written = scalarized.build(total, (jnp.ones(6),), [True], 400, Limits(1, 1, 1))
     text = Text(1)
     backend = LLVM(text, lambda number: Input("%input", np.dtype(np.float32), align))
     backend.compile(written.schedule, written.outputs)
@@ -122,7 +113,7 @@ def test_constants_fold_to_what_jax_computes(name):
     assert np.isfinite(folded)
     _, *mixes = itertools.product([False, True], repeat=len(operands))
     for mix in mixes:
-        graph = Graph(branch_cost=0, unrolled=0, unrolled_arrays=0, unrolled_on_request=0)
+        graph = Graph(0, Limits())
         leaves = [graph.leaf(x.dtype, True, position=(0, i)) for i, x in enumerate(operands)]
         mixed = [leaf if lane else x for leaf, x, lane in zip(leaves, operands, mix, strict=True)]
         backend = XLA(lambda place: jnp.full(2, operands[place[1]]), (2,))
@@ -134,7 +125,7 @@ def test_constants_fold_to_what_jax_computes(name):
 
 @pytest.mark.parametrize("name", [n for n, facts in ops.FACTS.items() if facts.commutes])
 def test_operations_that_commute_are_shared(name):
-    graph = Graph(branch_cost=0, unrolled=0, unrolled_arrays=0, unrolled_on_request=0)
+    graph = Graph(0, Limits())
     x, y = (graph.leaf(operands_of(name)[0].dtype, True) for _ in range(2))
     assert graph.call(name, x, y) is graph.call(name, y, x)
 

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce import envs, normal
+from mjx_reinforce import envs, fused, normal
 from mjx_reinforce.engines import choice as engines
 from mjx_reinforce.engines import rollouts
+from mjx_reinforce.fused import evaluate
 from mjx_reinforce.types import action_space
 
 NUM_STATES = 10_000
@@ -109,3 +110,18 @@ def test_auto_says_what_it_takes_and_why():
     assert "contacts" in contacts.why
     with pytest.raises(ValueError, match=r"a policy of its own.*choose auto"):
         engines.choose("native", pendulum)
+
+
+def test_a_fault_of_the_writer_is_told_from_what_it_does_not_support(monkeypatch):
+    """Its message has the exception's name, and another engine plays."""
+
+    def faulty(graph, eqn, *operands):
+        raise TypeError("a rule of ours")
+
+    monkeypatch.setitem(evaluate._RULES, "mul", faulty)
+    env = Wide(envs.make("InvertedPendulum-v5"))
+    reason = engines.unsupported_by_fused(env, fused.vmap(env.step, in_axes=-1, out_axes=-1))
+    assert "it cannot be written out (TypeError: a rule of ours" in reason
+    monkeypatch.setattr(evaluate, "_RULES", {})
+    reason = engines.unsupported_by_fused(env, fused.vmap(env.step, in_axes=-1, out_axes=-1))
+    assert reason.startswith("there is no rule for the primitive")

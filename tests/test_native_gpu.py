@@ -184,9 +184,17 @@ def kernel_text(env, sizes):
         examples,
         [True] * len(jax.tree.leaves(examples)),
         step.BRANCH_COST,
-        **program.GPU_LOOPS,
+        program.GPU_LOOPS,
     )
     return player.kernel_text(written, len(jax.tree.leaves(actor)))
+
+
+def test_a_division_that_llvm_spells_otherwise_is_not_left():
+    """That of doubles is exact, as in XLA."""
+    text = "div.rn.ftz.f32 %f1, %f2, %f3;\n\tdiv.rn.f64 %d1, %d2, %d3;"
+    assert ptx._with_xla_divisions(text) == text.replace("div.rn.ftz", "div.full.ftz")
+    with pytest.raises(AssertionError, match="another name"):
+        ptx._with_xla_divisions("div.rn.f32 %f1, %f2, %f3;")
 
 
 @pytest.mark.parametrize(

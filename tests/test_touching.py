@@ -8,7 +8,7 @@ from mujoco import mjx
 
 from mjx_reinforce import envs
 from mjx_reinforce.physics import touching
-from mjx_reinforce.physics.mjx_internals import jax_fields
+from mjx_reinforce.physics.mjx_internals import jax_fields, with_contact
 
 
 def contacts_of(env_id):
@@ -57,8 +57,9 @@ def test_values_go_back_to_the_contacts_that_touch():
 def test_where_it_is_not_worth_it_the_solver_has_the_data_as_it_is(env_id, contacts):
     env, asked = envs.make(env_id), []
     data = mjx.make_data(env.mj_model, impl="jax")
-    few = jax.tree.map(lambda x: x[:contacts], jax_fields(data).contact)
-    data = data.tree_replace({"_impl.contact": few})
+    contact = jax_fields(data).contact
+    few = jax.tree.map(lambda x: x[:contacts], contact)
+    data = with_contact(data, few, contact.dim[:contacts])
     touching.solve(lambda *given: asked.extend(given), env.model, data)
     assert asked[0] is env.model
     assert asked[1] is data

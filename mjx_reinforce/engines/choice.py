@@ -19,7 +19,7 @@ from mjx_reinforce.checks import explain
 from mjx_reinforce.engines.episode import Act
 from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.engines.rollouts import rollout
-from mjx_reinforce.fused.vmap import MAX_OPERATIONS
+from mjx_reinforce.fused.vmap import MAX_OPERATIONS, Mapped
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Environment, PyTree, Trajectory, null_action
@@ -73,7 +73,7 @@ def choose(
       name: one of ``NAMES``.
       env: what is played.
       player: who plays it; None where every episode has parameters of its own, which
-        machine code cannot hold.
+      machine code cannot hold.
       horizon: T, the time limit in steps, for machine code.
 
     Raises:
@@ -141,7 +141,7 @@ def _from_any_key(
     return play(env, act, actor, distribution, key, **options)
 
 
-def unsupported_by_fused(env: Environment, step: Callable[..., PyTree]) -> str | None:
+def unsupported_by_fused(env: Environment, step: Mapped) -> str | None:
     """Returns why an environment does not run, or not well, on the fused engine; None if it does.
 
     Nothing is compiled: the step is traced and written out, about a second.
@@ -160,7 +160,7 @@ def unsupported_by_fused(env: Environment, step: Callable[..., PyTree]) -> str |
         return f"its observation has {entries:,} entries, more than {MAX_ENTRIES:,}"
     try:
         written = step.write(*jax.eval_shape(one))
-    except (fused.TooLarge, fused.UnsupportedPrimitive, TypeError) as error:
+    except (fused.TooLarge, fused.UnsupportedPrimitive) as error:
         return " ".join(str(error).split())
     except Exception as error:  # whatever it is, another engine may play this
         return f"it cannot be written out ({explain(error)})"

@@ -17,7 +17,7 @@ _TOGETHER = 4
 def unit_by_unit(
     call: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any], context: Any
 ) -> Any:
-    """Computes an `MLP` of one observation two layers at a time, as a loop; for flax to call.
+    """Computes an ``MLP`` of one observation two layers at a time, as a loop; for flax to call.
 
     Each unit of the first layer is computed and at once added to all units of the second, in the
     order of the units. Written out, a network of 64 and 64 units would be a program of 9,000

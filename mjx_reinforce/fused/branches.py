@@ -1,4 +1,8 @@
-"""The rule for `cond`: cheap branches are both evaluated, expensive ones skipped if unneeded."""
+"""The rules for choices.
+
+Of ``cond``, cheap branches are both evaluated, and expensive ones skipped if unneeded. Of
+``by_engine``, the program for one episode is taken.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,12 +23,12 @@ def cond_rule(
     """Evaluates the branches that lanes may take and picks each lane's own.
 
     Args:
-        graph: where nodes are made.
-        run: (program, arguments, which results are used) -> results.
-        eqn: the equation.
-        used: which of its results are used.
-        index: [] which branch is taken.
-        *operands: the arguments of every branch.
+      graph: where nodes are made.
+      run: (program, arguments, which results are used) -> results.
+      eqn: the equation.
+      used: which of its results are used.
+      index: [] which branch is taken.
+      *operands: the arguments of every branch.
     """
     programs = [jaxprs.program(branch) for branch in eqn.params["branches"]]
     (choice,) = arrays.elements(index)
@@ -37,6 +41,14 @@ def cond_rule(
         return lambda: layout.unpack(run(program, list(operands), used))
 
     return layout.pack(_choose_among(graph, [branch(program) for program in programs], choice))
+
+
+def by_engine_rule(
+    graph: Graph, run: Callable, eqn: Any, used: list[bool], *operands: Any
+) -> list[np.ndarray]:
+    """Takes the program for an engine that writes out; see ``by_engine``."""
+    program = jaxprs.program(eqn.params["one"])
+    return run(program, list(operands), used, may_unroll=eqn.params["may_unroll"])
 
 
 def _choose_among(graph: Graph, branches: list[Branch], choice: Node) -> list[Scalar]:

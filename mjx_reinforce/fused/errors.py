@@ -9,6 +9,14 @@ class TooLarge(NotImplementedError):  # noqa: N818 (reads as what it is)
     """A function that is too large to be written out."""
 
 
+def no_keys() -> UnsupportedPrimitive:
+    """Returns the error for typed PRNG keys."""
+    return UnsupportedPrimitive(
+        "typed PRNG keys (jax.random.key) cannot be written out; draw the random numbers outside "
+        "and pass them, or use jax.vmap for this function"
+    )
+
+
 def no_rule(name: str, source: str) -> UnsupportedPrimitive:
     """Returns the error for a primitive without a rule.
 

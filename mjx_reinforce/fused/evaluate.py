@@ -17,13 +17,30 @@ _RULES = {
     **linear.RULES,
     **indexing.RULES,
 }
-_CONTROL = {"while": loops.while_rule, "scan": loops.scan_rule, "cond": branches.cond_rule}
+_CONTROL = {
+    "while": loops.while_rule,
+    "scan": loops.scan_rule,
+    "cond": branches.cond_rule,
+    "by_engine": branches.by_engine_rule,
+}
 
 
 def run(
-    graph: Graph, program: jaxprs.Program, args: list[np.ndarray], used: list[bool] | None = None
+    graph: Graph,
+    program: jaxprs.Program,
+    args: list[np.ndarray],
+    used: list[bool] | None = None,
+    may_unroll: bool = False,
 ) -> list[np.ndarray]:
-    """Returns a program's outputs; those not used are zeros and nothing is computed for them."""
+    """Returns a program's outputs.
+
+    Args:
+      graph: where nodes are made.
+      program: what is evaluated.
+      args: its arguments.
+      used: which of its outputs are; others are zeros, and nothing is computed for them.
+      may_unroll: whether its scans may be written out; see ``by_engine``.
+    """
     jaxpr = program.jaxpr
     used = [True] * len(jaxpr.outvars) if used is None else used
     values = dict(zip(jaxpr.invars, args, strict=True))
@@ -34,6 +51,7 @@ def run(
         return jaxprs.literal(atom) if jaxprs.is_literal(atom) else values[atom]
 
     for eqn, needed in jaxprs.live_equations(jaxpr, used):
+        graph.may_unroll = may_unroll  # of this equation; programs inside have their own
         results = _apply(graph, eqn, needed, [read(atom) for atom in eqn.invars])
         values.update(zip(eqn.outvars, results, strict=True))
     return [
@@ -53,10 +71,11 @@ def _apply(graph: Graph, eqn: Any, used: list[bool], operands: list[np.ndarray])
     program = jaxprs.callee(eqn)
     if program is not None:
         with graph.evaluating(eqn):
-            return run(graph, program, operands, used)
-    if all(map(arrays.is_numeric, operands)):
+            return run(graph, program, operands, used, graph.may_unroll)
+    makes_keys = any(jaxprs.is_key(out.aval) for out in eqn.outvars)
+    if all(map(arrays.is_numeric, operands)) and not makes_keys:
         return jaxprs.evaluate(eqn.primitive.bind, eqn.params, operands)
-    raise no_rule(name, jaxprs.source(eqn))
+    raise no_rule(name, graph.source(eqn))
 
 
 def _settled(eqn: Any, results: list[np.ndarray]) -> list[np.ndarray]:

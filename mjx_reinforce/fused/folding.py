@@ -4,40 +4,51 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from jax import lax
 
 from mjx_reinforce.fused import jaxprs
-from mjx_reinforce.fused.ops import Op
+from mjx_reinforce.fused.ops import FACTS, Op
 
 
 def fold(op: Op, operands: Sequence[Any], dtype: np.dtype) -> Any:
     """Applies an operation to constants, scalars or arrays.
 
     Args:
-        op: the operation.
-        operands: NumPy scalars or arrays of one shape.
-        dtype: that of the result.
+      op: the operation.
+      operands: NumPy scalars or arrays of one shape.
+      dtype: that of the result.
 
     Returns:
-        A NumPy array, or a NumPy scalar where the operands are scalars.
+      A NumPy array, or a NumPy scalar where the operands are scalars.
     """
     name = op.name
     if name == "convert_element_type":
         result = np.asarray(operands[0]).astype(dtype)
     elif name == "bitcast_convert_type":
         result = np.asarray(operands[0]).view(dtype)
-    elif name in _BY_NUMPY:
-        result = _BY_NUMPY[name](*operands)
+    elif (by_numpy := _EXCEPTIONS.get(name, FACTS[name].in_numpy)) is not None:
+        result = by_numpy(*operands)
     else:
-        result = jaxprs.evaluate(_BY_JAX[name], dict(op.params), operands)[0]
+        result = jaxprs.evaluate(jaxprs.operation(name), dict(op.params), operands)[0]
     return np.asarray(result, dtype)[()]
 
 
 def _divide(x: Any, y: Any) -> Any:
-    """Division as XLA does it: integers round towards zero."""
-    if np.issubdtype(np.asarray(x).dtype, np.integer):
-        return np.where(y == 0, -1, (x - np.fmod(x, y)) // np.where(y == 0, 1, y))
-    return np.true_divide(x, y)
+    """Division as XLA does it: integers round towards zero, and by zero it is -1."""
+    if not _are_integers(x):
+        return np.true_divide(x, y)
+    ones = ~np.zeros_like(y)  # -1, in an unsigned integer the greatest
+    return np.where(y == 0, ones, (x - _remainder(x, y)) // np.where(y == 0, 1, y))
+
+
+def _remainder(x: Any, y: Any) -> Any:
+    """The rest of that division: an integer divided by zero is what remains."""
+    if not _are_integers(x):
+        return np.fmod(x, y)
+    return np.where(y == 0, x, np.fmod(x, np.where(y == 0, 1, y)))
+
+
+def _are_integers(x: Any) -> bool:
+    return np.issubdtype(np.asarray(x).dtype, np.integer)
 
 
 def _select(predicate: Any, *cases: Any) -> Any:
@@ -56,78 +67,12 @@ def _rsqrt(x: Any) -> Any:
     return np.asarray(x).dtype.type(1) / np.sqrt(x)
 
 
-_BY_NUMPY: dict[str, Callable[..., Any]] = {
-    "add": np.add,
-    "mul": np.multiply,
-    "max": np.maximum,
-    "min": np.minimum,
-    "and": np.bitwise_and,
-    "or": np.bitwise_or,
-    "xor": np.bitwise_xor,
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "lt": np.less,
-    "le": np.less_equal,
-    "gt": np.greater,
-    "ge": np.greater_equal,
-    "is_finite": np.isfinite,
+#: What one function of NumPy does not compute. Rare operations that NumPy does not have at all JAX
+#: computes at once, in about 1 ms.
+_EXCEPTIONS: dict[str, Callable[..., Any]] = {
     "select_n": _select,
-    "sub": np.subtract,
     "div": _divide,
-    "rem": np.fmod,
-    "pow": np.power,
-    "atan2": np.arctan2,
-    "nextafter": np.nextafter,
-    "shift_left": np.left_shift,
-    "neg": np.negative,
-    "not": np.invert,
-    "abs": np.abs,
-    "sign": np.sign,
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "sqrt": np.sqrt,
+    "rem": _remainder,
     "rsqrt": _rsqrt,
-    "cbrt": np.cbrt,
-    "exp": np.exp,
-    "exp2": np.exp2,
-    "expm1": np.expm1,
-    "log": np.log,
-    "log1p": np.log1p,
     "logistic": _logistic,
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "asin": np.arcsin,
-    "acos": np.arccos,
-    "atan": np.arctan,
-    "sinh": np.sinh,
-    "cosh": np.cosh,
-    "tanh": np.tanh,
-    "asinh": np.arcsinh,
-    "acosh": np.arccosh,
-    "atanh": np.arctanh,
-}
-
-# Rare operations that NumPy does not have. JAX computes them at once, in about 1 ms.
-_BY_JAX: dict[str, Callable[..., Any]] = {
-    "bessel_i0e": lax.bessel_i0e,
-    "bessel_i1e": lax.bessel_i1e,
-    "clz": lax.clz,
-    "digamma": lax.digamma,
-    "erf": lax.erf,
-    "erf_inv": lax.erf_inv,
-    "erfc": lax.erfc,
-    "igamma": lax.igamma,
-    "igamma_grad_a": lax.igamma_grad_a,
-    "igammac": lax.igammac,
-    "lgamma": lax.lgamma,
-    "polygamma": lax.polygamma,
-    "population_count": lax.population_count,
-    "random_gamma_grad": lax.random_gamma_grad,
-    "reduce_precision": lax.reduce_precision,
-    "regularized_incomplete_beta": lax.betainc,
-    "round": lax.round,
-    "shift_right_arithmetic": lax.shift_right_arithmetic,
-    "shift_right_logical": lax.shift_right_logical,
-    "zeta": lax.zeta,
 }

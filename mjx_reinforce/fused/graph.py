@@ -1,13 +1,13 @@
 """The scalar graph: a program as elementwise operations on scalars.
 
-`nodes` has the parts; here they are made. Equal nodes are one object, so common subexpressions are
-shared. A node that needs nothing of a loop's body is placed before the loop. Nothing is moved out
-of a branch, because then it would run also where the branch is skipped.
+``nodes`` has the parts; here they are made. Equal nodes are one object, so common subexpressions
+are shared. A node that needs nothing of a loop's body is placed before the loop. Nothing is moved
+out of a branch, because then it would run also where the branch is skipped.
 """
 
 import contextlib
 from collections.abc import Hashable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,33 +17,46 @@ from mjx_reinforce.fused.nodes import Captured, Gate, Loop, Node, Scalar, Scope,
 from mjx_reinforce.fused.size import MAX_SCALARS
 
 _BOOL = np.dtype(bool)
-#: `size` foresees what is written; where it errs, writing ends here.
+
+
+class Limits(NamedTuple):
+    """Up to which length a scan is written out.
+
+    Constants fold iteration by iteration in a scan that is written out, and a loop is shorter. A
+    scan whose own ``unroll`` is its whole length is always written out, as JAX does.
+
+    plain: of a scan that reads and makes no arrays.
+    arrays: of one that reads or makes arrays, which a loop keeps in memory.
+    unrollable: of one for which ``by_engine`` says that it may be, instead of the other two.
+    """
+
+    plain: int = 4
+    arrays: int = 4
+    unrollable: int = 4
+
+
+#: ``size`` foresees what is written; where it errs, writing ends here.
 _MOST = 3 * MAX_SCALARS
 
 
 class Graph:
     """Makes nodes, folding constants and sharing equal ones.
 
-    Attributes:
-        branch_cost: a branch of more scalar operations than this is skipped where no element of
-            the batch needs it.
-        unrolled: a scan that reads and makes no arrays is written out up to this length.
-        unrolled_arrays: one that reads or makes arrays is written out up to this length.
-        unrolled_on_request: one whose `unroll` is more than 1 is, up to this length.
-        path: the equations that are being evaluated, from the outermost one, by their ids.
-        learned: what was found out on a path. The body of a loop is evaluated again and again, each
-            time with less assumed of what never changes, and what was found out inside still holds.
-        certain: predicates of the branches and loops around the present scope. Its code runs only
-            if each of them is true for at least one element of the batch.
+    branch_cost: a branch of more scalar operations than this is skipped where no element of
+      the batch needs it.
+    limits: up to which length scans are written out.
+    may_unroll: whether ``limits.unrollable`` is that of a scan that is evaluated now.
+    path: the equations that are being evaluated, from the outermost one, by their ids.
+    learned: what was found out on a path. The body of a loop is evaluated again and again, each
+      time with less assumed of what never changes, and what was found out inside still holds.
+    certain: predicates of the branches and loops around the present scope. Its code runs only
+      if each of them is true for at least one element of the batch.
     """
 
-    def __init__(
-        self, branch_cost: int, unrolled: int, unrolled_arrays: int, unrolled_on_request: int
-    ):
+    def __init__(self, branch_cost: int, limits: Limits):
         self.branch_cost = branch_cost
-        self.unrolled = unrolled
-        self.unrolled_arrays = unrolled_arrays
-        self.unrolled_on_request = unrolled_on_request
+        self.limits = limits
+        self.may_unroll = False
         self.path: tuple[int, ...] = ()
         self.learned: dict[Hashable, Any] = {}
         self._evaluated: dict[int, Any] = {}  # kept, so that no id is given twice
@@ -71,6 +84,14 @@ class Graph:
             yield
         finally:
             self.path = before
+
+    def source(self, eqn: Any) -> str:
+        """Returns the user's line that an equation is from, or else the innermost call around it.
+
+        Inside of a jitted function of JAX no line is the user's.
+        """
+        around = [eqn, *(self._evaluated[number] for number in reversed(self.path))]
+        return next(filter(None, map(jaxprs.source, around)), "an unknown line")
 
     @contextlib.contextmanager
     def loop_body(self) -> Iterator[Scope]:

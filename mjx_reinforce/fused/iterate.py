@@ -12,7 +12,7 @@ Step = Callable[[list[Scalar], list[Scalar]], tuple[list[Scalar], list[Scalar]]]
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
-    """What is to be repeated; the fields as in `iterate`."""
+    """What is to be repeated; the fields as in ``iterate``."""
 
     step: Step
     inits: list[Scalar]
@@ -38,12 +38,12 @@ def iterate(
     part of an outer loop's body, that begins with what was found then.
 
     Args:
-        graph: where the loop is made.
-        step: evaluates one iteration in the graph's innermost scope.
-        inits: what the carry starts from.
-        length: the number of iterations, or None for no limit.
-        active: the position in the carry of the bool that ends the loop when no lane has it.
-        xs: for each element, its value in each iteration.
+      graph: where the loop is made.
+      step: evaluates one iteration in the graph's innermost scope.
+      inits: what the carry starts from.
+      length: the number of iterations, or None for no limit.
+      active: the position in the carry of the bool that ends the loop when no lane has it.
+      xs: for each element, its value in each iteration.
     """
     plan = _Plan(step, list(inits), length, active, list(xs))
     place = (graph.path, active)

@@ -8,13 +8,18 @@ import functools
 import hashlib
 import re
 from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.core
 import numpy as np
+from jax import lax
 from jax.extend import core
 from jax.interpreters import partial_eval
+
+from mjx_reinforce.fused.errors import no_keys
+from mjx_reinforce.fused.ops import FACTS
 
 # The parameter under which a call-like primitive keeps the jaxpr that it calls.
 _CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
@@ -23,9 +28,8 @@ _CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 class Program(NamedTuple):
     """A jaxpr with the values of its constant variables.
 
-    Attributes:
-        jaxpr: the equations.
-        consts: one array for each constant variable; may be tracers.
+    jaxpr: the equations.
+    consts: one array for each constant variable; may be tracers.
     """
 
     jaxpr: core.Jaxpr
@@ -33,11 +37,10 @@ class Program(NamedTuple):
 
 
 class ScanParts(NamedTuple):
-    """How the operands and results of a `scan` equation divide.
+    """How the operands and results of a ``scan`` equation divide.
 
-    Attributes:
-        num_consts: the leading operands, the same in every iteration.
-        num_carry: the operands after them, and the leading results; the rest are xs and ys.
+    num_consts: the leading operands, the same in every iteration.
+    num_carry: the operands after them, and the leading results; the rest are xs and ys.
     """
 
     num_consts: int
@@ -105,14 +108,33 @@ def callee(eqn: Any) -> Program | None:
     return None
 
 
-def default_platform(eqn: Any) -> int:
-    """Returns which branch of `platform_dependent` is the default; its branches agree."""
+def default_platform(eqn: Any) -> int | None:
+    """Returns which branch of ``platform_dependent`` is the default; None if it has no default.
+
+    The default is taken because what is written out does not depend on where it will run, and the
+    default alone is right on every platform.
+    """
     platforms = list(eqn.params["platforms"])
-    return platforms.index(None) if None in platforms else 0
+    return platforms.index(None) if None in platforms else None
+
+
+def depends(closed: Any, given: Iterable[bool]) -> list[bool]:
+    """Returns which results of a program may depend on some of its arguments.
+
+    Args:
+      closed: a closed jaxpr.
+      given: for each argument, whether it is one of them.
+    """
+    jaxpr = program(closed).jaxpr
+    found = {variable for variable, is_given in zip(jaxpr.invars, given, strict=True) if is_given}
+    for eqn in jaxpr.eqns:
+        if any(_named(atom) and atom in found for atom in eqn.invars):
+            found.update(eqn.outvars)
+    return [_named(out) and out in found for out in jaxpr.outvars]
 
 
 def scan_parts(eqn: Any) -> ScanParts:
-    """Returns how a `scan` equation's operands divide."""
+    """Returns how a ``scan`` equation's operands divide."""
     if "num_consts" in eqn.params:  # JAX 0.10
         return ScanParts(eqn.params["num_consts"], eqn.params["num_carry"])
     consts, carry, _ = eqn.params["ft_in"].update(list(eqn.invars)).unpack()
@@ -133,13 +155,15 @@ def as_numpy(value: Any) -> np.ndarray | None:
     """Returns a constant's value, or None for a tracer, which has none yet."""
     if isinstance(value, jax.core.Tracer):
         return None
+    if is_key(jax.typeof(value)):
+        raise no_keys()
     return np.asarray(value)
 
 
 def prune(fn: Callable) -> Callable:
-    """Returns fn without the operations that its results do not need; to be called under `jax.jit`.
+    """Returns fn without the operations that its results do not need; call it under ``jax.jit``.
 
-    Simulators compute much that one task does not read, and `jax.vmap` and the compiler pay for
+    Simulators compute much that one task does not read, and ``jax.vmap`` and the compiler pay for
     all of it.
     """
 
@@ -171,13 +195,27 @@ def live_equations(jaxpr: core.Jaxpr, used: Iterable[bool]) -> list[Any]:
 
 
 def source(eqn: Any) -> str:
-    """Returns 'file:line (function)' of the user's code that an equation came from."""
+    """Returns 'file:line (function)' of the user's code that an equation came from.
+
+    It is "" where the equation came from inside of a jitted function of JAX, or from here.
+    """
     try:
         from jax._src import source_info_util  # no public equivalent
 
-        return source_info_util.summarize(eqn.source_info)
+        line = source_info_util.summarize(eqn.source_info)
     except (ImportError, AttributeError):
-        return "an unknown line"
+        return ""
+    return "" if line.startswith(str(Path(__file__).parent)) else line
+
+
+def is_key(aval: Any) -> bool:
+    """Returns whether an abstract value is an array of typed PRNG keys."""
+    return jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key)
+
+
+def operation(name: str) -> Callable[..., Any]:
+    """Returns JAX's function for an operation of the scalar graph."""
+    return getattr(lax, FACTS[name].in_jax or name)
 
 
 def evaluate(function: Callable, params: dict, operands: Sequence[Any]) -> list[np.ndarray]:

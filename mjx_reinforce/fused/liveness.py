@@ -15,10 +15,9 @@ from mjx_reinforce.fused.nodes import Gate, Loop, Node, Scalar, Scope
 class Out(NamedTuple):
     """One result of a gate.
 
-    Attributes:
-        leaf: the node that stands for it after the gate.
-        hot: its value at the end of the body.
-        cold: its value if the body is skipped; computed before the gate.
+    leaf: the node that stands for it after the gate.
+    hot: its value at the end of the body.
+    cold: its value if the body is skipped; computed before the gate.
     """
 
     leaf: Node
@@ -29,11 +28,10 @@ class Out(NamedTuple):
 class Carry(NamedTuple):
     """One value that a loop changes.
 
-    Attributes:
-        leaf: the node that stands for it in the body.
-        init: its value before the loop.
-        next: its value at the end of the body.
-        out: the node that stands for it after the loop.
+    leaf: the node that stands for it in the body.
+    init: its value before the loop.
+    next: its value at the end of the body.
+    out: the node that stands for it after the loop.
     """
 
     leaf: Node
@@ -45,9 +43,8 @@ class Carry(NamedTuple):
 class Element(NamedTuple):
     """One value that a loop reads from a list, another one in each iteration.
 
-    Attributes:
-        leaf: the node that stands for it in the body.
-        values: its value in each iteration; computed before the loop.
+    leaf: the node that stands for it in the body.
+    values: its value in each iteration; computed before the loop.
     """
 
     leaf: Node
@@ -57,9 +54,8 @@ class Element(NamedTuple):
 class Record(NamedTuple):
     """One value that a loop keeps of each iteration.
 
-    Attributes:
-        value: its value at the end of the body.
-        outs: the nodes that stand for it after the loop, one for each iteration.
+    value: its value at the end of the body.
+    outs: the nodes that stand for it after the loop, one for each iteration.
     """
 
     value: Scalar
@@ -70,10 +66,9 @@ class Record(NamedTuple):
 class LiveGate:
     """A branch that runs only if some lane needs it.
 
-    Attributes:
-        predicate: which lanes need the branch.
-        body: what it computes.
-        outs: its results.
+    predicate: which lanes need the branch.
+    body: what it computes.
+    outs: its results.
     """
 
     predicate: Node
@@ -85,14 +80,13 @@ class LiveGate:
 class LiveLoop:
     """A loop.
 
-    Attributes:
-        length: the number of iterations, or None for no limit.
-        active: the position in `carries` of the bool that ends the loop when no lane has it; None
-            if the loop always runs to its length.
-        body: what one iteration computes.
-        carries: what it changes.
-        elements: what it reads.
-        records: what it keeps.
+    length: the number of iterations, or None for no limit.
+    active: the position in ``carries`` of the bool that ends the loop when no lane has it; None
+      if the loop always runs to its length.
+    body: what one iteration computes.
+    carries: what it changes.
+    elements: what it reads.
+    records: what it keeps.
     """
 
     length: int | None
@@ -110,8 +104,8 @@ def schedule(root: Scope, results: Iterable[Scalar]) -> Schedule:
     """Returns what these scalars need, directly or through loops and gates.
 
     Args:
-        root: the scope of the whole program.
-        results: scalars of that scope.
+      root: the scope of the whole program.
+      results: scalars of that scope.
     """
     needs = _Needs()
     waiting, seen = list(results), set()

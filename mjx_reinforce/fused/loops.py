@@ -1,4 +1,4 @@
-"""Rules for `while` and `scan`: loops that end when no lane needs another iteration."""
+"""Rules for ``while`` and ``scan``: loops that end when no lane needs another iteration."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,9 +9,6 @@ from mjx_reinforce.fused import arrays, jaxprs
 from mjx_reinforce.fused.graph import Graph
 from mjx_reinforce.fused.iterate import Step, iterate, varies
 from mjx_reinforce.fused.nodes import Gate, Loop, Node, Scalar, is_constant, same
-
-# Scans at most this long are written out; their constants then fold iteration by iteration.
-UNROLLED_LENGTH = 4
 
 
 def while_rule(graph: Graph, run: Callable, eqn: Any, used: Any, *operands: np.ndarray) -> list:
@@ -57,10 +54,7 @@ def scan_rule(graph: Graph, run: Callable, eqn: Any, used: Any, *operands: np.nd
 
     rows = [ins.unpack([x[t : t + 1] for x in operands[split:]]) for t in order]
     has_arrays = len(operands) > split or len(eqn.outvars) > parts.num_carry
-    limit = graph.unrolled_arrays if has_arrays else graph.unrolled
-    if eqn.params["unroll"] > 1:
-        limit = length if eqn.params["unroll"] >= length else graph.unrolled_on_request
-    if length <= limit:
+    if length <= max(_limit(graph, has_arrays), eqn.params["unroll"]):
         final, table = _unroll(step, carry.unpack(init), rows)
     else:
         final, table = _as_loop(graph, step, carry.unpack(init), rows, length)
@@ -70,6 +64,13 @@ def scan_rule(graph: Graph, run: Callable, eqn: Any, used: Any, *operands: np.nd
     if not table:
         ys = [arrays.zeros(out.aval) for out in eqn.outvars[parts.num_carry :]]
     return [*carry.pack(final), *ys]
+
+
+def _limit(graph: Graph, has_arrays: bool) -> int:
+    """Returns up to which length a scan is written out."""
+    if graph.may_unroll:
+        return graph.limits.unrollable
+    return graph.limits.arrays if has_arrays else graph.limits.plain
 
 
 def _unroll(step: Step, state: list[Scalar], rows: list[list[Scalar]]) -> tuple[list, list]:

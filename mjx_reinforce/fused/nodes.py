@@ -1,6 +1,6 @@
 """What a scalar graph is made of.
 
-A *scalar* is a NumPy scalar (a constant) or a `Node` (a value that each lane of the batch has its
+A *scalar* is a NumPy scalar (a constant) or a ``Node`` (a value that each lane of the batch has its
 own of, or that all lanes share). The body of a loop and an expensive branch are scopes of their
 own: a node placed there is not visible outside.
 """
@@ -20,12 +20,11 @@ Scalar = Any  # np.generic or Node
 class Scope:
     """Where nodes live.
 
-    Attributes:
-        depth: 0 for the program itself.
-        floor: nodes made here are placed in a scope at least this deep.
-        known: the nodes of this scope by what they compute.
-        cost: the number of nodes placed here.
-        has_loop: whether a loop was made here.
+    depth: 0 for the program itself.
+    floor: nodes made here are placed in a scope at least this deep.
+    known: the nodes of this scope by what they compute.
+    cost: the number of nodes placed here.
+    has_loop: whether a loop was made here.
     """
 
     depth: int
@@ -38,8 +37,7 @@ class Scope:
 class Captured(NamedTuple):
     """An array that the program closes over and whose value is not known yet.
 
-    Attributes:
-        array: a tracer of an outer transformation.
+    array: a tracer of an outer transformation.
     """
 
     array: Any
@@ -49,15 +47,14 @@ class Captured(NamedTuple):
 class Node:
     """One value.
 
-    Attributes:
-        dtype: its dtype.
-        varying: True if each lane has its own, False if all lanes share it.
-        scope: where it can be used.
-        index: nodes are numbered as they are made, so operands come before results.
-        op: what computes it; None for a leaf.
-        args: the operands.
-        owner: what a leaf belongs to; None for an input of the program.
-        position: which of the owner's values a leaf is; for an input (argument, element).
+    dtype: its dtype.
+    varying: True if each lane has its own, False if all lanes share it.
+    scope: where it can be used.
+    index: nodes are numbered as they are made, so operands come before results.
+    op: what computes it; None for a leaf.
+    args: the operands.
+    owner: what a leaf belongs to; None for an input of the program.
+    position: which of the owner's values a leaf is; for an input (argument, element).
     """
 
     dtype: np.dtype
@@ -74,14 +71,13 @@ class Node:
 class Gate:
     """A branch that runs only if some lane needs it.
 
-    Attributes:
-        scope: where the gate is.
-        index: its place among the nodes of that scope.
-        predicate: which lanes need the branch.
-        body: the scope of the branch.
-        hot: the results if some lane needs it, each lane's own already selected.
-        cold: the results if none does.
-        outs: the leaf that stands for each result; None where hot and cold are the same.
+    scope: where the gate is.
+    index: its place among the nodes of that scope.
+    predicate: which lanes need the branch.
+    body: the scope of the branch.
+    hot: the results if some lane needs it, each lane's own already selected.
+    cold: the results if none does.
+    outs: the leaf that stands for each result; None where hot and cold are the same.
     """
 
     scope: Scope
@@ -97,20 +93,19 @@ class Gate:
 class Loop:
     """A loop over scalars.
 
-    Attributes:
-        scope: where the loop runs.
-        index: its place among the nodes of that scope.
-        length: the number of iterations, or None for no limit.
-        inits: what the carry starts from.
-        active: the position in the carry of the bool that ends the loop when no lane has it.
-        xs: for each element, its value in each iteration.
-        body: the scope of one iteration.
-        carries: the leaf that stands for each carry; None where the carry never changes.
-        elements: the leaf that stands for each of xs; None where it is the same throughout.
-        nexts: the carry after one iteration.
-        ys: what each iteration adds to the results.
-        outs: the leaf that stands for each final carry.
-        stacked: the leaf that stands for each of ys in each iteration.
+    scope: where the loop runs.
+    index: its place among the nodes of that scope.
+    length: the number of iterations, or None for no limit.
+    inits: what the carry starts from.
+    active: the position in the carry of the bool that ends the loop when no lane has it.
+    xs: for each element, its value in each iteration.
+    body: the scope of one iteration.
+    carries: the leaf that stands for each carry; None where the carry never changes.
+    elements: the leaf that stands for each of xs; None where it is the same throughout.
+    nexts: the carry after one iteration.
+    ys: what each iteration adds to the results.
+    outs: the leaf that stands for each final carry.
+    stacked: the leaf that stands for each of ys in each iteration.
     """
 
     scope: Scope

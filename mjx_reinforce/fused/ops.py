@@ -1,11 +1,11 @@
-"""The operations of the scalar graph: their names, and what is known of each name.
+"""The operations of the scalar graph: the one table of their names, and of how each is computed.
 
-How an operation is computed is not said here. `folding` computes it on constants, each backend on
-everything else.
+JAX computes an operation on lanes, NumPy computes it on constants. ``folding`` lists what NumPy has
+no one function for, and a backend that does not go through JAX lists what it writes instead.
 """
 
-from collections.abc import Hashable
-from typing import NamedTuple
+from collections.abc import Callable, Hashable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,9 +13,8 @@ import numpy as np
 class Op(NamedTuple):
     """An elementwise operation. Equal operations are equal tuples.
 
-    Attributes:
-        name: a name of `FACTS`; mostly that of a JAX primitive.
-        params: its parameters by name, sorted; few operations have any.
+    name: a name of ``FACTS``; mostly that of a JAX primitive.
+    params: its parameters by name, sorted; few operations have any.
     """
 
     name: str
@@ -25,47 +24,96 @@ class Op(NamedTuple):
 class Facts(NamedTuple):
     """What is known of a name.
 
-    Attributes:
-        commutes: whether two operands may change places.
-        is_predicate: whether the result is a bool whatever the operands are.
-        has_params: whether the parameters of the JAX primitive are part of the operation.
+    in_numpy: operands -> result; None where NumPy has no one function for it.
+    in_jax: the name of a function of ``jax.lax``, (operands, **parameters) -> result; "" where
+      that is the name of the operation.
+    arity: how many operands it takes; ``select_n`` takes a number of a case and the cases.
+    commutes: whether two operands may change places.
+    is_predicate: whether the result is a bool whatever the operands are.
+    has_params: whether the parameters of the JAX primitive are part of the operation.
     """
 
+    in_numpy: Callable[..., Any] | None = None
+    in_jax: str = ""
+    arity: int = 1
     commutes: bool = False
     is_predicate: bool = False
     has_params: bool = False
 
 
-_COMMUTING = ("add", "mul", "max", "min", "and", "or", "xor")
-_PREDICATES = ("eq", "ne", "lt", "le", "gt", "ge", "is_finite")
-_OTHERS = (
-    *("select_n", "sub", "div", "rem", "pow", "atan2", "nextafter", "shift_left", "neg", "not"),
-    *("abs", "sign", "floor", "ceil", "sqrt", "rsqrt", "cbrt", "exp", "exp2", "expm1", "log"),
-    *("log1p", "logistic", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
-    *("asinh", "acosh", "atanh"),
-)
-_WITH_PARAMS = (
-    *(
-        "convert_element_type",
-        "bitcast_convert_type",
-        "bessel_i0e",
-        "bessel_i1e",
-        "clz",
-        "digamma",
-        "erf",
-        "erf_inv",
-    ),
-    *("erfc", "igamma", "igamma_grad_a", "igammac", "lgamma", "polygamma", "population_count"),
-    *("round", "zeta", "random_gamma_grad", "reduce_precision", "regularized_incomplete_beta"),
-    *("shift_right_arithmetic", "shift_right_logical"),
-)
-
 #: Every operation that a rule can make.
 FACTS: dict[str, Facts] = {
-    **dict.fromkeys(_COMMUTING, Facts(commutes=True)),
-    **dict.fromkeys(_PREDICATES, Facts(is_predicate=True)),
-    **dict.fromkeys(_OTHERS, Facts()),
-    **dict.fromkeys(_WITH_PARAMS, Facts(has_params=True)),
+    "add": Facts(np.add, arity=2, commutes=True),
+    "mul": Facts(np.multiply, arity=2, commutes=True),
+    "max": Facts(np.maximum, arity=2, commutes=True),
+    "min": Facts(np.minimum, arity=2, commutes=True),
+    "and": Facts(np.bitwise_and, in_jax="bitwise_and", arity=2, commutes=True),
+    "or": Facts(np.bitwise_or, in_jax="bitwise_or", arity=2, commutes=True),
+    "xor": Facts(np.bitwise_xor, in_jax="bitwise_xor", arity=2, commutes=True),
+    "eq": Facts(np.equal, arity=2, is_predicate=True),
+    "ne": Facts(np.not_equal, arity=2, is_predicate=True),
+    "lt": Facts(np.less, arity=2, is_predicate=True),
+    "le": Facts(np.less_equal, arity=2, is_predicate=True),
+    "gt": Facts(np.greater, arity=2, is_predicate=True),
+    "ge": Facts(np.greater_equal, arity=2, is_predicate=True),
+    "is_finite": Facts(np.isfinite, is_predicate=True),
+    "select_n": Facts(arity=3),
+    "sub": Facts(np.subtract, arity=2),
+    "div": Facts(arity=2),
+    "rem": Facts(arity=2),
+    "pow": Facts(np.power, arity=2),
+    "atan2": Facts(np.arctan2, arity=2),
+    "nextafter": Facts(np.nextafter, arity=2),
+    "shift_left": Facts(np.left_shift, arity=2),
+    "neg": Facts(np.negative),
+    "not": Facts(np.invert, in_jax="bitwise_not"),
+    "abs": Facts(np.abs),
+    "sign": Facts(np.sign),
+    "floor": Facts(np.floor),
+    "ceil": Facts(np.ceil),
+    "sqrt": Facts(np.sqrt),
+    "rsqrt": Facts(),
+    "cbrt": Facts(np.cbrt),
+    "exp": Facts(np.exp),
+    "exp2": Facts(np.exp2),
+    "expm1": Facts(np.expm1),
+    "log": Facts(np.log),
+    "log1p": Facts(np.log1p),
+    "logistic": Facts(),
+    "sin": Facts(np.sin),
+    "cos": Facts(np.cos),
+    "tan": Facts(np.tan),
+    "asin": Facts(np.arcsin),
+    "acos": Facts(np.arccos),
+    "atan": Facts(np.arctan),
+    "sinh": Facts(np.sinh),
+    "cosh": Facts(np.cosh),
+    "tanh": Facts(np.tanh),
+    "asinh": Facts(np.arcsinh),
+    "acosh": Facts(np.arccosh),
+    "atanh": Facts(np.arctanh),
+    "convert_element_type": Facts(has_params=True),
+    "bitcast_convert_type": Facts(has_params=True),
+    "bessel_i0e": Facts(has_params=True),
+    "bessel_i1e": Facts(has_params=True),
+    "clz": Facts(has_params=True),
+    "digamma": Facts(has_params=True),
+    "erf": Facts(has_params=True),
+    "erf_inv": Facts(has_params=True),
+    "erfc": Facts(has_params=True),
+    "igamma": Facts(arity=2, has_params=True),
+    "igamma_grad_a": Facts(arity=2, has_params=True),
+    "igammac": Facts(arity=2, has_params=True),
+    "lgamma": Facts(has_params=True),
+    "polygamma": Facts(arity=2, has_params=True),
+    "population_count": Facts(has_params=True),
+    "round": Facts(has_params=True),
+    "zeta": Facts(arity=2, has_params=True),
+    "random_gamma_grad": Facts(arity=2, has_params=True),
+    "reduce_precision": Facts(has_params=True),
+    "regularized_incomplete_beta": Facts(in_jax="betainc", arity=3, has_params=True),
+    "shift_right_arithmetic": Facts(arity=2, has_params=True),
+    "shift_right_logical": Facts(arity=2, has_params=True),
 }
 
 SELECT = Op("select_n")

@@ -1,4 +1,4 @@
-"""`scalarize`: a function of one example, written out in scalars."""
+"""``scalarize``: a function of one example, written out in scalars."""
 
 import dataclasses
 from collections import Counter
@@ -8,24 +8,27 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_reinforce.fused import arrays, evaluate, jaxprs, liveness, loops, size
+from mjx_reinforce.fused import arrays, evaluate, jaxprs, liveness, size
 from mjx_reinforce.fused.backends import BACKENDS
-from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.errors import no_keys
+from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import Scalar
 from mjx_reinforce.registry import check_name, load
+
+#: Looks at every program that was written out. The tests set it to ``verify``; users leave it.
+inspect: Callable[["Scalarized"], None] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class Scalarized:
     """A function written out in scalars.
 
-    Attributes:
-        in_avals: shape and dtype of each leaf of the arguments.
-        out_tree: the structure of its result.
-        out_avals: shape and dtype of each leaf of the result.
-        outputs: the scalars of each leaf of the result.
-        schedule: the steps that compute them.
-        captures: whether it closes over an array that an outer transformation traces.
+    in_avals: shape and dtype of each leaf of the arguments.
+    out_tree: the structure of its result.
+    out_avals: shape and dtype of each leaf of the result.
+    outputs: the scalars of each leaf of the result.
+    schedule: the steps that compute them.
+    captures: whether it closes over an array that an outer transformation traces.
     """
 
     in_avals: list[Any]
@@ -39,8 +42,8 @@ class Scalarized:
         """Returns what a backend makes of the function.
 
         Args:
-            backend: a name of `backends.BACKENDS`.
-            **settings: what the backend takes.
+          backend: a name of ``backends.BACKENDS``.
+          **settings: what the backend takes.
         """
         check_name("backend", backend, BACKENDS)
         return load(BACKENDS[backend])(**settings).compile(self.schedule, self.outputs)
@@ -55,10 +58,10 @@ def scalarize(fn: Callable, *examples: Any, branch_cost: int = 400) -> Scalarize
     """Writes a function out in scalars, for a backend.
 
     Args:
-        fn: a function of one example.
-        *examples: its arguments, or their `jax.ShapeDtypeStruct`s.
-        branch_cost: a branch of `cond` with more operations than this, or with a loop, is skipped
-            where no lane needs it; others are computed for every lane.
+      fn: a function of one example.
+      *examples: its arguments, or their ``jax.ShapeDtypeStruct``s.
+      branch_cost: a branch of ``cond`` with more operations than this, or with a loop, is skipped
+        where no lane needs it; others are computed for every lane.
     """
     return build(fn, examples, [True] * len(jax.tree.leaves(examples)), branch_cost)
 
@@ -68,28 +71,26 @@ def build(
     examples: Sequence[Any],
     varying: Sequence[bool],
     branch_cost: int,
-    unrolled: int = loops.UNROLLED_LENGTH,
-    unrolled_arrays: int = loops.UNROLLED_LENGTH,
-    unrolled_on_request: int = loops.UNROLLED_LENGTH,
+    limits: Limits = Limits(),  # noqa: B008 (a tuple of numbers)
 ) -> Scalarized:
     """Writes a function out.
 
     Args:
-        fn: a function of one example.
-        examples: its arguments, or their shapes.
-        varying: which of their leaves differ from lane to lane.
-        branch_cost: as in `scalarize`.
-        unrolled: a scan that reads and makes no arrays is written out up to this length.
-        unrolled_arrays: one that reads or makes arrays is written out up to this length.
-        unrolled_on_request: one whose `unroll` is more than 1 is, up to this length.
+      fn: a function of one example.
+      examples: its arguments, or their shapes.
+      varying: which of their leaves differ from lane to lane.
+      branch_cost: as in ``scalarize``.
+      limits: up to which length scans are written out.
 
     Raises:
-        TooLarge: it is more than is written out.
-        UnsupportedPrimitive: it uses a primitive that has no rule.
+      TooLarge: it is more than is written out.
+      UnsupportedPrimitive: it uses a primitive that has no rule.
     """
     program, out_shape = jaxprs.trace(fn, *examples)
+    if any(jaxprs.is_key(variable.aval) for variable in program.jaxpr.invars):
+        raise no_keys()
     size.check_size(program)
-    graph = Graph(branch_cost, unrolled, unrolled_arrays, unrolled_on_request)
+    graph = Graph(branch_cost, limits)
     inputs = [
         _inputs(graph, number, variable.aval, varies)
         for number, (variable, varies) in enumerate(zip(program.jaxpr.invars, varying, strict=True))
@@ -98,7 +99,7 @@ def build(
         results = evaluate.run(graph, program, inputs)
     outputs = [arrays.elements(result) for result in results]
     out_avals, out_tree = jax.tree.flatten(out_shape)
-    return Scalarized(
+    written = Scalarized(
         in_avals=[variable.aval for variable in program.jaxpr.invars],
         out_tree=out_tree,
         out_avals=out_avals,
@@ -106,6 +107,9 @@ def build(
         schedule=liveness.schedule(graph.scope, (x for leaf in outputs for x in leaf)),
         captures=graph.captures,
     )
+    if inspect is not None:
+        inspect(written)
+    return written
 
 
 def _inputs(graph: Graph, number: int, aval: Any, varying: bool) -> np.ndarray:

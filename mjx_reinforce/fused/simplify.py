@@ -1,8 +1,11 @@
 """Algebra on scalars: what need not be computed.
 
-Everything here keeps IEEE results, but for two deviations that the speed comes from:
-  - x * 0, 0 / x and x - x are 0, also where x is infinite or NaN;
-  - the sign of a zero is not kept (x + 0 is x, 0 - x is -x, a masked product is +0).
+Results are those of IEEE arithmetic, with the exceptions that the package's docstring lists:
+
+- x * 0, 0 / x and x - x are 0, also where x is infinite or NaN.
+- x times a bool is 0 where the bool is false, also where x is infinite or NaN.
+- The sign of a zero is not kept: x + 0 is x, 0 - x is -x, and -(x - y) is y - x.
+- A power with a constant integer exponent up to 8 is a product, which rounds otherwise.
 
 A division by a constant becomes a product only where the reciprocal is exact.
 """
@@ -16,7 +19,7 @@ from mjx_reinforce.fused import folding
 from mjx_reinforce.fused.nodes import Node, Scalar, is_constant
 from mjx_reinforce.fused.ops import Op
 
-# Greater powers are not faster as products than as `pow`.
+# Greater powers are not faster as products than as ``pow``.
 _LARGEST_POWER = 8
 
 
@@ -126,7 +129,7 @@ def _mask(graph: Builder, mask: Scalar, value: Scalar) -> Scalar | None:
 
 
 def _div(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
-    if _is(x, 0):
+    if _is(x, 0) and np.issubdtype(x.dtype, np.floating):  # an integer 0 / 0 is -1
         return x
     if is_constant(y) and np.issubdtype(y.dtype, np.floating):
         mantissa, exponent = np.frexp(y)
@@ -136,7 +139,7 @@ def _div(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
 
 
 def _pow(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
-    if is_constant(y) and y == int(y if np.isfinite(y) else 0.5) and abs(y) <= _LARGEST_POWER:
+    if is_constant(y) and float(y).is_integer() and abs(y) <= _LARGEST_POWER:
         return power(graph, x, int(y))
     return None
 
@@ -175,7 +178,7 @@ def _or(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
 
 
 def _bitwise(x: Scalar, y: Scalar, absorbing: bool) -> Scalar | None:
-    """Simplifies `and` (absorbing False) and `or` (absorbing True) of bools."""
+    """Simplifies ``and`` (absorbing False) and ``or`` (absorbing True) of bools."""
     if x.dtype != np.bool_:
         return None
     for left, right in ((x, y), (y, x)):
@@ -245,7 +248,7 @@ def _through_select(
 ) -> Scalar | None:
     """Folds an operation whose operands are constants and selections among constants."""
     nodes = [arg for arg in args if not is_constant(arg)]
-    if op.name == "convert_element_type" and nodes[0].dtype == np.bool_ != dtype:
+    if op.name == "convert_element_type" and nodes[0].dtype == np.bool_ and dtype != np.bool_:
         return graph.select(nodes[0], dtype.type(1), dtype.type(0))
     choices: list[tuple] = [_args(node, "select_n") or () for node in nodes]
     for choice in choices:

@@ -5,6 +5,7 @@ was then written.
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 from mjx_reinforce.fused import jaxprs, ops
@@ -36,7 +37,7 @@ def num_scalars(program: jaxprs.Program) -> int:
     return sum(_size(eqn, default) for eqn in program.jaxpr.eqns)
 
 
-def _size(eqn: Any, default: dict[Any, int]) -> int:
+def _size(eqn: Any, default: Mapping[Any, int | None]) -> int:
     """Returns the size of one equation."""
     name, params = eqn.primitive.name, eqn.params
     if name == "cond":
@@ -44,6 +45,8 @@ def _size(eqn: Any, default: dict[Any, int]) -> int:
         index = eqn.invars[0]
         known = None if jaxprs.is_literal(index) else default.get(index)
         return sum(sizes) if known is None else sizes[known]
+    if name == "by_engine":
+        return num_scalars(jaxprs.program(params["one"]))
     if name == "while":
         bodies = (params[part] for part in ("cond_jaxpr", "body_jaxpr"))
         return _LOOP * sum(num_scalars(jaxprs.program(body)) for body in bodies)

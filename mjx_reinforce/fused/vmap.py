@@ -1,4 +1,4 @@
-"""`vmap`: a drop-in for `jax.vmap` that leaves only elementwise work."""
+"""``vmap``: a drop-in for ``jax.vmap`` that leaves only elementwise work."""
 
 import functools
 import warnings
@@ -16,37 +16,48 @@ from mjx_reinforce.fused import scalarized
 MAX_OPERATIONS = 20_000
 
 
-def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 32) -> Callable:
-    """Maps a function over a batch, like `jax.vmap`, one array over the batch for each scalar.
+def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 32) -> "Mapped":
+    """Maps a function over a batch, like ``jax.vmap``, one array over the batch for each scalar.
 
     The function is traced for one example and evaluated element by element; see the package's
     docstring for what that costs and which floating-point promises it loosens. Call the result
-    under `jax.jit`. The fastest layout keeps the batch last (axes of -1): then each scalar's lane
+    under ``jax.jit``. The fastest layout keeps the batch last (axes of -1): then each scalar's lane
     is one contiguous row.
 
     Args:
-        fn: a function of one example; pytrees in and out.
-        in_axes: for each argument an axis, None for one that all lanes share, or a pytree prefix.
-        out_axes: the same for the result; None only for what does not depend on the lane.
-        branch_cost: a branch of `cond` with more scalar operations than this, or with a loop, is
-            skipped where no lane needs it; others are computed for every lane. XLA's CPU backend
-            computes shared values again in each fusion, and a real branch also stops that.
+      fn: a function of one example; pytrees in and out.
+      in_axes: for each argument an axis, None for one that all lanes share, or a pytree prefix.
+      out_axes: the same for the result; None only for what does not depend on the lane.
+      branch_cost: a branch of ``cond`` with more scalar operations than this, or with a loop, is
+        skipped where no lane needs it; others are computed for every lane. XLA's CPU backend
+        computes shared values again in each fusion, and a real branch also stops that.
 
     Returns:
-        The mapped function. Keyword arguments are mapped over their first axis. Its `write`
-        takes the same arguments, or their shapes, and returns the `Scalarized` that it evaluates.
+      The mapped function. Keyword arguments are mapped over their first axis.
 
     Raises:
-        ValueError: if no argument is mapped, the mapped sizes differ, or an axis does not fit.
-        TooLarge: if fn is more than is written out.
-        UnsupportedPrimitive: if fn uses a primitive that has no rule.
+      ValueError: if no argument is mapped, the mapped sizes differ, or an axis does not fit.
+      TooLarge: if fn is more than is written out.
+      UnsupportedPrimitive: if fn uses a primitive that has no rule, or reads typed PRNG keys.
     """
-    write = _Writer(fn, in_axes, branch_cost)
+    return Mapped(fn, in_axes, out_axes, branch_cost)
 
-    @functools.wraps(fn)
-    def mapped(*args: Any, **kwargs: Any) -> Any:
+
+class Mapped:
+    """What ``vmap`` returns: a function that is written out once for each kind of arguments."""
+
+    def __init__(self, fn: Callable, in_axes: Any, out_axes: Any, branch_cost: int):
+        """Takes the arguments of ``vmap``."""
+        functools.update_wrapper(self, fn)
+        self._fn = fn
+        self._in_axes, self._out_axes = in_axes, out_axes
+        self._branch_cost = branch_cost
+        self._written: dict[Any, scalarized.Scalarized] = {}
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Evaluates the function for every example of a batch."""
         args, kwargs = jax.tree.map(jnp.asarray, (args, kwargs))
-        written, axes = write(args, kwargs)
+        written, axes = self._write(args, kwargs)
         count = sum(written.operations.values())
         if count > MAX_OPERATIONS:
             warnings.warn(
@@ -60,28 +71,18 @@ def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 3
         values = written.compile("xla", read=lambda place: _row(rows, *place), batch_shape=(batch,))
         out_tree = written.out_tree
         target = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
-        ends = _axes(out_axes, target)
+        ends = _axes(self._out_axes, target)
         outputs = [
             _assemble(scalars, aval, axis, batch)
             for scalars, aval, axis in zip(values, written.out_avals, ends, strict=True)
         ]
         return jax.tree.unflatten(out_tree, outputs)
 
-    # The type that `wraps` gives a function has no room for attributes.
-    mapped.write = lambda *args, **kwargs: write(args, kwargs)[0]  # pyright: ignore[reportAttributeAccessIssue]
-    return mapped
+    def write(self, *args: Any, **kwargs: Any) -> scalarized.Scalarized:
+        """Returns what is evaluated for these arguments, of which the shapes are enough."""
+        return self._write(args, kwargs)[0]
 
-
-class _Writer:
-    """Writes a function out once for each kind of arguments."""
-
-    def __init__(self, fn: Callable, in_axes: Any, branch_cost: int):
-        self._fn = fn
-        self._in_axes = in_axes
-        self._branch_cost = branch_cost
-        self._written: dict[Any, scalarized.Scalarized] = {}
-
-    def __call__(
+    def _write(
         self, args: tuple, kwargs: dict[str, Any]
     ) -> tuple[scalarized.Scalarized, list[int | None]]:
         """Returns the function written out for these arguments, and the axis of each leaf."""
@@ -95,19 +96,17 @@ class _Writer:
         varying = tuple(axis is not None for axis in axes)
         precision = jnp.result_type(float)  # constants inside depend on it
         key = (in_tree, tuple((x.shape, x.dtype) for x in examples), varying, precision)
-        written = self._written.get(key)
-        if written is None:  # writing it out takes about a second
-            written = self._write(in_tree, examples, varying)
-            if not written.captures:
-                self._written[key] = written
-        return written, axes
 
-    def _write(self, in_tree: Any, examples: list, varying: tuple) -> scalarized.Scalarized:
         def flat_fn(*flat: Any) -> Any:
             args, kwargs = jax.tree.unflatten(in_tree, flat)
             return self._fn(*args, **kwargs)
 
-        return scalarized.build(flat_fn, examples, varying, self._branch_cost)
+        written = self._written.get(key)
+        if written is None:  # writing it out takes about a second
+            written = scalarized.build(flat_fn, examples, varying, self._branch_cost)
+            if not written.captures:
+                self._written[key] = written
+        return written, axes
 
 
 def _is_none(x: Any) -> bool:

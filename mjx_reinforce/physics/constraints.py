@@ -4,15 +4,16 @@ MJX's Newton solver is a loop around a line search that is another loop, in ever
 also where no constraint is active. Two cases are cheaper and lead to the same answer:
 
 - Where the only constraint rows are limits of slide and hinge joints, at most two of them to a
-  kinematic tree, the optimum has a closed form: `limits`.
+  kinematic tree, the optimum has a closed form: ``limits``.
 - Otherwise the solver is entered only if some row is active; if none is, the acceleration is the
-  unconstrained one. (Under `jax.vmap` both branches are computed for every episode.) For all of
-  Gymnasium's tasks with contacts the solver is `newton`, whose line search is exact; MJX's own
+  unconstrained one. (Under ``jax.vmap`` both branches are computed for every episode.) For all of
+  Gymnasium's tasks with contacts the solver is ``newton``, whose line search is exact; MJX's own
   remains for elliptic cones, friction loss and conjugate gradients.
 
 The model's solver options stay as they are. The closed form is exact and reads none of
-`iterations`, `tolerance` and the warm start. C's Newton solver also stops at a small gradient or a
-small improvement, `newton` only at the optimum or at a step too small to count: now and then it
+``iterations``, ``tolerance`` and the warm start. C's Newton solver also stops at a small gradient
+or a
+small improvement, ``newton`` only at the optimum or at a step too small to count: now and then it
 makes one iteration more than C, and ends nearer to the optimum.
 """
 
@@ -28,11 +29,11 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """Finds the acceleration under constraints, and the constraint forces.
 
     Args:
-        model: an MJX model made with impl='jax'.
-        data: its data after `mjx.fwd_acceleration`, with at least one constraint row.
+      model: an MJX model made with impl='jax'.
+      data: its data after ``mjx.fwd_acceleration``, with at least one constraint row.
 
     Returns:
-        The data with `qacc`, `qfrc_constraint` and `efc_force`.
+      The data with ``qacc``, ``qfrc_constraint`` and ``efc_force``.
     """
     fields = jax_fields(data)
     if limits.supports(model, data):
@@ -67,7 +68,7 @@ def _iterate(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, ja
     """Solves by Newton's method where it applies, otherwise by MJX's solver.
 
     Returns:
-        The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
+      The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
     if newton.supports(model, data):
         return touching.solve(newton.solve, model, data)

@@ -1,7 +1,7 @@
 """Products with the Jacobian of the constraint rows, where few contacts touch.
 
 A contact that does not touch has rows of zeros, and of those that touch not all push. Machine code
-for one episode (`fused`) skips such a contact by a branch. Where XLA computes many episodes at
+for one episode (``fused``) skips such a contact by a branch. Where XLA computes many episodes at
 once both sides of a branch would be computed, and there these are products of whole matrices.
 """
 
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.physics.by_engine import UNROLL, by_engine
+from mjx_reinforce.fused import by_engine
 
 
 class Blocks(NamedTuple):
@@ -20,20 +20,20 @@ class Blocks(NamedTuple):
 
     others: the leading rows, which belong to no contact
     groups: contacts with equally many rows: how many contacts, and how many rows each
-    unroll: of loops over contacts, see `by_engine`
+    may_unroll: whether loops over contacts may be written out, see ``fused.by_engine``
     """
 
     others: int
     groups: tuple[tuple[int, int], ...]
-    unroll: int
+    may_unroll: bool
 
 
-def blocks(others: int, dims: np.ndarray, unroll: int = UNROLL) -> Blocks:
+def blocks(others: int, dims: np.ndarray, may_unroll: bool = True) -> Blocks:
     """Returns the division for contacts [C] of these dimensions under pyramidal cones."""
     kinds = [dim for dim in (1, 3, 4, 6) if (dims == dim).any()]
     rows = {dim: 1 if dim == 1 else 2 * (dim - 1) for dim in kinds}
     groups = tuple((int((dims == dim).sum()), rows[dim]) for dim in kinds)
-    return Blocks(others, groups, unroll)
+    return Blocks(others, groups, may_unroll)
 
 
 def weighted(
@@ -42,11 +42,11 @@ def weighted(
     """Returns start [nv, nv] + J' diag(mass) J, and J' force [nv].
 
     Args:
-        division: of the rows.
-        start: [nv, nv] what the first product is added to.
-        jacobian: [rows, nv]
-        mass: [rows]; where all of a contact's are zero, its forces are zero too.
-        force: [rows]
+      division: of the rows.
+      start: [nv, nv] what the first product is added to.
+      jacobian: [rows, nv]
+      mass: [rows]; where all of a contact's are zero, its forces are zero too.
+      force: [rows]
     """
 
     def whole(start: jax.Array, *rows: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -63,10 +63,11 @@ def weighted(
         zero = jnp.zeros_like(start)
         sums = whole(start, *(x[: division.others] for x in rows))
         for group in _by_group(division, rows):
-            sums, _ = lax.scan(add, sums, group, unroll=division.unroll)
+            sums, _ = lax.scan(add, sums, group)
         return sums
 
-    return by_engine(by_contact, whole, start, jacobian, mass, force)
+    operands = start, jacobian, mass, force
+    return by_engine(by_contact, whole, *operands, may_unroll=division.may_unroll)
 
 
 def along(
@@ -75,10 +76,10 @@ def along(
     """Returns J direction, [rows].
 
     Args:
-        division: of the rows.
-        jacobian: [rows, nv]
-        direction: [nv]
-        touching: [C] whether a contact's rows may be other than zero.
+      division: of the rows.
+      jacobian: [rows, nv]
+      direction: [nv]
+      touching: [C] whether a contact's rows may be other than zero.
     """
 
     def whole(jacobian: jax.Array, direction: jax.Array, touching: jax.Array) -> jax.Array:
@@ -95,11 +96,12 @@ def along(
             division.groups, _by_group(division, (jacobian,)), strict=True
         ):
             block = rows, touching[first : first + count]
-            parts.append(lax.scan(product, None, block, unroll=division.unroll)[1].reshape(-1))
+            parts.append(lax.scan(product, None, block)[1].reshape(-1))
             first += count
         return jnp.concatenate(parts)
 
-    return by_engine(by_contact, whole, jacobian, direction, touching)
+    operands = jacobian, direction, touching
+    return by_engine(by_contact, whole, *operands, may_unroll=division.may_unroll)
 
 
 def _by_group(division: Blocks, rows: tuple) -> list[tuple]:

@@ -1,18 +1,18 @@
 """Contacts as C MuJoCo makes them, where MJX makes others.
 
 Gymnasium runs C MuJoCo, and MJX 3.17 departs from it in three collision functions, by enough to
-change an episode; these agree with MuJoCo 4.0 (`engine_collision_primitive.c`) to rounding.
+change an episode; these agree with MuJoCo 4.0 (``engine_collision_primitive.c``) to rounding.
 
-- `plane_capsule`: MJX's contact frame no longer follows a capsule that is more than 60 degrees
+- ``plane_capsule``: MJX's contact frame no longer follows a capsule that is more than 60 degrees
   from the plane, and the friction pyramid turns with the frame.
-- `sphere_capsule` and `capsule_capsule`: MJX adds 1e-6 to its denominators.
+- ``sphere_capsule`` and ``capsule_capsule``: MJX adds 1e-6 to its denominators.
 
 One difference remains. Capsules within 1e-4 rad of parallel meet in two contacts in C, at the
 ends of their overlap, and here in one, at its middle: the number of rows is static in JAX, so that
 every pair of capsules would pay for a second row (a fifth of Humanoid's time on a CPU). None of
 60,000 states of Humanoid, HumanoidStandup and Hopper under random actions had such a pair.
 
-`fwd_position` is MJX's with these three in the table of collision functions.
+``fwd_position`` is MJX's with these three in the table of collision functions.
 """
 
 import jax
@@ -32,7 +32,7 @@ from mjx_reinforce.physics.rows import make_constraint
 # What C takes for zero (mjMINVAL); in single precision, what rounding may leave of a zero distance
 # between points a few metres from the origin. Axes that cross, as in a planar Hopper, have that.
 _MIN_LENGTH = {"float64": 1e-15, "float32": 2e-6}
-# Capsules are parallel in C (`mjc_segWeights`) below this square of their angle's sine.
+# Capsules are parallel in C (``mjc_segWeights``) below this square of their angle's sine.
 _PARALLEL = 1e-8
 
 
@@ -125,7 +125,7 @@ _collision = collision_with(
 
 
 def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Computes what depends on position: `mjx.fwd_position` with this module's contacts."""
+    """Computes what depends on position: ``mjx.fwd_position`` with this module's contacts."""
     data = mjx.kinematics(model, data)
     data = mjx.com_pos(model, data)
     data = mjx.camlight(model, data)

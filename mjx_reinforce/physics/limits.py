@@ -48,11 +48,11 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
     """Solves for the limits' forces exactly.
 
     Args:
-        model: a model that `supports` accepts.
-        data: its data after `mjx.fwd_acceleration`.
+      model: a model that ``supports`` accepts.
+      data: its data after ``mjx.fwd_acceleration``.
 
     Returns:
-        The acceleration [nv], the limits' joint forces [nv] and the rows' forces [rows].
+      The acceleration [nv], the limits' joint forces [nv] and the rows' forces [rows].
     """
     # The rows are made again here, so that nothing outside this branch needs them.
     fields = jax_fields(mjx.make_constraint(model, data))

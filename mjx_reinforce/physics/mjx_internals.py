@@ -2,16 +2,16 @@
 
 No other file imports MJX's private modules or reads the private part of its data. Three kinds:
 
-- Names that MJX keeps private, here without underscore: the imports, and `advance`.
-- Fields of `mjx.Data` that only MJX's JAX implementation has: `jax_fields`, `with_solution`,
-  `rows_of`, `with_rows`, `with_contact`, `Simulation`, `num_contacts`.
-- Functions of MJX in which a name is given another meaning: `collision_with` and `fenced`. They
-  would do nothing, silently, if MJX stopped looking that name up; `check_lookup` raises then.
+- Names that MJX keeps private, here without underscore: the imports, and ``advance``.
+- Fields of ``mjx.Data`` that only MJX's JAX implementation has: ``jax_fields``, ``with_solution``,
+  ``rows_of``, ``with_rows``, ``with_contact``, ``Simulation``, ``num_contacts``.
+- Functions of MJX in which a name is given another meaning: ``collision_with`` and ``fenced``. They
+  would do nothing, silently, if MJX stopped looking that name up; ``check_lookup`` raises then.
 
-`tests/test_mjx_internals.py` holds a hash of each MJX function that this package replaces or
+``tests/test_mjx_internals.py`` holds a hash of each MJX function that this package replaces or
 whose source it depends on: a new MJX fails there first.
 
-`fenced` makes two changes for XLA's CPU backend; neither changes an answer.
+``fenced`` makes two changes for XLA's CPU backend; neither changes an answer.
 
 - A body's pose needs every entry of its parent's. XLA fuses the whole chain and then computes the
   parent's entries again for each entry of the child: time grows exponentially with depth. Pusher's
@@ -19,7 +19,7 @@ whose source it depends on: a new MJX fails there first.
 - The contacts of cylinders and ellipsoids are found in ten steps of gradient descent, a loop that
   depends on nothing else in the forward pass. jaxlib 0.10.2 runs such a loop beside other work, and
   for some programs (Pusher, 512 episodes) waits forever for it. Here the steps are written out for
-  XLA, and a loop for `fused`.
+  XLA, and a loop for ``fused``.
 """
 
 import contextlib
@@ -44,7 +44,7 @@ from mujoco.mjx._src.forward import _advance as advance
 from mujoco.mjx._src.math import make_frame
 from mujoco.mjx._src.smooth import solve_m
 
-from mjx_reinforce.physics.by_engine import by_engine
+from mjx_reinforce.fused import by_engine
 
 __all__ = [
     "Collision",
@@ -66,7 +66,7 @@ __all__ = [
     "with_solution",
 ]
 
-#: What this package was tested with; `pyproject.toml` bounds the versions at the same.
+#: What this package was tested with; ``pyproject.toml`` bounds the versions at the same.
 TESTED_VERSIONS = {"mujoco": "4.0", "mujoco-mjx": "3.17"}
 
 
@@ -77,12 +77,12 @@ def check_lookup(module: types.ModuleType, function: str, name: str) -> None:
     """Checks that a function of MJX looks up a global name, so that it sees another meaning.
 
     Args:
-        module: the module of MJX that has the function and the name.
-        function: the function's name.
-        name: the global name that this package gives another meaning.
+      module: the module of MJX that has the function and the name.
+      function: the function's name.
+      name: the global name that this package gives another meaning.
 
     Raises:
-        RuntimeError: if the function is gone, or does not look the name up in this module.
+      RuntimeError: if the function is gone, or does not look the name up in this module.
     """
     found = inspect.unwrap(getattr(module, function, None))  # type: ignore
     if (
@@ -124,14 +124,14 @@ _Colliders = dict[tuple[mjx.GeomType, mjx.GeomType], Callable[..., Any]]
 def collision_with(
     functions: Callable[[_Colliders], _Colliders],
 ) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
-    """Returns a copy of `mjx.collision` with other collision functions.
+    """Returns a copy of ``mjx.collision`` with other collision functions.
 
     MJX finds its collision functions in one table, a global of a module; the copy has a table of
     its own, and MJX stays as it is.
 
     Args:
-        functions: from MJX's table, a `collider` for each pair of types of geoms in MJX's order,
-            makes the copy's.
+      functions: from MJX's table, a ``collider`` for each pair of types of geoms in MJX's order,
+        makes the copy's.
     """
     plain = inspect.unwrap(mjx.collision)
     table = functions(dict(collision_driver._COLLISION_FUNC))
@@ -164,7 +164,7 @@ def _fenced_level(*inputs: Any) -> Any:
 
 
 def _descend(objective: Callable[..., Any], x: jax.Array, niter: int) -> tuple[Any, jax.Array]:
-    """Returns the least distance found [] and where [3], as MJX's `_gradient_descent`."""
+    """Returns the least distance found [] and where [3], as MJX's ``_gradient_descent``."""
 
     @jax.jit  # not inlined: JAX vmaps it once for all iterations
     def step(state: collision_sdf.GradientState) -> collision_sdf.GradientState:
@@ -205,10 +205,10 @@ def with_solution(
     """Returns the data with what a constraint solver found.
 
     Args:
-        data: an MJX simulation.
-        qacc: [nv] the acceleration.
-        qfrc_constraint: [nv] the constraints' joint forces.
-        efc_force: [rows] the constraint rows' forces.
+      data: an MJX simulation.
+      qacc: [nv] the acceleration.
+      qfrc_constraint: [nv] the constraints' joint forces.
+      efc_force: [rows] the constraint rows' forces.
     """
     solved = data.tree_replace(
         {"qacc": qacc, "qfrc_constraint": qfrc_constraint, "_impl.efc_force": efc_force}
@@ -220,12 +220,12 @@ _ROW_FIELDS = ("efc_J", "efc_D", "efc_aref", "efc_pos", "efc_margin", "efc_frict
 
 
 def rows_of(data: mjx.Data) -> list[jax.Array]:
-    """Returns what `mjx.make_constraint` makes."""
+    """Returns what ``mjx.make_constraint`` makes."""
     return [getattr(jax_fields(data), name) for name in _ROW_FIELDS]
 
 
 def with_rows(data: mjx.Data, rows: list[jax.Array]) -> mjx.Data:
-    """Returns the data with rows as `rows_of` lists them."""
+    """Returns the data with rows as ``rows_of`` lists them."""
     names = (f"_impl.{name}" for name in _ROW_FIELDS)
     return cast(mjx.Data, data.tree_replace(dict(zip(names, rows, strict=True))))
 

@@ -5,13 +5,13 @@ The acceleration a minimises (MuJoCo's documentation, "Computation", "Constraint
     (a - a_s)' M (a - a_s) / 2 + \sum_i D_i min(0, J_i a - r_i)^2 / 2
 
 with the unconstrained acceleration a_s, the inertia matrix M and, of the constraint rows, the
-Jacobian J, reference r and constraint mass D (`efc_J`, `efc_aref`, `efc_D`); rows of equality
+Jacobian J, reference r and constraint mass D (``efc_J``, ``efc_aref``, ``efc_D``); rows of equality
 constraints count on both sides of zero. The cost is convex, and quadratic for a given set of active
 rows, so that Newton's method, with an exact line search, ends after finitely many steps: when a
 full step leaves the set as it is, that step led to the minimum.
 
 MJX's own solver does the same steps, but its line search evaluates three points in each of
-`ls_iterations` (50) rounds, which `jax.vmap` carries out for every episode until the slowest is
+``ls_iterations`` (50) rounds, which ``jax.vmap`` carries out for every episode until the slowest is
 done; here a round evaluates one point, and the search ends when no row changes any more.
 """
 
@@ -22,7 +22,6 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from mjx_reinforce.physics import contact_rows
-from mjx_reinforce.physics.by_engine import UNROLL
 from mjx_reinforce.physics.mjx_internals import jax_fields
 
 # mjMINVAL: what C takes for zero.
@@ -92,7 +91,7 @@ class _LineSearch(NamedTuple):
 
 
 def supports(model: mjx.Model, data: mjx.Data) -> bool:
-    """Returns whether `solve` is for this model: Newton, pyramidal cones, no friction loss."""
+    """Returns whether ``solve`` is for this model: Newton, pyramidal cones, no friction loss."""
     return (
         model.opt.solver == mjx.SolverType.NEWTON
         and model.opt.cone == mjx.ConeType.PYRAMIDAL
@@ -101,25 +100,26 @@ def supports(model: mjx.Model, data: mjx.Data) -> bool:
 
 
 def solve(
-    model: mjx.Model, data: mjx.Data, unroll: int = UNROLL
+    model: mjx.Model, data: mjx.Data, may_unroll: bool = True
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds the acceleration under constraints, from the start that costs less.
 
     The starts are the unconstrained acceleration and, unless the model disables it, the warm start.
 
     Args:
-        model: a model that `supports` accepts; `iterations` and `ls_iterations` bound the loops.
-        data: with its constraint rows made.
-        unroll: of loops over contacts, see `by_engine`.
+      model: a model that ``supports`` accepts; ``iterations`` and ``ls_iterations`` bound the
+        loops.
+      data: with its constraint rows made.
+      may_unroll: whether loops over contacts may be written out, see ``fused.by_engine``.
 
     Returns:
-        The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
+      The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
     fields = jax_fields(data)
     equality = jnp.arange(fields.efc_D.shape[0]) < fields.ne
     rows = _Rows(fields.efc_J, fields.efc_aref, fields.efc_D, equality)
     num_others = fields.ne + fields.nf + fields.nl
-    division = contact_rows.blocks(num_others, fields.contact.dim, unroll)
+    division = contact_rows.blocks(num_others, fields.contact.dim, may_unroll)
     # A NaN counts as touching, so that it gets to the acceleration.
     touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
     inertia = mjx.full_m(model, data)
@@ -215,12 +215,12 @@ def _line_search(
     is zero, and the length is 1.
 
     Args:
-        rows: the constraints.
-        point: where the step starts.
-        change: [rows] how the residual changes along it.
-        slope: [] the derivative there, without rows.
-        curvature: [] how that derivative changes along the step.
-        max_rounds: lengths to evaluate at most.
+      rows: the constraints.
+      point: where the step starts.
+      change: [rows] how the residual changes along it.
+      slope: [] the derivative there, without rows.
+      curvature: [] how that derivative changes along the step.
+      max_rounds: lengths to evaluate at most.
     """
     row_slope = rows.constraint_mass * change * point.residual
     row_curvature = rows.constraint_mass * change**2

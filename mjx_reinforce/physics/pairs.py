@@ -1,7 +1,7 @@
 """Pairs of geoms one after the other, and only where their bounding spheres meet, as in C.
 
 MJX collides all pairs of one kind at once, which is best where XLA computes many episodes. Machine
-code for one episode (`fused`) is a loop over the pairs: short, and quick where geoms are apart.
+code for one episode (``fused``) is a loop over the pairs: short, and quick where geoms are apart.
 """
 
 import types
@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from mujoco import mjx
 
-from mjx_reinforce.physics.by_engine import UNROLL, by_engine
+from mjx_reinforce.fused import by_engine
 
 #: A collision function of MJX: (model, data, key, geoms [P, 2]) -> dist, pos, frame of contacts.
 Collide = Callable[..., Any]
@@ -26,7 +26,7 @@ def one_by_one(collide: Collide) -> Collide:
     Of contacts between geoms that are apart only the sign of the distance is right.
 
     Args:
-        collide: made by MJX's `collider`, for geoms with a bounding sphere.
+      collide: made by MJX's ``collider``, for geoms with a bounding sphere.
     """
 
     def together(model: mjx.Model, data: mjx.Data, key: Any, geoms: Any) -> Any:
@@ -42,7 +42,7 @@ def one_by_one(collide: Collide) -> Collide:
             return collide(model, data, key, geoms)
 
         def in_turn(*rows: jax.Array) -> Any:
-            contacts = lax.scan(lambda _, row: (None, pair(*row)), None, rows, unroll=UNROLL)[1]
+            contacts = lax.scan(lambda _, row: (None, pair(*row)), None, rows)[1]
             return jax.tree.map(jnp.concatenate, contacts)
 
         def pair(pos: Any, mat: Any, size: Any, spheres: Any, margin: Any) -> Any:
@@ -60,7 +60,7 @@ def one_by_one(collide: Collide) -> Collide:
                 near,
             )
 
-        return by_engine(in_turn, all_at_once, *rows, spheres, margins)
+        return by_engine(in_turn, all_at_once, *rows, spheres, margins, may_unroll=True)
 
     together.ncon = collide.ncon  # pyright: ignore
     return together

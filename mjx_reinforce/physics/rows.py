@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from mujoco import mjx
 
-from mjx_reinforce.physics.by_engine import UNROLL, by_engine
+from mjx_reinforce.fused import by_engine
 from mjx_reinforce.physics.mjx_internals import (
     jax_fields,
     rows_of,
@@ -24,11 +24,11 @@ from mjx_reinforce.physics.mjx_internals import (
 _NO_OTHERS = mjx.DisableBit.EQUALITY | mjx.DisableBit.FRICTIONLOSS | mjx.DisableBit.LIMIT
 
 
-def make_constraint(model: mjx.Model, data: mjx.Data, unroll: int = UNROLL) -> mjx.Data:
-    """Makes the constraint rows, as `mjx.make_constraint`.
+def make_constraint(model: mjx.Model, data: mjx.Data, may_unroll: bool = True) -> mjx.Data:
+    """Makes the constraint rows, as ``mjx.make_constraint``.
 
     Of a contact that does not touch only the Jacobian and the reference, both zero, are right.
-    ``unroll`` is that of loops over contacts, see `by_engine`.
+    ``may_unroll`` is that of loops over contacts, see ``fused.by_engine``.
     """
     contact = jax_fields(data).contact
     if model.opt.disableflags & mjx.DisableBit.CONSTRAINT or not contact.dim.size:
@@ -42,15 +42,13 @@ def make_constraint(model: mjx.Model, data: mjx.Data, unroll: int = UNROLL) -> m
         for dim in (1, 3, 4, 6):
             chosen = np.flatnonzero(contact.dim == dim)
             if chosen.size:
-                parts.append(_contact_rows(model, data, int(dim), chosen, unroll))
+                parts.append(_contact_rows(model, data, int(dim), chosen))
         return [jnp.concatenate(part) for part in zip(*parts, strict=True)]
 
-    return with_rows(data, by_engine(in_turn, whole))
+    return with_rows(data, by_engine(in_turn, whole, may_unroll=may_unroll))
 
 
-def _contact_rows(
-    model: mjx.Model, data: mjx.Data, dim: int, chosen: np.ndarray, unroll: int
-) -> list[Any]:
+def _contact_rows(model: mjx.Model, data: mjx.Data, dim: int, chosen: np.ndarray) -> list[Any]:
     """Makes the rows of these contacts, all of one dimension, in a loop."""
     alone = model.replace(opt=model.opt.replace(disableflags=model.opt.disableflags | _NO_OTHERS))
     contact = jax_fields(data).contact
@@ -68,5 +66,5 @@ def _contact_rows(
         )
 
     contacts = jax.tree.map(lambda x: x[chosen], contact)
-    rows = lax.scan(make, None, contacts, unroll=unroll)[1]
+    rows = lax.scan(make, None, contacts)[1]
     return [x.reshape(-1, *x.shape[2:]) for x in rows]

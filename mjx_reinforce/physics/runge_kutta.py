@@ -1,4 +1,4 @@
-"""Runge-Kutta of order 4 as `mj_RungeKutta` of C MuJoCo 4.0.
+"""Runge-Kutta of order 4 as ``mj_RungeKutta`` of C MuJoCo 4.0.
 
 It is MJX's, but for the orientations of free and ball joints. MJX 3.17 averages the stages' angular
 velocities, though each is in its own stage's frame, which makes it a method of order 2. MuJoCo,
@@ -16,7 +16,7 @@ from mjx_reinforce.physics.mjx_internals import advance
 # For each stage: its place in the timestep, its weight, and the place of the next stage.
 _STAGES = ((0, 1 / 6, 0.5), (0.5, 1 / 3, 0.5), (0.5, 1 / 3, 1), (1, 1 / 6, 0))
 
-# Below this square of an angle a series in it replaces the closed form in `_rotation_rate`.
+# Below this square of an angle a series in it replaces the closed form in ``_rotation_rate``.
 _SMALL_SQUARE = 0.01
 _BORTZ_SERIES = (1 / 12, 1 / 720, 1 / 30240, 1 / 1209600)
 
@@ -27,9 +27,9 @@ def runge_kutta_4(
     """Advances the simulation by one timestep.
 
     Args:
-        model: an MJX model made with impl='jax'.
-        data: its data, with `ctrl` set.
-        evaluate: the model's forward pass, up to the acceleration.
+      model: an MJX model made with impl='jax'.
+      data: its data, with ``ctrl`` set.
+      evaluate: the model's forward pass, up to the acceleration.
     """
     start, timestep = data, model.opt.timestep
 
@@ -72,10 +72,10 @@ def _displacement_rate(
     """Returns how fast the displacement since the step's start grows at a stage, [nv].
 
     Args:
-        model: an MJX model; without free and ball joints, the answer is `qvel`.
-        qvel: [nv] the stage's velocity.
-        last_rate: [nv] the rate that led to the stage.
-        position: [] the stage's place in the timestep, from 0 to 1.
+      model: an MJX model; without free and ball joints, the answer is ``qvel``.
+      qvel: [nv] the stage's velocity.
+      last_rate: [nv] the rate that led to the stage.
+      position: [] the stage's place in the timestep, from 0 to 1.
     """
     rate = qvel
     for kind, dof in zip(model.jnt_type, model.jnt_dofadr, strict=True):
@@ -91,7 +91,7 @@ def _displacement_rate(
 def _rotation_rate(rotation: jax.Array, velocity: jax.Array) -> jax.Array:
     r"""Returns the time derivative of a rotation vector r under angular velocity w, [3].
 
-    Bortz (1971), with w in the rotated frame; `mju_derivExpmap` of MuJoCo 4.0:
+    Bortz (1971), with w in the rotated frame; ``mju_derivExpmap`` of MuJoCo 4.0:
 
         r' = w + r x w / 2 + c(|r|) r x (r x w),   c(x) = (1 - (x/2) cot(x/2)) / x^2
 

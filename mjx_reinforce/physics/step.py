@@ -2,14 +2,14 @@
 
 The stages are MJX's own, in MJX's order, but for four:
 
-- `constraints` solves for the constraint forces in closed form, or not at all where no constraint
+- ``constraints`` solves for the constraint forces in closed form, or not at all where no constraint
   is active, or with a line search that ends when it is exact.
-- `contacts` finds the contacts of capsules as C MuJoCo 4.0 does; MJX 3.17 departs from it.
-- `runge_kutta` turns free and ball joints as C MuJoCo 4.0 does; MJX 3.17 departs from it.
-- `forward` computes the sensors of accelerations without constraints too, where MJX skips them.
+- ``contacts`` finds the contacts of capsules as C MuJoCo 4.0 does; MJX 3.17 departs from it.
+- ``runge_kutta`` turns free and ball joints as C MuJoCo 4.0 does; MJX 3.17 departs from it.
+- ``forward`` computes the sensors of accelerations without constraints too, where MJX skips them.
 
 Gymnasium runs C MuJoCo, so its answer is the one we want. For a model without such contacts and
-joints, such as InvertedPendulum's, a step equals `mjx.step`.
+joints, such as InvertedPendulum's, a step equals ``mjx.step``.
 """
 
 import functools
@@ -28,19 +28,19 @@ __all__ = ["forward", "like", "step"]
 def step(
     model: mjx.Model, data: mjx.Data, evaluate: Callable[[mjx.Data], mjx.Data] | None = None
 ) -> mjx.Data:
-    """Advances the simulation by one timestep, as `mj_step` of C MuJoCo 4.0.
+    """Advances the simulation by one timestep, as ``mj_step`` of C MuJoCo 4.0.
 
-    Equal to `mjx.step(model, data)` where the model has no contacts of capsules and, if its
+    Equal to ``mjx.step(model, data)`` where the model has no contacts of capsules and, if its
     integrator is Runge-Kutta, no free or ball joints.
 
     Args:
-        model: an MJX model made with impl='jax'.
-        data: its data, with `ctrl` set.
-        evaluate: `forward` of this model, where the caller has it jitted.
+      model: an MJX model made with impl='jax'.
+      data: its data, with ``ctrl`` set.
+      evaluate: ``forward`` of this model, where the caller has it jitted.
 
     Raises:
-        ValueError: if the model is not of MJX's JAX implementation.
-        NotImplementedError: if MJX has no such integrator.
+      ValueError: if the model is not of MJX's JAX implementation.
+      NotImplementedError: if MJX has no such integrator.
     """
     if model.impl != mjx.Impl.JAX:
         raise ValueError(f"physics.step needs mjx.put_model(model, impl='jax'), got {model.impl}")
@@ -58,7 +58,7 @@ def step(
 
 
 def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Computes accelerations as `mjx.forward(model, data)` does, but for what this file lists."""
+    """Computes accelerations as ``mjx.forward(model, data)`` does, but for what this file lists."""
     data = contacts.fwd_position(model, data)
     data = mjx.sensor_pos(model, data)
     data = mjx.fwd_velocity(model, data)

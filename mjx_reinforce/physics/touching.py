@@ -16,16 +16,16 @@ import numpy as np
 from jax import lax
 from mujoco import mjx
 
-from mjx_reinforce.physics.by_engine import UNROLL, by_engine
+from mjx_reinforce.fused import by_engine
 from mjx_reinforce.physics.mjx_internals import jax_fields, with_contact
 from mjx_reinforce.physics.rows import make_constraint
 
 #: Acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
 Solution = tuple[jax.Array, jax.Array, jax.Array]
-#: (model, data with rows, `unroll` of loops over contacts) -> solution
+#: (model, data with rows, whether loops over contacts may be written out) -> solution
 Solver = Callable[..., Solution]
-#: Loops over so few contacts are written out where `by_engine.UNROLL` asks for it.
-_WRITTEN_OUT = 6
+#: Loops over more contacts are not written out, whatever the engine.
+_FEW = 6
 
 
 def solve(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
@@ -35,9 +35,9 @@ def solve(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
     0.8 of the speed, 0.7 with a trained policy), and all are solved with.
 
     Args:
-        solver: what solves; it takes fewer contacts than the model has.
-        model: an MJX model.
-        data: with its constraint rows made.
+      solver: what solves; it takes fewer contacts than the model has.
+      model: an MJX model.
+      data: with its constraint rows made.
     """
     contact = jax_fields(data).contact
     kinds = [k for dim in (1, 3, 4, 6) if (k := np.flatnonzero(contact.dim == dim)).size]
@@ -65,7 +65,7 @@ def _with_few(
     """Solves; the kinds are the numbers of the contacts of each dimension."""
     contact = jax_fields(data).contact
     touching = ~(contact.dist - contact.includemargin >= 0)  # a NaN counts as touching
-    unroll = UNROLL if room <= _WRITTEN_OUT else 1
+    may_unroll = room <= _FEW
     num_others = jax_fields(data).efc_D.size - sum(_rows_of_one(contact, k) * k.size for k in kinds)
 
     def few() -> Solution:
@@ -73,8 +73,10 @@ def _with_few(
             lambda *x: jnp.concatenate(x), *(contacts for contacts, _ in packed)
         )
         dims = [np.full(min(k.size, room), contact.dim[k[0]]) for k in kinds]
-        ready = make_constraint(model, with_contact(data, together, np.concatenate(dims)), unroll)
-        qacc, joint_force, force = solver(model, ready, unroll)
+        ready = make_constraint(
+            model, with_contact(data, together, np.concatenate(dims)), may_unroll
+        )
+        qacc, joint_force, force = solver(model, ready, may_unroll)
         parts, first = [force[:num_others]], num_others
         for kind in kinds:
             size = _rows_of_one(contact, kind)
@@ -84,7 +86,7 @@ def _with_few(
         return qacc, joint_force, jnp.concatenate(parts)
 
     def every() -> Solution:
-        return solver(model, make_constraint(model, data, 1), 1)
+        return solver(model, make_constraint(model, data, False), False)
 
     def packed_kind(kind: np.ndarray) -> tuple[Any, jax.Array]:
         return _pack(jax.tree.map(lambda x: x[kind], contact), touching[kind], room)
@@ -103,12 +105,12 @@ def _pack(contacts: Any, touching: jax.Array, room: int) -> tuple[Any, jax.Array
     """Brings the first contacts that touch together, in their order.
 
     Args:
-        contacts: [C, ...]
-        touching: [C] which of them touch.
-        room: for how many there is room.
+      contacts: [C, ...]
+      touching: [C] which of them touch.
+      room: for how many there is room.
 
     Returns:
-        Contacts [room, ...], those that do not touch in the places left, and how many touch [].
+      Contacts [room, ...], those that do not touch in the places left, and how many touch [].
     """
     if touching.size <= room:
         return contacts, jnp.int32(0)

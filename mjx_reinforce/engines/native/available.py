@@ -12,7 +12,7 @@ from mjx_reinforce.engines.native.gpu import seam as gpu
 
 #: LLVM 20, which llvmlite 0.45 has, is the first that reads the IR as it is written here.
 _OLDEST = (20,)
-#: JAX's generator whose noise it draws; `rollout` looks at the keys that it gets.
+#: JAX's generator whose noise it draws; ``rollout`` looks at the keys that it gets.
 GENERATOR = "threefry2x32"
 #: Settings of JAX that change numbers.
 _SETTINGS = (

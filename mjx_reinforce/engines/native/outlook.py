@@ -17,7 +17,7 @@ from mjx_reinforce.types import Environment, null_action
 if TYPE_CHECKING:
     from mjx_reinforce.types import MjModel
 
-#: Nobody waits longer for what `jax.vmap` compiles in less.
+#: Nobody waits longer for what ``jax.vmap`` compiles in less.
 MAX_SECONDS = 80
 #: People are told beforehand of what takes longer.
 _WORTH_SAYING = 15

@@ -14,13 +14,14 @@ from mjx_reinforce.engines.native.gpu import player as gpu_player
 from mjx_reinforce.engines.native.gpu import ptx, scratch
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
 from mjx_reinforce.fused import jaxprs, scalarized
+from mjx_reinforce.fused.graph import Limits
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import Environment, PyTree
 
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
-LOOPS = {"unrolled": 1, "unrolled_arrays": 1, "unrolled_on_request": 1}
+LOOPS = Limits(plain=1, arrays=1, unrollable=1)
 #: On GPUs a loop over few contacts is written out: an array that a loop reads is in memory there.
-GPU_LOOPS = {**LOOPS, "unrolled_on_request": scratch.WRITTEN_OUT}
+GPU_LOOPS = LOOPS._replace(unrollable=scratch.WRITTEN_OUT)
 #: The folders whose files decide what is written for a step.
 _WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
 
@@ -84,7 +85,7 @@ def _write_gpu(function: Any, examples: tuple[Any, ...]) -> str:
     """Writes a step, and the kernel around it, as LLVM IR."""
     actor = examples[0]
     varying = [True] * len(jax.tree.leaves(examples))
-    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **GPU_LOOPS)
+    written = scalarized.build(function, examples, varying, step.BRANCH_COST, GPU_LOOPS)
     return gpu_player.kernel_text(written, len(jax.tree.leaves(actor)))
 
 
@@ -93,7 +94,7 @@ def _write_cpu(function: Any, examples: tuple[Any, ...], target: machine.Machine
     actor, carried, *_ = examples
     num_actor = len(jax.tree.leaves(actor))
     varying = [True] * len(jax.tree.leaves(examples))
-    written = scalarized.build(function, examples, varying, step.BRANCH_COST, **LOOPS)
+    written = scalarized.build(function, examples, varying, step.BRANCH_COST, LOOPS)
     buffers = [x for x in jax.tree.leaves((actor, carried.state)) if np.prod(x.shape)]
     records = [np.dtype(x.dtype).itemsize for x in written.out_avals[: queue.NUM_RECORDS]]
     num_args, lanes = queue.NUM_CONTROLS + len(buffers), target.lanes

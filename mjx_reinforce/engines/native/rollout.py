@@ -1,7 +1,8 @@
 """Complete episodes in machine code: the whole rollout is one call.
 
-`rollout` is `rollouts.rollout` for CPUs and NVIDIA GPUs. Start states are drawn by the same calls
-as everywhere, noise from the same keys, so the same key gives the same episodes, up to rounding.
+``rollout`` is ``rollouts.rollout`` for CPUs and NVIDIA GPUs. Start states are drawn by the same
+calls as everywhere, noise from the same keys, so the same key gives the same episodes, up to
+rounding.
 """
 
 import functools
@@ -41,7 +42,7 @@ def rollout(
     active: bool | jax.Array = True,
     threads: int = 0,
 ) -> Trajectory:
-    """Plays N episodes from fresh resets; arguments and result are those of `rollouts.rollout`.
+    """Plays N episodes from fresh resets; arguments and result are those of ``rollouts.rollout``.
 
     Vmapped over seeds it remains one call, in which no lane waits for another: an episode that is
     over makes room for the next, of whatever seed. One that is not played takes no lane.

@@ -1,6 +1,6 @@
 """Backends: what the scalar graph becomes."""
 
-#: Backends: name -> "module:class" of a `backend.Backend`.
+#: Backends: name -> "module:class" of a ``backend.Backend``.
 BACKENDS = {
     "xla": "mjx_reinforce.fused.backends.xla:XLA",
     "llvm": "mjx_reinforce.fused.backends.llvm:LLVM",

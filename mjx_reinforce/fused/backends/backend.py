@@ -15,11 +15,10 @@ class Backend(abc.ABC, Generic[Value]):
     """Makes something of a scalar graph, step by step.
 
     An *environment* has the value of each node that is known so far. What a loop's body or a
-    branch computes is known only inside, so it is run in an environment of its own (`inside`).
+    branch computes is known only inside, so it is run in an environment of its own (``inside``).
 
-    Attributes:
-        OPERATIONS: what the backend makes of each operation, by name, with an entry for every
-            name of `ops.FACTS`; None for a backend that treats all alike.
+    OPERATIONS: what the backend makes of each operation, by name, with an entry for every
+      name of ``ops.FACTS``; None for a backend without a table of its own.
     """
 
     OPERATIONS: ClassVar[Mapping[str, Any] | None] = None
@@ -54,7 +53,7 @@ class Backend(abc.ABC, Generic[Value]):
         return outputs
 
     def compile(self, schedule: Schedule, outputs: list[list[Scalar]]) -> Any:
-        """Runs a whole program; returns its `result`."""
+        """Runs a whole program; returns its ``result``."""
         values: dict[Node, Value] = {}
         self.run(schedule, values)
         return self.result([[self.value(x, values) for x in leaf] for leaf in outputs])
@@ -80,9 +79,9 @@ class Backend(abc.ABC, Generic[Value]):
         """Runs the body of a loop or a gate; returns the values at its end.
 
         Args:
-            body: its steps.
-            values: the values known around it, left as they are.
-            known: the values of the leaves that the body starts from.
+          body: its steps.
+          values: the values known around it, left as they are.
+          known: the values of the leaves that the body starts from.
         """
         inner = {**values, **(known or {})}
         self.run(body, inner)

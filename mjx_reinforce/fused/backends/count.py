@@ -10,7 +10,7 @@ from mjx_reinforce.fused.nodes import Node
 
 
 class Count(Backend[None]):
-    """Makes a `Counter` of a scalar graph; values are of no interest."""
+    """Makes a ``Counter`` of a scalar graph; values are of no interest."""
 
     def __init__(self) -> None:
         self._counter: Counter[str] = Counter()

@@ -20,10 +20,9 @@ from mjx_reinforce.fused.ops import Op
 class Input(NamedTuple):
     """An argument: lane vectors, one after the other, that stay as they are until the end.
 
-    Attributes:
-        pointer: where the first lies.
-        dtype: of their entries.
-        align: bytes of which the pointer is known to be a multiple; 1 leaves it to the dtype.
+    pointer: where the first lies.
+    dtype: of their entries.
+    align: bytes of which the pointer is known to be a multiple; 1 leaves it to the dtype.
     """
 
     pointer: str
@@ -35,10 +34,9 @@ class Input(NamedTuple):
 class Memory:
     """A value that stays in memory and is loaded wherever it is used: registers are few.
 
-    Attributes:
-        pointer: where its lane vector lies.
-        dtype: of its entries.
-        align: as of ``Input``. Neighbours that are known to be aligned are loaded together.
+    pointer: where its lane vector lies.
+    dtype: of its entries.
+    align: as of ``Input``. Neighbours that are known to be aligned are loaded together.
     """
 
     pointer: str
@@ -51,7 +49,7 @@ Value = str | Memory
 
 
 class LLVM(Backend[Value]):
-    """Writes LLVM IR into a `Text`; a value is a lane vector."""
+    """Writes LLVM IR into a ``Text``; a value is a lane vector."""
 
     OPERATIONS = OPERATIONS
 
@@ -59,8 +57,8 @@ class LLVM(Backend[Value]):
         """Says what is written into, and where the inputs are.
 
         Args:
-            text: the body of a function.
-            inputs: an argument by its number.
+          text: the body of a function.
+          inputs: an argument by its number.
         """
         self._text = text
         self._inputs = inputs
@@ -166,7 +164,7 @@ class LLVM(Backend[Value]):
         """Writes at the start of a loop's body a branch around it, for what does not go on.
 
         Returns:
-            The block with the branch, and the one to come behind the body; None for no branch.
+          The block with the branch, and the one to come behind the body; None for no branch.
         """
         return None
 

@@ -21,10 +21,9 @@ class Lanes(NamedTuple):
     A product that a sum takes may become one fused operation, rounded once, where the machine
     has it. Comparisons with NaN are false.
 
-    Attributes:
-        text: where operations are written.
-        dtype: the dtype of a lane.
-        name: the operand.
+    text: where operations are written.
+    dtype: the dtype of a lane.
+    name: the operand.
     """
 
     text: Text

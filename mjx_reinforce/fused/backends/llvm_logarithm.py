@@ -1,6 +1,6 @@
 """Logarithms and inverse hyperbolic functions of float32 lanes.
 
-An operand below the smallest normal number counts as zero in `log`, as it does in XLA's threads.
+An operand below the smallest normal number counts as zero in ``log``, as it does in XLA's threads.
 """
 
 import math

@@ -30,7 +30,7 @@ def scalar_type(dtype: Any) -> str:
     """Returns the LLVM type of one value.
 
     Raises:
-        TypeError: the dtype has none here.
+      TypeError: the dtype has none here.
     """
     name = np.dtype(dtype).name
     if name not in _SCALARS:
@@ -51,9 +51,8 @@ def literal(number: Any) -> str:
 class Hole(NamedTuple):
     """An instruction that is written later.
 
-    Attributes:
-        name: its result.
-        place: the number of its line.
+    name: its result.
+    place: the number of its line.
     """
 
     name: str
@@ -63,10 +62,9 @@ class Hole(NamedTuple):
 class Text:
     """The body of a function as it is written; a value is the text of an operand.
 
-    Attributes:
-        lanes: how many values a lane vector holds; 1 writes scalars.
-        declared: the intrinsics and library functions that were called, as declarations.
-        block: the basic block that is being written.
+    lanes: how many values a lane vector holds; 1 writes scalars.
+    declared: the intrinsics and library functions that were called, as declarations.
+    block: the basic block that is being written.
     """
 
     def __init__(self, lanes: int):
@@ -136,7 +134,8 @@ class Text:
     def once(self, key: Hashable, write: Callable[[], Written]) -> Written:
         """Returns what was written under a key where it is known to have been, or writes it.
 
-        It is known until the next `start`, but that what is done `unless_none` ends no knowledge.
+        It is known until the next ``start``, but that what is done ``unless_none`` ends no
+        knowledge.
         """
         if key not in self._known:
             self._known[key] = write()

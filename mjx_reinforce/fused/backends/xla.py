@@ -9,7 +9,7 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.fused.backends.backend import Backend
-from mjx_reinforce.fused.backends.xla_operations import OPERATIONS
+from mjx_reinforce.fused.jaxprs import operation
 from mjx_reinforce.fused.lanes import any_lane
 from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
@@ -21,14 +21,12 @@ Values = dict[Node, Any]
 class XLA(Backend[Any]):
     """Emits JAX operations; a value is a lane, a value that all lanes share, or a constant."""
 
-    OPERATIONS = OPERATIONS
-
     def __init__(self, read: Callable[[tuple[int, int]], Any], batch_shape: tuple[int, ...]):
         """Says where the program runs.
 
         Args:
-            read: returns the lane of an input from (number of the argument, position in it).
-            batch_shape: the shape of one lane.
+          read: returns the lane of an input from (number of the argument, position in it).
+          batch_shape: the shape of one lane.
         """
         self._read = read
         self._batch_shape = batch_shape
@@ -54,10 +52,10 @@ class XLA(Backend[Any]):
             value if is_constant(arg) and mixes else self._spread(value, node.varying)
             for arg, value in zip(node.args, operands, strict=True)
         ]
-        return OPERATIONS[op.name](*values, **dict(op.params))
+        return operation(op.name)(*values, **dict(op.params))
 
     def gate(self, gate: LiveGate, values: Values) -> Sequence[Any]:
-        """Emits a `cond`."""
+        """Emits a ``cond``."""
         predicate = self._any_of(self.value(gate.predicate, values))
         before = dict(values)
         cold = [self._materialize(out.cold, out.leaf.varying, before) for out in gate.outs]
@@ -69,7 +67,7 @@ class XLA(Backend[Any]):
         return lax.cond(predicate, hot, lambda: cold)
 
     def loop(self, loop: LiveLoop, values: Values) -> tuple[list[Any], list[Any]]:
-        """Emits a `fori_loop`, a `scan` or a `while_loop`."""
+        """Emits a ``fori_loop``, a ``scan`` or a ``while_loop``."""
         init = [self._materialize(c.init, c.out.varying, values) for c in loop.carries]
         body = functools.partial(self._iteration, loop, values)
         if loop.records or loop.elements:

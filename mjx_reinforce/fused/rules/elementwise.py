@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays, folding, jaxprs, ops, simplify
+from mjx_reinforce.fused import arrays, folding, ops, simplify
 from mjx_reinforce.fused.errors import no_rule
 from mjx_reinforce.fused.graph import Graph
 
@@ -32,7 +32,7 @@ def _convert(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
 
 def _bitcast(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
     if x.shape != eqn.outvars[0].aval.shape:
-        raise no_rule("bitcast_convert_type to another size", jaxprs.source(eqn))
+        raise no_rule("bitcast_convert_type to another size", graph.source(eqn))
     return _elementwise(graph, eqn, x)
 
 

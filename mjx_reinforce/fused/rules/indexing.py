@@ -20,10 +20,9 @@ from mjx_reinforce.fused.nodes import is_constant
 class Unknown(NamedTuple):
     """A start that is not a constant.
 
-    Attributes:
-        index: the scalar that holds it.
-        stride: how far apart two starts are in the flat operand.
-        count: the number of starts that keep the window inside.
+    index: the scalar that holds it.
+    stride: how far apart two starts are in the flat operand.
+    count: the number of starts that keep the window inside.
     """
 
     index: Any
@@ -34,10 +33,9 @@ class Unknown(NamedTuple):
 class Window(NamedTuple):
     """One window of a flat operand.
 
-    Attributes:
-        positions: where its elements are while the unknown starts are 0.
-        unknowns: the starts that are not constants.
-        inside: whether the constant starts keep it inside the operand.
+    positions: where its elements are while the unknown starts are 0.
+    unknowns: the starts that are not constants.
+    inside: whether the constant starts keep it inside the operand.
     """
 
     positions: np.ndarray

@@ -38,9 +38,11 @@ def _named(name: str) -> Callable:
 
 
 def _logaddexp(graph: Graph, x: Any, y: Any) -> Any:
-    largest = graph.call("max", x, y)
-    terms = [graph.call("exp", graph.call("sub", term, largest)) for term in (x, y)]
-    return graph.call("add", largest, graph.call("log", graph.call("add", *terms)))
+    """The sum of equal infinities, and of NaN, is found without their difference."""
+    delta = graph.call("sub", x, y)
+    correction = graph.call("log1p", graph.call("exp", graph.call("neg", graph.call("abs", delta))))
+    total = graph.call("add", graph.call("max", x, y), correction)
+    return graph.select(graph.call("ne", delta, delta), graph.call("add", x, y), total)
 
 
 def _arg_extreme(graph: Graph, eqn: Any, x: np.ndarray, *, better: str) -> list[np.ndarray]:

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.fused import arrays, jaxprs
+from mjx_reinforce.fused.errors import no_rule
 from mjx_reinforce.fused.graph import Graph
 
 
@@ -85,7 +86,10 @@ def _empty(graph: Graph, eqn: Any) -> list[np.ndarray]:
 
 
 def _platform_index(graph: Graph, eqn: Any) -> list[np.ndarray]:
-    return [np.asarray(jaxprs.default_platform(eqn), eqn.outvars[0].aval.dtype)]
+    default = jaxprs.default_platform(eqn)
+    if default is None:
+        raise no_rule("platform_dependent without a default", graph.source(eqn))
+    return [np.asarray(default, eqn.outvars[0].aval.dtype)]
 
 
 def _identity(graph: Graph, eqn: Any, *operands: np.ndarray) -> list[np.ndarray]:

@@ -61,10 +61,10 @@ def handler_text(num_args: int, result_bytes: Sequence[int], lanes: int = 1) -> 
 
     Args:
       num_args: the number of arguments: plays [*B, N] int32 (of ``native.plays``), threads [*B]
-        int32 (at most so many, 0 for all), keys [*B, N, 2] uint32, and the player's.
+      int32 (at most so many, 0 for all), keys [*B, N, 2] uint32, and the player's.
       result_bytes: the bytes of an element of each result: observation [*B, T, N, O],
-        action [*B, T, N, A], reward [*B, T, N], length [*B, N], broken [*B, N],
-        simulated [*B] int32.
+      action [*B, T, N, A], reward [*B, T, N], length [*B, N], broken [*B, N],
+      simulated [*B] int32.
       lanes: the items that a thread plays at once; fewer are not worth a thread.
     """
     num_results = len(result_bytes)

@@ -15,10 +15,9 @@ ALIGNMENT = 128
 class Field:
     """Lane vectors that lie one after the other.
 
-    Attributes:
-        offset: where they begin, in bytes.
-        dtype: of their entries.
-        count: how many there are.
+    offset: where they begin, in bytes.
+    dtype: of their entries.
+    count: how many there are.
     """
 
     offset: int
@@ -30,15 +29,14 @@ class Field:
 class Layout:
     """Where everything is.
 
-    Attributes:
-        inputs: the leaves of the arguments of a step: actor, state, keys, t, deterministic, alive.
-        actor: how many of them are the actor's.
-        state: how many of them are the state's.
-        broken: 1 where an episode left the finite numbers.
-        seed: which seed a lane plays for.
-        episode: which of its episodes.
-        counted: the steps of the episodes that it has ended.
-        size: of all, in bytes.
+    inputs: the leaves of the arguments of a step: actor, state, keys, t, deterministic, alive.
+    actor: how many of them are the actor's.
+    state: how many of them are the state's.
+    broken: 1 where an episode left the finite numbers.
+    seed: which seed a lane plays for.
+    episode: which of its episodes.
+    counted: the steps of the episodes that it has ended.
+    size: of all, in bytes.
     """
 
     inputs: list[Field]
@@ -86,13 +84,13 @@ def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> Layout:
     """Returns where the lanes' values are.
 
     Args:
-        leaves: shape and dtype of each leaf of the arguments of a step.
-        actor: how many of them, the first ones, are the actor's.
-        state: how many of those after them are the state's.
-        lanes: how many lanes there are.
+      leaves: shape and dtype of each leaf of the arguments of a step.
+      actor: how many of them, the first ones, are the actor's.
+      state: how many of those after them are the state's.
+      lanes: how many lanes there are.
 
     Raises:
-        TypeError: numbers of another size than 4 or 8 bytes.
+      TypeError: numbers of another size than 4 or 8 bytes.
     """
     for leaf in leaves:
         if np.dtype(leaf.dtype).itemsize not in (4, 8):

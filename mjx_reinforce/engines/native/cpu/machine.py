@@ -69,7 +69,7 @@ def this_machine(level: str | None = None) -> Machine:
 
     Args:
       level: one of ``LEVELS``, or ``HOST`` for all that the CPU has; by default what the variable
-        MJX_REINFORCE_CPU says, else ``HOST``.
+      MJX_REINFORCE_CPU says, else ``HOST``.
 
     Raises:
       ValueError: the level is unknown, or this CPU is below it.

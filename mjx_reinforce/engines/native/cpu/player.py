@@ -26,10 +26,10 @@ def player_text(step: scalarized.Scalarized, num_actor: int, lanes: int, flush: 
     """Returns the LLVM IR of ``@work(job)``.
 
     Args:
-        step: of ``step.step_function``, written out.
-        num_actor: how many leaves of its arguments are the actor's.
-        lanes: how many lanes a vector has.
-        flush: what makes all threads round alike.
+      step: of ``step.step_function``, written out.
+      num_actor: how many leaves of its arguments are the actor's.
+      lanes: how many lanes a vector has.
+      flush: what makes all threads round alike.
     """
     num_state = len(step.in_avals) - num_actor - _NUM_OTHERS
     places = layout(step.in_avals, num_actor, num_state, lanes)

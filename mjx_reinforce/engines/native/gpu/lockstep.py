@@ -43,7 +43,7 @@ class Lockstep(LLVM):
     """Writes LLVM IR for one of the threads of a block, all of which run what it writes."""
 
     def __init__(self, text: ScratchText, inputs: Callable[[int], Input]):
-        """Arguments are those of `LLVM`."""
+        """Arguments are those of ``LLVM``."""
         super().__init__(text, inputs)
         self._scratch = text
         self._together = True

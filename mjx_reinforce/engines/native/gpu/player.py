@@ -57,8 +57,8 @@ def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
     it waits for others in its block as simulated for the seed it played last, if there is one.
 
     Args:
-        step: of ``step.step_function`` where an episode is running, written out.
-        num_actor: how many leaves of its arguments are the actor's.
+      step: of ``step.step_function`` where an episode is running, written out.
+      num_actor: how many leaves of its arguments are the actor's.
     """
     return _Kernel(step, num_actor).write()
 

@@ -93,5 +93,12 @@ def _compile(text: str, capability: str) -> str:
             f"llvmlite {llvmlite.__version__} does not know GPUs of compute capability "
             f"{capability}; install a newer one"
         )
-    # Division as XLA's GPU programs have it, within 2 units in the last place.
-    return written.replace("div.rn.ftz.f32", "div.full.ftz.f32")
+    return _with_xla_divisions(written)
+
+
+def _with_xla_divisions(text: str) -> str:
+    """Returns PTX with division as XLA's GPU programs have it, within 2 units in the last place."""
+    replaced = text.replace("div.rn.ftz.f32", "div.full.ftz.f32")
+    left = re.search(r"\bdiv\.rn\S*\.f32", replaced)
+    assert left is None, f"LLVM has another name for a division: {left}"
+    return replaced

@@ -20,8 +20,7 @@ _NUMBER = "call i32 @llvm.nvvm.read.ptx.sreg.{}()"
 class ScratchText(Text):
     """Text for one thread of a GPU, whose long arrays are in the kernel's argument ``%scratch``.
 
-    Attributes:
-        words: how many words of it each thread has, so far.
+    words: how many words of it each thread has, so far.
     """
 
     def __init__(self):
@@ -38,7 +37,7 @@ class ScratchText(Text):
         return f"@scratch = constant i32 {self.words}\n{super().function(signature)}"
 
     def reserve_long(self, dtype: DTypeLike, count: int) -> str:
-        """Returns what `reserve` does, in the buffer if the array is long; `at` finds entries."""
+        """Returns what ``reserve`` does, in the buffer if the array is long; ``at`` reads it."""
         if count <= WRITTEN_OUT or np.dtype(dtype).itemsize > _WORD:
             return self.reserve(dtype, count)
         name = self.name()

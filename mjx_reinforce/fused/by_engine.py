@@ -1,0 +1,90 @@
+"""``by_engine``: one result computed in two ways, for an engine that writes out and for XLA.
+
+The choice is a primitive of our own, ``by_engine``, which carries both programs. XLA compiles
+``many`` and never sees ``one``; ``fused`` writes ``one`` out. No other code chooses between the
+two.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.core
+import numpy as np
+from jax.extend import core
+from jax.interpreters import ad, batching, mlir
+
+from mjx_reinforce.fused import jaxprs
+
+#: Its operands are those of both programs, which read what they need of them.
+_CHOICE = core.Primitive("by_engine")
+_CHOICE.multiple_results = True
+
+
+def by_engine(one: Callable, many: Callable, *args: Any, may_unroll: bool = False) -> Any:
+    """Computes ``many`` where XLA compiles it, and ``one`` where ``fused`` writes it out.
+
+    The derivative is that of ``many``, for all engines.
+
+    Args:
+      one: best where an episode takes its own branches.
+      many: best where many episodes are computed at once; it returns the same.
+      *args: arguments of both.
+      may_unroll: whether the scans of ``one`` may be written out, those outside of its loops and
+        branches. Up to which length they are is the engine's ``Limits.unrollable``.
+
+    Raises:
+      TypeError: the results of ``one`` and ``many`` differ in structure, shape or dtype.
+    """
+    leaves, tree = jax.tree.flatten(args)
+    (first, shapes), (second, others) = (
+        jaxprs.trace(lambda *flat, f=f: f(*tree.unflatten(flat)), *leaves) for f in (one, many)
+    )
+    if _described(shapes) != _described(others):
+        raise TypeError(f"by_engine got two different results, {shapes} and {others}")
+    consts = [*first.consts, *second.consts]
+    start, end = len(first.consts), len(consts)
+    operands = [*consts, *leaves]
+    results = _CHOICE.bind(
+        *operands,
+        one=_without_consts(first.jaxpr, slice(0, start), end, operands),
+        many=_without_consts(second.jaxpr, slice(start, end), end, operands),
+        may_unroll=may_unroll,
+    )
+    return jax.tree.structure(shapes).unflatten(results)
+
+
+def _described(shapes: Any) -> tuple[Any, list[tuple]]:
+    leaves, tree = jax.tree.flatten(shapes)
+    return tree, [(leaf.shape, np.dtype(leaf.dtype)) for leaf in leaves]
+
+
+def _without_consts(jaxpr: Any, consts: slice, end: int, operands: Sequence[Any]) -> Any:
+    """Returns a program of all operands, of which the first ``end`` are constants of programs."""
+    return jax.make_jaxpr(lambda *xs: jax.core.eval_jaxpr(jaxpr, xs[consts], *xs[end:]))(*operands)
+
+
+def _many(*operands: Any, many: Any, **_: Any) -> list[Any]:
+    return core.jaxpr_as_fun(many)(*operands)
+
+
+def _batched(operands: Sequence[Any], axes: Sequence[int | None], **params: Any) -> tuple:
+    """Maps both programs; a result that depends on nothing mapped stays as it is."""
+    mapped = [axis is not None for axis in axes]
+    programs = [params["one"], params["many"]]
+    spread = np.any([jaxprs.depends(program, mapped) for program in programs], axis=0)
+    out_axes = [0 if wide else None for wide in spread]
+    one, many = (jax.vmap(core.jaxpr_as_fun(x), tuple(axes), out_axes) for x in programs)
+    return by_engine(one, many, *operands, may_unroll=params["may_unroll"]), out_axes
+
+
+def _derivative(primals: Sequence[Any], tangents: Sequence[Any], *, many: Any, **_: Any) -> Any:
+    filled = tuple(map(ad.instantiate_zeros, tangents))
+    return jax.jvp(core.jaxpr_as_fun(many), tuple(primals), filled)
+
+
+_CHOICE.def_impl(lambda *operands, many, **_: jax.jit(core.jaxpr_as_fun(many))(*operands))
+_CHOICE.def_abstract_eval(lambda *_, many, **__: many.out_avals)
+batching.primitive_batchers[_CHOICE] = _batched
+ad.primitive_jvps[_CHOICE] = _derivative
+mlir.register_lowering(_CHOICE, mlir.lower_fun(_many, multiple_results=True))

@@ -1,0 +1,155 @@
+"""The choice by engine: XLA computes one program, and the other is what is written out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from mjx_reinforce import fused
+from mjx_reinforce.fused import jaxprs, scalarized, size
+from mjx_reinforce.fused.graph import Limits
+
+
+def choice(x, scale=1.0):
+    """Tells which of the two was computed: x + 1 is `one`, 2 x is `many`."""
+    return fused.by_engine(lambda y: scale * (y + 1), lambda y: scale * (2 * y), x)
+
+
+X = jnp.arange(3.0)
+
+
+@pytest.mark.parametrize(
+    "transformed",
+    [
+        choice,
+        jax.jit(choice),
+        jax.vmap(choice),
+        jax.jit(jax.vmap(jax.vmap(choice, in_axes=0), in_axes=None, axis_size=1)),
+        lambda x: jax.vmap(choice, in_axes=(0, None))(x, 1.0),
+        jax.checkpoint(choice),
+        lambda x: lax.map(choice, x),
+        lambda x: lax.cond(x[0] < 9, choice, jnp.sin, x),
+        fused.prune(lambda x: (choice(x), jnp.sort(x))[0]),
+    ],
+)
+def test_xla_computes_many(transformed):
+    np.testing.assert_array_equal(np.squeeze(transformed(X)), 2 * X)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        choice,
+        jax.jit(choice),
+        lambda x: lax.cond(x < 9, choice, jnp.sin, x),
+        jax.checkpoint(choice),
+    ],
+)
+def test_one_is_written_out(function):
+    np.testing.assert_array_equal(fused.vmap(function)(X), X + 1)
+
+
+def test_one_is_written_out_where_the_function_maps_it_itself():
+    x = jnp.ones((2, 3))
+    np.testing.assert_array_equal(fused.vmap(jax.vmap(choice))(x), x + 1)
+    np.testing.assert_array_equal(jax.vmap(jax.vmap(choice))(x), 2 * x)
+
+
+def test_derivatives_are_those_of_many():
+    """For all engines, forwards and in reverse, with respect to what is closed over too."""
+    for mapped in (jax.vmap, fused.vmap):
+        np.testing.assert_array_equal(mapped(jax.grad(choice))(X), [2.0, 2.0, 2.0])
+        np.testing.assert_array_equal(mapped(jax.grad(choice, 1), (0, None))(X, 1.0), 2 * X)
+        np.testing.assert_array_equal(mapped(jax.jacfwd(choice))(X), [2.0, 2.0, 2.0])
+
+
+def test_derivatives_pass_integers_by():
+    pick = lambda x, i: fused.by_engine(lambda x, i: x[i], lambda x, i: x[i] * 2, x, i)  # noqa: E731
+    np.testing.assert_array_equal(jax.grad(pick)(X, 1), [0.0, 2.0, 0.0])
+
+
+def test_a_result_of_nothing_mapped_stays_one():
+    """As of `lax.cond`: what XLA computes for all lanes together is not computed for each."""
+
+    def fn(x, y):
+        return fused.by_engine(lambda x, y: (x, y + 1), lambda x, y: (x, y + 2), x, y)
+
+    out = jax.vmap(fn, in_axes=(0, None), out_axes=(0, None))(X, 1.0)
+    assert out[1].shape == ()
+    np.testing.assert_array_equal(out[1], 3.0)
+
+
+def test_what_xla_compiles_has_nothing_of_one():
+    def fn(x):
+        return fused.by_engine(lambda y: jnp.tanh(y), lambda y: jnp.cos(y), x)
+
+    text = jax.jit(jax.vmap(fn)).lower(X).as_text()
+    assert "cosine" in text
+    assert "tanh" not in text
+
+
+def test_the_size_is_that_of_one():
+    traced, _ = jaxprs.trace(
+        lambda x: fused.by_engine(lambda x: x + 1, lambda x: jnp.sin(jnp.cos(x)), x), X
+    )
+    assert size.num_scalars(traced) == 3
+
+
+@pytest.mark.parametrize("other", [lambda x: (x,), lambda x: x[:1], lambda x: x > 0])
+def test_results_that_differ_are_refused(other):
+    with pytest.raises(TypeError, match="by_engine got two different results"):
+        fused.by_engine(lambda x: x, other, X)
+
+
+def total(x, **options):
+    step = lambda carry, row: (carry + jnp.sin(row), None)  # noqa: E731
+    return lax.scan(step, 0.0, x, **options)[0]
+
+
+def sines(fn, unrollable, length=7):
+    limits = Limits(plain=1, arrays=1, unrollable=unrollable)
+    return scalarized.build(fn, (jnp.ones(length),), [True], 400, limits).operations["sin"]
+
+
+def chosen(may_unroll, inner=total):
+    return lambda x: fused.by_engine(inner, lambda x: x[0], x, may_unroll=may_unroll)
+
+
+@pytest.mark.parametrize(
+    ("may_unroll", "unrollable", "count"), [(False, 7, 1), (True, 6, 1), (True, 7, 7)]
+)
+def test_scans_that_may_be_written_out_are_up_to_a_length(may_unroll, unrollable, count):
+    assert sines(chosen(may_unroll), unrollable) == count
+
+
+def test_scans_inside_loops_are_not_what_may_be_written_out():
+    def nested(x):
+        return lax.fori_loop(0, 9, lambda _, y: y + total(x), 0.0)
+
+    assert sines(chosen(True, nested), 7) == 1
+    # Jitted functions are no loops, and what comes behind the mark is not marked.
+    assert sines(lambda x: chosen(True, jax.jit(total))(x) + total(2 * x), 7) == 7 + 1
+
+
+@pytest.mark.parametrize(("unroll", "count"), [(1, 1), (2, 1), (6, 1), (7, 7), (True, 7)])
+def test_the_unroll_of_a_scan_means_what_it_means_to_jax(unroll, count):
+    """Only a scan that JAX would write out whole is written out."""
+    assert sines(lambda x: total(x, unroll=unroll), 7) == count
+
+
+def test_platform_dependent_takes_its_default():
+    """Documented: what is written out does not depend on where it will run."""
+
+    def fn(x):
+        return lax.platform_dependent(x, cpu=lambda x: x + 1, cuda=jnp.sin, default=lambda x: x + 2)
+
+    np.testing.assert_array_equal(fused.vmap(fn)(X), X + 2)
+
+
+def test_platform_dependent_without_a_default_is_refused_by_name():
+    def fn(x):
+        return lax.platform_dependent(x, cpu=lambda x: x + 1, cuda=jnp.sin)
+
+    with pytest.raises(fused.UnsupportedPrimitive, match=r"without a default.*test_by_engine\.py"):
+        fused.vmap(fn)(X)
