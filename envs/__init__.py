@@ -50,7 +50,7 @@ def names() -> list[str]:
     return sorted(_TABLE)
 
 
-def make(id: str, /, **kwargs: Any) -> Any:
+def make(id: str, /, **kwargs: object) -> Any:
     """Builds an environment.
 
     Args:
@@ -123,7 +123,7 @@ def is_ours(id: str) -> bool:
     return id in _TABLE and isinstance(_TABLE[id][0], str)
 
 
-def register(id: str, entry: Callable[..., Any], /, **kwargs: Any) -> None:
+def register(id: str, entry: Callable[..., Any], /, **kwargs: object) -> None:
     """Adds an environment to ``make`` and ``names``.
 
     Args:

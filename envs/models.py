@@ -132,7 +132,7 @@ def _compile(compiler: Callable[[str], Any], source: str, xml_file: str) -> Any:
         raise ValueError(f"MuJoCo cannot compile {xml_file!r}: {explain(error)}") from error
 
 
-def make_data(model: Any) -> mjx.Data:
+def make_data(model: "mjx.Model") -> mjx.Data:
     """Returns MJX's simulation of a model at its start, on this process's own device."""
     return mjx.make_data(model, impl="jax", device=jax.local_devices()[0])
 

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from jax.typing import DTypeLike
 
 from mjx_reinforce.fused.nodes import is_constant
 
@@ -18,7 +19,7 @@ def elements(array: np.ndarray) -> list[Any]:
     return list(array.flat)
 
 
-def pack(scalars: Iterable[Any], shape: Sequence[int], dtype: Any) -> np.ndarray:
+def pack(scalars: Iterable[Any], shape: Sequence[int], dtype: DTypeLike) -> np.ndarray:
     """Returns the array of these scalars."""
     scalars = list(scalars)
     if dtype is not object and all(map(is_constant, scalars)):
@@ -34,7 +35,7 @@ def lift(array: np.ndarray) -> np.ndarray:
     return np.fromiter(array.flat, object, array.size).reshape(array.shape)
 
 
-def settle(array: np.ndarray, dtype: Any) -> np.ndarray:
+def settle(array: np.ndarray, dtype: DTypeLike) -> np.ndarray:
     """Returns the array as a numeric one if every element is a constant."""
     return array if is_numeric(array) else pack(array.flat, array.shape, dtype)
 
@@ -56,7 +57,9 @@ def zeros(aval: Any) -> np.ndarray:
     return np.zeros(aval.shape, aval.dtype)
 
 
-def map_elements(function: Callable, shape: Sequence[int], dtype: Any, *arrays: Any) -> np.ndarray:
+def map_elements(
+    function: Callable, shape: Sequence[int], dtype: DTypeLike, *arrays: Any
+) -> np.ndarray:
     """Applies a scalar function element by element; axes of size 1 are shared."""
     columns = [elements(np.broadcast_to(array, shape)) for array in arrays]
     return pack(map(function, *columns), shape, dtype)

@@ -5,7 +5,6 @@ Of ``cond``, cheap branches are both evaluated, and expensive ones skipped if un
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -18,7 +17,12 @@ Branch = Callable[[], list[Scalar]]
 
 
 def cond_rule(
-    graph: Graph, run: Callable, eqn: Any, used: list[bool], index: np.ndarray, *operands: Any
+    graph: Graph,
+    run: Callable,
+    eqn: jaxprs.Equation,
+    used: list[bool],
+    index: np.ndarray,
+    *operands: np.ndarray,
 ) -> list[np.ndarray]:
     """Evaluates the branches that lanes may take and picks each lane's own.
 
@@ -44,7 +48,7 @@ def cond_rule(
 
 
 def by_engine_rule(
-    graph: Graph, run: Callable, eqn: Any, used: list[bool], *operands: Any
+    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: list[bool], *operands: np.ndarray
 ) -> list[np.ndarray]:
     """Takes the program for an engine that writes out; see ``by_engine``."""
     program = jaxprs.program(eqn.params["one"])

@@ -15,13 +15,14 @@ from jax.extend import core
 from jax.interpreters import ad, batching, mlir
 
 from mjx_reinforce.fused import jaxprs
+from mjx_reinforce.types import PyTree
 
 #: Its operands are those of both programs, which read what they need of them.
 _CHOICE = core.Primitive("by_engine")
 _CHOICE.multiple_results = True
 
 
-def by_engine(one: Callable, many: Callable, *args: Any, may_unroll: bool = False) -> Any:
+def by_engine(one: Callable, many: Callable, *args: PyTree, may_unroll: bool = False) -> Any:
     """Computes ``many`` where XLA compiles it, and ``one`` where ``fused`` writes it out.
 
     The derivative is that of ``many``, for all engines.
@@ -64,7 +65,7 @@ def _without_consts(jaxpr: Any, consts: slice, end: int, operands: Sequence[Any]
     return jax.make_jaxpr(lambda *xs: jax.core.eval_jaxpr(jaxpr, xs[consts], *xs[end:]))(*operands)
 
 
-def _many(*operands: Any, many: Any, **_: Any) -> list[Any]:
+def _many(*operands: PyTree, many: Any, **_: Any) -> list[Any]:
     return core.jaxpr_as_fun(many)(*operands)
 
 

@@ -60,7 +60,9 @@ def run(
     ]
 
 
-def _apply(graph: Graph, eqn: Any, used: list[bool], operands: list[np.ndarray]) -> list:
+def _apply(
+    graph: Graph, eqn: jaxprs.Equation, used: list[bool], operands: list[np.ndarray]
+) -> list:
     """Applies the rule of one equation; what has no rule may call a program that can be run."""
     name = eqn.primitive.name
     if name in _CONTROL:
@@ -78,7 +80,7 @@ def _apply(graph: Graph, eqn: Any, used: list[bool], operands: list[np.ndarray])
     raise no_rule(name, graph.source(eqn))
 
 
-def _settled(eqn: Any, results: list[np.ndarray]) -> list[np.ndarray]:
+def _settled(eqn: jaxprs.Equation, results: list[np.ndarray]) -> list[np.ndarray]:
     """Turns results that became constants into numeric arrays."""
     return [
         arrays.settle(result, out.aval.dtype)

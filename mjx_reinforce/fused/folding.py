@@ -32,7 +32,7 @@ def fold(op: Op, operands: Sequence[Any], dtype: np.dtype) -> Any:
     return np.asarray(result, dtype)[()]
 
 
-def _divide(x: Any, y: Any) -> Any:
+def _divide(x: np.ndarray, y: np.ndarray) -> Any:
     """Division as XLA does it: integers round towards zero, and by zero it is -1."""
     if not _are_integers(x):
         return np.true_divide(x, y)
@@ -40,29 +40,29 @@ def _divide(x: Any, y: Any) -> Any:
     return np.where(y == 0, ones, (x - _remainder(x, y)) // np.where(y == 0, 1, y))
 
 
-def _remainder(x: Any, y: Any) -> Any:
+def _remainder(x: np.ndarray, y: np.ndarray) -> Any:
     """The rest of that division: an integer divided by zero is what remains."""
     if not _are_integers(x):
         return np.fmod(x, y)
     return np.where(y == 0, x, np.fmod(x, np.where(y == 0, 1, y)))
 
 
-def _are_integers(x: Any) -> bool:
+def _are_integers(x: np.ndarray) -> bool:
     return np.issubdtype(np.asarray(x).dtype, np.integer)
 
 
-def _select(predicate: Any, *cases: Any) -> Any:
+def _select(predicate: np.ndarray, *cases: np.ndarray) -> Any:
     """Picks the case that the predicate numbers."""
     return np.choose(np.asarray(predicate, int), cases)
 
 
-def _logistic(x: Any) -> Any:
+def _logistic(x: np.ndarray) -> Any:
     """1 / (1 + exp(-x)) in x's dtype."""
     one = np.asarray(x).dtype.type(1)
     return one / (one + np.exp(-x))
 
 
-def _rsqrt(x: Any) -> Any:
+def _rsqrt(x: np.ndarray) -> Any:
     """1 / sqrt(x) in x's dtype."""
     return np.asarray(x).dtype.type(1) / np.sqrt(x)
 

@@ -10,6 +10,7 @@ from collections.abc import Hashable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+from jax.typing import DTypeLike
 
 from mjx_reinforce.fused import arrays, folding, jaxprs, ops, simplify
 from mjx_reinforce.fused.errors import TooLarge
@@ -76,7 +77,7 @@ class Graph:
         return bool(self._captured)
 
     @contextlib.contextmanager
-    def evaluating(self, eqn: Any) -> Iterator[None]:
+    def evaluating(self, eqn: jaxprs.Equation) -> Iterator[None]:
         """Lengthens the path by an equation."""
         self._evaluated[id(eqn)] = eqn
         before, self.path = self.path, (*self.path, id(eqn))
@@ -85,7 +86,7 @@ class Graph:
         finally:
             self.path = before
 
-    def source(self, eqn: Any) -> str:
+    def source(self, eqn: jaxprs.Equation) -> str:
         """Returns the user's line that an equation is from, or else the innermost call around it.
 
         Inside of a jitted function of JAX no line is the user's.
@@ -128,7 +129,11 @@ class Graph:
             self.certain = before
 
     def leaf(
-        self, dtype: Any, varying: bool, owner: Loop | Gate | None = None, position: Any = None
+        self,
+        dtype: DTypeLike,
+        varying: bool,
+        owner: Loop | Gate | None = None,
+        position: Any = None,
     ) -> Node:
         """Makes a node that nothing computes: an input, a loop's carry, a gate's result."""
         index = self.number()
@@ -158,7 +163,7 @@ class Graph:
         predicate = ops.FACTS[name].is_predicate
         return self.apply(ops.Op(name), args, _BOOL if predicate else args[-1].dtype)
 
-    def convert(self, value: Scalar, dtype: Any) -> Scalar:
+    def convert(self, value: Scalar, dtype: DTypeLike) -> Scalar:
         """Converts a scalar to another dtype."""
         dtype = np.dtype(dtype)
         return self.apply(ops.conversion(dtype), (value,), dtype)

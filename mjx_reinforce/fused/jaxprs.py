@@ -9,7 +9,7 @@ import hashlib
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.core
@@ -20,6 +20,7 @@ from jax.interpreters import partial_eval
 
 from mjx_reinforce.fused.errors import no_keys
 from mjx_reinforce.fused.ops import FACTS
+from mjx_reinforce.types import PyTree
 
 # The parameter under which a call-like primitive keeps the jaxpr that it calls.
 _CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
@@ -36,6 +37,36 @@ class Program(NamedTuple):
     consts: list[Any]
 
 
+class Shape(Protocol):
+    """What is known of an operand or a result; JAX's own type for it declares neither."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+class Atom(Protocol):
+    """An operand or a result of an equation."""
+
+    aval: Shape
+
+
+class Equation(Protocol):
+    """An equation of a jaxpr, a ``jax.extend.core.JaxprEqn``, by what is read of it.
+
+    primitive: what is done.
+    params: how.
+    invars: the operands.
+    outvars: the results.
+    source_info: where it was written.
+    """
+
+    primitive: core.Primitive
+    params: dict[str, Any]
+    invars: list[Atom]
+    outvars: list[Atom]
+    source_info: Any
+
+
 class ScanParts(NamedTuple):
     """How the operands and results of a ``scan`` equation divide.
 
@@ -47,7 +78,7 @@ class ScanParts(NamedTuple):
     num_carry: int
 
 
-def trace(fn: Callable, *examples: Any) -> tuple[Program, Any]:
+def trace(fn: Callable, *examples: PyTree) -> tuple[Program, Any]:
     """Returns fn's program for one example and the pytree of its output shapes."""
     closed, out_shape = jax.make_jaxpr(fn, return_shape=True)(*examples)
     return program(closed), out_shape
@@ -90,7 +121,7 @@ def program(closed: Any) -> Program:
     return Program(getattr(closed, "jaxpr", closed), list(getattr(closed, "consts", ())))
 
 
-def callee(eqn: Any) -> Program | None:
+def callee(eqn: Equation) -> Program | None:
     """Returns the program that a call-like equation calls, or None."""
     for name in _CALLEE_PARAMS:
         if name in eqn.params:
@@ -99,7 +130,8 @@ def callee(eqn: Any) -> Program | None:
         avals = [variable.aval for variable in eqn.invars]
         return program(jax.make_jaxpr(eqn.params["_prim"].expand)(*avals))
     if eqn.primitive.name == "random_bits":  # a key is an array of its words
-        implementation = eqn.invars[0].aval.dtype._impl
+        key_type: Any = eqn.invars[0].aval.dtype
+        implementation = key_type._impl
         width, shape = eqn.params["bit_width"], eqn.params["shape"]
         words = jax.ShapeDtypeStruct(implementation.key_shape, np.uint32)
         return program(
@@ -133,7 +165,7 @@ def depends(closed: Any, given: Iterable[bool]) -> list[bool]:
     return [_named(out) and out in found for out in jaxpr.outvars]
 
 
-def scan_parts(eqn: Any) -> ScanParts:
+def scan_parts(eqn: Equation) -> ScanParts:
     """Returns how a ``scan`` equation's operands divide."""
     if "num_consts" in eqn.params:  # JAX 0.10
         return ScanParts(eqn.params["num_consts"], eqn.params["num_carry"])
@@ -151,7 +183,7 @@ def literal(atom: Any) -> np.ndarray:
     return np.asarray(atom.val, atom.aval.dtype)
 
 
-def as_numpy(value: Any) -> np.ndarray | None:
+def as_numpy(value: object) -> np.ndarray | None:
     """Returns a constant's value, or None for a tracer, which has none yet."""
     if isinstance(value, jax.core.Tracer):
         return None
@@ -168,7 +200,7 @@ def prune(fn: Callable) -> Callable:
     """
 
     @functools.wraps(fn)
-    def pruned(*args: Any) -> Any:
+    def pruned(*args: PyTree) -> Any:
         leaves, in_tree = jax.tree.flatten(args)
         (jaxpr, consts), out_shape = trace(lambda *flat: fn(*in_tree.unflatten(flat)), *leaves)
         outs = [True] * len(jaxpr.outvars)
@@ -194,7 +226,7 @@ def live_equations(jaxpr: core.Jaxpr, used: Iterable[bool]) -> list[Any]:
     return kept[::-1]
 
 
-def source(eqn: Any) -> str:
+def source(eqn: Equation) -> str:
     """Returns 'file:line (function)' of the user's code that an equation came from.
 
     It is "" where the equation came from inside of a jitted function of JAX, or from here.

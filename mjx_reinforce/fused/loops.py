@@ -11,7 +11,9 @@ from mjx_reinforce.fused.iterate import Step, iterate, varies
 from mjx_reinforce.fused.nodes import Gate, Loop, Node, Scalar, is_constant, same
 
 
-def while_rule(graph: Graph, run: Callable, eqn: Any, used: Any, *operands: np.ndarray) -> list:
+def while_rule(
+    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: Any, *operands: np.ndarray
+) -> list:
     """Makes a loop; a lane that is done keeps its values while others go on."""
     num_cond, num_body = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
     cond_consts, body_consts = operands[:num_cond], operands[num_cond : num_cond + num_body]
@@ -37,7 +39,9 @@ def while_rule(graph: Graph, run: Callable, eqn: Any, used: Any, *operands: np.n
     return carry.pack(loop.results()[0][1:])
 
 
-def scan_rule(graph: Graph, run: Callable, eqn: Any, used: Any, *operands: np.ndarray) -> list:
+def scan_rule(
+    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: Any, *operands: np.ndarray
+) -> list:
     """Writes a short scan out; makes a loop of a longer one, which may end early."""
     length, parts = eqn.params["length"], jaxprs.scan_parts(eqn)
     body = jaxprs.program(eqn.params["jaxpr"])

@@ -14,6 +14,7 @@ from mjx_reinforce.fused.errors import no_keys
 from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import Scalar
 from mjx_reinforce.registry import check_name, load
+from mjx_reinforce.types import PyTree
 
 #: Looks at every program that was written out. The tests set it to ``verify``; users leave it.
 inspect: Callable[["Scalarized"], None] | None = None
@@ -54,7 +55,7 @@ class Scalarized:
         return self.compile("count")
 
 
-def scalarize(fn: Callable, *examples: Any, branch_cost: int = 400) -> Scalarized:
+def scalarize(fn: Callable, *examples: PyTree, branch_cost: int = 400) -> Scalarized:
     """Writes a function out in scalars, for a backend.
 
     Args:

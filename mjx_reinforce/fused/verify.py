@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
+from jax.typing import DTypeLike
 
 from mjx_reinforce.fused.backends.backend import Backend
 from mjx_reinforce.fused.iterate import varies
@@ -129,7 +130,7 @@ def _fits(node: Node, operands: list[np.dtype]) -> bool:
     return len(set(operands)) == 1 and made == dtype
 
 
-def _agree(what: str, dtype: Any, scalars: Sequence[Scalar]) -> None:
+def _agree(what: str, dtype: DTypeLike, scalars: Sequence[Scalar]) -> None:
     dtypes = {str(scalar.dtype) for scalar in scalars}
     _check(dtypes <= {str(np.dtype(dtype))}, f"{what} is {dtype} and also {sorted(dtypes)}")
 

@@ -10,13 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.fused import scalarized
+from mjx_reinforce.fused import jaxprs, scalarized
+from mjx_reinforce.types import PyTree
 
 #: XLA takes minutes to compile more operations, and what it makes of them is slow.
 MAX_OPERATIONS = 20_000
 
 
-def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 32) -> "Mapped":
+def vmap(
+    fn: Callable, in_axes: PyTree = 0, out_axes: PyTree = 0, branch_cost: int = 32
+) -> "Mapped":
     """Maps a function over a batch, like ``jax.vmap``, one array over the batch for each scalar.
 
     The function is traced for one example and evaluated element by element; see the package's
@@ -46,7 +49,7 @@ def vmap(fn: Callable, in_axes: Any = 0, out_axes: Any = 0, branch_cost: int = 3
 class Mapped:
     """What ``vmap`` returns: a function that is written out once for each kind of arguments."""
 
-    def __init__(self, fn: Callable, in_axes: Any, out_axes: Any, branch_cost: int):
+    def __init__(self, fn: Callable, in_axes: PyTree, out_axes: PyTree, branch_cost: int):
         """Takes the arguments of ``vmap``."""
         functools.update_wrapper(self, fn)
         self._fn = fn
@@ -54,7 +57,7 @@ class Mapped:
         self._branch_cost = branch_cost
         self._written: dict[Any, scalarized.Scalarized] = {}
 
-    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+    def __call__(self, *args: PyTree, **kwargs: PyTree) -> Any:
         """Evaluates the function for every example of a batch."""
         args, kwargs = jax.tree.map(jnp.asarray, (args, kwargs))
         written, axes = self._write(args, kwargs)
@@ -78,7 +81,7 @@ class Mapped:
         ]
         return jax.tree.unflatten(out_tree, outputs)
 
-    def write(self, *args: Any, **kwargs: Any) -> scalarized.Scalarized:
+    def write(self, *args: PyTree, **kwargs: PyTree) -> scalarized.Scalarized:
         """Returns what is evaluated for these arguments, of which the shapes are enough."""
         return self._write(args, kwargs)[0]
 
@@ -97,7 +100,7 @@ class Mapped:
         precision = jnp.result_type(float)  # constants inside depend on it
         key = (in_tree, tuple((x.shape, x.dtype) for x in examples), varying, precision)
 
-        def flat_fn(*flat: Any) -> Any:
+        def flat_fn(*flat: PyTree) -> Any:
             args, kwargs = jax.tree.unflatten(in_tree, flat)
             return self._fn(*args, **kwargs)
 
@@ -109,17 +112,17 @@ class Mapped:
         return written, axes
 
 
-def _is_none(x: Any) -> bool:
+def _is_none(x: object) -> bool:
     return x is None
 
 
-def _axes(prefix: Any, tree: Any) -> list[Any]:
+def _axes(prefix: PyTree, tree: PyTree) -> list[Any]:
     """Returns the axis of each leaf of the tree, as a pytree prefix says."""
     if isinstance(prefix, list) and isinstance(tree, tuple):
         prefix = tuple(prefix)
     axes: list[Any] = []
 
-    def note(axis: Any, subtree: Any) -> None:
+    def note(axis: Any, subtree: PyTree) -> None:
         axes.extend([axis] * len(jax.tree.leaves(subtree)))
 
     jax.tree.map(note, prefix, tree, is_leaf=_is_none)
@@ -159,7 +162,7 @@ def _row(rows: list[jax.Array], number: int, position: int) -> jax.Array:
     return lax.index_in_dim(rows[number], position, keepdims=False)
 
 
-def _assemble(scalars: list[Any], aval: Any, axis: int | None, batch: int) -> jax.Array:
+def _assemble(scalars: list[Any], aval: jaxprs.Shape, axis: int | None, batch: int) -> jax.Array:
     """Puts one leaf of the result together."""
     shared = all(np.ndim(scalar) == 0 for scalar in scalars)
     if axis is None and not shared:

@@ -45,7 +45,9 @@ def one_by_one(collide: Collide) -> Collide:
             contacts = lax.scan(lambda _, row: (None, pair(*row)), None, rows)[1]
             return jax.tree.map(jnp.concatenate, contacts)
 
-        def pair(pos: Any, mat: Any, size: Any, spheres: Any, margin: Any) -> Any:
+        def pair(
+            pos: jax.Array, mat: jax.Array, size: jax.Array, spheres: Any, margin: jax.Array
+        ) -> Any:
             place = types.SimpleNamespace(geom_xpos=pos, geom_xmat=mat)
             shape = types.SimpleNamespace(geom_size=size)
 

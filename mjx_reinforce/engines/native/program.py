@@ -1,5 +1,6 @@
 """From an environment and a policy to machine code, made once and kept on disk."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +14,7 @@ from mjx_reinforce.engines.native.cpu.denormals import flush
 from mjx_reinforce.engines.native.gpu import player as gpu_player
 from mjx_reinforce.engines.native.gpu import ptx, scratch
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
+from mjx_reinforce.engines.native.step import Written
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.fused.graph import Limits
 from mjx_reinforce.policies.distribution import Distribution
@@ -76,12 +78,12 @@ def build(
     return Program(code, shapes.record)
 
 
-def while_running(function: Any) -> Any:
+def while_running(function: Callable[..., Written]) -> Any:
     """Returns a step of episodes that are running."""
     return lambda *args: function(*args, jnp.int32(1))
 
 
-def _write_gpu(function: Any, examples: tuple[Any, ...]) -> str:
+def _write_gpu(function: Callable[..., Written], examples: tuple[Any, ...]) -> str:
     """Writes a step, and the kernel around it, as LLVM IR."""
     actor = examples[0]
     varying = [True] * len(jax.tree.leaves(examples))
@@ -89,7 +91,9 @@ def _write_gpu(function: Any, examples: tuple[Any, ...]) -> str:
     return gpu_player.kernel_text(written, len(jax.tree.leaves(actor)))
 
 
-def _write_cpu(function: Any, examples: tuple[Any, ...], target: machine.Machine) -> str:
+def _write_cpu(
+    function: Callable[..., Written], examples: tuple[Any, ...], target: machine.Machine
+) -> str:
     """Writes a step, and all around it, as LLVM IR."""
     actor, carried, *_ = examples
     num_actor = len(jax.tree.leaves(actor))

@@ -1,8 +1,9 @@
 """Lane vectors under Python's operators, so that formulas written in LLVM IR read as formulas."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from jax.typing import DTypeLike
 
 from mjx_reinforce.fused.backends.llvm_text import Text
 
@@ -37,7 +38,9 @@ class Lanes(NamedTuple):
         scalar = np.asarray(number, self.dtype)
         return Lanes(self.text, self.dtype, self.text.constant(scalar))
 
-    def write(self, operation: str, *operands: "Lanes | float", dtype: Any = None) -> "Lanes":
+    def write(
+        self, operation: str, *operands: "Lanes | float", dtype: DTypeLike | None = None
+    ) -> "Lanes":
         """Writes an instruction on this and further operands; returns its result."""
         operation = f"{operation} {self.text.type(self.dtype)} "
         names = ", ".join([self.name, *(self.like(x).name for x in operands)])
@@ -125,7 +128,7 @@ class Lanes(NamedTuple):
     def __abs__(self):
         return self.call("fabs")
 
-    def convert(self, operation: str, dtype: Any) -> "Lanes":
+    def convert(self, operation: str, dtype: DTypeLike) -> "Lanes":
         """Converts to another dtype by an instruction such as "sitofp"."""
         kind = self.text.type(np.dtype(dtype))
         source = f"{self.text.type(self.dtype)} {self.name}"

@@ -1,9 +1,9 @@
 """The transcendental operations of the scalar graph in LLVM IR."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
+from jax.typing import DTypeLike
 
 from mjx_reinforce.fused.backends import (
     llvm_exponential,
@@ -51,7 +51,7 @@ _OF_DTYPE = {"float32": _FLOAT32, "float64": _FLOAT64}
 
 
 def _function(name: str) -> Callable[..., str]:
-    def write(text: Text, dtype: Any, *operands: str) -> str:
+    def write(text: Text, dtype: DTypeLike, *operands: str) -> str:
         lanes = [Lanes(text, np.dtype(dtype), x) for x in operands]
         return _OF_DTYPE[np.dtype(dtype).name][name](*lanes).name
 

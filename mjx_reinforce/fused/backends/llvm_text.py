@@ -6,6 +6,7 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
+from jax.typing import DTypeLike
 
 #: The LLVM type of one value of each dtype. A bool in memory is a byte.
 _SCALARS = {
@@ -26,7 +27,7 @@ _LEAST_ALIGN = 64
 Written = TypeVar("Written")
 
 
-def scalar_type(dtype: Any) -> str:
+def scalar_type(dtype: DTypeLike) -> str:
     """Returns the LLVM type of one value.
 
     Raises:
@@ -85,7 +86,7 @@ class Text:
         lines = [*tables, f"define {signature} {{", *body, "}", *sorted(self.declared)]
         return "\n".join(lines) + "\n"
 
-    def type(self, dtype: Any) -> str:
+    def type(self, dtype: DTypeLike) -> str:
         """Returns the type of a lane vector."""
         scalar = scalar_type(dtype)
         return scalar if self.lanes == 1 else f"<{self.lanes} x {scalar}>"
@@ -111,7 +112,7 @@ class Text:
         self._count += 1
         return f"%v{self._count}"
 
-    def call(self, function: str, dtype: Any, *operands: str) -> str:
+    def call(self, function: str, dtype: DTypeLike, *operands: str) -> str:
         """Calls an intrinsic such as "llvm.sqrt" on lane vectors of one dtype."""
         kind = self.type(dtype)
         scalar = {"float": "f32", "double": "f64"}.get(scalar_type(dtype), scalar_type(dtype))
@@ -145,7 +146,7 @@ class Text:
         """Writes what is done only if some lane of a mask is set."""
         return self.when(self.any(mask))
 
-    def phi(self, dtype: Any, values: dict[str, str]) -> str:
+    def phi(self, dtype: DTypeLike, values: dict[str, str]) -> str:
         """Returns at the start of a basic block the value of the block from which it is entered."""
         pairs = ", ".join(f"[{value}, %{block}]" for block, value in values.items())
         return self.let(f"phi {self.type(dtype)} {pairs}")
@@ -180,20 +181,20 @@ class Text:
         """Writes the instruction of a hole."""
         self._lines[hole.place] = f"  {hole.name} = {expression}"
 
-    def reserve(self, dtype: Any, count: int) -> str:
+    def reserve(self, dtype: DTypeLike, count: int) -> str:
         """Returns a pointer to room for lane vectors, which lasts until the function returns."""
         name, align = self.name(), max(_LEAST_ALIGN, np.dtype(dtype).itemsize * self.lanes)
         self._reserved.append(f"  {name} = alloca [{count} x {self.type(dtype)}], align {align}")
         return name
 
-    def table(self, dtype: Any, literals: list[str]) -> str:
+    def table(self, dtype: DTypeLike, literals: list[str]) -> str:
         """Returns a pointer to constant scalars."""
         scalar = scalar_type(dtype)
         entries = ", ".join(f"{scalar} {x}" for x in literals)
         text = f"[{len(literals)} x {scalar}] [{entries}]"
         return self._tables.setdefault(text, f"@t{len(self._tables)}")
 
-    def spread(self, dtype: Any, table: str, index: str) -> str:
+    def spread(self, dtype: DTypeLike, table: str, index: str) -> str:
         """Returns an entry of a table in every lane."""
         scalar = scalar_type(dtype)
         place = self.let(f"getelementptr inbounds {scalar}, ptr {table}, i64 {index}")
@@ -208,20 +209,20 @@ class Text:
         none = f"<{self.lanes} x i32> zeroinitializer"
         return self.let(f"shufflevector {kind} {first}, {kind} poison, {none}")
 
-    def at(self, pointer: str, dtype: Any, index: int | str) -> str:
+    def at(self, pointer: str, dtype: DTypeLike, index: int | str) -> str:
         """Returns the pointer to a lane vector of an array of them."""
         return self.let(f"getelementptr inbounds {self.type(dtype)}, ptr {pointer}, i64 {index}")
 
-    def load(self, pointer: str, dtype: Any, align: int = 1) -> str:
+    def load(self, pointer: str, dtype: DTypeLike, align: int = 1) -> str:
         """Loads a lane vector; ``align`` as of ``llvm.Input``."""
         suffix = f", align {align}" if align > np.dtype(dtype).itemsize else ""
         return self.let(f"load {self.type(dtype)}, ptr {pointer}{suffix}")
 
-    def store(self, value: str, pointer: str, dtype: Any) -> None:
+    def store(self, value: str, pointer: str, dtype: DTypeLike) -> None:
         """Stores a lane vector."""
         self.line(f"store {self.type(dtype)} {value}, ptr {pointer}")
 
-    def scatter(self, value: str, base: str, index: str, mask: str, dtype: Any) -> None:
+    def scatter(self, value: str, base: str, index: str, mask: str, dtype: DTypeLike) -> None:
         """Stores each lane's value at its own index of an array, where the mask is set."""
         scalar, kind, lanes = scalar_type(dtype), self.type(dtype), self.lanes
         if lanes == 1:
@@ -252,7 +253,7 @@ class Text:
         masked = self.let(f"and i{self.lanes} {mask}, {1 << number}")
         return self.let(f"icmp ne i{self.lanes} {masked}, 0")
 
-    def saturate(self, dtype: Any, before: Any, value: str) -> str:
+    def saturate(self, dtype: DTypeLike, before: Any, value: str) -> str:
         """Converts a float to the nearest integer that there is, and NaN to 0."""
         sign = "s" if np.dtype(dtype).kind == "i" else "u"
         new, old = self.type(dtype), self.type(before)

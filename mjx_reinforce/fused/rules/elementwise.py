@@ -1,56 +1,60 @@
 """Rules for the primitives that work on each element alone."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays, folding, ops, simplify
+from mjx_reinforce.fused import arrays, folding, jaxprs, ops, simplify
 from mjx_reinforce.fused.errors import no_rule
 from mjx_reinforce.fused.graph import Graph
 
 
-def _elementwise(graph: Graph, eqn: Any, *operands: np.ndarray) -> list[np.ndarray]:
+def _elementwise(graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray) -> list[np.ndarray]:
     """The general rule: the operation has the primitive's name."""
     name = eqn.primitive.name
     params = tuple(sorted(eqn.params.items())) if ops.FACTS[name].has_params else ()
     return [_apply(graph, ops.Op(name, params), eqn.outvars[0].aval, operands)]
 
 
-def _apply(graph: Graph, op: ops.Op, aval: Any, operands: Any) -> np.ndarray:
+def _apply(
+    graph: Graph, op: ops.Op, aval: jaxprs.Shape, operands: Sequence[np.ndarray]
+) -> np.ndarray:
     if all(map(arrays.is_numeric, operands)):
         return np.asarray(folding.fold(op, operands, aval.dtype))
     apply, dtype = graph.apply, np.dtype(aval.dtype)
     return arrays.map_elements(lambda *args: apply(op, args, dtype), aval.shape, dtype, *operands)
 
 
-def _convert(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
+def _convert(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
     aval = eqn.outvars[0].aval
     if eqn.invars[0].aval.dtype == aval.dtype:
         return [x]
     return [_apply(graph, ops.conversion(np.dtype(aval.dtype)), aval, (x,))]
 
 
-def _bitcast(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
+def _bitcast(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
     if x.shape != eqn.outvars[0].aval.shape:
         raise no_rule("bitcast_convert_type to another size", graph.source(eqn))
     return _elementwise(graph, eqn, x)
 
 
-def _add_any(graph: Graph, eqn: Any, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+def _add_any(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
     return [_apply(graph, ops.Op("add"), eqn.outvars[0].aval, (x, y))]
 
 
-def _square(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
+def _square(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
     return [_apply(graph, ops.Op("mul"), eqn.outvars[0].aval, (x, x))]
 
 
-def _clamp(graph: Graph, eqn: Any, low: Any, x: np.ndarray, high: Any) -> list[np.ndarray]:
+def _clamp(
+    graph: Graph, eqn: jaxprs.Equation, low: np.ndarray, x: np.ndarray, high: np.ndarray
+) -> list[np.ndarray]:
     aval = eqn.outvars[0].aval
     raised = _apply(graph, ops.Op("max"), aval, (x, low))
     return [_apply(graph, ops.Op("min"), aval, (raised, high))]
 
 
-def _integer_pow(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
+def _integer_pow(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
     aval = eqn.outvars[0].aval
     return [
         arrays.map_elements(
@@ -59,7 +63,7 @@ def _integer_pow(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def _pow(graph: Graph, eqn: Any, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+def _pow(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
     """An exponent may be an integer under a float base."""
     exponent = y if y.dtype in (object, x.dtype) else y.astype(eqn.outvars[0].aval.dtype)
     return [_apply(graph, ops.Op("pow"), eqn.outvars[0].aval, (x, exponent))]

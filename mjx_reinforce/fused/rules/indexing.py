@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays
+from mjx_reinforce.fused import arrays, jaxprs
 from mjx_reinforce.fused.graph import Graph
 from mjx_reinforce.fused.nodes import is_constant
 
@@ -102,12 +102,14 @@ def _starts(
         yield start
 
 
-def _mode(eqn: Any) -> str:
+def _mode(eqn: jaxprs.Equation) -> str:
     """Returns what happens to a window outside: 'drop' or 'clip'."""
     return "drop" if "FILL" in str(eqn.params["mode"]) else "clip"
 
 
-def _gather(graph: Graph, eqn: Any, operand: np.ndarray, indices: np.ndarray) -> list[np.ndarray]:
+def _gather(
+    graph: Graph, eqn: jaxprs.Equation, operand: np.ndarray, indices: np.ndarray
+) -> list[np.ndarray]:
     dims, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
     aval, flat = eqn.outvars[0].aval, operand.reshape(-1)
     hidden = {*dims.collapsed_slice_dims, *dims.operand_batching_dims}
@@ -129,7 +131,7 @@ def _gather(graph: Graph, eqn: Any, operand: np.ndarray, indices: np.ndarray) ->
     return [arrays.settle(gathered, aval.dtype)]
 
 
-def _fill(graph: Graph, eqn: Any, values: np.ndarray, window: Window) -> np.ndarray:
+def _fill(graph: Graph, eqn: jaxprs.Equation, values: np.ndarray, window: Window) -> np.ndarray:
     """Replaces the values of a window that is outside by the fill value."""
     dtype = np.dtype(eqn.outvars[0].aval.dtype)
     inside = np.bool_(window.inside)
@@ -153,7 +155,13 @@ def _default_fill(dtype: np.dtype) -> Any:
 
 
 def _scatter(
-    graph: Graph, eqn: Any, operand: Any, indices: Any, updates: Any, *, combine: Callable
+    graph: Graph,
+    eqn: jaxprs.Equation,
+    operand: np.ndarray,
+    indices: np.ndarray,
+    updates: np.ndarray,
+    *,
+    combine: Callable,
 ) -> list[np.ndarray]:
     dims = eqn.params["dimension_numbers"]
     hidden = {*dims.inserted_window_dims, *dims.operand_batching_dims}
@@ -187,7 +195,9 @@ def _clip(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequ
     return clipped
 
 
-def _dynamic_slice(graph: Graph, eqn: Any, operand: np.ndarray, *starts: Any) -> list[np.ndarray]:
+def _dynamic_slice(
+    graph: Graph, eqn: jaxprs.Equation, operand: np.ndarray, *starts: np.ndarray
+) -> list[np.ndarray]:
     aval = eqn.outvars[0].aval
     window = _window(operand.shape, eqn.params["slice_sizes"], [s[()] for s in starts])
     values = _read(graph, operand.reshape(-1), window.positions, window.unknowns)
@@ -195,7 +205,7 @@ def _dynamic_slice(graph: Graph, eqn: Any, operand: np.ndarray, *starts: Any) ->
 
 
 def _dynamic_update_slice(
-    graph: Graph, eqn: Any, operand: np.ndarray, update: np.ndarray, *starts: Any
+    graph: Graph, eqn: jaxprs.Equation, operand: np.ndarray, update: np.ndarray, *starts: np.ndarray
 ) -> list[np.ndarray]:
     clipped = _clip(graph, [s[()] for s in starts], operand.shape, update.shape)
     flat = arrays.lift(operand).reshape(-1).copy()

@@ -4,12 +4,15 @@ import itertools
 from typing import Any
 
 import numpy as np
+from jax.typing import DTypeLike
 
-from mjx_reinforce.fused import arrays
+from mjx_reinforce.fused import arrays, jaxprs
 from mjx_reinforce.fused.graph import Graph
 
 
-def _dot_general(graph: Graph, eqn: Any, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+def _dot_general(
+    graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, y: np.ndarray
+) -> list[np.ndarray]:
     (x_sum, y_sum), (x_batch, y_batch) = eqn.params["dimension_numbers"]
     aval = eqn.outvars[0].aval
     x_rows = _as_matrices(_cast(graph, eqn.invars[0].aval, x, aval.dtype), x_batch, x_sum)
@@ -23,7 +26,7 @@ def _dot_general(graph: Graph, eqn: Any, x: np.ndarray, y: np.ndarray) -> list[n
     return [arrays.pack(products, aval.shape, aval.dtype)]
 
 
-def _cast(graph: Graph, aval: Any, x: np.ndarray, dtype: Any) -> np.ndarray:
+def _cast(graph: Graph, aval: jaxprs.Shape, x: np.ndarray, dtype: DTypeLike) -> np.ndarray:
     if aval.dtype == dtype:
         return x
     return arrays.map_elements(lambda value: graph.convert(value, dtype), x.shape, dtype, x)
@@ -37,12 +40,12 @@ def _as_matrices(x: np.ndarray, batch: tuple, contracted: tuple) -> np.ndarray:
     return x.transpose([*batch, *free, *contracted]).reshape(sizes)
 
 
-def _dot(graph: Graph, left: list, right: list, dtype: Any) -> Any:
+def _dot(graph: Graph, left: list, right: list, dtype: DTypeLike) -> Any:
     terms = [graph.call("mul", a, b) for a, b in zip(left, right, strict=True)]
     return _sum(graph, terms, dtype)
 
 
-def _sum(graph: Graph, terms: list, dtype: Any) -> Any:
+def _sum(graph: Graph, terms: list, dtype: DTypeLike) -> Any:
     total = np.dtype(dtype).type(0)
     for term in terms:
         total = graph.call("add", total, term)
@@ -55,7 +58,7 @@ def _minus_dot(graph: Graph, start: Any, left: list, right: list) -> Any:
     return start
 
 
-def _cholesky(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
+def _cholesky(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
     """The lower factor; NaN where the matrix is not positive definite."""
     size, dtype = x.shape[-1], eqn.outvars[0].aval.dtype
     factors = [
@@ -64,7 +67,7 @@ def _cholesky(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
     return [arrays.settle(np.stack(factors).reshape(x.shape), dtype)]
 
 
-def _factor(graph: Graph, matrix: np.ndarray, size: int, dtype: Any) -> np.ndarray:
+def _factor(graph: Graph, matrix: np.ndarray, size: int, dtype: DTypeLike) -> np.ndarray:
     lower = arrays.lift(np.zeros((size, size), dtype))
     for j in range(size):
         row = list(lower[j, :j])
@@ -75,7 +78,9 @@ def _factor(graph: Graph, matrix: np.ndarray, size: int, dtype: Any) -> np.ndarr
     return lower
 
 
-def _triangular_solve(graph: Graph, eqn: Any, a: np.ndarray, b: np.ndarray) -> list[np.ndarray]:
+def _triangular_solve(
+    graph: Graph, eqn: jaxprs.Equation, a: np.ndarray, b: np.ndarray
+) -> list[np.ndarray]:
     """Solves op(a) x = b, or x op(a) = b, matrix by matrix."""
     params, aval = eqn.params, eqn.outvars[0].aval
     lower = params["lower"] != params["transpose_a"]

@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays, ops
+from mjx_reinforce.fused import arrays, jaxprs, ops
 from mjx_reinforce.fused.graph import Graph
 
 
-def _reduce(graph: Graph, eqn: Any, x: np.ndarray, *, combine: str, empty: float) -> list:
+def _reduce(
+    graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, *, combine: str, empty: float
+) -> list:
     """Combines the elements along some axes, from the first to the last."""
     axes, aval = tuple(eqn.params["axes"]), eqn.outvars[0].aval
     if x.size == 0:
@@ -22,7 +24,9 @@ def _reduce(graph: Graph, eqn: Any, x: np.ndarray, *, combine: str, empty: float
     return [arrays.pack(reduced, aval.shape, aval.dtype)]
 
 
-def _cumulate(graph: Graph, eqn: Any, x: np.ndarray, *, combine: Callable) -> list[np.ndarray]:
+def _cumulate(
+    graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, *, combine: Callable
+) -> list[np.ndarray]:
     """Combines each element with all before it (after it, if reversed)."""
     step = -1 if eqn.params["reverse"] else 1
     lines = np.moveaxis(arrays.lift(x), eqn.params["axis"], -1)[..., ::step].copy()
@@ -45,7 +49,9 @@ def _logaddexp(graph: Graph, x: Any, y: Any) -> Any:
     return graph.select(graph.call("ne", delta, delta), graph.call("add", x, y), total)
 
 
-def _arg_extreme(graph: Graph, eqn: Any, x: np.ndarray, *, better: str) -> list[np.ndarray]:
+def _arg_extreme(
+    graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, *, better: str
+) -> list[np.ndarray]:
     """The position of the first extreme element; the first NaN counts as extreme."""
     (axis,), aval = eqn.params["axes"], eqn.outvars[0].aval
     rows = np.moveaxis(x, axis, -1).reshape(-1, x.shape[axis])
@@ -63,7 +69,7 @@ def _first_extreme(graph: Graph, row: list, better: str, dtype: np.dtype) -> Any
     return where
 
 
-def _sort(graph: Graph, eqn: Any, *operands: np.ndarray) -> list[np.ndarray]:
+def _sort(graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray) -> list[np.ndarray]:
     """Sorts short arrays by exchanging neighbours, which is stable; NaN comes last."""
     axis, num_keys = eqn.params["dimension"], eqn.params["num_keys"]
     columns = [np.moveaxis(arrays.lift(x), axis, -1).copy() for x in operands]
@@ -96,7 +102,7 @@ def _precedes(graph: Graph, x: Any, y: Any) -> Any:
     return graph.call("or", graph.call("lt", x, y), graph.call("and", number, nan))
 
 
-def _top_k(graph: Graph, eqn: Any, x: np.ndarray) -> list[np.ndarray]:
+def _top_k(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
     """The k largest elements, the first of equal ones first, and where they are.
 
     The list of the k largest so far is in order, and each element in turn is put into it, behind
