@@ -75,7 +75,7 @@ def test_a_result_of_nothing_mapped_stays_one():
     def fn(x, y):
         return fused.by_engine(lambda x, y: (x, y + 1), lambda x, y: (x, y + 2), x, y)
 
-    out = jax.vmap(fn, in_axes=(0, None), out_axes=(0, None))(X, 1.0)
+    out = jax.jit(jax.vmap(fn, in_axes=(0, None), out_axes=(0, None)))(X, 1.0)
     assert out[1].shape == ()
     np.testing.assert_array_equal(out[1], 3.0)
 
@@ -96,10 +96,18 @@ def test_the_size_is_that_of_one():
     assert size.num_scalars(traced) == 3
 
 
+def test_what_is_not_traced_is_computed_at_once():
+    """Without a look at ``one``; programs that have been traced are computed without it too."""
+    fused.by_engine(pytest.fail, lambda x: x, X)
+    jaxpr = jax.make_jaxpr(choice)(X)
+    assert "by_engine" in str(jaxpr)
+    np.testing.assert_array_equal(jax.core.eval_jaxpr(jaxpr.jaxpr, jaxpr.consts, X)[0], 2 * X)
+
+
 @pytest.mark.parametrize("other", [lambda x: (x,), lambda x: x[:1], lambda x: x > 0])
 def test_results_that_differ_are_refused(other):
     with pytest.raises(TypeError, match="by_engine got two different results"):
-        fused.by_engine(lambda x: x, other, X)
+        jax.jit(lambda x: fused.by_engine(lambda x: x, other, x))(X)
 
 
 def total(x, **options):
