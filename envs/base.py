@@ -143,7 +143,7 @@ class MujocoEnv(Env):
     @abc.abstractmethod
     def outcome(
         self, before: Before, data: Simulation, action: jax.Array
-    ) -> tuple[jax.Array, jax.Array, dict[str, jax.Array]]:
+    ) -> tuple[float | jax.Array, bool | jax.Array, dict[str, Any]]:
         """Returns the reward [], whether the episode terminated [], and the reward's terms.
 
         Args:

@@ -17,7 +17,7 @@ class Arm(NamedTuple):
     """What the seeds of a setting did.
 
     name: the arm
-    count: S
+    num_seeds: S
     failing: the share whose last policy is below the threshold without noise
     failures, never, stand: how many, how many of them never were above, how many are with noise
     fallen: the share that fell below it again in one evaluation at least
@@ -28,7 +28,7 @@ class Arm(NamedTuple):
     """
 
     name: str
-    count: int
+    num_seeds: int
     failing: Estimate
     failures: int
     never: int
@@ -94,7 +94,7 @@ def _arm(name: str, seeds: Arrays, p_failing: float, p_fallen: float) -> Arm:
     median, slowest = np.quantile(steps, (0.5, 0.99), method="inverted_cdf")
     return Arm(
         name=name,
-        count=count,
+        num_seeds=count,
         failing=wilson(bad.sum(), count),
         failures=int(bad.sum()),
         never=int((bad & np.isinf(steps)).sum()),

@@ -67,7 +67,7 @@ def page(kept: Kept, found: list[Arm]) -> str:
             f"{arm.name}_began": f"{moved['began']}",
             f"{arm.name}_p_failing": _p_value(arm.p_failing),
             f"{arm.name}_p_fallen": _p_value(arm.p_fallen),
-            f"{arm.name}_count": f"{arm.count}",
+            f"{arm.name}_count": f"{arm.num_seeds}",
             f"{arm.name}_failures": f"{arm.failures}",
             f"{arm.name}_failing": _share(arm.failing),
             f"{arm.name}_fallen": percent(arm.fallen.value, 0),
@@ -101,7 +101,7 @@ def _arms(found: Iterable[Arm]) -> str:
     rows = [
         (
             WORDS[arm.name],
-            f"{arm.count}",
+            f"{arm.num_seeds}",
             _share(arm.failing),
             _p_value(arm.p_failing),
             percent(arm.fallen.value, 1),

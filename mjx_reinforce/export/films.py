@@ -156,7 +156,7 @@ def write_small_gif(path: Path, frames: Sequence[np.ndarray], rate: float, most_
     Raises:
       ValueError: the film is larger with the fewest colours.
     """
-    samples = frames[:: -(-len(frames) // _SAMPLES)]
+    film, samples = b"", frames[:: -(-len(frames) // _SAMPLES)]
     for colors in _FEWER_COLORS:
         film = gif(frames, rate, samples, colors)
         if len(film) <= most_bytes:

@@ -62,12 +62,12 @@ class _Search(NamedTuple):
     """The state of Newton's method.
 
     point: the acceleration reached
-    count: [] steps made
+    steps: [] how many were made
     settled: [] whether the last step led to the minimum
     """
 
     point: _Point
-    count: jax.Array
+    steps: jax.Array
     settled: jax.Array
 
 
@@ -78,7 +78,7 @@ class _LineSearch(NamedTuple):
     high: [] the smallest length known to have a positive derivative
     root: [] where the derivative would be zero if no row changed from the last length evaluated
     active: [rows] whether a row pushes at the last length evaluated
-    count: [] lengths evaluated
+    evaluated: [] how many lengths were
     settled: [] whether the last two lengths evaluated have the same active rows
     """
 
@@ -86,7 +86,7 @@ class _LineSearch(NamedTuple):
     high: jax.Array
     root: jax.Array
     active: jax.Array
-    count: jax.Array
+    evaluated: jax.Array
     settled: jax.Array
 
 
@@ -143,7 +143,7 @@ def solve(
             before.residual + length * change,
         )
         settled = jnp.all(after.active == before.active) | (decrement < smallest)
-        return _Search(after, search.count + 1, settled)
+        return _Search(after, search.steps + 1, settled)
 
     def begin(qacc: jax.Array) -> _Point:
         imbalance = inertia @ qacc - data.qfrc_smooth
@@ -155,7 +155,7 @@ def solve(
         better = _cost(rows, data, warm) < _cost(rows, data, start)
         start = jax.tree.map(lambda w, s: jnp.where(better, w, s), warm, start)
     end = jax.lax.while_loop(
-        lambda search: ~search.settled & (search.count < model.opt.iterations),
+        lambda search: ~search.settled & (search.steps < model.opt.iterations),
         improve,
         _Search(start, jnp.int32(0), jnp.array(False)),
     ).point
@@ -237,7 +237,7 @@ def _line_search(
             high=jnp.where(root > length, last.high, length),
             root=root,
             active=active,
-            count=last.count + 1,
+            evaluated=last.evaluated + 1,
             settled=jnp.all(active == last.active),
         )
 
@@ -246,9 +246,9 @@ def _line_search(
         high=jnp.full_like(slope, jnp.inf),
         root=jnp.ones_like(slope),  # a full Newton step
         active=point.active,
-        count=jnp.int32(0),
+        evaluated=jnp.int32(0),
         settled=jnp.array(False),
     )
     return jax.lax.while_loop(
-        lambda last: ~last.settled & (last.count < max_rounds), evaluate, start
+        lambda last: ~last.settled & (last.evaluated < max_rounds), evaluate, start
     ).root

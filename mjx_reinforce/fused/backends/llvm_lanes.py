@@ -88,16 +88,16 @@ class Lanes(NamedTuple):
     def __rshift__(self, other):
         return self.write("ashr", other)
 
-    def __lt__(self, other):
+    def __lt__(self, other):  # pyright: ignore[reportIncompatibleMethodOverride] (lanes)
         return self.compare("lt", other)
 
-    def __le__(self, other):
+    def __le__(self, other):  # pyright: ignore[reportIncompatibleMethodOverride] (lanes)
         return self.compare("le", other)
 
-    def __gt__(self, other):
+    def __gt__(self, other):  # pyright: ignore[reportIncompatibleMethodOverride] (lanes)
         return self.compare("gt", other)
 
-    def __ge__(self, other):
+    def __ge__(self, other):  # pyright: ignore[reportIncompatibleMethodOverride] (lanes)
         return self.compare("ge", other)
 
     def compare(self, predicate: str, other: "Lanes | float") -> "Lanes":

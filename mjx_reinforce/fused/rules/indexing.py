@@ -22,12 +22,12 @@ class Unknown(NamedTuple):
 
     index: the scalar that holds it.
     stride: how far apart two starts are in the flat operand.
-    count: the number of starts that keep the window inside.
+    num_starts: the number of starts that keep the window inside.
     """
 
     index: Any
     stride: int
-    count: int
+    num_starts: int
 
 
 class Window(NamedTuple):
@@ -79,7 +79,7 @@ def _write(
     graph: Graph, flat: np.ndarray, window: Window, updates: np.ndarray, combine: Callable
 ) -> None:
     """Combines updates into a window, in place; a start outside changes nothing."""
-    for ks in itertools.product(*(range(unknown.count) for unknown in window.unknowns)):
+    for ks in itertools.product(*(range(unknown.num_starts) for unknown in window.unknowns)):
         hit, offset = np.True_, 0
         for k, (index, stride, _) in zip(ks, window.unknowns, strict=True):
             hit = graph.call("and", hit, graph.call("eq", index, index.dtype.type(k)))

@@ -41,7 +41,7 @@ class _Leaf(NamedTuple):
 
     pointer: str
     dtype: np.dtype
-    count: int
+    size: int
 
 
 def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
@@ -156,10 +156,8 @@ class _Kernel:
         """Writes how a thread begins an episode."""
         text = self.text
         place = self._wide(item)
-        for leaf, given in zip(
-            (x for x in self.state if x.count), self.given["state"], strict=True
-        ):
-            self._copy(given, place, leaf, leaf.count)
+        for leaf, given in zip((x for x in self.state if x.size), self.given["state"], strict=True):
+            self._copy(given, place, leaf, leaf.size)
         self._copy("%keys", place, self.keys, 2)
         for value, where in (
             (mode, self.mode.pointer),
@@ -215,8 +213,8 @@ class _Kernel:
 
     def _row(self, leaf: _Leaf, seed: str) -> Input:
         """Returns a seed's row of a leaf of the actor."""
-        first = self.text.let(f"mul i64 {self._wide(seed)}, {leaf.count}")
-        align = math.gcd(_BUFFER_ALIGN, leaf.dtype.itemsize * leaf.count)
+        first = self.text.let(f"mul i64 {self._wide(seed)}, {leaf.size}")
+        align = math.gcd(_BUFFER_ALIGN, leaf.dtype.itemsize * leaf.size)
         return Input(self.text.at(leaf.pointer, leaf.dtype, first), leaf.dtype, align)
 
     def _record(self, records: list[list[Any]], seed: str) -> None:
