@@ -14,7 +14,7 @@ import time
 from pathlib import Path
 from typing import NamedTuple
 
-from trainings import RUN, Training, results, status
+from trainings import COMMANDS, Training, results, status
 
 ALARMS = ("Traceback", "Exception ignored")
 _SIZE = "16m"
@@ -60,7 +60,7 @@ def fill(disk: Path, pages: int) -> None:
         ballast.write(bytes(max(free.f_bavail - pages, 0) * free.f_bsize))
 
 
-def meet(case: Case, disk: Path, screen: Path, command: list[str], cache: Path) -> Training:
+def meet(case: Case, disk: Path, screen: Path, command: tuple[str, str], cache: Path) -> Training:
     """Trains until the run ends on its full disk, and makes room; returns the process."""
     run, shown = disk / "run", disk if case.screen else screen
     if case.resumed:
@@ -97,8 +97,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--env", default="CartPole-v1")
     parser.add_argument("--cases", type=int, nargs="*", default=range(len(CASES)))
+    parser.add_argument("--command", choices=COMMANDS, default="train")
     settings = parser.parse_args()
-    command, wrong = ["--env", settings.env, *RUN], 0
+    command, wrong = (settings.command, settings.env), 0
     screen = Path(tempfile.mkdtemp(prefix="full-disk-"))
     disk, cache = screen / "disk", screen / "cache"
     disk.mkdir()

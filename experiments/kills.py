@@ -21,7 +21,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
 
-from trainings import RUN, Training, results, status
+from trainings import COMMANDS, Training, results, status
 
 #: The phases of a chain of 20 kills. The first two find no run; in "cold" ones XLA compiles, since
 #: the compilation cache is empty.
@@ -46,7 +46,7 @@ class Kill(NamedTuple):
     left: str
 
 
-def alone(run: Path, command: list[str], cache: Path) -> dict[str, float]:
+def alone(run: Path, command: tuple[str, str], cache: Path) -> dict[str, float]:
     """Trains without a kill; returns how long each phase took (s)."""
     training, last, lengths = Training(run, *command, cache=cache), time.monotonic(), {}
     for phase, following in (
@@ -121,8 +121,9 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--env", default="InvertedPendulum-v5")
+    parser.add_argument("--command", choices=COMMANDS, default="train")
     settings = parser.parse_args()
-    command = ["--env", settings.env, *RUN]
+    command = (settings.command, settings.env)
     draw, directory = random.Random(settings.seed), Path(tempfile.mkdtemp(prefix="kills-"))
     cache = directory / "cache"
     cold, warm = (alone(directory / name, command, cache) for name in ("first", "whole"))
