@@ -346,6 +346,23 @@ def test_a_full_disk_costs_no_training(run, monkeypatch, capsys):
     assert said.count("warning: cannot write a checkpoint (No space left on device)") == 2
 
 
+def test_a_chunk_that_was_interrupted_before_its_first_update_goes_on(run, monkeypatch):
+    command = f"{STEPS} --num-seeds 4 --chunk-runs 4"
+    assert run(f"{command} --output whole") == 0
+    drive, driven = conduct.drive, []
+
+    def interrupted(chunk, asked):
+        driven.append(None)
+        return len(driven) == 1 and drive(chunk, asked)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(conduct, "drive", interrupted)
+        assert run(f"{command} --output parts") == 0
+    assert json.loads(Path("parts/sweep.json").read_text())["status"] == "interrupted"
+    assert run("--resume parts") == 0
+    assert same(curves(Path("whole")), curves(Path("parts")))
+
+
 def test_a_chunk_that_goes_on_saves_when_it_is_due(run, monkeypatch):
     """Not at its first look: the checkpoint that it was found in counts."""
     monkeypatch.setattr(chunks, "_SECONDS", 0.0)
@@ -421,6 +438,18 @@ def test_a_sweep_that_crashed_goes_on(run, monkeypatch, where):
     assert run("--resume crashed") == 0  # killed before the report was written
     assert reported == [Path("crashed")]
     assert run("--resume crashed --learning-rate 0.5") == 2
+
+
+def test_what_a_kill_left_of_a_report_goes(tmp_path, monkeypatch):
+    """A write that was killed leaves a file with a name of its own."""
+    (tmp_path / "report").mkdir()
+    left = [tmp_path / ".report.html.12ab", tmp_path / "report" / ".final.png.8f95"]
+    for path in left:
+        path.write_text("half")
+    nothing = Written(0.0, [], 0)
+    monkeypatch.setattr("mjx_reinforce.report.write_sweep", lambda directory, output: nothing)
+    assert perform._report(tmp_path) == nothing
+    assert not any(path.exists() for path in left)
 
 
 def test_what_ended_earlier_repeats_its_last_row():

@@ -79,7 +79,8 @@ class History:
         self.now = {name: arrays[name] for name in self.now}
         self.seconds = float(arrays["seconds"])
         self._before = self.now["env_steps"], self.seconds
-        self._curves = Table({name: arrays[f"curves.{name}"] for name in _CURVES})
+        curves = {name: f"curves.{name}" for name in _CURVES}  # none before the first evaluation
+        self._curves = Table({name: arrays[key] for name, key in curves.items() if key in arrays})
 
     def evaluated(self) -> bool:
         """Returns whether the present policies of all runs have been evaluated."""

@@ -169,9 +169,11 @@ def _finish(
 
 
 def _report(directory: Path) -> "Written":
-    """Writes the report of a sweep."""
+    """Writes the report of a sweep; removes what a crash left of writing it."""
     from mjx_reinforce import report
 
+    for part in [*directory.glob(".report.html.*"), *(directory / "report").glob(".*")]:
+        part.unlink()
     return report.write_sweep(directory, directory / "report.html")
 
 
