@@ -29,6 +29,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 
 import jax
 import pytest
+from command_lines import added_environments, run_command
 
 SLOW = Path(__file__).with_name("slow.txt")
 _STALE = pytest.StashKey[list[str]]()
@@ -64,3 +65,19 @@ def _stale(lines, collected):
     files = {line: line.partition("::")[0] for line in lines}
     there = {path.name for path in SLOW.parent.rglob("test_*.py")}
     return sorted(line for line, file in files.items() if file in collected or file not in there)
+
+
+@pytest.fixture
+def register():
+    """Adds an environment for the test, or replaces one: a name, and a class or function."""
+    with added_environments() as register:
+        yield register
+
+
+@pytest.fixture
+def run(register, tmp_path):
+    """Runs a command line, that of ``train`` unless told, in an empty folder: its exit code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        patch.chdir(tmp_path)
+        yield run_command

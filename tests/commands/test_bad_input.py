@@ -38,19 +38,14 @@ from mjx_reinforce.store.build import build
 
 
 @pytest.fixture
-def refused(monkeypatch, tmp_path, capsys):
+def refused(run, monkeypatch, tmp_path, capsys):
     """Runs a command line that must be refused, and returns what it said."""
-    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(train_module, "train", lambda *_: pytest.fail("it was not refused"))
 
-    def run(*arguments):
+    def refuse(*arguments):
         before = sorted(tmp_path.rglob("*"))
-        monkeypatch.setattr(sys, "argv", ["train", *arguments])
-        with pytest.raises(SystemExit) as stop:
-            train_module.main()
+        assert run(*arguments) == 2
         printed = capsys.readouterr()
-        assert stop.value.code == 2
         assert printed.out == ""
         assert printed.err.startswith("error: ")
         assert printed.err.count("\n") <= 2
@@ -58,7 +53,7 @@ def refused(monkeypatch, tmp_path, capsys):
         assert sorted(tmp_path.rglob("*")) == before
         return printed.err
 
-    return run
+    return refuse
 
 
 #: Begins a command without root's right to enter every folder.
@@ -355,9 +350,8 @@ def test_an_environment_with_a_mistake_is_refused(refused, name, message):
     assert message in refused("--env", f"bad_envs:{name}", "--num-seeds", "1")
 
 
-def test_the_environments_that_those_change_are_right(monkeypatch):
-    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
-    for id in ("Survive-v0", "bad_envs:Pole", "bad_envs:InitialOfIntegers"):
+def test_the_environments_that_those_change_are_right():
+    for id in ("toys:Survive", "bad_envs:Pole", "bad_envs:InitialOfIntegers"):
         build(envs.make(id), Config(env=id, engine="vmap"))
 
 
@@ -511,14 +505,9 @@ def test_text_is_not_read_as_markup(text, capsys):
     assert capsys.readouterr().out.count(text) == 4
 
 
-def test_a_run_in_a_folder_with_brackets_names_it(monkeypatch, tmp_path, capsys):
-    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
-    monkeypatch.chdir(tmp_path)
+def test_a_run_in_a_folder_with_brackets_names_it(run, tmp_path, capsys):
     arguments = "--env Survive-v0 --num-seeds 1 --max-updates 1 --hidden-sizes --output t/[/b]é"
-    monkeypatch.setattr(sys, "argv", ["train", *arguments.split()])
-    with pytest.raises(SystemExit) as stop:
-        train_module.main()
-    assert stop.value.code == 0
+    assert run(*arguments.split()) == 0
     assert "t/[/b]é" in capsys.readouterr().out
     assert (tmp_path / "t" / "[/b]é" / "summary.json").exists()
 
@@ -575,20 +564,15 @@ def test_words_that_nobody_reads_end_no_sweep_of_a_script(monkeypatch):
         nobody.close()
 
 
-def test_a_run_that_nobody_reads_goes_on(monkeypatch, tmp_path):
+def test_a_run_that_nobody_reads_goes_on(run, monkeypatch, tmp_path):
     """As by ``| head -1``: what it says is lost, what it makes is not."""
-    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
-    monkeypatch.chdir(tmp_path)
     arguments = "--env Survive-v0 --num-seeds 1 --max-updates 2 --hidden-sizes --output out"
-    monkeypatch.setattr(sys, "argv", ["train", *arguments.split()])
     read, write = os.pipe()
     os.close(read)
     with open(write, "w") as nobody, monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", nobody)
         patch.setattr(sys, "stderr", nobody)
-        with pytest.raises(SystemExit) as stop:
-            train_module.main()
-    assert stop.value.code == 0
+        assert run(*arguments.split()) == 0
     assert json.loads((tmp_path / "out/summary.json").read_text())["status"] == "finished"
 
 

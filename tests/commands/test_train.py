@@ -16,8 +16,7 @@ import pytest
 from places import HELPERS
 from toys import Survive
 
-from mjx_reinforce import envs, load_policy
-from mjx_reinforce import train as train_module
+from mjx_reinforce import load_policy
 from mjx_reinforce.files import append_csv, create_csv
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.reports.statistics import smooth
@@ -27,21 +26,6 @@ from mjx_reinforce.training.nonfinite import as_events
 from mjx_reinforce.training.record import Record
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
-
-
-@pytest.fixture
-def run(monkeypatch, tmp_path):
-    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["train", *arguments])
-        with pytest.raises(SystemExit) as stop:
-            train_module.main()
-        return stop.value.code
-
-    return run
 
 
 def read(directory):
@@ -403,9 +387,9 @@ class Fragile(Survive):
         return after.replace(obs=jnp.where(bad, jnp.nan, after.obs))
 
 
-def test_a_broken_simulation_is_named(run, tmp_path, monkeypatch, capsys):
+def test_a_broken_simulation_is_named(run, register, tmp_path, capsys):
     """In one line a block of updates; the training return of such an update is no number."""
-    monkeypatch.setitem(envs._TABLE, "Fragile-v0", (Fragile, {}))
+    register("Fragile-v0", Fragile)
     assert run("--env", "Fragile-v0", "--env-steps", "1500", "--output", "out") == 0
     rows, summary = read(tmp_path / "out")
     blocks = {event["update"] // 5 for event in summary["nonfinite"]}
@@ -425,9 +409,9 @@ class Broken(Survive):
         return after.replace(obs=after.obs * jnp.nan, done=jnp.zeros(()))
 
 
-def test_a_run_without_a_finite_number_stops(run, tmp_path, monkeypatch, capsys):
+def test_a_run_without_a_finite_number_stops(run, register, tmp_path, capsys):
     """Not with returns of 0, and long before its budget is used."""
-    monkeypatch.setitem(envs._TABLE, "Broken-v0", (Broken, {}))
+    register("Broken-v0", Broken)
     arguments = ["--env", "Broken-v0", "--num-seeds", "3", "--env-steps", "100000"]
     assert run(*arguments, "--eval-every", "2", "--output", "out") == 1
     said = capsys.readouterr().out

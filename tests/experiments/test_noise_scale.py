@@ -9,7 +9,7 @@ import pytest
 from toys import Drift
 
 import noise_scale as module
-from mjx_reinforce import envs, leave_one_out, mlp_policy, normal, rollout
+from mjx_reinforce import leave_one_out, mlp_policy, normal, rollout
 from mjx_reinforce.learners.gradients import accumulate_gradient
 from mjx_reinforce.learners.reinforce import _surrogate
 from mjx_reinforce.policies import normalize
@@ -76,9 +76,8 @@ def test_gradients_of_episodes_sum_to_that_of_the_update():
     assert np.all(np.abs(each).sum(axis=1) > 0)
 
 
-def test_a_table_of_a_small_task(monkeypatch, tmp_path):
+def test_a_table_of_a_small_task(register, monkeypatch, tmp_path):
     """Of every estimator, discount and shift, before and after training."""
-    monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
     vmapped = dataclasses.replace(of_task("Drift-v0"), num_seeds=1, engine="vmap")
     monkeypatch.setattr(module, "_config", lambda env: vmapped)
     settings = Settings(

@@ -287,9 +287,8 @@ def test_what_takes_long_says_so_without_a_terminal(capfd, monkeypatch):
     assert "still compiling and playing, 0 s" in capfd.readouterr().err
 
 
-def test_an_environment_without_a_model_is_refused(tmp_path, monkeypatch, capsys):
+def test_an_environment_without_a_model_is_refused(register, tmp_path, monkeypatch, capsys):
     """Survive has what training needs, and no more."""
-    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
     make_run(tmp_path, "InvertedPendulum-v5", observation_size=1)
     for file in ("config.json", "policy/policy.json"):
         change(tmp_path / file, env="Survive-v0")

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 import os
 import subprocess
 import sys
@@ -24,17 +25,8 @@ from mjx_reinforce.store import ready
 
 
 @pytest.fixture
-def run(monkeypatch, tmp_path):
-    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["train", "--env", "Survive-v0", *arguments])
-        with pytest.raises(SystemExit) as stop:
-            train_module.main()
-        return stop.value.code
-
-    return run
+def run(run):
+    return functools.partial(run, "--env", "Survive-v0")
 
 
 def updates(path):

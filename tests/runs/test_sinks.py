@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from toys import Survive
 
-from mjx_reinforce import envs, files
+from mjx_reinforce import files
 from mjx_reinforce import train as train_module
 from mjx_reinforce.reports.statistics import iqm, iqm_interval
 from mjx_reinforce.runs.log import RunLog
@@ -333,18 +332,13 @@ def test_wandb_that_has_no_key_says_what_to_do(directory, monkeypatch):
         sink.open_sinks(Config(wandb=True), directory, None)
 
 
-def test_only_a_disk_is_asked_for_room(tmp_path, monkeypatch, capsys):
+def test_only_a_disk_is_asked_for_room(run, monkeypatch, capsys):
     def fail(*_):
         raise OSError("no key; run wandb login")
 
-    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(train_module, "train", fail)
-    command = "train --env Survive-v0 --num-seeds 1 --max-updates 1 --engine vmap --output out"
-    monkeypatch.setattr(sys, "argv", command.split())
-    with pytest.raises(SystemExit, match=r"^1$"):
-        train_module.main()
+    command = "--env Survive-v0 --num-seeds 1 --max-updates 1 --engine vmap --output out"
+    assert run(*command.split()) == 1
     assert "(no key; run wandb login); then try again" in capsys.readouterr().err
 
 
@@ -363,29 +357,12 @@ def test_a_missing_package_is_named_before_anything_starts(tmp_path, monkeypatch
     assert not (tmp_path / "out").exists()
 
 
-def test_a_run_with_all_sinks_and_its_resumption(tmp_path, monkeypatch):
-    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["train", *arguments])
-        with pytest.raises(SystemExit, match=r"^0$"):
-            train_module.main()
-
-    size = [
-        "--num-seeds",
-        "2",
-        "--eval-episodes",
-        "2",
-        "--hidden-sizes",
-        "4",
-        "--env-steps",
-        "None",
-    ]
+def test_a_run_with_all_sinks_and_its_resumption(run, tmp_path):
+    size = ["--num-seeds", "2", "--eval-episodes", "2", "--hidden-sizes", "4"]
+    size += ["--env", "Survive-v0", "--env-steps", "None", "--num-episodes", "4"]
     sinks = ["--tensorboard", "--jsonl", "--output", "out"]
-    run("--env", "Survive-v0", *size, "--num-episodes", "4", "--max-updates", "8", *sinks)
-    run("--resume", "out", "--max-updates", "15")
+    assert run(*size, "--max-updates", "8", *sinks) == 0
+    assert run("--resume", "out", "--max-updates", "15") == 0
     out = tmp_path / "out"
     table = as_csv(out / "metrics.csv")
     assert as_json(out / "metrics.jsonl") == table
@@ -394,17 +371,6 @@ def test_a_run_with_all_sinks_and_its_resumption(tmp_path, monkeypatch):
     last = [row for row in table if row["update"] == 15]
     for name in ("eval_return", "kl", "policy_std", "gradient_snr", "explained_variance"):
         assert shown[15][f"{name}/seed_1"] == pytest.approx(last[1][name], rel=1e-6)
-    run(
-        "--env",
-        "Survive-v0",
-        *size,
-        "--num-episodes",
-        "4",
-        "--max-updates",
-        "5",
-        "--overwrite",
-        "--output",
-        "out",
-    )
+    assert run(*size, "--max-updates", "5", "--overwrite", "--output", "out") == 0
     assert not (out / "metrics.jsonl").exists()
     assert not list((out / "tensorboard").iterdir())

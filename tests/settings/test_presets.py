@@ -29,22 +29,13 @@ TINY += ["--eval-every", "1", "--eval-episodes", "1"]
 
 
 @pytest.fixture(autouse=True)
-def toys(monkeypatch, tmp_path):
+def toys(register, run):
     for name in ("InvertedPendulum-v4", "InvertedPendulum-v5", "InvertedDoublePendulum-v5"):
-        monkeypatch.setitem(envs._TABLE, name, (Survive, {}))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.chdir(tmp_path)
-
-
-def run(monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["train", *arguments])
-    with pytest.raises(SystemExit) as stop:
-        train_module.main()
-    return stop.value.code
+        register(name, Survive)
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_trains(name, monkeypatch, tmp_path):
+def test_a_preset_trains(name, run, tmp_path):
     ars = PRESETS[name][1].algorithm == "ars"
     arguments = [
         name,
@@ -56,7 +47,7 @@ def test_a_preset_trains(name, monkeypatch, tmp_path):
     ]
     if PRESETS[name][1].update == "minibatches":
         arguments += ["--minibatch-updates", "3"]
-    assert run(monkeypatch, *arguments) == 0
+    assert run(*arguments) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     config = json.loads((tmp_path / "out" / "config.json").read_text())
     assert np.all(np.isfinite(summary["final_returns"]))
@@ -125,8 +116,8 @@ def test_engines_have_names(name):
         command_line.parse(["--engine", "mjx"])
 
 
-def test_an_unknown_preset_is_explained(monkeypatch, capsys):
-    assert run(monkeypatch, "gymnasium-tutorail") == 2
+def test_an_unknown_preset_is_explained(run, capsys):
+    assert run("gymnasium-tutorail") == 2
     assert "Did you mean 'gymnasium-tutorial'" in capsys.readouterr().err
 
 

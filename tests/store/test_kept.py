@@ -175,8 +175,7 @@ def test_programs_need_no_code_of_others(monkeypatch):
     assert kept.read(kept.key_of(CONFIG)) is not None
 
 
-def test_nothing_is_kept_of_an_environment_of_the_users(monkeypatch):
-    monkeypatch.setitem(envs._TABLE, "Survive-v0", (Survive, {}))
+def test_nothing_is_kept_of_an_environment_of_the_users(register):
     for name in ("Survive-v0", "toys:Survive"):
         assert kept.key_of(Config(env=name)) is None
 

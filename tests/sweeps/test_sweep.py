@@ -47,19 +47,10 @@ RATES = "--over learning-rate 1e-2 3e-2 1e-1"
 
 
 @pytest.fixture
-def run(monkeypatch, tmp_path):
-    monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
-    nothing = Written(0.0, [], 0)  # the report has tests of its own
-    monkeypatch.setattr(perform, "_report", lambda directory: nothing)
-    monkeypatch.chdir(tmp_path)
-
-    def run(command, module=sweep_command):
-        monkeypatch.setattr(sys, "argv", ["sweep", *command.split()])
-        with pytest.raises(SystemExit) as stop:
-            module.main()
-        return stop.value.code
-
-    return run
+def run(run, monkeypatch):
+    """Runs a sweep of arguments in one string; the report has tests of its own."""
+    monkeypatch.setattr(perform, "_report", lambda directory: Written(0.0, [], 0))
+    return lambda line, command=sweep_command: run(*line.split(), command=command)
 
 
 def curves(directory):
@@ -319,9 +310,8 @@ def test_a_crash_among_runs_that_ended_changes_nothing(run, monkeypatch):
 
     with monkeypatch.context() as patch:
         patch.setattr(conduct.Saver, "save", crash)
-        patch.setattr(sys, "argv", ["sweep", *command.split(), "--output", "crashed"])
         with pytest.raises(CrashError):
-            sweep_command.main()
+            run(f"{command} --output crashed")
     assert run("--resume crashed") == 0
     assert same(curves(Path("whole")), curves(Path("crashed")))
 
@@ -360,10 +350,8 @@ def test_a_chunk_that_goes_on_saves_when_it_is_due(run, monkeypatch):
             raise CrashError
 
     monkeypatch.setattr(conduct.Saver, "save", crash)
-    monkeypatch.setattr(sys, "argv", ["sweep", *command.split(), "--max-updates", "9"])
-    monkeypatch.setattr(sys, "argv", [*sys.argv, "--output", "crashed"])
     with pytest.raises(CrashError):
-        sweep_command.main()
+        run(f"{command} --max-updates 9 --output crashed")
     assert run("--resume crashed") == 0
     assert saved == [4, 8]
 
@@ -403,9 +391,8 @@ def test_a_sweep_that_crashed_goes_on(run, monkeypatch, where):
 
     with monkeypatch.context() as patch:
         patch.setattr(owner, name, crash)
-        patch.setattr(sys, "argv", ["sweep", *command.split(), "--output", "crashed"])
         with pytest.raises(CrashError):
-            sweep_command.main()
+            run(f"{command} --output crashed")
     assert json.loads(Path("crashed/sweep.json").read_text())["status"] == "running"
     assert len(list(Path("crashed/parts").glob("[0-9]*.npz"))) == 1
     assert run("--resume crashed") == 0
@@ -652,8 +639,7 @@ def test_ranges_are_drawn_as_their_settings_are():
 
 
 @pytest.mark.parametrize("report", [True, False])
-def test_from_python_a_report_can_be_left_out(monkeypatch, tmp_path, capsys, report):
-    monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
+def test_from_python_a_report_can_be_left_out(register, monkeypatch, tmp_path, capsys, report):
     written = Written(1.5, ["The best is learning rate 0.03.", "It is sure."], 1)
     monkeypatch.setattr(perform, "_report", lambda directory: written)
     base = Config(

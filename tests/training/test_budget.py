@@ -4,14 +4,10 @@ import dataclasses
 import json
 import math
 import re
-import sys
 
 import numpy as np
 import pytest
-from toys import Drift
 
-from mjx_reinforce import envs
-from mjx_reinforce import train as train_module
 from mjx_reinforce.export.policy_files import load_policy
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.settings import defaults
@@ -21,21 +17,6 @@ from trainings import results
 
 SMALL = ["--env", "Drift-v0", "--num-seeds", "3", "--eval-episodes", "2", "--num-episodes", "4"]
 SMALL += ["--hidden-sizes", "4"]
-
-
-@pytest.fixture
-def run(monkeypatch, tmp_path):
-    monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["train", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            train_module.main()
-        return stop.value.code
-
-    return run
 
 
 def settings(directory):

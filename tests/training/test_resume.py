@@ -9,7 +9,6 @@ import os
 import resource
 import shutil
 import signal
-import sys
 import time
 from pathlib import Path
 
@@ -17,10 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from command_lines import added_environments, run_command
 from saved_runs import assert_same
-from toys import Drift
 
-from mjx_reinforce import envs, files
+from mjx_reinforce import files
 from mjx_reinforce import files as export_files
 from mjx_reinforce import train as train_module
 from mjx_reinforce.engines.native.cpu import machine
@@ -43,21 +42,6 @@ ANY = ["--env", "Drift-v0", "--env-steps", "None", *SIZE]
 #: A rate that lasts as long as the budget would make another run of a larger one.
 COMMON = [*ANY, "--num-episodes", "4", "--decay-steps", "9000"]
 AUTO = ["--num-episodes", "auto", "--min-episodes", "2", "--max-episodes", "16"]
-
-
-@pytest.fixture
-def run(monkeypatch, tmp_path):
-    monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.chdir(tmp_path)
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["train", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            train_module.main()
-        return stop.value.code
-
-    return run
 
 
 @pytest.mark.parametrize(
@@ -114,13 +98,9 @@ def test_seeds_that_stood_still_are_played_again(run, tmp_path):
 def trained(tmp_path_factory):
     """A run of 20 updates; its checkpoints at 15 and 20 are left."""
     directory = tmp_path_factory.mktemp("trained")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
-        patch.chdir(directory)
+    with added_environments(), contextlib.chdir(directory):
         budget = ["--max-updates", "20", "--checkpoint-every", "5", "--output", "whole"]
-        patch.setattr(sys, "argv", ["train", *COMMON, *budget])
-        with pytest.raises(SystemExit, match=r"^0$"):
-            train_module.main()
+        assert run_command(*COMMON, *budget) == 0
     return directory / "whole"
 
 
@@ -217,8 +197,6 @@ def test_a_run_that_cannot_end_is_resumed(run, trained, tmp_path, monkeypatch, c
     assert "then go on with --resume full" in capsys.readouterr().err
     assert json.loads((tmp_path / "full" / "summary.json").read_text())["status"] == "running"
     monkeypatch.undo()
-    monkeypatch.setitem(envs._TABLE, "Drift-v0", (Drift, {}))
-    monkeypatch.chdir(tmp_path)
     assert run("--resume", "full") == 0
     assert_same(trained, tmp_path / "full")
 

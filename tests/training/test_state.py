@@ -97,9 +97,9 @@ LUCK = Config(env="Luck-v0", num_seeds=3, hidden_sizes=(), eval_episodes=2, test
 
 
 @pytest.fixture
-def measure(monkeypatch):
+def measure(register):
     """Returns what settings evaluate to before and after an update, and what they test to."""
-    monkeypatch.setitem(envs._TABLE, "Luck-v0", (Luck, {}))
+    register("Luck-v0", Luck)
 
     def measure(**changes):
         config = dataclasses.replace(LUCK, **changes)
