@@ -6,7 +6,6 @@ They run on the CPU unless JAX_PLATFORMS names something else.
 import atexit
 import os
 import shutil
-import sys
 import tempfile
 from importlib.metadata import version
 from pathlib import Path
@@ -30,11 +29,10 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 
 import jax
 import pytest
+from command_lines import added_environments, run_command
 
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.fused.verify import verify
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 SLOW = Path(__file__).with_name("slow.txt")
 _STALE = pytest.StashKey[list[str]]()
@@ -69,8 +67,21 @@ def stale_lines(request):
 def _stale(lines, collected):
     """Returns those of some lines whose file is among the collected ones, or is not there."""
     files = {line: line.partition("::")[0] for line in lines}
-    return sorted(
-        line
-        for line, file in files.items()
-        if file in collected or not SLOW.with_name(file).exists()
-    )
+    there = {path.name for path in SLOW.parent.rglob("test_*.py")}
+    return sorted(line for line, file in files.items() if file in collected or file not in there)
+
+
+@pytest.fixture
+def register():
+    """Adds an environment for the test, or replaces one: a name, and a class or function."""
+    with added_environments() as register:
+        yield register
+
+
+@pytest.fixture
+def run(register, tmp_path):
+    """Runs a command line, that of ``train`` unless told, in an empty folder: its exit code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        patch.chdir(tmp_path)
+        yield run_command

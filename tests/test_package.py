@@ -6,14 +6,14 @@ import re
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
+from places import ROOT
 from saved_runs import make_run
 
 import mjx_reinforce
 
-ROOT = Path(__file__).parents[1]
+TESTS = ROOT / "tests"
 PACKAGE = ROOT / "mjx_reinforce"
 #: Folders and root modules from the ground up; a file imports from its own folder and those before.
 ORDER = (
@@ -124,3 +124,27 @@ def test_type_checkers_see_the_public_names():
 
 def test_slow_tests_are_tests(stale_lines):
     assert not stale_lines
+
+
+TEST_FILES = {path.stem: path for path in sorted(TESTS.rglob("test_*.py"))}
+
+
+def test_names_of_test_files_are_told_apart():
+    """They are modules without a package, and slow.txt names them without their folders."""
+    assert len(TEST_FILES) == len(list(TESTS.rglob("test_*.py")))
+
+
+def test_test_files_are_in_folders_of_the_package():
+    """And what tests a module of the root, or all of it, is in none."""
+    folders = {path.parent.relative_to(TESTS).as_posix() for path in TEST_FILES.values()}
+    assert folders <= {".", *ORDER, "commands", "experiments"}
+
+
+@pytest.mark.parametrize("name", TEST_FILES)
+def test_no_test_file_imports_another(name):
+    """What several use is in tests/helpers."""
+    for node in ast.walk(ast.parse(TEST_FILES[name].read_text("utf-8"))):
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom):
+            names = [node.module or ""]
+        assert not {each.partition(".")[0] for each in names} & {*TEST_FILES, "conftest"}

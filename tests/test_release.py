@@ -6,14 +6,13 @@ import re
 import subprocess
 import sys
 import tomllib
-from pathlib import Path
 
 import pytest
+from places import ROOT
 
 import mjx_reinforce
 from mjx_reinforce.reports.page.citation import YEAR
 
-ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 #: Packages that conda-forge calls otherwise than PyPI.
 CONDA_NAMES = {

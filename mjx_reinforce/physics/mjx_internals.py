@@ -8,8 +8,8 @@ No other file imports MJX's private modules or reads the private part of its dat
 - Functions of MJX in which a name is given another meaning: ``collision_with`` and ``fenced``. They
   would do nothing, silently, if MJX stopped looking that name up; ``check_lookup`` raises then.
 
-``tests/test_mjx_internals.py`` holds a hash of each MJX function that this package replaces or
-whose source it depends on: a new MJX fails there first.
+``tests/physics/test_mjx_internals.py`` holds a hash of each MJX function that this package replaces
+or whose source it depends on: a new MJX fails there first.
 
 ``fenced`` makes two changes for XLA's CPU backend; neither changes an answer.
 

@@ -1,0 +1,320 @@
+"""The command line as a stranger finds it: its menu, its help, its hints. Nothing is compiled."""
+
+import importlib.metadata
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from places import ROOT
+
+from mjx_reinforce import __main__ as script
+from mjx_reinforce import envs, registry
+from mjx_reinforce.checks import whole_number
+from mjx_reinforce.console import commands, lines
+from mjx_reinforce.envs.__main__ import main as envs_main
+from mjx_reinforce.playing.newest import choose_run
+from mjx_reinforce.runs.command_line import parse
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.settings.groups import MAIN
+
+
+@pytest.fixture
+def call(monkeypatch, tmp_path, capsys):
+    """Runs ``mjx-reinforce`` to where a command would begin; returns status, output and error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["/bin/mjx-reinforce", *arguments])
+        with pytest.raises(SystemExit) as stop:
+            script.main()
+        printed = capsys.readouterr()
+        return stop.value.code, printed.out, printed.err
+
+    return call
+
+
+# The menu.
+
+
+def test_alone_it_is_a_menu_of_all_commands(call):
+    for arguments in ([], ["--help"], ["help"]):
+        status, out, _ = call(*arguments)
+        assert status == 0
+        for name in commands.COMMANDS:
+            assert f"mjx-reinforce {name} " in out
+
+
+def test_it_says_its_version(call):
+    version = importlib.metadata.version("mjx-reinforce")
+    assert call("--version") == (0, f"mjx-reinforce {version}\n", "")
+
+
+@pytest.mark.parametrize("name", commands.COMMANDS)
+def test_every_command_explains_itself(call, name):
+    status, out, _ = call(name, "--help")
+    assert status == 0
+    assert out.startswith(f"usage: mjx-reinforce {name} ")
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--num-seeds", "0"], ["gymnasium-tutorial", "--seed", "-1"]]
+)
+def test_flags_or_a_preset_alone_train(call, arguments):
+    status, _, err = call(*arguments)
+    assert status == 2
+    assert "--num-seeds must be at least 1" in err or "--seed must be in" in err
+
+
+def test_commands_are_called_as_this_one_was(monkeypatch):
+    for called, said in {
+        "/usr/bin/mjx-reinforce": "mjx-reinforce watch",
+        "C:/Scripts/mjx-reinforce.exe": "mjx-reinforce watch",
+        "/lib/mjx_reinforce/__main__.py": "mjx-reinforce watch",
+        "/lib/mjx_reinforce/train.py": "python -m mjx_reinforce.watch",
+        "train_all.py": "python -m mjx_reinforce.watch",
+    }.items():
+        monkeypatch.setattr(sys, "argv", [called])
+        assert commands.command("watch") == said
+
+
+def test_a_sweep_records_what_was_typed(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/mjx-reinforce", "--over", "policy", "a b"])
+    assert commands.typed("sweep") == "mjx-reinforce sweep --over policy 'a b'"
+    monkeypatch.setattr(sys, "argv", ["my study.py", "7"])
+    assert commands.typed("sweep") == "'my study.py' 7"
+
+
+# Help.
+
+
+@pytest.mark.parametrize("name", ["train", "sweep"])
+def test_help_has_ten_settings_and_help_all_the_rest(call, name):
+    brief, whole = call(name, "--help")[1], call(name, "--help", "all")[1]
+    shown, every = (re.findall(r"(?m)^[|│ ] (--[a-z][a-z-]+)", page) for page in (brief, whole))
+    assert len(shown) == 10
+    if name == "train":
+        assert shown == [f"--{name.replace('_', '-')}" for name in MAIN]
+    assert set(shown) < set(every)
+    assert f"--help all shows all {len(every)} settings" in brief
+
+
+@pytest.mark.parametrize("columns", [60, 200])
+def test_help_wraps_at_words(call, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    shown = call("train", "--help", "all")[1]
+    assert max(map(len, shown.splitlines())) <= columns
+    words = set(shown.split())
+    for word in ("learning_curve.png,", "InvertedPendulum-v5,", "independent", "interrupted,"):
+        assert word in words, word
+
+
+def test_text_wraps_at_words():
+    text = f"{'word ' * 30}\n  name    {'what ' * 30}\nmjx_reinforce.{'x' * 70} --flag"
+    for columns in (20, 60, 200):
+        shown = lines.wrapped(text, columns)
+        assert shown.split() == text.split()
+        assert all(len(line) <= columns or "x" * 70 in line for line in shown.splitlines())
+    first, second = lines.wrapped(f"  name    {'what ' * 8}", 40).splitlines()
+    assert (first[:10], second[:10]) == ("  name    ", " " * 10)
+
+
+# Numbers.
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [
+        ("1e6", 10**6),
+        ("2_000_000", 2 * 10**6),
+        ("1e12", 10**12),
+        ("7", 7),
+        ("-3", -3),
+        ("1.5e1", 15),
+    ],
+)
+def test_whole_numbers_are_read_as_people_write_them(text, number):
+    assert whole_number(text) == number
+
+
+@pytest.mark.parametrize("text", ["1.5", "", "many", "nan", "inf", "1e-3", "1e999999999", "1,000"])
+def test_what_is_no_whole_number_is_refused(text):
+    with pytest.raises(ValueError, match="takes a whole number, such as 4 or 2e6"):
+        whole_number(text)
+
+
+def test_a_budget_with_an_exponent_is_that_budget_and_picks_its_settings():
+    for text in ("2e8", "--env_steps=2e8", "200_000_000"):
+        arguments = [text] if text.startswith("--") else ["--env-steps", text]
+        config = parse(["--env", "Ant-v5", *arguments])
+        assert config == of_task("Ant-v5", 200_000_000)
+        assert config.num_episodes != of_task("Ant-v5", 500_000).num_episodes
+    assert parse(["--hidden-sizes", "3e1", "32"]).hidden_sizes == (30, 32)
+    assert parse(["--decay-steps", "1e6"]).decay_steps == 10**6
+    assert parse(["--num-episodes", "1e2"]).num_episodes == 100
+
+
+# What a task is.
+
+
+def test_a_task_is_described(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["envs", "InvertedPendulum-v5"])
+    envs_main()
+    said = capsys.readouterr().out
+    for text in (
+        "observation  4 numbers",
+        "1 number in [-3, 3]",
+        "at most 1,000 env steps, of 0.04 s each",
+        "at a return of 950",
+        "mjx_reinforce.train --env InvertedPendulum-v5\n",
+        "  --max-kl 0.01\n",
+        "compiling takes about",
+    ):
+        assert text in said, text
+    assert "--env-steps" not in said
+
+
+def test_tasks_are_listed_as_ever():
+    command = [sys.executable, "-m", "mjx_reinforce.envs"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert done.stdout.splitlines() == envs.names()
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        *(("hopper", "Hopper-v5"), ("Hopper-v4", "Hopper-v5"), ("cheetah", "HalfCheetah-v5")),
+        *(("walker", "Walker2d-v5"), ("Hoper-v5", "Hopper-v5"), ("HUMANOID-V5", "Humanoid-v5")),
+        *(("cartpole-v1", "CartPole-v1"), ("cartpol-v0", "CartPole-v0"), ("xyz", None)),
+        *(("Pong-v5", None), ("nope", None), ("InvertedPendulum", "InvertedPendulum-v5")),
+    ],
+)
+def test_the_nearest_name_is_found(typed, meant):
+    assert registry.nearest(typed, envs.names()) == meant
+
+
+# The newest run.
+
+
+def test_without_a_name_the_newest_run_plays(call, monkeypatch, tmp_path):
+    status, _, err = call("watch")
+    assert status == 2
+    assert "mjx-reinforce train trains one" in err
+    for name, written in {"first": 100, "last": 300, "second": 200}.items():
+        run = tmp_path / "runs" / name
+        (run / "policy").mkdir(parents=True)
+        (run / "config.json").write_text("{}")
+        os.utime(run / "policy", (written, written))
+    (tmp_path / "runs" / "unfinished").mkdir()
+    (tmp_path / "runs" / "unfinished" / "config.json").write_text("{}")
+    assert "runs/last/config.json is damaged" in call("watch")[2]
+    assert "runs/first/config.json is damaged" in call("watch", "runs/first")[2]
+    assert choose_run(tmp_path / "runs") == tmp_path / "runs/last"
+    assert choose_run(tmp_path / "HalfCheetah-v5") == tmp_path / "HalfCheetah-v5"
+
+
+# Mistakes.
+
+#: What a stranger may type after ``mjx-reinforce``, and what the answer must say.
+MISTAKES = {
+    # The task, or the command, is not where it belongs.
+    "Hopper-v5": "'Hopper-v5' is a task: write mjx-reinforce train --env Hopper-v5",
+    "train Hopper-v5": "'Hopper-v5' is a task: write --env Hopper-v5",
+    "train --num-seeds 3 Hopper-v5": "'Hopper-v5' is a task: write --env Hopper-v5",
+    "sweep Hopper-v5 --over discount 0.9 1": "'Hopper-v5' is a task: write --env Hopper-v5",
+    "train hopper": "unknown task 'hopper'. Did you mean --env Hopper-v5?",
+    "train --env Hoper-v5": "unknown environment 'Hoper-v5'. Did you mean 'Hopper-v5'?",
+    "train --env cheetah": "Did you mean 'HalfCheetah-v5'?",
+    "train --env nope": "unknown environment 'nope'. Known: Ant-v5,",
+    "train --no-such": "unknown flag '--no-such'. (See mjx-reinforce train --help.)",
+    "train --env my_arm": "Your own is named module:Class.",
+    "train my_arm:Arm": "'my_arm:Arm' is a task: write --env my_arm:Arm",
+    "train my_arm.py": "'my_arm.py' is a file; a task is a class in one: write --env module:Class",
+    "train runs/first": "'runs/first' is a directory: --output runs/first writes a run there",
+    "envs Hoper": "Did you mean 'Hopper-v5'?",
+    "envs --env Hopper-v5": "unknown flag '--env': leave it out",
+    "trian": "Did you mean the command mjx-reinforce train?",
+    "play runs/first": "Did you mean the command mjx-reinforce watch?",
+    "train watch": "'watch' is a command of its own: mjx-reinforce watch",
+    "train train": "the command 'train' is given twice",
+    "train --seed 1 sweep": "'sweep' is a command of its own: mjx-reinforce sweep",
+    "gymnasium-tutorail": "Did you mean 'gymnasium-tutorial'?",
+    # Flags of other libraries, and misspelt ones.
+    "train --seeds 3": "unknown flag '--seeds'. Did you mean '--num-seeds'?",
+    "train --lr 0.1": "unknown flag '--lr'. Did you mean '--learning-rate'?",
+    "train --lr=0.1": "unknown flag '--lr'. Did you mean '--learning-rate'?",
+    "train --steps 1e6": "unknown flag '--steps'. Did you mean '--env-steps'?",
+    "train --total_timesteps 1e6": "Did you mean '--env-steps'?",
+    "train --gamma 0.9": "Did you mean '--discount'?",
+    "train --batch-size 32": "Did you mean '--num-episodes'?",
+    "train -n 3": "Did you mean '--num-seeds'?",
+    "train --num-sedes 3": "Did you mean '--num-seeds'?",
+    "train -env Hopper-v5": "unknown flag '-env': write --env",
+    "train --Env Hopper-v5": "unknown flag '--Env': write --env",
+    "train --num-seeds 3 \N{EM DASH}env Hopper-v5": "unknown flag '\N{EM DASH}env': write --env",
+    "train env=Hopper-v5": "'env=Hopper-v5' lacks its dashes: write --env Hopper-v5",
+    "train --no-learning-rate": "--learning-rate is no switch but takes a value",
+    "train --version": "mjx-reinforce --version says it",
+    "train --config mine.json": "config.json; mjx-reinforce train --like RUN repeats them",
+    "train --device cuda": "JAX_PLATFORMS=cuda before the command",
+    "train --over discount 0.9 1": "unknown flag '--over': it is one of mjx-reinforce sweep",
+    "watch --run runs/first": "unknown flag '--run': leave it out",
+    # Values.
+    "train --env": "--env needs a value after it",
+    "train --env-steps 1.5": "takes a whole number, such as 4 or 2e6, or None, got '1.5'",
+    "train --env-steps 1M": "--env-steps takes a whole number, such as 4 or 2e6, or None, got '1M'",
+    "train --num-seeds many": "--num-seeds takes a whole number, such as 4 or 2e6, got 'many'",
+    "train --num-episodes few": "a whole number, such as 4 or 2e6, or auto, got 'few'",
+    "train --decay-steps long": "such as 4 or 2e6, or None or budget, got 'long'",
+    "train --learning-rate 0,1": "--learning-rate takes a number, such as 0.5, got '0,1'",
+    "train --hidden-sizes 64,64": "takes whole numbers with spaces between them, such as 32 32",
+    "train --standardize False": "it takes no value, got 'False'; --no-standardize switches it off",
+    "train --num-seeds 3 4": "no flag takes '4': --num-seeds takes one value",
+    "train --algorithm PPO": "--algorithm takes ars or reinforce, got 'PPO'",
+    "watch Hopper-v5 --backend isaac": "--backend takes gymnasium or mjx or mujoco, got 'isaac'",
+    "watch Hopper-v5 --beside x": "or None or untrained or best or worst or median, got 'x'",
+    "train --output=": "--output takes a path or None, got ''",
+    "train --estimator value_baseline": "Did you mean 'value-baseline'?",
+    "watch --seed first": "--seed takes a whole number, such as 4 or 2e6, or best or worst or",
+    "watch --output film.avi runs/first": "runs/first is no run directory",
+    "watch runs/first runs/second": "no flag takes 'runs/second'",
+    # What is swept, reported, exported.
+    "sweep": "nothing is swept: give --over a setting and its values, such as --over learning-rate",
+    "sweep --over lr 0.1 0.2": "unknown setting 'lr' after --over. Did you mean 'learning-rate'?",
+    "sweep --over learning-rate 0.1,0.2": "'0.1,0.2', which is no number; write spaces between",
+    "sweep --over num-episodes 1.5 2": "'1.5', which is no whole number or auto",
+    "report": "there is nothing to report on: name a run or a sweep directory",
+    "report nowhere": "there is no directory nowhere; name that of a run or a sweep",
+    "export": "mjx-reinforce export needs RUN and --to",
+    "export runs/first --to torch": "--to takes numpy or onnx, got 'torch'",
+}
+
+
+@pytest.mark.parametrize("typed", MISTAKES)
+def test_a_mistake_gets_the_remedy(call, typed):
+    status, out, err = call(*typed.split())
+    assert (status, out) == (2, "")
+    assert err.startswith("error: ")
+    assert err.count("\n") == 1
+    assert MISTAKES[typed] in err
+
+
+@pytest.mark.parametrize("command", ["watch", "report", "new", "export --to numpy"])
+def test_nothing_is_no_path(call, command):
+    assert "'' is no path" in call(*command.split(), "")[2]
+
+
+def test_a_script_sees_modules_of_the_current_folder():
+    """Python leaves that folder out for scripts, as -P does for modules."""
+    done = subprocess.run(
+        [sys.executable, "-P", "-m", "mjx_reinforce.envs", "my_arm:Arm"],
+        cwd=ROOT / "experiments",
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "action       3 numbers" in done.stdout

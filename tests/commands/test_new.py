@@ -1,0 +1,105 @@
+"""Your own robot: the arm of the example learns to reach, and a model becomes a class."""
+
+import csv
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from places import ROOT
+
+from mjx_reinforce import envs, new
+
+EXPERIMENTS = ROOT / "experiments"
+SENSED = """<mujoco><option timestep="0.002"/><worldbody>
+  <body name='say "it"'><freejoint/><geom size="0.1"/><site name="end-effector"/>
+    <body><joint axis="0 1 0"/><geom size="0.1"/></body></body></worldbody>
+  <actuator><motor joint="j"/></actuator><sensor><gyro site="end-effector"/></sensor></mujoco>"""
+
+
+def test_the_arm_learns_to_reach(tmp_path):
+    command = [sys.executable, "-m", "mjx_reinforce.train", "--env", "my_arm:Arm"]
+    options = ["--num-episodes", "64", "--env-steps", "300_000", "--num-seeds", "2"]
+    output = ["--output", str(tmp_path / "arm")]
+    subprocess.run([*command, *options, *output], check=True, capture_output=True, cwd=EXPERIMENTS)
+    with (tmp_path / "arm" / "metrics.csv").open() as file:
+        rows = [*csv.DictReader(file)]
+    returns = [float(row["eval_return"]) for row in rows if row["seed"] == "0"]
+    assert returns[-1] > returns[0] / 2  # both are negative: half of the way is left
+
+
+def test_the_arm_is_paid_for_the_distance_of_the_ball(monkeypatch):
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    env = envs.make("my_arm:Arm")
+    qpos, qvel = env.initial(jax.random.key(0))
+    assert (qpos.shape, qvel.shape, env.action_size) == ((6,), (6,), 3)
+    state = env.set_state(jnp.zeros(6).at[3:].set(jnp.array([0.3, 0.0, 0.2])), qvel)
+    tip = np.array([0.0, 0.0, 0.83])
+    np.testing.assert_allclose(state.obs[-3:], np.array([0.3, 0.0, 0.2]) - tip, atol=1e-6)
+    starts = jax.vmap(env.initial)(jax.random.split(jax.random.key(1), 100))[0]
+    assert np.all(np.linalg.norm(starts[:, 3:], axis=1) < 0.75)  # within reach
+
+
+def test_a_model_becomes_a_class_that_plays(tmp_path, monkeypatch, capsys):
+    shutil.copy(EXPERIMENTS / "my_arm.xml", tmp_path / "my_robot-2.xml")
+    monkeypatch.chdir(tmp_path)
+    new.main(["my_robot-2.xml"])
+    said = capsys.readouterr().out
+    assert "mjx-reinforce train --env my_robot_2:MyRobot2 --output my_robot_2_run" in said
+    monkeypatch.syspath_prepend(tmp_path)
+    env = envs.make("my_robot_2:MyRobot2")
+    state = jax.eval_shape(env.reset, jax.random.key(0))
+    after = jax.eval_shape(env.step, state, jnp.zeros(3))
+    assert after.obs.shape == (12,)
+    assert set(after.metrics) == {"reward_pose", "reward_control"}
+    text = (tmp_path / "my_robot_2.py").read_text()
+    assert "SITE_TIP = 0" in text
+    assert "shoulder in [-0.523599, 1.74533]" in text
+    for check in (["check", "--select", "E,F,W"], ["format", "--check"]):
+        options = ["--isolated", "--line-length", "100", "my_robot_2.py"]
+        subprocess.run([sys.executable, "-m", "ruff", *check, *options], check=True)
+
+
+def test_names_of_a_model_cannot_break_the_class(tmp_path, monkeypatch):
+    (tmp_path / "sensed.xml").write_text(SENSED.replace("<joint axis", '<joint name="j" axis'))
+    monkeypatch.chdir(tmp_path)
+    new.main(["sensed.xml"])
+    monkeypatch.syspath_prepend(tmp_path)
+    env = envs.make("sensed:Sensed")
+    assert env.dt == pytest.approx(0.04)
+    assert env.observation_size == 8 + 7 + 3
+    assert (env.max_episode_steps, sys.modules["sensed"].SITE_END_EFFECTOR) == (125, 0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nothing.xml"], "there is no model"),
+        (["model.urdf"], "model.urdf is no model; give an MJCF file that ends in .xml"),
+        (["arm.xml", "--output", "json.py"], "json.py would hide Python's json"),
+        (["arm.xml", "--output", "my-arm.py"], "Python cannot import 'my-arm.py'"),
+        (["arm.xml", "--output", "../arm.py"], "must be in the folder of arm.xml"),
+        (["arm.xml", "--output", "there.py"], "there.py exists; pass --overwrite"),
+        (["still.xml"], "has no actuators"),
+        (["broken.xml"], "MuJoCo cannot compile"),
+        (["pgs.xml"], 'set <option solver="Newton"/>'),
+        (["arm.xml", "--outptu", "a.py"], "Did you mean '--output'?"),
+    ],
+)
+def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
+    arm = (EXPERIMENTS / "my_arm.xml").read_text()
+    texts = {"arm": arm, "still": "<mujoco/>", "broken": "<mujoco"}
+    texts["pgs"] = arm.replace("<option", '<option solver="PGS"')
+    for name, text in texts.items():
+        (tmp_path / f"{name}.xml").write_text(text)
+    (tmp_path / "there.py").write_text("")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        new.main(arguments)
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "arm.py").exists()

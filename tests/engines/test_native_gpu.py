@@ -1,0 +1,308 @@
+"""The native engine's kernels for GPUs: what they play, run on this CPU, and what they are."""
+
+import re
+import shutil
+import subprocess
+
+import gpu_on_cpu
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from players import actor_and_act, assert_same_episodes, both, played
+from scenes import MANY_FEET, Scene
+from toys import Bytes, Chain, Drifting, categorical
+
+from mjx_reinforce import envs
+from mjx_reinforce.engines import choice
+from mjx_reinforce.engines.native import available, objects, program, rollout, step
+from mjx_reinforce.engines.native.gpu import lockstep, player, ptx, scratch, seam
+from mjx_reinforce.fused import scalarized
+
+if reason := available.unavailable():
+    pytest.skip(reason, allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    env = envs.make("InvertedPendulum-v5")
+    return env, actor_and_act(env, (5, 6))
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_same_episodes_as_everywhere(pendulum, monkeypatch, threads):
+    """Of a task, and of toys whose state has a counter, a flag, a limit and a number of 8 bits."""
+    gpu_on_cpu.emulate(monkeypatch, threads)
+    toys = ((env, actor_and_act(env, (4,))) for env in (Drifting(), Bytes()))
+    for env, who in (pendulum, *toys):
+        got, want = both(env, who, deterministic=jnp.arange(5) < 2, horizon=100)
+        assert got.mask[:, 0].all()
+        assert not got.mask[:, -1].all()
+        assert_same_episodes(got, want, rounding=2e-5)
+
+
+def test_actions_may_be_integers(monkeypatch):
+    gpu_on_cpu.emulate(monkeypatch)
+    env = Chain()
+    got, want = both(env, actor_and_act(env, (4,), distribution=categorical(2)))
+    assert got.action.dtype == want.action.dtype
+    assert_same_episodes(got, want, rounding=1e-6)
+
+
+def test_steps_are_counted_for_the_seed_that_played_them(pendulum, monkeypatch):
+    gpu_on_cpu.emulate(monkeypatch)
+    result = played(rollout.rollout, *pendulum, num_episodes=7, horizon=100)
+    np.testing.assert_array_equal(result.simulated, result.mask.sum((1, 2)))
+
+
+def test_seeds_that_are_not_active_are_not_played(pendulum, monkeypatch):
+    gpu_on_cpu.emulate(monkeypatch)
+    env, (actor, act, distribution) = pendulum
+
+    def one(key, active):
+        size = {"num_episodes": 5, "horizon": 20}
+        return rollout.rollout(env, act, actor, distribution, key, active=active, **size)
+
+    keys = jax.random.split(jax.random.key(0), 4)
+    all_seeds, some = (
+        jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(keys, jnp.array(active)))
+        for active in ([True] * 4, [False, True, False, True])
+    )
+    assert all_seeds.mask[:, 0].all()
+    for got, want in zip(jax.tree.leaves(some), jax.tree.leaves(all_seeds), strict=True):
+        assert not got[[0, 2]].any()
+        np.testing.assert_array_equal(got[[1, 3]], want[[1, 3]])
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_episodes_that_are_not_active_are_not_played(pendulum, monkeypatch, threads):
+    """Also in step with others: a thread that never had an episode counts no steps."""
+    block = gpu_on_cpu.Block(threads)
+    gpu_on_cpu.emulate(monkeypatch, block=block)
+    monkeypatch.setattr(lockstep, "LONG", 0)
+    env, (actor, act, distribution) = pendulum
+
+    def one(key, active):
+        size = {"num_episodes": 5, "horizon": 20, "deterministic": jnp.arange(5) % 2 == 1}
+        return rollout.rollout(env, act, actor, distribution, key, active=active, **size)
+
+    keys = jax.random.split(jax.random.key(0), 3)
+    chosen = np.array([[0] * 5, [0, 1, 0, 0, 1], [0] * 5]).astype(bool)
+    play = jax.jit(jax.vmap(one))
+    some, every = (
+        jax.tree.map(np.asarray, play(keys, x)) for x in (jnp.array(chosen), jnp.ones((3, 5), bool))
+    )
+    assert block.apart is None
+    np.testing.assert_array_equal(some.mask, every.mask & chosen[:, None])
+    for name in ("observation", "action", "reward"):
+        played = some.mask.reshape(some.mask.shape + (1,) * (getattr(some, name).ndim - 3))
+        np.testing.assert_array_equal(getattr(some, name), played * getattr(every, name))
+    assert not some.simulated[[0, 2]].any()
+    lengths = some.mask[1].sum(axis=0)
+    assert some.simulated[1] == (lengths.sum() if threads == 1 else 2 * lengths.max())
+
+
+def test_in_step_or_apart_an_episode_is_the_same(monkeypatch):
+    """Hopper's loops and branches, entered by all threads together or by each alone.
+
+    Threads of a block meet at one place, also where their episodes have ended.
+    """
+    env = envs.make("Hopper-v5")
+    who = actor_and_act(env, (4,))
+    gpu_on_cpu.emulate(monkeypatch)
+    want = played(rollout.rollout, env, who, horizon=30)
+    meetings = []
+    for long in (10**9, 3_000, 0):
+        block = gpu_on_cpu.Block(3)
+        gpu_on_cpu.emulate(monkeypatch, block=block)
+        monkeypatch.setattr(lockstep, "LONG", long)
+        got = played(rollout.rollout, env, who, horizon=30)
+        assert block.apart is None
+        meetings.append(block.meetings)
+        for name in ("observation", "action", "reward", "mask", "nonfinite"):
+            np.testing.assert_array_equal(getattr(got, name), getattr(want, name))
+    assert 0 < meetings[0] < meetings[1] < meetings[2]
+
+
+def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
+    env = Scene(MANY_FEET)
+    who = actor_and_act(env, ())
+    size = {"num_episodes": 12, "horizon": 2}
+    gpu_on_cpu.emulate(monkeypatch)
+    want = played(rollout.rollout, env, who, **size)
+    block = gpu_on_cpu.Block(3)
+    gpu_on_cpu.emulate(monkeypatch, block=block)
+    monkeypatch.setattr(lockstep, "LONG", 0)
+    got = played(rollout.rollout, env, who, **size)
+    assert block.apart is None
+    for name in ("observation", "action", "reward", "mask"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(want, name))
+
+
+def test_long_arrays_are_in_a_buffer(monkeypatch):
+    env = envs.make("Hopper-v5")
+    who = actor_and_act(env, (4,))
+    gpu_on_cpu.emulate(monkeypatch)
+    want = played(rollout.rollout, env, who, horizon=30)
+    monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
+    made, load = [], ptx.load
+    monkeypatch.setattr(ptx, "load", lambda *x: made.append(load(*x)) or made[-1])
+    got = played(rollout.rollout, env, who, horizon=30)
+    assert made[0].scratch > 100
+    for name in ("observation", "action", "reward", "mask"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(want, name))
+
+
+def test_each_thread_has_words_of_its_own():
+    """Those of the threads of a warp are side by side."""
+    text = scratch.ScratchText()
+    arrays = [text.reserve_long(np.int32, count) for count in (30, 40)]
+    block, lane = (
+        text.let(f"call i32 @llvm.nvvm.read.ptx.sreg.{x}()") for x in ("ctaid.x", "tid.x")
+    )
+    thread = text.let(f"add i32 {text.let(f'mul i32 {block}, 32')}, {lane}")
+    for array, count in zip(arrays, (30, 40), strict=True):
+        for k in range(count):
+            value = text.let(f"add i32 {text.let(f'mul i32 {thread}, 100')}, {k + count}")
+            text.store(value, text.at(array, np.int32, text.let(f"add i64 {k}, 0")), np.int32)
+    text.line("ret void")
+    code = gpu_on_cpu.compiled(text.function("ptx_kernel void @play(ptr %scratch) #0"))
+    buffer = np.zeros((2, 70, 32), np.int32)
+    gpu_on_cpu.run_threads(code.addresses["play"], 64, [buffer])
+    entries = np.concatenate([np.arange(30) + 30, np.arange(40) + 40])
+    threads = np.arange(64).reshape(2, 1, 32)
+    np.testing.assert_array_equal(buffer, 100 * threads + entries[:, None])
+
+
+def kernel_text(env, sizes):
+    actor, act, distribution = actor_and_act(env, sizes)
+    examples = step.examples(env, actor)[:-1]
+    function = step.step_function(env, act, distribution, 50)
+    written = scalarized.build(
+        lambda *args: function(*args, jnp.int32(1)),
+        examples,
+        [True] * len(jax.tree.leaves(examples)),
+        step.BRANCH_COST,
+        program.GPU_LOOPS,
+    )
+    return player.kernel_text(written, len(jax.tree.leaves(actor)))
+
+
+def test_a_division_that_llvm_spells_otherwise_is_not_left():
+    """That of doubles is exact, as in XLA."""
+    text = "div.rn.ftz.f32 %f1, %f2, %f3;\n\tdiv.rn.f64 %d1, %d2, %d3;"
+    assert ptx._with_xla_divisions(text) == text.replace("div.rn.ftz", "div.full.ftz")
+    with pytest.raises(AssertionError, match="another name"):
+        ptx._with_xla_divisions("div.rn.f32 %f1, %f2, %f3;")
+
+
+@pytest.mark.parametrize(
+    ("name", "threads", "blocks"), [("InvertedPendulum-v5", 32, 16), ("Hopper-v5", 128, 2)]
+)
+@pytest.mark.parametrize("capability", ["7.5", "9.0"])
+def test_ptx(name, threads, blocks, capability, tmp_path, monkeypatch):
+    """It is one kernel that calls nothing; NVIDIA's assembler takes it, where there is one."""
+    monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
+    text = kernel_text(envs.make(name), (4,))
+    made = ptx.load(text, lambda: text, capability, tmp_path)
+    assert made.compiled
+    assert (made.threads, made.blocks) == (threads, blocks)
+    assert (made.scratch > 0) == (name == "Hopper-v5")
+    assert made.text.count(".entry play(") == 1
+    assert f".target sm_{capability.replace('.', '')}" in made.text
+    assert "call" not in made.text
+    meetings = re.findall(r"(bar.warp.sync 0xffffffff; )?bar(?:rier)?\.(?:sync|red)", made.text)
+    assert meetings
+    assert all(meetings)  # a warp comes together before each: an H200 waited forever without
+    ptx._LOADED.clear()
+    again = ptx.load(text, lambda: pytest.fail("it is on disk"), capability, tmp_path)
+    assert again == made._replace(compiled=False)
+    if shutil.which("ptxas"):
+        source = tmp_path / "play.ptx"
+        source.write_text(made.text)
+        architecture = f"-arch=sm_{capability.replace('.', '')}"
+        subprocess.run(["ptxas", "-O0", architecture, source, "-o", "/dev/null"], check=True)
+
+
+def test_the_buffer_has_room_for_the_threads_of_all_blocks(monkeypatch, tmp_path):
+    env = envs.make("Hopper-v5")
+    actor, act, distribution = actor_and_act(env, (4,))
+    monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
+    monkeypatch.setattr(objects, "folder", lambda: tmp_path)
+    monkeypatch.setattr(ptx, "_LOADED", {})
+
+    def one(key):
+        return rollout.rollout(env, act, actor, distribution, key, num_episodes=70, horizon=50)
+
+    text = gpu_on_cpu.lowered(monkeypatch, one, jax.random.key(0))
+    (kernel,) = ptx._LOADED.values()
+    assert kernel.scratch > 0
+    (call,) = (line for line in text.splitlines() if "@__gpu$xla.gpu.ptx" in line)
+    assert "grid_x = 3 : i32" in call
+    assert f"tensor<{kernel.scratch * 96}xi32>)" in call
+
+
+def test_a_gpu_that_llvm_does_not_know_is_refused():
+    text = "define ptx_kernel void @play() { ret void }"
+    assert ".target sm_90" in ptx._compile(text, "9.0")
+    with pytest.raises(RuntimeError, match="does not know GPUs of compute capability 99"):
+        ptx._compile(text, "99.0")
+
+
+def test_one_launch_for_all_seeds_in_loops(pendulum, monkeypatch):
+    """Vmapped twice, in a scan, it is one custom call that writes over zeros."""
+    env, (actor, act, distribution) = pendulum
+
+    def one(key):
+        return rollout.rollout(env, act, actor, distribution, key, num_episodes=8, horizon=50)
+
+    def repeated(keys):
+        def body(keys, _):
+            seeds = jax.vmap(jax.vmap(one))(keys)
+            return jax.vmap(jax.vmap(lambda k: jax.random.split(k)[0]))(keys), seeds.reward.sum()
+
+        return jax.lax.scan(body, keys, length=3)
+
+    text = gpu_on_cpu.lowered(monkeypatch, repeated, jax.random.split(jax.random.key(0), (2, 3)))
+    calls = [line for line in text.splitlines() if "@__gpu$xla.gpu.ptx" in line]
+    assert len(calls) == 1
+    assert "tensor<6x50x4x8xf32>" in calls[0]
+    assert calls[0].count("operand_index") == len(player.RESULTS)
+    assert "grid_x = 2 : i32" in calls[0]
+    assert "block_x = 32 : i32" in calls[0]
+
+
+@pytest.mark.cpu
+def test_it_says_why_there_are_no_kernels(monkeypatch):
+    monkeypatch.setattr(seam, "compute_capability", lambda: "gfx90a")
+    assert "this is 'gfx90a'" in (seam.unavailable() or "")
+    monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
+    with monkeypatch.context() as patch:
+        patch.setattr("llvmlite.binding.llvm_version_info", (20, 1, 8))
+        assert "llvmlite>=0.48" in (seam.unavailable() or "")
+    with jax.enable_x64(True):
+        assert "float32 alone" in (seam.unavailable() or "")
+    assert "does not launch its kernels" in (seam.unavailable() or "")
+
+
+@pytest.mark.cpu
+def test_another_engine_plays_where_kernels_are_not_launched(pendulum, monkeypatch):
+    monkeypatch.setattr(available, "platform", lambda: "gpu")
+    monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
+    env, (actor, act, distribution) = pendulum
+    who = choice.Player(act, actor, distribution)
+    chosen = choice.choose("auto", env, who, 50)
+    assert chosen.name == "fused"
+    assert "does not launch its kernels" in chosen.why
+    with pytest.raises(ValueError, match="does not launch its kernels"):
+        choice.choose("native", env, who, 50)
+
+
+def test_few_episodes_are_spread_over_all_multiprocessors(monkeypatch):
+    monkeypatch.setattr(jax, "devices", lambda: [type("GPU", (), {"core_count": 100})])
+    assert seam._grid(1, 512, 2) == (1, 32)
+    assert seam._grid(1_600, 512, 2) == (50, 32)
+    assert seam._grid(6_400, 512, 2) == (100, 64)
+    assert seam._grid(51_200, 512, 2) == (100, 512)
+    assert seam._grid(10**7, 512, 2) == (200, 512)
+    assert seam._grid(10**7, 32, 16) == (1_600, 32)

@@ -1,0 +1,29 @@
+"""Run directories as `train` writes them, of returns drawn by a formula: nobody trained."""
+
+import csv
+import json
+
+from mjx_reinforce.training.rows import COLUMNS
+
+#: What a small sweep goes over.
+ONE = {"learning_rate": [1e-3, 3e-3]}
+
+
+def make_measured_run(
+    directory, *, num_seeds=3, evaluations=4, offset=0.0, summary=None, **settings
+):
+    """Writes what a run leaves that a report reads: seed s returns 100 s + 10 e + offset."""
+    directory.mkdir(parents=True)
+    config = {"env": "CartPole-v1", "learning_rate": 0.01, "hidden_sizes": [32, 32]} | settings
+    provenance = {"python": "3.11.9", "device": "cpu", "packages": {"jax": "0.10.2"}}
+    (directory / "config.json").write_text(json.dumps(config | provenance))
+    said = {"status": "finished", "threshold": 195.0, "compile_seconds": 2.0, "nonfinite": []}
+    (directory / "summary.json").write_text(json.dumps(said | (summary or {})))
+    with (directory / "metrics.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
+        writer.writeheader()
+        for e in range(evaluations):
+            for s in range(num_seeds):
+                value = 100.0 * s + 10 * e + offset
+                writer.writerow({"seed": s, "env_steps": 50 * e, "eval_return": value})
+    return directory

@@ -1,0 +1,57 @@
+"""Policies to play with, and what the episodes of two engines must have in common."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_reinforce import mlp_policy, normal, types
+from mjx_reinforce.engines import rollouts
+from mjx_reinforce.engines.native import rollout
+from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.actor import Actor
+
+
+def actor_and_act(env, hidden_sizes, seed=0, distribution=None):
+    size = types.observation_size(env)
+    policy = mlp_policy(size, distribution or normal(types.action_space(env)), hidden_sizes)
+    key = jax.random.key(seed)
+    statistics = normalize.update(
+        normalize.init(size), jax.random.normal(key, (5, 3, size)), jnp.ones((5, 3), bool), 100
+    )
+    actor = Actor(params=policy.init(key), normalizer=statistics)
+
+    def act(actor, observation):
+        return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))
+
+    return actor, act, policy.distribution
+
+
+def assert_same_episodes(got, want, *, rounding):
+    np.testing.assert_array_equal(got.mask, want.mask)
+    np.testing.assert_array_equal(got.nonfinite, want.nonfinite)
+    for name in ("observation", "action", "reward"):
+        np.testing.assert_allclose(
+            getattr(got, name), getattr(want, name), atol=rounding, rtol=rounding, err_msg=name
+        )
+
+
+def played(play, env, player, num_seeds=3, num_episodes=5, **options):
+    """Plays several seeds at once, each with its own key; the result on the host."""
+    actor, act, distribution = player
+    settings = {"num_episodes": num_episodes, "horizon": env.max_episode_steps} | options
+
+    @jax.jit
+    def all_seeds(keys, actor):
+        def one(key, scale):
+            scaled = jax.tree.map(lambda x: x * scale, actor)
+            return play(env, act, scaled, distribution, key, **settings)
+
+        return jax.vmap(one)(keys, jnp.linspace(1.0, 0.5, num_seeds))
+
+    keys = jax.random.split(jax.random.key(4), num_seeds)
+    return jax.tree.map(np.asarray, all_seeds(keys, actor))
+
+
+def both(env, player, other=rollouts.rollout, **options):
+    got = played(rollout.rollout, env, player, **options)
+    return got, played(other, env, player, **options)

@@ -1,0 +1,226 @@
+"""Environments small enough to know everything about, and a categorical distribution."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from mjx_reinforce import Box, Discrete, Distribution, Policy
+
+
+@struct.dataclass
+class ToyState:
+    obs: jax.Array
+    reward: jax.Array
+    done: jax.Array
+    info: Any = None
+
+
+class Toy:
+    """One step, one observation, one action; subclasses say what it earns."""
+
+    max_episode_steps = 1
+    action_size = 1
+    action_space = Box(np.array([-1.0]), np.array([1.0]))
+    reward_threshold = None
+
+    def observe(self, key):
+        del key
+        return jnp.zeros(1)
+
+    def earn(self, obs, action):
+        del obs, action
+        return jnp.ones(())
+
+    def reset(self, rng):
+        return ToyState(self.observe(rng), jnp.zeros(()), jnp.zeros(()))
+
+    def step(self, state, action):
+        return state.replace(reward=self.earn(state.obs, action), done=jnp.ones(()))
+
+
+class Signed(Toy):
+    """The observation is -1 or 1, and so is the reward."""
+
+    def observe(self, key):
+        return jax.random.rademacher(key, (1,)).astype(jnp.float32)
+
+    def earn(self, obs, action):
+        return obs[0]
+
+
+class Late(Toy):
+    """Two steps, told apart by the observation; only the second pays."""
+
+    max_episode_steps = 2
+
+    def step(self, state, action):
+        second = state.obs[0] > 0
+        return state.replace(
+            obs=state.obs + 1.0,
+            reward=jnp.where(second, 1.0, 0.0),
+            done=jnp.where(second, 1.0, 0.0),
+        )
+
+
+class Target(Toy):
+    """The best action is 0.5."""
+
+    def earn(self, obs, action):
+        return -((action[0] - 0.5) ** 2)
+
+
+class SignedTarget(Signed):
+    """The best action is half the observation."""
+
+    def earn(self, obs, action):
+        return -((action[0] - 0.5 * obs[0]) ** 2)
+
+
+class Survive(Toy):
+    """Up to 20 steps, ended by an action beyond the threshold; one reward a step."""
+
+    max_episode_steps = 20
+    reward_threshold = 15.0
+
+    def step(self, state, action):
+        fell = jnp.abs(action[0]) > 0.5
+        return state.replace(reward=jnp.ones(()), done=fell.astype(jnp.float32))
+
+
+class Drift(Survive):
+    """Up to 20 steps; starts, returns and lengths vary, and one action in a hundred breaks it."""
+
+    def observe(self, key):
+        return jax.random.uniform(key, (1,), minval=-1.0)
+
+    def step(self, state, action):
+        obs = state.obs + 0.3 * action
+        reward = 1.0 - obs[0] ** 2
+        broken = (action[0] > 1.1) & (action[0] < 1.15)
+        done = (jnp.abs(obs[0]) > 1.2).astype(jnp.float32)
+        return state.replace(obs=jnp.where(broken, jnp.nan, obs), reward=reward, done=done)
+
+
+class Tempting(Toy):
+    """Three steps that cost 1 to 2 each, the least at -0.5; an action beyond 0.5 breaks it."""
+
+    max_episode_steps = 3
+
+    def step(self, state, action):
+        obs = jnp.where(action > 0.5, jnp.nan, state.obs)
+        return state.replace(obs=obs, reward=-1.0 - jnp.minimum((action[0] + 0.5) ** 2, 1.0))
+
+
+class Chain:
+    """Two arms, up to three pulls; arm 0 may end the episode. Rewards depend on pull and arm.
+
+    The expected return of a policy is a sum over 2^3 sequences, so its gradient is exact.
+    """
+
+    max_episode_steps = 3
+    action_size = 2
+    action_space = Discrete(2)
+    rewards = np.array([[1.0, -0.5], [2.0, 0.7], [-1.0, 3.0]])
+
+    def reset(self, rng):
+        del rng
+        return ToyState(jnp.eye(3)[0], jnp.zeros(()), jnp.zeros(()))
+
+    def step(self, state, action):
+        t = jnp.argmax(state.obs)
+        reward = jnp.asarray(self.rewards, state.obs.dtype)[t, action]
+        done = (t == 2) | ((t == 1) & (action == 0))
+        obs = jnp.roll(state.obs, 1)
+        return state.replace(obs=obs, reward=reward, done=done.astype(state.obs.dtype))
+
+
+def expected_return(logits, discount):
+    """The exact discounted return of Chain under softmax ``logits`` [3, 2]."""
+    log_probs = jax.nn.log_softmax(logits)
+    total = 0.0
+    for first in range(2):
+        for second in range(2):
+            for third in range(2):
+                arms = (first, second) if second == 0 else (first, second, third)
+                if second == 0 and third == 1:
+                    continue
+                probability = jnp.exp(sum(log_probs[t, arm] for t, arm in enumerate(arms)))
+                earned = sum(discount**t * Chain.rewards[t, arm] for t, arm in enumerate(arms))
+                total = total + probability * earned
+    return total
+
+
+def categorical(num_actions):
+    """A softmax over arms; the noise is Gumbel."""
+
+    def log_prob(outputs, action):
+        chosen = jnp.take_along_axis(jax.nn.log_softmax(outputs), action[..., None], axis=-1)
+        return chosen[..., 0]
+
+    def entropy(outputs):
+        log_probs = jax.nn.log_softmax(outputs)
+        return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
+
+    return Distribution(
+        num_outputs=num_actions,
+        constants=(),
+        noise=lambda key, shape: jax.random.gumbel(key, (*shape, num_actions)),
+        sample=lambda outputs, noise: jnp.argmax(outputs + noise, axis=-1),
+        mode=lambda outputs: jnp.argmax(outputs, axis=-1),
+        log_prob=log_prob,
+        entropy=entropy,
+    )
+
+
+def tabular_policy():
+    """One row of logits for each pull of Chain."""
+
+    def init(key):
+        del key
+        return jnp.array([[0.2, -0.1], [0.5, 0.3], [-0.4, 0.1]])
+
+    return Policy(init, lambda params, observation: observation @ params, categorical(2))
+
+
+class Drifting(Survive):
+    """Ends by chance and by what it does; its state has a counter, a flag and a limit besides."""
+
+    max_episode_steps = 120
+
+    def __init__(self, space=None, length=40.0):
+        self.length = length
+        if space is not None:
+            self.action_space = space
+            discrete = isinstance(space, Discrete)
+            self.action_size = space.num_actions if discrete else len(space.low)
+
+    def reset(self, rng):
+        *obs, part = jax.random.uniform(rng, (3,))
+        info = (jnp.int32(0), jnp.bool_(False), self.length * (0.1 + 2 * part))
+        return ToyState(2 * jnp.stack(obs) - 1, jnp.zeros(()), jnp.zeros(()), info)
+
+    def step(self, state, action):
+        count, flag, limit = state.info
+        moved = 0.9 * state.obs + 0.1 * jnp.sum(action)
+        done = (count + moved[1] >= limit) & ~flag
+        info = (count + 1, count % 7 == 3, limit)
+        earned = jnp.mean(jnp.asarray(action, moved.dtype))
+        return state.replace(obs=moved, reward=earned, done=done.astype(moved.dtype), info=info)
+
+
+class Bytes(Drifting):
+    """Its state has a number of 8 bits, which overflows."""
+
+    def reset(self, rng):
+        state = super().reset(rng)
+        return state.replace(info=(*state.info, jnp.int8(1)))
+
+    def step(self, state, action):
+        *info, number = state.info
+        after = super().step(state.replace(info=tuple(info)), action)
+        number = number + jnp.int8(50)
+        reward = after.reward + number.astype(after.reward.dtype)
+        return after.replace(info=(*after.info, number), reward=reward)

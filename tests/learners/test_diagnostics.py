@@ -1,0 +1,291 @@
+"""Diagnostics against closed forms, enumerated episodes, and updates made to be so."""
+
+import dataclasses
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jax.flatten_util import ravel_pytree
+from problems import MASK, PARAMS, make_problem
+from scipy import integrate, stats
+from toys import Chain, Survive, Target, categorical, tabular_policy
+
+from mjx_reinforce import Box, Discrete, Trajectory, mlp_policy, normal, reinforce, train_step
+from mjx_reinforce.learners import diagnostics, estimators, updates
+from mjx_reinforce.learners.ars import ars
+from mjx_reinforce.policies.categorical import categorical as softmax
+from mjx_reinforce.policies.truncated_normal import truncated_normal
+
+BOX = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))
+
+
+def make_trajectory(lengths, horizon, poison=0.0):
+    """The observation is the number of the step; behind the end stands ``poison``."""
+    mask = np.arange(horizon)[:, None] < np.array(lengths)
+    number = np.broadcast_to(np.arange(horizon, dtype=float)[:, None], mask.shape)
+    seen = jnp.asarray(np.where(mask, number, poison))[..., None]
+    return Trajectory(
+        observation=seen,
+        action=0.1 * seen,
+        reward=jnp.asarray(mask, float),
+        mask=jnp.asarray(mask),
+        nonfinite=jnp.zeros(len(lengths), bool),
+        simulated=jnp.int32(mask.size),
+    )
+
+
+def test_of_few_steps_all_are_visited():
+    visited = diagnostics.visited_steps(make_trajectory([5, 1, 3], 7))
+    weight, seen = np.asarray(visited.weight), np.asarray(visited.observation[..., 0])
+    for n, length in enumerate([5, 1, 3]):
+        assert sorted(seen[weight[:, n] > 0, n]) == list(range(length))
+    np.testing.assert_allclose(weight[weight > 0], 1 / 9, rtol=1e-6)
+    assert float(visited.mean(visited.observation[..., 0])) == pytest.approx(13 / 9, rel=1e-6)
+
+
+def test_of_many_steps_each_stands_for_its_neighbours(monkeypatch):
+    """Three of each episode: of 10 steps every fourth, of 2 both; each counts as its share."""
+    monkeypatch.setattr(diagnostics, "MAX_STEPS", 6)
+    visited = diagnostics.visited_steps(make_trajectory([10, 2], 10))
+    weight, seen = np.asarray(visited.weight), np.asarray(visited.observation[..., 0])
+    assert seen[weight[:, 0] > 0, 0].tolist() == [2, 6]
+    assert seen[weight[:, 1] > 0, 1].tolist() == [0, 1]
+    np.testing.assert_allclose(weight.sum(axis=0), [10 / 12, 2 / 12], rtol=1e-6)
+
+
+@pytest.mark.parametrize("num_episodes", [1, 40, 64, 65, 1000])
+def test_no_more_steps_than_promised_are_visited(num_episodes):
+    visited = diagnostics.visited_steps(make_trajectory([300] * num_episodes, 300, np.nan))
+    assert 32 <= visited.weight.size <= diagnostics.MAX_STEPS
+    assert float(jnp.sum(visited.weight)) == pytest.approx(1, rel=1e-5)
+    assert np.all(np.isfinite(visited.observation))
+
+
+def test_nothing_after_the_end_is_visited():
+    policy = mlp_policy(1, normal(Target.action_space))
+    learner = reinforce(Target(), policy=policy)
+    actor = jax.jit(learner.init)(jax.random.key(0)).actor
+    moved = actor.replace(params=jax.tree.map(lambda x: x + 0.1, actor.params))
+    clean, poisoned = (
+        diagnostics.policy_metrics(
+            policy, actor, moved, diagnostics.visited_steps(make_trajectory([4, 9], 20, poison))
+        )
+        for poison in (0.0, np.nan)
+    )
+    assert clean == poisoned
+    assert clean["policy_std"] == pytest.approx(0.5, rel=1e-6)
+    assert clean["kl"] > 0
+
+
+def test_the_kl_of_normals_is_the_integral():
+    family = normal(BOX, std="softplus")
+    old, new = jnp.array([0.3, -0.2, 0.1, -0.5]), jnp.array([0.1, 0.4, -0.2, 0.3])
+
+    def moments(outputs):
+        return np.asarray(family.mode(outputs)), np.asarray(family.std(outputs))
+
+    expected = 0.0
+    for mean, std, other_mean, other_std in zip(*moments(old), *moments(new), strict=True):
+        p, q = stats.norm(mean, std), stats.norm(other_mean, other_std)
+        expected += integrate.quad(
+            lambda x, p=p, q=q: p.pdf(x) * (p.logpdf(x) - q.logpdf(x)), mean - 9, mean + 9
+        )[0]
+    assert float(family.kl(old, new)) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.cpu  # GPUs divide within 2 units in the last place
+def test_the_kl_of_normals_to_themselves_is_0():
+    family = normal(BOX, std="softplus")
+    outputs = jnp.array([0.3, -0.2, 0.1, -0.5])
+    assert float(family.kl(outputs, outputs)) == 0.0
+
+
+def test_a_tiny_kl_of_normals_does_not_cancel():
+    """It is d^2 / 2 + s^2 for means d standard deviations apart and log-stds that differ by s."""
+    family = normal(Box(np.array([-1.0]), np.array([1.0])), initial_std=1.0)
+    kl = family.kl(jnp.array([0.0, 0.0]), jnp.array([2e-4, 1e-4]))
+    assert float(kl) == pytest.approx(2e-8 + 1e-8, rel=1e-3)
+
+
+def test_the_kl_of_categoricals_is_the_sum():
+    old, new = np.array([0.3, -1.0, 2.0]), np.array([0.0, 0.5, 1.0])
+    p, q = (np.exp(x) / np.exp(x).sum() for x in (old, new))
+    kl = softmax(Discrete(3)).kl(jnp.asarray(old), jnp.asarray(new))
+    assert float(kl) == pytest.approx(stats.entropy(p, q), rel=1e-5)
+
+
+def test_the_estimated_kl_is_unbiased_and_never_negative():
+    """Its mean over all actions, weighted by the old policy, is the divergence."""
+    family, actions = categorical(3), jnp.arange(3)
+    old, new = jnp.array([0.3, -1.0, 2.0]), jnp.array([0.0, 0.5, 1.0])
+    each = diagnostics.kl_divergence(family, *(jnp.tile(x, (3, 1)) for x in (old, new)), actions)
+    p, q = jax.nn.softmax(old), jax.nn.softmax(new)
+    assert float(p @ each) == pytest.approx(stats.entropy(p, q), rel=1e-5)
+    assert np.all(np.asarray(each) > 0)
+
+
+def test_a_family_without_a_closed_form_is_estimated():
+    """Of 20,000 samples, within five standard errors of the integral."""
+    family = truncated_normal(Box(np.array([-1.0]), np.array([1.0])))
+    old, new = jnp.array([0.2, -0.3]), jnp.array([0.5, -0.1])
+    action = family.sample(
+        jnp.broadcast_to(old, (20_000, 2)), family.noise(jax.random.key(0), (20_000,))
+    )
+    each = np.asarray(diagnostics.kl_divergence(family, old, new, action))
+
+    def integrand(x):
+        p, q = (float(family.log_prob(outputs, jnp.array([x]))) for outputs in (old, new))
+        return np.exp(p) * (p - q)
+
+    expected = integrate.quad(integrand, -1, 1)[0]
+    assert abs(each.mean() - expected) < 5 * each.std() / np.sqrt(each.size)
+
+
+def test_the_noise_of_all_episodes_is_the_sample_variance_of_their_mean():
+    each = np.random.default_rng(0).normal(size=(6, 3)) + 1
+    mean = each.mean(axis=0)
+    got = diagnostics.signal_to_noise(jnp.asarray(mean), jnp.asarray(each), 6)
+    noise = np.sum(np.var(each, axis=0, ddof=1)) / 6
+    assert float(got) == pytest.approx((np.sum(mean**2) - noise) / noise, rel=1e-4)
+
+
+def chain_moments():
+    """The exact mean and variance of an episode's gradient of Chain, by its six episodes."""
+    logits = tabular_policy().init(None)
+    gradients, probabilities = [], []
+    arms = [(a, 0) for a in (0, 1)] + list(itertools.product((0, 1), (1,), (0, 1)))
+    for episode in arms:
+        returns = np.cumsum([Chain.rewards[t, a] for t, a in enumerate(episode)][::-1])[::-1]
+
+        def weighted(logits, episode=episode, returns=returns):
+            log_probs = jax.nn.log_softmax(logits)
+            return sum(g * log_probs[t, a] for t, (a, g) in enumerate(zip(episode, returns)))  # noqa: B905
+
+        gradients.append(np.asarray(jax.grad(weighted)(logits)).ravel())
+        log_probs = np.asarray(jax.nn.log_softmax(logits))
+        probabilities.append(np.exp(sum(log_probs[t, a] for t, a in enumerate(episode))))
+    gradients, probabilities = np.array(gradients), np.array(probabilities)
+    assert probabilities.sum() == pytest.approx(1, rel=1e-5)
+    mean = probabilities @ gradients
+    return np.sum(mean**2), probabilities @ np.sum(gradients**2, axis=1) - np.sum(mean**2)
+
+
+def test_signal_and_noise_are_unbiased_on_a_bandit():
+    """Of updates of four episodes, of which one is looked at, against all six that there are."""
+    learner = reinforce(
+        Chain(),
+        policy=tabular_policy(),
+        estimator=estimators.reward_to_go(1.0),
+        num_episodes=4,
+        normalize_steps=0,
+    )
+
+    def measure(key):
+        metrics = train_step(learner, jax.jit(learner.init)(key))[1]
+        square = metrics["gradient_norm"] ** 2
+        return square, square / (1 + metrics["gradient_snr"])
+
+    keys = jax.random.split(jax.random.key(0), 30_000)
+    square, noise = map(np.asarray, jax.jit(jax.vmap(measure))(keys))
+    signal, variance = chain_moments()
+    for got, expected in ((noise, variance / 4), (square - noise, signal)):
+        assert abs(got.mean() - expected) < 4.5 * got.std() / np.sqrt(got.size)
+        assert got.std() / np.sqrt(got.size) < 0.05 * expected
+
+
+@pytest.mark.parametrize(("bound", "share"), [(1e-6, 1.0), (1e6, 0.0)])
+@pytest.mark.parametrize(
+    "update", [updates.full_batch(), updates.each_step(), updates.minibatches(3, 4)]
+)
+def test_all_gradients_are_clipped_or_none(update, bound, share):
+    problem = make_problem(updates.make_optimizer(max_grad_norm=bound))
+    _, _, metrics = update(problem, jax.random.key(1), PARAMS, problem.optimizer.init(PARAMS))
+    assert float(metrics["clipped_gradients"]) == share
+
+
+def test_the_share_of_clipped_gradients_is_that_of_the_steps():
+    """A rate of 0 keeps the parameters, so that a step's gradient is that of its time alone."""
+    problem = make_problem(optax.chain(updates.clip_by_norm(0.3), optax.sgd(0.0)))
+    state = problem.optimizer.init(PARAMS)
+    _, _, metrics = updates.each_step()(problem, jax.random.key(0), PARAMS, state)
+    norms = []
+    for t in range(MASK.sum(axis=0).max()):
+        grads = jax.grad(lambda p, t=t: problem.surrogate(p, [x[t] for x in problem.samples])[0])
+        norms.append(float(optax.tree.norm(grads(PARAMS))) / 3)
+    share = np.mean(np.array(norms) > 0.3)
+    assert 0 < share < 1
+    assert float(metrics["clipped_gradients"]) == pytest.approx(share)
+
+
+def test_what_does_not_clip_has_no_share():
+    problem = make_problem(updates.make_optimizer(max_grad_norm=None))
+    _, _, metrics = updates.full_batch()(problem, None, PARAMS, problem.optimizer.init(PARAMS))
+    assert "clipped_gradients" not in metrics
+
+
+NAMES = {"kl", "policy_std", "explained_variance", "gradient_snr", "clipped_gradients"}
+
+
+def test_an_update_goes_no_further_than_it_may():
+    """From the second update on: the first also scales the observations, which counts, too."""
+
+    @jax.jit
+    def moved(max_kl):
+        learner = reinforce(Survive(), num_episodes=4, max_kl=max_kl)
+        state = learner.init(jax.random.key(0))
+        state = dataclasses.replace(state, actor=scaled(state.actor))
+        after, metrics = learner.step(state)
+        change = jax.tree.map(jnp.subtract, after.actor.params, state.actor.params)
+        return ravel_pytree(change)[0], metrics["kl"]
+
+    def scaled(actor):  # counted enough already
+        counted = actor.normalizer.replace(count=jnp.float32(2000), m2=jnp.full(1, 2000.0))
+        return actor.replace(normalizer=counted)
+
+    free, free_kl = moved(jnp.inf)
+    np.testing.assert_allclose(free, moved(None)[0], atol=1e-6)  # it rounds otherwise
+    for share in (0.5, 0.1, 0.01):
+        short, kl = moved(share * free_kl)
+        assert kl == pytest.approx(share * float(free_kl), rel=0.1)
+        cosine = free @ short / np.linalg.norm(free) / np.linalg.norm(short)
+        assert cosine == pytest.approx(1, abs=1e-4)
+    same, same_kl = moved(2 * free_kl)
+    assert np.array_equal(same, free)
+    assert same_kl == free_kl
+
+
+def test_a_change_without_a_kl_is_kept_as_it_is():
+    policy = mlp_policy(1, normal(Survive.action_space), ())
+    actor = reinforce(Survive(), policy=policy).init(jax.random.key(0)).actor
+    visited = diagnostics.visited_steps(make_trajectory([4, 9], 20))
+    same = diagnostics.within_kl(policy, actor, actor.params, visited, 0.01)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, actor.params))
+    broken = jax.tree.map(lambda x: x * jnp.nan, actor.params)
+    kept = diagnostics.within_kl(policy, actor, broken, visited, 0.01)
+    assert all(np.isnan(x).all() for x in jax.tree.leaves(kept))  # for ``keep_finite`` to see
+
+
+def test_an_update_has_all_of_them():
+    learner = reinforce(Survive(), num_episodes=4)
+    metrics = train_step(learner, jax.jit(learner.init)(jax.random.key(0)))[1]
+    assert metrics.keys() >= NAMES
+    assert all(np.isfinite(metrics[name]) for name in NAMES)
+
+
+def test_a_search_has_the_noise_of_its_directions_alone():
+    learner = ars(Target(), num_directions=5)
+    state = jax.jit(learner.init)(jax.random.key(0))
+    play_key = jax.random.split(state.key, 3)[1]
+    trial = jax.jit(learner.play)(state, play_key, True)
+    returns = np.sum(np.asarray(trial.trajectory.reward), axis=0).reshape(2, 5)
+    difference = returns[0] - returns[1]
+    leaves = [np.asarray(x).reshape(5, -1) for x in jax.tree.leaves(trial.directions)]
+    each = difference[:, None] * np.concatenate(leaves, axis=1)
+    noise = np.sum(np.var(each, axis=0, ddof=1)) / 5
+    metrics = train_step(learner, state)[1]
+    expected = np.sum(each.mean(axis=0) ** 2) / noise - 1
+    assert float(metrics["gradient_snr"]) == pytest.approx(expected, rel=1e-3)
+    assert metrics.keys() & NAMES == {"gradient_snr"}

@@ -1,0 +1,476 @@
+"""The report: what is on the page, that it needs nothing else, and that it loses no file."""
+
+import csv
+import json
+import math
+import re
+import sys
+
+import numpy as np
+import pytest
+from browser import CHROMIUM, opened_browser
+from fake_sweeps import GRID, make_sweep
+from measured_runs import ONE, make_measured_run
+from pages import CUT, content, run_report, visible
+
+from mjx_reinforce import report
+from mjx_reinforce.reports import findings, sources
+from mjx_reinforce.reports.page import distributions, tables, words
+
+HOSTILE = "x</script><script>alert(1)</script>\"'&"
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A sweep and its page."""
+    directory = make_sweep(tmp_path_factory.mktemp("sweeps") / "sweep", num_seeds=40)
+    page = directory / "report.html"
+    report.write([directory], page)
+    return directory, page
+
+
+@pytest.fixture(scope="module")
+def found(written):
+    return findings.find(sources.read([written[0]]))
+
+
+def test_the_page_needs_nothing_else(written):
+    text = written[1].read_text(encoding="utf-8")
+    markup = re.sub(r"<script\b.*?</script>", "", text, flags=re.S)
+    assert not re.search(r'(src|href)="(?!#|data:)', markup)
+    assert "url(" not in markup
+    assert "@import" not in markup
+    assert not re.search(r"<script[^>]+src", text)
+
+
+def test_the_page_says_what_was_found(written, found):
+    said = visible(written[1])
+    best = found.results[0]
+    for sentence in (*words.answer(found), *words.distrust(found)):
+        assert " ".join(sentence.split()) in said
+    assert f"{best.solving.at_end} of its 40 seeds solve the task at the end" in said
+    for each in found.results:
+        assert each.configuration.label in said
+    for fact in (
+        "0123456789abcdef",
+        "mujoco 4.0.0",
+        "compile time",
+        "21.4 s",
+        "--over learning-rate",
+    ):
+        assert fact in said
+    assert "--learning-rate" in said  # how to train the worst seed again
+
+
+def test_the_figures_are_those_of_the_curves(found):
+    """The best by a mean that is worked out here, and its numbers."""
+    parts = found.experiment.configurations
+    finals = np.array([part.eval_return[-1] for part in parts])
+    scores = np.where(np.isfinite(finals), finals, np.nanmin(finals))
+    assert found.results[0].configuration.label == parts[scores.mean(axis=1).argmax()].label
+    assert [parts[i].label for i in found.order] == [r.configuration.label for r in found.results]
+    for result in found.results:
+        returns = result.configuration.eval_return
+        assert result.solving.ever == (np.nan_to_num(returns) >= 950).any(axis=0).sum()
+        assert result.solving.at_end == (returns[-1] >= 950).sum()
+        assert result.mean.low <= result.mean.value <= result.mean.high
+    assert len(found.comparisons) == 16 * 15 / 2
+
+
+def test_a_histogram_has_every_seed(found):
+    data = tables.chart_tables(found)["histogram"]
+    last = len(distributions.moments(found)) - 1
+    for place, result in enumerate(found.results):
+        rows = zip(data["configuration"], data["moment"], data["share"], strict=True)
+        share = sum(share for c, m, share in rows if (c, m) == (place, last))
+        finite = np.isfinite(result.seeds[-1]).mean()
+        assert share == pytest.approx(finite, abs=0.005)
+
+
+def test_solved_share_rises_to_those_who_ever_did(found):
+    data = tables.chart_tables(found)["solved"]
+    for place, result in enumerate(found.results):
+        shares = [
+            s for c, s in zip(data["configuration"], data["share"], strict=True) if c == place
+        ]
+        assert shares == sorted(shares)
+        assert shares[-1] == pytest.approx(result.solving.ever / 40, abs=1e-4)
+
+
+def solve_at_the_end(directory, runs, threshold):
+    """Lets some runs of a sweep reach the threshold at their last evaluation, not before."""
+    with np.load(directory / "curves.npz") as archive:
+        arrays = dict(archive)
+    arrays["eval_return"][:-1, runs] = np.minimum(arrays["eval_return"][:-1, runs], threshold / 2)
+    arrays["eval_return"][-1, runs] = threshold + 10
+    np.savez(directory / "curves.npz", **arrays)
+
+
+def test_tables_and_figures_agree_on_who_solved(tmp_path):
+    """Seeds end at different env steps; the figures' last place is the end of each, as table 1."""
+    directory = make_sweep(tmp_path / "sweep", num_seeds=40, over=ONE)
+    solve_at_the_end(directory, [1, 5, 9, 42, 77], 950)
+    report.write([directory], directory / "report.html")
+    shown = findings.find(sources.read([directory]))
+    data, said = tables.chart_tables(shown), visible(directory / "report.html")
+    with (directory / "report" / "summary.csv").open(encoding="utf-8", newline="") as file:
+        summary = list(csv.DictReader(file))
+    for place, result in enumerate(shown.results):
+        at_end = int((result.configuration.eval_return[-1] >= 950).sum())
+        ever = int((result.configuration.eval_return >= 950).any(axis=0).sum())
+        assert f"{at_end} of 40 " in said  # table 1
+        assert (summary[place]["solved_at_end"], summary[place]["ever_solved"]) == (
+            str(at_end),
+            str(ever),
+        )
+        rows = zip(data["moments"]["configuration"], data["moments"]["said"], strict=True)
+        assert f", {at_end} of 40 solved" in [text for c, text in rows if c == place][-1]
+        rows = zip(data["solved"]["configuration"], data["solved"]["share"], strict=True)
+        assert [share for c, share in rows if c == place][-1] == pytest.approx(ever / 40, abs=1e-4)
+    assert "the last evaluation of each seed, as in table 1" in (
+        directory / "report.html"
+    ).read_text(encoding="utf-8")
+
+
+def test_numbers_and_pictures_lie_beside(written):
+    directory, page = written
+    beside = directory / "report"
+    lines = (beside / "results.csv").read_text().splitlines()
+    assert lines[0].startswith("configuration,learning_rate,discount,seed,final_return")
+    assert len(lines) == 1 + 16 * 40
+    assert content(page)["files"]["results.csv"].splitlines() == lines
+    for name in ("final", "curves", "solved", "distribution", "profile", "sensitivity-0", "worst"):
+        assert (beside / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def cells(path):
+    """All cells of a CSV file but the header's."""
+    with path.open(encoding="utf-8", newline="") as file:
+        return [cell for row in list(csv.reader(file))[1:] for cell in row]
+
+
+def is_number(text):
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+FORMULAS = ("=HYPERLINK(1)", "@SUM(1+1)", "+A1", "-A1", "\tA1")
+
+
+def test_names_are_no_formulas_in_spreadsheets(tmp_path):
+    """A spreadsheet computes what begins like a formula: numbers may, names may not."""
+    runs = [make_measured_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
+    report.write(runs, tmp_path / "page.html")
+    files = sorted((tmp_path / "page").glob("*.csv"))
+    texts = [cell for path in files for cell in cells(path)]
+    assert {"'=HYPERLINK(1)", "'@SUM(1+1)", "-120.5"} <= set(texts)
+    begun = [text for text in texts if text.startswith(("=", "+", "-", "@", "\t", "\r"))]
+    assert [text for text in begun if not is_number(text)] == []
+    for name, text in content(tmp_path / "page.html")["files"].items():
+        assert (tmp_path / "page" / name).read_text(encoding="utf-8") == text
+
+
+def test_every_table_names_its_configurations(written):
+    files = sorted((written[0] / "report").glob("*.csv"))
+    assert {path.name for path in files} >= {"band.csv", "worst.csv", "curves.csv"}
+    assert [p.name for p in files if "configuration" not in p.read_text().splitlines()[0]] == []
+
+
+def test_every_picture_can_be_downloaded(written):
+    buttons = set(re.findall(r'data-png="([^"]+)"', written[1].read_text(encoding="utf-8")))
+    assert buttons == {path.stem for path in (written[0] / "report").glob("*.png")}
+
+
+def test_a_thousand_seeds_make_no_larger_charts(tmp_path):
+    """Charts take the same room whatever the seeds; only results.csv grows, a line for each."""
+    sizes = []
+    for seeds in (50, 200):
+        directory = make_sweep(tmp_path / str(seeds), num_seeds=seeds, over=ONE)
+        figures = findings.find(sources.read([directory]))
+        sizes.append(len(json.dumps(tables.chart_tables(figures))))
+    assert sizes[1] < 1.2 * sizes[0]
+
+
+def test_a_run_alone_and_names_that_are_markup(tmp_path):
+    directory = make_measured_run(tmp_path / "<b>run", env=HOSTILE, note=HOSTILE)
+    page = tmp_path / "page.html"
+    report.write([directory], page)
+    text = page.read_text(encoding="utf-8")
+    assert "alert(1)</script>" not in text
+    assert text.count("<script") == 3
+    assert "<b>run" not in text
+    assert HOSTILE in visible(page)
+    assert "Pair by pair" not in visible(page)
+    assert f"watch '{directory}' --seed 0" in visible(page)
+
+
+def command_of(directory):
+    experiment = sources.read([directory])
+    return report.how_to_watch(experiment, findings.find(experiment))
+
+
+def test_the_worst_seed_is_watched_by_the_policy_that_its_sweep_kept(tmp_path):
+    directory = make_sweep(tmp_path / "a sweep", num_seeds=12)
+    experiment = sources.read([directory])
+    figures = findings.find(experiment)
+    number, best = figures.order[0], figures.results[0]
+    seed = int(best.configuration.seed[tables.worst_seeds(best)[0]])
+    place = directory / "policies" / f"{number:03d}"
+    (place / "policy").mkdir(parents=True)
+    known = {"env": "InvertedPendulum-v5", "horizon": 1000, "seeds": [seed, 99]}
+    (place / "config.json").write_text(json.dumps(known))
+    watch = report.how_to_watch(experiment, figures)
+    assert watch.command == f"python -m mjx_reinforce.watch '{place}' --seed {seed}"
+    (place / "config.json").write_text(json.dumps(known | {"seeds": [98, 99]}))
+    assert "train --env InvertedPendulum-v5" in command_of(directory).command
+
+
+def test_a_command_on_the_page_runs_nothing_else(tmp_path):
+    """Whatever sweep.json says: words are quoted, and an id that is none gives no command."""
+    hostile = "x; touch pwn; echo "
+    settings = {"env": "InvertedPendulum-v5", "num_seeds": 5, "seed": 0, "policy": hostile}
+    quoted = make_sweep(tmp_path / "quoted", num_seeds=5, over=ONE, settings=settings)
+    assert f" --policy '{hostile}' " in command_of(quoted).command
+    refused = make_sweep(tmp_path / "env", num_seeds=5, over=ONE, env=hostile, settings=settings)
+    assert command_of(refused).command == ""
+    assert "unknown environment" in command_of(refused).said
+
+
+def test_a_path_that_the_locale_cannot_read_is_escaped(tmp_path):
+    """Where Python reads the file system as ASCII, a path's other bytes are surrogates."""
+    directory = make_measured_run(tmp_path / "run\udce6")
+    report.write([directory], tmp_path / "page.html")
+    assert r"run\udce6" in (tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+def test_seeds_that_all_failed_are_no_answer(tmp_path):
+    directory = make_sweep(tmp_path / "sweep", num_seeds=5, over=ONE)
+    with np.load(directory / "curves.npz") as archive:
+        arrays = dict(archive)
+    arrays["eval_return"][2:] = np.nan
+    np.savez(directory / "curves.npz", **arrays)
+    report.write([directory], directory / "report.html")
+    assert "There is no answer" in visible(directory / "report.html")
+
+
+def test_command_line(tmp_path):
+    """It writes into the run, and replaces what exists when it is asked to, or says one line."""
+    run = make_measured_run(tmp_path / "run")
+    page = run / "report.html"
+    done = run_report(run)
+    assert done.returncode == 0, done.stderr
+    assert str(page) in done.stdout
+    assert (run / "report" / "results.csv").is_file()
+    page.write_text("mine")
+    refused = run_report(run)
+    assert refused.returncode == 2
+    assert refused.stderr == f"error: {page} exists; pass --overwrite or another --output\n"
+    assert page.read_text() == "mine"
+    assert run_report(run, "--overwrite").returncode == 0
+    assert "<!doctype html>" in page.read_text()
+
+
+def said_by_main(monkeypatch, capsys, *arguments):
+    """What the command says, or how it refuses; nothing is drawn."""
+    monkeypatch.setattr(report, "figures", lambda findings: [])
+    monkeypatch.setattr(report.document, "render", lambda *arguments: "a page")
+    monkeypatch.setattr(sys, "argv", ["report", *map(str, arguments)])
+    status = 0
+    try:
+        report.main()
+    except SystemExit as stop:
+        status = stop.code
+    return status, "".join(capsys.readouterr())
+
+
+def test_pages_go_where_they_belong(tmp_path, monkeypatch, capsys):
+    """Of A into A, of B into B, of both here: none replaces another, nor the pictures alone."""
+    monkeypatch.chdir(tmp_path)
+    first, second = make_measured_run(tmp_path / "a"), make_measured_run(tmp_path / "b")
+    for chosen, page in (
+        ([first], first / "report.html"),
+        ([second, second], second / "report.html"),
+        ([first, second], tmp_path / "report.html"),
+    ):
+        assert said_by_main(monkeypatch, capsys, *chosen)[0] == 0
+        assert page.read_text() == "a page"
+        status, said = said_by_main(monkeypatch, capsys, *chosen)
+        assert (status, "exists; pass --overwrite" in said) == (2, True)
+        page.unlink()
+        status, said = said_by_main(monkeypatch, capsys, *chosen)
+        assert (status, "report exists; pass --overwrite" in said) == (2, True)
+        assert said_by_main(monkeypatch, capsys, *chosen, "--overwrite")[0] == 0
+    status, said = said_by_main(monkeypatch, capsys, tmp_path / "none")
+    assert (status, said) == (
+        2,
+        f"error: there is no directory {tmp_path / 'none'}; name that of a run or a sweep\n",
+    )
+
+
+@pytest.mark.parametrize("name", ["page.txt", "none/page.html", "folder.html", "page.html"])
+def test_outputs_that_cannot_be_are_refused(tmp_path, name):
+    (tmp_path / "folder.html").mkdir()
+    (tmp_path / "page").mkdir()
+    (tmp_path / "page" / "notes.txt").write_text("mine")
+    with pytest.raises(ValueError, match=name.partition("/")[0].partition(".")[0]):
+        report.check_output(tmp_path / name, overwrite=False)
+
+
+def test_ties_are_said_as_ties(tmp_path):
+    """Equal means are not "0.0 above", and p = 1 is not "or more"."""
+    directory = make_sweep(tmp_path / "sweep", num_seeds=8, over=ONE)
+    with np.load(directory / "curves.npz") as archive:
+        arrays = dict(archive)
+    arrays["eval_return"][-1] = 1000.0
+    np.savez(directory / "curves.npz", **arrays)
+    said = " ".join(words.answer(findings.find(sources.read([directory]))))
+    assert "The mean equals that of the next" in said
+    assert "chance too often (p = 1)." in said
+
+
+def test_a_configuration_that_ended_earlier_stays_at_its_end(tmp_path):
+    """At the slider's last stop its histogram is of its final returns, and says so."""
+    directory = make_sweep(tmp_path / "sweep", num_seeds=40, over=ONE)
+    with np.load(directory / "curves.npz") as archive:
+        arrays = dict(archive)
+    arrays["env_steps"][:, arrays["configuration"] == 0] //= 2
+    np.savez(directory / "curves.npz", **arrays)
+    shown = findings.find(sources.read([directory]))
+    place = shown.order.index(0)
+    drawn = distributions.distributions(shown)
+    last = len(distributions.moments(shown)) - 1
+    said = drawn["moments"]["said"][place * (last + 1) : (place + 1) * (last + 1)]
+    assert "its end: " in said[last]
+    assert "its end: " not in said[0]
+    bars = drawn["histogram"]
+    rows = zip(bars["configuration"], bars["moment"], bars["share"], strict=True)
+    final = arrays["eval_return"][-1, arrays["configuration"] == 0]
+    share = sum(share for c, m, share in rows if (c, m) == (place, last))
+    assert share == pytest.approx(np.isfinite(final).mean(), abs=0.005)
+
+
+@pytest.mark.parametrize(("seeds", "worst"), [(1, 1), (4, 1), (8, 2), (200, 10)])
+def test_the_worst_are_a_quarter_at_most(tmp_path, seeds, worst):
+    directory = make_sweep(tmp_path / "sweep", num_seeds=seeds, over=ONE)
+    best = findings.find(sources.read([directory])).results[0]
+    places = tables.worst_seeds(best)
+    assert len(places) == worst
+    assert best.scores[places].max() <= np.delete(best.scores, places).min(initial=np.inf)
+
+
+#: Charts whose legend, words or axes lie outside their picture, where print cuts them.
+OVERFLOW = """[...document.querySelectorAll('.chart')].filter((chart) => {
+  const box = (name) => chart.querySelector(name).getBoundingClientRect();
+  const [whole, drawn] = [box('svg'), box('svg g')];
+  return drawn.top < whole.top - 1 || drawn.bottom > whole.bottom + 1;
+}).map((chart) => chart.id)"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+def test_charts_are_whole_at_any_width_and_on_paper(tmp_path):
+    directory = make_sweep(
+        tmp_path / "sweep", num_seeds=8, over={"learning_rate": [1e-3, 3e-3, 1e-2]}
+    )
+    page = directory / "report.html"
+    report.write([directory], page)
+    with opened_browser() as browser:
+        for width in (1280, 700, 390):
+            browser.open(page, width=width)
+            assert browser.run(OVERFLOW) == []
+            browser.run("dispatchEvent(new Event('beforeprint'))")
+            assert browser.run(OVERFLOW) == []
+            drawn = "document.querySelector('#chart-curves svg').getAttribute('width')"
+            assert browser.run(drawn) == "780"
+            browser.run("dispatchEvent(new Event('afterprint'))")
+            whole = browser.run("document.querySelector('figure').clientWidth")
+            assert browser.run(drawn) == str(whole)
+        assert browser.errors == []
+
+
+#: Cells of table 1 whose words are not seen.
+HIDDEN = """[...document.querySelectorAll('.results td, .results tbody th')].filter((cell) => {
+  const box = cell.getBoundingClientRect();
+  return !box.width || box.left < 0 || box.right > innerWidth;
+}).map((cell) => cell.textContent)"""
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+@pytest.mark.parametrize("over", [ONE, GRID], ids=["two", "sixteen"])
+def test_no_column_is_cut_at_any_width(tmp_path, over):
+    """From a phone to a wide screen, also where returns have seven digits."""
+    directory = make_sweep(tmp_path / "sweep", num_seeds=8, over=over)
+    with np.load(directory / "curves.npz") as archive:
+        arrays = dict(archive)
+    arrays["eval_return"] = -1234.5678 * arrays["eval_return"]
+    np.savez(directory / "curves.npz", **arrays)
+    page = directory / "report.html"
+    report.write([directory], page)
+    with opened_browser() as browser:
+        browser.open(page, width=360)
+        browser.run("document.querySelectorAll('details.data').forEach((x) => { x.open = true })")
+        filled = "[...document.querySelectorAll('.numbers')].every((x) => x.innerText)"
+        browser.wait_for(filled)
+        for width in (360, 390, 480, 640, 768, 831, 832, 833, 900, 1024, 1280, 1920):
+            browser.resize(width)
+            assert browser.run(CUT) == [], width
+            assert browser.run(HIDDEN) == [], width
+            assert browser.run("document.documentElement.scrollWidth") <= width
+        assert browser.errors == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+def test_tables_of_a_figure_are_no_formulas_either(tmp_path):
+    """What the page itself writes when a button is pressed."""
+    runs = [make_measured_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
+    report.write(runs, tmp_path / "page.html")
+    with opened_browser() as browser:
+        browser.open(tmp_path / "page.html")
+        browser.run(
+            "window.saved = []; URL.createObjectURL = (blob) => {"
+            "blob.text().then((text) => saved.push(text)); return '#'; }"
+        )
+        browser.run("document.querySelectorAll('[data-csv]').forEach((x) => x.click())")
+        buttons = browser.run("document.querySelectorAll('[data-csv]').length")
+        browser.wait_for(f"saved.length === {buttons}")
+        texts = browser.run("saved")
+    listed = [
+        cell for text in texts for row in list(csv.reader(text.splitlines()))[1:] for cell in row
+    ]
+    assert {"'=HYPERLINK(1)", "'@SUM(1+1)", "-120.5"} <= set(listed)
+    begun = [text for text in listed if text.startswith(("=", "+", "-", "@", "\t", "\r"))]
+    assert [text for text in begun if not is_number(text)] == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
+def test_in_a_browser(written):
+    """No error, no request, nothing wider than a phone; the keyboard moves the slider."""
+    with opened_browser() as browser:
+        browser.open(written[1])
+        assert browser.run("document.querySelectorAll('.chart svg').length") == 8
+        rows = "document.querySelectorAll('#chart-distribution .mark-text.role-mark text').length"
+        before = browser.run("document.getElementById('chart-distribution').textContent")
+        browser.run("document.getElementById('moment').focus()")
+        browser.press("ArrowLeft")
+        browser.press("Home")
+        browser.wait_for("document.getElementById('moment-said').textContent.startsWith('0 env')")
+        after = "document.getElementById('chart-distribution').textContent"
+        browser.wait_for(f"{after} !== {json.dumps(before)}")
+        assert browser.run(rows) == 4
+        visible = "document.querySelector('#vg-tooltip-element.visible') !== null"
+        browser.hover("#chart-curves svg", until=visible)
+        told = browser.run("document.getElementById('vg-tooltip-element').innerText")
+        assert any(label in told for label in content(written[1])["labels"])
+        browser.run("document.querySelector('[data-choose=\"1\"]').focus()")
+        browser.press(" ", "Space")
+        browser.wait_for(f"{rows} === 1")
+        browser.run("document.getElementById('log-x').click()")
+        browser.run("document.getElementById('log-y').click()")
+        browser.run("document.querySelector('details.data summary').click()")
+        browser.wait_for("document.querySelectorAll('details.data[open] tbody tr').length > 20")
+        assert browser.print().startswith(b"%PDF")
+        browser.open(written[1], width=390, height=844)
+        assert browser.run("document.documentElement.scrollWidth") == 390
+        assert browser.errors == []
+        assert not [r for r in browser.requests if not r.startswith(("file:", "data:", "blob:"))]

@@ -1,0 +1,168 @@
+"""What a report reads: runs, sweeps, and what is said of damaged ones."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+from fake_sweeps import make_sweep
+from measured_runs import ONE, make_measured_run
+
+from mjx_reinforce.reports import sources
+from mjx_reinforce.reports.experiment import describe, ordered
+from mjx_reinforce.training.rows import COLUMNS
+
+
+def test_a_run(tmp_path):
+    events = [{"seed": 1, "update": 3}, {"seed": 1, "update": 4}]
+    found = sources.read([make_measured_run(tmp_path / "a", summary={"nonfinite": events})])
+    (part,) = found.configurations
+    np.testing.assert_array_equal(part.eval_return[:, 2], [200, 210, 220, 230])
+    np.testing.assert_array_equal(part.env_steps[:, 0], [0, 50, 100, 150])
+    assert part.nonfinite.tolist() == [0, 2, 0]
+    assert found.threshold == 195.0
+    assert found.timings == {"compile_seconds": 2.0}
+    assert found.provenance["device"] == "cpu"
+    assert found.settings["learning_rate"] == 0.01
+    assert "3 seeds" in found.asked
+    assert found.unfinished == []
+
+
+def test_runs_are_told_apart_by_what_differs(tmp_path):
+    first = make_measured_run(tmp_path / "a")
+    second = make_measured_run(
+        tmp_path / "b", learning_rate=0.003, hidden_sizes=[], output="elsewhere"
+    )
+    third = make_measured_run(tmp_path / "c")
+    found = sources.read([first, second, third])
+    labels = [part.label for part in found.configurations]
+    assert labels[1] == "learning rate 0.003, hidden sizes none"
+    assert labels[0] == f"learning rate 0.01, hidden sizes 32-32 in {first}"
+    assert "learning_rate" not in found.settings
+
+
+def test_a_run_that_goes_on_is_read_so_far(tmp_path):
+    directory = make_measured_run(tmp_path / "a", summary={"status": "running"})
+    (directory / "summary.json").unlink()
+    path = directory / "metrics.csv"
+    path.write_text(path.read_text()[:-40])
+    found = sources.read([directory])
+    assert found.unfinished == [directory]
+    assert found.configurations[0].eval_return.shape == (3, 3)
+
+
+def test_a_sweep(tmp_path):
+    found = sources.read([make_sweep(tmp_path / "sweep", num_seeds=6)])
+    assert len(found.configurations) == 16
+    part = found.configurations[5]
+    assert part.label == "learning rate 0.003, discount 0.98"
+    assert part.settings == {"learning_rate": 0.003, "discount": 0.98}
+    assert part.eval_return.shape == part.env_steps.shape == (20, 6)
+    assert part.seed.tolist() == list(range(6))
+    broken = np.isnan(part.eval_return).sum(axis=0)
+    np.testing.assert_array_equal(part.nonfinite, broken)
+    assert found.provenance["git_commit"].startswith("0123")
+    assert found.timings["run_seconds"] == 63.0
+
+
+def test_a_thousand_seeds_are_read_in_a_second(tmp_path):
+    directory = make_measured_run(tmp_path / "a", num_seeds=1000, evaluations=60)
+    started = time.process_time()
+    sources.read([directory])
+    assert time.process_time() - started < 1
+
+
+def test_values_in_words():
+    settings = {"learning_rate": 0.003, "hidden_sizes": (16, 32), "standardize": True, "x_y": None}
+    assert describe(settings) == "learning rate 0.003, hidden sizes 16-32, standardize on, x y none"
+    assert ordered([0.3, 0.1, 0.3]) == [0.1, 0.3]
+    assert ordered(["b", "a", "b"]) == ["b", "a"]
+
+
+def damage_metrics(old, new):
+    def damage(directory):
+        path = directory / "metrics.csv"
+        path.write_text(path.read_text().replace(old, new, 1))
+
+    return damage
+
+
+def damage_json(name, **entries):
+    def damage(directory):
+        path = directory / name
+        path.write_text(json.dumps(json.loads(path.read_text()) | entries))
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (
+            damage_metrics("210.0", "many"),
+            "metrics.csv is damaged: eval_return in line 7 is 'many'",
+        ),
+        (
+            damage_metrics("eval_return,", "return,"),
+            "metrics.csv is damaged: it has no column eval_",
+        ),
+        (damage_metrics("\n1,", "\n2,"), "metrics.csv is damaged: line 3 is not of seed 1"),
+        (
+            damage_metrics("\n1,", "\n1,1,"),
+            f"line 3 has {len(COLUMNS) + 1} entries, not {len(COLUMNS)}",
+        ),
+        (damage_json("summary.json", threshold="much"), "summary.json is damaged: threshold is"),
+        (damage_json("summary.json", nonfinite=3), "summary.json is damaged: nonfinite is no list"),
+        (damage_json("config.json", env=3), "config.json is damaged: env is 3"),
+        (lambda directory: (directory / "metrics.csv").unlink(), "cannot read"),
+    ],
+)
+def test_damaged_runs_are_named(tmp_path, damage, said):
+    directory = make_measured_run(tmp_path / "a")
+    damage(directory)
+    with pytest.raises(ValueError, match=said):
+        sources.read([directory])
+
+
+def change_arrays(directory, **arrays):
+    with np.load(directory / "curves.npz") as archive:
+        kept = dict(archive) | arrays
+    np.savez(directory / "curves.npz", **{k: v for k, v in kept.items() if v is not None})
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (
+            lambda d: change_arrays(d, env_steps=None),
+            "curves.npz is damaged: it has no array env_st",
+        ),
+        (lambda d: change_arrays(d, seed=np.zeros(3)), r"seed has the shape \(3,\), not \(10,\)"),
+        (
+            lambda d: change_arrays(d, more=np.zeros(3)),
+            "curves.npz is damaged: 'more' is not an array of a sweep",
+        ),
+        (lambda d: (d / "curves.npz").write_bytes(b"x"), "curves.npz is damaged: it is no whole"),
+        (lambda d: change_arrays(d, configuration=np.full(10, 7)), "no row of configuration 7"),
+        (damage_json("sweep.json", configurations=[]), "does not name configuration 0"),
+        (damage_json("sweep.json", configurations={"a": 1}), "configurations is no list"),
+    ],
+)
+def test_damaged_sweeps_are_named(tmp_path, damage, said):
+    directory = make_sweep(tmp_path / "sweep", num_seeds=5, over=ONE)
+    damage(directory)
+    with pytest.raises(ValueError, match=said):
+        sources.read([directory])
+
+
+def test_what_cannot_be_compared_is_refused(tmp_path):
+    (tmp_path / "empty").mkdir()
+    run, sweep = make_measured_run(tmp_path / "run"), make_sweep(tmp_path / "sweep", over=ONE)
+    for directories, said in (
+        ([run, sweep], "different tasks"),
+        ([tmp_path / "empty"], "neither a run nor a sweep"),
+        ([tmp_path / "none"], "there is no directory"),
+        ([], "nothing to report on"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            sources.read(directories)

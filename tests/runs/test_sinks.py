@@ -1,0 +1,376 @@
+"""Sinks: what they hold is what metrics.csv holds, also after a full disk, a kill and a resume."""
+
+import csv
+import errno
+import json
+import struct
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mjx_reinforce import files
+from mjx_reinforce import train as train_module
+from mjx_reinforce.reports.statistics import iqm, iqm_interval
+from mjx_reinforce.runs.log import RunLog
+from mjx_reinforce.runs.sinks import over_seeds, sink, tensorboard
+from mjx_reinforce.runs.sinks.sink import Queue
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training import rows
+
+
+def evaluation(update, num_seeds=20, first=False):
+    """Rows of one evaluation; the last seed failed, and the last but one stood still."""
+    rng = np.random.default_rng(update)
+    values = rng.normal(size=num_seeds).astype(np.float32)
+    values[-1] = np.nan
+    updates = np.full(num_seeds, update)
+    updates[-2] = min(update, 5)
+    names = ("eval_return", "eval_return_stochastic", "eval_length")
+    measured = dict.fromkeys(names, values)
+    metrics = ("episode_return", "episode_length", "entropy", "gradient_norm")
+    counts = ("nonfinite_episodes", "skipped_update")
+    last = dict.fromkeys(metrics, values) | dict.fromkeys(counts, updates)
+    return rows.of_evaluation(
+        measured, {} if first else last, updates, 4 * updates, 40 * updates, 0.1 * update
+    )
+
+
+@pytest.fixture
+def directory(tmp_path):
+    """A run's directory with its metrics.csv, and settings, as sinks find it."""
+    files.create_csv(tmp_path / "metrics.csv", rows.COLUMNS)
+    (tmp_path / "config.json").write_text('{"env": "Survive-v0", "learning_rate": 0.01}')
+    return tmp_path
+
+
+def as_csv(path):
+    """The rows of metrics.csv, with numbers; None where there is none that is finite."""
+
+    def number(text):
+        return float(text) if text and np.isfinite(float(text)) else None
+
+    with path.open(newline="") as file:
+        return [{name: number(x) for name, x in row.items()} for row in csv.DictReader(file)]
+
+
+def as_json(path):
+    return [json.loads(line, parse_constant=pytest.fail) for line in path.open()]
+
+
+def events(folder):
+    """All events of a folder, file after file, with their checksums checked."""
+    from tensorboardX.proto.event_pb2 import Event
+    from tensorboardX.record_writer import masked_crc32c
+
+    for path in sorted(folder.glob(tensorboard.PATTERN)):
+        content = path.read_bytes()
+        while content:
+            length, of_length = struct.unpack("<QI", content[:12])
+            data, of_data = content[12 : 12 + length], content[12 + length : 16 + length]
+            assert masked_crc32c(content[:8]) == of_length
+            assert masked_crc32c(data) == struct.unpack("<I", of_data)[0]
+            yield Event.FromString(data)
+            content = content[16 + length :]
+
+
+def charts(folder):
+    """What TensorBoard shows: {step: {name: value}}, without what a later start drops."""
+    shown = {}
+    for event in events(folder):
+        if event.HasField("session_log"):
+            shown = {step: x for step, x in shown.items() if step < event.step}
+        elif event.HasField("summary"):
+            assert event.step not in shown
+            shown[event.step] = {
+                value.tag: value.simple_value if value.HasField("simple_value") else value.histo
+                for value in event.summary.value
+            }
+    return shown
+
+
+def test_statistics_are_over_all_seeds_and_a_few_seeds_are_single():
+    shown = over_seeds.scalars(evaluation(10))
+    values = over_seeds.measured(evaluation(10))["eval_return"]
+    low, high = iqm_interval(values)
+    assert shown["eval_return/iqm"] == float(iqm(values))
+    assert (shown["eval_return/iqm_low"], shown["eval_return/iqm_high"]) == (low, high)
+    assert np.isnan(shown["eval_return/lowest"])
+    assert shown["eval_return/highest"] == np.nanmax(values)
+    worst_first = np.sort(np.where(np.isnan(values), -np.inf, values))
+    assert shown["eval_return/quantile_25"] == worst_first[4]
+    assert shown["eval_return/quantile_50"] == worst_first[9]
+    single = [name for name in shown if name.startswith("eval_return/seed_")]
+    assert single == [f"eval_return/seed_{i}" for i in range(16)]
+    assert shown["eval_return/seed_3"] == values[3]
+    assert shown["progress/env_steps"] == pytest.approx((19 * 400 + 200) / 20)
+
+
+def test_before_the_first_update_its_columns_are_not_shown():
+    shown = over_seeds.scalars(evaluation(0, first=True))
+    assert {name.partition("/")[0] for name in shown} == {
+        *("progress", "eval_return", "eval_return_stochastic", "eval_length")
+    }
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@given(data=st.data())
+@settings(derandomize=True, deadline=None, database=None)
+def test_cells_come_back_to_the_last_bit(dtype, data):
+    floats = st.floats(width=np.finfo(dtype).bits)
+    values = np.array(data.draw(st.lists(floats, min_size=1)), dtype)
+    back = [rows.number(cell) for cell in rows._cells(values)]
+    assert all(isinstance(x, float) for x in back)
+    back = np.array(back, dtype)
+    np.testing.assert_array_equal(back, values)
+    number = ~np.isnan(values)  # of NaN, text keeps no sign
+    np.testing.assert_array_equal(np.signbit(back[number]), np.signbit(values[number]))
+
+
+def test_json_lines_are_the_rows_of_the_table(directory):
+    [lines] = sink.open_sinks(Config(jsonl=True), directory, None)
+    for update in (0, 5, 10):
+        new = rows.lines(evaluation(update, first=not update))
+        files.append(directory / "metrics.csv", new)
+        lines.write(evaluation(update, first=not update))
+    table = as_csv(directory / "metrics.csv")
+    assert len(table) == 60
+    assert as_json(directory / "metrics.jsonl") == table
+    assert isinstance(as_json(directory / "metrics.jsonl")[0]["update"], int)
+    written = (directory / "metrics.jsonl").read_bytes()
+    (directory / "metrics.jsonl").write_bytes(written[:100] + b"\n{half a ro")
+    sink.open_sinks(Config(jsonl=True), directory, 10)
+    assert (directory / "metrics.jsonl").read_bytes() == written
+
+
+@pytest.mark.parametrize("name", ["metrics.jsonl", "wandb/mjx_reinforce.json", "config.json"])
+def test_what_a_kill_left_of_writing_a_file_is_removed(directory, name):
+    """At the next start of the run, or when it goes on."""
+    (directory / "wandb").mkdir()
+    log, part = RunLog(directory), (directory / name).with_name(f".{(directory / name).name}.0a1b")
+    part.touch()
+    log.begin({})
+    assert not part.exists()
+    part.touch()
+    log.resume({}, {}, None)
+    assert not part.exists()
+
+
+def test_tensorboard_has_the_numbers_and_the_histograms(directory):
+    [charted] = sink.open_sinks(Config(tensorboard=True), directory, None)
+    for update in (0, 5):
+        charted.write(evaluation(update))
+    charted.close()
+    shown = charts(directory / "tensorboard")
+    assert list(shown) == [0, 5]
+    expected = over_seeds.scalars(evaluation(5))
+    for name, value in expected.items():
+        np.testing.assert_allclose(shown[5][name], value, rtol=1e-6, err_msg=name)
+    histogram = shown[5]["eval_return/seeds"]
+    assert histogram.num == 19
+    assert sum(histogram.bucket) == 19
+
+
+@pytest.mark.parametrize("level", [0.0, 1000.0, -3e38])
+def test_a_histogram_of_equal_values_is_one_bin(directory, level):
+    [charted] = sink.open_sinks(Config(tensorboard=True), directory, None)
+    charted.write(evaluation(0) | {"eval_return": 20 * [str(level)]})
+    histogram = charts(directory / "tensorboard")[0]["eval_return/seeds"]
+    assert [count for count in histogram.bucket if count] == [20]
+
+
+def resumed_charts(directory):
+    """Events of a run that was killed after 10 updates and went on from 5, then of 3 seeds."""
+    config = Config(tensorboard=True)
+    [killed] = sink.open_sinks(config, directory, None)
+    for update in (0, 5, 10):
+        killed.write(evaluation(update))
+    [resumed] = sink.open_sinks(config, directory, 5)
+    resumed.write(evaluation(10, num_seeds=3))
+    resumed.write(evaluation(15, num_seeds=3))
+    return directory / "tensorboard"
+
+
+def test_tensorboard_of_a_resumed_run_shows_no_step_twice(directory):
+    shown = charts(resumed_charts(directory))
+    assert list(shown) == [0, 5, 10, 15]
+    assert "eval_return/seed_15" in shown[5]
+    assert "eval_return/seed_15" not in shown[10]
+
+
+def test_tensorboard_itself_reads_it_so(directory):
+    """Also where the kill cut off the last event."""
+    reader = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+    folder = resumed_charts(directory)
+    first = min(folder.iterdir())
+    first.write_bytes(first.read_bytes()[:-9])
+    read = reader.EventAccumulator(str(folder)).Reload()
+    assert [event.step for event in read.Scalars("eval_return/iqm")] == [0, 5, 10, 15]
+
+
+def test_a_run_that_starts_again_drops_everything(directory):
+    for _ in range(2):
+        [charted] = sink.open_sinks(Config(tensorboard=True), directory, None)
+        charted.write(evaluation(0))
+    assert list(charts(directory / "tensorboard")) == [0]
+    assert sum(event.HasField("summary") for event in events(directory / "tensorboard")) == 2
+
+
+@pytest.mark.parametrize("name", ["jsonl", "tensorboard"])
+def test_a_full_disk_delays_rows_and_loses_none(directory, monkeypatch, name):
+    config = Config(**{name: True})
+    [slow] = sink.open_sinks(config, directory, None)
+    module = f"mjx_reinforce.runs.sinks.{'json_lines' if name == 'jsonl' else name}"
+
+    def full(path, content):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    slow.write(evaluation(0))
+    with monkeypatch.context() as patch:
+        patch.setattr(f"{module}.append", full)
+        for update in (5, 10):
+            with pytest.raises(OSError, match="No space left"):
+                slow.write(evaluation(update))
+    slow.write(evaluation(15))
+    if name == "jsonl":
+        updates = [row["update"] for row in as_json(directory / "metrics.jsonl")]
+        assert updates[::20] == [0, 5, 10, 15]
+    else:
+        assert list(charts(directory / "tensorboard")) == [0, 5, 10, 15]
+
+
+def test_rows_that_wait_are_written_at_the_end():
+    class Flaky:
+        def __init__(self):
+            self.got, self.broken = [], True
+
+        def write(self, rows):
+            if self.broken:
+                raise OSError("full")
+            self.got.append(rows)
+
+        def close(self):
+            self.got.append("end")
+
+    flaky = Flaky()
+    queue = Queue("flaky", flaky)
+    for row in ("one", "two"):
+        with pytest.raises(OSError, match="full"):
+            queue.write([row])
+    flaky.broken = False
+    queue.close()
+    assert flaky.got == [["one"], ["two"], "end"]
+
+
+def wandb_records(content):
+    """The records of a file of W&B: LevelDB's log format after a header of 7 bytes."""
+    at, data = 7, b""
+    while at + 7 <= len(content):
+        if (left := 2**15 - at % 2**15) < 7:  # no room for another in this block
+            at += left
+            continue
+        _, length, kind = struct.unpack("<IHB", content[at : at + 7])
+        data += content[at + 7 : at + 7 + length]
+        at += 7 + length
+        if kind in (1, 4):  # whole, or its last part
+            yield data
+            data = b""
+
+
+def wandb_rows(directory):
+    """Steps and values in the files that `wandb sync` uploads."""
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    found, ids = [], set()
+    for path in sorted((directory / "wandb").glob("offline-run-*/*.wandb")):
+        for record in map(Record.FromString, wandb_records(path.read_bytes())):
+            if record.HasField("run"):
+                ids.add(record.run.run_id)
+            if record.HasField("history"):
+                items = {"/".join(x.nested_key) or x.key: x for x in record.history.item}
+                found.append({name: json.loads(x.value_json) for name, x in items.items()})
+    return found, ids
+
+
+WANDB_PROGRAM = """
+import json, pathlib, sys
+from mjx_reinforce.runs.sinks.weights_and_biases import WeightsAndBiases
+sink = WeightsAndBiases(pathlib.Path("."))
+for rows in json.load(sys.stdin):
+    sink.write(rows)
+sink.close()
+"""
+
+
+def test_wandb_is_offline_and_goes_on(directory, monkeypatch):
+    """No step is logged twice; both parts are of one run, and nothing is outside its folder."""
+    pytest.importorskip("wandb")
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    for updates in ((0, 5), (5, 10)):
+        given = json.dumps([evaluation(update) for update in updates])
+        command = [sys.executable, "-c", WANDB_PROGRAM]
+        subprocess.run(command, input=given, check=True, cwd=directory, text=True)
+    found, ids = wandb_rows(directory)
+    assert [row["_step"] for row in found] == [0, 5, 10]
+    assert found[1]["eval_return/iqm"] == over_seeds.scalars(evaluation(5))["eval_return/iqm"]
+    assert len(ids) == 1
+    assert {path.name for path in directory.iterdir()} == {"metrics.csv", "config.json", "wandb"}
+
+
+def test_wandb_that_has_no_key_says_what_to_do(directory, monkeypatch):
+    wandb = pytest.importorskip("wandb")
+
+    def init(**_):
+        raise wandb.Error("No API key configured.")
+
+    monkeypatch.setattr(wandb, "init", init)
+    monkeypatch.setenv("WANDB_MODE", "online")
+    with pytest.raises(OSError, match="key configured; run wandb login, or unset WANDB_MODE"):
+        sink.open_sinks(Config(wandb=True), directory, None)
+
+
+def test_only_a_disk_is_asked_for_room(run, monkeypatch, capsys):
+    def fail(*_):
+        raise OSError("no key; run wandb login")
+
+    monkeypatch.setattr(train_module, "train", fail)
+    command = "--env Survive-v0 --num-seeds 1 --max-updates 1 --engine vmap --output out"
+    assert run(*command.split()) == 1
+    assert "(no key; run wandb login); then try again" in capsys.readouterr().err
+
+
+def test_a_missing_package_is_named_before_anything_starts(tmp_path, monkeypatch, capsys):
+    """Also where a folder of its name lies beside."""
+    (tmp_path / "wandb").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "wandb", raising=False)
+    real = [path for path in sys.path if "site-packages" not in path]
+    monkeypatch.setattr(sys, "path", real)
+    monkeypatch.setattr(sys, "argv", ["train", "--wandb", "--output", "out"])
+    with pytest.raises(SystemExit, match=r"^2$"):
+        train_module.main()
+    assert "--wandb needs the package wandb" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_with_all_sinks_and_its_resumption(run, tmp_path):
+    size = ["--num-seeds", "2", "--eval-episodes", "2", "--hidden-sizes", "4"]
+    size += ["--env", "Survive-v0", "--env-steps", "None", "--num-episodes", "4"]
+    sinks = ["--tensorboard", "--jsonl", "--output", "out"]
+    assert run(*size, "--max-updates", "8", *sinks) == 0
+    assert run("--resume", "out", "--max-updates", "15") == 0
+    out = tmp_path / "out"
+    table = as_csv(out / "metrics.csv")
+    assert as_json(out / "metrics.jsonl") == table
+    shown = charts(out / "tensorboard")
+    assert list(shown) == sorted({int(row["update"]) for row in table})
+    last = [row for row in table if row["update"] == 15]
+    for name in ("eval_return", "kl", "policy_std", "gradient_snr", "explained_variance"):
+        assert shown[15][f"{name}/seed_1"] == pytest.approx(last[1][name], rel=1e-6)
+    assert run(*size, "--max-updates", "5", "--overwrite", "--output", "out") == 0
+    assert not (out / "metrics.jsonl").exists()
+    assert not list((out / "tensorboard").iterdir())

@@ -1,0 +1,323 @@
+"""Programs of runs on disk: a second start traces nothing, and gives the same numbers."""
+
+import contextlib
+import dataclasses
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+from toys import Survive
+
+from mjx_reinforce import envs
+from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce.engines.native import objects
+from mjx_reinforce.engines.native.cpu import machine
+from mjx_reinforce.engines.native.gpu import seam as gpu
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.store import kept, ready, trees
+from mjx_reinforce.training.state import budget_of, compile_parts
+
+CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
+SETTINGS = {
+    "plain": {},
+    "all else": {
+        "estimator": "value-baseline",
+        "optimizer": "adamw",
+        "one_start": True,
+        "update": "minibatches",
+        "decay_steps": None,
+    },
+    "search": {"algorithm": "ars", "hidden_sizes": (), "engine": "vmap"},
+}
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(objects, "folder", lambda: tmp_path)
+    return tmp_path
+
+
+def numbers(prepared, config):
+    """Everything that two blocks of updates, an evaluation and a test leave."""
+    state, programs = compile_parts(prepared.parts, config)
+    measured = []
+    for _ in range(2):
+        state, metrics, looked = programs.advance(state, True, budget_of(config))
+        measured += [metrics, looked.measured, programs.evaluate(state).measured]
+    leaves = [jax.random.key_data(state.train_states.key), state.train_states.env_steps]
+    leaves += jax.tree.leaves(state.train_states.actor)
+    return [measured, programs.test(state.train_states.actor), leaves]
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_second_start_traces_nothing_and_gives_the_same(name, monkeypatch):
+    config = dataclasses.replace(CONFIG, **SETTINGS[name])
+    plain = ready.made(envs.make(config.env), config)
+    first = ready.get_ready(config, config)
+    expected = numbers(first, config)
+    with monkeypatch.context() as patch:
+        patch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
+        second = ready.get_ready(config, config)
+        assert second.engine_seconds == 0
+        assert jax.tree.structure(second.parts.like) == jax.tree.structure(plain.parts.like)
+        for prepared in (first, second):
+            assert prepared[:5] == plain[:5]
+        jax.tree.map(np.testing.assert_array_equal, numbers(second, config), expected)
+    jax.tree.map(np.testing.assert_array_equal, numbers(plain, config), expected)
+
+
+def test_seeds_and_budgets_are_inputs_and_all_else_is_not():
+    key = kept.key_of(CONFIG)
+    for change in ({"seed": 7}, {"eval_seed": 1}, {"env_steps": 999}, {"jsonl": True}):
+        assert kept.key_of(dataclasses.replace(CONFIG, **change)) == key
+    changes = (
+        *({"num_seeds": 3}, {"discount": 0.5}, {"horizon": 9}, {"stop_when_solved": True}),
+        {"eval_every": 2},
+    )
+    others = [kept.key_of(dataclasses.replace(CONFIG, **change)) for change in changes]
+    assert len({key, *others}) == 1 + len(changes)
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [(objects, "source_digest"), (kept, "provenance"), (kept, "made_for"), (kept, "version")],
+)
+def test_programs_depend_on_sources_versions_and_the_machine(owner, name, monkeypatch):
+    key = kept.key_of(CONFIG)
+    monkeypatch.setattr(owner, name, lambda *_: {"git_commit": "", "python": "another"})
+    assert kept.key_of(CONFIG) != key
+
+
+def test_programs_depend_on_what_jax_is_told(monkeypatch):
+    keys = {kept.key_of(CONFIG)}
+    with jax.default_matmul_precision("float32"):
+        keys.add(kept.key_of(CONFIG))
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
+    keys.add(kept.key_of(CONFIG))
+    monkeypatch.setattr(kept, "platform", lambda: "tpu")
+    keys.add(kept.key_of(CONFIG))
+    assert len(keys) == 4
+    assert None in keys
+
+
+def test_a_program_that_launches_a_gpus_kernel_is_kept():
+    def add(x):
+        return gpu._call(gpu._PROBE, "probe", (1, 1), [jnp.ones(1, jnp.int32)], [x])
+
+    kept._export("key", "look", lambda: add, (jax.ShapeDtypeStruct((1,), np.int32),))
+    assert gpu.PTX.encode() in kept._read("key", "look")
+
+
+def test_a_commit_that_changes_no_source_changes_nothing(monkeypatch):
+    made_by, key = kept.provenance(), kept.key_of(CONFIG)
+    monkeypatch.setattr(kept, "provenance", lambda: made_by | {"git_commit": "0123"})
+    assert kept.key_of(CONFIG) == key
+
+
+def test_a_resumed_run_finds_its_programs(monkeypatch):
+    """Its config.json has the time limit, which the command line had left out."""
+    numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+    monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
+    resumed = dataclasses.replace(CONFIG, horizon=500, resume=Path("run"), env_steps=999)
+    assert ready.get_ready(resumed, CONFIG).horizon == 500
+    with pytest.raises(pytest.fail.Exception, match="was built"):
+        ready.get_ready(dataclasses.replace(resumed, horizon=400), CONFIG)
+
+
+def test_another_seed_finds_the_programs_and_differs(monkeypatch):
+    first = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+    monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
+    other = dataclasses.replace(CONFIG, seed=1)
+    assert not np.array_equal(numbers(ready.get_ready(other, other), other)[2][0], first[2][0])
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["facts", "advance", pytest.param("", id="machine code", marks=pytest.mark.cpu)],
+)
+def test_what_is_damaged_is_made_again(name, folder, monkeypatch):
+    monkeypatch.setattr(machine, "_LOADED", {})  # as in a process that has loaded nothing
+    expected = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+    (path,) = (path for path in folder.iterdir() if path.stem.partition("-")[2] == name)
+    path.write_bytes(path.read_bytes()[:-1])
+    monkeypatch.setattr(machine, "_LOADED", {})
+    assert kept.read(kept.key_of(CONFIG)) is None
+    again = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+    jax.tree.map(np.testing.assert_array_equal, again, expected)
+    assert kept.read(kept.key_of(CONFIG)) is not None
+
+
+def test_bad_input_is_refused_of_what_is_kept_too():
+    numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+    many = dataclasses.replace(CONFIG, env_steps=None, max_updates=10**14)
+    with pytest.raises(ValueError, match="more than the 2\\^53"):
+        ready.get_ready(many, CONFIG)
+    idle = dataclasses.replace(CONFIG, initial_std=2.0)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"--initial-std 2\.0 would do nothing"):
+            ready.get_ready(idle, CONFIG)
+
+
+def test_programs_need_no_code_of_others(monkeypatch):
+    """A process that plays other tasks has their code in memory too."""
+    own = kept.seam.targets
+    monkeypatch.setattr(kept.seam, "targets", lambda: [*own(), "mjx_reinforce_" + 64 * "0"])
+    numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+    assert kept.read(kept.key_of(CONFIG)) is not None
+
+
+def test_nothing_is_kept_of_an_environment_of_the_users(register):
+    for name in ("Survive-v0", "toys:Survive"):
+        assert kept.key_of(Config(env=name)) is None
+
+
+@pytest.mark.parametrize("looks", ["jax_debug_nans", "jax_debug_infs"])
+def test_nothing_is_kept_where_jax_is_to_look_for_nans(looks):
+    jax.config.update(looks, True)
+    try:
+        assert kept.key_of(CONFIG) is None
+    finally:
+        jax.config.update(looks, False)
+
+
+@contextlib.contextmanager
+def cache_of_jax(folder):
+    """Lets JAX keep programs in a folder, and its warnings be shown as the commands show them."""
+    before = jax.config.values["jax_compilation_cache_dir"]
+    show = warnings.showwarning
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")
+            jax.config.update("jax_compilation_cache_dir", str(folder))
+            compilation_cache.reset_cache()
+            configure_jax()
+            yield
+    finally:
+        warnings.showwarning = show
+        jax.config.update("jax_compilation_cache_dir", before)
+        compilation_cache.reset_cache()
+
+
+def compile_and_run():
+    def shifted_sine(x):
+        return jnp.sin(x) + 2
+
+    return float(jax.jit(shifted_sine)(1.0))
+
+
+def test_a_damaged_program_in_the_cache_of_jax_is_replaced(tmp_path, capsys):
+    """JAX itself would leave it there, and compile at every start."""
+    with cache_of_jax(tmp_path):
+        value = compile_and_run()
+        [program] = tmp_path.glob("jit_shifted_sine-*-cache")
+        os.truncate(program, 100)
+        assert compile_and_run() == value
+        assert "jit_shifted_sine in" in capsys.readouterr().err
+        assert program.stat().st_size > 100
+        assert compile_and_run() == value
+        assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("where", ["", "native/key.o"])
+def test_a_cache_of_jax_in_which_others_may_write_is_not_used(where, tmp_path, capsys):
+    """What is in it is run."""
+    cache = tmp_path / "cache"
+    (cache / "native").mkdir(parents=True)
+    (cache / "native" / "key.o").touch()
+    (cache / where).chmod(0o777)
+    with cache_of_jax(cache):
+        compile_and_run()
+        assert jax.config.values["jax_compilation_cache_dir"] is None
+    (said,) = capsys.readouterr().err.splitlines()
+    assert f"the cache {cache} is not used (others may write to {cache / where})" in said
+    assert said.endswith("set JAX_COMPILATION_CACHE_DIR to a folder of your own")
+    assert [path.name for path in cache.iterdir()] == ["native"]
+
+
+def test_a_cache_of_jax_that_does_not_work_is_named_once(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.touch()
+    with cache_of_jax(file):
+        assert compile_and_run() == compile_and_run()
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith(f"warning: the cache {file} is not used (FileExistsError")
+
+
+def test_nothing_is_kept_where_jax_keeps_nothing(monkeypatch):
+    monkeypatch.setattr(objects, "folder", lambda: None)
+    assert kept.key_of(CONFIG) is None
+
+
+def test_a_program_that_calls_python_is_not_kept(folder):
+    def part():
+        return lambda *_: jax.pure_callback(lambda: np.float32(3), jax.ShapeDtypeStruct((), "f4"))
+
+    program = kept._export("key", "look", part, ())
+    assert float(jax.jit(program)()) == 3
+    assert not list(folder.iterdir())
+
+
+@pytest.mark.parametrize("env", ["InvertedPendulum-v5", "CartPole-v1"])
+def test_a_tree_of_states_is_described_and_rebuilt(env):
+    config = of_task(env)
+    like = ready.made(envs.make(env), config).parts.like
+    again = trees.rebuild(trees.describe(like))
+    assert jax.tree.structure(again) == jax.tree.structure(like)
+    for new, old in zip(jax.tree.leaves(again), jax.tree.leaves(like), strict=True):
+        assert (new.shape, new.dtype) == (old.shape, old.dtype)
+
+
+def test_a_tree_of_other_classes_is_neither_described_nor_rebuilt():
+    with pytest.raises(TypeError, match="another package"):
+        trees.describe({"a": Survive().reset(jax.random.key(0))})
+    with pytest.raises(TypeError, match="a leaf of"):
+        trees.describe([3])
+    assert trees.rebuild(trees.describe((optax.EmptyState(), None))) == (optax.EmptyState(), None)
+    with pytest.raises(ValueError, match="another package"):
+        trees.rebuild({"class": "subprocess:Popen", "fields": {"args": {"dict": {}}}})
+
+
+_SECOND = """
+import jax, numpy, sys
+from mjx_reinforce import envs
+from mjx_reinforce.store import ready
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce.training.state import budget_of, compile_parts
+configure_jax()
+if sys.argv[1] == "second":
+    envs.make = None
+config = Config(env="InvertedPendulum-v5", num_seeds=2, num_episodes=2, eval_episodes=2)
+prepared = ready.get_ready(config, config)
+state, programs = compile_parts(prepared.parts, config)
+state, metrics, looked = programs.advance(state, True, budget_of(config))
+print(prepared.engine, metrics["episode_return"].tolist(), looked.measured["eval_return"])
+print("mujoco" in sys.modules)
+"""
+
+
+def test_a_second_process_loads_the_machine_code_and_no_simulator(tmp_path):
+    def run(which):
+        environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
+        done = subprocess.run(
+            [sys.executable, "-c", _SECOND, which],
+            check=True,
+            capture_output=True,
+            text=True,
+            env=environment,
+        )
+        return done.stdout.splitlines()
+
+    first, second = run("first"), run("second")
+    assert first[0].startswith("native")
+    assert second[0] == first[0]
+    assert (first[1], second[1]) == ("True", "False")

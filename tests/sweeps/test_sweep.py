@@ -1,0 +1,714 @@
+"""Sweeps: the runs of ``train``, whatever is beside them, wherever they are, however they stop."""
+
+import csv
+import dataclasses
+import errno
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from places import PYTHONPATH
+from toys import Drift
+
+import mjx_reinforce
+from mjx_reinforce import envs
+from mjx_reinforce import train as train_module
+from mjx_reinforce.export.player import load_seed
+from mjx_reinforce.export.run_files import choose_seed, read_run
+from mjx_reinforce.report import Written
+from mjx_reinforce.runs import plan as runs_plan
+from mjx_reinforce.settings.config import Config, check
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.store.build import build
+from mjx_reinforce.sweeps import chunks, conduct, perform
+from mjx_reinforce.sweeps import main as sweep_command
+from mjx_reinforce.sweeps.designs import plan, rungs, search
+from mjx_reinforce.sweeps.designs.design import Design, check_design
+from mjx_reinforce.sweeps.designs.grid import configure, grid, read_over
+from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
+from mjx_reinforce.sweeps.reading import read_results
+from mjx_reinforce.sweeps.results import join
+from mjx_reinforce.sweeps.slots import programs
+from mjx_reinforce.sweeps.slots.packing import pack
+from mjx_reinforce.training.state import eval_keys, evaluation
+
+
+class CrashError(Exception):
+    pass
+
+
+SMALL = "--env Drift-v0 --num-episodes 4 --eval-episodes 2 --hidden-sizes 4 --env-steps None"
+RATES = "--over learning-rate 1e-2 3e-2 1e-1"
+
+
+@pytest.fixture
+def run(run, monkeypatch):
+    """Runs a sweep of arguments in one string; the report has tests of its own."""
+    monkeypatch.setattr(perform, "_report", lambda directory: Written(0.0, [], 0))
+    return lambda line, command=sweep_command: run(*line.split(), command=command)
+
+
+def curves(directory):
+    with np.load(directory / "curves.npz", allow_pickle=False) as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+def same(one, other):
+    return all(np.array_equal(one[name], other[name], equal_nan=True) for name in one | other)
+
+
+def close(one, other):
+    """As near as rounding leaves runs of few updates."""
+    return all(np.allclose(one[n], other[n], rtol=1e-4, equal_nan=True) for n in one | other)
+
+
+def test_a_run_is_that_of_train(run):
+    """Of whichever configuration and group, and with a std of its own."""
+    over = "--over learning-rate 1e-2 3e-2 --over estimator leave-one-out total-return "
+    over += "--over initial-std 0.4 0.6 --over decay-steps 40 4000"
+    shared = f"{SMALL} --num-seeds 2 --max-updates 12 --max-kl 0.01 --final-std 0.1"
+    assert run(f"{shared} {over} --output swept") == 0
+    results = read_results(Path("swept"))
+    assert len(results.configurations) == 16
+    assert results.configurations[10] == {
+        "learning_rate": 3e-2,
+        "estimator": "leave-one-out",
+        "initial_std": 0.6,
+        "decay_steps": 40,
+    }
+    alone = "--learning-rate 3e-2 --initial-std 0.6 --decay-steps 40 --output alone"
+    assert run(f"{shared} {alone}", train_module) == 0
+    rows = list(csv.DictReader(Path("alone/metrics.csv").read_text().splitlines()))
+    for name in ("eval_return", "env_steps"):
+        expected = np.array([float(row[name]) for row in rows]).reshape(-1, 2)
+        measured = getattr(results, name)[:, results.configuration == 10]
+        assert np.allclose(measured, expected, rtol=1e-4, equal_nan=True)
+    assert not same({"": results.eval_return[:, :2]}, {"": results.eval_return[:, 20:22]})
+    assert not same({"": results.eval_return[:, 20:22]}, {"": results.eval_return[:, 22:24]})
+
+
+def test_a_seed_has_the_same_starts_in_every_configuration_and_as_in_train(run):
+    """And others than the seeds beside it: of policies that are alike, as all are at first."""
+    shared = f"{SMALL.replace('sizes 4', 'sizes')} --num-seeds 4 --max-updates 2"
+    over = "--over num-episodes 3 5 --over learning-rate 1e-2 1e-1 --chunk-runs 5"
+    assert run(f"{shared} {over} --output swept") == 0
+    results = read_results(Path("swept"))
+    first = [results.eval_return[0, results.configuration == number] for number in range(4)]
+    assert all(np.array_equal(first[0], other) for other in first)
+    assert len(set(first[0].tolist())) == 4
+    assert run(f"{shared.replace('seeds 4', 'seeds 2')} --output alone", train_module) == 0
+    rows = list(csv.DictReader(Path("alone/metrics.csv").read_text().splitlines()))
+    assert np.allclose([float(row["eval_return"]) for row in rows[:2]], first[0][:2])
+
+
+def test_the_files_say_what_was_measured(run):
+    command = f"{SMALL} --num-seeds 2 --max-updates 7 --over hidden-sizes none 3,3 {RATES}"
+    assert run(f"{command} --output swept") == 0
+    rows = list(csv.DictReader(Path("swept/results.csv").read_text().splitlines()))
+    assert [(row["configuration"], row["seed"]) for row in rows] == [
+        (str(c), str(s)) for c in range(6) for s in range(2)
+    ]
+    assert [rows[0]["hidden_sizes"], rows[-1]["hidden_sizes"]] == ["none", "3,3"]
+    measured = curves(Path("swept"))
+    final = measured["eval_return"][-1]
+    assert np.allclose([float(row["final_return"]) for row in rows], final, equal_nan=True)
+    assert [int(row["env_steps"]) for row in rows] == measured["env_steps"][-1].tolist()
+    for index, row in enumerate(rows):
+        solved = np.flatnonzero(measured["eval_return"][:, index] >= Drift.reward_threshold)
+        expected = str(measured["env_steps"][solved[0], index]) if len(solved) else ""
+        assert row["env_steps_to_solve"] == expected
+    said = json.loads(Path("swept/sweep.json").read_text())
+    assert said["status"] == "finished"
+    assert said["configurations"][4] == {
+        "configuration": 4,
+        "hidden_sizes": [3, 3],
+        "learning_rate": 3e-2,
+    }
+    assert len(said["chunk_runs"]) == 2  # two networks, two programs
+
+
+def test_a_sweep_whose_estimate_is_wrong_says_so_after_a_group(run, monkeypatch, capsys):
+    """Once: after the last group nothing is left to be estimated."""
+    monkeypatch.setattr(conduct, "group_seconds", lambda *arguments: 1e5)
+    command = f"{SMALL} --num-seeds 2 --max-updates 7 --over hidden-sizes none 3,3"
+    assert run(f"{command} --output swept") == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if "as was said" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("2 runs took ")
+    assert ", not about 28 h as was said: the rest takes about " in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "configurations", "part"),
+    [
+        ("grid", 8, 1.0),
+        ("random", 8, 9 / 8),
+        # An eighth of the budget for 8, half of 1/4, 1/2 and 1 for 4, 2 and 1, and all for fresh.
+        ("halving", 8, (8 / 8 + 4 / 8 + 2 / 4 + 1 / 2 + 1) / 8),
+        ("halving", 5, (5 / 8 + 3 / 8 + 2 / 4 + 1 / 2 + 1) / 5),
+    ],
+)
+def test_the_time_of_a_search_is_that_of_what_it_trains(kind, configurations, part):
+    assert rungs.part_trained(kind, configurations) == pytest.approx(part)
+
+
+def test_a_sweeps_plan_counts_value_networks(monkeypatch):
+    """Six configurations of 128 seeds: announced with 27 s, it was not done in 11 minutes."""
+    monkeypatch.setattr(runs_plan, "num_cores", lambda: 2)
+    env, base = envs.make("CartPole-v1"), of_task("CartPole-v1")
+    base = dataclasses.replace(base, num_seeds=128, value_fit="full-batch", value_fits=10)
+    said = {}
+    for estimator in ("leave-one-out", "value-baseline"):
+        group = make_groups([dataclasses.replace(base, estimator=estimator)] * 2, (), exact=False)
+        said[estimator] = plan.group_seconds(env, 500, "native", group[0], 1)
+    assert 10 < said["leave-one-out"] < 60
+    assert 200 < said["value-baseline"] < 1800
+    assert plan.group_seconds(env, 500, "vmap", group[0], 1) is None
+
+
+def test_chunks_change_nothing_but_rounding(run):
+    command = f"{SMALL} --num-seeds 3 --max-updates 11 {RATES}"
+    assert run(f"{command} --output whole") == 0
+    assert run(f"{command} --chunk-runs 4 --output parts") == 0
+    assert len(list(Path("parts/parts").glob("*.npz"))) == 3
+    assert close(curves(Path("whole")), curves(Path("parts")))
+
+
+@pytest.mark.parametrize("episodes", ["4", "auto --min-episodes 2 --max-episodes 40"])
+def test_an_exact_run_does_not_depend_on_the_others(run, episodes):
+    """Neither on its chunk, nor on what is swept beside it."""
+    small = SMALL.replace("--num-episodes 4", f"--num-episodes {episodes}")
+    command = f"{small} --num-seeds 3 --max-updates 11 --exact"
+    assert run(f"{command} {RATES} --output whole") == 0
+    assert run(f"{command} {RATES} --chunk-runs 2 --output parts") == 0
+    whole = curves(Path("whole"))
+    assert same(whole, curves(Path("parts")))
+    more = "--over learning-rate 3e-2 1e-1 --over discount 0.9 0.99"
+    assert run(f"{command} {more} --output beside") == 0
+    beside = curves(Path("beside"))
+    assert same({"": whole["eval_return"][:, 3:6]}, {"": beside["eval_return"][:, 3:6]})
+
+
+def test_numbers_of_shifts_dampings_and_values_are_traced():
+    """As arguments of one program, side by side, they do what they do alone."""
+    base = dataclasses.replace(
+        Config(env="Drift-v0"),
+        estimator="value-baseline",
+        value_fits=3,
+        value_batch_size=16,
+        update="natural-gradient",
+        max_kl=1e-2,
+        num_episodes=4,
+        hidden_sizes=(4,),
+        engine="vmap",
+    )
+    configs = [
+        dataclasses.replace(base, reward_shift=shift, natural_damping=damping)
+        for shift, damping in ((0.0, 0.1), (0.5, 0.1), (0.5, 1.0))
+    ]
+    (group,) = make_groups(configs, ("reward_shift",), exact=True)
+    assert {"reward_shift", "natural_damping", "max_kl", "value_learning_rate"} <= {*group.settings}
+    builder, key = learner_builder(Drift(), group.config), jax.random.key(3)
+
+    def trained(learner):
+        state = learner.step(learner.init(key))[0]
+        return learner.step(state)[0].actor.params
+
+    together = jax.jit(jax.vmap(lambda settings: trained(builder(settings))))(group.settings)
+    found = []
+    for number, config in enumerate(configs):
+        alone = jax.jit(lambda config=config: trained(build(Drift(), config)[0]))()
+        jax.tree.map(
+            lambda x, y, number=number: np.testing.assert_allclose(x[number], y, atol=1e-4),
+            together,
+            alone,
+        )
+        found.append(np.concatenate([np.ravel(x) for x in jax.tree.leaves(alone)]))
+    assert np.abs(found[0] - found[1]).max() > 1e-3 < np.abs(found[1] - found[2]).max()
+
+
+#: Runs end one by one, for the noisier their actions are the shorter are their episodes.
+STEPS = f"{SMALL} --env-steps 300 --decay-steps 280000 --eval-every 1 --over initial-std 0.3 1 3"
+
+
+def in_place(chosen, lengths, widths, num_devices):
+    """A packing that leaves all runs in their lanes until the last has ended."""
+    del lengths, num_devices
+    lanes = np.full(-(-len(chosen) // widths[0]) * widths[0], -1)
+    lanes[: len(chosen)] = np.arange(len(chosen))
+    return lanes.reshape(-1, widths[0])
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize("exact", [False, True])
+def test_packing_changes_nothing(run, monkeypatch, exact):
+    """Neither which runs share a slot, nor how wide it is, nor that those that ended lie aside."""
+    # With this seed one run trains last, alone.
+    command = f"{STEPS} --num-seeds 4 --seed 2 {'--exact' * exact}"
+    shapes = []
+
+    def packed(*arguments):
+        shapes.append(pack(*arguments).shape)
+        return pack(*arguments)
+
+    monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
+    monkeypatch.setattr(programs, "pack", packed)
+    assert run(f"{command} --output packed") == 0
+    assert shapes[0] == ((12, 1) if exact else (3, 4))
+    assert shapes[-2] == (1, 1)
+    assert shapes[-1] == shapes[0]  # the last policies of all are evaluated together
+    assert len(set(shapes)) > 3
+    monkeypatch.setattr(plan, "_CPU_EPISODES", (48,))
+    monkeypatch.setattr(programs, "pack", in_place)
+    assert run(f"{command} --output wide") == 0
+    one, other = curves(Path("packed")), curves(Path("wide"))
+    assert len(set(one["env_steps"][-1])) > 6
+    assert (same if exact else close)(one, other)
+
+
+def test_blocks_without_a_pause_change_nothing(run, monkeypatch):
+    """Runs that one slot holds make several blocks before the host looks at them."""
+    command = f"{STEPS} --num-seeds 2"
+    monkeypatch.setattr(plan, "_CPU_EPISODES", (24,))
+    made, advance = [], programs.Programs.advance
+
+    def counted(*arguments):
+        blocks = advance(*arguments)
+        made.append(len(blocks))
+        return blocks
+
+    monkeypatch.setattr(programs.Programs, "advance", counted)
+    monkeypatch.setattr(chunks, "_SECONDS", 60.0)
+    assert run(f"{command} --output several") == 0
+    assert made[:4] == [1, 2, 4, 8]
+    several, total = curves(Path("several")), sum(made)
+    monkeypatch.setattr(chunks, "_SECONDS", 0.0)
+    made.clear()
+    assert run(f"{command} --output each") == 0
+    assert set(made) == {1}
+    assert len(made) == total == len(several["env_steps"]) - 1
+    assert same(several, curves(Path("each")))
+
+
+def test_a_crash_among_runs_that_ended_changes_nothing(run, monkeypatch):
+    """A checkpoint holds the runs that train and those that lie aside."""
+    monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
+    command = f"{STEPS} --num-seeds 4 --checkpoint-every 1"
+    assert run(f"{command} --output whole") == 0
+    save, ended = conduct.Saver.save, []
+
+    def crash(self, states, history):
+        save(self, states, history)
+        ended.append((history.now["env_steps"] >= 300).sum())
+        if 3 < ended[-1] < 9:
+            raise CrashError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(conduct.Saver, "save", crash)
+        with pytest.raises(CrashError):
+            run(f"{command} --output crashed")
+    assert run("--resume crashed") == 0
+    assert same(curves(Path("whole")), curves(Path("crashed")))
+
+
+def test_a_full_disk_costs_no_training(run, monkeypatch, capsys):
+    """As in a run: a checkpoint that cannot be written is a warning, and the next one is tried."""
+    command = f"{STEPS} --num-seeds 2 --checkpoint-every 1"
+    assert run(f"{command} --output whole") == 0
+    save, tried = chunks.checkpoint.save, []
+
+    def full(*arguments, **options):
+        tried.append(None)
+        if len(tried) in (1, 2, 4):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(*arguments, **options)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(chunks.checkpoint, "save", full)
+        assert run(f"{command} --output full") == 0
+    assert len(tried) > 4
+    assert same(curves(Path("whole")), curves(Path("full")))
+    said = capsys.readouterr().out
+    assert said.count("warning: cannot write a checkpoint (No space left on device)") == 2
+
+
+def test_a_chunk_that_was_interrupted_before_its_first_update_goes_on(run, monkeypatch):
+    command = f"{STEPS} --num-seeds 4 --chunk-runs 4"
+    assert run(f"{command} --output whole") == 0
+    drive, driven = conduct.drive, []
+
+    def interrupted(chunk, asked):
+        driven.append(None)
+        return len(driven) == 1 and drive(chunk, asked)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(conduct, "drive", interrupted)
+        assert run(f"{command} --output parts") == 0
+    assert json.loads(Path("parts/sweep.json").read_text())["status"] == "interrupted"
+    assert run("--resume parts") == 0
+    assert same(curves(Path("whole")), curves(Path("parts")))
+
+
+def test_a_chunk_that_goes_on_saves_when_it_is_due(run, monkeypatch):
+    """Not at its first look: the checkpoint that it was found in counts."""
+    monkeypatch.setattr(chunks, "_SECONDS", 0.0)
+    command = f"{SMALL} --num-seeds 2 --eval-every 1 --checkpoint-every 4 {RATES}"
+    save, saved = conduct.Saver.save, []
+
+    def crash(self, states, history):
+        save(self, states, history)
+        saved.append(int(history.now["updates"].max()))
+        if saved == [4]:
+            raise CrashError
+
+    monkeypatch.setattr(conduct.Saver, "save", crash)
+    with pytest.raises(CrashError):
+        run(f"{command} --max-updates 9 --output crashed")
+    assert run("--resume crashed") == 0
+    assert saved == [4, 8]
+
+
+def start(count, command, folder):
+    """Starts a sweep in a process that has so many devices."""
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={count}"
+    environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": PYTHONPATH}
+    line = [sys.executable, "-m", "mjx_reinforce.sweep", *command.split()]
+    return subprocess.Popen(line, cwd=folder, env=environment, stdout=subprocess.DEVNULL)
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize("exact", [False, True])
+def test_devices_change_nothing_but_rounding(run, tmp_path, exact):
+    command = f"{STEPS} --num-seeds 3 {'--exact' * exact}"
+    assert run(f"{command} --output one") == 0
+    elsewhere = command.replace("Drift-v0", "toys:Drift")
+    assert start(8, f"{elsewhere} --output eight", tmp_path).wait(timeout=120) == 0
+    one, eight = curves(tmp_path / "one"), curves(tmp_path / "eight")
+    assert (same if exact else close)(one, eight)
+
+
+@pytest.mark.parametrize("where", ["after", "between"])
+def test_a_sweep_that_crashed_goes_on(run, monkeypatch, where):
+    """From a checkpoint inside a chunk, or after a chunk."""
+    command = f"{SMALL} --num-seeds 2 --max-updates 20 --checkpoint-every 5 {RATES} --chunk-runs 3"
+    assert run(f"{command} --output whole") == 0
+    owner, name = (conduct.Saver, "save") if where == "after" else (conduct.SweepFiles, "add")
+    calls, original = [], getattr(owner, name)
+
+    def crash(*arguments):
+        original(*arguments)
+        calls.append(arguments)
+        if len(calls) == (6 if where == "after" else 1):
+            raise CrashError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, crash)
+        with pytest.raises(CrashError):
+            run(f"{command} --output crashed")
+    assert json.loads(Path("crashed/sweep.json").read_text())["status"] == "running"
+    assert len(list(Path("crashed/parts").glob("[0-9]*.npz"))) == 1
+    assert run("--resume crashed") == 0
+    assert same(curves(Path("whole")), curves(Path("crashed")))
+    assert Path("whole/results.csv").read_bytes() == Path("crashed/results.csv").read_bytes()
+    reported = []
+    written = Written(1.0, [], 0)
+    monkeypatch.setattr(perform, "_report", lambda directory: reported.append(directory) or written)
+    assert run("--resume crashed") == 0  # there is nothing left to do
+    assert reported == []
+    path = Path("crashed/sweep.json")
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"statistics_seconds": None}))
+    assert run("--resume crashed") == 0  # killed before the report was written
+    assert reported == [Path("crashed")]
+    assert run("--resume crashed --learning-rate 0.5") == 2
+
+
+def test_what_a_kill_left_of_a_report_goes(tmp_path, monkeypatch):
+    """A write that was killed leaves a file with a name of its own."""
+    (tmp_path / "report").mkdir()
+    left = [tmp_path / ".report.html.12ab", tmp_path / "report" / ".final.png.8f95"]
+    for path in left:
+        path.write_text("half")
+    nothing = Written(0.0, [], 0)
+    monkeypatch.setattr("mjx_reinforce.report.write_sweep", lambda directory, output: nothing)
+    assert perform._report(tmp_path) == nothing
+    assert not any(path.exists() for path in left)
+
+
+def test_what_ended_earlier_repeats_its_last_row():
+    joined = join(
+        [
+            {"configuration": np.array([1, 0]), "seed": np.array([0, 0]), "eval_return": np.eye(2)},
+            {
+                "configuration": np.array([0]),
+                "seed": np.array([1]),
+                "eval_return": np.full((3, 1), 7.0),
+            },
+        ]
+    )
+    assert joined["configuration"].tolist() == [0, 0, 1]
+    assert joined["seed"].tolist() == [0, 1, 0]
+    assert joined["eval_return"].tolist() == [[0, 7, 1], [1, 7, 0], [1, 7, 0]]
+
+
+def test_numbers_share_a_program_and_the_rest_does_not():
+    over = {"learning_rate": [1e-3, 1e-2], "max_grad_norm": [1.0, None, 2.0]}
+    configs = configure(Config(), grid(over))
+    groups = make_groups(configs, tuple(over), exact=False)
+    assert [group.members.tolist() for group in groups] == [[0, 2, 3, 5], [1, 4]]
+    assert groups[0].settings["max_grad_norm"].tolist() == [1.0, 2.0, 1.0, 2.0]
+    # Left alone, it follows the first rate.
+    assert np.allclose(groups[1].settings["final_learning_rate"], [1e-4, 1e-3])
+
+
+def test_values_are_read_as_their_settings_are():
+    over = read_over(
+        [
+            ("hidden-sizes", "none", "32,32"),
+            ("max-grad-norm", "None", "1"),
+            ("standardize", "True", "false"),
+            ("estimator", "total-return", "reward-to-go"),
+            ("eval_every", "2", "3"),
+        ]
+    )
+    assert over == {
+        "hidden_sizes": [(), (32, 32)],
+        "max_grad_norm": [None, 1.0],
+        "standardize": [True, False],
+        "estimator": ["total-return", "reward-to-go"],
+        "eval_every": [2, 3],
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "nothing is swept"),
+        (
+            "--over learning-rat 1 2",
+            "unknown setting 'learning-rat' after --over. Did you mean 'learning-rate'?",
+        ),
+        ("--over learning-rate", "needs two values or more"),
+        ("--over learning-rate 1e-3", "for one value pass --learning-rate"),
+        ("--over learning-rate 1e-3 1e-3", "has the value 0.001 twice"),
+        ("--over learning-rate 1e-3 x", "'x', which is no number"),
+        ("--over learning-rate 1 2 --over learning_rate 3 4", "given twice"),
+        ("--over learning-rate 1e-3 -1", "--learning-rate must be positive"),
+        ("--over env CartPole-v0 CartPole-v1", "cannot go over env"),
+        ("--over seed 1 2", "cannot go over seed"),
+        ("--over value-learning-rate 1e-3 1e-2", "would do nothing"),
+        ("--over learning-rate 1e-2 1e-3 --value-fits 3", "--value-fits 3 would do nothing"),
+        ("--over learning-rate 1e-2 1e-3 --stop-when-solved", "not for sweeps"),
+        ("--over learning-rate 1e-2 1e-3 --chunk-runs 0", "--chunk-runs must be at least 1"),
+        ("--over learning-rate 1e-2 1e-3 --jsonl", "--jsonl logs a run"),
+        ("--over tensorboard True False", "cannot go over tensorboard"),
+        ("--over minutes 1 2", "cannot go over minutes"),
+        ("--over init-from a b", "cannot go over init-from"),
+        ("--over like a b", "cannot go over like"),
+        ("--update natural-gradient --over max-kl None 0.1", "from --max-kl, which is None"),
+        ("--min-episodes 9 --max-episodes 4 --over num-episodes 2 auto", "--min-episodes must be"),
+        ("--over learning-rate 1 2 --num-seeds 2000000000", "results of 4,000,000,000 runs do not"),
+        (
+            "--over discount 0 1 --search random --budget 2000000000",
+            "lower --num-seeds or --budget",
+        ),
+        ("--resume nowhere", "cannot read nowhere/sweep.json"),
+    ],
+)
+def test_bad_sweeps_are_refused(run, capsys, tmp_path, monkeypatch, arguments, message):
+    monkeypatch.setattr(conduct, "compile_programs", lambda *_: pytest.fail("it was compiled"))
+    assert run(f"--env Drift-v0 {arguments}") == 2
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
+    assert printed.out == ""
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("base", "over"),
+    [
+        ({"update": "natural-gradient"}, {"max_kl": [0.01, 0.1]}),
+        ({"env_steps": None}, {"max_updates": [1, 2]}),
+        ({"num_episodes": 1}, {"estimator": ["reward-to-go", "total-return"]}),
+    ],
+)
+def test_what_every_configuration_sets_need_not_be_given_besides(base, over):
+    config = Config(env="CartPole-v1", **base)
+    with pytest.raises(ValueError, match=r"--max-kl|nothing would end|leave-one-out"):
+        check(config)
+    check_design(Design(base=config, over=over))
+
+
+def test_a_sweep_over_the_length_of_natural_gradients(run):
+    """As one over configurations that each have it from the command line."""
+    shared = f"{SMALL} --num-seeds 2 --max-updates 3 --update natural-gradient"
+    assert run(f"{shared} --over max-kl 0.01 0.1 --output swept") == 0
+    assert run(f"{shared} --max-kl 1.0 --over max-kl 0.01 0.1 --output given") == 0
+    swept, given = curves(Path("swept")), curves(Path("given"))
+    assert same(swept, given)
+    assert not same({"": swept["eval_return"][:, :2]}, {"": swept["eval_return"][:, 2:]})
+
+
+def test_a_flag_that_one_configuration_reads_is_accepted():
+    configurations = grid({"estimator": ["leave-one-out", "value-baseline"]})
+    configure(Config(value_fits=3), configurations, given=["value_fits"])
+    with pytest.raises(ValueError, match="would do nothing"):
+        configure(Config(decay_steps=None), grid({"final_learning_rate": [1e-3, 1e-2]}))
+
+
+def test_halving_goes_on_with_the_better_half(run, monkeypatch):
+    """The winner's training is that of a run alone, and its last figure is of other seeds.
+
+    Every rung has the programs of the first.
+    """
+    compiled = []
+
+    def compile_programs(*arguments):
+        compiled.append(arguments)
+        return programs.compile_programs(*arguments)
+
+    monkeypatch.setattr(conduct, "compile_programs", compile_programs)
+    over = "--over learning-rate 1e-3 1e-1 --over estimator leave-one-out total-return "
+    command = f"{SMALL} --num-seeds 3 --max-updates 20 --search halving --budget 5 {over}"
+    assert run(f"{command} --output swept") == 0
+    assert len(compiled) == 2  # of an estimator each
+    results = read_results(Path("swept"))
+    configurations = results.configurations
+    rates = [values["learning_rate"] for values in configurations]
+    assert len(set(rates)) == 5
+    assert all(1e-3 <= rate <= 1e-1 for rate in rates)
+    last = results.env_steps[-1].reshape(5, 3)
+    winner = json.loads(Path("swept/sweep.json").read_text())["winner"]
+    chosen = winner["configuration"]
+    assert np.all(last[chosen] == last.max(axis=0))
+    alone = f"{SMALL} --num-seeds 3 --max-updates 20 "
+    alone += f"--learning-rate {rates[chosen]} --estimator {configurations[chosen]['estimator']}"
+    assert run(f"{alone} --output alone", train_module) == 0
+    summary = json.loads(Path("alone/summary.json").read_text())
+    runs = results.configuration == chosen
+    final = results.eval_return[-1, runs]
+    assert np.allclose(final, summary["final_returns"], rtol=1e-4, equal_nan=True)
+    assert results.env_steps[-1, runs].tolist() == summary["env_steps"]
+    assert run(f"{alone} --seed 1 --output fresh", train_module) == 0
+    summary = json.loads(Path("fresh/summary.json").read_text())
+    assert np.allclose(winner["final_returns"], summary["final_returns"], rtol=1e-4)
+    assert winner["iqm"] == pytest.approx(summary["iqm"], rel=1e-4)
+
+
+def test_programs_have_run_once_for_no_run_before_they_train(run, monkeypatch):
+    """A GPU's driver translates kernels when they first run: that is compiling too."""
+    made, block_of_updates = [], programs.block_of_updates
+
+    def counting(*arguments):
+        advance = block_of_updates(*arguments)
+
+        def counted(*arguments):
+            state, block = advance(*arguments)
+            jax.debug.callback(lambda x: made.append(int(x)), block.made)
+            return state, block
+
+        return counted
+
+    monkeypatch.setattr(programs, "block_of_updates", counting)
+    assert run(f"{SMALL} --num-seeds 2 --max-updates 3 {RATES} --output swept") == 0
+    jax.effects_barrier()
+    assert made[0] == 0
+    assert sum(made) >= 3
+
+
+def test_half_the_configurations_stay_until_one_is_left():
+    returns = {"configuration": np.repeat(np.arange(6), 2), "eval_return": np.zeros((3, 12))}
+    returns["eval_return"][-1] = [5, 5, 1, 1, 9, 9, np.nan, np.nan, 5, 5, 7, 7]
+    assert rungs.best(returns, 3) == [0, 2, 5]  # of two that are equal, the first
+    configs = configure(Config(), grid({"learning_rate": [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2]}))
+    groups = make_groups(configs, ["learning_rate"], exact=False)
+
+    def measured(name):
+        assert name == str(len(seen) - 1)
+        kept = seen[-1].groups[0].members
+        return {"configuration": kept, "eval_return": kept[None].astype(float)}
+
+    seen = []
+    for rung in rungs.schedule(groups, "halving", measured):
+        seen.append(rung)
+    assert [rung.name for rung in seen] == ["0", "1", "2", "3", "fresh"]
+    kept = [rung.groups[0].members.tolist() for rung in seen]
+    assert kept == [[0, 1, 2, 3, 4, 5], [3, 4, 5], [4, 5], [5], [5]]
+    budgets = [rung.groups[0].config.env_steps for rung in seen]
+    assert budgets == [35_000, 70_000, 140_000, 280_000, 280_000]
+    assert [rung.groups[0].config.seed for rung in seen] == [0, 0, 0, 0, 1]
+    assert seen[-1].groups[0].settings["learning_rate"].tolist() == [3e-2]
+
+
+def test_ranges_are_drawn_as_their_settings_are():
+    over = {
+        "learning_rate": [1e-4, 1e-1],
+        "discount": [0.9, 0.999],
+        "num_episodes": [4, 7],
+        "estimator": ["leave-one-out", "total-return"],
+        "entropy_cost": [0.0, 0.25, 1.0],
+    }
+    drawn = search.draw(over, 400, seed=0)
+    assert drawn == search.draw(over, 400, seed=0)
+    assert drawn != search.draw(over, 400, seed=1)
+    columns = {name: [values[name] for values in drawn] for name in over}
+    # Half of the draws lie on each side of the middle of the scale: 200, standard deviation 10.
+    assert abs(np.sum(np.array(columns["learning_rate"]) < 10**-2.5) - 200) < 50
+    assert abs(np.sum(1 - np.array(columns["discount"]) < 1e-2) - 200) < 50
+    assert set(columns["num_episodes"]) == {4, 5, 6, 7}
+    assert set(columns["estimator"]) == set(over["estimator"])
+    assert set(columns["entropy_cost"]) == {0.0, 0.25, 1.0}
+    with pytest.raises(ValueError, match="only 2 different"):
+        search.draw({"estimator": over["estimator"]}, 3, seed=0)
+
+
+@pytest.mark.parametrize("report", [True, False])
+def test_from_python_a_report_can_be_left_out(register, monkeypatch, tmp_path, capsys, report):
+    written = Written(1.5, ["The best is learning rate 0.03.", "It is sure."], 1)
+    monkeypatch.setattr(perform, "_report", lambda directory: written)
+    base = Config(
+        env="Drift-v0", num_seeds=2, num_episodes=4, eval_episodes=2, env_steps=None, max_updates=2
+    )
+    results = mjx_reinforce.sweep(
+        base, {"learning_rate": [1e-2, 3e-2]}, output=tmp_path / "out", report=report
+    )
+    assert results.eval_return.shape[1] == 4
+    known = json.loads((tmp_path / "out" / "sweep.json").read_text())
+    assert known["statistics_seconds"] == (1.5 if report else None)
+    said = capsys.readouterr().out
+    assert ("statistics and report" in said) == report
+    assert ("The best is learning rate 0.03.\nIt is sure.\n" in said) == report
+    assert (f"mjx_reinforce.watch {tmp_path}/out/policies/001\n" in said) == report
+    assert (tmp_path / "out/policies/001/config.json").is_file()
+
+
+def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
+    """To the bit: played on the starts of the sweep's evaluations they return what it measured."""
+    command = f"{SMALL} --num-seeds 5 --chunk-runs 6 --max-updates 6 {RATES} --output swept"
+    assert run(command) == 0
+    results, env = read_results(Path("swept")), envs.make("Drift-v0")
+    assert not list(Path("swept/parts").glob("policies-*"))
+    for number in range(3):
+        chosen = results.configuration == number
+        final, seeds = results.eval_return[-1, chosen], results.seed[chosen]
+        folder = Path(f"swept/policies/{number:03d}")
+        known = read_run(folder)
+        ranked = np.nan_to_num(final, nan=-np.inf)  # a broken evaluation is the worst
+        worst, best = int(seeds[ranked.argmin()]), int(seeds[ranked.argmax()])
+        assert known.seeds == tuple(sorted({worst, best}))
+        assert choose_seed(known, "worst") == worst
+        assert choose_seed(known, "best") == best
+        config = Config(env="Drift-v0", num_seeds=5, eval_episodes=2, hidden_sizes=(4,))
+        learner, horizon = build(env, config)
+        evaluate = jax.jit(evaluation(env, learner, horizon, config, sampled=False))
+        for seed in known.seeds:
+            actor = jax.tree.map(lambda x: x[None], load_seed(known, seed)[0].actor)
+            returns = evaluate(actor, eval_keys(config)[seed : seed + 1])["eval_return"]
+            np.testing.assert_array_equal(returns[0], final[seeds == seed][0])
+    with pytest.raises(ValueError, match="has the policies of the seeds"):
+        load_seed(read_run(Path("swept/policies/000")), 99)

@@ -1,0 +1,500 @@
+"""Checkpoints: a run that goes on ends as one that never stopped, whatever happens to its files."""
+
+import contextlib
+import csv
+import errno
+import functools
+import json
+import os
+import resource
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from command_lines import added_environments, run_command
+from saved_runs import assert_same
+
+from mjx_reinforce import files
+from mjx_reinforce import files as export_files
+from mjx_reinforce import train as train_module
+from mjx_reinforce.engines.native.cpu import machine
+from mjx_reinforce.learners import counts
+from mjx_reinforce.learners.learner import TrainState
+from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.runs.directory import locked, make_directory
+from mjx_reinforce.runs.log import RunLog
+from mjx_reinforce.runs.observers import RunFiles
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training import checkpoint
+from mjx_reinforce.training.best import first_best, keep_best
+from mjx_reinforce.training.driver import Driver
+from mjx_reinforce.training.record import Record
+from mjx_reinforce.training.state import Looked
+
+SIZE = ["--num-seeds", "3", "--eval-episodes", "2", "--hidden-sizes", "4"]
+ANY = ["--env", "Drift-v0", "--env-steps", "None", *SIZE]
+#: A rate that lasts as long as the budget would make another run of a larger one.
+COMMON = [*ANY, "--num-episodes", "4", "--decay-steps", "9000"]
+AUTO = ["--num-episodes", "auto", "--min-episodes", "2", "--max-episodes", "16"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--estimator", "value-baseline", "--value-hidden-sizes", "4", "--value-fits", "2"],
+        ["--algorithm", "ars", "--num-directions", "3"],
+        ["--one-start", "--update", "minibatches", "--minibatch-updates", "3"],
+        [*AUTO, "--decay-steps", "9000"],
+    ],
+)
+def test_a_run_in_two_parts_is_the_run_in_one(run, tmp_path, arguments):
+    """Also where the first part ends in the middle of a block, or between two checkpoints."""
+    common = ANY if {"ars", "auto"} & {*arguments} else COMMON
+    assert run(*common, *arguments, "--max-updates", 24, "--output", "whole") == 0
+    more = ["--checkpoint-every", 5, "--output", "parts"]
+    assert run(*common, *arguments, "--max-updates", 10, *more) == 0
+    assert run("--resume", "parts", "--max-updates", 13) == 0
+    assert run("--resume", "parts", "--max-updates", 24) == 0
+    assert_same(tmp_path / "whole", tmp_path / "parts")
+    config = json.loads((tmp_path / "parts" / "config.json").read_text())
+    assert config["max_updates"] == 24
+    assert [entry["updates"] for entry in config["resumed"]] == [10, 10]
+    assert not list((tmp_path / "parts").rglob(".*"))
+
+
+def test_episodes_are_counted_where_their_number_follows_the_noise(run, tmp_path):
+    """Each seed's own, between the bounds, and not the same in every update."""
+    assert run(*ANY, *AUTO, "--max-updates", 20, "--eval-every", 1, "--output", "out") == 0
+    rows = list(csv.DictReader((tmp_path / "out" / "metrics.csv").read_text().splitlines()))
+    seeds = sorted({row["seed"] for row in rows})
+    counts = [[int(row["episodes"]) for row in rows if row["seed"] == s] for s in seeds]
+    played = np.diff(counts, axis=1)
+    assert played.shape == (len(seeds), 20)
+    assert played.min() >= 2
+    assert played.max() <= 16
+    assert np.all(played[:, 0] == 2)
+    assert len(np.unique(played)) > 3
+    assert len({*map(tuple, played)}) == len(seeds)
+
+
+def test_seeds_that_stood_still_are_played_again(run, tmp_path):
+    """Under --env-steps they stop one by one; a run of a larger budget knows no such state."""
+    steps = [*COMMON, "--env-steps"]
+    assert run(*steps, 900, "--output", "whole") == 0
+    assert run(*steps, 300, "--checkpoint-every", 5, "--output", "parts") == 0
+    updates = json.loads((tmp_path / "parts" / "summary.json").read_text())["best_updates"]
+    assert run("--resume", "parts", "--env-steps", 900) == 0
+    assert_same(tmp_path / "whole", tmp_path / "parts")
+    assert len(updates) == 3
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run of 20 updates; its checkpoints at 15 and 20 are left."""
+    directory = tmp_path_factory.mktemp("trained")
+    with added_environments(), contextlib.chdir(directory):
+        budget = ["--max-updates", "20", "--checkpoint-every", "5", "--output", "whole"]
+        assert run_command(*COMMON, *budget) == 0
+    return directory / "whole"
+
+
+@pytest.fixture
+def parts(trained, tmp_path):
+    """A copy of that run, as if it had been killed at its end."""
+    shutil.copytree(trained, tmp_path / "parts")
+    (tmp_path / "parts" / "summary.json").write_text('{"status": "running"}')
+    return tmp_path / "parts"
+
+
+def checkpoints(directory):
+    return sorted((directory / "checkpoint").iterdir())
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "changed", "all"])
+def test_a_damaged_checkpoint_costs_an_interval(run, trained, parts, capsys, damage):
+    old, new = checkpoints(parts)
+    content = new.read_bytes()
+    new.write_bytes({"cut": content[:-7], "empty": b""}.get(damage, content[:-1] + b"!"))
+    if damage == "all":
+        old.unlink()
+    assert run("--resume", "parts") == 0
+    assert_same(trained, parts)
+    output = capsys.readouterr().out
+    assert f"checkpoint {new.name} is damaged; trying the one before" in output
+    assert f"going on after {0 if damage == 'all' else 15} updates" in output
+
+
+def test_a_checkpoint_that_is_compressed_is_none(trained, tmp_path):
+    """A few bytes can ask for gigabytes; whoever writes such a file can name it by its digest."""
+    [*_, newest] = checkpoints(trained)
+    with np.load(newest) as archive:
+        np.savez_compressed(tmp_path / "small.npz", **archive)
+    number, digest = newest.name.split("-")[0], checkpoint._digest
+    packed = (tmp_path / "small.npz").read_bytes()
+    named = (tmp_path / "small.npz").rename(tmp_path / f"{number}-{digest(packed)}.npz")
+    assert checkpoint._read(named) is None
+    assert checkpoint._read(newest) == newest.read_bytes()
+    assert checkpoint.settings_of(tmp_path) == {}
+
+
+def test_a_shortened_table_is_played_again(run, trained, parts, capsys):
+    metrics = parts / "metrics.csv"
+    metrics.write_bytes(metrics.read_bytes()[:-7])
+    assert run("--resume", "parts") == 0
+    assert_same(trained, parts)
+    assert "metrics.csv is shorter than at checkpoint 4" in capsys.readouterr().out
+
+
+def test_rows_after_the_checkpoint_are_played_again(run, trained, parts):
+    checkpoints(parts)[-1].unlink()
+    with (parts / "metrics.csv").open("a") as file:
+        file.write("0,25,half a ro")
+    assert run("--resume", "parts") == 0
+    assert_same(trained, parts)
+
+
+def test_a_full_disk_costs_no_training(run, trained, tmp_path, monkeypatch, capsys):
+    """Neither checkpoints nor policies nor rows can be written, then all of them again."""
+    written, real = [], export_files.write_bytes
+    appended, real_append = [], files.append
+
+    def full(path, content):
+        written.append(path.name)
+        if path.suffix == ".npz" and len(written) < 20:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real(path, content)
+
+    def full_for_rows(path, content):
+        appended.append(content)
+        if 1 < len(appended) < 4:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        real_append(path, content)
+
+    monkeypatch.setattr(files, "append", full_for_rows)
+    for module in (checkpoint, export_files):
+        monkeypatch.setattr(module, "write_bytes", full)
+    arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "full"]
+    assert run(*COMMON, *arguments) == 0
+    assert_same(trained, tmp_path / "full")
+    output = capsys.readouterr().out
+    for what in ("a checkpoint", "metrics.csv"):
+        assert f"warning: cannot write {what} (No space left on device)" in output
+
+
+def test_a_run_that_cannot_end_is_resumed(run, trained, tmp_path, monkeypatch, capsys):
+    def full(path, content):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("mjx_reinforce.runs.log.write_bytes", full)
+    arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "full"]
+    assert run(*COMMON, *arguments) == 1
+    assert "then go on with --resume full" in capsys.readouterr().err
+    assert json.loads((tmp_path / "full" / "summary.json").read_text())["status"] == "running"
+    monkeypatch.undo()
+    assert run("--resume", "full") == 0
+    assert_same(trained, tmp_path / "full")
+
+
+def signalled(method, when):
+    """The method, and after its ``when``-th call a signal, which has been heard when it returns."""
+    calls = []
+
+    @functools.wraps(method)
+    def called(*arguments):
+        result = method(*arguments)
+        calls.append(None)
+        if len(calls) == when:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.3)
+        return result
+
+    return called
+
+
+@pytest.mark.parametrize(
+    ("owner", "name", "when", "status", "rows"),
+    [
+        (RunLog, "begin", 1, 143, 1),
+        (Driver, "advance", 2, 143, 2),  # whose evaluation is left to the run that goes on
+        (Driver, "advance", 4, 143, 4),
+        (RunFiles, "save_if_due", 2, 143, 2),
+        (Record, "add_test", 1, 143, 5),
+        (Record, "add_test", 2, 0, 5),  # nothing is left to stop
+        (RunFiles, "save_policies", 5, 0, 5),
+    ],
+)
+def test_a_signal_anywhere_costs_nothing(
+    run, trained, tmp_path, monkeypatch, owner, name, when, status, rows
+):
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, name, signalled(getattr(owner, name), when))
+        arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "parts"]
+        assert run(*COMMON, *arguments) == status
+    summary = json.loads((tmp_path / "parts" / "summary.json").read_text())
+    assert summary["status"] == ("interrupted" if status else "finished")
+    assert ("final_test_returns" in summary) == (status == 0)
+    assert (tmp_path / "parts" / "metrics.csv").read_text().count("\n") == 1 + 3 * rows
+    if status:
+        assert run("--resume", "parts") == 0
+    assert_same(trained, tmp_path / "parts")
+
+
+@pytest.mark.parametrize("resumed", [False, True])
+def test_a_full_disk_is_refused_at_once(run, parts, tmp_path, monkeypatch, capsys, resumed):
+    """A limit on the size of files stands for it."""
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    arguments = ["--resume", "parts"] if resumed else [*COMMON, "--output", "new/out"]
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.setattr(train_module, "make_plan", pytest.fail)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        code = run(*arguments, "--max-updates", 30)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert code == 2
+    assert "(File too large); make room there" in capsys.readouterr().err
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_screen_that_takes_nothing_ends_no_run(run, trained, tmp_path, monkeypatch, capsys):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("rich.console.Console.print", full)
+    arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "out"]
+    assert run(*COMMON, *arguments) == 0
+    assert_same(trained, tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--learning-rate", "0.5"], "--learning-rate is 0.01 in parts and cannot become 0.5"),
+        (["--eval-every", "1"], "--eval-every is 5"),
+        (["--num-seeds", "4"], "--num-seeds is 3"),
+        (["--output", "other"], "leave --output out"),
+        (["--overwrite"], "leave --output out"),
+        (["--max-updates", "13"], "--max-updates 13 is less than the 20"),
+        (["--checkpoint-every", "0"], "--checkpoint-every must be at least 1"),
+    ],
+)
+def test_only_the_budget_may_change(run, parts, capsys, arguments, message):
+    before = {path: path.read_bytes() for path in parts.rglob("*") if path.is_file()}
+    assert run("--resume", "parts", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") <= 2
+    assert before == {path: path.read_bytes() for path in parts.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda old: {"packages": old["packages"] | {"jax": "0.1"}}, "was begun with jax 0.1"),
+        (lambda old: {"device": "TPU"}, "was begun with device TPU"),
+        (lambda old: {"cpu": "i486"}, "was begun with cpu i486"),
+        (lambda old: {"cores": 77}, "was begun with cores 77"),
+        (
+            lambda old: {"jax_settings": {"jax_default_matmul_precision": "low"}},
+            "was begun with jax_default_matmul_precision low",
+        ),
+        (lambda old: {"num_seeds": "four"}, "num_seeds is 'four'"),
+        (lambda old: {"hidden_sizes": [1.5]}, "hidden_sizes is (1.5,)"),
+        (lambda old: {"eval_every": None}, "eval_every is None: it is damaged, or of another"),
+        (
+            lambda old: {"engine": "kernel"},
+            "engine is 'kernel', not one of auto, vmap, fused, native: it is damaged, or of "
+            "another version of the program; resume with the version that wrote it",
+        ),
+    ],
+)
+def test_what_cannot_be_resumed_is_named(run, parts, capsys, change, message):
+    path = parts / "config.json"
+    config = json.loads(path.read_text())
+    path.write_text(json.dumps(config | change(config)))
+    assert run("--resume", "parts") == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"learning_rate": 0.5}, "learning_rate is 0.5, but the run was trained with 0.01"),
+        ({"hidden_sizes": [8]}, "hidden_sizes is [8], but the run was trained with [4]"),
+        ({"seed": 1}, "seed is 1, but the run was trained with 0"),
+        ({"horizon": 7}, "horizon is 7, but the run was trained with"),
+    ],
+)
+def test_settings_changed_by_hand_are_noticed(run, parts, capsys, change, message):
+    path = parts / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | change))
+    assert run("--resume", "parts") == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") <= 2
+
+
+def test_a_budget_changed_by_hand_is_a_budget(run, parts):
+    path = parts / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"max_updates": 24}))
+    assert run("--resume", "parts") == 0
+    with (parts / "metrics.csv").open(newline="") as file:
+        assert [row["update"] for row in csv.DictReader(file)][-3:] == ["24"] * 3
+
+
+@pytest.mark.parametrize("content", [None, "{", "[]", "{}"])
+def test_what_is_no_run_is_named(run, tmp_path, capsys, content):
+    (tmp_path / "out").mkdir()
+    if content is not None:
+        (tmp_path / "out" / "config.json").write_text(content)
+    assert run("--resume", "out") == 2
+    assert "config.json" in capsys.readouterr().err
+
+
+def test_two_processes_do_not_train_in_one_directory(run, parts, capsys):
+    with locked(parts):
+        assert run("--resume", "parts") == 2
+    assert "another process trains in parts" in capsys.readouterr().err
+
+
+def test_the_folder_of_a_run_that_begins_elsewhere_stays(run, tmp_path, monkeypatch, capsys):
+    """Of two processes one makes the folder, and the other is quicker to train in it."""
+    with contextlib.ExitStack() as other:
+
+        def quicker(directory):
+            other.enter_context(locked(directory))
+            return locked(directory)
+
+        monkeypatch.setattr("mjx_reinforce.runs.directory.locked", quicker)
+        assert run("--output", "out/in") == 2
+    assert "another process trains in out/in" in capsys.readouterr().err
+    assert (tmp_path / "out" / "in").is_dir()
+
+
+def test_a_folder_that_another_process_makes_is_not_ours(tmp_path, monkeypatch):
+    mkdir = Path.mkdir
+
+    def late(folder, *arguments):
+        mkdir(folder, *arguments)
+        return mkdir(folder, *arguments)
+
+    monkeypatch.setattr(Path, "mkdir", late)
+    assert make_directory(tmp_path / "a" / "b", False) == []
+    monkeypatch.undo()
+    assert make_directory(tmp_path / "c" / "d", False) == [
+        tmp_path / "c" / "d",
+        tmp_path / "c",
+    ]
+
+
+def test_a_finished_run_has_nothing_to_do(run, tmp_path, capsys):
+    assert run(*COMMON, "--max-updates", 5, "--output", "out") == 0
+    before = (tmp_path / "out" / "summary.json").read_bytes()
+    assert run("--resume", "out") == 0
+    assert "is finished" in capsys.readouterr().out
+    assert (tmp_path / "out" / "summary.json").read_bytes() == before
+
+
+def test_the_best_policies_are_kept_and_tested(run, tmp_path):
+    assert run(*COMMON, "--max-updates", 20, "--output", "out") == 0
+    out = tmp_path / "out"
+    rows = [line.split(",") for line in (out / "metrics.csv").read_text().splitlines()]
+    names = rows[0]
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["status"] == "finished"
+    for seed, update in enumerate(summary["best_updates"]):
+        mine = [dict(zip(names, row, strict=True)) for row in rows[1:] if row[0] == str(seed)]
+        best = max(float(row["eval_return"]) for row in mine)
+        latest = [row for row in mine if float(row["eval_return"]) == best][-1]
+        assert int(latest["update"]) == update
+        last = update == 20
+        ours = [summary[f"{kind}_test_returns"][seed] for kind in ("final", "best")]
+        assert (ours[0] == ours[1]) == last
+
+
+def test_ties_go_to_the_later_and_nan_is_never_best():
+    def state(updates):
+        normalizer = jax.vmap(lambda _: normalize.init(2))(jnp.zeros(3))
+        return TrainState(
+            key=jax.random.split(jax.random.key(0), 3),
+            num_updates=jnp.tile(counts.from_int(updates), (3, 1)),
+            env_steps=jnp.tile(counts.zero(), (3, 1)),
+            progress=jnp.zeros(3),
+            actor=Actor(params={"w": jnp.full((3, 2), float(updates))}, normalizer=normalizer),
+            opt_state=(),
+            estimator_state=(),
+        )
+
+    nan = np.nan
+    best = first_best(state(0))
+    for updates, returns in ((0, [1, 2, nan]), (5, [1, 1, 3]), (10, [0, 2, nan])):
+        now = state(updates)
+        measured = {"eval_return": np.array(returns, np.float32)}
+        best = keep_best(best, Looked(jax.device_get(now.actor), now.num_updates, measured))
+    assert counts.to_int(best.num_updates).tolist() == [5, 10, 5]
+    np.testing.assert_array_equal(best.actor.params["w"][:, 0], [5, 10, 5])
+    np.testing.assert_array_equal(best.eval_return, [1, 2, 3])
+
+
+def test_a_record_comes_back_whole():
+    rng = np.random.default_rng(0)
+    config = Config(num_seeds=2, max_updates=9)
+    record = Record(config, threshold=1.0)
+
+    def evaluation():
+        names = (
+            "eval_return",
+            "eval_return_stochastic",
+            "eval_length",
+            "simulated_steps",
+            "eval_steps",
+        )
+        return {name: rng.random(2, np.float32) for name in names}
+
+    def block():
+        floats = ("episode_return", "episode_length", "entropy", "gradient_norm")
+        metrics = {name: rng.random((3, 2), np.float32) for name in floats}
+        whole = ("env_steps", "episodes", "simulated_steps", "nonfinite_episodes", "skipped_update")
+        metrics |= {name: rng.integers(0, 3, (3, 2)) for name in whole}
+        return metrics | {"active": rng.random((3, 2)) < 0.7}
+
+    record.add_evaluation(evaluation(), 0.5)
+    for _ in range(2):
+        record.add_updates(block())
+        record.add_evaluation(evaluation(), 1.0)
+    other = Record(config, threshold=1.0)
+    other.restore(record.arrays())
+    metrics, result = block(), evaluation()
+    for one in (record, other):
+        one.add_updates(metrics)
+    rows, others = (one.add_evaluation(result, 2.0) for one in (record, other))
+    assert str(rows) == str(others)  # with nan, which equals nothing
+    assert json.dumps(record.summary("e", 1, 2)) == json.dumps(other.summary("e", 1, 2))
+    assert vars(record).keys() == vars(other).keys()
+    for name, value in record.arrays().items():
+        np.testing.assert_array_equal(value, other.arrays()[name])
+    for method in ("history", "training"):
+        ours, theirs = getattr(record, method)(), getattr(other, method)()
+        for name, value in ours.items():
+            np.testing.assert_array_equal(value, theirs[name])
+            assert value.dtype == theirs[name].dtype
+
+
+def test_code_for_another_cpu_is_another_program(run, parts, monkeypatch, capsys):
+    """Though the machine is the same; nothing is promised then, and nothing changed."""
+    before = (parts / "config.json").read_bytes()
+    here = json.loads(before)["machine_code"]
+    monkeypatch.setenv(machine.VARIABLE, "x86-64")
+    assert run("--resume", "parts", "--max-updates", 24) == 2
+    error = capsys.readouterr().err
+    assert f"was begun with machine_code {here}, and here it is llvmlite" in error
+    assert "x86-64, 4 lanes" in error
+    assert (parts / "config.json").read_bytes() == before

@@ -1,0 +1,155 @@
+"""The compiled programs of a run."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import Toy
+
+from mjx_reinforce import envs
+from mjx_reinforce.learners import counts
+from mjx_reinforce.reports.statistics.aggregates import interval
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.store import ready
+from mjx_reinforce.training.state import budget_of, compile_parts
+from mjx_reinforce.types import plain, with_keys
+
+CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
+
+
+def test_they_have_run_once_without_an_update():
+    """A GPU's driver translates kernels when they first run: that is compiling too."""
+    prepared, made = ready.made(envs.make(CONFIG.env), CONFIG), []
+
+    def advance():
+        program = prepared.parts.advance()
+
+        def counted(*arguments):
+            leaves, block, present = program(*arguments)
+            jax.debug.callback(lambda x: made.append(int(x)), block[0])
+            return leaves, block, present
+
+        return counted
+
+    parts = prepared.parts._replace(advance=advance)
+    state, programs = compile_parts(parts, CONFIG)
+    jax.effects_barrier()
+    assert made == [0]
+    assert not state.train_states.env_steps.any()
+    programs.advance(state, True, budget_of(CONFIG))
+    jax.effects_barrier()
+    assert made[1] > 0
+
+
+def test_evaluations_ride_with_the_updates_that_follow():
+    """They measure the policies before these, and leave what is trained as it is, to the bit."""
+    prepared = ready.made(envs.make(CONFIG.env), CONFIG)
+    assert prepared.engine == "native"
+    assert prepared.parts.rides
+    first, programs = compile_parts(prepared.parts, CONFIG)
+    kept, budget = jax.tree.map(np.asarray, plain(first)), budget_of(CONFIG)
+
+    def again():
+        return with_keys(jax.tree.map(jnp.array, kept), first)
+
+    alone = programs.evaluate(again())
+    one, metrics, looked = programs.advance(again(), True, budget)
+    other, same, none = programs.advance(again(), False, budget)
+    assert none is None
+    assert np.all(metrics.pop("simulated_steps")[0] > same.pop("simulated_steps")[0])
+    for tree, like in ((looked.actor, alone.actor), (plain(one), plain(other)), (metrics, same)):
+        jax.tree.map(np.testing.assert_array_equal, tree, like)
+    for name in ("eval_return", "eval_return_stochastic", "eval_length", "eval_steps"):
+        np.testing.assert_array_equal(looked.measured[name], alone.measured[name])
+    assert looked.num_updates.tolist() == [[0, 0]] * 2
+    made = metrics["active"].sum(axis=0)
+    assert counts.to_int(one.train_states.num_updates).tolist() == made.tolist()
+
+
+def test_runs_count_beyond_32_bits():
+    """A budget that ends two updates beyond 2^32 env steps, and half of its schedules."""
+    config = dataclasses.replace(CONFIG, env_steps=2**32 + 200, eval_every=50)
+    state, programs = compile_parts(ready.made(envs.make(config.env), config).parts, config)
+    played = jnp.tile(jnp.asarray(counts.from_int(2**32 - 50)), (2, 1))
+    train_states = dataclasses.replace(state.train_states, env_steps=played)
+    state = dataclasses.replace(state, train_states=train_states)
+    state, metrics, _ = programs.advance(state, True, budget_of(config))
+    total = 2**32 - 50 + metrics["env_steps"].sum(axis=0)
+    assert counts.to_int(state.train_states.env_steps).tolist() == total.tolist()
+    last = metrics["env_steps"][metrics["active"].sum(axis=0) - 1, [0, 1]]
+    assert np.all((total >= 2**32 + 200) & (total - last < 2**32 + 200))
+    np.testing.assert_allclose(state.train_states.progress, 1, atol=1e-6)
+
+
+class Luck(Toy):
+    """The return is the start, whatever is done: its mean is 0, and every policy is equal."""
+
+    def observe(self, key):
+        return jax.random.uniform(key, (1,), minval=-1.0)
+
+    def earn(self, obs, action):
+        return obs[0]
+
+
+LUCK = Config(env="Luck-v0", num_seeds=3, hidden_sizes=(), eval_episodes=2, test_episodes=5)
+
+
+@pytest.fixture
+def measure(register):
+    """Returns what settings evaluate to before and after an update, and what they test to."""
+    register("Luck-v0", Luck)
+
+    def measure(**changes):
+        config = dataclasses.replace(LUCK, **changes)
+        state, programs = compile_parts(ready.made(envs.make(config.env), config).parts, config)
+        state, _, first = programs.advance(state, True, budget_of(config))
+        later = programs.evaluate(state).measured
+        return first.measured, later, programs.test(state.train_states.actor)
+
+    return measure
+
+
+def test_each_seed_is_evaluated_and_tested_on_starts_of_its_own(measure):
+    first, second, test = (result["eval_return"] for result in measure())
+    assert len({*first.tolist(), *test.tolist()}) == 6
+    assert np.array_equal(first, second)  # the same at every evaluation
+
+
+@pytest.mark.parametrize(
+    "changes", [{"num_seeds": 5}, {"seed": 7, "learning_rate": 0.5, "hidden_sizes": (3,)}]
+)
+def test_a_seed_keeps_its_starts_whatever_is_trained(measure, changes):
+    for one, other in zip(measure(), measure(**changes), strict=True):
+        assert np.array_equal(one["eval_return"], other["eval_return"][:3])
+    other = measure(eval_seed=1)
+    assert not np.isin(one["eval_return"], other[2]["eval_return"]).any()
+
+
+def test_a_test_plays_whole_evaluations_from_starts_of_their_own(measure):
+    tests = [measure(test_episodes=episodes)[2] for episodes in (None, 2, 5, 6)]
+    assert [int(test["eval_steps"][0]) for test in tests] == [2 * n for n in (2, 2, 6, 6)]
+    for name in ("eval_return", "eval_return_stochastic", "eval_length"):
+        assert np.array_equal(tests[0][name], tests[1][name])
+        assert np.array_equal(tests[2][name], tests[3][name])
+    assert not np.isin(tests[0]["eval_return"], tests[2]["eval_return"]).any()
+
+
+def test_an_interval_over_seeds_covers_the_mean_over_starts():
+    """With starts shared by the seeds of a run it never would: all returns would be one number."""
+    config = dataclasses.replace(LUCK, num_seeds=20, test_episodes=4)
+    parts = ready.made(Luck(), config).parts
+
+    @jax.jit
+    def tested(eval_seed):
+        leaves, keys = parts.start()(0, eval_seed)
+        state = jax.tree.unflatten(jax.tree.structure(parts.like), leaves)
+        actor = jax.tree.leaves(state.train_states.actor)
+        return jnp.mean(jnp.stack([parts.look()(actor, key)["eval_return"] for key in keys]), 0)
+
+    covered = []
+    for eval_seed in range(100):
+        found = interval("mean", np.asarray(tested(np.uint32(eval_seed))))
+        covered.append(found.low <= 0 <= found.high)
+    assert 0.88 <= np.mean(covered) <= 1  # 95 %, with a standard error of 2.2
