@@ -10,7 +10,7 @@ from collections.abc import Hashable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from jax.typing import DTypeLike
+from numpy.typing import DTypeLike
 
 from mjx_reinforce.fused import arrays, folding, jaxprs, ops, simplify
 from mjx_reinforce.fused.errors import TooLarge

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
-from jax.typing import DTypeLike
+from numpy.typing import DTypeLike
 
 from mjx_reinforce.fused.backends.backend import Backend
 from mjx_reinforce.fused.iterate import varies

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jax.typing import DTypeLike
+from numpy.typing import DTypeLike
 
 from mjx_reinforce.fused.backends.llvm_text import Text
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import numpy as np
-from jax.typing import DTypeLike
+from numpy.typing import DTypeLike
 
 from mjx_reinforce.fused.backends import (
     llvm_exponential,

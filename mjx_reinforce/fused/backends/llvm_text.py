@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jax.typing import DTypeLike
+from numpy.typing import DTypeLike
 
 #: The LLVM type of one value of each dtype. A bool in memory is a byte.
 _SCALARS = {

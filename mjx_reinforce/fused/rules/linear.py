@@ -4,7 +4,7 @@ import itertools
 from typing import Any
 
 import numpy as np
-from jax.typing import DTypeLike
+from numpy.typing import DTypeLike
 
 from mjx_reinforce.fused import arrays, jaxprs
 from mjx_reinforce.fused.graph import Graph
