@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from jax.typing import DTypeLike
+from numpy.typing import DTypeLike
 
 #: The bytes of the widest lane vector, 16 numbers of 8 bytes: a vector begins at a multiple of its
 #: size, as LLVM takes for granted.

@@ -6,7 +6,7 @@ threads that run takes 1.6 GB.
 """
 
 import numpy as np
-from jax.typing import DTypeLike
+from numpy.typing import DTypeLike
 
 from mjx_reinforce.fused.backends.llvm_text import Text
 
