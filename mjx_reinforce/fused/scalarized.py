@@ -12,7 +12,7 @@ from mjx_reinforce.fused import arrays, evaluate, jaxprs, liveness, loops, size
 from mjx_reinforce.fused.backends import BACKENDS
 from mjx_reinforce.fused.graph import Graph
 from mjx_reinforce.fused.nodes import Scalar
-from mjx_reinforce.registry import check_name, load
+from mjx_reinforce.registry import check_name, load_definition
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Scalarized:
             **settings: what the backend takes.
         """
         check_name("backend", backend, BACKENDS)
-        return load(BACKENDS[backend])(**settings).compile(self.schedule, self.outputs)
+        return load_definition(BACKENDS[backend])(**settings).compile(self.schedule, self.outputs)
 
     @property
     def operations(self) -> Counter:

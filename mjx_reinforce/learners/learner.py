@@ -15,12 +15,11 @@ from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.fused import any_lane
 from mjx_reinforce.learners import counts
+from mjx_reinforce.learners.diagnostics import Metrics
 from mjx_reinforce.learners.pace import Pace
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.policy import Policy
 from mjx_reinforce.types import Environment, PyTree, Trajectory
-
-Metrics = dict[str, jax.Array]
 
 
 @struct.dataclass(kw_only=True)

@@ -218,7 +218,7 @@ class _Reinforce:
     def learner(self, engine: str) -> Learner:
         """Returns the learner, whose episodes are played by the engine of that name."""
         actor = jax.eval_shape(self._first_actor, jax.random.key(0))
-        player = choice.Player(self._act, actor, self.policy.distribution)
+        player = choice.ActingPolicy(self._act, actor, self.policy.distribution)
         chosen = choice.choose(engine, self.env, player, self.horizon)
         if self.auto is None:
             return self._with_engine(chosen)
@@ -261,7 +261,7 @@ class _Reinforce:
                 estimator_key, self.observation_size
             ),
             start_key=start_key,
-            pace=None if self.auto is None else pace.begin(self.auto),
+            pace=None if self.auto is None else pace.first_pace(self.auto),
         )
 
     def _play(
@@ -337,12 +337,12 @@ class _Reinforce:
             optimizer=self.optimizer,
             samples=(scaled, trajectory.action, weight, mask),
             divisor=self._divisor(trajectory),
-            clock=Clock(state.progress, counts.number(state.env_steps)),
+            clock=Clock(state.progress, counts.as_float(state.env_steps)),
             played=trajectory.played,
         )
         params, opt_state, update_metrics = self.update(problem, key, actor.params, state.opt_state)
         if self.auto is not None and state.pace is not None:
-            paced = pace.follow(state.pace, self.auto, update_metrics.pop("noise"))
+            paced = pace.next_pace(state.pace, self.auto, update_metrics.pop("noise"))
             state = dataclasses.replace(state, pace=paced)
         visited = visited_steps(trajectory)
         if self.max_kl is not None:

@@ -34,7 +34,7 @@ def supports(model: mjx.Model, data: mjx.Data) -> bool:
     return only_limits and max(map(len, _coupled_rows(model, joints))) <= _MAX_ROWS_TOGETHER
 
 
-def reached(model: mjx.Model, data: mjx.Data) -> jax.Array:
+def past_limit(model: mjx.Model, data: mjx.Data) -> jax.Array:
     """Returns whether some joint is past its limit [], by the same test as MJX's rows."""
     joints = _limited_joints(model)
     position = data.qpos[np.asarray(model.jnt_qposadr)[joints]]
@@ -44,7 +44,7 @@ def reached(model: mjx.Model, data: mjx.Data) -> jax.Array:
     return ~jnp.all(distance >= 0)
 
 
-def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
+def solve_limits(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Solves for the limits' forces exactly.
 
     Args:

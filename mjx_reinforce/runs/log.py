@@ -41,8 +41,8 @@ class RunLog:
         self._remove_parts()
         for name in _RESULTS:
             (self.directory / name).unlink(missing_ok=True)
-        checkpoint.remove(self.directory / "checkpoint")
-        sink.remove(self.directory)
+        checkpoint.remove_checkpoints(self.directory / "checkpoint")
+        sink.remove_outputs(self.directory)
         write_json(self.directory / "config.json", {**settings, **provenance()})
         files.create_csv(self._metrics, rows.COLUMNS)
 
@@ -68,7 +68,9 @@ class RunLog:
         resumed = [*recorded.get("resumed", []), moment]
         write_json(self.directory / "config.json", {**recorded, **budget, "resumed": resumed})
         self.say_running(moment)
-        checkpoint.remove(self.directory / "checkpoint", after=found.number if found else 0)
+        checkpoint.remove_checkpoints(
+            self.directory / "checkpoint", after=found.number if found else 0
+        )
         if found is None:
             files.create_csv(self._metrics, rows.COLUMNS)
         else:

@@ -26,7 +26,7 @@ from mjx_reinforce.runs.plan import make_plan
 from mjx_reinforce.runs.sinks.sink import check_installed
 from mjx_reinforce.runs.training import compile_driver, draw, summarize
 from mjx_reinforce.settings.config import Config, check
-from mjx_reinforce.settings.memory import check_size
+from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.store.ready import get_ready
 from mjx_reinforce.training.driver import Driver, Evaluation
 
@@ -115,7 +115,7 @@ def run(
     if output is not None:
         config = dataclasses.replace(config, output=Path(output))
     check(config)
-    check_size(config)
+    check_memory(config)
     check_installed(config)
     configure_jax()
     with contextlib.ExitStack() as held:

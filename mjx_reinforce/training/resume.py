@@ -163,7 +163,7 @@ def check_same_program(
             )
 
 
-def find(like: "RunState", config: Config, say: Callable[[str], None]) -> Any:
+def newest_checkpoint(like: "RunState", config: Config, say: Callable[[str], None]) -> Any:
     """Returns the newest checkpoint that serves, or None: then the run starts again.
 
     Args:
@@ -182,7 +182,7 @@ def find(like: "RunState", config: Config, say: Callable[[str], None]) -> Any:
     _check_unchanged(config, checkpoint.settings_of(config.resume / "checkpoint"))
     states = like, shape_of_best(like.train_states)
     length = _size(config.resume / "metrics.csv")
-    for found in checkpoint.load(config.resume / "checkpoint", states, say):
+    for found in checkpoint.read_checkpoints(config.resume / "checkpoint", states, say):
         if found.metrics_bytes > length:
             say(f"metrics.csv is shorter than at checkpoint {found.number}; trying the one before")
         elif _serves(found, config):

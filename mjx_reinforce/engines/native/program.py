@@ -8,9 +8,9 @@ import numpy as np
 
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.native import available, objects, outlook, step
-from mjx_reinforce.engines.native.cpu import handler, machine, player, queue
+from mjx_reinforce.engines.native.cpu import handler, kernel, machine, queue
 from mjx_reinforce.engines.native.cpu.denormals import flush
-from mjx_reinforce.engines.native.gpu import player as gpu_player
+from mjx_reinforce.engines.native.gpu import kernel as gpu_kernel
 from mjx_reinforce.engines.native.gpu import ptx, scratch
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
 from mjx_reinforce.fused import jaxprs, scalarized
@@ -25,7 +25,7 @@ GPU_LOOPS = {**LOOPS, "unrolled_on_request": scratch.WRITTEN_OUT}
 _WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
 
 
-class Program(NamedTuple):
+class NativeProgram(NamedTuple):
     """Machine code that plays.
 
     code: of ``seam.call`` on a CPU, of ``seam.launch`` on a GPU
@@ -36,9 +36,9 @@ class Program(NamedTuple):
     record: list[jax.ShapeDtypeStruct]
 
 
-def build(
+def build_program(
     env: Environment, act: episode.Act, actor: PyTree, distribution: Distribution, length: int
-) -> Program:
+) -> NativeProgram:
     """Returns the program of an environment and a policy, compiled unless memory or disk has it.
 
     Args:
@@ -69,10 +69,10 @@ def build(
         return _write_cpu(function, examples, target)
 
     if target is None:
-        code = ptx.load(source, write, gpu_seam.compute_capability(), folder)
+        code = ptx.load_kernel(source, write, gpu_seam.compute_capability(), folder)
     else:
-        code = machine.load(source, write, handler.NAMES, target, folder)
-    return Program(code, shapes.record)
+        code = machine.load_module(source, write, handler.NAMES, target, folder)
+    return NativeProgram(code, shapes.record)
 
 
 def while_running(function: Any) -> Any:
@@ -85,7 +85,7 @@ def _write_gpu(function: Any, examples: tuple[Any, ...]) -> str:
     actor = examples[0]
     varying = [True] * len(jax.tree.leaves(examples))
     written = scalarized.build(function, examples, varying, step.BRANCH_COST, **GPU_LOOPS)
-    return gpu_player.kernel_text(written, len(jax.tree.leaves(actor)))
+    return gpu_kernel.kernel_text(written, len(jax.tree.leaves(actor)))
 
 
 def _write_cpu(function: Any, examples: tuple[Any, ...], target: machine.Machine) -> str:
@@ -98,4 +98,4 @@ def _write_cpu(function: Any, examples: tuple[Any, ...], target: machine.Machine
     records = [np.dtype(x.dtype).itemsize for x in written.out_avals[: queue.NUM_RECORDS]]
     num_args, lanes = queue.NUM_CONTROLS + len(buffers), target.lanes
     entry = handler.handler_text(num_args, [*records, 4, 4, 4], lanes)
-    return entry + player.player_text(written, num_actor, lanes, flush(target.triple))
+    return entry + kernel.player_text(written, num_actor, lanes, flush(target.triple))

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 
-def pack(
+def pack_slots(
     chosen: np.ndarray, lengths: np.ndarray, widths: Sequence[int], num_devices: int
 ) -> np.ndarray:
     """Returns the runs of each slot.

@@ -27,7 +27,7 @@ class Field:
 
 
 @dataclasses.dataclass(frozen=True)
-class Layout:
+class VectorLayout:
     """Where everything is.
 
     Attributes:
@@ -82,7 +82,7 @@ class Layout:
         return self.inputs[-1]
 
 
-def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> Layout:
+def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> VectorLayout:
     """Returns where the lanes' values are.
 
     Args:
@@ -108,4 +108,4 @@ def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> Layout:
 
     inputs = [field(x.dtype, int(np.prod(x.shape, dtype=int))) for x in leaves]
     others = [field(np.int32, 1), *(field(np.int64, 1) for _ in range(3))]
-    return Layout(inputs, actor, state, *others, size=end)
+    return VectorLayout(inputs, actor, state, *others, size=end)
