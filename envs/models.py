@@ -35,7 +35,7 @@ NOT_CARRIED = {
 }
 _ON_JOINT = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
-#: What else MJX ignores in silence, likewise.
+#: What else MJX ignores in silence.
 _IGNORED = (
     ("actuator_armature", "the armature of an actuator", _ON_JOINT),
     ("actuator_damping", "the damping of an actuator", _ON_JOINT),

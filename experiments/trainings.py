@@ -65,7 +65,7 @@ class Training:
 
 
 def results(directory: Path) -> dict[str, object]:
-    """Returns what a run leaves, but for its clocks."""
+    """Returns what a run leaves, without its clocks."""
     rows = [line.split(",") for line in (directory / "metrics.csv").read_text().splitlines()]
     clock = rows[0].index("wall_seconds")
     summary = json.loads((directory / "summary.json").read_text())

@@ -185,7 +185,7 @@ def _check_env(settings: WatchSettings, source: PolicySource) -> None:
 
 
 def _waiting(what: str) -> AbstractContextManager[Any]:
-    """Returns a ``with`` block that shows that its contents go on."""
+    """Returns a ``with`` block that shows on the screen that its contents are still running."""
     console = Console(stderr=True)
     return console.status(what) if console.is_terminal else heartbeat(console.print, None, what)
 

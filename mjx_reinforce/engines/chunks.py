@@ -24,8 +24,8 @@ def while_any(
 ) -> LoopState:
     """``lax.while_loop`` that, vmapped, runs as long as any seed needs it.
 
-    A seed that is done goes through the body all the same: a body must leave the
-    result of a finished seed as it is.
+    The body also runs for a seed that is done: it must leave the result of a
+    finished seed as it is.
     """
     return lax.while_loop(lambda carry: any_lane(cond(carry)), body, init)
 

@@ -102,7 +102,7 @@ def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
     with _damage_in(actor_path):
         check_finite(arrays, seed)
     # Files from before there was a checksum have none. It finds damage, not ill will: who changes
-    # the files can compute it anew.
+    # the files can compute it again.
     if checksum is not None and checksum != _checksum(settings, arrays):
         raise ValueError(
             f"{settings_path} is damaged, or actor.npz beside it: they do not belong together "

@@ -1,6 +1,6 @@
 """Diagnostics: how an update changed the policy, and how noisy the gradient was that it followed.
 
-Nothing that is learned depends on them, but for ``within_kl``. They cost a few percent of an update
+Only ``within_kl`` changes what is learned. The diagnostics cost a few percent of an update
 at most: the policies are compared at a few of the visited steps, and the noise is that of a few
 episodes.
 """

@@ -61,7 +61,7 @@ class Pace:
 
     num_episodes: [] int32
     signal: [] running mean of ``Noise.signal``, as of zeros before the first update
-    noise: [] running mean of ``Noise.noise``, likewise: the two have the same bias, which cancels
+    noise: [] running mean of ``Noise.noise``, with the same bias as ``signal``, which cancels
     """
 
     num_episodes: jax.Array

@@ -122,7 +122,7 @@ def reinforce(
         the state near the middle, statistics that never stop shrink, and magnify the
         observations until the policy fails.)
       normalize_min_std: the least that an observation is divided by, in its own unit. (What hardly
-        changes in the first steps would be magnified for ever.)
+        changes in the first steps would be magnified for the rest of training.)
       one_start: reset every episode of a seed with the same key, drawn once at ``init``.
       num_seeds: how many will learn at once, vmapped. It decides nothing but speed: of many,
         updates whose episodes are all short pass over their first steps alone, the same up to
@@ -231,7 +231,7 @@ class _Reinforce:
     def _with_engine(self, engine: Engine) -> Learner:
         play: Any = functools.partial(self._play, engine)
         if engine.name == "native" and not self.one_start:
-            # Elsewhere an episode that is not played takes its place all the same.
+            # Elsewhere an episode that is not played still takes its place.
             play = Host(play, functools.partial(self._play_with, engine))
         room = self.num_episodes
         return Learner(self._init, play, self._learn, self.policy, engine, room=room)

@@ -60,7 +60,7 @@ def solve_limits(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
     dofs = np.asarray(model.jnt_dofadr)[joints]
     sign = [fields.efc_J[i, dof] for i, dof in enumerate(dofs)]
     unit = jnp.eye(model.nv, dtype=data.qacc_smooth.dtype)
-    # response[i] is inv(M) applied to row i, but for its sign.
+    # response[i] is inv(M) applied to row i, up to its sign.
     response = [solve_m(model, data, unit[dof]) for dof in dofs]
     force: list[Any] = [None] * dofs.size
     for rows in _coupled_rows(model, joints):

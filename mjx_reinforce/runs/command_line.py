@@ -89,9 +89,9 @@ def check_resumed(env: str, arguments: Sequence[str], directory: Path) -> None:
     """Raises ValueError if going on would run code that the command line does not name.
 
     Args:
-      env: the environment of what goes on.
+      env: the environment of the run or sweep that is resumed.
       arguments: the command line.
-      directory: of what goes on.
+      directory: of the run or sweep that is resumed.
     """
     check_named(env, named_task(arguments), directory)
 
@@ -155,7 +155,7 @@ def read_groups(
       arguments: the flags.
       default: holds for the settings of a run that no flag names.
       prog: the name of the program, for --help.
-      description: of the program, likewise.
+      description: of the program, for --help.
       main: the settings that --help alone shows.
 
     Raises:

@@ -87,7 +87,7 @@ class Display:
             print_commands(self.console, commands)
 
     def compiling(self, expected: float | None) -> AbstractContextManager[None]:
-        """Returns a ``with`` block that shows that its contents go on.
+        """Returns a ``with`` block that shows that its contents are still running.
 
         Args:
           expected: how long they take (s), or None if that is not known.

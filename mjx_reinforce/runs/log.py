@@ -83,7 +83,7 @@ class RunLog:
                 part.unlink()
 
     def say_running(self, reached: Mapping[str, Any]) -> None:
-        """Writes a summary.json that says how far the run is, for whoever finds it killed."""
+        """Writes a summary.json that says how far the run is, in case the run is killed."""
         write_json(self.directory / "summary.json", {"status": "running", **reached})
 
     def add_rows(self, new: rows.Cells) -> None:

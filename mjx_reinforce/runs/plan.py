@@ -38,7 +38,7 @@ class Hardware(NamedTuple):
     name: for people
     speeds: what was measured on a machine of its kind
     faster: how many times as fast as that one it is
-    memory: what arrays may take (bytes)
+    memory: the memory available to arrays (bytes)
     shared: whether that is the memory that compiling needs too
     """
 

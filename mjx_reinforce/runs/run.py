@@ -41,7 +41,7 @@ class RunResults(NamedTuple):
     training: [U, S] each: ``episode_return``, the mean of an update's episodes, and the
       ``env_steps`` and ``episodes`` after it
     test_returns: [S] of the last policies, on starts that nothing else is played on
-    best_test_returns: [S] likewise, of the policies with the best evaluations
+    best_test_returns: [S] the same of the policies with the best evaluations
     policy: the network and its distribution
     actor: [S, ...] the last policies
     best: [S, ...] the policies with the best evaluations

@@ -38,7 +38,7 @@ class Runs(NamedTuple):
 
 
 def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
-    """Returns the runs of a group in chunks, all of one size but for the last.
+    """Returns the runs of a group in chunks, all of one size except the last.
 
     Seeds come before configurations, so that every chunk has its share of each configuration and
     all take about as long.

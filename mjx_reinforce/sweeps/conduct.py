@@ -28,7 +28,7 @@ from mjx_reinforce.sweeps.slots.ahead import Stopwatch, one_ahead
 from mjx_reinforce.sweeps.slots.programs import SlotPrograms, compile_programs, shape_of_states
 from mjx_reinforce.training.progress import Progress
 
-#: More than this of a sweep is all of it, but for rounding.
+#: More than this share of a sweep is all of it, up to rounding.
 _ALL = 1 - 1e-6
 
 
@@ -264,7 +264,7 @@ class Conductor:
         return (self._rungs_done + rung) / self._num_rungs
 
     def _progress(self, history: History, each: float) -> Progress:
-        """Returns how far the chunk is, but for the whole sweep where that differs."""
+        """Returns how far the chunk is, or the whole sweep where that differs."""
         now = history.progress()
         done = self._part_done(each * now.num_seeds * now.fraction)
         passed = self.clock.running + history.seconds

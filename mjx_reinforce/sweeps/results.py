@@ -1,7 +1,7 @@
 """The files of a sweep: DIR/sweep.json, results.csv, curves.npz, and the parts of them so far.
 
 A part is what one chunk of runs measured. It is written whole, when the chunk ends, and is all that
-results.csv and curves.npz are made of: whatever else a crash leaves is written anew.
+results.csv and curves.npz are made of: all else that a crash leaves is written again.
 """
 
 import shutil
@@ -137,7 +137,7 @@ class SweepFiles:
         return self.parts / f"{chunk}.npz"
 
     def _all(self) -> Arrays:
-        """Returns what all chunks measured so far, but for those of fresh seeds."""
+        """Returns what all chunks measured so far, without those of fresh seeds."""
         rungs = []
         while measured := self.measured(str(len(rungs))):
             rungs.append(measured)

@@ -1,7 +1,7 @@
 """Checkpoints: a run between two blocks of updates, as NumPy archives in RUN/checkpoint/.
 
 Each archive is written whole, under a name that ends in the beginning of its SHA-256: a file that
-was cut off or changed is noticed, and the one before it serves. The newest two are kept, and the
+was cut off or changed is noticed, and the one before it is used. The newest two are kept, and the
 newest one that is even, for runs whose budget is raised.
 """
 

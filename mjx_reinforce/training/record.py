@@ -57,7 +57,7 @@ class RunRecord:
 
     updates: [S] int64, how many each seed has made
     env_steps: [S] int64, how many each seed has played in training
-    episodes: [S] int64, likewise
+    episodes: [S] int64, how many each seed has played in training
     seconds: wall time from the end of compilation to the last evaluation
     threshold: the return that counts as solved, if any
     """

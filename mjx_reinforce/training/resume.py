@@ -1,4 +1,4 @@
-"""Going on with a run: its own settings, the same program, and the checkpoint that serves."""
+"""Resuming a run: its own settings, the same program, and the newest usable checkpoint."""
 
 import dataclasses
 import json
@@ -86,7 +86,7 @@ def _choices(hint: Any) -> str:
 
 
 def recordable(config: Config) -> dict[str, Any]:
-    """Returns the settings as config.json has them, but for where the run is."""
+    """Returns the settings as config.json has them, except where the run is."""
     settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in PLACES}
     return json.loads(json.dumps(settings))
 
@@ -164,7 +164,7 @@ def check_same_program(
 
 
 def newest_checkpoint(like: "RunState", config: Config, say: Callable[[str], None]) -> Any:
-    """Returns the newest checkpoint that serves, or None: then the run starts again.
+    """Returns the newest usable checkpoint, or None: then the run starts again.
 
     Args:
       like: the shapes of its ``RunState``.
@@ -194,7 +194,7 @@ def _check_unchanged(config: Config, trained: Mapping[str, Any]) -> None:
     """Raises ValueError if config.json was changed by hand since a checkpoint was written.
 
     Args:
-      config: what config.json says now, but for the budget.
+      config: what config.json says now, except the budget.
       trained: the settings in the checkpoint.
     """
     said = recordable(config)

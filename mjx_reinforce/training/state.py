@@ -44,9 +44,9 @@ class Budget(NamedTuple):
     """What each seed may use. It is an input of the programs: another budget compiles nothing.
 
     env_steps: [2] a count, see ``counts``; a seed stops after the update that reaches it
-    updates: [2] likewise, how many it makes at most
+    updates: [2] a count, how many updates it makes at most
     all_env_steps: [2] how long schedules last; more than ``env_steps`` where a run goes on later
-    all_updates: [2] likewise
+    all_updates: [2] the same in updates
     """
 
     env_steps: counts.Count

@@ -36,7 +36,7 @@ class StepResult(NamedTuple):
     record: observation [O], action [A] or [], reward []
     alive: [] int32, 1 where the episode goes on
     broken: [] int32, 1 where it left the finite numbers
-    carried: what goes on into the next step
+    carried: what the next step reads
     """
 
     record: list[Any]

@@ -167,7 +167,7 @@ def _labels(findings: Findings) -> list[str]:
 
 
 def _text(findings: Findings, drawn: list[Figure]) -> dict[str, Any]:
-    """Returns what the template says, but for where it comes from."""
+    """Returns the text of the page, without the provenance of its numbers."""
     figures = {figure.name: figure for figure in drawn}
     sensitivity = [figure for figure in drawn if figure.name.startswith("sensitivity-")]
     listed, matrix = listings(findings), pairs_matrix(findings)

@@ -101,7 +101,7 @@ def renamed(spec: Any, names: Mapping[str, str]) -> Any:
 
 
 def shown_rows(data: str) -> alt.Chart:
-    """Returns a chart of those rows that are shown; a log axis has no place for 0."""
+    """Returns a chart of the rows that are shown; a log axis has no place for 0."""
     return (
         alt.Chart(alt.NamedData(data))
         .transform_filter(_IS_SHOWN)

@@ -72,7 +72,7 @@ class WeightsAndBiases:
 
 @contextlib.contextmanager
 def _errors_as_os_errors(remedy: str = "") -> Iterator[None]:
-    """Raises W&B's own errors as OSError: a run warns of those, and goes on."""
+    """Raises W&B's own errors as OSError: a run warns of an OSError and continues."""
     import wandb
 
     try:

@@ -53,7 +53,7 @@ class Design:
     budget: how many configurations are drawn, None for a grid
     given: other settings that the user chose; at least one configuration must read each
     exact: see ``SweepSettings``
-    chunk_runs: likewise
+    chunk_runs: see ``SweepSettings``
     processes: those that train it
     resume: the directory of a sweep that goes on
     """

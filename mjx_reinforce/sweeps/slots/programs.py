@@ -62,8 +62,8 @@ class SlotPrograms(NamedTuple):
     begin: (data of keys [R, 2] and of those of evaluations [R, 2], settings [R] each) -> the first
       states
     movers: by the width of a slot, the widest first; the narrower ones may still be compiling
-    keys: [S, 2], the data of those that the seeds begin with
-    eval_keys: [S, 2], the data of those of the seeds' evaluations, the same in all configurations
+    keys: [S, 2], the data of the keys that the seeds begin with
+    eval_keys: [S, 2], the data of the keys of evaluations, the same in all configurations
     limits: the budget of each run, on all devices
     whole: the settings of all that a run is to do, in one or more parts
     devices: among which a slot is divided
@@ -97,7 +97,7 @@ class SlotPrograms(NamedTuple):
           training: [R] which of them still train; at least one does.
           lengths: [R] about how long their episodes are, see ``packing.pack_slots``.
           blocks: how many, where one of the narrowest slots holds these runs. Else they are packed
-            anew after one.
+            again after one.
 
         Returns:
           What each block measured, of the runs that made an update; none without any.
@@ -181,7 +181,7 @@ def compile_programs(
       build_learner: from the traced settings of a run to its learner.
       horizon: T, the time limit of an episode in steps.
       config: the settings, in which those that are traced stand for any value.
-      traced: the names of those that are.
+      traced: the names of the settings that are traced.
       widths: how many runs a slot may have, the most first; multiples of the number of devices.
       devices: where.
       clock: of the sweep.
@@ -273,7 +273,7 @@ def _movers(
 ) -> Movers:
     """Compiles what moves slots of ``width`` runs; the arguments are ``compile_programs``'.
 
-    Programs are traced one after the other, by whoever holds ``tracing``.
+    Programs are traced one after the other; the lock ``tracing`` is held meanwhile.
     """
     with ThreadPoolExecutor() as pool, tracing:  # the first compiles while the second is traced
         like = jax.eval_shape(beginning(build_learner), *_arguments(traced, width))
