@@ -13,7 +13,7 @@ from typing import Any
 
 from mjx_reinforce.checks import BadEnvironmentError, check_parts, explain
 from mjx_reinforce.physics.quiet import silence_mjx
-from mjx_reinforce.registry import check_name, load
+from mjx_reinforce.registry import check_name, load_definition
 
 silence_mjx()  # before any environment imports it
 
@@ -81,7 +81,7 @@ def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
     if ":" in id and not {"", os.getcwd()} & set(sys.path):  # python -m has it, a script has not
         sys.path.insert(0, os.getcwd())
     try:
-        build = load(entry)
+        build = load_definition(entry)
     except (Exception, SystemExit) as error:  # an import runs the user's code
         remedy = "write module:Class of a module that is in this folder or installed"
         if isinstance(error, MemoryError) or any(text in str(error) for text in _NO_MEMORY):

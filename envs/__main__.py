@@ -9,11 +9,11 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.lines import for_stream
 from mjx_reinforce.console.streams import accept_everything
-from mjx_reinforce.settings.flags import one_line_errors, read
+from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class EnvsSettings:
     """List the tasks, or describe one: sizes, rules, default settings, and how long it takes."""
 
     env: tyro.conf.Positional[str | None] = None
@@ -24,7 +24,9 @@ def main() -> None:
     """Reads the command line, prints, and exits: 0 done, 2 bad input, 130 interrupted."""
     accept_everything()
     with one_line_errors():
-        settings = read(Settings, sys.argv[1:], command("envs"), Settings.__doc__ or "")
+        settings = read_command_line(
+            EnvsSettings, sys.argv[1:], command("envs"), EnvsSettings.__doc__ or ""
+        )
         if settings.env is None:
             print("\n".join(envs.names()))
             return

@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from mjx_reinforce.envs.settings import Range, check_range
+from mjx_reinforce.envs.settings import Interval, check_range
 from mjx_reinforce.envs.walkers import Healthy
 
 
@@ -35,11 +35,11 @@ class Ant(Healthy):
         ctrl_cost_weight: float = 0.5
         contact_cost_weight: float = 5e-4
         """What one unit of squared, clipped contact force costs."""
-        healthy_z_range: Range = (0.2, 1.0)
+        healthy_z_range: Interval = (0.2, 1.0)
         """Heights of a healthy torso (m), bounds included."""
         main_body: int | str = 1
         """The body whose speed counts, by name or number."""
-        contact_force_range: Range = (-1.0, 1.0)
+        contact_force_range: Interval = (-1.0, 1.0)
         """Contact torques (N m) and forces (N) are clipped to this."""
         reset_noise_scale: float = 0.1
         include_cfrc_ext_in_observation: bool = True

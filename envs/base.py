@@ -12,7 +12,7 @@ from brax.envs.base import Env, State
 from flax import struct
 from mujoco import mjx
 
-from mjx_reinforce.checks import changed
+from mjx_reinforce.checks import changed_fields
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.outcomes import check_outcome, check_shape, check_start
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings, check_positive
@@ -120,7 +120,7 @@ class MujocoEnv(Env):
         self.frame_skip = self.settings.frame_skip
         self.max_episode_steps = self.settings.max_episode_steps
         self.reward_threshold = self.settings.reward_threshold
-        self.mj_model = models.load(self.settings.xml_file)
+        self.mj_model = models.load_model(self.settings.xml_file)
         if self.settings.solver == "fast":
             self.mj_model.opt.iterations, self.mj_model.opt.ls_iterations = 1, 4
         self.model = models.to_mjx(self.mj_model, self.settings.xml_file)
@@ -239,7 +239,7 @@ class MujocoEnv(Env):
         return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[0]
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({changed(self.settings)})"
+        return f"{type(self).__name__}({changed_fields(self.settings)})"
 
     @property
     def action_size(self) -> int:

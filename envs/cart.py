@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from mjx_reinforce.checks import changed
+from mjx_reinforce.checks import changed_fields
 from mjx_reinforce.envs.base import Env, State
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
 from mjx_reinforce.registry import check_name
@@ -74,7 +74,7 @@ class Cart(Env):
         return 4
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}({changed(self.settings)})"
+        return f"{type(self).__name__}({changed_fields(self.settings)})"
 
     @property
     def action_size(self) -> int:

@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from mjx_reinforce.envs.settings import Range, check_range
+from mjx_reinforce.envs.settings import Interval, check_range
 from mjx_reinforce.envs.walkers import PlanarWalker, within
 
 
@@ -31,10 +31,10 @@ class Hopper(PlanarWalker):
         frame_skip: int = 4
         reward_threshold: float | None = 3800.0
         ctrl_cost_weight: float = 1e-3
-        healthy_state_range: Range = (-100.0, 100.0)
+        healthy_state_range: Interval = (-100.0, 100.0)
         """Angles (rad) and velocities (m/s, rad/s) of a healthy state, bounds excluded."""
-        healthy_z_range: Range = (0.7, float("inf"))
-        healthy_angle_range: Range = (-0.2, 0.2)
+        healthy_z_range: Interval = (0.7, float("inf"))
+        healthy_angle_range: Interval = (-0.2, 0.2)
         reset_noise_scale: float = 5e-3
 
         def __post_init__(self):

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 
 from mjx_reinforce.envs.person import Person
-from mjx_reinforce.envs.settings import Range, check_range
+from mjx_reinforce.envs.settings import Interval, check_range
 from mjx_reinforce.envs.walkers import Healthy, within
 
 
@@ -39,10 +39,10 @@ class Humanoid(Person, Healthy):
         forward_reward_weight: float = 1.25
         contact_cost_weight: float = 5e-7
         """What one unit of squared contact force costs."""
-        contact_cost_range: Range = (-float("inf"), 10.0)
+        contact_cost_range: Interval = (-float("inf"), 10.0)
         """The cost of contacts is clipped to this."""
         healthy_reward: float = 5.0
-        healthy_z_range: Range = (1.0, 2.0)
+        healthy_z_range: Interval = (1.0, 2.0)
 
         def __post_init__(self):
             """Raises ValueError for a value that is out of its range."""

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 
 from mjx_reinforce.envs.person import Person
-from mjx_reinforce.envs.settings import Range, check_range
+from mjx_reinforce.envs.settings import Interval, check_range
 
 
 class HumanoidStandup(Person):
@@ -31,7 +31,7 @@ class HumanoidStandup(Person):
         """Times the reward for height; Gymnasium takes this argument and ignores it."""
         impact_cost_weight: float = 0.5e-6
         """What one unit of squared contact force costs."""
-        impact_cost_range: Range = (-float("inf"), 10.0)
+        impact_cost_range: Interval = (-float("inf"), 10.0)
         """The cost of contacts is clipped to this."""
 
         def __post_init__(self):

@@ -35,7 +35,7 @@ NOT_CARRIED = {
 }
 _ON_JOINT = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
-#: What else MJX ignores in silence, likewise.
+#: What else MJX ignores in silence.
 _IGNORED = (
     ("actuator_armature", "the armature of an actuator", _ON_JOINT),
     ("actuator_damping", "the damping of an actuator", _ON_JOINT),
@@ -75,7 +75,7 @@ _ONLY_REPORTS = int(mjtEnableBit.mjENBL_ENERGY | mjtEnableBit.mjENBL_FWDINV)
 _ELSE = "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
 
 
-def load(xml_file: str) -> Any:
+def load_model(xml_file: str) -> Any:
     """Compiles an MJCF file of the package's assets, or the user's own by a path.
 
     Args:
@@ -107,7 +107,7 @@ def is_own(xml_file: str) -> bool:
 
 
 def spec(xml_file: str) -> Any:
-    """Returns a model before it is compiled, an ``MjSpec`` of the reader's own, as ``load``."""
+    """Returns a model before it is compiled, an ``MjSpec``; otherwise as ``load_model``."""
     if is_own(xml_file):
         return _compile(MjSpec.from_file, xml_file, xml_file)
     return _compile(MjSpec.from_string, _asset(xml_file), xml_file)

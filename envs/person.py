@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_reinforce.envs.locomotion import Body
-from mjx_reinforce.envs.settings import Range
+from mjx_reinforce.envs.settings import Interval
 from mjx_reinforce.physics.mjx_internals import Simulation
 
 
@@ -32,7 +32,7 @@ class Person(Body):
     settings: Settings
     contact_forces = True
 
-    def contact_cost(self, data: Simulation, weight: float, bounds: Range) -> jax.Array:
+    def contact_cost(self, data: Simulation, weight: float, bounds: Interval) -> jax.Array:
         """Returns what the contacts cost [].
 
         Args:

@@ -10,7 +10,7 @@ from typing import Any
 from mjx_reinforce.checks import check_type, is_nan
 from mjx_reinforce.registry import check_name
 
-Range = tuple[float, float]
+Interval = tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ def check_positive(name: str, value: int) -> None:
         raise ValueError(f"{name} must be 1 or more, got {value}")
 
 
-def check_range(name: str, bounds: Range) -> None:
+def check_range(name: str, bounds: Interval) -> None:
     """Raises ValueError for a range that contains nothing."""
     low, high = bounds
     if not low < high:

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from mjx_reinforce.envs.settings import Range
+from mjx_reinforce.envs.settings import Interval
 from mjx_reinforce.envs.walkers import PlanarWalker
 
 
@@ -30,8 +30,8 @@ class Walker2d(PlanarWalker):
         frame_skip: int = 4
         reward_threshold: float | None = None
         ctrl_cost_weight: float = 1e-3
-        healthy_z_range: Range = (0.8, 2.0)
-        healthy_angle_range: Range = (-1.0, 1.0)
+        healthy_z_range: Interval = (0.8, 2.0)
+        healthy_angle_range: Interval = (-1.0, 1.0)
         reset_noise_scale: float = 5e-3
 
     settings: Settings

@@ -6,7 +6,7 @@ import dataclasses
 import jax
 
 from mjx_reinforce.envs.locomotion import Runner
-from mjx_reinforce.envs.settings import Range, check_range
+from mjx_reinforce.envs.settings import Interval, check_range
 from mjx_reinforce.physics.mjx_internals import Simulation
 
 
@@ -21,7 +21,7 @@ class Healthy(Runner):
         """What a healthy step earns."""
         terminate_when_unhealthy: bool = True
         """Whether an unhealthy step ends the episode."""
-        healthy_z_range: Range
+        healthy_z_range: Interval
         """Heights of a healthy torso (m), bounds excluded."""
 
         def __post_init__(self):
@@ -51,7 +51,7 @@ class PlanarWalker(Healthy):
     class Settings(Healthy.Settings):
         """Arguments of the planar walkers."""
 
-        healthy_angle_range: Range
+        healthy_angle_range: Interval
         """Angles of a healthy torso (rad), bounds excluded."""
 
         def __post_init__(self):
@@ -76,7 +76,7 @@ class PlanarWalker(Healthy):
         return reward, terminated, terms | {"z_distance_from_origin": height}
 
 
-def within(x: jax.Array, bounds: Range) -> jax.Array:
+def within(x: jax.Array, bounds: Interval) -> jax.Array:
     """Returns whether x lies strictly between two bounds; NaN does not."""
     low, high = bounds
     return (low < x) & (x < high)

@@ -27,7 +27,7 @@ from rich.table import Table
 from benchmark_peers import peers
 from benchmark_rows import Candidate, append, facts, measure, speed
 from mjx_reinforce import Actor, act, envs, load_policy, mlp_policy, reinforce
-from mjx_reinforce.engines.choice import Player, choose
+from mjx_reinforce.engines.choice import ActingPolicy, choose
 from mjx_reinforce.learners.reinforce import default_distribution
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.types import action_space, observation_size
@@ -156,7 +156,7 @@ def rollouts(
         network, actor = the_policy(env, policy)
         play_act = functools.partial(act, network)
         began = time.perf_counter()
-        player = Player(play_act, actor, network.distribution)
+        player = ActingPolicy(play_act, actor, network.distribution)
         engine = choose(engine_name, env, player, steps)
         choosing = time.perf_counter() - began  # machine code is made here
         for batch in batches:

@@ -226,7 +226,7 @@ TABLES: dict[str, Callable[[Raw], str]] = {
 
 
 def page(text: str, raw: Raw) -> str:
-    """Returns a page with its tables made anew."""
+    """Returns a page with its tables made again."""
     return filled(text, {name: functools.partial(make, raw) for name, make in TABLES.items()})
 
 

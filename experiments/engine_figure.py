@@ -50,7 +50,7 @@ def main(count: bool = False) -> None:
     """Reads and draws.
 
     Args:
-      count: write the operations anew first.
+      count: write the operations again first.
     """
     path = DOCS / "operations.csv"
     with path.open(encoding="utf-8") as file:

@@ -22,7 +22,7 @@ COMPARED = {
     "policy_std": "std of the actions",
 }
 #: Updates at which they are compared, counted from 1, with which nothing is scaled yet; after the
-#: last of those that are drawn, many seeds have used their budget.
+#: last of the points that are drawn, many seeds have used their budget.
 LOOKS, SHOWN = (2, 3, 4, 6, 8), 14
 #: A gradient below this norm has no direction to learn from: no episode did better than another.
 NO_GRADIENT = 1e-2

@@ -18,7 +18,7 @@ class Sb3(NamedTuple):
     num_envs: environments that are stepped one after the other, in one process
     normalize: whether observations and rewards are normalized by their running scales
     arguments: of the algorithm's class
-    policy: ``policy_kwargs`` of the algorithm's class, but for the activation, which is a name
+    policy: ``policy_kwargs`` of the algorithm's class, except the activation, which is a name
     """
 
     source: str

@@ -9,7 +9,7 @@ from scipy import stats
 from mjx_reinforce.settings.presets import PRESETS
 from reproduce_cases import Case
 
-LEVEL = 0.05  # of the tests; the range over seeds holds 95 % likewise
+LEVEL = 0.05  # of the tests; the range over seeds holds 95 % too
 
 
 def windowed(scores: np.ndarray, count: int, window: int) -> np.ndarray:
@@ -18,7 +18,7 @@ def windowed(scores: np.ndarray, count: int, window: int) -> np.ndarray:
 
 
 def reached(entry: Mapping[str, Any], count: int) -> np.ndarray:
-    """Returns the values after ``count`` updates of those of a program's seeds that got there."""
+    """Returns the values after ``count`` updates of a program's seeds that got there."""
     index = count // entry["every_updates"] - 1
     return np.array([curve[index] for curve in entry["seeds"].values() if index < len(curve)])
 

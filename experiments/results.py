@@ -14,7 +14,7 @@ another machine: what the stages after ``train`` need of them, to be unpacked in
     python experiments/results.py pretrained DIR    # the package's policies, of all runs in DIR
     python experiments/results.py films             # docs/films, of the package's policies
 
-``page`` without DIR writes the page anew from the small files in experiments/results. The tasks,
+``page`` without DIR writes the page again from the small files in experiments/results. The tasks,
 their budgets, their seeds and the published figures are the table in results_tasks.py.
 """
 

@@ -43,7 +43,7 @@ def sections(results: Path, docs: Path) -> list[str]:
     if played := kept.played(results):
         films = {task: Path("films") / task for task in played}
         words = (
-            "The best and the median seed of those runs by their last evaluation, without noise,\n"
+            "The best and the median seed of these runs by their last evaluation, without noise,\n"
             "here and in plain Gymnasium, from starts that were used nowhere else:"
         )
         parts += ["### In Gymnasium, and films", words, play_table(played, films, docs)]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import spoken
+from mjx_reinforce.reports.experiment import setting_in_words
 from results_files import Result
 from results_runs import FACTOR
 from results_tables import moved_measure
@@ -88,7 +88,7 @@ def _sensitivity(results: Sequence[Result]) -> Any:
     styles = dict(zip(settings, zip(_COLOURS, _MARKERS, strict=True), strict=False))
     for ax, result in zip(axes, results, strict=True):
         _moved_panel(ax, result, styles)
-    handles = [_line(c, spoken(name), marker=m) for name, (c, m) in styles.items()]
+    handles = [_line(c, setting_in_words(name), marker=m) for name, (c, m) in styles.items()]
     handles.append(_line("black", "defaults, 95 % interval", linewidth=6, alpha=0.2))
     _legend(figure, handles, len(axes))
     figure.supxlabel("factor by which one setting is moved", fontsize="small")

@@ -75,9 +75,9 @@ def page(
 def _introduction(results: Sequence[Result]) -> str:
     roots = dict.fromkeys(f"{result.facts['settings']['seed']:,}" for result in results)
     return (
-        "REINFORCE with the default settings of every task, but for the budgets (env steps a\n"
-        "seed, in the table) and how often it is evaluated; 32-32 has `--hidden-sizes 32 32`\n"
-        f"besides. No search used these seeds (roots {listed(roots)}).\n"
+        "REINFORCE with the default settings of every task, except the budgets (env steps a\n"
+        "seed, in the table) and the interval of evaluations; 32-32 also has\n"
+        f"`--hidden-sizes 32 32`. No search used these seeds (roots {listed(roots)}).\n"
         "This page, words included, is written by `experiments/results.py` from measured runs;\n"
         "last are the commands."
     )

@@ -66,7 +66,7 @@ def own_simulation(run: Run, player: Player, num_episodes: int) -> Any:
     from mjx_reinforce.policies.actor import act
 
     env, policy = envs.make(run.env), player.policy
-    whose = choice.Player(functools.partial(act, policy), player.actor, policy.distribution)
+    whose = choice.ActingPolicy(functools.partial(act, policy), player.actor, policy.distribution)
     engine = choice.choose("auto", env, whose, run.horizon)
 
     @jax.jit

@@ -15,7 +15,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.export.player import Player, load_seed
 from mjx_reinforce.export.policy_files import SavedPolicy, save_policy
-from mjx_reinforce.export.pretrained import PROVENANCE
+from mjx_reinforce.export.pretrained import PROVENANCE_FILE
 from mjx_reinforce.export.run_files import Run, read_run
 from mjx_reinforce.files import read_json, write_json
 from mjx_reinforce.settings.config import flag
@@ -66,7 +66,7 @@ def pack(directory: Path, folder: Path, num_episodes: int) -> list[str]:
         provenance = _provenance(best, returns)
         actor = jax.tree.map(lambda x: np.asarray(x)[None], best.player.actor)
         save_policy(folder / task, actor, best.saved.settings)
-        write_json(folder / task / PROVENANCE, provenance)
+        write_json(folder / task / PROVENANCE_FILE, provenance)
         low, high = provenance["interval"]
         said.append(f"{task}: {provenance['return']:.1f} ({low:.1f} to {high:.1f})")
         print(said[-1], flush=True)

@@ -15,7 +15,7 @@ _TASKS = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Swimmer-v5", 
 
 
 def write(groups: Sequence[kept.Group], docs: Path, readme: Path) -> None:
-    """Writes the table anew, between ``<!-- results -->`` and ``<!-- end -->``.
+    """Writes the table again, between ``<!-- results -->`` and ``<!-- end -->``.
 
     Args:
       groups: what is kept of runs that had a time.

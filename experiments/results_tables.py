@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import spoken
+from mjx_reinforce.reports.experiment import setting_in_words
 from mjx_reinforce.reports.statistics import Estimate
 from mjx_reinforce.reports.statistics.aggregates import interval
 from results_files import POLICIES, STAY_SOLVED, Columns, Result, tested_returns
@@ -212,7 +212,7 @@ def moved_measure(result: Result) -> tuple[str, np.ndarray, np.ndarray, np.ndarr
 
 
 def _label(moved: dict[str, np.ndarray], row: int) -> str:
-    return f"{spoken(str(moved['setting'][row]))} {moved['value'][row]}"
+    return f"{setting_in_words(str(moved['setting'][row]))} {moved['value'][row]}"
 
 
 def _share(x: float) -> str:

@@ -8,7 +8,7 @@ from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.settings.measured import TASKS as MEASURED
 
 #: Roots of all randomness of the results. No tuning used them. The second and the third are of
-#: tasks whose settings were chosen anew after a run with the first.
+#: tasks whose settings were chosen again after a run with the first.
 ROOT, SECOND_ROOT, THIRD_ROOT = 923917982, 456536658, 612381924
 #: The seeds of a published figure, and the env steps of each.
 PUBLISHED_SEEDS, PUBLISHED_STEPS = 10, 10_000_000
@@ -121,7 +121,7 @@ TASKS: dict[str, Task] = {
 
 
 def settings_of(task: Task, num_seeds: int, env_steps: int) -> Config:
-    """Returns the settings of a task's runs: its defaults, but for these and ``eval_every``."""
+    """Returns the settings of a task's runs: its defaults, except these and ``eval_every``."""
     config = dataclasses.replace(
         of_task(task.env, env_steps, num_seeds), seed=task.root, **task.settings
     )

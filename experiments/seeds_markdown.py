@@ -33,7 +33,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def filled(text: str, tables: Mapping[str, Callable[[], str]]) -> str:
-    """Returns a page whose text between ``<!-- NAME -->`` and ``<!-- end -->`` is made anew.
+    """Returns a page whose text between ``<!-- NAME -->`` and ``<!-- end -->`` is made again.
 
     Args:
       text: the page, in Markdown.

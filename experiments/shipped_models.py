@@ -136,8 +136,8 @@ def play(file: str, site: Path) -> None:
     from mjx_reinforce.envs.base import MujocoEnv
 
     if jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
-        as_shipped = models.load
-        models.load = lambda file: _to_the_optimum(as_shipped(file))
+        as_shipped = models.load_model
+        models.load_model = lambda file: _to_the_optimum(as_shipped(file))
 
     class Shipped(MujocoEnv):
         """A model from its first key frame or reference pose, with small noise, for no reward."""

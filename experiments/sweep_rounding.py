@@ -33,10 +33,10 @@ def train(width: int, output: Path) -> None:
     from mjx_reinforce import envs
     from mjx_reinforce.console.jax_setup import configure_jax
     from mjx_reinforce.settings.defaults import of_task
-    from mjx_reinforce.sweeps.chunks import begin, split
+    from mjx_reinforce.sweeps.chunks import initial_states, split_runs
     from mjx_reinforce.sweeps.designs.grid import configure, grid
     from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
-    from mjx_reinforce.sweeps.slots.ahead import Clock
+    from mjx_reinforce.sweeps.slots.ahead import Stopwatch
     from mjx_reinforce.sweeps.slots.devices import Devices
     from mjx_reinforce.sweeps.slots.programs import compile_programs
 
@@ -48,9 +48,11 @@ def train(width: int, output: Path) -> None:
     group = make_groups(configs, ["learning_rate"], exact=False)[0]
     env, devices = envs.make(base.env), Devices()
     build, traced = learner_builder(env, group.config), tuple(group.settings)
-    programs = compile_programs(env, build, 1000, group.config, traced, (width,), devices, Clock())
+    programs = compile_programs(
+        env, build, 1000, group.config, traced, (width,), devices, Stopwatch()
+    )
     kept = {}
-    rows = begin(programs, group, split(group, "0", 1)[0])
+    rows = initial_states(programs, group, split_runs(group, "0", 1)[0])
     for count in range(1, max(UPDATES) + 1):
         programs.advance(rows, np.ones(24, bool), np.zeros(24), blocks=1)
         if count in UPDATES:

@@ -94,7 +94,7 @@ class Training:
 
 
 def results(directory: Path) -> dict[str, object]:
-    """Returns what a run or a sweep leaves, but for its clocks."""
+    """Returns what a run or a sweep leaves, without its clocks."""
     if (directory / "sweep.json").exists():
         return _of_sweep(directory)
     rows = [line.split(",") for line in (directory / "metrics.csv").read_text().splitlines()]

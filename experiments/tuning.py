@@ -1,7 +1,7 @@
 """The searches behind the default settings; experiments/tuning is what is kept of them.
 
     python experiments/tuning.py list            # the searches
-    python experiments/tuning.py run NAME DIR    # trains one anew, and writes DIR/NAME.csv
+    python experiments/tuning.py run NAME DIR    # trains one again, and writes DIR/NAME.csv
     python experiments/tuning.py keep NAME DIR   # DIR/NAME.csv of the sweep in DIR/NAME
 
 searches.json has their configurations, drawn at random or chosen after earlier ones, and the

@@ -123,7 +123,7 @@ def check_kind(name: str, value: object, kind: type, example: str) -> None:
         raise ValueError(f"{name} must be of type {kind.__name__}, such as {example}, got {got}")
 
 
-def changed(settings: "DataclassInstance") -> str:
+def changed_fields(settings: "DataclassInstance") -> str:
     """Returns the fields of a dataclass that have other values than their defaults, as code."""
     given = (
         f"{field.name}={value!r}"

@@ -15,6 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+#: Named arrays, as an archive (.npz) holds them.
+Arrays = dict[str, np.ndarray]
+
 #: Versions of NumPy's format that arrays of numbers and text have, and what reads their headers.
 _HEADERS: dict[tuple[int, int], Callable[..., Any]] = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -100,7 +103,7 @@ def read_arrays(
     check: Callable[[Mapping[str, Header]], Any] | None = None,
     *,
     stored: bool = False,
-) -> dict[str, np.ndarray]:
+) -> Arrays:
     """Returns the arrays of a NumPy archive by their names.
 
     Args:

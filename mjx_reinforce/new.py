@@ -13,7 +13,7 @@ import tyro
 
 from mjx_reinforce.console.streams import accept_everything
 from mjx_reinforce.files import write_bytes
-from mjx_reinforce.settings.flags import one_line_errors, read
+from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 
 if TYPE_CHECKING:
     import mujoco
@@ -69,7 +69,7 @@ from mjx_reinforce.envs.base import MujocoEnv
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class NewSettings:
     """Write the class of an environment from a MuJoCo model; its reward is yours to write."""
 
     model: tyro.conf.Positional[Path]
@@ -89,13 +89,17 @@ def main(argv: Sequence[str] | None = None) -> None:
     accept_everything()
     with one_line_errors():
         arguments = sys.argv[1:] if argv is None else argv
-        output = write(read(Settings, arguments, "mjx-reinforce new", Settings.__doc__ or ""))
+        output = write_class(
+            read_command_line(
+                NewSettings, arguments, "mjx-reinforce new", NewSettings.__doc__ or ""
+            )
+        )
         module = output.stem
         command = f"mjx-reinforce train --env {module}:{_title(module)} --output {module}_run"
         print(f"{output}: write its reward, then, in its folder: {command}")
 
 
-def write(settings: Settings) -> Path:
+def write_class(settings: NewSettings) -> Path:
     """Writes the file and returns its name.
 
     Raises:
@@ -121,13 +125,13 @@ def write(settings: Settings) -> Path:
     from mjx_reinforce.envs import models
 
     path = str(xml if xml.parent != Path() else Path.cwd() / xml)
-    model = models.load(path)
+    model = models.load_model(path)
     models.to_mjx(model, path)
-    write_bytes(output, source(model, xml.name, name).encode())
+    write_bytes(output, class_source(model, xml.name, name).encode())
     return output
 
 
-def source(model: "MjModel", xml: str, module: str) -> str:
+def class_source(model: "MjModel", xml: str, module: str) -> str:
     """Returns the text of the class.
 
     Args:

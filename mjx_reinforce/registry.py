@@ -68,7 +68,7 @@ def _plain(name: str) -> str:
     return re.sub(r"-v\d+$", "", name.lower())
 
 
-def load(entry: str | Callable[..., Any]) -> Callable[..., Any]:
+def load_definition(entry: str | Callable[..., Any]) -> Callable[..., Any]:
     """Returns a definition: itself, or imported from "module:name"."""
     if not isinstance(entry, str):
         return entry

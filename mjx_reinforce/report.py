@@ -18,16 +18,16 @@ from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.files import check_folder, write_bytes
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
-from mjx_reinforce.reports.film import Film, make
-from mjx_reinforce.reports.findings import Findings, find
+from mjx_reinforce.reports.film import PageFilm, film_of_median
+from mjx_reinforce.reports.findings import Findings, compute_findings
 from mjx_reinforce.reports.page import columns, document, latex, learning, tables, tasks_page
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.listings import listings
-from mjx_reinforce.reports.page.vega import ONE, draw
+from mjx_reinforce.reports.page.vega import ONE, render_chart
 from mjx_reinforce.reports.tasks import find_tasks, rename
 from mjx_reinforce.settings.defaults import check_task, of_task
-from mjx_reinforce.settings.flags import read
+from mjx_reinforce.settings.flags import read_command_line
 from mjx_reinforce.settings.own_code import env_flag
 from mjx_reinforce.settings.relevance import as_words
 from mjx_reinforce.store.provenance import version
@@ -40,7 +40,7 @@ _ABOUT = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class ReportSettings:
     """What is reported on, and where the page goes."""
 
     sources: tyro.conf.Positional[tuple[Path, ...]]
@@ -63,7 +63,7 @@ def main() -> None:
     """Reads the command line, writes the report, and exits: 0 done, 2 bad input, 130 stopped."""
     accept_everything()
     try:
-        settings = read(Settings, sys.argv[1:], command("report"), _ABOUT)
+        settings = read_command_line(ReportSettings, sys.argv[1:], command("report"), _ABOUT)
         if settings.output is not None:
             check_output(settings.output, settings.overwrite)
         experiments = rename(sources.read_tasks(settings.sources), _new_names(settings.labels))
@@ -111,7 +111,7 @@ def check_output(output: Path, overwrite: bool) -> None:
             raise ValueError(f"{path} exists; pass --overwrite or another --output")
 
 
-class Written(NamedTuple):
+class WrittenReport(NamedTuple):
     """A page that was written.
 
     seconds: how long that took
@@ -124,21 +124,23 @@ class Written(NamedTuple):
     best: int
 
 
-def write_sweep(directory: Path, output: Path) -> Written:
-    """Does what ``write`` does for one sweep, and returns what the page says first."""
+def write_sweep(directory: Path, output: Path) -> WrittenReport:
+    """Does what ``write_report`` does for one sweep, and returns what the page says first."""
     started = time.perf_counter()
-    findings = find(sources.read([directory]))
+    findings = compute_findings(sources.read_experiment([directory]))
     _write(findings, output, started)
-    return Written(time.perf_counter() - started, learning.headline(findings), findings.order[0])
+    return WrittenReport(
+        time.perf_counter() - started, learning.headline(findings), findings.order[0]
+    )
 
 
-def write(chosen: Sequence[Path], output: Path) -> float:
+def write_report(chosen: Sequence[Path], output: Path) -> float:
     """Writes the page, and its pictures and tables beside it; returns how long it took (s).
 
     Replaces what is there; ``check_output`` refuses that.
 
     Args:
-      chosen: run and sweep directories, see ``sources.read``.
+      chosen: run and sweep directories, see ``sources.read_experiment``.
       output: the page.
 
     Raises:
@@ -152,7 +154,7 @@ def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = 
     """Writes the page of one task, or that of several, with a page of each beside it."""
     started = time.perf_counter()
     if len(experiments) == 1:
-        _write(find(experiments[0]), output, started, film=film)
+        _write(compute_findings(experiments[0]), output, started, film=film)
         return time.perf_counter() - started
     tasks = find_tasks(experiments)
     beside = _beside(output)
@@ -162,9 +164,9 @@ def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = 
         name = re.sub(r"[^\w.-]", "_", each.env)
         page = beside / f"{name}.html"
         whole = len(shared.results) == len(each.configurations)
-        _write(shared if whole else find(each), page, started)
+        _write(shared if whole else compute_findings(each), page, started)
         pages.append((page.name, f"{beside.name}/{page.name}"))
-    drawn, data = tasks_page.figures(tasks), tasks_page.chart_tables(tasks)
+    drawn, data = tasks_page.tasks_figures(tasks), tasks_page.tasks_chart_tables(tasks)
     labels = tasks_page.labels(tasks)
     files = {"scores.csv": columns.table_csv(tasks_page.scores(tasks), labels)}
     texts = {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
@@ -173,7 +175,7 @@ def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = 
     for figure in drawn:
         _draw(figure, data, labels, figure.title, beside)
     seconds = time.perf_counter() - started
-    text = tasks_page.render(tasks, drawn, data, files, pages, _ours(), seconds)
+    text = tasks_page.render_tasks(tasks, drawn, data, files, pages, _ours(), seconds)
     write_bytes(output, encoded(text))
     return time.perf_counter() - started
 
@@ -208,11 +210,11 @@ def _write(findings: Findings, output: Path, started: float, *, film: bool = Fal
     write_bytes(output, encoded(text))
 
 
-def _film(experiment: Experiment, output: Path) -> Film | None:
+def _film(experiment: Experiment, output: Path) -> PageFilm | None:
     """Returns the film of a run that has policies; runs of code of one's own are not played."""
     directory = experiment.directories[0]
     alone = len(experiment.configurations) == 1 and (directory / "policy").is_dir()
-    return make(directory, output) if alone and not env_flag(experiment.env) else None
+    return film_of_median(directory, output) if alone and not env_flag(experiment.env) else None
 
 
 def _beside(output: Path) -> Path:
@@ -235,7 +237,7 @@ def _draw(
     """Writes a figure as PNG, SVG and PDF."""
     names = [*figure.tables, *figure.hidden, *ONE]
     needed = {name: columns.rows({**data, **ONE}[name], labels) for name in names}
-    for ending, picture in draw(figure.spec, needed, title).items():
+    for ending, picture in render_chart(figure.spec, needed, title).items():
         write_bytes(folder / f"{figure.name}.{ending}", picture)
 
 

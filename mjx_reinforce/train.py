@@ -30,7 +30,7 @@ from mjx_reinforce.runs.directory import (
 from mjx_reinforce.runs.plan import Plan, make_plan
 from mjx_reinforce.runs.sinks.sink import check_installed
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
-from mjx_reinforce.settings.memory import check_size
+from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.settings.own_code import env_flag
 from mjx_reinforce.store.provenance import versions
 from mjx_reinforce.training import resume
@@ -63,7 +63,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
         with _collection_paused():
             config, settings = parse_all(arguments)
             check(config)
-            check_size(config)
+            check_memory(config)
             check_installed(config)
             common = {**resume.recordable(config), **versions()}
             processes = held.enter_context(joined(settings, interrupt, common))
@@ -148,7 +148,7 @@ def _start(
         from mjx_reinforce.hosts.shares import shape_of_all
 
         like = shape_of_all(like, config.num_seeds)
-    found = resume.find(like, config, print)
+    found = resume.newest_checkpoint(like, config, print)
     if found is None and config.minutes is not None:
         raise ValueError(
             f"{config.resume} has no checkpoint to go on from for {config.minutes:g} min; leave "

@@ -26,11 +26,11 @@ from mjx_reinforce.export.films import (
     mediapy_with_ffmpeg,
     write_film,
 )
-from mjx_reinforce.export.run_files import Seed, Which
+from mjx_reinforce.export.run_files import SeedChoice, Which
 from mjx_reinforce.files import check_folder
-from mjx_reinforce.playing.cast import Role, Source, cast, main_seed, read_source
+from mjx_reinforce.playing.cast import PolicySource, Role, cast, main_seed, read_source
 from mjx_reinforce.playing.newest import RUNS, choose_run
-from mjx_reinforce.settings.flags import read
+from mjx_reinforce.settings.flags import read_command_line
 from mjx_reinforce.settings.own_code import check_named
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ _RANGES = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class WatchSettings:
     """Play one episode of a trained policy, print its return, and make a film of it."""
 
     run: tyro.conf.Positional[Path] = RUNS
@@ -57,12 +57,12 @@ class Settings:
     env: str | None = None
     """Needed where a run was trained on module:Class, code of your own or of another: that name
     again, for then it is run."""
-    seed: Seed = "best"
+    seed: SeedChoice = "best"
     """Which of the run's seeds plays: best, worst or median by its final evaluation, or a number.
     """
     which: Which = "last"
     """The policy at the end of training, or the one that did best on the way, if it was kept."""
-    beside: Literal["untrained"] | Seed | None = None
+    beside: Literal["untrained"] | SeedChoice | None = None
     """A second policy, on the left, from the same start: untrained (before and after), or another
     seed of the run, such as worst."""
     push: float = 0.0
@@ -101,7 +101,9 @@ def main() -> None:
     accept_everything()
     silence_alarms()
     try:
-        settings = read(Settings, sys.argv[1:], command("watch"), Settings.__doc__ or "")
+        settings = read_command_line(
+            WatchSettings, sys.argv[1:], command("watch"), WatchSettings.__doc__ or ""
+        )
         film(dataclasses.replace(settings, run=choose_run(settings.run)))
     except (ValueError, OSError) as error:
         say_error(str(error))
@@ -110,7 +112,7 @@ def main() -> None:
         sys.exit(130)
 
 
-def film(settings: Settings) -> None:
+def film(settings: WatchSettings) -> None:
     """Plays the episode, says what it returned, and writes the film.
 
     Raises:
@@ -119,16 +121,16 @@ def film(settings: Settings) -> None:
     """
     source = read_source(settings.run)
     _check_env(settings, source)
-    output = check(settings, source)
+    output = film_path(settings, source)
     if settings.backend == "gymnasium":
         import_gymnasium()
     import_mujoco()
     configure_jax()
-    from mjx_reinforce.playing.simulations import check_size
+    from mjx_reinforce.playing.simulations import check_observations
 
     roles = cast(settings, source)
     env = envs.make(source.env)
-    check_size(env, roles[-1].player, source)
+    check_observations(env, roles[-1].player, source)
     if settings.live:
         from mjx_reinforce.playing.live import live
 
@@ -149,7 +151,7 @@ def film(settings: Settings) -> None:
 
 
 def _take(
-    settings: Settings, source: Source, env: "MujocoEnv", model: "MjModel", role: Role
+    settings: WatchSettings, source: PolicySource, env: "MujocoEnv", model: "MjModel", role: Role
 ) -> Any:
     """Returns the episode of one policy, and says what it earned."""
     from mjx_reinforce.export.takes import Take
@@ -175,7 +177,7 @@ def _stands_still(take: "Take") -> bool:
     return len(later) * take.dt > 5 and float(np.ptp(later, axis=0).max()) < _STILL
 
 
-def _check_env(settings: Settings, source: Source) -> None:
+def _check_env(settings: WatchSettings, source: PolicySource) -> None:
     """Raises ValueError for another environment than the run's, or where one must be named."""
     if settings.env not in (None, source.env):
         raise ValueError(f"--env is {settings.env}, but {settings.run} was trained on {source.env}")
@@ -183,12 +185,12 @@ def _check_env(settings: Settings, source: Source) -> None:
 
 
 def _waiting(what: str) -> AbstractContextManager[Any]:
-    """Returns a ``with`` block that shows that its contents go on."""
+    """Returns a ``with`` block that shows on the screen that its contents are still running."""
     console = Console(stderr=True)
     return console.status(what) if console.is_terminal else heartbeat(console.print, None, what)
 
 
-def compare(settings: Settings, simulators: Mapping[str, Any]) -> str:
+def compare(settings: WatchSettings, simulators: Mapping[str, Any]) -> str:
     """Returns the mean and range of the returns in each simulation, side by side."""
     said = []
     for name, play in simulators.items():
@@ -198,7 +200,7 @@ def compare(settings: Settings, simulators: Mapping[str, Any]) -> str:
     return f"mean return of {settings.episodes} episodes: {', '.join(said)}"
 
 
-def check(settings: Settings, source: Source) -> Path:
+def film_path(settings: WatchSettings, source: PolicySource) -> Path:
     """Returns the film's path.
 
     Raises:
@@ -229,7 +231,7 @@ def check(settings: Settings, source: Source) -> Path:
     return output
 
 
-def _check_together(settings: Settings) -> None:
+def _check_together(settings: WatchSettings) -> None:
     """Raises ValueError for settings that exclude each other, or where --live has no screen."""
     if not abs(settings.push) < float("inf"):
         raise ValueError(f"--push must be finite, got {settings.push}")

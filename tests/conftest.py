@@ -15,7 +15,7 @@ from pathlib import Path
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
-    # On a GPU a program compiled anew may else round otherwise.
+    # On a GPU a program compiled again may else round otherwise.
     + " --xla_gpu_deterministic_ops=true"
     # JAX 0.10's older emitters of fusions compile twice as fast; its users have the newer ones.
     + " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10."),
@@ -42,7 +42,7 @@ jax.config.update("jax_default_matmul_precision", "highest")
 
 
 def pytest_collection_modifyitems(config, items):
-    """Marks what slow.txt lists, and puts it first: no worker is left alone with it at the end."""
+    """Marks what slow.txt lists, and puts it first, so that no worker ends with a slow test."""
     slow = {line for line in SLOW.read_text().splitlines() if not line.startswith("#")}
     found = set()
     for item in items:

@@ -28,8 +28,8 @@ _CACHE_ERROR = r"Error (reading|writing) persistent compilation cache entry for 
 def configure_jax() -> None:
     """Turns on exact float32 products and the compilation cache, unless the user chose.
 
-    A program in the cache that cannot be read is removed, so that JAX, which replaces none, writes
-    it anew.
+    A program in the cache that cannot be read is removed, because JAX replaces no file; then JAX
+    writes it again.
 
     Raises:
       ValueError: JAX finds no device, such as where JAX_PLATFORMS names one that is not here, or is

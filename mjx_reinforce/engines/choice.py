@@ -30,7 +30,7 @@ MAX_ENTRIES = 200
 _CPU_BRANCH_COST = 32
 
 
-class Player(NamedTuple):
+class ActingPolicy(NamedTuple):
     """The policy that all episodes share.
 
     act: (actor, observation [..., O]) -> outputs [..., K] of the distribution
@@ -61,11 +61,11 @@ class Engine(NamedTuple):
         return f"Engine({self.name})"
 
 
-NAMES = ("auto", "vmap", "fused", "native")
+ENGINES = ("auto", "vmap", "fused", "native")
 
 
 def choose(
-    name: str, env: Environment, player: Player | None = None, horizon: int | None = None
+    name: str, env: Environment, player: ActingPolicy | None = None, horizon: int | None = None
 ) -> Engine:
     """Returns an engine by name; "auto" is the fastest that supports the environment.
 
@@ -84,8 +84,10 @@ def choose(
     return engine._replace(seconds=time.perf_counter() - began)
 
 
-def _choose(name: str, env: Environment, player: Player | None, horizon: int | None) -> Engine:
-    check_name("engine", name, dict.fromkeys(NAMES))
+def _choose(
+    name: str, env: Environment, player: ActingPolicy | None, horizon: int | None
+) -> Engine:
+    check_name("engine", name, dict.fromkeys(ENGINES))
     why = "chosen by name"
     if name == "vmap":
         return Engine(name, why, rollout)
@@ -115,7 +117,7 @@ def _choose(name: str, env: Environment, player: Player | None, horizon: int | N
 
 
 def _against_native(
-    name: str, env: Environment, player: Player | None, horizon: int | None
+    name: str, env: Environment, player: ActingPolicy | None, horizon: int | None
 ) -> str | None:
     """Returns why machine code must not play this; None if it can."""
     if name not in ("auto", "native"):

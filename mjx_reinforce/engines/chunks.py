@@ -13,19 +13,19 @@ from mjx_reinforce.fused import any_lane
 from mjx_reinforce.policies.distribution import Distribution
 from mjx_reinforce.types import PyTree
 
-Carry = TypeVar("Carry")
+LoopState = TypeVar("LoopState")
 
 #: Noise is drawn for so many steps at once, and only then is it seen whether all episodes are over.
 CHUNK_STEPS = 50
 
 
 def while_any(
-    cond: Callable[[Carry], jax.Array], body: Callable[[Carry], Carry], init: Carry
-) -> Carry:
+    cond: Callable[[LoopState], jax.Array], body: Callable[[LoopState], LoopState], init: LoopState
+) -> LoopState:
     """``lax.while_loop`` that, vmapped, runs as long as any seed needs it.
 
-    A seed that is done goes through the body all the same: a body must leave the
-    result of a finished seed as it is.
+    The body also runs for a seed that is done: it must leave the result of a
+    finished seed as it is.
     """
     return lax.while_loop(lambda carry: any_lane(cond(carry)), body, init)
 

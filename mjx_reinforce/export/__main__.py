@@ -11,13 +11,13 @@ import tyro
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import accept_everything
 from mjx_reinforce.export.pretrained import is_pretrained
-from mjx_reinforce.export.run_files import Seed, Which, read_run
+from mjx_reinforce.export.run_files import SeedChoice, Which, read_run
 from mjx_reinforce.files import check_folder
-from mjx_reinforce.settings.flags import one_line_errors, read
+from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Settings:
+class ExportSettings:
     """Write the deterministic action of a trained policy as a file that needs no JAX."""
 
     run: tyro.conf.Positional[Path]
@@ -25,7 +25,7 @@ class Settings:
     to: Literal["numpy", "onnx"]
     """"numpy": an archive .npz and a short .py beside it that needs NumPy alone. "onnx": a model
     from observation, float32 [N, O], to action [N, A]; needs pip install onnx."""
-    seed: Seed = "best"
+    seed: SeedChoice = "best"
     """Which of the run's seeds: best, worst or median by its final evaluation, or a number."""
     which: Which = "last"
     """The policy at the end of training, or the one that did best on the way, if it was kept."""
@@ -41,11 +41,13 @@ def main() -> None:
     accept_everything()
     prog = command("export")
     with one_line_errors():
-        settings = read(Settings, sys.argv[1:], prog, Settings.__doc__ or "")
+        settings = read_command_line(
+            ExportSettings, sys.argv[1:], prog, ExportSettings.__doc__ or ""
+        )
         print("\n".join(map(str, export(settings))))
 
 
-def export(settings: Settings) -> list[Path]:
+def export(settings: ExportSettings) -> list[Path]:
     """Writes the files and returns their names.
 
     Raises:
@@ -61,7 +63,7 @@ def export(settings: Settings) -> list[Path]:
     from mjx_reinforce.files import write_arrays, write_bytes
 
     player, saved = load_saved(settings.run, settings.seed, settings.which)
-    outputs = check(settings, player.seed)
+    outputs = output_files(settings, player.seed)
     if settings.to == "onnx":
         import_onnx()
     plain = arithmetic(saved)
@@ -74,7 +76,7 @@ def export(settings: Settings) -> list[Path]:
     return outputs
 
 
-def check(settings: Settings, seed: int) -> list[Path]:
+def output_files(settings: ExportSettings, seed: int) -> list[Path]:
     """Returns the files that are to be written.
 
     Raises:

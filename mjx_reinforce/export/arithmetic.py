@@ -4,7 +4,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.export.policy_files import SavedPolicy, action_space
+from mjx_reinforce.export.policy_files import SavedPolicy, saved_action_space
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.action_range import middle_and_half_range
 from mjx_reinforce.policies.gaussian import gaussian_outputs
@@ -99,7 +99,7 @@ def _ending(head: str, settings: dict[str, Any]) -> tuple[np.ndarray, np.ndarray
     Returns:
       ``middle`` and ``half``, one entry for each entry of the last layer, and the arrays.
     """
-    space = action_space(settings)
+    space = saved_action_space(settings)
     if isinstance(space, Discrete):
         return np.zeros(space.num_actions), np.ones(space.num_actions), {}
     rescale = settings.get("rescale", True)

@@ -32,7 +32,7 @@ def onnx_model(plain: Arithmetic, env: str, seed: int) -> bytes:
     Args:
       plain: what it computes.
       env: the id of the environment, for the model's description.
-      seed: the number of the seed, likewise.
+      seed: the number of the seed, for the description too.
     """
     onnx = import_onnx()
     helper, float32, int64 = onnx.helper, onnx.TensorProto.FLOAT, onnx.TensorProto.INT64

@@ -10,10 +10,10 @@ import numpy as np
 
 from mjx_reinforce.checks import check_type
 from mjx_reinforce.export.policy_files import SavedPolicy, read_policy
-from mjx_reinforce.export.pretrained import FOLDER, is_pretrained, provenance
+from mjx_reinforce.export.pretrained import FOLDER, is_pretrained, provenance_of
 from mjx_reinforce.export.run_files import (
     Run,
-    Seed,
+    SeedChoice,
     Which,
     choose_seed,
     final_returns,
@@ -76,7 +76,7 @@ class Player(NamedTuple):
         return np.array(action) if action.ndim else int(action)
 
 
-def load(run: str | Path, seed: Seed = "best", *, which: Which = "last") -> Player:
+def load(run: str | Path, seed: SeedChoice = "best", *, which: Which = "last") -> Player:
     """Loads a trained policy to play, in Gymnasium or elsewhere.
 
     Args:
@@ -94,7 +94,7 @@ def load(run: str | Path, seed: Seed = "best", *, which: Which = "last") -> Play
 
 
 def load_saved(
-    run: str | Path, seed: Seed = "best", which: Which = "last"
+    run: str | Path, seed: SeedChoice = "best", which: Which = "last"
 ) -> tuple[Player, SavedPolicy]:
     """Loads a policy, as ``load``, with what its files say."""
     check_type("run", run, str | Path)
@@ -104,7 +104,7 @@ def load_saved(
 
 
 def load_pretrained(
-    name: str, seed: Seed = "best", which: Which = "last"
+    name: str, seed: SeedChoice = "best", which: Which = "last"
 ) -> tuple[Player, SavedPolicy]:
     """Loads the policy for a task that comes with the package, as ``load_saved``."""
     if (seed, which) != ("best", "last"):
@@ -113,10 +113,10 @@ def load_pretrained(
             "or give a run directory"
         )
     saved = read_policy(FOLDER / name, 0)
-    return Player(name, provenance(name)["seed"], saved.policy, saved.actor), saved
+    return Player(name, provenance_of(name)["seed"], saved.policy, saved.actor), saved
 
 
-def load_seed(run: Run, seed: Seed, which: Which = "last") -> tuple[Player, SavedPolicy]:
+def load_seed(run: Run, seed: SeedChoice, which: Which = "last") -> tuple[Player, SavedPolicy]:
     """Loads one seed, as ``load``, with what its files say."""
     folder, number = policy_folder(run, which), choose_seed(run, seed, which)
     saved = read_policy(folder, run.place(number))

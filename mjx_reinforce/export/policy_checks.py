@@ -13,7 +13,7 @@ from mjx_reinforce.files import Header
 _MAX_SIZE = 2**20
 
 
-def check_settings(settings: Mapping[str, Any]) -> None:
+def check_policy_settings(settings: Mapping[str, Any]) -> None:
     """Checks the entries of ``policy.json`` one by one.
 
     Raises:

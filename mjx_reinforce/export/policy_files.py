@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import serialization, traverse_util
 
-from mjx_reinforce.export.policy_checks import check_arrays, check_finite, check_settings
+from mjx_reinforce.export.policy_checks import check_arrays, check_finite, check_policy_settings
 from mjx_reinforce.files import (
     Header,
     finite,
@@ -24,7 +24,7 @@ from mjx_reinforce.files import (
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.policies.policy import Policy, mlp_policy
-from mjx_reinforce.registry import DISTRIBUTIONS, check_name, load
+from mjx_reinforce.registry import DISTRIBUTIONS, check_name, load_definition
 from mjx_reinforce.types import Box, Discrete
 
 #: The name in the archive of what says that it belongs to the settings beside it.
@@ -86,7 +86,7 @@ def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
     settings_path, actor_path = Path(directory) / "policy.json", Path(directory) / "actor.npz"
     settings = read_json(settings_path)
     with _damage_in(settings_path):
-        check_settings(settings)
+        check_policy_settings(settings)
         policy = build_policy(settings)
     shapes = _shapes(policy, settings["observation_size"])
 
@@ -102,7 +102,7 @@ def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
     with _damage_in(actor_path):
         check_finite(arrays, seed)
     # Files from before there was a checksum have none. It finds damage, not ill will: who changes
-    # the files can compute it anew.
+    # the files can compute it again.
     if checksum is not None and checksum != _checksum(settings, arrays):
         raise ValueError(
             f"{settings_path} is damaged, or actor.npz beside it: they do not belong together "
@@ -161,8 +161,8 @@ def build_policy(settings: dict[str, Any]) -> Policy:
     weights, means scaled to the action's range.
     """
     check_name("policy", settings["policy"], DISTRIBUTIONS)
-    distribution = load(DISTRIBUTIONS[settings["policy"]])(
-        action_space(settings),
+    distribution = load_definition(DISTRIBUTIONS[settings["policy"]])(
+        saved_action_space(settings),
         initial_std=settings["initial_std"],
         rescale=settings.get("rescale", True),
     )
@@ -175,7 +175,7 @@ def build_policy(settings: dict[str, Any]) -> Policy:
     )
 
 
-def action_space(settings: dict[str, Any]) -> Box | Discrete:
+def saved_action_space(settings: dict[str, Any]) -> Box | Discrete:
     """Returns the action space that ``settings`` of ``save_policy`` describe.
 
     It is ``num_actions``, or ``action_low`` and ``action_high``; None, as JSON has no infinity,

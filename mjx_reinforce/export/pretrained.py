@@ -9,7 +9,7 @@ from typing import Any
 from mjx_reinforce.files import read_json
 
 FOLDER = Path(__file__).parent / "trained"
-PROVENANCE = "provenance.json"
+PROVENANCE_FILE = "provenance.json"
 
 
 def pretrained() -> dict[str, dict[str, Any]]:
@@ -21,7 +21,7 @@ def pretrained() -> dict[str, dict[str, Any]]:
       ``git_commit``, ``machine``, ``seconds`` (of training) and ``compile_seconds``; ``env_steps``
       and ``seed`` of the policy; ``seeds``, of how many it is the best; ``horizon`` (env steps).
     """
-    return {path.name: provenance(path.name) for path in sorted(FOLDER.glob("*-v*"))}
+    return {path.name: provenance_of(path.name) for path in sorted(FOLDER.glob("*-v*"))}
 
 
 def is_pretrained(name: str | Path) -> bool:
@@ -29,6 +29,6 @@ def is_pretrained(name: str | Path) -> bool:
     return str(name) in {path.name for path in FOLDER.glob("*-v*")} and not Path(name).exists()
 
 
-def provenance(name: str) -> dict[str, Any]:
+def provenance_of(name: str) -> dict[str, Any]:
     """Returns where the policy for a task comes from, as ``pretrained``."""
-    return read_json(FOLDER / name / PROVENANCE)
+    return read_json(FOLDER / name / PROVENANCE_FILE)

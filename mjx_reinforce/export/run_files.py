@@ -11,7 +11,7 @@ from mjx_reinforce.files import read_json
 from mjx_reinforce.registry import nearest
 
 #: A seed by its rank in the run's final evaluation, or by its number.
-Seed = Literal["best", "worst", "median"] | int
+SeedChoice = Literal["best", "worst", "median"] | int
 #: Each seed's policy at the end of training, or the one that did best on the way.
 Which = Literal["last", "best"]
 
@@ -109,7 +109,7 @@ def policy_folder(run: Run, which: Which) -> Path:
     return folder
 
 
-def choose_seed(run: Run, seed: Seed, which: Which = "last") -> int:
+def choose_seed(run: Run, seed: SeedChoice, which: Which = "last") -> int:
     """Returns the number of a seed.
 
     Args:

@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    import mujoco
-
     from mjx_reinforce.types import MjModel, MjSpec
 
 #: Colours from 0 to 1: the sky overhead and at the horizon, and the two kinds of tiles.
@@ -29,6 +27,8 @@ def dress(spec: "MjSpec", *, replace: bool) -> Any:
       replace: whether they take the place of the model's own sky and lights and of the colours of
         its planes; otherwise the model gets only what it lacks.
     """
+    import mujoco
+
     kinds: Any = mujoco
     lowest, length, middle = _extent(_compile(spec))
     skies = [x for x in spec.textures if x.type == kinds.mjtTexture.mjTEXTURE_SKYBOX]
@@ -108,6 +108,8 @@ def _extent(model: "MjModel") -> tuple[float, float, np.ndarray | None]:
 
     The third value is the middle [3] (m) of what moves, if that is higher than wide.
     """
+    import mujoco
+
     kinds: Any = mujoco
     data = kinds.MjData(model)
     kinds.mj_forward(model, data)

@@ -13,7 +13,7 @@ from mjx_reinforce.fused.backends import BACKENDS
 from mjx_reinforce.fused.errors import no_keys
 from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import Scalar
-from mjx_reinforce.registry import check_name, load
+from mjx_reinforce.registry import check_name, load_definition
 from mjx_reinforce.types import PyTree
 
 #: Looks at every program that was written out. The tests set it to ``verify``; users leave it.
@@ -47,7 +47,7 @@ class Scalarized:
           **settings: what the backend takes.
         """
         check_name("backend", backend, BACKENDS)
-        return load(BACKENDS[backend])(**settings).compile(self.schedule, self.outputs)
+        return load_definition(BACKENDS[backend])(**settings).compile(self.schedule, self.outputs)
 
     @property
     def operations(self) -> Counter:

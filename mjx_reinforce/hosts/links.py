@@ -11,7 +11,7 @@ import struct
 import threading
 from collections.abc import Callable
 
-#: Kinds of messages: data for whoever waits for it, a signal that asks to stop, a leave-taking, and
+#: Kinds of messages: data for a process that waits, a signal that asks to stop, a leave-taking, and
 #: word of a third process that died.
 DATA, STOP, BYE, DIED = b"D", b"S", b"B", b"X"
 #: A message begins with its kind and its length in bytes.

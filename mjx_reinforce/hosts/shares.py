@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce.files import Arrays
 from mjx_reinforce.hosts.processes import Processes
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.training.state import Arrays, Budget, Looked, Programs, RunState, restored
+from mjx_reinforce.training.state import Budget, Looked, Programs, RunState, restored
 from mjx_reinforce.types import PyTree, plain
 
 #: What a process is asked for, besides the names of ``Programs``.

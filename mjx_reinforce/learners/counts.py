@@ -38,7 +38,7 @@ def reached(count: Count, limit: Count) -> jax.Array:
     return (high > limit[0]) | ((high == limit[0]) & (low >= limit[1]))
 
 
-def number(count: Count) -> jax.Array:
+def as_float(count: Count) -> jax.Array:
     """Returns counts [..., 2] as floats [...], to their precision."""
     words = jnp.asarray(count).astype(float)
     return words[..., 0] * 2.0**32 + words[..., 1]

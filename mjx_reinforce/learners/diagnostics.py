@@ -1,6 +1,6 @@
 """Diagnostics: how an update changed the policy, and how noisy the gradient was that it followed.
 
-Nothing that is learned depends on them, but for ``within_kl``. They cost a few percent of an update
+Only ``within_kl`` changes what is learned. The diagnostics cost a few percent of an update
 at most: the policies are compared at a few of the visited steps, and the noise is that of a few
 episodes.
 """
@@ -22,7 +22,7 @@ from mjx_reinforce.types import Trajectory
 Metrics = dict[str, jax.Array]
 
 #: The policies before and after an update are compared at so many visited steps at most.
-MAX_STEPS = 64
+MAX_COMPARED = 64
 
 
 class Visited(NamedTuple):
@@ -43,16 +43,16 @@ class Visited(NamedTuple):
 
 
 def visited_steps(trajectory: Trajectory) -> Visited:
-    """Returns at most ``MAX_STEPS`` steps; all of them, if each episode has at most K.
+    """Returns at most ``MAX_COMPARED`` steps; all of them, if each episode has at most K.
 
     Of an episode of L steps, every s-th is taken, from the middle of the first s on, with s = L / K
-    rounded up. Together they count as L. Of more episodes than ``MAX_STEPS``, every second, third,
-    ... is taken.
+    rounded up. Together they count as L. Of more than ``MAX_COMPARED`` episodes, every second,
+    third, ... is taken.
     """
     apart = _apart(trajectory)
     mask = trajectory.mask[:, apart]
     horizon, num_episodes = mask.shape
-    each = min(horizon, MAX_STEPS // num_episodes)
+    each = min(horizon, MAX_COMPARED // num_episodes)
     length = jnp.sum(mask, axis=0)
     stride = jnp.maximum(-(-length // each), 1)
     time = stride // 2 + stride * jnp.arange(each)[:, None]
@@ -71,11 +71,11 @@ def visited_steps(trajectory: Trajectory) -> Visited:
 
 
 def _apart(trajectory: Trajectory) -> slice | jax.Array:
-    """Returns which episodes are looked at, ``MAX_STEPS`` at most, evenly apart."""
+    """Returns which episodes are looked at, ``MAX_COMPARED`` at most, evenly apart."""
     count = trajectory.mask.shape[1]
-    if trajectory.played is None or count <= MAX_STEPS:
-        return slice(None, None, -(-count // MAX_STEPS))
-    return jnp.arange(MAX_STEPS) * trajectory.num_played() // MAX_STEPS
+    if trajectory.played is None or count <= MAX_COMPARED:
+        return slice(None, None, -(-count // MAX_COMPARED))
+    return jnp.arange(MAX_COMPARED) * trajectory.num_played() // MAX_COMPARED
 
 
 def policy_metrics(policy: Policy, before: Actor, after: Actor, visited: Visited) -> Metrics:

@@ -106,7 +106,7 @@ def mean_log_prob(discount: float | jax.Array = 0.99) -> Estimator:
     That is what the loss ``-sum(mean(log_probs) * returns)`` of Gymnasium's first
     REINFORCE tutorial comes to, though its comment promises the sum of the
     products log pi[t] G[t]: the mean over log-probabilities is taken before the
-    product. Its gradient is unbiased, but for E[sum_t G[t] / L], which counts a
+    product. Its gradient is unbiased, except for E[sum_t G[t] / L], which counts a
     reward the more often the later it comes. It is also noisy, because the weight of an action
     contains the rewards from before that action.
     """
@@ -202,7 +202,7 @@ def shift_rewards(estimator: Estimator, shift: float | jax.Array) -> Estimator:
     Where an episode can end early, that is another objective: a bonus for every step survived is
     worth that much less (Mania et al. 2018, arXiv:1803.07055, subtract the survival
     bonus of MuJoCo's walkers, whose policies would else learn to stand still). Where all episodes
-    are of one length, the gradient is the same but for its noise. Returns that are reported stay
+    are of one length, the gradient is the same up to its noise. Returns that are reported stay
     those of the task.
 
     Args:
@@ -248,7 +248,7 @@ def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array)
     """Returns how much of the returns a baseline explains, 1 - Var(residual) / Var(returns), [].
 
     1 is a perfect baseline, 0 as good as a constant, and less is worse than none. It is NaN where
-    the returns do not vary, but for rounding: there is nothing to explain.
+    the returns vary by rounding only: there is nothing to explain.
 
     Args:
       residual: [T, N] what the baseline leaves of the returns.

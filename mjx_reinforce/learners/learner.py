@@ -15,12 +15,11 @@ from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.fused import any_lane
 from mjx_reinforce.learners import counts
+from mjx_reinforce.learners.diagnostics import Metrics
 from mjx_reinforce.learners.pace import Pace
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.policy import Policy
 from mjx_reinforce.types import Environment, PyTree, Trajectory
-
-Metrics = dict[str, jax.Array]
 
 
 @struct.dataclass(kw_only=True)
@@ -29,9 +28,9 @@ class TrainState:
 
     key: [] the seed's own random key, split by every update
     num_updates: [2] how many updates were made, as ``counts`` has it
-    env_steps: [2] how many env steps were played in them, likewise
+    env_steps: [2] how many env steps were played in them, as ``counts`` has it
     progress: [] the share of the budget that is used, for what changes with it, such as the
-      learning rate; whoever drives the learner sets it
+      learning rate; the caller of the learner sets it
     actor: the policy's parameters and the observation statistics
     opt_state: the optimiser's state
     estimator_state: the estimator's, such as a critic
@@ -173,7 +172,7 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
     ``jax.vmap(functools.partial(train_step, learner))(states)``.
 
     Args:
-      learner: from ``reinforce`` or ``ars``; another learner compiles anew.
+      learner: from ``reinforce`` or ``ars``; another learner is compiled again.
       state: from ``learner.init`` or the step before.
 
     Returns:

@@ -24,12 +24,12 @@ from mjx_reinforce.policies.arguments import check_count, check_number
 from mjx_reinforce.policies.policy import Policy
 
 #: Conjugate gradients know F from so many of the visited steps at most.
-MAX_STEPS = 4096
+MAX_FISHER_STEPS = 4096
 #: They end where the residual is this share of the gradient.
 _TOLERANCE = 1e-8
 
 #: (problem, key, params, gradient) -> (F + damping I)^-1 gradient; may consume the key.
-Solver = Callable[[Problem, jax.Array, Any, Any], Any]
+LinearSolver = Callable[[Problem, jax.Array, Any, Any], Any]
 
 
 def natural_gradient(
@@ -52,7 +52,7 @@ def natural_gradient(
     (``normal``), F is exact, a matrix (O + 1) x (O + 1) for each entry of the action, which is
     factored. Else conjugate gradients solve for x, with products of F and a vector that are two
     passes through the network (Schulman et al. 2015, appendix C), over all visited steps or
-    ``MAX_STEPS`` that are drawn.
+    ``MAX_FISHER_STEPS`` that are drawn.
 
     The metrics are those of ``full_batch``; ``gradient_norm`` and ``gradient_snr`` are of g.
 
@@ -102,7 +102,7 @@ def _is_linear(policy: Policy) -> bool:
     return jax.tree.structure(params) == jax.tree.structure(like)
 
 
-def _exact(policy: Policy, damping: float | jax.Array) -> Solver:
+def _exact(policy: Policy, damping: float | jax.Array) -> LinearSolver:
     """Factors F: kron(E[o o^T], D) of the weights with D diagonal, and a diagonal of constants."""
 
     def solve(problem, key, params, gradient):
@@ -131,15 +131,17 @@ def _exact(policy: Policy, damping: float | jax.Array) -> Solver:
     return solve
 
 
-def _by_conjugate_gradients(policy: Policy, damping: float | jax.Array, iterations: int) -> Solver:
+def _by_conjugate_gradients(
+    policy: Policy, damping: float | jax.Array, iterations: int
+) -> LinearSolver:
     """Solves with products of F alone."""
 
     def solve(problem, key, params, gradient):
         observation, *_, mask = problem.samples
         observation = observation.reshape(mask.size, -1)
-        if mask.size > MAX_STEPS:
-            observation = observation[draw_steps(key, mask, (MAX_STEPS,))]
-            share = jnp.full(MAX_STEPS, 1 / MAX_STEPS)
+        if mask.size > MAX_FISHER_STEPS:
+            observation = observation[draw_steps(key, mask, (MAX_FISHER_STEPS,))]
+            share = jnp.full(MAX_FISHER_STEPS, 1 / MAX_FISHER_STEPS)
         else:
             share = mask.reshape(-1) / jnp.maximum(jnp.sum(mask), 1)
 

@@ -61,7 +61,7 @@ class Pace:
 
     num_episodes: [] int32
     signal: [] running mean of ``Noise.signal``, as of zeros before the first update
-    noise: [] running mean of ``Noise.noise``, likewise: the two have the same bias, which cancels
+    noise: [] running mean of ``Noise.noise``, with the same bias as ``signal``, which cancels
     """
 
     num_episodes: jax.Array
@@ -81,13 +81,13 @@ def check_auto(auto: AutoEpisodes, update: object) -> None:
         )
 
 
-def begin(auto: AutoEpisodes) -> Pace:
+def first_pace(auto: AutoEpisodes) -> Pace:
     """Returns the pace of the first update, which plays the fewest episodes."""
     zero = jnp.zeros(())
     return Pace(num_episodes=jnp.int32(auto.least), signal=zero, noise=zero)
 
 
-def follow(pace: Pace, auto: AutoEpisodes, measured: Noise) -> Pace:
+def next_pace(pace: Pace, auto: AutoEpisodes, measured: Noise) -> Pace:
     """Returns the pace of the next update.
 
     Where the mean signal is not positive, noise hides it: the number of episodes grows. An update

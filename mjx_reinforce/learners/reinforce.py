@@ -122,7 +122,7 @@ def reinforce(
         the state near the middle, statistics that never stop shrink, and magnify the
         observations until the policy fails.)
       normalize_min_std: the least that an observation is divided by, in its own unit. (What hardly
-        changes in the first steps would be magnified for ever.)
+        changes in the first steps would be magnified for the rest of training.)
       one_start: reset every episode of a seed with the same key, drawn once at ``init``.
       num_seeds: how many will learn at once, vmapped. It decides nothing but speed: of many,
         updates whose episodes are all short pass over their first steps alone, the same up to
@@ -218,7 +218,7 @@ class _Reinforce:
     def learner(self, engine: str) -> Learner:
         """Returns the learner, whose episodes are played by the engine of that name."""
         actor = jax.eval_shape(self._first_actor, jax.random.key(0))
-        player = choice.Player(self._act, actor, self.policy.distribution)
+        player = choice.ActingPolicy(self._act, actor, self.policy.distribution)
         chosen = choice.choose(engine, self.env, player, self.horizon)
         if self.auto is None:
             return self._with_engine(chosen)
@@ -231,7 +231,7 @@ class _Reinforce:
     def _with_engine(self, engine: Engine) -> Learner:
         play: Any = functools.partial(self._play, engine)
         if engine.name == "native" and not self.one_start:
-            # Elsewhere an episode that is not played takes its place all the same.
+            # Elsewhere an episode that is not played still takes its place.
             play = Host(play, functools.partial(self._play_with, engine))
         room = self.num_episodes
         return Learner(self._init, play, self._learn, self.policy, engine, room=room)
@@ -261,7 +261,7 @@ class _Reinforce:
                 estimator_key, self.observation_size
             ),
             start_key=start_key,
-            pace=None if self.auto is None else pace.begin(self.auto),
+            pace=None if self.auto is None else pace.first_pace(self.auto),
         )
 
     def _play(
@@ -337,12 +337,12 @@ class _Reinforce:
             optimizer=self.optimizer,
             samples=(scaled, trajectory.action, weight, mask),
             divisor=self._divisor(trajectory),
-            clock=Clock(state.progress, counts.number(state.env_steps)),
+            clock=Clock(state.progress, counts.as_float(state.env_steps)),
             played=trajectory.played,
         )
         params, opt_state, update_metrics = self.update(problem, key, actor.params, state.opt_state)
         if self.auto is not None and state.pace is not None:
-            paced = pace.follow(state.pace, self.auto, update_metrics.pop("noise"))
+            paced = pace.next_pace(state.pace, self.auto, update_metrics.pop("noise"))
             state = dataclasses.replace(state, pace=paced)
         visited = visited_steps(trajectory)
         if self.max_kl is not None:

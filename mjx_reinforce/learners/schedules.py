@@ -96,7 +96,7 @@ def look_further(
 
     Args:
       first: the discount at the beginning, less than 1.
-      last: at the end, likewise.
+      last: the discount at the end, less than 1.
       progress: [] the share of the budget that is used.
     """
     ahead = jnp.log1p(-jnp.asarray(first)), jnp.log1p(-jnp.asarray(last))

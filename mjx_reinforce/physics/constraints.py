@@ -37,7 +37,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     """
     fields = jax_fields(data)
     if limits.supports(model, data):
-        active, solver = limits.reached(model, data), limits.solve
+        active, solver = limits.past_limit(model, data), limits.solve_limits
     elif fields.ne or fields.nf:  # rows that are always active
         active, solver = jnp.array(True), _iterate
     else:
@@ -71,6 +71,6 @@ def _iterate(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, ja
       The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
     if newton.supports(model, data):
-        return touching.solve(newton.solve, model, data)
+        return touching.solve_touching(newton.solve_newton, model, data)
     data = mjx.solve(model, data)
     return data.qacc, data.qfrc_constraint, jax_fields(data).efc_force

@@ -34,7 +34,7 @@ def supports(model: mjx.Model, data: mjx.Data) -> bool:
     return only_limits and max(map(len, _coupled_rows(model, joints))) <= _MAX_ROWS_TOGETHER
 
 
-def reached(model: mjx.Model, data: mjx.Data) -> jax.Array:
+def past_limit(model: mjx.Model, data: mjx.Data) -> jax.Array:
     """Returns whether some joint is past its limit [], by the same test as MJX's rows."""
     joints = _limited_joints(model)
     position = data.qpos[np.asarray(model.jnt_qposadr)[joints]]
@@ -44,7 +44,7 @@ def reached(model: mjx.Model, data: mjx.Data) -> jax.Array:
     return ~jnp.all(distance >= 0)
 
 
-def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
+def solve_limits(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Solves for the limits' forces exactly.
 
     Args:
@@ -60,7 +60,7 @@ def solve(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.A
     dofs = np.asarray(model.jnt_dofadr)[joints]
     sign = [fields.efc_J[i, dof] for i, dof in enumerate(dofs)]
     unit = jnp.eye(model.nv, dtype=data.qacc_smooth.dtype)
-    # response[i] is inv(M) applied to row i, but for its sign.
+    # response[i] is inv(M) applied to row i, up to its sign.
     response = [solve_m(model, data, unit[dof]) for dof in dofs]
     force: list[Any] = [None] * dofs.size
     for rows in _coupled_rows(model, joints):

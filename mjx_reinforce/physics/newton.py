@@ -91,7 +91,7 @@ class _LineSearch(NamedTuple):
 
 
 def supports(model: mjx.Model, data: mjx.Data) -> bool:
-    """Returns whether ``solve`` is for this model: Newton, pyramidal cones, no friction loss."""
+    """Returns whether ``solve_newton`` fits: Newton, pyramidal cones, no friction loss."""
     return (
         model.opt.solver == mjx.SolverType.NEWTON
         and model.opt.cone == mjx.ConeType.PYRAMIDAL
@@ -99,7 +99,7 @@ def supports(model: mjx.Model, data: mjx.Data) -> bool:
     )
 
 
-def solve(
+def solve_newton(
     model: mjx.Model, data: mjx.Data, may_unroll: bool = True
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Finds the acceleration under constraints, from the start that costs less.

@@ -1,6 +1,6 @@
 """Runge-Kutta of order 4 as ``mj_RungeKutta`` of C MuJoCo 4.0.
 
-It is MJX's, but for the orientations of free and ball joints. MJX 3.17 averages the stages' angular
+It is MJX's, except the orientations of free and ball joints. MJX 3.17 averages the stages' angular
 velocities, though each is in its own stage's frame, which makes it a method of order 2. MuJoCo,
 from 4.0 on, averages the rates of one rotation vector (Runge-Kutta-Munthe-Kaas).
 """

@@ -1,6 +1,6 @@
 """C MuJoCo's step in MJX, with constraint solvers that do less work for the same answer.
 
-The stages are MJX's own, in MJX's order, but for four:
+The stages are MJX's own, in MJX's order, with four exceptions:
 
 - ``constraints`` solves for the constraint forces in closed form, or not at all where no constraint
   is active, or with a line search that ends when it is exact.
@@ -58,7 +58,7 @@ def step(
 
 
 def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
-    """Computes accelerations as ``mjx.forward(model, data)`` does, but for what this file lists."""
+    """Computes accelerations as ``mjx.forward(model, data)``, except for what this file lists."""
     data = contacts.fwd_position(model, data)
     data = mjx.sensor_pos(model, data)
     data = mjx.fwd_velocity(model, data)

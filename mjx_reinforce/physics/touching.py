@@ -28,7 +28,7 @@ Solver = Callable[..., Solution]
 _FEW = 6
 
 
-def solve(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
+def solve_touching(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
     """Solves with the contacts that touch, or with all where more touch than there is room for.
 
     Where that leaves more than half of the rows, it is not worth the branches (Pusher on an H200:

@@ -4,11 +4,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from mjx_reinforce.export.player import Player
-from mjx_reinforce.export.pretrained import is_pretrained, provenance
+from mjx_reinforce.export.pretrained import is_pretrained, provenance_of
 from mjx_reinforce.export.run_files import Run, choose_seed, read_run
 
 
-class Source(NamedTuple):
+class PolicySource(NamedTuple):
     """Where policies come from.
 
     env: the id of their environment
@@ -34,19 +34,19 @@ class Role(NamedTuple):
     player: Any
 
 
-def read_source(place: Path) -> Source:
+def read_source(place: Path) -> PolicySource:
     """Returns the run of a directory, or the policy of the package for a task of that name.
 
     Raises:
       ValueError: there is neither, or the run has no policy yet.
     """
     if is_pretrained(place):
-        return Source(str(place), provenance(str(place))["horizon"], None)
+        return PolicySource(str(place), provenance_of(str(place))["horizon"], None)
     run = read_run(place)
-    return Source(run.env, run.horizon, run)
+    return PolicySource(run.env, run.horizon, run)
 
 
-def main_seed(settings: Any, source: Source) -> int:
+def main_seed(settings: Any, source: PolicySource) -> int:
     """Returns the number of the seed that plays.
 
     Raises:
@@ -60,14 +60,14 @@ def main_seed(settings: Any, source: Source) -> int:
             f"the package has one policy for {source.env}; leave --seed, --which and --beside out "
             "(but for --beside untrained), or give a run directory"
         )
-    return provenance(source.env)["seed"]
+    return provenance_of(source.env)["seed"]
 
 
-def cast(settings: Any, source: Source) -> list[Role]:
+def cast(settings: Any, source: PolicySource) -> list[Role]:
     """Returns the policies that play, from left to right; the last is the one asked for.
 
     Args:
-      settings: ``seed``, ``which`` and ``beside``, as in ``watch.Settings``.
+      settings: ``seed``, ``which`` and ``beside``, as in ``watch.WatchSettings``.
       source: of the policies.
 
     Raises:
@@ -82,7 +82,7 @@ def cast(settings: Any, source: Source) -> list[Role]:
     return [_role(settings.beside, settings, source), main]
 
 
-def _role(seed: Any, settings: Any, source: Source) -> Role:
+def _role(seed: Any, settings: Any, source: PolicySource) -> Role:
     from mjx_reinforce.export.player import load_pretrained, load_seed
 
     if source.run is None:

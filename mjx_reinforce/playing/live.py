@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export.player import Player
-from mjx_reinforce.playing.mujoco_playing import moments
+from mjx_reinforce.playing.mujoco_playing import simulate
 
 if TYPE_CHECKING:
     from mjx_reinforce.envs.base import MujocoEnv
@@ -23,7 +23,7 @@ def live(env: "MujocoEnv", model: "MjModel", player: Player, horizon: int, setti
       model: what is drawn, with the bodies of the task's own model.
       player: the policy.
       horizon: the time limit in steps.
-      settings: ``episode``, ``noise`` and ``push``, as in ``watch.Settings``.
+      settings: ``episode``, ``noise`` and ``push``, as in ``watch.WatchSettings``.
 
     Raises:
       ValueError: the viewer does not open, or C MuJoCo cannot play the task.
@@ -42,7 +42,7 @@ def live(env: "MujocoEnv", model: "MjModel", player: Player, horizon: int, setti
     with window:
         for episode in itertools.count(settings.episode):
             total, due = 0.0, time.monotonic()
-            steps = moments(simulation, player, episode, settings.noise, settings.push)
+            steps = simulate(simulation, player, episode, settings.noise, settings.push)
             for moment in itertools.islice(steps, 1 + horizon):
                 if not window.is_running():
                     return

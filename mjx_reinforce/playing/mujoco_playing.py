@@ -53,7 +53,7 @@ def mujoco_simulator(
     simulation = InMujoco(env)
 
     def play(episode: int, noise: bool) -> Episode:
-        steps = moments(simulation, player, episode, noise, push)
+        steps = simulate(simulation, player, episode, noise, push)
         played, qpos = [], []
         for moment in itertools.islice(steps, 1 + horizon):
             if moment is not None:
@@ -66,7 +66,7 @@ def mujoco_simulator(
     return play
 
 
-def moments(
+def simulate(
     simulation: InMujoco, player: Player, episode: int, noise: bool, push: float
 ) -> Iterator[Moment | None]:
     """Plays an episode until it ends by its own rule; yields None at its start, then each step."""

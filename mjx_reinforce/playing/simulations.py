@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from mjx_reinforce.envs.base import MujocoEnv
 from mjx_reinforce.export.player import Player
-from mjx_reinforce.playing.cast import Source
+from mjx_reinforce.playing.cast import PolicySource
 from mjx_reinforce.playing.mjx_playing import Episode, gymnasium_simulator, simulator
 from mjx_reinforce.playing.mujoco_playing import mujoco_simulator
 from mjx_reinforce.types import observation_size
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
 
 
 def simulators(
-    backend: str | None, env: "Environment", player: Player, source: Source, push: float
+    backend: str | None, env: "Environment", player: Player, source: PolicySource, push: float
 ) -> dict[str, Callable[[int, bool], Episode]]:
     """Returns what plays an episode, by name; the last is filmed, others are compared with it.
 
     Args:
-      backend: as in ``watch.Settings``.
+      backend: as in ``watch.WatchSettings``.
       env: what is played.
       player: the policy.
       source: of the policy.
@@ -42,7 +42,7 @@ def simulators(
     return found
 
 
-def check_size(env: "Environment", player: Player, source: Source) -> None:
+def check_observations(env: "Environment", player: Player, source: PolicySource) -> None:
     """Raises ValueError for a policy of a run whose observations are not the environment's."""
     if source.run is None:
         return

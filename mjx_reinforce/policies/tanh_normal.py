@@ -37,7 +37,7 @@ def tanh_normal(
     Args:
       space: the action bounds, [A] each, finite.
       std: as in ``normal``, of the Normal before the tanh.
-      initial_std: likewise.
+      initial_std: as in ``normal``.
       rescale: False takes the network's output as the mean itself.
 
     Returns:

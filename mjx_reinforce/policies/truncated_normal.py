@@ -26,7 +26,7 @@ def truncated_normal(
     Args:
       space: the action bounds, [A] each, finite.
       std: as in ``normal``, of the Normal before it is restricted.
-      initial_std: likewise.
+      initial_std: as in ``normal``.
       rescale: False takes the network's output as the mean itself.
 
     Returns:

@@ -67,12 +67,12 @@ class Experiment(NamedTuple):
     disagree: list[str]
 
 
-def describe(settings: Mapping[str, Any]) -> str:
+def settings_in_words(settings: Mapping[str, Any]) -> str:
     """Returns settings in words: "learning rate 0.003, discount 0.99"."""
-    return ", ".join(f"{spoken(name)} {say(value)}" for name, value in settings.items())
+    return ", ".join(f"{setting_in_words(name)} {say(value)}" for name, value in settings.items())
 
 
-def spoken(name: str) -> str:
+def setting_in_words(name: str) -> str:
     """Returns the name of a setting in words."""
     return name.replace("_", " ")
 
@@ -88,7 +88,7 @@ def say(value: object) -> str:
     return "none" if value is None else str(value)
 
 
-def count(number: int, noun: str) -> str:
+def counted(number: int, noun: str) -> str:
     """Returns a number and its noun: "1 seed", "1,024 seeds"."""
     return f"{number:,} {noun}" + ("" if number == 1 else "s")
 
@@ -96,13 +96,13 @@ def count(number: int, noun: str) -> str:
 def asked(env: str, configurations: Sequence[Configuration]) -> str:
     """Returns the question that configurations answer."""
     numbers = sorted({part.eval_return.shape[1] for part in configurations})
-    seeds = count(numbers[0], "seed")
+    seeds = counted(numbers[0], "seed")
     if len(numbers) > 1:
-        seeds = f"{numbers[0]:,} to {count(numbers[-1], 'seed')}"
+        seeds = f"{numbers[0]:,} to {counted(numbers[-1], 'seed')}"
     steps = max(int(part.env_steps[-1].max()) for part in configurations)
     if len(configurations) == 1:
         return f"What return does {env} reach with {seeds} and {steps:,} env steps a seed?"
-    swept = "; ".join(f"{spoken(k)} {v}" for k, v in _values(configurations).items())
+    swept = "; ".join(f"{setting_in_words(k)} {v}" for k, v in _values(configurations).items())
     return (
         f"Which of {len(configurations):,} configurations of {env} ends with the greatest return, "
         f"with {seeds} of each and up to {steps:,} env steps a seed? They differ in {swept}."

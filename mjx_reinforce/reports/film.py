@@ -12,14 +12,14 @@ _PATIENCE = 600
 _FORM = ("--seconds", "8", "--width", "360", "--height", "270")
 
 
-class Film(NamedTuple):
+class PageFilm(NamedTuple):
     """A film for the page: what is seen in it, and the GIF as a data URL; or why there is none."""
 
     said: str
     url: str = ""
 
 
-def make(run: Path, output: Path) -> Film:
+def film_of_median(run: Path, output: Path) -> PageFilm:
     """Films the seed of a run whose last return is the median, and returns the film.
 
     Args:
@@ -33,9 +33,9 @@ def make(run: Path, output: Path) -> Film:
             command, capture_output=True, text=True, errors="replace", timeout=_PATIENCE
         )
     except subprocess.TimeoutExpired:
-        return Film(f"There is no film: it was not ready after {_PATIENCE} s.")
+        return PageFilm(f"There is no film: it was not ready after {_PATIENCE} s.")
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"watch exited with {done.returncode}"]
-        return Film(f"There is no film: {lines[-1].removeprefix('error: ')}.")
+        return PageFilm(f"There is no film: {lines[-1].removeprefix('error: ')}.")
     encoded = base64.b64encode(output.read_bytes()).decode()
-    return Film(done.stdout.splitlines()[0], f"data:image/gif;base64,{encoded}")
+    return PageFilm(done.stdout.splitlines()[0], f"data:image/gif;base64,{encoded}")

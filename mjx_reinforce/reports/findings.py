@@ -60,7 +60,7 @@ class Findings(NamedTuple):
     learning: Learning
 
 
-def find(experiment: Experiment) -> Findings:
+def compute_findings(experiment: Experiment) -> Findings:
     """Computes all figures of a report."""
     parts = experiment.configurations
     ends = [int(part.env_steps[-1].min()) for part in parts]

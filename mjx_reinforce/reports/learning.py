@@ -19,7 +19,7 @@ from mjx_reinforce.reports.statistics.comparisons import (
 from mjx_reinforce.reports.statistics.survival import log_rank
 
 
-class Speed(NamedTuple):
+class SpeedTest(NamedTuple):
     """The log-rank test of two results, ``first`` and ``second`` being their places.
 
     p_value: that both solve the task equally soon
@@ -58,7 +58,7 @@ class Learning(NamedTuple):
     """
 
     until: int
-    speeds: list[Speed]
+    speeds: list[SpeedTest]
     areas: list[Comparison]
     levels: list[Level]
 
@@ -78,7 +78,7 @@ def fastest(results: Sequence[Result]) -> int:
     return int(np.argmin(means))
 
 
-def _speeds(results: Sequence[Result]) -> list[Speed]:
+def _speeds(results: Sequence[Result]) -> list[SpeedTest]:
     solving = [each.solving for each in results if each.solving is not None]
     pairs = list(itertools.combinations(range(len(solving)), 2))
     found = [
@@ -86,7 +86,7 @@ def _speeds(results: Sequence[Result]) -> list[Speed]:
         for i, j in pairs
     ]
     return [
-        Speed(i, j, p_value, float(adjusted))
+        SpeedTest(i, j, p_value, float(adjusted))
         for (i, j), p_value, adjusted in zip(pairs, found, holm(found), strict=True)
     ]
 

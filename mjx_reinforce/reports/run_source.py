@@ -17,7 +17,7 @@ PROVENANCE = (
 _COLUMNS = {"seed": np.int64, "env_steps": np.int64, "eval_return": np.float64}
 
 
-def read(directory: Path) -> Source:
+def read_run_source(directory: Path) -> Source:
     """Reads a run, which may go on or have been interrupted.
 
     Raises:
@@ -43,7 +43,7 @@ def read(directory: Path) -> Source:
     return Source(
         directory=directory,
         env=config["env"],
-        threshold=number(summary, "threshold", path),
+        threshold=number_entry(summary, "threshold", path),
         configurations=[part],
         settings=settings,
         provenance=kept | {"engine": summary.get("engine", config.get("engine"))},
@@ -133,7 +133,7 @@ def _nonfinite(summary: dict[str, Any], path: Path, num_seeds: int) -> np.ndarra
         raise ValueError(f"{path} is damaged: nonfinite is no list of updates") from error
 
 
-def number(content: dict[str, Any], name: str, path: Path) -> float | None:
+def number_entry(content: dict[str, Any], name: str, path: Path) -> float | None:
     """Returns an entry of a JSON file, a number or None.
 
     Raises:
@@ -148,5 +148,5 @@ def number(content: dict[str, Any], name: str, path: Path) -> float | None:
 def timings(content: dict[str, Any], path: Path) -> dict[str, float]:
     """Returns the seconds that a JSON file gives for compiling, running and statistics."""
     names = ("compile_seconds", "run_seconds", "statistics_seconds")
-    found = {name: number(content, name, path) for name in names}
+    found = {name: number_entry(content, name, path) for name in names}
     return {name: seconds for name, seconds in found.items() if seconds is not None}

@@ -11,8 +11,8 @@ from mjx_reinforce.reports.experiment import (
     Experiment,
     Source,
     asked,
-    count,
-    describe,
+    counted,
+    settings_in_words,
 )
 
 #: Settings that say where and how a run was kept, not what was trained.
@@ -21,7 +21,7 @@ _HOUSEKEEPING = ("output", "overwrite", "resume", "checkpoint_every", "num_seeds
 _COMPARABLE = ("python", "packages", "git_commit", "device", "x64", "engine")
 
 
-def read(sources: Sequence[Path]) -> Experiment:
+def read_experiment(sources: Sequence[Path]) -> Experiment:
     """Reads run directories and sweep directories as one experiment.
 
     The configurations of a sweep are told apart by what it swept; those of several sources by the
@@ -47,7 +47,7 @@ def read_tasks(sources: Sequence[Path]) -> list[Experiment]:
     """Reads run and sweep directories as one experiment for each task, in their order.
 
     Raises:
-      ValueError: as ``read`` does, but not for different tasks.
+      ValueError: as ``read_experiment`` does, but not for different tasks.
     """
     if not sources:
         raise ValueError("there is nothing to report on: name a run or a sweep directory")
@@ -64,7 +64,7 @@ def _experiment(found: Sequence[Source]) -> Experiment:
     timings = sum((Counter(source.timings) for source in found), Counter())
     env = found[0].env
     return Experiment(
-        title=f"{env}, {count(len(configurations), 'configuration')}",
+        title=f"{env}, {counted(len(configurations), 'configuration')}",
         env=env,
         threshold=thresholds[0] if thresholds else None,
         asked=asked(env, configurations),
@@ -80,9 +80,9 @@ def _experiment(found: Sequence[Source]) -> Experiment:
 
 def _read_source(directory: Path) -> Source:
     if (directory / "sweep.json").is_file():
-        return sweep_source.read(directory)
+        return sweep_source.read_sweep_source(directory)
     if (directory / "config.json").is_file():
-        return run_source.read(directory)
+        return run_source.read_run_source(directory)
     if not directory.is_dir():
         raise ValueError(f"there is no directory {directory}; name that of a run or a sweep")
     raise ValueError(
@@ -104,7 +104,9 @@ def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
     for (source, part), settings in zip(pairs, full, strict=True):
         own = {name: settings.get(name) for name in differ}
         parts.append(
-            part._replace(settings=own, label=describe(own) or _name(source.directory.name))
+            part._replace(
+                settings=own, label=settings_in_words(own) or _name(source.directory.name)
+            )
         )
     repeated = {label for label, times in Counter(p.label for p in parts).items() if times > 1}
     return [

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.files import Header, read_arrays, read_json
-from mjx_reinforce.reports.experiment import Configuration, Source, describe
-from mjx_reinforce.reports.run_source import number, read_columns, timings
+from mjx_reinforce.reports.experiment import Configuration, Source, settings_in_words
+from mjx_reinforce.reports.run_source import number_entry, read_columns, timings
 
 #: What sweep.json says of the sweep itself; all else is its provenance.
 _OWN = (
@@ -19,7 +19,7 @@ _COLUMNS = {"configuration": np.int64, "seed": np.int64, "nonfinite": np.int64}
 _ARRAYS = ("configuration", "seed", "eval_return", "env_steps")
 
 
-def read(directory: Path) -> Source:
+def read_sweep_source(directory: Path) -> Source:
     """Reads a sweep, which may go on or have been interrupted.
 
     Raises:
@@ -43,7 +43,7 @@ def read(directory: Path) -> Source:
     return Source(
         directory=directory,
         env=content["env"],
-        threshold=number(content, "threshold", path),
+        threshold=number_entry(content, "threshold", path),
         configurations=parts,
         settings=settings if isinstance(settings, dict) else {},
         provenance={name: x for name, x in content.items() if name not in _OWN},
@@ -115,7 +115,7 @@ def _configuration(
 ) -> Configuration:
     rows = np.flatnonzero(curves["configuration"] == identity)
     return Configuration(
-        label=describe(settings),
+        label=settings_in_words(settings),
         settings=settings,
         eval_return=curves["eval_return"][:, rows].astype(float),
         env_steps=curves["env_steps"][:, rows].astype(np.int64),

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_reinforce.reports.experiment import Experiment, relabel
-from mjx_reinforce.reports.findings import Findings, find
+from mjx_reinforce.reports.findings import Findings, compute_findings
 from mjx_reinforce.reports.results import Result
 from mjx_reinforce.reports.statistics import Estimate
 from mjx_reinforce.reports.statistics.aggregates import interval
@@ -115,7 +115,7 @@ def find_tasks(experiments: Sequence[Experiment]) -> Tasks:
             f"the tasks have no configuration in common ({listed}); name those that belong "
             "together alike with --labels OLD=NEW"
         )
-    found = [find(_only(each, shared)) for each in experiments]
+    found = [compute_findings(_only(each, shared)) for each in experiments]
     scales = [scale(each) for each in found]
     overall = [_overall(label, found, scales) for label in shared]
     overall.sort(key=lambda each: (-_number(each.mean), -_number(each.area)))

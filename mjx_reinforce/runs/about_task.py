@@ -85,7 +85,7 @@ def _training(config: Config) -> list[str]:
 
 def _time(config: Config) -> str:
     """Returns how long a run takes on this machine, as the run itself says."""
-    machine = plan.this_machine()
+    machine = plan.this_hardware()
     task, speed = measured.TASKS.get(config.env), machine.speeds.get(config.env)
     if task is None or speed is None:
         return f"How long that takes on {machine.name} is not known; --minutes M sets a time."

@@ -14,8 +14,8 @@ from mjx_reinforce.hosts.processes import ProcessSettings, check_processes
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs.directory import remove_empty
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.defaults import for_arguments, named, named_task
-from mjx_reinforce.settings.flags import asks_brief_help, read
+from mjx_reinforce.settings.defaults import flag_value, for_arguments, named_task
+from mjx_reinforce.settings.flags import asks_brief_help, read_command_line
 from mjx_reinforce.settings.groups import GROUPS, MAIN
 from mjx_reinforce.settings.hints import about_word
 from mjx_reinforce.settings.own_code import check_named
@@ -60,7 +60,7 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
     """
     default, preset, flags, prog = start(arguments, command("train"))
     config, processes = _read(flags, default, prog)
-    if config.minutes is not None and named(flags, "--env-steps"):
+    if config.minutes is not None and flag_value(flags, "--env-steps"):
         raise ValueError(
             f"--minutes {config.minutes:g} and --env-steps {config.env_steps} both say when the "
             "run ends; leave one out"
@@ -89,9 +89,9 @@ def check_resumed(env: str, arguments: Sequence[str], directory: Path) -> None:
     """Raises ValueError if going on would run code that the command line does not name.
 
     Args:
-      env: the environment of what goes on.
+      env: the environment of the run or sweep that is resumed.
       arguments: the command line.
-      directory: of what goes on.
+      directory: of the run or sweep that is resumed.
     """
     check_named(env, named_task(arguments), directory)
 
@@ -120,7 +120,7 @@ def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequ
 
 def _default(arguments: Sequence[str]) -> Config:
     """Returns the settings that hold where the user gives none: a task's, or those of a run."""
-    if not (like := named(arguments, "--like")):
+    if not (like := flag_value(arguments, "--like")):
         return for_arguments(arguments)
     if not (Path(like) / "config.json").is_file():
         raise ValueError(f"--like {like}: there is no run, for it has no config.json")
@@ -155,11 +155,11 @@ def read_groups(
       arguments: the flags.
       default: holds for the settings of a run that no flag names.
       prog: the name of the program, for --help.
-      description: of the program, likewise.
+      description: of the program, for --help.
       main: the settings that --help alone shows.
 
     Raises:
-      ValueError: see ``flags.read``.
+      ValueError: see ``flags.read_command_line``.
     """
     known = vars(default)
     forms = [
@@ -167,7 +167,7 @@ def read_groups(
         for title, group in groups.items()
     ]
     form = dataclasses.make_dataclass("Arguments", forms, frozen=True)
-    return dict(vars(read(form, arguments, prog, description, main)))
+    return dict(vars(read_command_line(form, arguments, prog, description, main)))
 
 
 def join_groups(groups: Mapping[str, Any]) -> Config:

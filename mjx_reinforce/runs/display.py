@@ -87,7 +87,7 @@ class Display:
             print_commands(self.console, commands)
 
     def compiling(self, expected: float | None) -> AbstractContextManager[None]:
-        """Returns a ``with`` block that shows that its contents go on.
+        """Returns a ``with`` block that shows that its contents are still running.
 
         Args:
           expected: how long they take (s), or None if that is not known.
@@ -106,7 +106,7 @@ class Display:
     def show_progress(self, now: progress.Progress) -> None:
         """Shows how far the run is and how well it does."""
         self._bar.line, left = _numbers(now), _time_left(now)
-        done = percent(min(now.fraction, 1.0))
+        done = percent_done(min(now.fraction, 1.0))
         self._bar.update(self._task, completed=now.fraction, done=done, left=left)
         if not self.console.is_terminal:
             self.say(
@@ -117,7 +117,7 @@ class Display:
     def show_nonfinite(self, updates: dict[str, np.ndarray], num_seeds: int) -> None:
         """Says in a line which updates of a block met numbers that are not finite, if any did."""
         if len(updates["seed"]):
-            self.say(nonfinite.describe(updates, num_seeds), "yellow")
+            self.say(nonfinite.describe_nonfinite(updates, num_seeds), "yellow")
 
 
 def _numbers(now: progress.Progress) -> str:
@@ -137,7 +137,7 @@ def _time_left(now: progress.Progress) -> str:
     return f"left {datetime.timedelta(seconds=math.ceil(now.seconds_left))}"
 
 
-def percent(fraction: float) -> str:
+def percent_done(fraction: float) -> str:
     """Returns a fraction as a percentage with one decimal, rounded down: 100 % is all."""
     shown = Decimal(repr(fraction)).quantize(Decimal("0.001"), ROUND_DOWN)
     return f"{100 * shown:.1f} %"
@@ -170,7 +170,7 @@ def print_summary(console: Console, summary: dict[str, Any], directory: Path) ->
         last, best = (iqm(np.array(summary[f"{kind}_test_returns"])) for kind in ("final", "best"))
         table.add_row("last policies, best policies, on fresh starts", f"{last:.1f}, {best:.1f}")
     table.add_row("env steps a second", f"{summary['env_steps_per_second']:,.0f}")
-    useful = percent(summary["useful_step_fraction"])
+    useful = percent_done(summary["useful_step_fraction"])
     table.add_row("steps of episodes, of all simulated", useful)
     table.add_row("compiling", f"{summary['compile_seconds']:.1f} s")
     table.add_row("training and evaluating", f"{summary['run_seconds']:.1f} s")

@@ -41,8 +41,8 @@ class RunLog:
         self._remove_parts()
         for name in _RESULTS:
             (self.directory / name).unlink(missing_ok=True)
-        checkpoint.remove(self.directory / "checkpoint")
-        sink.remove(self.directory)
+        checkpoint.remove_checkpoints(self.directory / "checkpoint")
+        sink.remove_outputs(self.directory)
         write_json(self.directory / "config.json", {**settings, **provenance()})
         files.create_csv(self._metrics, rows.COLUMNS)
 
@@ -68,7 +68,9 @@ class RunLog:
         resumed = [*recorded.get("resumed", []), moment]
         write_json(self.directory / "config.json", {**recorded, **budget, "resumed": resumed})
         self.say_running(moment)
-        checkpoint.remove(self.directory / "checkpoint", after=found.number if found else 0)
+        checkpoint.remove_checkpoints(
+            self.directory / "checkpoint", after=found.number if found else 0
+        )
         if found is None:
             files.create_csv(self._metrics, rows.COLUMNS)
         else:
@@ -81,7 +83,7 @@ class RunLog:
                 part.unlink()
 
     def say_running(self, reached: Mapping[str, Any]) -> None:
-        """Writes a summary.json that says how far the run is, for whoever finds it killed."""
+        """Writes a summary.json that says how far the run is, in case the run is killed."""
         write_json(self.directory / "summary.json", {"status": "running", **reached})
 
     def add_rows(self, new: rows.Cells) -> None:

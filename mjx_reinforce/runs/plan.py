@@ -32,13 +32,13 @@ _MEASURED_PARAMETERS = 20_000
 _BASE_MEMORY = 2.5e9
 
 
-class Machine(NamedTuple):
+class Hardware(NamedTuple):
     """Where a run computes.
 
     name: for people
     speeds: what was measured on a machine of its kind
     faster: how many times as fast as that one it is
-    memory: what arrays may take (bytes)
+    memory: the memory available to arrays (bytes)
     shared: whether that is the memory that compiling needs too
     """
 
@@ -90,7 +90,7 @@ def make_plan(ready: "Ready", config: Config, num_processes: int = 1) -> Plan:
     """
     what = _what(config)
     config = dataclasses.replace(config, num_seeds=-(-config.num_seeds // num_processes))
-    task, machine = task_of(ready.policy, ready.horizon, config), this_machine()
+    task, machine = task_of(ready.policy, ready.horizon, config), this_hardware()
     base = task.base_memory if machine.shared else 0.0
     check_fits(config, task, machine.memory, base)
     speed = machine.speeds.get(config.env)
@@ -121,7 +121,7 @@ def is_wrong(said: float, taken: float) -> bool:
     return most > _WRONG * least and most - least > _NOTICED
 
 
-def run_seconds(config: Config, task: Task, machine: Machine, speed: Speed) -> tuple[float, bool]:
+def run_seconds(config: Config, task: Task, machine: Hardware, speed: Speed) -> tuple[float, bool]:
     """Returns how long a run trains and evaluates on a machine (s), and whether at most so long.
 
     What was measured is the task with its own settings; what other networks do besides is counted.
@@ -135,7 +135,7 @@ def run_seconds(config: Config, task: Task, machine: Machine, speed: Speed) -> t
     return (seconds + steps * beyond / rate) / machine.faster, bounded
 
 
-def _where(machine: Machine, num_processes: int) -> str:
+def _where(machine: Hardware, num_processes: int) -> str:
     """Returns on what a run trains: one device of each process."""
     import jax
 
@@ -175,7 +175,7 @@ def useful_part(task: Task, speed: Speed) -> float:
     return 1.0 if speed.engine == "native" else task.useful
 
 
-def this_machine() -> Machine:
+def this_hardware() -> Hardware:
     """Returns where JAX computes."""
     import jax
 
@@ -183,9 +183,9 @@ def this_machine() -> Machine:
     if device.platform == "cpu":
         cores = num_cores()
         name = f"{cores} CPU core{'s' * (cores > 1)}"
-        return Machine(name, measured.CPU, cpu_factor(), host_memory(), True)
+        return Hardware(name, measured.CPU, cpu_factor(), host_memory(), True)
     memory = float((device.memory_stats() or {}).get("bytes_limit", float("inf")))
-    return Machine(f"one {device.device_kind}", measured.GPU, 1.0, memory, False)
+    return Hardware(f"one {device.device_kind}", measured.GPU, 1.0, memory, False)
 
 
 def duration(seconds: float) -> str:

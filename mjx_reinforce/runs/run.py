@@ -26,7 +26,7 @@ from mjx_reinforce.runs.plan import make_plan
 from mjx_reinforce.runs.sinks.sink import check_installed
 from mjx_reinforce.runs.training import compile_driver, draw, summarize
 from mjx_reinforce.settings.config import Config, check
-from mjx_reinforce.settings.memory import check_size
+from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.store.ready import get_ready
 from mjx_reinforce.training.driver import Driver, Evaluation
 
@@ -41,7 +41,7 @@ class RunResults(NamedTuple):
     training: [U, S] each: ``episode_return``, the mean of an update's episodes, and the
       ``env_steps`` and ``episodes`` after it
     test_returns: [S] of the last policies, on starts that nothing else is played on
-    best_test_returns: [S] likewise, of the policies with the best evaluations
+    best_test_returns: [S] the same of the policies with the best evaluations
     policy: the network and its distribution
     actor: [S, ...] the last policies
     best: [S, ...] the policies with the best evaluations
@@ -115,7 +115,7 @@ def run(
     if output is not None:
         config = dataclasses.replace(config, output=Path(output))
     check(config)
-    check_size(config)
+    check_memory(config)
     check_installed(config)
     configure_jax()
     with contextlib.ExitStack() as held:

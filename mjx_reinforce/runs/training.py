@@ -14,7 +14,7 @@ from mjx_reinforce.training.driver import Driver
 from mjx_reinforce.training.initial import begin_with, last_actors
 from mjx_reinforce.training.minutes import env_steps_in
 from mjx_reinforce.training.nonfinite import HOPELESS
-from mjx_reinforce.training.record import Record
+from mjx_reinforce.training.record import RunRecord
 from mjx_reinforce.training.state import compile_parts
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def compile_driver(
         env_steps = env_steps_in(60 * config.minutes, programs, first, config.max_updates)
         say(f"{config.minutes:g} min are about {env_steps:,} env steps of a seed in all here")
         config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
-    record, best = Record(config, ready.threshold), first_best(state.train_states)
+    record, best = RunRecord(config, ready.threshold), first_best(state.train_states)
     known = dataclasses.replace(config, horizon=ready.horizon)
     return Driver(known, programs, record, state, best), seconds
 

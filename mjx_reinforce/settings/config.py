@@ -6,7 +6,7 @@ import functools
 import reprlib
 
 from mjx_reinforce import envs
-from mjx_reinforce.checks import changed, check_type
+from mjx_reinforce.checks import changed_fields, check_type
 from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS, check_name
 from mjx_reinforce.settings.declare import MAX_COUNT, MAX_OF_UPDATE, Range
 from mjx_reinforce.settings.groups import (
@@ -38,7 +38,7 @@ class Config(
     """Train policies, many seeds at once, and report over the seeds."""
 
     def __repr__(self) -> str:
-        return f"Config({changed(self)})"
+        return f"Config({changed_fields(self)})"
 
     @property
     def episodes_per_update(self) -> int:

@@ -252,7 +252,7 @@ def _in_time(seconds: float, rows: Sequence[tuple[int, Config]]) -> tuple[int, C
     """
     for least, config in reversed(rows):
         together = min(config.num_seeds, Config.num_seeds)
-        given = env_steps_in(seconds, dataclasses.replace(config, num_seeds=together))
+        given = expected_env_steps(seconds, dataclasses.replace(config, num_seeds=together))
         if has_gpu() or given >= least:
             return given, config
     raise AssertionError("the first row holds for any budget")
@@ -274,7 +274,7 @@ def _with_budget(config: Config, env_steps: int) -> Config:
     return dataclasses.replace(config, eval_every=max(config.eval_every, every))
 
 
-def env_steps_in(seconds: float, config: Config) -> int:
+def expected_env_steps(seconds: float, config: Config) -> int:
     """Returns about how many env steps of a seed this machine trains in a time, to two digits.
 
     A task that was not measured has those of its default budget.
@@ -297,10 +297,10 @@ def check_task(env: str) -> None:
 
 def named_task(arguments: Sequence[str]) -> str:
     """Returns the environment that a command line names with ``--env``, or the default one."""
-    return named(arguments, "--env") or Config().env
+    return flag_value(arguments, "--env") or Config().env
 
 
-def named(arguments: Sequence[str], flag: str) -> str | None:
+def flag_value(arguments: Sequence[str], flag: str) -> str | None:
     """Returns what a command line gives a flag, the last time that it does; None if nothing."""
     found = None
     for name, following in itertools.zip_longest(arguments, arguments[1:]):
@@ -312,8 +312,10 @@ def named(arguments: Sequence[str], flag: str) -> str | None:
 
 def for_arguments(arguments: Sequence[str]) -> Config:
     """Returns the default settings for what a command line names: the task, seeds and budget."""
-    env_steps, num_seeds = (_count(named(arguments, f)) for f in ("--env-steps", "--num-seeds"))
-    minutes = named(arguments, "--minutes") or ""
+    env_steps, num_seeds = (
+        _count(flag_value(arguments, f)) for f in ("--env-steps", "--num-seeds")
+    )
+    minutes = flag_value(arguments, "--minutes") or ""
     try:
         seconds = 60 * float(minutes)
     except ValueError:  # none, or what the parser refuses

@@ -74,7 +74,7 @@ def _path(text: str) -> Path:
     return Path(text)
 
 
-def read(
+def read_command_line(
     form: type[Form],
     arguments: Sequence[str],
     prog: str,

@@ -98,12 +98,13 @@ class RunSettings:
     env: str = setting(
         "InvertedPendulum-v5", once="its results are of one task; make a sweep for each"
     )
-    """Environment id; `python -m mjx_reinforce.envs` lists them. Or module:Class for your own."""
+    """Environment id, or module:Class for your own environment. `python -m mjx_reinforce.envs`
+    lists the ids."""
     algorithm: Literal["reinforce", "ars"] = "reinforce"
-    """reinforce follows the policy gradient; ars (augmented random search, Mania et al. 2018)
-    tries out changes of the parameters. Its own settings are in the group "search" below."""
+    """reinforce follows the policy gradient; ars (augmented random search, Mania et al. 2018) tries
+    out changes of the parameters. Its own settings are in the group "search" below."""
     num_seeds: int = setting(4, Range.AT_LEAST_1, once="every configuration has as many seeds")
-    """How many independent seeds are trained together, in one compiled program."""
+    """Number of independent seeds, trained together in one compiled program."""
     seed: int = setting(
         0,
         Range.SEED,
@@ -112,14 +113,15 @@ class RunSettings:
     )
     """Root of all randomness; the seeds' keys are split from it."""
     env_steps: int | None = setting(280_000, *TOTAL, Mark.BUDGET, Mark.NOT_COMPILED)
-    """Training budget of each seed in env steps; it stops after the update that reaches it. What
-    about a minute gives here if not given. None leaves it to --max-updates."""
+    """Training budget of each seed in env steps. A seed stops after the update that reaches the
+    budget. If not given, the budget is about a minute of training on this machine. None: only
+    --max-updates ends training."""
     minutes: float | None = setting(
         None, Range.POSITIVE, Mark.BUDGET, Mark.NOT_COMPILED, once="it is for one run"
     )
-    """In place of --env-steps, about how long to train, all seeds together: the first updates show
-    how many env steps that is. The number goes into config.json, so that --like RUN repeats the
-    run to the last bit. Where episodes grow, later steps come faster, above all on a GPU, and the
+    """Approximate training time of all seeds together, in place of --env-steps. The first updates
+    show how many env steps that is. The number goes into config.json, so --like RUN repeats the run
+    to the last bit. If episodes grow longer, later steps are faster, above all on a GPU, and the
     run ends early."""
     max_updates: int | None = setting(None, *TOTAL, Mark.BUDGET, Mark.NOT_COMPILED)
     """Stop every seed after this many updates; with --num-episodes 1, as many episodes."""
@@ -128,14 +130,15 @@ class RunSettings:
     )
     """Stop once every seed's last evaluation reached the environment's reward threshold."""
     num_episodes: int | Literal["auto"] = _for_reinforce(16, *COUNT)
-    """Complete episodes played for one update, for each seed. auto: as many as noise and signal of
-    the gradient are equal with, measured as the seed learns. (ars: see --num-directions.)"""
+    """Complete episodes that each seed plays for one update. auto: the number at which the noise of
+    the gradient equals its signal, measured during training. With ars, use --num-directions."""
     min_episodes: int = _for_reinforce(16, *SEVERAL, Reader.AUTO_EPISODES)
-    """With --num-episodes auto, how many an update plays at least,"""
+    """Minimum number of episodes of an update, with --num-episodes auto."""
     max_episodes: int = _for_reinforce(2048, *SEVERAL, Reader.AUTO_EPISODES)
-    """and at most: memory holds so many."""
+    """Maximum number of episodes of an update, with --num-episodes auto. Memory is reserved for
+    this number."""
     horizon: int | None = setting(None, *COUNT)
-    """Steps after which an episode ends; the environment's own limit if not given."""
+    """Time limit of an episode in env steps. If not given, the environment's own limit."""
     one_start: bool = False
     """Begin all training episodes of a seed in one state; each seed has its own. Evaluations keep
     their own starts, so they show what the policy does where it was not trained."""
@@ -146,12 +149,13 @@ class RunSettings:
     scalar operations), native (whole episodes in machine code for this CPU or NVIDIA GPU), or auto,
     the fastest here."""
     like: Path | None = setting(None, Mark.PLACE, once="every configuration begins with it")
-    """Take all settings from the run in this directory, but for what is given beside it."""
+    """Take all settings from the run in this directory, except those on the command line."""
     init_from: str | None = setting(None, Mark.NOT_COMPILED, once="it is for one run")
-    """Begin with the last policies of the run in this directory, which may have other settings, but
-    for the policy's own. Seed i begins with the policy of its seed i, or of i modulo its seeds."""
+    """Start with the last policies of the run in this directory. The run must have the same policy
+    settings; its other settings may differ. Seed i starts with the policy of seed i modulo the
+    number of seeds of that run."""
     output: Path | None = setting(None, Mark.PLACE, once="it has one directory")
-    """Run directory; runs/<env>-<time> if not given."""
+    """Directory of the run. If not given, runs/<env>-<time>."""
     overwrite: bool = setting(False, Reader.DIRECTORY, Mark.PLACE, once="it has one directory")
     """Write into an output directory that is not empty, replacing a run's files there."""
 
@@ -166,31 +170,34 @@ class PolicySettings:
     (discrete actions), deterministic (ars only); auto is categorical where the actions are
     discrete, else normal, or deterministic for ars."""
     hidden_sizes: tuple[int, ...] = setting((32, 32), *LAYERS)
-    """Units of the policy network's tanh layers; none, as the flag alone says, make it linear."""
+    """Units of each tanh layer of the policy network. The flag without a number makes the policy
+    linear."""
     shared_trunk: bool = True
-    """Compute means and stds in one network; else stds from the state have their own."""
+    """Compute means and stds in one network. Otherwise stds that depend on the state have a network
+    of their own."""
     initializer: Literal["orthogonal", "torch"] = "orthogonal"
-    """Initial weights: orthogonal, the last layer's scaled by 0.01, so that a fresh policy acts
-    alike everywhere; or torch.nn.Linear's uniform ones."""
+    """Initial weights. orthogonal: orthogonal matrices, scaled by 0.01 in the last layer, so that
+    an untrained policy acts alike in all states. torch: the uniform weights of torch.nn.Linear."""
     initial_std: float = setting(0.5, *POSITIVE, Reader.STD, Mark.TRACED, Mark.LOG)
     """Standard deviation of the actions before training, in the action's unit."""
     final_std: float | None = _for_reinforce(
         None, *POSITIVE, Reader.DECAY_STEPS, Reader.FREE_STD, Mark.TRACED, Mark.LOG
     )
-    """Towards this it shrinks over --decay-steps, besides what learning makes of it: some policies
-    play well with their noise alone. Where --max-kl shortens updates it stays larger. None leaves
-    it to learning."""
+    """Target of the standard deviation of the actions, reached over --decay-steps in addition to
+    what is learned. Without it, some policies learn to play well only with their noise. With
+    --max-kl the standard deviation may stay above the target. None: learned only."""
     rescale: bool = setting(True, Reader.CONTINUOUS)
-    """Scale the mean so that the network's output 1 is the end of the action's range; else the
-    output is the mean."""
+    """Scale the mean so that an output of 1 is the end of the action's range. Otherwise the output
+    of the network is the mean."""
     normalize_steps: int | None = setting(1000, Range.AT_LEAST_0, Range.INT32)
-    """Scale observations by the statistics of about the first so many steps; 0 does not, None
-    goes on for ever."""
+    """Scale observations by their mean and standard deviation over about this many first steps. 0:
+    do not scale. None: update the statistics throughout training."""
     normalize_min_std: float = setting(
         0.0, *NOT_NEGATIVE, Reader.NORMALIZATION, Mark.TRACED, Mark.LOG
     )
-    """They are divided by at least this, in the observation's unit: what hardly changes in those
-    steps would be magnified for ever."""
+    """Lower bound on the standard deviation that scales observations, in the observation's unit.
+    Without it, an entry that barely varies during the first steps is magnified for the rest of
+    training."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -198,29 +205,31 @@ class EstimatorSettings:
     """What multiplies the gradient of an action's log-probability (reinforce)."""
 
     estimator: str = _for_reinforce("leave-one-out")
-    """total-return; reward-to-go; leave-one-out (less that of the other episodes);
-    value-baseline (less a learned value); and two that are published but odd: mean-log-prob,
-    normalized-returns (their docstrings say how)."""
+    """What weights the gradient: total-return; reward-to-go; leave-one-out (reward-to-go minus the
+    mean of the other episodes); or value-baseline (reward-to-go minus a learned value).
+    mean-log-prob and normalized-returns reproduce published variants, which their docstrings
+    explain."""
     ended_episodes: Literal["zero", "skip"] = _for_reinforce("zero", Reader.LEAVE_ONE_OUT)
-    """How leave-one-out counts the other episodes that are over at a step: zero, as the 0 that
-    they still earn; skip, not at all, which is less noisy where episodes end at different times."""
+    """How leave-one-out counts other episodes that are over at a step. zero: as the 0 that they
+    still earn. skip: not at all, which is less noisy if episodes end at different times."""
     discount: float = _for_reinforce(0.99, Range.SHARE, Mark.TRACED, Mark.LOG_OF_REST)
     """Discount of rewards, in [0, 1]."""
     final_discount: float | None = _for_reinforce(None, Range.SHARE, Mark.TRACED)
-    """It goes to this one over the budget, evenly in the logarithm of 1 / (1 - discount), the
-    steps that it looks ahead: noisy gradients want few, sure ones many. None: it stays."""
+    """Discount at the end of the budget. It changes evenly in the logarithm of 1 / (1 - discount),
+    the number of steps that it looks ahead: few suit noisy gradients, many suit precise ones. None:
+    the discount is constant."""
     reward_shift: float = _for_reinforce(0.0, Range.FINITE, Mark.TRACED)
-    """Subtracted from the reward of every step for training alone, such as the bonus for staying
-    alive, which may keep a policy from moving (Mania et al. 2018). Returns stay those of the
-    task."""
+    """Number subtracted from the reward of every step, in training only. An example is the bonus
+    for staying alive, which may keep a policy from moving (Mania et al. 2018). Reported returns do
+    not change."""
     discount_weights: bool = _for_reinforce(False)
-    """Multiply the weight at step t by discount^t, which most programs leave out."""
+    """Multiply the weight at step t by discount^t. Most programs omit this factor."""
     standardize: bool = _for_reinforce(True)
-    """Divide the weights by their standard deviation plus the floor below."""
+    """Divide the weights by their standard deviation plus --standardize-floor."""
     standardize_floor: float = _for_reinforce(
         10.0, *NOT_NEGATIVE, Reader.STANDARDIZE, Mark.TRACED, Mark.LOG
     )
-    """Added to that standard deviation, in units of return."""
+    """Number added to the standard deviation that divides the weights, in units of return."""
     value_learning_rate: float = _for_reinforce(
         3e-3, *RATE, Reader.VALUE_BASELINE, Mark.TRACED, Mark.LOG
     )
@@ -228,17 +237,18 @@ class EstimatorSettings:
     value_fit: Literal["minibatches", "full-batch"] = _for_reinforce(
         "minibatches", Reader.VALUE_BASELINE
     )
-    """minibatches: it reads the time besides the observation, and is fitted, in units of the
-    return's standard deviation, to steps drawn from the episodes; full-batch: as published programs
-    do it, it reads the observation alone, and each gradient step takes the whole rollout."""
+    """How the value network is trained. minibatches: the network reads the observation and the
+    time, and is fitted to steps drawn from the episodes, in units of the return's standard
+    deviation. full-batch, as in published programs: the network reads the observation only, and
+    each gradient step takes the whole rollout."""
     value_fits: int = _for_reinforce(32, *STEPS, Reader.VALUE_BASELINE)
-    """Its gradient steps an update, on the squared error."""
+    """Gradient steps of the value network in each update, on the squared error."""
     value_batch_size: int = _for_reinforce(
         256, *COUNT, Reader.VALUE_BASELINE, Reader.VALUE_MINIBATCHES
     )
-    """Steps of the episodes a minibatch, drawn with replacement."""
+    """Env steps in each minibatch of the value network, drawn with replacement."""
     value_hidden_sizes: tuple[int, ...] = _for_reinforce((64, 64), *LAYERS, Reader.VALUE_BASELINE)
-    """Units of its tanh layers."""
+    """Units of each tanh layer of the value network."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -248,22 +258,22 @@ class UpdateSettings:
     update: Literal["full-batch", "natural-gradient", "minibatches", "each-step"] = _for_reinforce(
         "full-batch"
     )
-    """full-batch: one optimiser step a rollout; natural-gradient: one along the natural gradient,
-    as long as --max-kl says, of which decays of the learning rate leave a share; minibatches:
-    several, on steps drawn from it; each-step: one for every time step, in order. Only the first
-    two measure gradient_snr."""
+    """How a rollout changes the policy. full-batch: one optimizer step. natural-gradient: one step
+    along the natural gradient, whose length is --max-kl; a decay of the learning rate shortens it.
+    minibatches: several steps, each on env steps drawn from the rollout. each-step: one step for
+    each time step, in order. Only full-batch and natural-gradient measure gradient_snr."""
     natural_damping: float = _for_reinforce(0.1, *POSITIVE, Reader.NATURAL_GRADIENT, Mark.TRACED)
-    """Added to the diagonal of the Fisher matrix of natural-gradient: directions in which the
-    policy hardly changes are followed less far."""
+    """Number added to the diagonal of the Fisher matrix of natural-gradient. It shortens the step
+    along directions in which the policy hardly changes."""
     natural_iterations: int = _for_reinforce(
         10, *STEPS, Reader.NATURAL_GRADIENT, Reader.CONJUGATE_GRADIENTS
     )
-    """Conjugate gradients that solve for its direction; a linear policy with the distribution
-    normal needs none."""
+    """Iterations of conjugate gradients that solve for the direction of natural-gradient. A linear
+    policy with the distribution normal needs none."""
     minibatch_updates: int = _for_reinforce(50, *STEPS, Reader.MINIBATCHES)
-    """Optimiser steps a rollout, of minibatches."""
+    """Optimizer steps in each update, with --update minibatches."""
     minibatch_size: int = _for_reinforce(128, *COUNT, Reader.MINIBATCHES)
-    """Steps of the episodes a minibatch, drawn with replacement; their loss is averaged."""
+    """Env steps in each minibatch, drawn with replacement. The loss is their mean."""
     loss_per: Literal["episode", "step"] = _for_reinforce("episode", Reader.WHOLE_EPISODES)
     """Average the gradient over episodes (the definition) or over steps."""
     entropy_cost: float = _for_reinforce(0.0, *NOT_NEGATIVE, Mark.TRACED)
@@ -271,30 +281,31 @@ class UpdateSettings:
     optimizer: Literal["adam", "adamw", "sgd"] = _for_reinforce("adam", Reader.OPTIMIZER)
     """The rule that turns a gradient into a step."""
     learning_rate: float = _for_reinforce(1e-2, *RATE, Reader.FIRST_RATE, Mark.TRACED, Mark.LOG)
-    """The learning rate of the optimizer at the start."""
+    """Learning rate of the optimizer at the start of training."""
     momentum: float = _for_reinforce(0.9, Range.BELOW_1, Reader.OPTIMIZER, Reader.ADAM, Mark.TRACED)
-    """Of adam, its b1: how much of the last mean gradient the next one keeps."""
+    """b1 of adam and adamw: the share of the last mean gradient that the next one keeps."""
     final_learning_rate: float | None = _for_reinforce(
         None, *RATE, Reader.DECAY, Mark.TRACED, Mark.LOG
     )
-    """Learning rate after the decay, which is linear; a tenth of the first if not given."""
+    """Learning rate after the linear decay. If not given, a tenth of --learning-rate."""
     decay_steps: int | Literal["budget"] | None = _for_reinforce("budget", *TOTAL, Mark.TRACED)
-    """Env steps of a seed over which the learning rate decays, and the noise with --final-std:
-    budget is as long as the run, whatever --env-steps or --max-updates says. None: it stays, or
-    see --decay-updates."""
+    """Env steps of a seed over which the learning rate decays, and with --final-std also the noise.
+    budget: the length of the run, by --env-steps or --max-updates. None: no decay, unless
+    --decay-updates gives one."""
     decay_updates: int | None = _for_reinforce(None, *COUNT)
-    """Updates over which the learning rate decays; needs --decay-steps None."""
+    """Updates over which the learning rate decays. Requires --decay-steps None."""
     weight_decay: float = _for_reinforce(0.0, *NOT_NEGATIVE, Reader.OPTIMIZER)
-    """adamw: the parameters shrink by learning rate times this; adam, sgd: this times the
-    parameters is added to the gradient (L2, as in PyTorch)."""
+    """Weight decay. adamw: the parameters shrink by the learning rate times this. adam, sgd: this
+    times the parameters is added to the gradient (L2, as in PyTorch)."""
     max_grad_norm: float | None = _for_reinforce(
         1.0, *POSITIVE, Reader.OPTIMIZER, Mark.TRACED, Mark.LOG
     )
-    """The gradient is scaled down to at most this Euclidean norm; None leaves it."""
+    """Maximum Euclidean norm of the gradient; a longer gradient is scaled down. None: no
+    maximum."""
     max_kl: float | None = _for_reinforce(None, *POSITIVE, Mark.TRACED, Mark.LOG)
-    """An update moves the policy by at most about this mean KL divergence, in nats, over the steps
-    that it visited: a change that goes further is shortened. (A new scale of the observations
-    comes on top.) None shortens none."""
+    """Approximate maximum of the mean KL divergence, in nats, between the policies before and after
+    an update, over the visited steps. A larger change is shortened. A new scale of the observations
+    is not counted. None: no maximum."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -302,17 +313,18 @@ class SearchSettings:
     """Augmented random search (ars)."""
 
     num_directions: int = _for_ars(8, *COUNT)
-    """Directions tried in an update, each by one episode forwards and one backwards."""
+    """Directions tried in an update. Each takes one episode forwards and one backwards."""
     top_directions: int | None = _for_ars(None, Range.AT_LEAST_1)
-    """How many of them are used, those with the greatest returns; all if not given."""
+    """Number of directions that are used, those with the greatest returns. If not given, all."""
     step_size: float = _for_ars(0.02, *RATE, Mark.TRACED, Mark.LOG)
-    """Learning rate."""
+    """Learning rate of ars."""
     noise_std: float = _for_ars(0.03, *POSITIVE, Mark.TRACED, Mark.LOG)
-    """Distance along a direction from the present parameters to those that are tried."""
+    """Distance along a direction between the current parameters and the parameters that are
+    tried."""
     shared_starts: bool = _for_ars(False)
-    """Start the two episodes of a direction alike."""
+    """Start both episodes of a direction in the same state."""
     ars_update: Literal["paper", "document"] = _for_ars("paper")
-    """paper, or that of a published notebook with its mistakes."""
+    """Update rule. paper: Mania et al. document: a published notebook, with its mistakes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -322,33 +334,33 @@ class EvaluationSettings:
     eval_every: int = setting(5, *COUNT)
     """Updates between evaluations."""
     eval_episodes: int = setting(16, *COUNT)
-    """Episodes of an evaluation, with the mode and as many with samples. Each seed has starts of
-    its own, the same at every evaluation."""
+    """Episodes of an evaluation with the mode of the policy; as many are played with samples. Each
+    seed has its own starts, which are the same at every evaluation."""
     test_episodes: int | None = setting(None, *COUNT, once="it has no test")
-    """Episodes of the test at the end, which plays --eval-episodes at a time, from other starts; as
-    many as an evaluation if not given."""
+    """Episodes of the test at the end, from other starts than the evaluations. If not given,
+    --eval-episodes. The test plays --eval-episodes at a time."""
     eval_seed: int = setting(0, Range.SEED, Mark.NOT_COMPILED)
-    """Root of the evaluation's keys, apart from all training keys whatever its value."""
+    """Root of the randomness of evaluations. It is independent of the randomness of training."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CheckpointSettings:
-    """Going on with a run that was interrupted, or whose budget is used."""
+    """Resuming a run that was interrupted, or whose budget is used."""
 
     checkpoint_every: int | None = setting(
         None, *COUNT, Mark.BUDGET, Mark.NOT_COMPILED, once="it is saved as a whole"
     )
-    """Updates between checkpoints, to which a killed run falls back; about every minute if not
-    given. They are written after evaluations."""
+    """Updates between checkpoints, from which --resume continues. If not given, one is written
+    about every minute. Checkpoints are written after evaluations."""
     resume: Path | None = setting(None, Mark.PLACE, once="it goes on as a whole")
-    """Go on with the run in this directory, with its own settings. Only its budget may change:
-    --env-steps, --max-updates, --stop-when-solved, --checkpoint-every. A run of your own
-    module:Class needs its --env again."""
+    """Resume the run in this directory, with its own settings. Only the budget may change:
+    --env-steps, --max-updates, --stop-when-solved, --checkpoint-every. If the environment is your
+    own module:Class, give --env again."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class LogSettings:
-    """Where the rows of metrics.csv go besides. The charts' step is the number of updates.
+    """Logs to which the rows of metrics.csv also go. The x axis of charts is the number of updates.
 
     A column is empty where nothing is measured: gradient_snr, the signal-to-noise ratio of the
     gradient over episodes, needs --update full-batch or natural-gradient, or ars, and two episodes
@@ -360,10 +372,11 @@ class LogSettings:
     and a histogram over seeds, and the first 16 seeds. To see them: pip install tensorboard, then
     tensorboard --logdir RUN."""
     wandb: bool = setting(False, Mark.NOT_COMPILED, once="its rows are in results.csv")
-    """The same numbers for Weights & Biases (pip install wandb) in RUN/wandb, offline: wandb sync
-    uploads them. With WANDB_MODE=online in the environment they are sent as the run goes on."""
+    """Write the same numbers for Weights & Biases (pip install wandb) to RUN/wandb, offline; wandb
+    sync uploads them. With WANDB_MODE=online in the environment they are uploaded during the
+    run."""
     jsonl: bool = setting(False, Mark.NOT_COMPILED, once="its rows are in results.csv")
-    """All rows in RUN/metrics.jsonl too, a JSON object a line."""
+    """Also write all rows to RUN/metrics.jsonl, one JSON object per line."""
 
 
 #: The groups of --help, in order, under their titles.

@@ -10,7 +10,7 @@ and a linear policy, on 2026-11-23; all figures are good to a factor of two.
   day, by the time of the processor: 3e10 to 6e10 a second and core.
 - GPU: an H100, on 2026-11-24, from runs of 16 seeds with 1,024 episodes (Swimmer: 128, the double
   pendulum: 16) an update, and of 8 seeds of Ant; how an update's time divides into what every
-  update takes and what each episode adds was guessed, but for the pendulums and carts, which an
+  update takes and what each episode adds was guessed, except for the pendulums and carts, which an
   H200 ran before. The Humanoids' rates are those of rollouts on an H200. Compiling depends on the
   host: while many other programs run it takes up to four times as long. The operations of networks
   were not measured: they are taken to be a tenth of what the card can do.

@@ -37,7 +37,7 @@ _METRICS = 20
 _USEFUL_CORES = 4
 
 
-class Part(NamedTuple):
+class MemoryPart(NamedTuple):
     """A part of what a run needs.
 
     size: bytes
@@ -48,7 +48,7 @@ class Part(NamedTuple):
     lower: str
 
 
-def parts(config: Config, task: Task) -> list[Part]:
+def parts(config: Config, task: Task) -> list[MemoryPart]:
     """Returns what the arrays of a run need, wherever they lie.
 
     Args:
@@ -75,19 +75,19 @@ def parts(config: Config, task: Task) -> list[Part]:
     widest = max([values, *config.hidden_sizes])
     drawn = seeds * config.minibatch_size if config.update == "minibatches" else 0
     return [
-        Part(_FLOAT * drawn * widest, "--minibatch-size or --num-seeds"),
-        Part(
+        MemoryPart(_FLOAT * drawn * widest, "--minibatch-size or --num-seeds"),
+        MemoryPart(
             _FLOAT * fitted * (config.value_fits + values + _ACTIVATIONS * sum(critic)),
             "--value-batch-size, --value-fits or --num-seeds",
         ),
-        Part(_FLOAT * _COPIES * steps * values, f"--num-seeds, {fewer} or --horizon"),
-        Part(_FLOAT * network, f"--hidden-sizes, --num-seeds or {fewer}"),
-        Part(
+        MemoryPart(_FLOAT * _COPIES * steps * values, f"--num-seeds, {fewer} or --horizon"),
+        MemoryPart(_FLOAT * network, f"--hidden-sizes, --num-seeds or {fewer}"),
+        MemoryPart(
             _FLOAT * (_ACTIVATIONS * valued * sum(critic) + critics),
             "--value-hidden-sizes, --num-seeds or --horizon",
         ),
-        Part(_EVALUATED * evaluated, "--eval-episodes, --num-seeds or --horizon"),
-        Part(_FLOAT * _METRICS * seeds * config.block_length, "--eval-every or --num-seeds"),
+        MemoryPart(_EVALUATED * evaluated, "--eval-episodes, --num-seeds or --horizon"),
+        MemoryPart(_FLOAT * _METRICS * seeds * config.block_length, "--eval-every or --num-seeds"),
     ]
 
 
@@ -132,7 +132,7 @@ def check_fits(config: Config, task: Task, available: float, base: float) -> Non
     )
 
 
-def check_size(config: Config) -> None:
+def check_memory(config: Config) -> None:
     """Raises ValueError for a run that cannot be, before anything heavy is imported.
 
     What is not known yet is taken to be small: the sizes of a task of the user's own, and the

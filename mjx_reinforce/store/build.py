@@ -52,8 +52,8 @@ def build(
         "normalize_min_std": config.normalize_min_std,
         "engine": config.engine,
     }
-    build_learner = _build_ars if config.algorithm == "ars" else _build_reinforce
-    return build_learner(env, config, shared), horizon
+    build_one = _build_ars if config.algorithm == "ars" else _build_reinforce
+    return build_one(env, config, shared), horizon
 
 
 def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
@@ -134,13 +134,13 @@ def _build_estimator(
 def _estimator(config: Config, horizon: int, discount: "float | jax.Array") -> "Estimator":
     from mjx_reinforce.learners import estimators
     from mjx_reinforce.policies.arguments import known_number
-    from mjx_reinforce.registry import ESTIMATORS, load
+    from mjx_reinforce.registry import ESTIMATORS, load_definition
 
     if config.estimator == "value-baseline":
         estimator = _build_value_baseline(config, horizon, discount)
     else:
         settings = {"ended": config.ended_episodes} if config.estimator == "leave-one-out" else {}
-        estimator = load(ESTIMATORS[config.estimator])(discount, **settings)
+        estimator = load_definition(ESTIMATORS[config.estimator])(discount, **settings)
     if known_number(config.reward_shift) != 0:
         estimator = estimators.shift_rewards(estimator, config.reward_shift)
     if config.standardize:

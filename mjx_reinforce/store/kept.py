@@ -25,7 +25,7 @@ from mjx_reinforce.engines.native.gpu.seam import PTX
 from mjx_reinforce.settings.config import Config, marked
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.store.provenance import provenance, version
-from mjx_reinforce.store.trees import describe, rebuild
+from mjx_reinforce.store.trees import describe_tree, rebuild
 from mjx_reinforce.training.resume import recordable
 from mjx_reinforce.training.state import Budget, Parts, eval_keys_shape
 from mjx_reinforce.types import PyTree, plain
@@ -73,7 +73,7 @@ def keep(key: str, facts: dict[str, Any], parts: Parts) -> Parts:
       parts: its programs.
     """
     try:
-        whole = {"facts": facts, "like": describe(parts.like), "rides": parts.rides}
+        whole = {"facts": facts, "like": describe_tree(parts.like), "rides": parts.rides}
     except TypeError:
         return parts
     _write(key, "facts", json.dumps(whole).encode())
@@ -92,7 +92,7 @@ def keep(key: str, facts: dict[str, Any], parts: Parts) -> Parts:
     )
 
 
-def read(key: str) -> tuple[dict[str, Any], Parts] | None:
+def read_programs(key: str) -> tuple[dict[str, Any], Parts] | None:
     """Returns the facts and the programs of a run; None unless all of them are on disk."""
     read = {name: _read(key, name) for name in ("facts", *_NAMES)}
     found = {name: content for name, content in read.items() if content is not None}
@@ -131,10 +131,10 @@ def _leaves(tree: PyTree) -> list[jax.ShapeDtypeStruct]:
 
 def _read(key: str, name: str) -> bytes | None:
     folder = objects.folder()
-    return None if folder is None else objects.read(folder, f"{key}-{name}")
+    return None if folder is None else objects.read_object(folder, f"{key}-{name}")
 
 
 def _write(key: str, name: str, content: bytes) -> None:
     folder = objects.folder()
     if folder is not None:
-        objects.write(folder, f"{key}-{name}", content)
+        objects.write_object(folder, f"{key}-{name}", content)

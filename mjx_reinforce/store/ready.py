@@ -62,11 +62,11 @@ def get_ready(
 
 def _found(key: str, config: Config, share: slice) -> Ready | None:
     """Returns what is on disk of the settings; None if nothing is."""
-    found = kept.read(key)
+    found = kept.read_programs(key)
     if found is None and config.resume is not None:
         # A run that is resumed has its time limit from config.json, also one that was not given.
         first = kept.key_of(dataclasses.replace(config, horizon=None), share)
-        found = None if first is None else kept.read(first)
+        found = None if first is None else kept.read_programs(first)
         if found is not None and found[0]["horizon"] != config.horizon:
             return None
     if found is None:

@@ -13,7 +13,7 @@ from mjx_reinforce.types import PyTree, is_key
 _PACKAGES = ("mjx_reinforce", "optax")
 
 
-def describe(tree: PyTree) -> Any:
+def describe_tree(tree: PyTree) -> Any:
     """Returns what JSON can hold of a pytree: its structure, and its leaves' shapes and dtypes.
 
     Args:
@@ -25,24 +25,24 @@ def describe(tree: PyTree) -> Any:
     if tree is None:
         return None
     if isinstance(tree, dict):
-        return {"dict": {name: describe(x) for name, x in tree.items()}}
+        return {"dict": {name: describe_tree(x) for name, x in tree.items()}}
     kind, fields = type(tree), _fields(tree)
     if fields is not None:
         if kind.__module__.partition(".")[0] not in _PACKAGES:
             raise TypeError(f"{kind} is of another package than {', '.join(_PACKAGES)}")
         if "." in kind.__qualname__:
             raise TypeError(f"{kind} is not at the top of its module")
-        parts = {name: describe(getattr(tree, name)) for name in fields}
+        parts = {name: describe_tree(getattr(tree, name)) for name in fields}
         return {"class": f"{kind.__module__}:{kind.__qualname__}", "fields": parts}
     if isinstance(tree, tuple | list):
-        return {kind.__name__: [describe(x) for x in tree]}
+        return {kind.__name__: [describe_tree(x) for x in tree]}
     if not hasattr(tree, "shape"):
         raise TypeError(f"a leaf of {kind}")
     return {"leaf": "key" if is_key(tree) else np.dtype(tree.dtype).name, "shape": list(tree.shape)}
 
 
 def rebuild(described: Any) -> Any:
-    """Returns the pytree of ``describe``; its leaves are ``jax.ShapeDtypeStruct``.
+    """Returns the pytree of ``describe_tree``; its leaves are ``jax.ShapeDtypeStruct``.
 
     Raises:
       ValueError, KeyError, TypeError, AttributeError or ImportError: it is no such description.

@@ -31,14 +31,14 @@ def last_states(
     states = []
     for runs in chunks:
         folder = files.checkpoints(runs.name)
-        found = next(checkpoint.load(folder, shape_of(len(runs.seed)), say), None)
+        found = next(checkpoint.read_checkpoints(folder, shape_of(len(runs.seed)), say), None)
         if found is None:
             raise ValueError(f"the last states in {folder} are damaged; start another sweep")
         states.append(jax.device_get(found.state))
     return jax.tree.map(lambda *xs: np.concatenate(xs), *states)
 
 
-def choose(states: RunState, of: Sequence[Runs], runs: Runs) -> RunState:
+def select_runs(states: RunState, of: Sequence[Runs], runs: Runs) -> RunState:
     """Returns the states of some runs.
 
     Args:

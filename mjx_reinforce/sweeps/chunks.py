@@ -7,11 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.runs.state import Programs
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps.designs.groups import Group
 from mjx_reinforce.sweeps.history import History, Measured
-from mjx_reinforce.sweeps.slots.layout import Layout
-from mjx_reinforce.sweeps.slots.programs import Programs
+from mjx_reinforce.sweeps.slots.layout import StateRows
+from mjx_reinforce.sweeps.slots.programs import SlotPrograms
 from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.saving import Attempts, SaveDue
@@ -37,8 +38,8 @@ class Runs(NamedTuple):
     seed: np.ndarray
 
 
-def split(group: Group, name: str, num_chunks: int) -> list[Runs]:
-    """Returns the runs of a group in chunks, all of one size but for the last.
+def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
+    """Returns the runs of a group in chunks, all of one size except the last.
 
     Seeds come before configurations, so that every chunk has its share of each configuration and
     all take about as long.
@@ -58,7 +59,7 @@ def split(group: Group, name: str, num_chunks: int) -> list[Runs]:
     ]
 
 
-def begin(programs: Programs, group: Group, runs: Runs) -> np.ndarray:
+def initial_states(programs: SlotPrograms, group: Group, runs: Runs) -> np.ndarray:
     """Returns the states [R, B] of the runs of a chunk before their first update."""
     settings = {name: values[runs.place] for name, values in group.settings.items()}
     return programs.begin(programs.keys[runs.seed], programs.eval_keys[runs.seed], settings)
@@ -67,7 +68,7 @@ def begin(programs: Programs, group: Group, runs: Runs) -> np.ndarray:
 class Saver:
     """Keeps a chunk in progress in checkpoints, and finds it again."""
 
-    def __init__(self, folder: Path, config: Config, layout: Layout, say: Callable[[str], None]):
+    def __init__(self, folder: Path, config: Config, layout: StateRows, say: Callable[[str], None]):
         """Takes what a chunk is kept in.
 
         Args:
@@ -107,7 +108,7 @@ class Saver:
         """Returns the newest states that were saved, with their history restored, or None."""
         if not self._folder.exists():
             return None
-        for found in checkpoint.load(self._folder, like(), self._say):
+        for found in checkpoint.read_checkpoints(self._folder, like(), self._say):
             history.restore(found.record)
             self._due.saved(_updates(history))
             return self._layout.rows(found.state)
@@ -115,7 +116,7 @@ class Saver:
 
     def remove(self) -> None:
         """Removes the checkpoints."""
-        checkpoint.remove(self._folder)
+        checkpoint.remove_checkpoints(self._folder)
 
 
 def _updates(history: History) -> int:

@@ -28,7 +28,7 @@ _MAIN = (
 )
 
 
-def parse(arguments: Sequence[str]) -> Design:
+def parse_design(arguments: Sequence[str]) -> Design:
     """Returns the sweep that a command line asks for; --help exits.
 
     Args:

@@ -19,17 +19,17 @@ from mjx_reinforce.sweeps.chunks import Runs, Saver
 from mjx_reinforce.sweeps.designs import rungs
 from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.designs.groups import Group, learner_builder
-from mjx_reinforce.sweeps.designs.plan import Part, divide, group_seconds
+from mjx_reinforce.sweeps.designs.plan import GroupPlan, divide, group_seconds
 from mjx_reinforce.sweeps.designs.prepare import Prepared
 from mjx_reinforce.sweeps.designs.rungs import Rung
 from mjx_reinforce.sweeps.history import History
 from mjx_reinforce.sweeps.results import SweepFiles
-from mjx_reinforce.sweeps.slots.ahead import Clock, one_ahead
-from mjx_reinforce.sweeps.slots.programs import Programs, compile_programs, shape_of_states
+from mjx_reinforce.sweeps.slots.ahead import Stopwatch, one_ahead
+from mjx_reinforce.sweeps.slots.programs import SlotPrograms, compile_programs, shape_of_states
 from mjx_reinforce.training.driver import drive
 from mjx_reinforce.training.progress import Progress
 
-#: More than this of a sweep is all of it, but for rounding.
+#: More than this share of a sweep is all of it, up to rounding.
 _ALL = 1 - 1e-6
 
 
@@ -84,16 +84,16 @@ class Conductor:
         self._files, self._display = files, display
         self._interrupt = interrupt
         self._ready: Callable[[float], None] | None = ready
-        self._num_rungs = rungs.count(design.search, len(prepared.configurations))
+        self._num_rungs = rungs.num_rungs(design.search, len(prepared.configurations))
         self._rungs_done, self._total, self._done = 0, 0.0, 0.0
         self._before: list[Stage] = []
-        self._compiled: dict[int, Programs] = {}
-        self.clock = Clock()
+        self._compiled: dict[int, SlotPrograms] = {}
+        self.clock = Stopwatch()
 
     def conduct(self) -> bool:
         """Trains all rungs; returns whether they ended, or were interrupted."""
         groups, search = self._prepared.groups, self._design.search
-        for rung in rungs.schedule(groups, search, self._files.measured):
+        for rung in rungs.plan_rungs(groups, search, self._files.measured):
             if not self._train_rung(rung):
                 return False
             if not self._processes.meet():
@@ -165,10 +165,10 @@ class Conductor:
         made = []
         for number, group in rung.groups.items():
             name, count = f"{rung.name}-{number:03d}", self._divide(number, group).num_chunks
-            made.append(Stage(number, group, chunks.split(group, name, count)))
+            made.append(Stage(number, group, chunks.split_runs(group, name, count)))
         return made
 
-    def _divide(self, number: int, group: Group) -> Part:
+    def _divide(self, number: int, group: Group) -> GroupPlan:
         """Returns how the runs of a group in some rung are divided."""
         limit, devices = self._prepared.limits[number], self._prepared.devices.count
         return divide(group, limit, devices, exact=self._design.exact)
@@ -183,7 +183,7 @@ class Conductor:
         left = [stage.of([runs for runs in stage.chunks if runs.name in mine]) for stage in stages]
         return [stage for stage in left if stage.chunks]
 
-    def _compile(self, stage: Stage) -> Programs:
+    def _compile(self, stage: Stage) -> SlotPrograms:
         """Returns the programs of a group, which are those of its runs in the first rung."""
         if stage.number not in self._compiled:
             env, whole = self._prepared.env, self._prepared.groups[stage.number]
@@ -202,7 +202,9 @@ class Conductor:
             self._compiled[stage.number] = programs
         return self._compiled[stage.number].of(stage.group.config)
 
-    def _train(self, rung: Rung, stage: Stage, programs: Programs, runs: Runs, each: float) -> bool:
+    def _train(
+        self, rung: Rung, stage: Stage, programs: SlotPrograms, runs: Runs, each: float
+    ) -> bool:
         """Trains a chunk, from its last checkpoint if there is one; returns whether it ended.
 
         ``each`` is what a run of it takes, as ``_part_done`` counts.
@@ -237,16 +239,16 @@ class Conductor:
         return self._interrupt is not None and self._interrupt.number is not None
 
     def _begin(
-        self, rung: Rung, stage: Stage, programs: Programs, runs: Runs, history: History
+        self, rung: Rung, stage: Stage, programs: SlotPrograms, runs: Runs, history: History
     ) -> np.ndarray:
         """Returns the first states of a chunk: new ones, or those at the end of a rung before."""
         if rung.before is None:
-            return chunks.begin(programs, stage.group, runs)
+            return chunks.initial_states(programs, stage.group, runs)
         before = next(old for old in self._before if old.number == stage.number)
         build = learner_builder(self._prepared.env, before.group.config)
         shape_of = functools.partial(shape_of_states, build, tuple(before.group.settings))
         states = carry.last_states(self._files, before.chunks, shape_of, self._display.say)
-        states = carry.choose(states, before.chunks, runs)
+        states = carry.select_runs(states, before.chunks, runs)
         history.now["updates"] = counts.to_int(states.train_states.num_updates)
         history.now["env_steps"] = counts.to_int(states.train_states.env_steps)
         return programs.layout.rows(states)
@@ -264,7 +266,7 @@ class Conductor:
         return (self._rungs_done + rung) / self._num_rungs
 
     def _progress(self, history: History, each: float) -> Progress:
-        """Returns how far the chunk is, but for the whole sweep where that differs."""
+        """Returns how far the chunk is, or the whole sweep where that differs."""
         now = history.progress()
         done = self._part_done(each * now.num_seeds * now.fraction)
         passed = self.clock.running + history.seconds

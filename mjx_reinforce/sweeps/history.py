@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.files import Arrays
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.budget import used
-from mjx_reinforce.training.progress import Progress, measure
-from mjx_reinforce.training.record import Table
-
-Arrays = dict[str, np.ndarray]
+from mjx_reinforce.training.progress import Progress, measure_progress
+from mjx_reinforce.training.record import GrowingTable
 
 #: What is kept of every evaluation, and the name of its latest.
 _CURVES = {"eval_return": "eval_return", "env_steps": "eval_env_steps"}
@@ -47,7 +46,7 @@ class History:
         self.now: Arrays = {name: np.zeros(config.num_seeds, np.int64) for name in counts}
         self.now["eval_return"] = np.zeros(config.num_seeds, np.float32)
         self.seconds = 0.0
-        self._curves = Table({})
+        self._curves = GrowingTable({})
         self._before = self.now["env_steps"], self.seconds
 
     def keep(self, blocks: Sequence[Measured], seconds: float) -> None:
@@ -79,8 +78,9 @@ class History:
         self.now = {name: arrays[name] for name in self.now}
         self.seconds = float(arrays["seconds"])
         self._before = self.now["env_steps"], self.seconds
-        curves = {name: f"curves.{name}" for name in _CURVES}  # none before the first evaluation
-        self._curves = Table({name: arrays[key] for name, key in curves.items() if key in arrays})
+        curves = {f"curves.{name}": name for name in _CURVES}  # none before the first evaluation
+        known = {name: arrays[key] for key, name in curves.items() if key in arrays}
+        self._curves = GrowingTable(known)
 
     def evaluated(self) -> bool:
         """Returns whether the present policies of all runs have been evaluated."""
@@ -112,4 +112,4 @@ class History:
             "updates": self.now["updates"][None],
             "seconds": np.array([seconds, self.seconds]),
         }
-        return measure(past, np.array([self.used()] * 2))
+        return measure_progress(past, np.array([self.used()] * 2))

@@ -9,7 +9,7 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, silence_alarms
 from mjx_reinforce.runs.command_line import refuse
 from mjx_reinforce.runs.directory import remove_empty
-from mjx_reinforce.sweeps.command_line import parse
+from mjx_reinforce.sweeps.command_line import parse_design
 from mjx_reinforce.sweeps.perform import perform
 
 
@@ -30,7 +30,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt) -> int:
     made: list[Path] = []
     interrupt.on_exit(lambda: remove_empty(made))
     try:
-        _, ended = perform(parse(arguments), interrupt, made)
+        _, ended = perform(parse_design(arguments), interrupt, made)
     except ValueError as error:
         refuse(str(error), made)
     except RuntimeError as error:  # XLA's

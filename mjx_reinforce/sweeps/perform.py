@@ -19,7 +19,7 @@ from mjx_reinforce.sweeps.designs.design import Design, as_record, check_design,
 from mjx_reinforce.training.resume import check_same_program
 
 if TYPE_CHECKING:
-    from mjx_reinforce.report import Written
+    from mjx_reinforce.report import WrittenReport
     from mjx_reinforce.sweeps.designs.prepare import Prepared
     from mjx_reinforce.sweeps.results import SweepFiles
 
@@ -168,7 +168,7 @@ def _finish(
     files.write(contents)
 
 
-def _report(directory: Path) -> "Written":
+def _report(directory: Path) -> "WrittenReport":
     """Writes the report of a sweep; removes what a crash left of writing it."""
     from mjx_reinforce import report
 

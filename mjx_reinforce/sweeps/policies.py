@@ -13,11 +13,9 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.export.policy_files import actor_of, arrays_of, save_policy
-from mjx_reinforce.files import read_arrays, write_arrays, write_json
+from mjx_reinforce.files import Arrays, read_arrays, write_arrays, write_json
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.sweeps.chunks import Runs
-
-Arrays = dict[str, np.ndarray]
 
 #: Arrays of a part beside those of the actors.
 _FACTS = ("configuration", "seed", "final_return")

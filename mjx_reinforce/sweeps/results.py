@@ -1,7 +1,7 @@
 """The files of a sweep: DIR/sweep.json, results.csv, curves.npz, and the parts of them so far.
 
 A part is what one chunk of runs measured. It is written whole, when the chunk ends, and is all that
-results.csv and curves.npz are made of: whatever else a crash leaves is written anew.
+results.csv and curves.npz are made of: all else that a crash leaves is written again.
 """
 
 import shutil
@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce import files
-from mjx_reinforce.files import read_arrays, write_arrays, write_bytes, write_json
+from mjx_reinforce.files import Arrays, read_arrays, write_arrays, write_bytes, write_json
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.reports.statistics import steps_to_solve
 from mjx_reinforce.sweeps import policies
 from mjx_reinforce.sweeps.chunks import Runs
 from mjx_reinforce.sweeps.history import History
 from mjx_reinforce.training import checkpoint
-
-Arrays = dict[str, np.ndarray]
 
 _MEASURED = (
     *("seed", "final_return", "best_return", "env_steps_to_solve"),
@@ -128,18 +126,18 @@ class SweepFiles:
         for path in self.parts.glob("policies-*.npz"):
             path.unlink()
         for folder in self.parts.glob("*/"):
-            checkpoint.remove(folder)
+            checkpoint.remove_checkpoints(folder)
 
     def measured(self, rung: str) -> Arrays:
         """Returns what the chunks of a rung measured so far, sorted; empty if nothing."""
         paths = sorted(self.parts.glob(f"{rung}-*.npz"))
-        return join([read_arrays(path, stored=True) for path in paths]) if paths else {}
+        return join_parts([read_arrays(path, stored=True) for path in paths]) if paths else {}
 
     def _path(self, chunk: str) -> Path:
         return self.parts / f"{chunk}.npz"
 
     def _all(self) -> Arrays:
-        """Returns what all chunks measured so far, but for those of fresh seeds."""
+        """Returns what all chunks measured so far, without those of fresh seeds."""
         rungs = []
         while measured := self.measured(str(len(rungs))):
             rungs.append(measured)
@@ -167,7 +165,7 @@ class SweepFiles:
         ]
 
 
-def join(parts: Sequence[Arrays]) -> Arrays:
+def join_parts(parts: Sequence[Arrays]) -> Arrays:
     """Returns several parts as one, sorted by configuration and seed.
 
     A run whose evaluations ended earlier repeats its last.
@@ -185,7 +183,7 @@ def follow(rungs: Sequence[Arrays]) -> Arrays:
     """Returns the measurements of runs that went on from rung to rung; others repeat their last.
 
     Args:
-      rungs: from ``join``; each of runs that were in the one before, beginning with its last
+      rungs: from ``join_parts``; each of runs that were in the one before, beginning with its last
         evaluation once more.
     """
     joined = rungs[0]

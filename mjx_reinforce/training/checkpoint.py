@@ -1,7 +1,7 @@
 """Checkpoints: a run between two blocks of updates, as NumPy archives in RUN/checkpoint/.
 
 Each archive is written whole, under a name that ends in the beginning of its SHA-256: a file that
-was cut off or changed is noticed, and the one before it serves. The newest two are kept, and the
+was cut off or changed is noticed, and the one before it is used. The newest two are kept, and the
 newest one that is even, for runs whose budget is raised.
 """
 
@@ -18,10 +18,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mjx_reinforce.files import members, write_bytes
+from mjx_reinforce.files import Arrays, members, write_bytes
 from mjx_reinforce.types import PyTree, is_key, plain
-
-Arrays = dict[str, np.ndarray]
 
 _KEPT = 2
 _NAME = re.compile(r"\d{6,}-(even-)?[0-9a-f]{16}\.npz")
@@ -81,7 +79,9 @@ def save(folder: Path, checkpoint: Checkpoint, *, even: bool) -> None:
             path.unlink()
 
 
-def load(folder: Path, like: PyTree, say: Callable[[str], None]) -> Iterator[Checkpoint]:
+def read_checkpoints(
+    folder: Path, like: PyTree, say: Callable[[str], None]
+) -> Iterator[Checkpoint]:
     """Yields the checkpoints of a folder, the newest first, without those that are damaged.
 
     Args:
@@ -108,7 +108,7 @@ def settings_of(folder: Path) -> dict[str, Any]:
     return {}
 
 
-def remove(folder: Path, after: int = 0) -> None:
+def remove_checkpoints(folder: Path, after: int = 0) -> None:
     """Removes the checkpoints after a number, parts of unwritten ones, and a folder left empty."""
     parts = folder.glob(".*.npz.*")
     for path in [*parts, *(path for path in _files(folder) if _number(path) > after)]:
@@ -152,7 +152,7 @@ def _encode(checkpoint: Checkpoint) -> bytes:
 
 
 def _decode(content: bytes, path: Path, like: PyTree) -> Checkpoint:
-    """Reads what ``_encode`` returned; see ``load``."""
+    """Reads what ``_encode`` returned; see ``read_checkpoints``."""
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in archive.files}

@@ -6,15 +6,16 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from mjx_reinforce.files import Arrays
 from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.learner import TrainState
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.best import Best, keep_best
 from mjx_reinforce.training.checkpoint import Checkpoint
-from mjx_reinforce.training.record import Record
+from mjx_reinforce.training.record import RunRecord
 from mjx_reinforce.training.rows import Cells
-from mjx_reinforce.training.state import Arrays, Looked, Programs, RunState, budget_of
+from mjx_reinforce.training.state import Looked, Programs, RunState, budget_of
 
 
 class Evaluation(NamedTuple):
@@ -90,7 +91,7 @@ class Driver:
         self,
         config: Config,
         programs: Programs,
-        record: Record,
+        record: RunRecord,
         state: RunState,
         best: Best,
         observers: Sequence[Observer] = (),

@@ -1,4 +1,4 @@
-"""Where the policies of a run begin, if not anew: at the last ones of another run."""
+"""Policies that a run begins with: the last policies of another run."""
 
 import dataclasses
 from collections.abc import Mapping

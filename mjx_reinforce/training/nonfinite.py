@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-Arrays = dict[str, np.ndarray]
+from mjx_reinforce.files import Arrays
 
 #: Why a run that is ``hopeless`` is stopped.
 HOPELESS = (
@@ -12,7 +12,7 @@ HOPELESS = (
     "or its new policy not finite; lower --learning-rate (ars: --step-size) or mend the task"
 )
 #: The fields of such an update, in the order of summary.json.
-FIELDS = {"seed": np.int64, "update": np.int64, "episodes": np.int64, "skipped": np.bool_}
+EVENT_COLUMNS = {"seed": np.int64, "update": np.int64, "episodes": np.int64, "skipped": np.bool_}
 #: A run is not given up before each of its seeds was broken so many updates in a row: blocks may
 #: be shorter, and a seed may recover from one such update, since the next draws other numbers.
 _FEWEST = 5
@@ -34,13 +34,15 @@ def nonfinite_updates(metrics: Arrays, updates: np.ndarray) -> Arrays:
     episodes, skipped = metrics["nonfinite_episodes"], metrics["skipped_update"]
     k, s = np.nonzero((episodes + skipped) * metrics["active"])
     found = (s, updates[k, s] - 1, episodes[k, s], skipped[k, s])
-    return {name: x.astype(kind) for (name, kind), x in zip(FIELDS.items(), found, strict=True)}
+    return {
+        name: x.astype(kind) for (name, kind), x in zip(EVENT_COLUMNS.items(), found, strict=True)
+    }
 
 
 def as_events(updates: Arrays) -> list[dict[str, Any]]:
     """Returns the updates of ``nonfinite_updates`` one by one, as summary.json has them."""
-    columns = (updates[name].tolist() for name in FIELDS)
-    return [dict(zip(FIELDS, event, strict=True)) for event in zip(*columns, strict=True)]
+    columns = (updates[name].tolist() for name in EVENT_COLUMNS)
+    return [dict(zip(EVENT_COLUMNS, event, strict=True)) for event in zip(*columns, strict=True)]
 
 
 def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
@@ -72,7 +74,7 @@ def hopeless(in_a_row: np.ndarray, used: np.ndarray, block: int) -> bool:
     return bool(training.any() and np.all(in_a_row[training] >= max(block, _FEWEST)))
 
 
-def describe(updates: Arrays, num_seeds: int) -> str:
+def describe_nonfinite(updates: Arrays, num_seeds: int) -> str:
     """Returns one line about at least one update of ``nonfinite_updates``."""
     first, last = updates["update"].min(), updates["update"].max()
     seeds = np.unique(updates["seed"]).tolist()

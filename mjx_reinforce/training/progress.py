@@ -38,7 +38,7 @@ class Progress(NamedTuple):
     seconds_left: float
 
 
-def measure(past: dict[str, np.ndarray], fractions: np.ndarray) -> Progress:
+def measure_progress(past: dict[str, np.ndarray], fractions: np.ndarray) -> Progress:
     """Returns how far a run is.
 
     Args:

@@ -9,16 +9,15 @@ from typing import Any
 
 import numpy as np
 
+from mjx_reinforce.files import Arrays
 from mjx_reinforce.reports.statistics import summarize
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import nonfinite, rows
 from mjx_reinforce.training.budget import used
-from mjx_reinforce.training.progress import BLOCKS, Progress, measure
-
-Arrays = dict[str, np.ndarray]
+from mjx_reinforce.training.progress import BLOCKS, Progress, measure_progress
 
 
-class Table:
+class GrowingTable:
     """Named columns [rows, ...] that grow by blocks of rows."""
 
     def __init__(self, columns: Arrays):
@@ -53,12 +52,12 @@ def _joined(blocks: list[Arrays]) -> Arrays:
     return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
 
 
-class Record:
+class RunRecord:
     """Everything that a run has measured so far.
 
     updates: [S] int64, how many each seed has made
     env_steps: [S] int64, how many each seed has played in training
-    episodes: [S] int64, likewise
+    episodes: [S] int64, how many each seed has played in training
     seconds: wall time from the end of compilation to the last evaluation
     threshold: the return that counts as solved, if any
     """
@@ -77,9 +76,13 @@ class Record:
         self.seconds = 0.0
         kinds = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
         self._tables = {
-            "evaluations": Table({}),
-            "training": Table({k: np.zeros((0, config.num_seeds), x) for k, x in kinds.items()}),
-            "nonfinite": Table({k: np.zeros(0, x) for k, x in nonfinite.FIELDS.items()}),
+            "evaluations": GrowingTable({}),
+            "training": GrowingTable(
+                {k: np.zeros((0, config.num_seeds), x) for k, x in kinds.items()}
+            ),
+            "nonfinite": GrowingTable(
+                {k: np.zeros(0, x) for k, x in nonfinite.EVENT_COLUMNS.items()}
+            ),
         }
         self._last: Arrays = {}
         self._broken_in_a_row = np.zeros(config.num_seeds, np.int64)
@@ -118,7 +121,7 @@ class Record:
         self._evaluated = int(arrays["evaluated"])
         self._broken_in_a_row = arrays["broken_in_a_row"]
         self._last = groups.pop("last")
-        self._tables = {name: Table(columns) for name, columns in groups.items()}
+        self._tables = {name: GrowingTable(columns) for name, columns in groups.items()}
 
     def add_updates(self, metrics: Arrays) -> Arrays:
         """Takes in a block of updates.
@@ -222,7 +225,7 @@ class Record:
         names = ("eval_return", "env_steps", "updates", "seconds")
         past = self._tables["evaluations"].latest(BLOCKS + 1, *names)
         fractions = used(self._config, past["env_steps"], past["updates"]).min(axis=-1)
-        return measure(past, fractions)
+        return measure_progress(past, fractions)
 
     def history(self) -> Arrays:
         """Returns ``eval_return``, and ``env_steps`` and ``episodes`` until then, [E, S] each."""

@@ -1,4 +1,4 @@
-"""Going on with a run: its own settings, the same program, and the checkpoint that serves."""
+"""Resuming a run: its own settings, the same program, and the newest usable checkpoint."""
 
 import dataclasses
 import json
@@ -86,7 +86,7 @@ def _choices(hint: Any) -> str:
 
 
 def recordable(config: Config) -> dict[str, Any]:
-    """Returns the settings as config.json has them, but for where the run is."""
+    """Returns the settings as config.json has them, except where the run is."""
     settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in PLACES}
     return json.loads(json.dumps(settings))
 
@@ -163,8 +163,8 @@ def check_same_program(
             )
 
 
-def find(like: "RunState", config: Config, say: Callable[[str], None]) -> Any:
-    """Returns the newest checkpoint that serves, or None: then the run starts again.
+def newest_checkpoint(like: "RunState", config: Config, say: Callable[[str], None]) -> Any:
+    """Returns the newest usable checkpoint, or None: then the run starts again.
 
     Args:
       like: the shapes of its ``RunState``.
@@ -182,7 +182,7 @@ def find(like: "RunState", config: Config, say: Callable[[str], None]) -> Any:
     _check_unchanged(config, checkpoint.settings_of(config.resume / "checkpoint"))
     states = like, shape_of_best(like.train_states)
     length = _size(config.resume / "metrics.csv")
-    for found in checkpoint.load(config.resume / "checkpoint", states, say):
+    for found in checkpoint.read_checkpoints(config.resume / "checkpoint", states, say):
         if found.metrics_bytes > length:
             say(f"metrics.csv is shorter than at checkpoint {found.number}; trying the one before")
         elif _serves(found, config):
@@ -194,7 +194,7 @@ def _check_unchanged(config: Config, trained: Mapping[str, Any]) -> None:
     """Raises ValueError if config.json was changed by hand since a checkpoint was written.
 
     Args:
-      config: what config.json says now, but for the budget.
+      config: what config.json says now, except the budget.
       trained: the settings in the checkpoint.
     """
     said = recordable(config)

@@ -71,7 +71,7 @@ def lines(rows: Cells) -> bytes:
     return "".join(",".join(row) + "\n" for row in zip(*rows.values(), strict=True)).encode()
 
 
-def number(cell: str) -> int | float | None:
+def parse_cell(cell: str) -> int | float | None:
     """Returns what a cell says, an int in columns of counts; None if it is empty."""
     if cell.lstrip("-").isdigit():
         return int(cell)

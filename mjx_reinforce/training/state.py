@@ -12,6 +12,7 @@ import numpy as np
 from flax import struct
 from jax import lax
 
+from mjx_reinforce.files import Arrays
 from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.learner import Guests, Host, Learner, TrainState
 from mjx_reinforce.policies.actor import Actor
@@ -19,7 +20,6 @@ from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.training.evaluation import evaluate, guests_of, measure
 from mjx_reinforce.types import Environment, PyTree, plain, with_keys
 
-Arrays = dict[str, np.ndarray]
 #: A root of randomness; traced inside of programs.
 Seed = int | np.uint32 | jax.Array
 #: Returns the learner of settings that may be traced, of one seed each.
@@ -44,9 +44,9 @@ class Budget(NamedTuple):
     """What each seed may use. It is an input of the programs: another budget compiles nothing.
 
     env_steps: [2] a count, see ``counts``; a seed stops after the update that reaches it
-    updates: [2] likewise, how many it makes at most
+    updates: [2] a count, how many updates it makes at most
     all_env_steps: [2] how long schedules last; more than ``env_steps`` where a run goes on later
-    all_updates: [2] likewise
+    all_updates: [2] the same in updates
     """
 
     env_steps: counts.Count
@@ -246,7 +246,9 @@ def compile_parts(
         return Looked(actor, num_updates, to_numpy(measured))
 
     def tested(actor: Actor) -> Arrays:
-        return joined([to_numpy(compiled(actor, keys)) for keys in np.asarray(test_keys)])
+        return joined_evaluations(
+            [to_numpy(compiled(actor, keys)) for keys in np.asarray(test_keys)]
+        )
 
     return first, Programs(advanced, evaluated, tested)
 
@@ -333,10 +335,10 @@ def block_of_updates(
 
     def progress(state: RunState, budget: Budget) -> jax.Array:
         """Returns the share [S] of its whole budget that each seed has used."""
-        env_steps = counts.number(state.train_states.env_steps)
-        updates = counts.number(state.train_states.num_updates)
+        env_steps = counts.as_float(state.train_states.env_steps)
+        updates = counts.as_float(state.train_states.num_updates)
         # No seed goes on whose budget is nothing.
-        limits = (counts.number(x) for x in (budget.all_env_steps, budget.all_updates))
+        limits = (counts.as_float(x) for x in (budget.all_env_steps, budget.all_updates))
         one, other = (jnp.maximum(limit, 1.0) for limit in limits)
         return jnp.minimum(jnp.maximum(env_steps / one, updates / other), 1.0)
 
@@ -406,7 +408,7 @@ def evaluation(
     return jax.vmap(one)
 
 
-def joined(evaluations: Sequence[Arrays]) -> Arrays:
+def joined_evaluations(evaluations: Sequence[Arrays]) -> Arrays:
     """Returns what an evaluation of all episodes of several would have returned, [S] each."""
     return {
         name: (np.sum if name.endswith("steps") else np.mean)(

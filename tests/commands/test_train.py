@@ -23,7 +23,7 @@ from mjx_reinforce.reports.statistics import smooth
 from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, check_step_count
 from mjx_reinforce.store.build import build
 from mjx_reinforce.training.nonfinite import as_events
-from mjx_reinforce.training.record import Record
+from mjx_reinforce.training.record import RunRecord
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
 
@@ -277,7 +277,7 @@ def evaluation(*returns):
 
 def test_a_record_of_two_seeds_by_hand():
     config = Config(num_seeds=2, num_episodes=2, env_steps=60, stop_when_solved=True)
-    record = Record(config, threshold=8.0)
+    record = RunRecord(config, threshold=8.0)
     first = record.add_evaluation(evaluation(1, 9), 0.5)
     assert first["train_return"] == ["", ""]
     assert not record.finished()

@@ -16,7 +16,7 @@ from mjx_reinforce.engines import choice, rollouts
 from mjx_reinforce.engines.native import available, objects, outlook, program, rollout
 from mjx_reinforce.engines.native.cpu import lanes, machine
 from mjx_reinforce.engines.native.gpu import ptx
-from mjx_reinforce.registry import DISTRIBUTIONS, load
+from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
 from mjx_reinforce.types import Discrete
 
 if reason := available.unavailable():
@@ -28,10 +28,10 @@ def test_every_distribution_draws_the_same_noise(name):
     """Over three chunks, in lanes that are at different steps."""
     space = Box(np.array([-3.0]), np.array([1.0]))
     try:
-        distribution = load(DISTRIBUTIONS[name])(space)
+        distribution = load_definition(DISTRIBUTIONS[name])(space)
     except ValueError:
         space = Discrete(3)
-        distribution = load(DISTRIBUTIONS[name])(space)
+        distribution = load_definition(DISTRIBUTIONS[name])(space)
     env = Drifting(space)
     player = actor_and_act(env, (4,), distribution=distribution)
     got, want = both(env, player, deterministic=jnp.arange(5) % 2 == 0)
@@ -271,14 +271,14 @@ def test_no_code_is_made_twice(tmp_path, monkeypatch):
         env, (), distribution=categorical(env.action_space.num_actions)
     )
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
-    first = program.build(env, act, actor, distribution, 17)
+    first = program.build_program(env, act, actor, distribution, 17)
     assert first.code.compiled
-    assert program.build(env, act, actor, distribution, 17).code is first.code
-    assert program.build(env, act, actor, distribution, 19).code is not first.code
+    assert program.build_program(env, act, actor, distribution, 17).code is first.code
+    assert program.build_program(env, act, actor, distribution, 19).code is not first.code
     monkeypatch.setattr(machine, "_LOADED", {})
     monkeypatch.setattr(ptx, "_LOADED", {})
     monkeypatch.setattr(program.scalarized, "build", None)
-    assert not program.build(env, act, actor, distribution, 17).code.compiled
+    assert not program.build_program(env, act, actor, distribution, 17).code.compiled
 
 
 def test_constants_are_part_of_the_code():
@@ -292,7 +292,7 @@ def test_constants_are_part_of_the_code():
     for price in (2.0, 3.0, 3.0):
         env = Pays()
         env.prices = jnp.array([price])
-        keys.add(program.build(env, act, actor, distribution, 10).code.key)
+        keys.add(program.build_program(env, act, actor, distribution, 10).code.key)
     assert len(keys) == 2
 
 
@@ -301,7 +301,7 @@ def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
     actor, act, distribution = actor_and_act(
         env, (), distribution=categorical(env.action_space.num_actions)
     )
-    player = choice.Player(act, actor, distribution)
+    player = choice.ActingPolicy(act, actor, distribution)
     assert choice.choose("auto", env, player, 500).name == "native"
     assert choice.choose("auto", env).name == "fused"
 
@@ -312,7 +312,7 @@ def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
 
     gamma = Gamma()
     actor, act, distribution = actor_and_act(gamma, ())
-    player = choice.Player(act, actor, distribution)
+    player = choice.ActingPolicy(act, actor, distribution)
     assert choice.choose("auto", gamma, player, 500).name == "fused"
     with pytest.raises(ValueError, match=r"native engine cannot play this: .*lgamma.*choose auto"):
         choice.choose("native", gamma, player, 500)
@@ -325,7 +325,7 @@ def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
 def test_lanes_have_no_numbers_of_8_bits():
     env = Bytes()
     actor, act, distribution = actor_and_act(env, ())
-    chosen = choice.choose("auto", env, choice.Player(act, actor, distribution), 500)
+    chosen = choice.choose("auto", env, choice.ActingPolicy(act, actor, distribution), 500)
     assert chosen.name == "fused"
     assert "machine code cannot play this: its state has numbers of int8" in chosen.why
 
@@ -336,7 +336,7 @@ def test_keys_of_another_generator(implementation):
     env = Drifting()
     actor, act, distribution = actor_and_act(env, (4,))
     key = jax.random.key(1, impl=implementation)
-    engine = choice.choose("auto", env, choice.Player(act, actor, distribution), 20)
+    engine = choice.choose("auto", env, choice.ActingPolicy(act, actor, distribution), 20)
     assert engine.name == "native"
 
     def play(engine):
@@ -351,7 +351,7 @@ def test_keys_of_another_generator(implementation):
 
 def chosen(env, name="auto"):
     actor, act, distribution = actor_and_act(env, (4,))
-    return choice.choose(name, env, choice.Player(act, actor, distribution), 20)
+    return choice.choose(name, env, choice.ActingPolicy(act, actor, distribution), 20)
 
 
 @pytest.mark.cpu

@@ -16,7 +16,8 @@ from toys import Bytes, Chain, Drifting, categorical
 from mjx_reinforce import envs
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.native import available, objects, program, rollout, step
-from mjx_reinforce.engines.native.gpu import lockstep, player, ptx, scratch, seam
+from mjx_reinforce.engines.native.gpu import kernel as kernels
+from mjx_reinforce.engines.native.gpu import lockstep, ptx, scratch, seam
 from mjx_reinforce.fused import scalarized
 
 if reason := available.unavailable():
@@ -145,8 +146,8 @@ def test_long_arrays_are_in_a_buffer(monkeypatch):
     gpu_on_cpu.emulate(monkeypatch)
     want = played(rollout.rollout, env, who, horizon=30)
     monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
-    made, load = [], ptx.load
-    monkeypatch.setattr(ptx, "load", lambda *x: made.append(load(*x)) or made[-1])
+    made, load = [], ptx.load_kernel
+    monkeypatch.setattr(ptx, "load_kernel", lambda *x: made.append(load(*x)) or made[-1])
     got = played(rollout.rollout, env, who, horizon=30)
     assert made[0].scratch > 100
     for name in ("observation", "action", "reward", "mask"):
@@ -185,7 +186,7 @@ def kernel_text(env, sizes):
         step.BRANCH_COST,
         program.GPU_LOOPS,
     )
-    return player.kernel_text(written, len(jax.tree.leaves(actor)))
+    return kernels.kernel_text(written, len(jax.tree.leaves(actor)))
 
 
 def test_a_division_that_llvm_spells_otherwise_is_not_left():
@@ -204,7 +205,7 @@ def test_ptx(name, threads, blocks, capability, tmp_path, monkeypatch):
     """It is one kernel that calls nothing; NVIDIA's assembler takes it, where there is one."""
     monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
     text = kernel_text(envs.make(name), (4,))
-    made = ptx.load(text, lambda: text, capability, tmp_path)
+    made = ptx.load_kernel(text, lambda: text, capability, tmp_path)
     assert made.compiled
     assert (made.threads, made.blocks) == (threads, blocks)
     assert (made.scratch > 0) == (name == "Hopper-v5")
@@ -215,7 +216,7 @@ def test_ptx(name, threads, blocks, capability, tmp_path, monkeypatch):
     assert meetings
     assert all(meetings)  # a warp comes together before each: an H200 waited forever without
     ptx._LOADED.clear()
-    again = ptx.load(text, lambda: pytest.fail("it is on disk"), capability, tmp_path)
+    again = ptx.load_kernel(text, lambda: pytest.fail("it is on disk"), capability, tmp_path)
     assert again == made._replace(compiled=False)
     if shutil.which("ptxas"):
         source = tmp_path / "play.ptx"
@@ -267,7 +268,7 @@ def test_one_launch_for_all_seeds_in_loops(pendulum, monkeypatch):
     calls = [line for line in text.splitlines() if "@__gpu$xla.gpu.ptx" in line]
     assert len(calls) == 1
     assert "tensor<6x50x4x8xf32>" in calls[0]
-    assert calls[0].count("operand_index") == len(player.RESULTS)
+    assert calls[0].count("operand_index") == len(kernels.RESULTS)
     assert "grid_x = 2 : i32" in calls[0]
     assert "block_x = 32 : i32" in calls[0]
 
@@ -275,14 +276,14 @@ def test_one_launch_for_all_seeds_in_loops(pendulum, monkeypatch):
 @pytest.mark.cpu
 def test_it_says_why_there_are_no_kernels(monkeypatch):
     monkeypatch.setattr(seam, "compute_capability", lambda: "gfx90a")
-    assert "this is 'gfx90a'" in (seam.unavailable() or "")
+    assert "this is 'gfx90a'" in (seam.kernels_unavailable() or "")
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
     with monkeypatch.context() as patch:
         patch.setattr("llvmlite.binding.llvm_version_info", (20, 1, 8))
-        assert "llvmlite>=0.48" in (seam.unavailable() or "")
+        assert "llvmlite>=0.48" in (seam.kernels_unavailable() or "")
     with jax.enable_x64(True):
-        assert "float32 alone" in (seam.unavailable() or "")
-    assert "does not launch its kernels" in (seam.unavailable() or "")
+        assert "float32 alone" in (seam.kernels_unavailable() or "")
+    assert "does not launch its kernels" in (seam.kernels_unavailable() or "")
 
 
 @pytest.mark.cpu
@@ -290,7 +291,7 @@ def test_another_engine_plays_where_kernels_are_not_launched(pendulum, monkeypat
     monkeypatch.setattr(available, "platform", lambda: "gpu")
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
     env, (actor, act, distribution) = pendulum
-    who = choice.Player(act, actor, distribution)
+    who = choice.ActingPolicy(act, actor, distribution)
     chosen = choice.choose("auto", env, who, 50)
     assert chosen.name == "fused"
     assert "does not launch its kernels" in chosen.why

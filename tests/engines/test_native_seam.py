@@ -216,26 +216,26 @@ def test_code_that_others_may_have_written_is_not_loaded(tmp_path, place):
 
 @pytest.mark.parametrize("damage", [b"", b"short", bytes(2000)])
 def test_a_damaged_object_is_none(tmp_path, damage):
-    objects.write(tmp_path, "key", b"data")
-    assert objects.read(tmp_path, "key") == b"data"
+    objects.write_object(tmp_path, "key", b"data")
+    assert objects.read_object(tmp_path, "key") == b"data"
     (tmp_path / "key.o").write_bytes(damage)
-    assert objects.read(tmp_path, "key") is None
+    assert objects.read_object(tmp_path, "key") is None
 
 
 def test_the_cache_forgets_what_was_used_longest_ago(tmp_path):
     for age, key in enumerate("abc"):
-        objects.write(tmp_path, key, bytes(1000), limit=3200)
+        objects.write_object(tmp_path, key, bytes(1000), limit=3200)
         os.utime(tmp_path / f"{key}.o", (100 + age, 100 + age))
-    assert objects.read(tmp_path, "a") == bytes(1000)  # and is now the newest
-    objects.write(tmp_path, "d", b"1" * 1000, limit=3200)
+    assert objects.read_object(tmp_path, "a") == bytes(1000)  # and is now the newest
+    objects.write_object(tmp_path, "d", b"1" * 1000, limit=3200)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.o", "c.o", "d.o"]
-    assert objects.read(tmp_path, "b") is None
+    assert objects.read_object(tmp_path, "b") is None
 
 
 def test_a_cache_that_cannot_be_written_is_none(tmp_path):
     (tmp_path / "file").touch()
-    objects.write(tmp_path / "file" / "cache", "key", b"data")
-    assert objects.read(tmp_path / "file" / "cache", "key") is None
+    objects.write_object(tmp_path / "file" / "cache", "key", b"data")
+    assert objects.read_object(tmp_path / "file" / "cache", "key") is None
 
 
 def test_objects_are_kept_where_jax_keeps_programs():
@@ -408,7 +408,7 @@ def test_code_for_older_cpus(level, monkeypatch):
     numbers = np.arange(32, dtype=np.float32)
     aligned = numbers[(-numbers.ctypes.data % 64) // 4 :][:16]
     expected = aligned**2
-    code = machine.load(VECTORS, lambda: VECTORS, ("add",), found, None)
+    code = machine.load_module(VECTORS, lambda: VECTORS, ("add",), found, None)
     ctypes.CFUNCTYPE(None, ctypes.c_void_p)(code.addresses["add"])(aligned.ctypes.data)
     np.testing.assert_array_equal(aligned, expected)
     items.check(items.play(items.load(), ACTIVE), ACTIVE)

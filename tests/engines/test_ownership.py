@@ -99,17 +99,17 @@ def test_whose_files_are_trusted(mode, user, trusted):
 
 
 def test_an_object_that_is_a_link_is_none(tmp_path):
-    objects.write(tmp_path, "key", b"data")
+    objects.write_object(tmp_path, "key", b"data")
     (tmp_path / "key.o").rename(tmp_path / "other.o")
     (tmp_path / "key.o").symlink_to(tmp_path / "other.o")
-    assert objects.read(tmp_path, "other") == b"data"
-    assert objects.read(tmp_path, "key") is None
+    assert objects.read_object(tmp_path, "other") == b"data"
+    assert objects.read_object(tmp_path, "key") is None
 
 
 def test_what_is_kept_is_its_users_alone_whatever_the_umask(tmp_path):
     before = os.umask(0)
     try:
-        objects.write(tmp_path / "cache" / "native", "key", b"data")
+        objects.write_object(tmp_path / "cache" / "native", "key", b"data")
     finally:
         os.umask(before)
     modes = {path: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "cache").rglob("*")}

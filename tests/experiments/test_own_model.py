@@ -81,7 +81,7 @@ RANGEFINDER = """<mujoco><option><flag energy="enable" fwdinv="enable"/></option
 
 def test_what_only_reports_is_turned_off_and_a_rangefinder_measures(tmp_path):
     (tmp_path / "mine.xml").write_text(RANGEFINDER, encoding="utf-8")
-    model = models.load(str(tmp_path / "mine.xml"))
+    model = models.load_model(str(tmp_path / "mine.xml"))
     ours, data = models.to_mjx(model, "mine.xml"), mjx.make_data(model, impl="jax")
     seen = jax.jit(lambda: mjx.sensor_pos(ours, mjx.kinematics(ours, data)))()
     assert float(seen.sensordata[0]) == pytest.approx(1.0)
@@ -129,6 +129,6 @@ def test_the_remedy_is_that_of_what_is_wrong(monkeypatch, id, error, remedy):
     def fail(entry):
         raise error
 
-    monkeypatch.setattr(envs, "load", fail)
+    monkeypatch.setattr(envs, "load_definition", fail)
     with pytest.raises(ValueError, match=f"cannot import the environment '{id}'.*{remedy}"):
         envs.make(id)

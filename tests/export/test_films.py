@@ -156,7 +156,7 @@ def test_a_renderer_that_is_not_here_is_answered_with_egl(monkeypatch, name, nee
 @pytest.mark.parametrize("name", ASSETS)
 def test_scenery_moves_nothing(name, replace):
     """The drawn model has the same positions, at the same places, and a floor and a sky."""
-    plain, drawn = models.load(name), dress(models.spec(name), replace=replace)
+    plain, drawn = models.load_model(name), dress(models.spec(name), replace=replace)
     places = []
     for model in (plain, drawn):
         data = mujoco.MjData(model)
@@ -292,7 +292,7 @@ def test_live_plays_on_until_the_window_closes(monkeypatch, capsys):
     monkeypatch.setattr(viewer, "launch_passive", Window)
     monkeypatch.setattr(live.time, "sleep", lambda seconds: None)
     env, player = envs.make("Reacher-v5"), load("Reacher-v5")
-    settings = watch.Settings("Reacher-v5", live=True, episode=3)
+    settings = watch.WatchSettings("Reacher-v5", live=True, episode=3)
     live.live(env, env.mj_model, player, 50, settings)
     assert seen[-1] == "closed"
     for number, first in ((3, 0), (4, 51)):

@@ -19,7 +19,7 @@ from mjx_reinforce.fused.backends.llvm_text import Text
 from mjx_reinforce.fused.backends.xla import XLA
 from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import is_constant
-from mjx_reinforce.registry import load
+from mjx_reinforce.registry import load_definition
 
 #: Operands of which every float operation is finite.
 FLOATS = np.float32([0.25, 0.5, 0.75])
@@ -66,7 +66,7 @@ def dtype_of(op, operands):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_backend_with_a_table_knows_every_operation(backend):
-    table = load(BACKENDS[backend]).OPERATIONS
+    table = load_definition(BACKENDS[backend]).OPERATIONS
     if table is not None:
         assert set(table) == set(ops.FACTS)
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from mjx_reinforce.engines.native import available
 from mjx_reinforce.engines.native.cpu import machine
-from mjx_reinforce.engines.native.gpu import player, ptx, seam
+from mjx_reinforce.engines.native.gpu import ptx, seam
+from mjx_reinforce.engines.native.gpu.kernel import ENTRY
 
 _SOME = re.compile(r'call i32 asm sideeffect "[^"]*bar.red[^"]*", "=r,r"\(i32 (%\w+)\) convergent')
 _ALL = re.compile(r'call void asm sideeffect "[^"]*bar.sync[^\n]*')
@@ -80,7 +81,7 @@ def as_for_a_cpu(text, block=None):
 def compiled(text, block=None):
     """Returns a kernel's code for this CPU."""
     text = as_for_a_cpu(text, block)
-    return machine.load(text, lambda: text, (player.ENTRY,), machine.this_machine(), None)
+    return machine.load_module(text, lambda: text, (ENTRY,), machine.this_machine(), None)
 
 
 def run_threads(address, threads, arrays):
@@ -106,11 +107,11 @@ def emulate(monkeypatch, threads=1, block=None):
         text = write()
         code = compiled(text, block)
         words = int((re.findall(r"@scratch = constant i32 (\d+)", text) or [0])[0])
-        address = str(code.addresses[player.ENTRY])
+        address = str(code.addresses[ENTRY])
         return ptx.Kernel(code.key, address, 128, 2, words, compiled=True)
 
     def call(text, entry, grid, given, written, scratch=()):
-        assert entry == player.ENTRY
+        assert entry == ENTRY
         results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
         size = 32 * -(-threads // 32)
 
@@ -126,10 +127,10 @@ def emulate(monkeypatch, threads=1, block=None):
         return jax.pure_callback(run, results, *given, *written)
 
     monkeypatch.setattr(available, "platform", lambda: "gpu")
-    monkeypatch.setattr(seam, "unavailable", lambda: None)
+    monkeypatch.setattr(seam, "kernels_unavailable", lambda: None)
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
     monkeypatch.setattr(seam, "_grid", lambda items, most, blocks: (1, min(items, most)))
-    monkeypatch.setattr(ptx, "load", load)
+    monkeypatch.setattr(ptx, "load_kernel", load)
     monkeypatch.setattr(seam, "_call", call)
 
 

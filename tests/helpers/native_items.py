@@ -88,7 +88,7 @@ def text(lanes=1):
 
 
 def load(folder=None, lanes=1, level=None):
-    return machine.load(
+    return machine.load_module(
         text(lanes), lambda: text(lanes), handler.NAMES, machine.this_machine(level), folder
     )
 

@@ -16,7 +16,7 @@ COUNT = st.one_of(st.integers(0, 2**53), st.sampled_from([2**31, 2**32 - 1, 2**3
 def test_a_count_is_a_whole_number(number):
     count = counts.from_int(number)
     assert counts.to_int(count) == number
-    assert float(counts.number(count)) == pytest.approx(number, rel=2**-22)
+    assert float(counts.as_float(count)) == pytest.approx(number, rel=2**-22)
 
 
 @settings(deadline=None)

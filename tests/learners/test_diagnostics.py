@@ -48,7 +48,7 @@ def test_of_few_steps_all_are_visited():
 
 def test_of_many_steps_each_stands_for_its_neighbours(monkeypatch):
     """Three of each episode: of 10 steps every fourth, of 2 both; each counts as its share."""
-    monkeypatch.setattr(diagnostics, "MAX_STEPS", 6)
+    monkeypatch.setattr(diagnostics, "MAX_COMPARED", 6)
     visited = diagnostics.visited_steps(make_trajectory([10, 2], 10))
     weight, seen = np.asarray(visited.weight), np.asarray(visited.observation[..., 0])
     assert seen[weight[:, 0] > 0, 0].tolist() == [2, 6]
@@ -59,7 +59,7 @@ def test_of_many_steps_each_stands_for_its_neighbours(monkeypatch):
 @pytest.mark.parametrize("num_episodes", [1, 40, 64, 65, 1000])
 def test_no_more_steps_than_promised_are_visited(num_episodes):
     visited = diagnostics.visited_steps(make_trajectory([300] * num_episodes, 300, np.nan))
-    assert 32 <= visited.weight.size <= diagnostics.MAX_STEPS
+    assert 32 <= visited.weight.size <= diagnostics.MAX_COMPARED
     assert float(jnp.sum(visited.weight)) == pytest.approx(1, rel=1e-5)
     assert np.all(np.isfinite(visited.observation))
 

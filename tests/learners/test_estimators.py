@@ -15,13 +15,13 @@ from mjx_reinforce.learners import estimators as est
 from mjx_reinforce.learners.returns import discounted_returns
 from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
 from mjx_reinforce.policies.networks import MLP
-from mjx_reinforce.registry import ESTIMATORS, load
+from mjx_reinforce.registry import ESTIMATORS, load_definition
 
 LENGTHS = np.array([4, 1, 3])
 REWARD = np.array([[1.0, 2.0, 0.5], [0.5, 9.0, 1.5], [2.0, 9.0, 1.0], [3.0, 9.0, 9.0]])
 
 
-MAKERS = {name: load(path) for name, path in ESTIMATORS.items()}
+MAKERS = {name: load_definition(path) for name, path in ESTIMATORS.items()}
 MAKERS["full-batch value-baseline"] = full_batch_value_baseline
 MASK = np.arange(4)[:, None] < LENGTHS
 

@@ -164,7 +164,7 @@ def test_steps_are_drawn_where_there_are_many(monkeypatch):
     poisoned = jnp.where(MASK[..., None], observation, jnp.nan)
     update = natural_gradient(policy, MAX_KL, damping=0.1)
     every, _ = step(update, policy, params, problem)
-    monkeypatch.setattr(module, "MAX_STEPS", 20)
+    monkeypatch.setattr(module, "MAX_FISHER_STEPS", 20)
     keys = jax.random.split(jax.random.key(0), 20)
 
     def draw(key, observation=observation):

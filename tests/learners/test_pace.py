@@ -32,12 +32,12 @@ AUTO = AutoEpisodes(16, 400)
 
 def followed(measured, auto=AUTO, start=None):
     """Returns the numbers of episodes after each update that measured (signal, noise)."""
-    state = pace.begin(auto)
+    state = pace.first_pace(auto)
     if start is not None:
         state = dataclasses.replace(state, num_episodes=jnp.int32(start))
     numbers = []
     for signal, noise in measured:
-        state = pace.follow(state, auto, Noise(jnp.float32(signal), jnp.float32(noise)))
+        state = pace.next_pace(state, auto, Noise(jnp.float32(signal), jnp.float32(noise)))
         numbers.append(int(state.num_episodes))
     return numbers
 

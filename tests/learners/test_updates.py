@@ -320,7 +320,7 @@ def test_schedules_are_exact_for_budgets_of_any_size(budget):
 
     @jax.jit
     def share_of(count):
-        return counts.number(count) / counts.number(limit)
+        return counts.as_float(count) / counts.as_float(limit)
 
     for used in (0, 1, budget // 3, 2**31 - 1, 2**31, 2**32, 2**32 + 7, budget - 1, budget):
         if used <= budget:

@@ -61,7 +61,7 @@ SOURCES = {
     ),
     "constraint._efc_limit_slide_hinge": (
         "0a9ef2da54b801f4a42dd504667eba6109e05df62f8465dd97454fdbc3f00fbc",
-        "limits.reached and limits.solve",
+        "limits.past_limit and limits.solve_limits",
     ),
     "constraint.make_constraint": (
         "08ea07ad04cd25549b866f5e954ca8da70f648bd4fc32b0168a0e72200b9ede1",
@@ -69,11 +69,11 @@ SOURCES = {
     ),
     "solver.solve": (
         "e052e9cdd4255a970360662c1cef4723f85f5483a175e7f10082a608c6909403",
-        "newton.solve",
+        "newton.solve_newton",
     ),
     "smooth.solve_m": (
         "58a57c2a3ed4519fce2da85eb5d88563e29f5d005dc8c988afcdd0381c7f4b14",
-        "limits.solve",
+        "limits.solve_limits",
     ),
     "collision_driver.collision": (
         "0b7104d7b1479df84bf061b005006d7018c86b54f9c012f46b2e08960a40ed36",

@@ -60,7 +60,7 @@ def test_finds_the_optimum_that_mjx_finds():
             ready = rows_at(model, data, *state)
             theirs = mjx.solve(model, ready)
             expected = theirs.qacc, theirs.qfrc_constraint, jax_fields(theirs).efc_force
-            return newton.solve(model, ready), expected
+            return newton.solve_newton(model, ready), expected
 
         actual, expected = jax.jit(jax.vmap(both))(*states)
     assert (np.asarray(expected[2]) != 0).mean() > 0.1
@@ -77,7 +77,7 @@ def test_ends_where_the_gradient_vanishes(dtype):
 
         def imbalance(*state):
             ready = rows_at(model, data, *state)
-            qacc, joint_force, _ = newton.solve(model, ready)
+            qacc, joint_force, _ = newton.solve_newton(model, ready)
             forces = ready.qfrc_smooth + joint_force
             return mjx.mul_m(model, ready, qacc) - forces, forces
 
@@ -119,7 +119,9 @@ def test_a_nan_ends_the_search():
     """It reaches the acceleration, and does not keep the other episodes waiting."""
     model, data = scene()
     qpos, qvel, warmstart = random_states(model, 4)
-    solve = jax.jit(jax.vmap(lambda *state: newton.solve(model, rows_at(model, data, *state))[0]))
+    solve = jax.jit(
+        jax.vmap(lambda *state: newton.solve_newton(model, rows_at(model, data, *state))[0])
+    )
     clean = solve(qpos, qvel, warmstart)
     dirty = solve(qpos, qvel.at[2].set(jnp.nan), warmstart)
     assert np.isnan(dirty[2]).all()
@@ -158,7 +160,7 @@ def test_caps_leave_no_more_cost_than_the_start(cap):
                 inertial = offset @ mjx.mul_m(model, ready, offset)
                 return (inertial + jnp.sum(fields.efc_D * pushed**2)) / 2
 
-            return cost(newton.solve(capped, ready)[0]), cost(ready.qacc_smooth)
+            return cost(newton.solve_newton(capped, ready)[0]), cost(ready.qacc_smooth)
 
         after, before = jax.jit(jax.vmap(costs))(*random_states(model, 64))
     assert np.all(np.asarray(after) <= np.asarray(before))

@@ -60,6 +60,6 @@ def test_where_it_is_not_worth_it_the_solver_has_the_data_as_it_is(env_id, conta
     contact = jax_fields(data).contact
     few = jax.tree.map(lambda x: x[:contacts], contact)
     data = with_contact(data, few, contact.dim[:contacts])
-    touching.solve(lambda *given: asked.extend(given), env.model, data)
+    touching.solve_touching(lambda *given: asked.extend(given), env.model, data)
     assert asked[0] is env.model
     assert asked[1] is data

@@ -132,7 +132,7 @@ def test_a_return_that_is_not_finite_is_nan(tmp_path):
     np.testing.assert_array_equal(episode.rewards, [1.0, 1.0, np.nan])
     np.testing.assert_array_equal(episode.qpos, [[0.0], [1.0], [2.0]])
     assert math.isnan(episode.total)
-    said = watch.compare(watch.Settings(run, episodes=2), {"mjx": lambda *_: episode})
+    said = watch.compare(watch.WatchSettings(run, episodes=2), {"mjx": lambda *_: episode})
     assert said == "mean return of 2 episodes: mjx nan (nan to nan)"
 
 

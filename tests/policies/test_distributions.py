@@ -12,7 +12,7 @@ from scipy import integrate, special, stats
 from mjx_reinforce import Box, fused
 from mjx_reinforce.policies import normal_integrals
 from mjx_reinforce.policies.normal import normal
-from mjx_reinforce.registry import DISTRIBUTIONS, load
+from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
 from mjx_reinforce.types import Discrete
 
 LOW, HIGH = -3.0, 1.0
@@ -27,7 +27,7 @@ ENTROPY = jax.jit(normal_integrals.entropy)
 
 
 def build(name, space=SPACE, **settings):
-    return load(DISTRIBUTIONS[name])(space, **settings)
+    return load_definition(DISTRIBUTIONS[name])(space, **settings)
 
 
 def supporting(space):

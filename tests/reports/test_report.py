@@ -25,13 +25,13 @@ def written(tmp_path_factory):
     """A sweep and its page."""
     directory = make_sweep(tmp_path_factory.mktemp("sweeps") / "sweep", num_seeds=40)
     page = directory / "report.html"
-    report.write([directory], page)
+    report.write_report([directory], page)
     return directory, page
 
 
 @pytest.fixture(scope="module")
 def found(written):
-    return findings.find(sources.read([written[0]]))
+    return findings.compute_findings(sources.read_experiment([written[0]]))
 
 
 def test_the_page_needs_nothing_else(written):
@@ -46,7 +46,7 @@ def test_the_page_needs_nothing_else(written):
 def test_the_page_says_what_was_found(written, found):
     said = visible(written[1])
     best = found.results[0]
-    for sentence in (*words.answer(found), *words.distrust(found)):
+    for sentence in (*words.answer(found), *words.caveats(found)):
         assert " ".join(sentence.split()) in said
     assert f"{best.solving.at_end} of its 40 seeds solve the task at the end" in said
     for each in found.results:
@@ -79,7 +79,7 @@ def test_the_figures_are_those_of_the_curves(found):
 
 def test_a_histogram_has_every_seed(found):
     data = tables.chart_tables(found)["histogram"]
-    last = len(distributions.moments(found)) - 1
+    last = len(distributions.slider_stops(found)) - 1
     for place, result in enumerate(found.results):
         rows = zip(data["configuration"], data["moment"], data["share"], strict=True)
         share = sum(share for c, m, share in rows if (c, m) == (place, last))
@@ -110,8 +110,8 @@ def test_tables_and_figures_agree_on_who_solved(tmp_path):
     """Seeds end at different env steps; the figures' last place is the end of each, as table 1."""
     directory = make_sweep(tmp_path / "sweep", num_seeds=40, over=ONE)
     solve_at_the_end(directory, [1, 5, 9, 42, 77], 950)
-    report.write([directory], directory / "report.html")
-    shown = findings.find(sources.read([directory]))
+    report.write_report([directory], directory / "report.html")
+    shown = findings.compute_findings(sources.read_experiment([directory]))
     data, said = tables.chart_tables(shown), visible(directory / "report.html")
     with (directory / "report" / "summary.csv").open(encoding="utf-8", newline="") as file:
         summary = list(csv.DictReader(file))
@@ -162,7 +162,7 @@ FORMULAS = ("=HYPERLINK(1)", "@SUM(1+1)", "+A1", "-A1", "\tA1")
 def test_names_are_no_formulas_in_spreadsheets(tmp_path):
     """A spreadsheet computes what begins like a formula: numbers may, names may not."""
     runs = [make_measured_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
-    report.write(runs, tmp_path / "page.html")
+    report.write_report(runs, tmp_path / "page.html")
     files = sorted((tmp_path / "page").glob("*.csv"))
     texts = [cell for path in files for cell in cells(path)]
     assert {"'=HYPERLINK(1)", "'@SUM(1+1)", "-120.5"} <= set(texts)
@@ -188,7 +188,7 @@ def test_a_thousand_seeds_make_no_larger_charts(tmp_path):
     sizes = []
     for seeds in (50, 200):
         directory = make_sweep(tmp_path / str(seeds), num_seeds=seeds, over=ONE)
-        figures = findings.find(sources.read([directory]))
+        figures = findings.compute_findings(sources.read_experiment([directory]))
         sizes.append(len(json.dumps(tables.chart_tables(figures))))
     assert sizes[1] < 1.2 * sizes[0]
 
@@ -196,7 +196,7 @@ def test_a_thousand_seeds_make_no_larger_charts(tmp_path):
 def test_a_run_alone_and_names_that_are_markup(tmp_path):
     directory = make_measured_run(tmp_path / "<b>run", env=HOSTILE, note=HOSTILE)
     page = tmp_path / "page.html"
-    report.write([directory], page)
+    report.write_report([directory], page)
     text = page.read_text(encoding="utf-8")
     assert "alert(1)</script>" not in text
     assert text.count("<script") == 3
@@ -207,14 +207,14 @@ def test_a_run_alone_and_names_that_are_markup(tmp_path):
 
 
 def command_of(directory):
-    experiment = sources.read([directory])
-    return report.how_to_watch(experiment, findings.find(experiment))
+    experiment = sources.read_experiment([directory])
+    return report.how_to_watch(experiment, findings.compute_findings(experiment))
 
 
 def test_the_worst_seed_is_watched_by_the_policy_that_its_sweep_kept(tmp_path):
     directory = make_sweep(tmp_path / "a sweep", num_seeds=12)
-    experiment = sources.read([directory])
-    figures = findings.find(experiment)
+    experiment = sources.read_experiment([directory])
+    figures = findings.compute_findings(experiment)
     number, best = figures.order[0], figures.results[0]
     seed = int(best.configuration.seed[tables.worst_seeds(best)[0]])
     place = directory / "policies" / f"{number:03d}"
@@ -241,7 +241,7 @@ def test_a_command_on_the_page_runs_nothing_else(tmp_path):
 def test_a_path_that_the_locale_cannot_read_is_escaped(tmp_path):
     """Where Python reads the file system as ASCII, a path's other bytes are surrogates."""
     directory = make_measured_run(tmp_path / "run\udce6")
-    report.write([directory], tmp_path / "page.html")
+    report.write_report([directory], tmp_path / "page.html")
     assert r"run\udce6" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
@@ -251,7 +251,7 @@ def test_seeds_that_all_failed_are_no_answer(tmp_path):
         arrays = dict(archive)
     arrays["eval_return"][2:] = np.nan
     np.savez(directory / "curves.npz", **arrays)
-    report.write([directory], directory / "report.html")
+    report.write_report([directory], directory / "report.html")
     assert "There is no answer" in visible(directory / "report.html")
 
 
@@ -325,7 +325,7 @@ def test_ties_are_said_as_ties(tmp_path):
         arrays = dict(archive)
     arrays["eval_return"][-1] = 1000.0
     np.savez(directory / "curves.npz", **arrays)
-    said = " ".join(words.answer(findings.find(sources.read([directory]))))
+    said = " ".join(words.answer(findings.compute_findings(sources.read_experiment([directory]))))
     assert "The mean equals that of the next" in said
     assert "chance too often (p = 1)." in said
 
@@ -337,10 +337,10 @@ def test_a_configuration_that_ended_earlier_stays_at_its_end(tmp_path):
         arrays = dict(archive)
     arrays["env_steps"][:, arrays["configuration"] == 0] //= 2
     np.savez(directory / "curves.npz", **arrays)
-    shown = findings.find(sources.read([directory]))
+    shown = findings.compute_findings(sources.read_experiment([directory]))
     place = shown.order.index(0)
     drawn = distributions.distributions(shown)
-    last = len(distributions.moments(shown)) - 1
+    last = len(distributions.slider_stops(shown)) - 1
     said = drawn["moments"]["said"][place * (last + 1) : (place + 1) * (last + 1)]
     assert "its end: " in said[last]
     assert "its end: " not in said[0]
@@ -354,7 +354,7 @@ def test_a_configuration_that_ended_earlier_stays_at_its_end(tmp_path):
 @pytest.mark.parametrize(("seeds", "worst"), [(1, 1), (4, 1), (8, 2), (200, 10)])
 def test_the_worst_are_a_quarter_at_most(tmp_path, seeds, worst):
     directory = make_sweep(tmp_path / "sweep", num_seeds=seeds, over=ONE)
-    best = findings.find(sources.read([directory])).results[0]
+    best = findings.compute_findings(sources.read_experiment([directory])).results[0]
     places = tables.worst_seeds(best)
     assert len(places) == worst
     assert best.scores[places].max() <= np.delete(best.scores, places).min(initial=np.inf)
@@ -374,7 +374,7 @@ def test_charts_are_whole_at_any_width_and_on_paper(tmp_path):
         tmp_path / "sweep", num_seeds=8, over={"learning_rate": [1e-3, 3e-3, 1e-2]}
     )
     page = directory / "report.html"
-    report.write([directory], page)
+    report.write_report([directory], page)
     with opened_browser() as browser:
         for width in (1280, 700, 390):
             browser.open(page, width=width)
@@ -406,7 +406,7 @@ def test_no_column_is_cut_at_any_width(tmp_path, over):
     arrays["eval_return"] = -1234.5678 * arrays["eval_return"]
     np.savez(directory / "curves.npz", **arrays)
     page = directory / "report.html"
-    report.write([directory], page)
+    report.write_report([directory], page)
     with opened_browser() as browser:
         browser.open(page, width=360)
         browser.run("document.querySelectorAll('details.data').forEach((x) => { x.open = true })")
@@ -424,7 +424,7 @@ def test_no_column_is_cut_at_any_width(tmp_path, over):
 def test_tables_of_a_figure_are_no_formulas_either(tmp_path):
     """What the page itself writes when a button is pressed."""
     runs = [make_measured_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
-    report.write(runs, tmp_path / "page.html")
+    report.write_report(runs, tmp_path / "page.html")
     with opened_browser() as browser:
         browser.open(tmp_path / "page.html")
         browser.run(

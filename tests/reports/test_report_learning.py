@@ -50,15 +50,15 @@ def crossed(tmp_path_factory):
         num_seeds=30,
         over={"learning_rate": [1e-3, 3e-3], "discount": [0.98, 0.99, 0.995]},
     )
-    report.write([directory], directory / "report.html")
-    return directory, findings.find(sources.read([directory]))
+    report.write_report([directory], directory / "report.html")
+    return directory, findings.compute_findings(sources.read_experiment([directory]))
 
 
 def test_seeds_that_all_solve_are_told_apart_by_their_speed(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=24, over=RATES)
     all_solve(directory, [6, 2, 9])
-    found = findings.find(sources.read([directory]))
-    said = learning.answer(found)
+    found = findings.compute_findings(sources.read_experiment([directory]))
+    said = learning.learning_answer(found)
     assert said[0] == "Fastest is learning rate 0.003; the returns at the end are a tie."
     assert "It is faster than each of the others by the log-rank test (p < 0.001" in " ".join(said)
     rows = listings.listings(found)["speed"]["rows"]
@@ -70,9 +70,9 @@ def test_seeds_that_all_solve_are_told_apart_by_their_speed(tmp_path):
 def test_equal_speeds_are_not_told_apart(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=24, over=RATES)
     all_solve(directory, [4, 4, 4])
-    found = findings.find(sources.read([directory]))
+    found = findings.compute_findings(sources.read_experiment([directory]))
     assert learning.pace(found)[1] == []
-    assert "does not tell its speed from that of" in " ".join(learning.answer(found))
+    assert "does not tell its speed from that of" in " ".join(learning.learning_answer(found))
     assert {each.adjusted for each in found.learning.speeds} == {1.0}
 
 
@@ -80,11 +80,13 @@ def test_what_is_surely_slower_is_named_where_two_are_equally_fast(tmp_path):
     """Of one task, and of several together."""
     for env in ("InvertedPendulum-v5", "Other-v0"):
         all_solve(make_sweep(tmp_path / env, num_seeds=24, over=RATES, env=env), [6, 2, 2])
-    said = learning.answer(findings.find(sources.read([tmp_path / "Other-v0"])))
+    said = learning.learning_answer(
+        findings.compute_findings(sources.read_experiment([tmp_path / "Other-v0"]))
+    )
     slower = "faster than learning rate 0.001"
     assert said[0] == f"learning rate 0.01 is surely {slower}; the returns at the end are a tie."
     experiments = sources.read_tasks([tmp_path / "InvertedPendulum-v5", tmp_path / "Other-v0"])
-    said = tasks_page.answer(tasks.find_tasks(tasks.rename(experiments, {})))
+    said = tasks_page.tasks_answer(tasks.find_tasks(tasks.rename(experiments, {})))
     corrected = "(p < 0.001 after Holm's correction for 3 pairs)"
     assert [said[0], *said[3:]] == [
         f"By the log-rank tests of all tasks together, learning rate 0.01 is {slower} {corrected},"
@@ -97,7 +99,9 @@ def test_what_is_surely_slower_is_named_where_two_are_equally_fast(tmp_path):
 def test_nobody_solves_it_is_no_race(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=12, over=RATES)
     change_curves(directory, lambda returns, configuration: np.minimum(returns, 500, out=returns))
-    said = " ".join(learning.answer(findings.find(sources.read([directory]))))
+    said = " ".join(
+        learning.learning_answer(findings.compute_findings(sources.read_experiment([directory])))
+    )
     assert "soonest" not in said
     assert "has the greatest mean return" in said
 
@@ -127,7 +131,7 @@ def test_settings_that_were_not_crossed_have_no_main_effect(tmp_path):
     for place, entry in enumerate(entries["configurations"]):
         entry["discount"] = 0.9 + 0.01 * place
     (directory / "sweep.json").write_text(json.dumps(entries))
-    assert findings.find(sources.read([directory])).learning.levels == []
+    assert findings.compute_findings(sources.read_experiment([directory])).learning.levels == []
 
 
 def test_every_figure_is_a_vector_and_every_table_is_latex(crossed):
@@ -186,7 +190,7 @@ def two_tasks(tmp_path_factory):
     second = make_sweep(folder / "second", num_seeds=20, over=over, env="Other-v0", threshold=500.0)
     for directory in (first, second):
         all_solve(directory, [7, 3, 5, 2])
-    report.write([first, second], folder / "report.html")
+    report.write_report([first, second], folder / "report.html")
     return folder, tasks.find_tasks(tasks.rename(sources.read_tasks([first, second]), {}))
 
 
@@ -240,15 +244,15 @@ def test_tasks_without_a_scale_or_a_name_in_common_are_refused(tmp_path):
     first = make_sweep(tmp_path / "a", over=RATES)
     other = make_sweep(tmp_path / "b", over={"discount": [0.9, 0.99]}, env="Other-v0")
     with pytest.raises(ValueError, match=r"no configuration in common .* --labels OLD=NEW"):
-        report.write([first, other], tmp_path / "report.html")
+        report.write_report([first, other], tmp_path / "report.html")
     solved = make_sweep(tmp_path / "c", over=RATES, env="Easy-v0", threshold=1.0)
     with pytest.raises(ValueError, match="Easy-v0 has no normalized score"):
-        report.write([first, solved], tmp_path / "report.html")
+        report.write_report([first, solved], tmp_path / "report.html")
 
 
 def test_a_run_of_each_task_is_one_configuration(tmp_path):
     runs = [make_measured_run(tmp_path / "a"), make_measured_run(tmp_path / "b", env="Other-v0")]
-    report.write(runs, tmp_path / "report.html")
+    report.write_report(runs, tmp_path / "report.html")
     assert "2 tasks, 1 configuration" in visible(tmp_path / "report.html")
 
 
@@ -310,7 +314,7 @@ def test_no_film_is_made_unasked(tmp_path):
 
 def test_a_run_is_told_in_plain_words(tmp_path):
     directory = make_measured_run(tmp_path / "run", num_seeds=3, offset=150.0)
-    said = learning.answer(findings.find(sources.read([directory])))
+    said = learning.learning_answer(findings.compute_findings(sources.read_experiment([directory])))
     assert said[0].startswith("2 of 3 seeds learned to solve CartPole-v1. The return went from ")
 
 

@@ -9,13 +9,15 @@ from fake_sweeps import make_sweep
 from measured_runs import ONE, make_measured_run
 
 from mjx_reinforce.reports import sources
-from mjx_reinforce.reports.experiment import describe, ordered
+from mjx_reinforce.reports.experiment import ordered, settings_in_words
 from mjx_reinforce.training.rows import COLUMNS
 
 
 def test_a_run(tmp_path):
     events = [{"seed": 1, "update": 3}, {"seed": 1, "update": 4}]
-    found = sources.read([make_measured_run(tmp_path / "a", summary={"nonfinite": events})])
+    found = sources.read_experiment(
+        [make_measured_run(tmp_path / "a", summary={"nonfinite": events})]
+    )
     (part,) = found.configurations
     np.testing.assert_array_equal(part.eval_return[:, 2], [200, 210, 220, 230])
     np.testing.assert_array_equal(part.env_steps[:, 0], [0, 50, 100, 150])
@@ -34,7 +36,7 @@ def test_runs_are_told_apart_by_what_differs(tmp_path):
         tmp_path / "b", learning_rate=0.003, hidden_sizes=[], output="elsewhere"
     )
     third = make_measured_run(tmp_path / "c")
-    found = sources.read([first, second, third])
+    found = sources.read_experiment([first, second, third])
     labels = [part.label for part in found.configurations]
     assert labels[1] == "learning rate 0.003, hidden sizes none"
     assert labels[0] == f"learning rate 0.01, hidden sizes 32-32 in {first}"
@@ -46,13 +48,13 @@ def test_a_run_that_goes_on_is_read_so_far(tmp_path):
     (directory / "summary.json").unlink()
     path = directory / "metrics.csv"
     path.write_text(path.read_text()[:-40])
-    found = sources.read([directory])
+    found = sources.read_experiment([directory])
     assert found.unfinished == [directory]
     assert found.configurations[0].eval_return.shape == (3, 3)
 
 
 def test_a_sweep(tmp_path):
-    found = sources.read([make_sweep(tmp_path / "sweep", num_seeds=6)])
+    found = sources.read_experiment([make_sweep(tmp_path / "sweep", num_seeds=6)])
     assert len(found.configurations) == 16
     part = found.configurations[5]
     assert part.label == "learning rate 0.003, discount 0.98"
@@ -68,13 +70,16 @@ def test_a_sweep(tmp_path):
 def test_a_thousand_seeds_are_read_in_a_second(tmp_path):
     directory = make_measured_run(tmp_path / "a", num_seeds=1000, evaluations=60)
     started = time.process_time()
-    sources.read([directory])
+    sources.read_experiment([directory])
     assert time.process_time() - started < 1
 
 
 def test_values_in_words():
     settings = {"learning_rate": 0.003, "hidden_sizes": (16, 32), "standardize": True, "x_y": None}
-    assert describe(settings) == "learning rate 0.003, hidden sizes 16-32, standardize on, x y none"
+    assert (
+        settings_in_words(settings)
+        == "learning rate 0.003, hidden sizes 16-32, standardize on, x y none"
+    )
     assert ordered([0.3, 0.1, 0.3]) == [0.1, 0.3]
     assert ordered(["b", "a", "b"]) == ["b", "a"]
 
@@ -121,7 +126,7 @@ def test_damaged_runs_are_named(tmp_path, damage, said):
     directory = make_measured_run(tmp_path / "a")
     damage(directory)
     with pytest.raises(ValueError, match=said):
-        sources.read([directory])
+        sources.read_experiment([directory])
 
 
 def change_arrays(directory, **arrays):
@@ -152,7 +157,7 @@ def test_damaged_sweeps_are_named(tmp_path, damage, said):
     directory = make_sweep(tmp_path / "sweep", num_seeds=5, over=ONE)
     damage(directory)
     with pytest.raises(ValueError, match=said):
-        sources.read([directory])
+        sources.read_experiment([directory])
 
 
 def test_what_cannot_be_compared_is_refused(tmp_path):
@@ -165,4 +170,4 @@ def test_what_cannot_be_compared_is_refused(tmp_path):
         ([], "nothing to report on"),
     ):
         with pytest.raises(ValueError, match=said):
-            sources.read(directories)
+            sources.read_experiment(directories)

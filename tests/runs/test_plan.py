@@ -109,7 +109,7 @@ def test_what_cannot_be_is_refused(monkeypatch, settings, remedy):
     monkeypatch.setattr(memory, "host_memory", lambda: 24e9)
     monkeypatch.setattr(memory, "_may_have_accelerator", lambda: False)
     with pytest.raises(ValueError, match=r".") as refusal:
-        memory.check_size(Config(**settings))
+        memory.check_memory(Config(**settings))
     assert remedy in str(refusal.value)
     assert str(refusal.value).count("\n") <= 1
 
@@ -117,7 +117,7 @@ def test_what_cannot_be_is_refused(monkeypatch, settings, remedy):
 @pytest.mark.parametrize("id", measured.TASKS)
 def test_a_laptop_holds_every_tasks_defaults(monkeypatch, id):
     monkeypatch.setattr(memory, "host_memory", lambda: 8e9)
-    memory.check_size(of_task(id))
+    memory.check_memory(of_task(id))
 
 
 def test_the_memory_of_a_thousand_seeds():
@@ -169,9 +169,9 @@ def test_a_refusal_comes_before_jax(tmp_path):
 def test_an_accelerators_memory_counts_where_there_is_one(monkeypatch):
     monkeypatch.setattr(memory, "_may_have_accelerator", lambda: True)
     config = Config(env="Survive-v0", num_seeds=10**5, max_updates=1)
-    memory.check_size(config)  # it is not known before JAX is imported
-    machine = plan.Machine("a GPU", {}, 1.0, 1e8, shared=False)
-    monkeypatch.setattr(plan, "this_machine", lambda: machine)
+    memory.check_memory(config)  # it is not known before JAX is imported
+    machine = plan.Hardware("a GPU", {}, 1.0, 1e8, shared=False)
+    monkeypatch.setattr(plan, "this_hardware", lambda: machine)
     env = Survive()
     made = ready.made(env, config)
     with pytest.raises(ValueError, match=r"memory.*0\.1 GB are here"):
@@ -243,7 +243,7 @@ def test_estimates_are_good_to_a_factor_of_three(env, seeds, settings, steps, se
         settings = {"estimator": "value-baseline"} | fitted | settings
     config = dataclasses.replace(of_task(env), num_seeds=seeds, **settings)
     config = dataclasses.replace(config, env_steps=steps // seeds)
-    machine = plan.Machine("two cores", measured.CPU, 1.0, 1e10, shared=True)
+    machine = plan.Hardware("two cores", measured.CPU, 1.0, 1e10, shared=True)
     task, speed = measured.TASKS[env], measured.CPU[env]
     said, bounded = plan.run_seconds(config, task, machine, speed)
     assert not bounded
@@ -303,7 +303,9 @@ def test_durations_are_for_people(seconds, said):
 @pytest.mark.parametrize("engine", ["fused", "vmap"])
 def test_a_plan_says_what_is_known(monkeypatch, engine):
     speeds = {"Survive-v0": Speed("fused", 40.0, 1.0, 1e9)}
-    monkeypatch.setattr(plan, "this_machine", lambda: plan.Machine("3 mills", speeds, 2, 1e9, True))
+    monkeypatch.setattr(
+        plan, "this_hardware", lambda: plan.Hardware("3 mills", speeds, 2, 1e9, True)
+    )
     monkeypatch.setitem(measured.TASKS, "Survive-v0", Task(1, 1, 20, 0.5, 5e8))
     config = Config(env="Survive-v0", env_steps=1600, engine=engine)
     env = Survive()

@@ -122,7 +122,7 @@ def test_before_the_first_update_its_columns_are_not_shown():
 def test_cells_come_back_to_the_last_bit(dtype, data):
     floats = st.floats(width=np.finfo(dtype).bits)
     values = np.array(data.draw(st.lists(floats, min_size=1)), dtype)
-    back = [rows.number(cell) for cell in rows._cells(values)]
+    back = [rows.parse_cell(cell) for cell in rows._cells(values)]
     assert all(isinstance(x, float) for x in back)
     back = np.array(back, dtype)
     np.testing.assert_array_equal(back, values)

@@ -150,10 +150,10 @@ def test_what_is_damaged_is_made_again(name, folder, monkeypatch):
     (path,) = (path for path in folder.iterdir() if path.stem.partition("-")[2] == name)
     path.write_bytes(path.read_bytes()[:-1])
     monkeypatch.setattr(machine, "_LOADED", {})
-    assert kept.read(kept.key_of(CONFIG)) is None
+    assert kept.read_programs(kept.key_of(CONFIG)) is None
     again = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
     jax.tree.map(np.testing.assert_array_equal, again, expected)
-    assert kept.read(kept.key_of(CONFIG)) is not None
+    assert kept.read_programs(kept.key_of(CONFIG)) is not None
 
 
 def test_bad_input_is_refused_of_what_is_kept_too():
@@ -172,7 +172,7 @@ def test_programs_need_no_code_of_others(monkeypatch):
     own = kept.seam.targets
     monkeypatch.setattr(kept.seam, "targets", lambda: [*own(), "mjx_reinforce_" + 64 * "0"])
     numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
-    assert kept.read(kept.key_of(CONFIG)) is not None
+    assert kept.read_programs(kept.key_of(CONFIG)) is not None
 
 
 def test_nothing_is_kept_of_an_environment_of_the_users(register):
@@ -270,7 +270,7 @@ def test_a_program_that_calls_python_is_not_kept(folder):
 def test_a_tree_of_states_is_described_and_rebuilt(env):
     config = of_task(env)
     like = ready.made(envs.make(env), config).parts.like
-    again = trees.rebuild(trees.describe(like))
+    again = trees.rebuild(trees.describe_tree(like))
     assert jax.tree.structure(again) == jax.tree.structure(like)
     for new, old in zip(jax.tree.leaves(again), jax.tree.leaves(like), strict=True):
         assert (new.shape, new.dtype) == (old.shape, old.dtype)
@@ -278,10 +278,13 @@ def test_a_tree_of_states_is_described_and_rebuilt(env):
 
 def test_a_tree_of_other_classes_is_neither_described_nor_rebuilt():
     with pytest.raises(TypeError, match="another package"):
-        trees.describe({"a": Survive().reset(jax.random.key(0))})
+        trees.describe_tree({"a": Survive().reset(jax.random.key(0))})
     with pytest.raises(TypeError, match="a leaf of"):
-        trees.describe([3])
-    assert trees.rebuild(trees.describe((optax.EmptyState(), None))) == (optax.EmptyState(), None)
+        trees.describe_tree([3])
+    assert trees.rebuild(trees.describe_tree((optax.EmptyState(), None))) == (
+        optax.EmptyState(),
+        None,
+    )
     with pytest.raises(ValueError, match="another package"):
         trees.rebuild({"class": "subprocess:Popen", "fields": {"args": {"dict": {}}}})
 

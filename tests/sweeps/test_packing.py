@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.sweeps.slots.ahead import Clock, started
-from mjx_reinforce.sweeps.slots.layout import Layout
-from mjx_reinforce.sweeps.slots.packing import pack
+from mjx_reinforce.sweeps.slots.ahead import Stopwatch, started
+from mjx_reinforce.sweeps.slots.layout import StateRows
+from mjx_reinforce.sweeps.slots.packing import pack_slots
 
 
 @pytest.mark.parametrize("num_devices", [1, 2, 8])
@@ -19,7 +19,7 @@ def test_each_run_has_one_lane_and_each_device_its_share(num_devices, active):
     random = np.random.default_rng(active)
     chosen = random.permutation(100) < active
     lengths = random.integers(1, 21, 100)
-    lanes = pack(chosen, lengths, [32, 8], num_devices)
+    lanes = pack_slots(chosen, lengths, [32, 8], num_devices)
     assert lanes.shape == ((-(-active // 32), 32) if active > 8 else (-(-active // 8), 8))
     assert sorted(lanes[lanes >= 0]) == np.flatnonzero(chosen).tolist()
     shares = (lanes.reshape(len(lanes), num_devices, -1) >= 0).sum(axis=-1)
@@ -30,7 +30,7 @@ def test_each_run_has_one_lane_and_each_device_its_share(num_devices, active):
 
 def test_runs_of_equal_lengths_stay_in_order():
     """So that a resumed run packs as it would have."""
-    lanes = pack(np.ones(40, bool), np.full(40, 3), [16], 1)
+    lanes = pack_slots(np.ones(40, bool), np.full(40, 3), [16], 1)
     assert lanes[lanes >= 0].tolist() == list(range(40))
 
 
@@ -43,7 +43,7 @@ def test_no_bit_of_a_state_changes_on_its_way():
         "which": random.random((5, 3)) < 0.5,
         "nothing": np.zeros((5, 0), np.float32),
     }
-    layout = Layout(states)
+    layout = StateRows(states)
     rows = layout.rows(states)
     assert rows.shape == (5, 8 + 4 + 24 + 3)
     moved = jax.jit(layout.traced_rows)(jax.jit(layout.traced_states)(rows))
@@ -59,7 +59,7 @@ def test_no_bit_of_a_state_changes_on_its_way():
 
 
 def test_waiting_for_a_program_is_compiling():
-    clock = Clock()
+    clock = Stopwatch()
     assert clock.wait(started(lambda: time.sleep(0.2) or "program")) == "program"
     assert clock.compiling > 0
     assert clock.running == 0

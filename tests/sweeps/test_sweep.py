@@ -20,7 +20,7 @@ from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export.player import load_seed
 from mjx_reinforce.export.run_files import choose_seed, read_run
-from mjx_reinforce.report import Written
+from mjx_reinforce.report import WrittenReport
 from mjx_reinforce.runs import plan as runs_plan
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.settings.defaults import of_task
@@ -32,9 +32,9 @@ from mjx_reinforce.sweeps.designs.design import Design, check_design
 from mjx_reinforce.sweeps.designs.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
 from mjx_reinforce.sweeps.reading import read_results
-from mjx_reinforce.sweeps.results import join
+from mjx_reinforce.sweeps.results import join_parts
 from mjx_reinforce.sweeps.slots import programs
-from mjx_reinforce.sweeps.slots.packing import pack
+from mjx_reinforce.sweeps.slots.packing import pack_slots
 from mjx_reinforce.training.state import eval_keys, evaluation
 
 
@@ -49,7 +49,7 @@ RATES = "--over learning-rate 1e-2 3e-2 1e-1"
 @pytest.fixture
 def run(run, monkeypatch):
     """Runs a sweep of arguments in one string; the report has tests of its own."""
-    monkeypatch.setattr(perform, "_report", lambda directory: Written(0.0, [], 0))
+    monkeypatch.setattr(perform, "_report", lambda directory: WrittenReport(0.0, [], 0))
     return lambda line, command=sweep_command: run(*line.split(), command=command)
 
 
@@ -253,18 +253,18 @@ def test_packing_changes_nothing(run, monkeypatch, exact):
     shapes = []
 
     def packed(*arguments):
-        shapes.append(pack(*arguments).shape)
-        return pack(*arguments)
+        shapes.append(pack_slots(*arguments).shape)
+        return pack_slots(*arguments)
 
     monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
-    monkeypatch.setattr(programs, "pack", packed)
+    monkeypatch.setattr(programs, "pack_slots", packed)
     assert run(f"{command} --output packed") == 0
     assert shapes[0] == ((12, 1) if exact else (3, 4))
     assert shapes[-2] == (1, 1)
     assert shapes[-1] == shapes[0]  # the last policies of all are evaluated together
     assert len(set(shapes)) > 3
     monkeypatch.setattr(plan, "_CPU_EPISODES", (48,))
-    monkeypatch.setattr(programs, "pack", in_place)
+    monkeypatch.setattr(programs, "pack_slots", in_place)
     assert run(f"{command} --output wide") == 0
     one, other = curves(Path("packed")), curves(Path("wide"))
     assert len(set(one["env_steps"][-1])) > 6
@@ -275,14 +275,14 @@ def test_blocks_without_a_pause_change_nothing(run, monkeypatch):
     """Runs that one slot holds make several blocks before the host looks at them."""
     command = f"{STEPS} --num-seeds 2"
     monkeypatch.setattr(plan, "_CPU_EPISODES", (24,))
-    made, advance = [], programs.Programs.advance
+    made, advance = [], programs.SlotPrograms.advance
 
     def counted(*arguments):
         blocks = advance(*arguments)
         made.append(len(blocks))
         return blocks
 
-    monkeypatch.setattr(programs.Programs, "advance", counted)
+    monkeypatch.setattr(programs.SlotPrograms, "advance", counted)
     monkeypatch.setattr(chunks, "_SECONDS", 60.0)
     assert run(f"{command} --output several") == 0
     assert made[:4] == [1, 2, 4, 8]
@@ -416,7 +416,7 @@ def test_a_sweep_that_crashed_goes_on(run, monkeypatch, where):
     assert same(curves(Path("whole")), curves(Path("crashed")))
     assert Path("whole/results.csv").read_bytes() == Path("crashed/results.csv").read_bytes()
     reported = []
-    written = Written(1.0, [], 0)
+    written = WrittenReport(1.0, [], 0)
     monkeypatch.setattr(perform, "_report", lambda directory: reported.append(directory) or written)
     assert run("--resume crashed") == 0  # there is nothing left to do
     assert reported == []
@@ -433,14 +433,14 @@ def test_what_a_kill_left_of_a_report_goes(tmp_path, monkeypatch):
     left = [tmp_path / ".report.html.12ab", tmp_path / "report" / ".final.png.8f95"]
     for path in left:
         path.write_text("half")
-    nothing = Written(0.0, [], 0)
+    nothing = WrittenReport(0.0, [], 0)
     monkeypatch.setattr("mjx_reinforce.report.write_sweep", lambda directory, output: nothing)
     assert perform._report(tmp_path) == nothing
     assert not any(path.exists() for path in left)
 
 
 def test_what_ended_earlier_repeats_its_last_row():
-    joined = join(
+    joined = join_parts(
         [
             {"configuration": np.array([1, 0]), "seed": np.array([0, 0]), "eval_return": np.eye(2)},
             {
@@ -634,7 +634,7 @@ def test_half_the_configurations_stay_until_one_is_left():
         return {"configuration": kept, "eval_return": kept[None].astype(float)}
 
     seen = []
-    for rung in rungs.schedule(groups, "halving", measured):
+    for rung in rungs.plan_rungs(groups, "halving", measured):
         seen.append(rung)
     assert [rung.name for rung in seen] == ["0", "1", "2", "3", "fresh"]
     kept = [rung.groups[0].members.tolist() for rung in seen]
@@ -653,9 +653,9 @@ def test_ranges_are_drawn_as_their_settings_are():
         "estimator": ["leave-one-out", "total-return"],
         "entropy_cost": [0.0, 0.25, 1.0],
     }
-    drawn = search.draw(over, 400, seed=0)
-    assert drawn == search.draw(over, 400, seed=0)
-    assert drawn != search.draw(over, 400, seed=1)
+    drawn = search.draw_configurations(over, 400, seed=0)
+    assert drawn == search.draw_configurations(over, 400, seed=0)
+    assert drawn != search.draw_configurations(over, 400, seed=1)
     columns = {name: [values[name] for values in drawn] for name in over}
     # Half of the draws lie on each side of the middle of the scale: 200, standard deviation 10.
     assert abs(np.sum(np.array(columns["learning_rate"]) < 10**-2.5) - 200) < 50
@@ -664,12 +664,12 @@ def test_ranges_are_drawn_as_their_settings_are():
     assert set(columns["estimator"]) == set(over["estimator"])
     assert set(columns["entropy_cost"]) == {0.0, 0.25, 1.0}
     with pytest.raises(ValueError, match="only 2 different"):
-        search.draw({"estimator": over["estimator"]}, 3, seed=0)
+        search.draw_configurations({"estimator": over["estimator"]}, 3, seed=0)
 
 
 @pytest.mark.parametrize("report", [True, False])
 def test_from_python_a_report_can_be_left_out(register, monkeypatch, tmp_path, capsys, report):
-    written = Written(1.5, ["The best is learning rate 0.03.", "It is sure."], 1)
+    written = WrittenReport(1.5, ["The best is learning rate 0.03.", "It is sure."], 1)
     monkeypatch.setattr(perform, "_report", lambda directory: written)
     base = Config(
         env="Drift-v0", num_seeds=2, num_episodes=4, eval_episodes=2, env_steps=None, max_updates=2

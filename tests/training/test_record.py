@@ -16,7 +16,7 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import nonfinite
 from mjx_reinforce.training.evaluation import evaluate
 from mjx_reinforce.training.progress import Progress
-from mjx_reinforce.training.record import Record
+from mjx_reinforce.training.record import RunRecord
 from mjx_reinforce.types import Trajectory
 
 
@@ -47,7 +47,7 @@ def evaluation(*returns):
 
 def filled():
     """A record of three seeds, two blocks and three evaluations."""
-    record, random = Record(Config(num_seeds=3, max_updates=100), 2.0), np.random.default_rng(0)
+    record, random = RunRecord(Config(num_seeds=3, max_updates=100), 2.0), np.random.default_rng(0)
     record.add_evaluation(evaluation(1, 2, 3), 0.1)
     for i in range(2):
         record.add_updates(block(random, 4, 3))
@@ -66,7 +66,7 @@ def test_a_record_is_restored_exactly(tmp_path):
     """It goes through an archive; what the copy measures after that is the same too."""
     record = filled()
     np.savez(tmp_path / "record.npz", allow_pickle=False, **record.arrays())
-    copy = Record(Config(num_seeds=3, max_updates=100), 2.0)
+    copy = RunRecord(Config(num_seeds=3, max_updates=100), 2.0)
     with np.load(tmp_path / "record.npz", allow_pickle=False) as archive:
         copy.restore(dict(archive))
     for i in range(2):
@@ -83,20 +83,20 @@ def test_a_record_is_restored_exactly(tmp_path):
 
 
 def test_a_record_of_nothing_is_restored():
-    record, copy = (Record(Config(num_seeds=2), None) for _ in range(2))
+    record, copy = (RunRecord(Config(num_seeds=2), None) for _ in range(2))
     copy.restore(record.arrays())
     same(record.arrays(), copy.arrays())
     assert copy.add_evaluation(evaluation(1, 2), 0.5)["train_return"] == ["", ""]
 
 
 def test_a_block_waits_for_its_evaluation():
-    record = Record(Config(num_seeds=3, max_updates=100), 2.0)
+    record = RunRecord(Config(num_seeds=3, max_updates=100), 2.0)
     assert not record.evaluated()
     record.add_evaluation(evaluation(1, 2, 3), 0.1)
     assert record.evaluated()
     record.add_updates(block(np.random.default_rng(0), 4, 3))
     assert not record.evaluated()
-    copy = Record(Config(num_seeds=3, max_updates=100), 2.0)
+    copy = RunRecord(Config(num_seeds=3, max_updates=100), 2.0)
     copy.restore(record.arrays())
     assert not copy.evaluated()
     copy.add_evaluation(evaluation(1, 2, 3), 0.2)
@@ -141,7 +141,7 @@ def test_a_block_of_broken_updates_is_one_line():
     metrics["nonfinite_episodes"] = np.full((4, 9), 2)
     metrics["skipped_update"] = np.zeros((4, 9), int)
     made = 6 + np.cumsum(metrics["active"], axis=0)
-    assert nonfinite.describe(nonfinite.nonfinite_updates(metrics, made), 1000) == (
+    assert nonfinite.describe_nonfinite(nonfinite.nonfinite_updates(metrics, made), 1000) == (
         "updates 6 to 9: 9 of 1,000 seeds met numbers that are not finite (0, 1, 2, 3, 4, ...): "
         "66 episodes, 0 updates skipped"  # the last seed made one update of four
     )
@@ -161,7 +161,7 @@ def test_a_block_of_broken_updates_is_one_line():
     ],
 )
 def test_percentages_are_rounded_down(fraction, shown):
-    assert display.percent(fraction) == shown
+    assert display.percent_done(fraction) == shown
 
 
 def screen(width):

@@ -34,7 +34,7 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.best import first_best, keep_best
 from mjx_reinforce.training.driver import Driver
-from mjx_reinforce.training.record import Record
+from mjx_reinforce.training.record import RunRecord
 from mjx_reinforce.training.state import Looked
 
 SIZE = ["--num-seeds", "3", "--eval-episodes", "2", "--hidden-sizes", "4"]
@@ -224,8 +224,8 @@ def signalled(method, when):
         (Driver, "advance", 2, 143, 2),  # whose evaluation is left to the run that goes on
         (Driver, "advance", 4, 143, 4),
         (RunFiles, "save_if_due", 2, 143, 2),
-        (Record, "add_test", 1, 143, 5),
-        (Record, "add_test", 2, 0, 5),  # nothing is left to stop
+        (RunRecord, "add_test", 1, 143, 5),
+        (RunRecord, "add_test", 2, 0, 5),  # nothing is left to stop
         (RunFiles, "save_policies", 5, 0, 5),
     ],
 )
@@ -447,7 +447,7 @@ def test_ties_go_to_the_later_and_nan_is_never_best():
 def test_a_record_comes_back_whole():
     rng = np.random.default_rng(0)
     config = Config(num_seeds=2, max_updates=9)
-    record = Record(config, threshold=1.0)
+    record = RunRecord(config, threshold=1.0)
 
     def evaluation():
         names = (
@@ -470,7 +470,7 @@ def test_a_record_comes_back_whole():
     for _ in range(2):
         record.add_updates(block())
         record.add_evaluation(evaluation(), 1.0)
-    other = Record(config, threshold=1.0)
+    other = RunRecord(config, threshold=1.0)
     other.restore(record.arrays())
     metrics, result = block(), evaluation()
     for one in (record, other):

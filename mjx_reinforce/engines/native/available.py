@@ -33,7 +33,7 @@ def made_for() -> str:
         return reason
     import llvmlite
 
-    made_for = gpu.this_machine() if platform() == "gpu" else machine.this_machine()
+    made_for = gpu.kernel_dependencies() if platform() == "gpu" else machine.this_machine()
     return f"{llvmlite.__version__} {made_for}"
 
 
@@ -87,4 +87,4 @@ def unavailable() -> str | None:
         return f"it draws noise as {GENERATOR} does, not as {generator}"
     if not jax.config.values["jax_threefry_partitionable"]:
         return "it draws noise as JAX does with jax_threefry_partitionable"
-    return gpu.unavailable() if platform() == "gpu" else None
+    return gpu.kernels_unavailable() if platform() == "gpu" else None

@@ -25,7 +25,7 @@ LIMIT = 256 * 2**20
 _DIGEST = hashlib.sha256().digest_size
 
 
-def read(folder: Path, key: str) -> bytes | None:
+def read_object(folder: Path, key: str) -> bytes | None:
     """Returns the object of a key; None if there is none, or it is damaged, or may be another's."""
     path = folder / f"{key}.o"
     try:
@@ -41,7 +41,7 @@ def read(folder: Path, key: str) -> bytes | None:
     return data[_DIGEST:] if whole else None
 
 
-def write(folder: Path, key: str, data: bytes, limit: int = LIMIT) -> None:
+def write_object(folder: Path, key: str, data: bytes, limit: int = LIMIT) -> None:
     """Keeps an object and forgets the oldest; a folder that cannot be written keeps nothing."""
     with contextlib.suppress(OSError):
         make_folder(folder)

@@ -9,12 +9,12 @@ import numpy as np
 
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.native import available, objects, outlook, step
-from mjx_reinforce.engines.native.cpu import handler, machine, player, queue
+from mjx_reinforce.engines.native.cpu import handler, kernel, machine, queue
 from mjx_reinforce.engines.native.cpu.denormals import flush
-from mjx_reinforce.engines.native.gpu import player as gpu_player
+from mjx_reinforce.engines.native.gpu import kernel as gpu_kernel
 from mjx_reinforce.engines.native.gpu import ptx, scratch
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
-from mjx_reinforce.engines.native.step import Written
+from mjx_reinforce.engines.native.step import StepResult
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.fused.graph import Limits
 from mjx_reinforce.policies.distribution import Distribution
@@ -28,7 +28,7 @@ GPU_LOOPS = LOOPS._replace(unrollable=scratch.WRITTEN_OUT)
 _WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
 
 
-class Program(NamedTuple):
+class NativeProgram(NamedTuple):
     """Machine code that plays.
 
     code: of ``seam.call`` on a CPU, of ``seam.launch`` on a GPU
@@ -39,9 +39,9 @@ class Program(NamedTuple):
     record: list[jax.ShapeDtypeStruct]
 
 
-def build(
+def build_program(
     env: Environment, act: episode.Act, actor: PyTree, distribution: Distribution, length: int
-) -> Program:
+) -> NativeProgram:
     """Returns the program of an environment and a policy, compiled unless memory or disk has it.
 
     Args:
@@ -72,27 +72,27 @@ def build(
         return _write_cpu(function, examples, target)
 
     if target is None:
-        code = ptx.load(source, write, gpu_seam.compute_capability(), folder)
+        code = ptx.load_kernel(source, write, gpu_seam.compute_capability(), folder)
     else:
-        code = machine.load(source, write, handler.NAMES, target, folder)
-    return Program(code, shapes.record)
+        code = machine.load_module(source, write, handler.NAMES, target, folder)
+    return NativeProgram(code, shapes.record)
 
 
-def while_running(function: Callable[..., Written]) -> Any:
+def while_running(function: Callable[..., StepResult]) -> Any:
     """Returns a step of episodes that are running."""
     return lambda *args: function(*args, jnp.int32(1))
 
 
-def _write_gpu(function: Callable[..., Written], examples: tuple[Any, ...]) -> str:
+def _write_gpu(function: Callable[..., StepResult], examples: tuple[Any, ...]) -> str:
     """Writes a step, and the kernel around it, as LLVM IR."""
     actor = examples[0]
     varying = [True] * len(jax.tree.leaves(examples))
     written = scalarized.build(function, examples, varying, step.BRANCH_COST, GPU_LOOPS)
-    return gpu_player.kernel_text(written, len(jax.tree.leaves(actor)))
+    return gpu_kernel.kernel_text(written, len(jax.tree.leaves(actor)))
 
 
 def _write_cpu(
-    function: Callable[..., Written], examples: tuple[Any, ...], target: machine.Machine
+    function: Callable[..., StepResult], examples: tuple[Any, ...], target: machine.Machine
 ) -> str:
     """Writes a step, and all around it, as LLVM IR."""
     actor, carried, *_ = examples
@@ -103,4 +103,4 @@ def _write_cpu(
     records = [np.dtype(x.dtype).itemsize for x in written.out_avals[: queue.NUM_RECORDS]]
     num_args, lanes = queue.NUM_CONTROLS + len(buffers), target.lanes
     entry = handler.handler_text(num_args, [*records, 4, 4, 4], lanes)
-    return entry + player.player_text(written, num_actor, lanes, flush(target.triple))
+    return entry + kernel.player_text(written, num_actor, lanes, flush(target.triple))

@@ -20,7 +20,7 @@ from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.cpu import seam as cpu
 from mjx_reinforce.engines.native.gpu import seam as gpu
 from mjx_reinforce.engines.native.plays import MODE, NOT_PLAYED, SAMPLES
-from mjx_reinforce.engines.native.program import Program, build
+from mjx_reinforce.engines.native.program import NativeProgram, build_program
 from mjx_reinforce.engines.native.step import stored
 from mjx_reinforce.fused import TooLarge, UnsupportedPrimitive
 from mjx_reinforce.policies.distribution import Distribution
@@ -58,7 +58,7 @@ def rollout(
     if against:
         raise ValueError(f"the native engine cannot play this: {against}; {_REMEDY}")
     try:
-        program = build(env, act, actor, distribution, chunk_length(horizon))
+        program = build_program(env, act, actor, distribution, chunk_length(horizon))
     except (TooLarge, UnsupportedPrimitive) as error:
         raise ValueError(f"the native engine cannot play this: {error}") from error
     begin = functools.partial(episode.begin, env)
@@ -108,7 +108,7 @@ def unsupported(
     if reason:
         return reason
     try:
-        build(env, act, actor, distribution, chunk_length(horizon))
+        build_program(env, act, actor, distribution, chunk_length(horizon))
     except (TooLarge, UnsupportedPrimitive, TypeError) as error:
         return " ".join(str(error).split())
     except Exception as error:  # whatever it is, another engine may play this
@@ -118,7 +118,7 @@ def unsupported(
     return None
 
 
-def _results(program: Program, horizon: int, num_episodes: int) -> list[jax.ShapeDtypeStruct]:
+def _results(program: NativeProgram, horizon: int, num_episodes: int) -> list[jax.ShapeDtypeStruct]:
     """Returns the shapes of what a call returns; see ``handler.handler_text``."""
     shape = jax.ShapeDtypeStruct
     observation, action, reward = program.record

@@ -30,13 +30,13 @@ class Carried(NamedTuple):
     keys: Any
 
 
-class Written(NamedTuple):
+class StepResult(NamedTuple):
     """What a step returns.
 
     record: observation [O], action [A] or [], reward []
     alive: [] int32, 1 where the episode goes on
     broken: [] int32, 1 where it left the finite numbers
-    carried: what goes on into the next step
+    carried: what the next step reads
     """
 
     record: list[Any]
@@ -47,8 +47,8 @@ class Written(NamedTuple):
 
 def step_function(
     env: Environment, act: episode.Act, distribution: Distribution, length: int
-) -> Callable[..., Written]:
-    """Returns (actor, carried, t, deterministic, alive) -> ``Written``, for one episode.
+) -> Callable[..., StepResult]:
+    """Returns (actor, carried, t, deterministic, alive) -> ``StepResult``, for one episode.
 
     Args:
       env: what is played.
@@ -75,7 +75,7 @@ def step_function(
                 env.step, act, distribution, actor, state, noise, alive, deterministic != 0
             )
         after = jax.tree.leaves(episode.hold(alive, played.state, state))
-        return Written(
+        return StepResult(
             record=[played.observation, played.action, played.reward],
             alive=played.alive.astype(jnp.int32),
             broken=played.broken.astype(jnp.int32),

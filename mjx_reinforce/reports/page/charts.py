@@ -13,8 +13,8 @@ from mjx_reinforce.reports.page.vega import (
     Chart,
     dashes,
     moment_line,
-    named,
     series,
+    shown_rows,
     threshold_line,
 )
 
@@ -33,11 +33,11 @@ def curves(labels: Sequence[str], threshold: float | None, end: float) -> Chart:
     """
     x = alt.X("env_steps:Q", title=_STEPS, axis=_THOUSANDS, scale=alt.Scale(nice=False))
     y = alt.Y("value:Q", title="return of the deterministic policy", scale=alt.Scale(zero=False))
-    shown = named("curves")
+    shown = shown_rows("curves")
     near = alt.selection_point(
         name="near", on="pointerover", fields=["env_steps"], nearest=True, empty=False
     )
-    seeds = named("seeds").transform_filter("length(shown) == 1")
+    seeds = shown_rows("seeds").transform_filter("length(shown) == 1")
     layers = [
         seeds.mark_line(strokeWidth=0.8, opacity=0.35, clip=True).encode(
             x=x, y=y, detail="seed:N", color=series(labels)
@@ -111,7 +111,7 @@ def distribution(labels: Sequence[str], low: float, high: float) -> Chart:
     y = alt.Y("base:Q", axis=None, scale=scale)
     x_scale = alt.Scale(domain=[low, high], nice=False)
     bars = (
-        named("histogram")
+        shown_rows("histogram")
         .transform_filter(of_moment)
         .transform_calculate(base=row, top="datum.base + 0.5 * datum.height")
         .mark_bar(opacity=0.85, binSpacing=0)
@@ -130,7 +130,7 @@ def distribution(labels: Sequence[str], low: float, high: float) -> Chart:
         )
     )
     said = (
-        named("moments")
+        shown_rows("moments")
         .transform_filter(of_moment)
         .transform_calculate(base=row, top="datum.base + 0.92")
     )
@@ -146,7 +146,7 @@ def solved(labels: Sequence[str], end: float) -> Chart:
 
     Data: ``solved`` (configuration, env_steps, share, low, high).
     """
-    chart = named("solved")
+    chart = shown_rows("solved")
     x = alt.X("env_steps:Q", title=_STEPS, axis=_THOUSANDS, scale=alt.Scale(nice=False))
     scale = alt.Scale(domain=[0, 1])
     axis = alt.Axis(format=".0%")
@@ -172,7 +172,7 @@ def profile(labels: Sequence[str], threshold: float | None) -> Chart:
 
     Data: ``profile`` (configuration, threshold, share, low, high).
     """
-    chart = named("profile")
+    chart = shown_rows("profile")
     x = alt.X("threshold:Q", title="return at the end", scale=alt.Scale(nice=False))
     y = alt.Y(
         "share:Q",

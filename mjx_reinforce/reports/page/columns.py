@@ -38,7 +38,7 @@ def _integer(value: float) -> float | int:
     return int(value) if value.is_integer() else value
 
 
-def join(tables: Sequence[Table]) -> Table:
+def join_tables(tables: Sequence[Table]) -> Table:
     """Returns the rows of all tables."""
     return {name: [x for table in tables for x in table[name]] for name in tables[0]}
 

@@ -15,7 +15,7 @@ _BINS = 36
 _MOMENTS = 30
 
 
-def moments(findings: Findings) -> list[int]:
+def slider_stops(findings: Findings) -> list[int]:
     """Returns the points of the grid that the slider stops at."""
     last = len(findings.grid) - 1
     return np.unique(np.linspace(0, last, min(_MOMENTS, last + 1)).round().astype(int)).tolist()
@@ -33,7 +33,7 @@ def edges(findings: Findings) -> np.ndarray:
 
 def distributions(findings: Findings) -> dict[str, Table]:
     """Returns the histograms of all configurations at all moments, and what is said of each."""
-    borders, stops = edges(findings), moments(findings)
+    borders, stops = edges(findings), slider_stops(findings)
     bars: Table = {n: [] for n in ("configuration", "moment", "low", "high", "share", "height")}
     said: Table = {n: [] for n in ("configuration", "moment", "said")}
     starts, ends = short(borders[:-1]), short(borders[1:])

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import jinja2
 from markupsafe import Markup
 
-from mjx_reinforce.reports.experiment import Experiment, count, say, spoken
-from mjx_reinforce.reports.film import Film
+from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
+from mjx_reinforce.reports.film import PageFilm
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.page import charts, learning, palette, vega, words
 from mjx_reinforce.reports.page.citation import bibtex
 from mjx_reinforce.reports.page.columns import Table, short
-from mjx_reinforce.reports.page.distributions import moments
+from mjx_reinforce.reports.page.distributions import slider_stops
 from mjx_reinforce.reports.page.figures import SHOWN, Figure
 from mjx_reinforce.reports.page.listings import Listing, key_figures, listings
 from mjx_reinforce.reports.page.listings import matrix as pairs_matrix
@@ -57,7 +57,7 @@ def render(
     chart_tables: Mapping[str, Table],
     files: Mapping[str, str],
     watch: Watch,
-    film: Film | None,
+    film: PageFilm | None,
     version: str,
     seconds: float,
 ) -> str:
@@ -77,14 +77,14 @@ def render(
         "labels": _labels(findings),
         "specs": {figure.name: figure.spec for figure in drawn},
         "tables": {**chart_tables, **vega.ONE},
-        "moments": short(findings.grid[moments(findings)], 7),
+        "moments": short(findings.grid[slider_stops(findings)], 7),
         "files": files,
     }
     return fill(
         "page.html",
         content,
         **_text(findings, drawn),
-        **provenance(findings.experiment),
+        **provenance_rows(findings.experiment),
         watch=watch,
         film=film,
         moments=content["moments"],
@@ -167,7 +167,7 @@ def _labels(findings: Findings) -> list[str]:
 
 
 def _text(findings: Findings, drawn: list[Figure]) -> dict[str, Any]:
-    """Returns what the template says, but for where it comes from."""
+    """Returns the text of the page, without the provenance of its numbers."""
     figures = {figure.name: figure for figure in drawn}
     sensitivity = [figure for figure in drawn if figure.name.startswith("sensitivity-")]
     listed, matrix = listings(findings), pairs_matrix(findings)
@@ -186,15 +186,15 @@ def _text(findings: Findings, drawn: list[Figure]) -> dict[str, Any]:
         "title": findings.experiment.title,
         "asked": findings.experiment.asked,
         "contents": contents,
-        "answer": learning.answer(findings),
+        "answer": learning.learning_answer(findings),
         "key_figures": key_figures(findings),
-        "distrust": words.distrust(findings),
+        "distrust": words.caveats(findings),
         "figures": {name: figures.get(name) for name in names},
         "failures": failures,
         "labels": _labels(findings),
         "first_shown": SHOWN,
         "matrix": matrix,
-        "pairs": count(len(findings.comparisons), "pair"),
+        "pairs": counted(len(findings.comparisons), "pair"),
         "level": words.LEVEL,
         "listed": listed,
         "until": steps(findings.learning.until),
@@ -210,7 +210,7 @@ def _numbers(listed: Mapping[str, Listing]) -> dict[str, int]:
     return {name: place for place, name in enumerate(names, start=1)}
 
 
-def provenance(experiment: Experiment) -> dict[str, Any]:
+def provenance_rows(experiment: Experiment) -> dict[str, Any]:
     """Returns where the numbers come from, as pairs of names and values."""
     directories = list(dict.fromkeys(map(str, experiment.directories)))
     facts = [("read from", ", ".join(directories))]
@@ -219,18 +219,18 @@ def provenance(experiment: Experiment) -> dict[str, Any]:
         for name, seconds in experiment.timings.items()
     ]
     facts += [
-        (spoken(name), _plain(value))
+        (setting_in_words(name), _plain(value))
         for name, value in experiment.provenance.items()
         if value not in (None, "", [])
     ]
-    settings = [(spoken(name), say(value)) for name, value in experiment.settings.items()]
+    settings = [(setting_in_words(name), say(value)) for name, value in experiment.settings.items()]
     return {"facts": facts, "settings": settings}
 
 
 def _plain(value: object) -> str:
     """Returns an entry of the provenance in words."""
     if isinstance(value, Mapping):
-        listed = ((spoken(key), _plain(x)) for key, x in value.items() if x is not None)
+        listed = ((setting_in_words(key), _plain(x)) for key, x in value.items() if x is not None)
         return "; ".join(f"{key} {said}" for key, said in listed)
     if isinstance(value, list):
         return ", ".join(map(_plain, value))

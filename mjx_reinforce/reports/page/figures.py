@@ -2,12 +2,12 @@
 
 from typing import Any, NamedTuple
 
-from mjx_reinforce.reports.experiment import count, ordered, spoken
+from mjx_reinforce.reports.experiment import counted, ordered, setting_in_words
 from mjx_reinforce.reports.findings import Findings, swept, values_of
 from mjx_reinforce.reports.page import charts, tables
-from mjx_reinforce.reports.page.distributions import edges, moments
+from mjx_reinforce.reports.page.distributions import edges, slider_stops
 from mjx_reinforce.reports.page.vega import renamed, specification
-from mjx_reinforce.reports.page.words import interval, number
+from mjx_reinforce.reports.page.words import interval_in_words, number
 
 #: So many configurations are shown at first, the best.
 SHOWN = 4
@@ -46,7 +46,7 @@ def figures(findings: Findings) -> list[Figure]:
     return made
 
 
-def of_task(findings: Findings, task: int, place: int) -> list[Figure]:
+def task_figures(findings: Findings, task: int, place: int) -> list[Figure]:
     """Returns the figures of one of several tasks; their names, and their data's, end in -TASK."""
     made = []
     for build in (_curves, _solved):
@@ -70,7 +70,7 @@ def _labels(findings: Findings) -> list[str]:
 
 
 def _figure(findings: Findings, chart: Any, **fields: Any) -> Figure:
-    labels, last = _labels(findings), len(moments(findings)) - 1
+    labels, last = _labels(findings), len(slider_stops(findings)) - 1
     spec = specification(chart, labels, labels[:SHOWN], float(findings.grid[-1]), last)
     spec["description"] = fields["alt"]
     return Figure(spec=spec, **fields)
@@ -92,9 +92,9 @@ def _final(findings: Findings, place: int) -> list[Figure]:
                 "middle eight tenths of the seeds."
             ),
             alt=(
-                f"{count(len(findings.results), 'row')}, best first. The best, "
+                f"{counted(len(findings.results), 'row')}, best first. The best, "
                 f"{best.configuration.label}, is at {number(best.mean.value)}, 95 % interval "
-                f"{interval(best.mean)}. Table 1 has every number."
+                f"{interval_in_words(best.mean)}. Table 1 has every number."
             ),
             tables=["final"],
         )
@@ -191,14 +191,16 @@ def _sensitivity(findings: Findings, place: int) -> list[Figure]:
     made = []
     for n, name in enumerate(swept(findings)):
         kind, values = tables.axis_of(findings, name), values_of(findings, name)
-        chart = charts.sensitivity(spoken(name), f"sensitivity-{n}", kind, ordered(values))
-        said = f"Mean return at the end over {spoken(name)}; table 1 has the numbers."
+        chart = charts.sensitivity(
+            setting_in_words(name), f"sensitivity-{n}", kind, ordered(values)
+        )
+        said = f"Mean return at the end over {setting_in_words(name)}; table 1 has the numbers."
         figure = _figure(
             findings,
             chart,
             name=f"sensitivity-{n}",
             number=place,
-            title=spoken(name),
+            title=setting_in_words(name),
             caption="",
             alt=said,
             tables=[f"sensitivity-{n}"],

@@ -4,11 +4,11 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from mjx_reinforce.reports.experiment import count, say, spoken
+from mjx_reinforce.reports.experiment import counted, say, setting_in_words
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.learning import Level, fastest
 from mjx_reinforce.reports.page import words
-from mjx_reinforce.reports.page.words import LEVEL, interval, number, p_value, steps
+from mjx_reinforce.reports.page.words import LEVEL, interval_in_words, number, p_value, steps
 from mjx_reinforce.reports.results import COMPARED, Result
 
 #: The measures of a setting's effect, as the page calls them.
@@ -19,7 +19,7 @@ MEASURES = {
 }
 
 
-def answer(findings: Findings) -> list[str]:
+def learning_answer(findings: Findings) -> list[str]:
     """Returns the page's answer: what was reached, and who got there faster.
 
     Where the returns at the end cannot be told apart, and one configuration is surely faster than
@@ -67,7 +67,7 @@ def _of_speed(findings: Findings) -> Iterator[str]:
     first = fastest(compared)
     tests = [each for each in speeds if first in (each.first, each.second)]
     slower = [each for each in tests if each.adjusted < LEVEL]
-    pairs = count(len(speeds), "pair")
+    pairs = counted(len(speeds), "pair")
     half = f": {_half(compared[first])}" if first else ""  # the best's is said already
     yield f"The task is solved soonest by {compared[first].configuration.label}{half}."
     if slower:
@@ -105,7 +105,7 @@ def _half(result: Result) -> str:
     solving = result.solving
     if solving is None or math.isnan(solving.median.value):
         return "fewer than half of its seeds solve it"
-    bounds = interval(solving.median, steps)
+    bounds = interval_in_words(solving.median, steps)
     bounds = "" if bounds == "no interval" else f" (95 % interval {bounds})"
     return f"half of its seeds have after {steps(solving.median.value)} env steps{bounds}"
 
@@ -147,8 +147,8 @@ def _of_levels(findings: Findings) -> Iterator[str]:
         )
         told = "no other value" if not sure else told
         yield (
-            f"Averaged over the other settings, {spoken(setting)} {say(best.value)} {what}; that "
-            f"is sure (p below {LEVEL}) against {told}."
+            f"Averaged over the other settings, {setting_in_words(setting)} {say(best.value)} "
+            f"{what}; that is sure (p below {LEVEL}) against {told}."
         )
 
 
@@ -171,10 +171,10 @@ def speed_table(findings: Findings) -> dict[str, Any]:
         each, cells = compared[i], []
         if each.solving is not None:
             median, mean = each.solving.median, each.solving.mean
-            cells.append((steps(median.value), interval(median, steps)))
-            cells.append((steps(float(mean.value)), interval(mean, steps)))
+            cells.append((steps(median.value), interval_in_words(median, steps)))
+            cells.append((steps(float(mean.value)), interval_in_words(mean, steps)))
             cells.append((_against(speeds, i, order[0], "fastest"), ""))
-        cells.append((number(float(each.area.value)), interval(each.area)))
+        cells.append((number(float(each.area.value)), interval_in_words(each.area)))
         cells.append((_against(areas, i, best_area, "greatest"), ""))
         listed.append({"label": each.configuration.label, "cells": cells})
     return {"header": header, "rows": listed}
@@ -209,13 +209,15 @@ def effects_table(findings: Findings) -> dict[str, Any]:
         header += [MEASURES[measure], "p, Holm"]
     listed = []
     for level in levels:
-        cells = [(count(level.number, "configuration"), "")]
+        cells = [(counted(level.number, "configuration"), "")]
         for measure in measures:
             form = steps if measure == "steps" else number
             estimate = level.means[measure]
-            cells.append((form(float(estimate.value)), interval(estimate, form)))
+            cells.append((form(float(estimate.value)), interval_in_words(estimate, form)))
             cells.append((_p_of(level, measure), ""))
-        listed.append({"label": f"{spoken(level.setting)} {say(level.value)}", "cells": cells})
+        listed.append(
+            {"label": f"{setting_in_words(level.setting)} {say(level.value)}", "cells": cells}
+        )
     return {"header": header, "rows": listed}
 
 

@@ -3,10 +3,10 @@
 import math
 from typing import Any
 
-from mjx_reinforce.reports.experiment import count
+from mjx_reinforce.reports.experiment import counted
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.page import learning, tables, words
-from mjx_reinforce.reports.page.words import interval, number, percent, steps
+from mjx_reinforce.reports.page.words import interval_in_words, number, percent, steps
 from mjx_reinforce.reports.results import COMPARED, Result
 
 #: A table: its ``header``, and ``rows`` of a ``label`` and ``cells``, pairs of a value and what
@@ -40,20 +40,20 @@ def key_figures(findings: Findings) -> list[tuple[str, str, str]]:
     seeds = sum(len(each.final) for each in findings.results)
     ends = max(int(each.configuration.env_steps[-1].max()) for each in findings.results)
     found = [
-        ("seeds trained", f"{seeds:,}", count(len(findings.results), "configuration")),
+        ("seeds trained", f"{seeds:,}", counted(len(findings.results), "configuration")),
         (
             "return of the best" if findings.comparisons else "mean return",
             number(best.mean.value),
-            interval(best.mean),
+            interval_in_words(best.mean),
         ),
     ]
     if (solving := best.solving) is not None:
-        said = f"of {len(best.final):,}; {interval(solving.rate, percent)}"
+        said = f"of {len(best.final):,}; {interval_in_words(solving.rate, percent)}"
         found.append(("seeds that solve it", f"{solving.at_end:,}", said))
         until = steps(solving.median.value)
-        found.append(("env steps until half", until, interval(solving.median, steps)))
+        found.append(("env steps until half", until, interval_in_words(solving.median, steps)))
     else:
-        found.append(("worst tenth", number(best.tail.value), interval(best.tail)))
+        found.append(("worst tenth", number(best.tail.value), interval_in_words(best.tail)))
     found.append(("env steps a seed", f"{ends:,}", "at most"))
     return found
 
@@ -69,12 +69,12 @@ def _results(findings: Findings) -> dict[str, Any]:
     for each in findings.results:
         cells = [(f"{len(each.final):,}", "")]
         for estimate in (each.mean, each.iqm, each.tail):
-            cells.append((number(float(estimate.value)), interval(estimate)))
+            cells.append((number(float(estimate.value)), interval_in_words(estimate)))
         if each.solving is not None:
             share = f"{each.solving.at_end:,} of {len(each.final):,}"
             median = each.solving.median
-            cells.append((share, interval(each.solving.rate, percent)))
-            cells.append((steps(median.value), interval(median, steps)))
+            cells.append((share, interval_in_words(each.solving.rate, percent)))
+            cells.append((steps(median.value), interval_in_words(median, steps)))
             cells.append((f"{int(each.solving.fell.sum()):,}", ""))
         cells.append((f"{sum(not math.isfinite(x) for x in each.final):,}", ""))
         listed.append({"label": each.configuration.label, "cells": cells})
@@ -112,8 +112,11 @@ def _against(findings: Findings) -> Listing:
         {
             "label": findings.results[pair.second].configuration.label,
             "cells": [
-                (number(float(pair.difference.value)), interval(pair.difference)),
-                (percent(float(pair.improvement.value)), interval(pair.improvement, percent)),
+                (number(float(pair.difference.value)), interval_in_words(pair.difference)),
+                (
+                    percent(float(pair.improvement.value)),
+                    interval_in_words(pair.improvement, percent),
+                ),
                 (learning.short_p(pair.p_value), ""),
                 (learning.short_p(pair.adjusted), ""),
             ],

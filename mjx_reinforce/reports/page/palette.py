@@ -1,6 +1,6 @@
 """Colours of the report's page and pictures, on light and on dark ground.
 
-Charts name a colour as a CSS variable, so that one drawing serves both and print.
+Charts name a colour as a CSS variable, so that one drawing fits both and print.
 """
 
 import re

@@ -7,7 +7,7 @@ import numpy as np
 
 from mjx_reinforce.reports.experiment import ordered, say
 from mjx_reinforce.reports.findings import Findings, swept, values_of
-from mjx_reinforce.reports.page.columns import Table, join, short
+from mjx_reinforce.reports.page.columns import Table, join_tables, short
 from mjx_reinforce.reports.page.distributions import distributions
 from mjx_reinforce.reports.results import Result
 from mjx_reinforce.reports.statistics.profiles import performance_profile
@@ -32,7 +32,10 @@ def chart_tables(findings: Findings) -> dict[str, Table]:
         "solved": _solved(findings),
         "profile": _profile(findings),
         **worst_curves(findings),
-        **{f"sensitivity-{n}": sensitivity(findings, s) for n, s in enumerate(swept(findings))},
+        **{
+            f"sensitivity-{n}": sensitivity_table(findings, s)
+            for n, s in enumerate(swept(findings))
+        },
     }
 
 
@@ -58,7 +61,7 @@ def _curves(findings: Findings) -> Table:
                 "high": short(result.band.high[known]),
             }
         )
-    return join(parts)
+    return join_tables(parts)
 
 
 def _seeds(findings: Findings) -> Table:
@@ -80,7 +83,7 @@ def _seeds(findings: Findings) -> Table:
                     "value": short(result.seeds[known, s], 4),
                 }
             )
-    return join(parts)
+    return join_tables(parts)
 
 
 def _final(findings: Findings) -> Table:
@@ -139,7 +142,7 @@ def _profile(findings: Findings) -> Table:
                 "high": short(share.high, 4),
             }
         )
-    return join(parts)
+    return join_tables(parts)
 
 
 def worst_seeds(result: Result) -> np.ndarray:
@@ -171,7 +174,7 @@ def worst_curves(findings: Findings) -> dict[str, Table]:
         "env_steps": short(findings.grid[known], 7),
         "value": short(result.band.value[known]),
     }
-    return {"worst": join(parts), "band": band}
+    return {"worst": join_tables(parts), "band": band}
 
 
 def axis_of(findings: Findings, name: str) -> Literal["log", "linear", "ordinal"]:
@@ -183,7 +186,7 @@ def axis_of(findings: Findings, name: str) -> Literal["log", "linear", "ordinal"
     return "log" if low > 0 and high / low >= 8 else "linear"
 
 
-def sensitivity(findings: Findings, name: str) -> Table:
+def sensitivity_table(findings: Findings, name: str) -> Table:
     """Returns the final return over the values of a setting, in their order."""
     places = {repr(x): n for n, x in enumerate(ordered(values_of(findings, name)))}
     order = sorted(

@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from mjx_reinforce.reports.experiment import count
+from mjx_reinforce.reports.experiment import counted
 from mjx_reinforce.reports.page import charts, document, learning, vega
-from mjx_reinforce.reports.page.columns import Table, join, short
-from mjx_reinforce.reports.page.figures import SHOWN, Figure, of_task
+from mjx_reinforce.reports.page.columns import Table, join_tables, short
+from mjx_reinforce.reports.page.figures import SHOWN, Figure, task_figures
 from mjx_reinforce.reports.page.listings import Listing, listings
 from mjx_reinforce.reports.page.tables import task_tables
-from mjx_reinforce.reports.page.words import LEVEL, interval, number, p_value, percent
+from mjx_reinforce.reports.page.words import LEVEL, interval_in_words, number, p_value, percent
 from mjx_reinforce.reports.results import COMPARED
 from mjx_reinforce.reports.tasks import Faster, Tasks, in_order
 
@@ -30,7 +30,7 @@ _METHODS = (
 )
 
 
-class Part(NamedTuple):
+class TaskSection(NamedTuple):
     """One task on the page: its charts, and where the page of the task alone lies."""
 
     env: str
@@ -45,15 +45,15 @@ def labels(tasks: Tasks) -> list[str]:
     return [each.label for each in tasks.overall]
 
 
-def figures(tasks: Tasks) -> list[Figure]:
+def tasks_figures(tasks: Tasks) -> list[Figure]:
     """Returns the scores over all tasks, and each task's curves, numbered."""
     names = labels(tasks)
     title = "mean score over tasks"
     chart = charts.final(names, 1.0 if all(s.solved for s in tasks.scales) else None, title)
     best = tasks.overall[0]
     alt = (
-        f"{count(len(names), 'row')}, best first. The best, {best.label}, is at "
-        f"{number(float(best.mean.value))}, 95 % interval {interval(best.mean)}."
+        f"{counted(len(names), 'row')}, best first. The best, {best.label}, is at "
+        f"{number(float(best.mean.value))}, 95 % interval {interval_in_words(best.mean)}."
     )
     spec = vega.specification(chart, names, names[:SHOWN], 0.0, 0) | {"description": alt}
     caption = (
@@ -62,11 +62,11 @@ def figures(tasks: Tasks) -> list[Figure]:
     )
     made = [Figure("overall", 1, "The scores at the end", caption, alt, spec, ["final"])]
     for n, findings in enumerate(tasks.findings):
-        made += of_task(in_order(tasks, findings), n, len(made) + 1)
+        made += task_figures(in_order(tasks, findings), n, len(made) + 1)
     return made
 
 
-def chart_tables(tasks: Tasks) -> dict[str, Table]:
+def tasks_chart_tables(tasks: Tasks) -> dict[str, Table]:
     """Returns the data of the charts by name."""
     every = [np.concatenate(each.scores) for each in tasks.overall]
     spread = [np.quantile(each, [0.1, 0.9]) for each in every]
@@ -103,7 +103,7 @@ def scores(tasks: Tasks) -> Table:
                     "score_while_training": area.tolist(),
                 }
             )
-    return join(parts)
+    return join_tables(parts)
 
 
 def listed(tasks: Tasks) -> dict[str, Listing]:
@@ -133,7 +133,7 @@ def _overall(tasks: Tasks) -> Listing:
     for each in tasks.overall:
         cells = [(f"{sum(map(len, each.scores)):,}", "")]
         for estimate in (each.mean, each.iqm, each.area):
-            cells.append((number(float(estimate.value)), interval(estimate)))
+            cells.append((number(float(estimate.value)), interval_in_words(estimate)))
         if solving:
             cells.append((f"{each.solved:,} of {each.seeds:,}", percent(each.solved / each.seeds)))
         rows.append({"label": each.label, "cells": cells})
@@ -162,15 +162,17 @@ def _sooner(names: list[str], pair: Faster, statistic: float) -> str:
     return names[pair.first if statistic > 0 else pair.second]
 
 
-def answer(tasks: Tasks) -> list[str]:
+def tasks_answer(tasks: Tasks) -> list[str]:
     """Returns the answer in a few sentences; the speed first, where the best scores are equal."""
     best = tasks.overall[0]
-    envs = count(len(tasks.findings), "task")
-    mean = f"{number(float(best.mean.value))} (95 % interval {interval(best.mean)})"
+    envs = counted(len(tasks.findings), "task")
+    mean = f"{number(float(best.mean.value))} (95 % interval {interval_in_words(best.mean)})"
     if len(tasks.overall) == 1:
         return [f"Over {envs}, the mean score is {mean}.", _SCORE]
     second = tasks.overall[1]
-    next_mean = f"{number(float(second.mean.value))} (95 % interval {interval(second.mean)})"
+    next_mean = (
+        f"{number(float(second.mean.value))} (95 % interval {interval_in_words(second.mean)})"
+    )
     said = [
         f"Over {envs}, the greatest mean score is that of {best.label}: {mean}.",
         f"The next is {second.label}: {next_mean}. {_SCORE}",
@@ -200,7 +202,7 @@ def _of_speed(tasks: Tasks) -> Iterator[str]:
         return
     worst = p_value(max(slower.values()))
     bound = " or less" if len(slower) > 1 and not worst.startswith("p <") else ""
-    how = f"{worst}{bound} after Holm's correction for {count(len(tasks.faster), 'pair')}"
+    how = f"{worst}{bound} after Holm's correction for {counted(len(tasks.faster), 'pair')}"
     if len(slower) == len(own):
         yield (
             f"The tasks are solved soonest by {names[first]}: sooner than by "
@@ -227,7 +229,7 @@ def _of_tasks(tasks: Tasks) -> Iterator[str]:
             yield f"In {env}, no configuration is surely the fastest of all."
 
 
-def distrust(tasks: Tasks) -> list[str]:
+def tasks_caveats(tasks: Tasks) -> list[str]:
     """Returns what to distrust, the gravest first."""
     said = []
     for findings in tasks.findings:
@@ -244,7 +246,7 @@ def distrust(tasks: Tasks) -> list[str]:
             "scores cannot be compared with those of another report."
         )
     said.append(
-        f"{count(len(tasks.findings), 'task')}: the intervals are of other seeds on the same "
+        f"{counted(len(tasks.findings), 'task')}: the intervals are of other seeds on the same "
         "tasks, and say nothing of another task."
     )
     if len(tasks.overall) > 1:
@@ -252,7 +254,7 @@ def distrust(tasks: Tasks) -> list[str]:
     return said
 
 
-def render(
+def render_tasks(
     tasks: Tasks,
     drawn: list[Figure],
     data: Mapping[str, Table],
@@ -264,7 +266,7 @@ def render(
     """Returns the page; ``pages`` are the name and the address of each task's own page."""
     by_name = {figure.name: figure for figure in drawn}
     parts = [
-        Part(e.experiment.env, *page, by_name[f"curves-{n}"], by_name.get(f"solved-{n}"))
+        TaskSection(e.experiment.env, *page, by_name[f"curves-{n}"], by_name.get(f"solved-{n}"))
         for n, (e, page) in enumerate(zip(tasks.findings, pages, strict=True))
     ]
     envs = [part.env for part in parts]
@@ -281,16 +283,16 @@ def render(
     facts = [
         (f"{e.experiment.env}, {name}", value)
         for e in tasks.findings
-        for name, value in document.provenance(e.experiment)["facts"]
+        for name, value in document.provenance_rows(e.experiment)["facts"]
     ]
     return document.fill(
         "tasks.html",
         content,
-        title=f"{count(len(envs), 'task')}, {count(len(tasks.overall), 'configuration')}",
+        title=f"{counted(len(envs), 'task')}, {counted(len(tasks.overall), 'configuration')}",
         asked=f"Which configuration does best, and learns fastest, over {', '.join(envs)}?",
         contents=[*contents, ("source", "Where this comes from"), ("data", "Data")],
-        answer=answer(tasks),
-        distrust=distrust(tasks),
+        answer=tasks_answer(tasks),
+        distrust=tasks_caveats(tasks),
         figures={"overall": by_name["overall"]},
         labels=labels(tasks),
         first_shown=SHOWN,

@@ -73,7 +73,7 @@ def specification(
     return spec | {"config": config(), "autosize": {"type": "fit-x", "contains": "padding"}}
 
 
-def draw(spec: dict[str, Any], datasets: dict[str, Any], title: str) -> dict[str, bytes]:
+def render_chart(spec: dict[str, Any], datasets: dict[str, Any], title: str) -> dict[str, bytes]:
     """Returns a specification and its data as pictures, by the endings of their files."""
     import vl_convert
 
@@ -100,8 +100,8 @@ def renamed(spec: Any, names: Mapping[str, str]) -> Any:
     return found
 
 
-def named(data: str) -> alt.Chart:
-    """Returns a chart of those rows that are shown; a log axis has no place for 0."""
+def shown_rows(data: str) -> alt.Chart:
+    """Returns a chart of the rows that are shown; a log axis has no place for 0."""
     return (
         alt.Chart(alt.NamedData(data))
         .transform_filter(_IS_SHOWN)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import count, ordered, say, spoken
+from mjx_reinforce.reports.experiment import counted, ordered, say, setting_in_words
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.results import COMPARED, Result
 from mjx_reinforce.reports.statistics import Estimate
@@ -25,7 +25,7 @@ def number(value: float) -> str:
     return f"{value:,.1f}" if abs(value) >= 10 or value == 0 else f"{value:.3g}"
 
 
-def interval(estimate: Estimate, form: Any = number) -> str:
+def interval_in_words(estimate: Estimate, form: Any = number) -> str:
     """Returns an interval, "997.0 to 999.0", or that there is none."""
     if math.isnan(estimate.low) or math.isnan(estimate.high):
         return "no interval"
@@ -72,7 +72,9 @@ def answer(findings: Findings) -> list[str]:
 
 def _headline(findings: Findings) -> str:
     best, env = findings.results[0], findings.experiment.env
-    mean = f"a mean return of {number(best.mean.value)} (95 % interval {interval(best.mean)})"
+    mean = (
+        f"a mean return of {number(best.mean.value)} (95 % interval {interval_in_words(best.mean)})"
+    )
     mean = mean.replace("(95 % interval no interval)", "(one seed, so there is no interval)")
     if len(findings.results) == 1:
         return _learned(findings, env, mean)
@@ -87,7 +89,7 @@ def _learned(findings: Findings, env: str, mean: str) -> str:
     """Returns what the seeds of one configuration learned."""
     best = findings.results[0]
     returns, at = best.configuration.eval_return, best.configuration.env_steps
-    seeds = count(len(best.final), "seed")
+    seeds = counted(len(best.final), "seed")
     untrained = returns[0][np.isfinite(returns[0])]
     if at[0].any() or not len(untrained) or len(returns) < 2:
         return f"{seeds} of {env} ended with {mean}."
@@ -113,10 +115,11 @@ def _ahead(findings: Findings) -> Iterator[str]:
     where = "The mean" if len(sizes) == 1 else "Over the seeds that all have, the mean"
     yield (
         f"{where} {_above(float(next_best.difference.value))} that of the next, {label} "
-        f"(95 % interval {interval(next_best.difference)}; {p_value(next_best.adjusted)} after "
-        f"Holm's correction for {count(len(findings.comparisons), 'pair')}). Of two seeds, one of "
-        f"each, that of the best ends higher with a probability of {percent(improvement.value)} "
-        f"(95 % interval {interval(improvement, percent)}; ties count half)."
+        f"(95 % interval {interval_in_words(next_best.difference)}; {p_value(next_best.adjusted)} "
+        f"after Holm's correction for {counted(len(findings.comparisons), 'pair')}). Of two seeds, "
+        "one of each, that of the best ends higher with a probability of "
+        f"{percent(improvement.value)} (95 % interval "
+        f"{interval_in_words(improvement, percent)}; ties count half)."
     )
     ties = unsure(findings)
     if ties:
@@ -142,12 +145,13 @@ def _solving(findings: Findings) -> Iterator[str]:
     whose = "its " if len(findings.results) > 1 else ""
     kept = f"; {fell:,} had solved it and fell back" if fell else ""
     yield (
-        f"{solving.at_end:,} of {whose}{count(seeds, 'seed')} solve the task at the end "
-        f"({percent(float(solving.rate.value))}, 95 % interval {interval(solving.rate, percent)}; "
-        f"solved is a return of {number(findings.experiment.threshold or 0.0)}){kept}."
+        f"{solving.at_end:,} of {whose}{counted(seeds, 'seed')} solve the task at the end "
+        f"({percent(float(solving.rate.value))}, 95 % interval "
+        f"{interval_in_words(solving.rate, percent)}; solved is a return of "
+        f"{number(findings.experiment.threshold or 0.0)}){kept}."
     )
     if not math.isnan(solving.median.value):
-        bounds = interval(solving.median, steps)
+        bounds = interval_in_words(solving.median, steps)
         bounds = "" if bounds == "no interval" else f" (95 % interval {bounds})"
         yield f"Half of them had solved it after {steps(solving.median.value)} env steps{bounds}."
 
@@ -166,7 +170,7 @@ def _few(findings: Findings) -> list[str]:
     return [f"With few seeds, the next would have looked better than the best {listed}; {needed}."]
 
 
-def distrust(findings: Findings) -> list[str]:
+def caveats(findings: Findings) -> list[str]:
     """Returns what to distrust in the answer, the gravest first."""
     checks = (_of_sources, _of_seeds, _of_failures, _of_choice, _of_budget, _of_measure)
     return [sentence for check in checks for sentence in check(findings)]
@@ -176,15 +180,15 @@ def _of_sources(findings: Findings) -> Iterator[str]:
     experiment = findings.experiment
     for directory in experiment.unfinished:
         yield f"{directory} is not finished: these are its results so far."
-    for name in experiment.disagree:
-        yield f"The sources were made with different {spoken(name)}; see where they come from."
+    for name in map(setting_in_words, experiment.disagree):
+        yield f"The sources were made with different {name}; see where they come from."
 
 
 def _of_seeds(findings: Findings) -> Iterator[str]:
     sizes = [len(each.final) for each in findings.results]
     if min(sizes) < _FEW_SEEDS:
         yield (
-            f"{count(min(sizes), 'seed')} of a configuration are few: below {_FEW_SEEDS}, a "
+            f"{counted(min(sizes), 'seed')} of a configuration are few: below {_FEW_SEEDS}, a "
             "bootstrap interval holds the truth less often than 95 % of the time."
         )
     if len(set(sizes)) > 1:
@@ -199,14 +203,14 @@ def _of_failures(findings: Findings) -> Iterator[str]:
     total = sum(len(each.final) for each in findings.results)
     if failed:
         yield (
-            f"{failed:,} of {count(total, 'seed')} ended with a return that is not finite. They "
+            f"{failed:,} of {counted(total, 'seed')} ended with a return that is not finite. They "
             "count as the worst finite return of all, which may flatter them."
         )
     best = findings.results[0]
     fell = int(best.solving.fell.sum()) if best.solving else 0
     if fell:
         yield (
-            f"{count(fell, 'seed')} of the best configuration had solved the task and lost it "
+            f"{counted(fell, 'seed')} of the best configuration had solved the task and lost it "
             "again: stopped earlier, or by its best policy, it would look better."
         )
 
@@ -242,7 +246,8 @@ def _at_the_edge(findings: Findings, name: str) -> Iterator[str]:
     best = findings.results[0].configuration.settings[name]
     for end, said in ((values[0], "least"), (values[-1], "greatest")):
         if best == end:
-            yield f"{spoken(name).capitalize()} {say(best)} is the {said} tried: try beyond it."
+            label = setting_in_words(name).capitalize()
+            yield f"{label} {say(best)} is the {said} tried: try beyond it."
 
 
 def _of_budget(findings: Findings) -> Iterator[str]:
@@ -267,8 +272,8 @@ def _of_measure(findings: Findings) -> Iterator[str]:
     episodes = findings.experiment.settings.get("eval_episodes")
     if episodes is not None:
         yield (
-            f"A return is the mean of {count(int(episodes), 'episode')} without exploration, from "
-            "starts that are the same at every evaluation of a seed."
+            f"A return is the mean of {counted(int(episodes), 'episode')} without exploration, "
+            "from starts that are the same at every evaluation of a seed."
         )
     yield "One task: nothing here says how these settings do on another."
 

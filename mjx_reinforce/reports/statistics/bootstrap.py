@@ -2,7 +2,7 @@
 
 A mean over a range of ranks, as the interquartile mean is, needs of a resample only how many draws
 of the lowest seed, the second lowest, ... lie in that range. Which seed is the lowest does not
-matter, so one table of such numbers serves every point of every curve: sorted values times the
+matter, so one table of such numbers does for every point of every curve: sorted values times the
 table, a product of matrices, are the means of all resamples.
 """
 

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from mjx_reinforce.files import append, finite, write_bytes
-from mjx_reinforce.training.rows import Cells, number
+from mjx_reinforce.training.rows import Cells, parse_cell
 
 NAME = "metrics.jsonl"
 
@@ -31,6 +31,6 @@ class JsonLines:
 
 
 def _lines(rows: Cells) -> bytes:
-    numbers = zip(*(map(number, cells) for cells in rows.values()), strict=True)
+    numbers = zip(*(map(parse_cell, cells) for cells in rows.values()), strict=True)
     objects = (finite(dict(zip(rows, row, strict=True))) for row in numbers)
     return "".join(json.dumps(each, allow_nan=False) + "\n" for each in objects).encode()

@@ -14,7 +14,7 @@ _QUANTILES = (5, 25, 50, 75, 95)
 _WITH_INTERVAL = ("eval_return",)
 
 
-def step(rows: Cells) -> int:
+def chart_step(rows: Cells) -> int:
     """Returns the place of an evaluation on the axis of charts: the most updates of a seed."""
     return max(map(int, rows["update"]))
 

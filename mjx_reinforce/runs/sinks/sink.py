@@ -91,7 +91,7 @@ def files(directory: Path) -> list[Path]:
     return [directory / json_lines.NAME, directory / weights_and_biases.NAME]
 
 
-def remove(directory: Path) -> None:
+def remove_outputs(directory: Path) -> None:
     """Removes what the sinks of an older run left; W&B keeps its runs apart itself."""
     from mjx_reinforce.runs.sinks import tensorboard
 

@@ -59,7 +59,7 @@ class TensorBoard:
             if len(finite) > 1:
                 counts = make_histogram(finite, _edges(finite))
                 shown.append(summary.Value(tag=f"{name}/seeds", histo=counts))
-        step, now = over_seeds.step(rows), time.time()
+        step, now = over_seeds.chart_step(rows), time.time()
         append(self._path, _record(event(wall_time=now, step=step, summary=summary(value=shown))))
 
     def close(self) -> None:

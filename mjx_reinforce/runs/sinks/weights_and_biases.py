@@ -53,7 +53,7 @@ class WeightsAndBiases:
 
     def write(self, rows: Cells) -> None:
         """Logs the rows of one evaluation, or raises OSError."""
-        step = over_seeds.step(rows)
+        step = over_seeds.chart_step(rows)
         if step <= self._logged:
             return
         with _errors_as_os_errors():
@@ -72,7 +72,7 @@ class WeightsAndBiases:
 
 @contextlib.contextmanager
 def _errors_as_os_errors(remedy: str = "") -> Iterator[None]:
-    """Raises W&B's own errors as OSError: a run warns of those, and goes on."""
+    """Raises W&B's own errors as OSError: a run warns of an OSError and continues."""
     import wandb
 
     try:

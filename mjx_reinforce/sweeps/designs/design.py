@@ -11,9 +11,9 @@ import tyro
 from mjx_reinforce.files import read_json
 from mjx_reinforce.hosts.processes import ProcessSettings, check_processes
 from mjx_reinforce.settings.config import Config, check_each, flag
-from mjx_reinforce.settings.memory import check_size, gigabytes, host_memory
+from mjx_reinforce.settings.memory import check_memory, gigabytes, host_memory
 from mjx_reinforce.sweeps.designs.grid import check_over, configure, grid
-from mjx_reinforce.sweeps.designs.search import draw
+from mjx_reinforce.sweeps.designs.search import draw_configurations
 from mjx_reinforce.training.resume import PLACES, as_config
 
 #: What writing results.csv and curves.npz needs for a run with two evaluations (bytes).
@@ -53,7 +53,7 @@ class Design:
     budget: how many configurations are drawn, None for a grid
     given: other settings that the user chose; at least one configuration must read each
     exact: see ``SweepSettings``
-    chunk_runs: likewise
+    chunk_runs: see ``SweepSettings``
     processes: those that train it
     resume: the directory of a sweep that goes on
     """
@@ -76,7 +76,7 @@ class Design:
         """Returns the values of what is swept, in each configuration."""
         if self.budget is None:
             return grid(self.over)
-        return draw(self.over, self.budget, self.base.seed)
+        return draw_configurations(self.over, self.budget, self.base.seed)
 
 
 def as_record(design: Design) -> dict[str, Any]:
@@ -131,7 +131,7 @@ def check_design(design: Design) -> None:
         raise ValueError("--distributed needs --output, a directory that all processes see")
     configs = configure(design.base, design.configurations(), design.given)
     for config in configs:
-        check_size(dataclasses.replace(config, num_seeds=1))
+        check_memory(dataclasses.replace(config, num_seeds=1))
 
 
 def _check_results(design: Design) -> None:

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from mjx_reinforce.runs.plan import duration, run_seconds, task_of, this_machine
+from mjx_reinforce.runs.plan import duration, run_seconds, task_of, this_hardware
 from mjx_reinforce.settings.memory import gigabytes, needed, num_cores
 from mjx_reinforce.store.build import policy_settings
 from mjx_reinforce.sweeps.designs.groups import Group
@@ -19,7 +19,7 @@ _CPU_EPISODES = (128,)
 _GPU_EPISODES = (65_536, 8_192)
 
 
-class Part(NamedTuple):
+class GroupPlan(NamedTuple):
     """How the runs of a group are divided.
 
     num_chunks: of about the same size
@@ -30,7 +30,7 @@ class Part(NamedTuple):
     widths: tuple[int, ...]
 
 
-def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> Part:
+def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> GroupPlan:
     """Returns how the runs of a group are divided.
 
     Args:
@@ -42,11 +42,11 @@ def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> Part:
     total = len(group.members) * group.config.num_seeds
     num_chunks = -(-total // limit)
     if exact:
-        return Part(num_chunks, (num_devices,))
+        return GroupPlan(num_chunks, (num_devices,))
     most = -(-total // (num_chunks * num_devices))
-    side = _CPU_EPISODES if this_machine().shared else _GPU_EPISODES
+    side = _CPU_EPISODES if this_hardware().shared else _GPU_EPISODES
     each = {min(most, -(-count // group.config.episodes_per_update)) for count in side}
-    return Part(num_chunks, tuple(num_devices * width for width in sorted(each, reverse=True)))
+    return GroupPlan(num_chunks, tuple(num_devices * width for width in sorted(each, reverse=True)))
 
 
 def chunk_limit(
@@ -78,7 +78,7 @@ def chunk_limit(
 def _capacity(env: Environment, horizon: int, group: Group, num_devices: int) -> int:
     """Returns how many runs memory holds side by side."""
     one = dataclasses.replace(group.config, num_seeds=1)
-    task, machine = task_of(policy_settings(env, one), horizon, one), this_machine()
+    task, machine = task_of(policy_settings(env, one), horizon, one), this_hardware()
     memory = machine.memory - task.base_memory if machine.shared else machine.memory * num_devices
     capacity = int(_MEMORY * memory / needed(one, task))
     if capacity < num_devices:
@@ -89,12 +89,12 @@ def _capacity(env: Environment, horizon: int, group: Group, num_devices: int) ->
     return capacity
 
 
-def describe(
+def describe_plan(
     env: Environment,
     horizon: int,
     learners: Sequence[Any],
     groups: Sequence[Group],
-    parts: Sequence[Part],
+    parts: Sequence[GroupPlan],
     num_devices: int,
     part_trained: float,
 ) -> str:
@@ -109,7 +109,7 @@ def describe(
       num_devices: on which they are.
       part_trained: of the budgets of all runs, see ``rungs.part_trained``.
     """
-    first, machine = groups[0].config, this_machine()
+    first, machine = groups[0].config, this_hardware()
     configurations = sum(len(group.members) for group in groups)
     runs, chunks = configurations * first.num_seeds, sum(part.num_chunks for part in parts)
     at_once = num_cores() if machine.shared else 1  # slots
@@ -149,7 +149,7 @@ def _time(
         if seconds is None:
             return "How long this takes here is not known"
         total += part_trained * seconds
-    compiling = duration(this_machine().speeds[groups[0].config.env].compiling)
+    compiling = duration(this_hardware().speeds[groups[0].config.env].compiling)
     return f"Compiling takes about {compiling} each, training about {duration(total)}"
 
 
@@ -165,7 +165,7 @@ def group_seconds(
       group: of configurations, with their budget.
       num_devices: on which they are.
     """
-    machine, num_seeds = this_machine(), len(group.members) * group.config.num_seeds
+    machine, num_seeds = this_hardware(), len(group.members) * group.config.num_seeds
     config = dataclasses.replace(group.config, num_seeds=num_seeds)
     speed = machine.speeds.get(config.env)
     if speed is None or engine != speed.engine:

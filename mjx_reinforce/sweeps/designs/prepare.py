@@ -8,7 +8,7 @@ from mjx_reinforce.store.build import build
 from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.designs.grid import configure
 from mjx_reinforce.sweeps.designs.groups import Group, make_groups
-from mjx_reinforce.sweeps.designs.plan import chunk_limit, describe, divide
+from mjx_reinforce.sweeps.designs.plan import chunk_limit, describe_plan, divide
 from mjx_reinforce.sweeps.designs.rungs import part_trained
 from mjx_reinforce.sweeps.slots.devices import Devices
 
@@ -66,6 +66,6 @@ def prepare_sweep(design: Design, limits: Sequence[int] | None, num_processes: i
     ]
     learners = [learner for learner, _ in built]
     trained = part_trained(design.search, len(configurations))
-    plan = describe(env, horizon, learners, groups, parts, devices.count, trained)
+    plan = describe_plan(env, horizon, learners, groups, parts, devices.count, trained)
     engine = learners[0].engine.name, sum(learner.engine.seconds for learner in learners)
     return Prepared(env, horizon, devices, configurations, groups, list(limits), *engine, plan)

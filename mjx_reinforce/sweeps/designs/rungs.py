@@ -12,11 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.files import Arrays
 from mjx_reinforce.reports.statistics import iqm, iqm_interval
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps.designs.groups import Group
-
-Arrays = dict[str, np.ndarray]
 
 #: The part of a rung's budget that runs which go on have not used before.
 _ADDED = 0.5
@@ -50,7 +49,7 @@ def _num_halvings(search: str, configurations: int) -> int:
     return (configurations - 1).bit_length() if search == "halving" else 0
 
 
-def count(search: str, configurations: int) -> int:
+def num_rungs(search: str, configurations: int) -> int:
     """Returns how many rungs a sweep has."""
     return 1 + _num_halvings(search, configurations) + (search != "grid")
 
@@ -65,7 +64,7 @@ def part_trained(search: str, configurations: int) -> float:
     return (steps + (search != "grid")) / configurations
 
 
-def schedule(
+def plan_rungs(
     groups: Sequence[Group], search: str, measured: Callable[[str], Arrays]
 ) -> Iterator[Rung]:
     """Yields the rungs of a sweep; each must have been trained before the next is asked for.

@@ -15,7 +15,9 @@ _DIGITS = 4
 _PATIENCE = 100
 
 
-def draw(over: Mapping[str, Sequence[Any]], count: int, seed: int) -> list[dict[str, Any]]:
+def draw_configurations(
+    over: Mapping[str, Sequence[Any]], count: int, seed: int
+) -> list[dict[str, Any]]:
     """Returns different configurations, drawn at random.
 
     Two numbers are the ends of a range: of rates, standard deviations, floors and norms evenly in

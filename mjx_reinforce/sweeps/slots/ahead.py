@@ -9,7 +9,7 @@ from typing import Any
 
 
 @dataclasses.dataclass
-class Clock:
+class Stopwatch:
     """Where the time of a sweep goes (s).
 
     compiling: with nothing trained beside it

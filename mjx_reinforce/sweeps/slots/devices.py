@@ -33,7 +33,7 @@ class Devices:
         Args:
           function: of arrays that hold one device's part.
           in_specs: for its arguments, how they are divided.
-          out_specs: likewise, for its result.
+          out_specs: for its result, how it is divided.
           options: of ``jax.jit``.
         """
         mapped = jax.shard_map(

@@ -14,7 +14,7 @@ from jax import lax
 from mjx_reinforce.types import PyTree
 
 
-class Layout:
+class StateRows:
     """Writes the states of runs as rows [R, B] of bytes, and reads them; no bit changes."""
 
     def __init__(self, like: PyTree):

@@ -2,7 +2,7 @@
 
 A compiled program moves a fixed number of runs at once, a slot, and takes about as long as the
 longest episode in it, whether the others still train or not. So before a block of updates the
-runs that still train are sorted by the length of their episodes and packed into slots anew. Runs
+runs that still train are sorted by the length of their episodes and packed into slots again. Runs
 whose budget is used lie aside. The packing follows from what a checkpoint holds, so that a resumed
 run packs as it would have.
 """
@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 
-def pack(
+def pack_slots(
     chosen: np.ndarray, lengths: np.ndarray, widths: Sequence[int], num_devices: int
 ) -> np.ndarray:
     """Returns the runs of each slot.

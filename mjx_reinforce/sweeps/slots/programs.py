@@ -16,10 +16,10 @@ from mjx_reinforce.learners.learner import Host
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.settings.memory import num_cores
 from mjx_reinforce.sweeps.history import Measured
-from mjx_reinforce.sweeps.slots.ahead import Clock, started
+from mjx_reinforce.sweeps.slots.ahead import Stopwatch, started
 from mjx_reinforce.sweeps.slots.devices import NONE, RUNS, Devices
-from mjx_reinforce.sweeps.slots.layout import Layout
-from mjx_reinforce.sweeps.slots.packing import pack
+from mjx_reinforce.sweeps.slots.layout import StateRows
+from mjx_reinforce.sweeps.slots.packing import pack_slots
 from mjx_reinforce.training.state import (
     Arrays,
     Budget,
@@ -42,7 +42,7 @@ _LOOKED = ("eval_return", "eval_steps")
 
 
 class Movers(NamedTuple):
-    """What moves the runs of one slot on. States are rows of bytes, see ``layout.Layout``.
+    """What moves the runs of one slot on. States are rows of bytes, see ``layout.StateRows``.
 
     block: (states [W, B], which lanes have a run [W], budget) -> (states [W, B], which runs made an
       update [W], and what ``history.Measured`` has of updates [W], and of evaluations where these
@@ -56,14 +56,14 @@ class Movers(NamedTuple):
     rides: bool
 
 
-class Programs(NamedTuple):
+class SlotPrograms(NamedTuple):
     """The compiled programs of a group. States of runs [R, B] are on the host between them.
 
     begin: (data of keys [R, 2] and of those of evaluations [R, 2], settings [R] each) -> the first
       states
     movers: by the width of a slot, the widest first; the narrower ones may still be compiling
-    keys: [S, 2], the data of those that the seeds begin with
-    eval_keys: [S, 2], the data of those of the seeds' evaluations, the same in all configurations
+    keys: [S, 2], the data of the keys that the seeds begin with
+    eval_keys: [S, 2], the data of the keys of evaluations, the same in all configurations
     limits: the budget of each run, on all devices
     whole: the settings of all that a run is to do, in one or more parts
     devices: among which a slot is divided
@@ -80,10 +80,10 @@ class Programs(NamedTuple):
     whole: Config
     devices: Devices
     shape_of: Callable[[int], RunState]
-    layout: Layout
-    clock: Clock
+    layout: StateRows
+    clock: Stopwatch
 
-    def of(self, config: Config) -> "Programs":
+    def of(self, config: Config) -> "SlotPrograms":
         """Returns the same programs for settings with a part of the budget, or another seed."""
         return self._replace(**_inputs(config, self.whole, self.devices))
 
@@ -95,9 +95,9 @@ class Programs(NamedTuple):
         Args:
           states: [R, B] of all runs; changed.
           training: [R] which of them still train; at least one does.
-          lengths: [R] about how long their episodes are, see ``packing.pack``.
+          lengths: [R] about how long their episodes are, see ``packing.pack_slots``.
           blocks: how many, where one of the narrowest slots holds these runs. Else they are packed
-            anew after one.
+            again after one.
 
         Returns:
           What each block measured, of the runs that made an update; none without any.
@@ -131,7 +131,7 @@ class Programs(NamedTuple):
 
     def _pack(self, chosen: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, Movers]:
         """Returns the runs of each slot, and what moves them."""
-        lanes = pack(chosen, lengths, list(self.movers), self.devices.count)
+        lanes = pack_slots(chosen, lengths, list(self.movers), self.devices.count)
         return lanes, self.clock.wait(self.movers[lanes.shape[1]])
 
     def _put(self, slot: PyTree) -> Any:
@@ -170,8 +170,8 @@ def compile_programs(
     traced: Collection[str],
     widths: Sequence[int],
     devices: Devices,
-    clock: Clock,
-) -> Programs:
+    clock: Stopwatch,
+) -> SlotPrograms:
     """Compiles the programs of a group for the widest slot, and begins with the narrower ones.
 
     These are traced while the widest are compiled: a sweep of some seconds soon needs them.
@@ -181,19 +181,19 @@ def compile_programs(
       build_learner: from the traced settings of a run to its learner.
       horizon: T, the time limit of an episode in steps.
       config: the settings, in which those that are traced stand for any value.
-      traced: the names of those that are.
+      traced: the names of the settings that are traced.
       widths: how many runs a slot may have, the most first; multiples of the number of devices.
       devices: where.
       clock: of the sweep.
     """
-    layout = Layout(shape_of_states(build_learner, traced, 1))
+    layout = StateRows(shape_of_states(build_learner, traced, 1))
     compile_for = functools.partial(_movers, env, build_learner, horizon, config, traced, devices)
     compile_for = functools.partial(compile_for, layout, threading.Lock())
     movers = {width: started(functools.partial(compile_for, width)) for width in widths}
     begin = started(functools.partial(_begin, build_learner, traced, widths[0], devices, layout))
     inputs = started(functools.partial(_inputs, config, config, devices))
     movers[widths[0]].result()
-    return Programs(
+    return SlotPrograms(
         begin=begin.result(),
         movers=movers,
         whole=config,
@@ -206,7 +206,7 @@ def compile_programs(
 
 
 def _inputs(config: Config, whole: Config, devices: Devices) -> dict[str, Any]:
-    """Returns what is no part of a program, as ``Programs`` has it."""
+    """Returns what is no part of a program, as ``SlotPrograms`` has it."""
     part, all_of_it = budget_of(config), budget_of(whole)
     budget = Budget(part.env_steps, part.updates, all_of_it.env_steps, all_of_it.updates)
     keys = jax.device_get(plain({"keys": seed_keys(config), "eval_keys": eval_keys(config)}))
@@ -235,9 +235,9 @@ def _begin(
     traced: Collection[str],
     width: int,
     devices: Devices,
-    layout: Layout,
+    layout: StateRows,
 ) -> Callable[..., np.ndarray]:
-    """Compiles ``Programs.begin``, which begins ``width`` runs at once."""
+    """Compiles ``SlotPrograms.begin``, which begins ``width`` runs at once."""
 
     def first(keys: jax.Array, eval_keys: jax.Array, settings: dict[str, jax.Array]) -> jax.Array:
         typed = map(jax.random.wrap_key_data, (keys, eval_keys))
@@ -267,13 +267,13 @@ def _movers(
     config: Config,
     traced: Collection[str],
     devices: Devices,
-    layout: Layout,
+    layout: StateRows,
     tracing: threading.Lock,
     width: int,
 ) -> Movers:
     """Compiles what moves slots of ``width`` runs; the arguments are ``compile_programs``'.
 
-    Programs are traced one after the other, by whoever holds ``tracing``.
+    Programs are traced one after the other; the lock ``tracing`` is held meanwhile.
     """
     with ThreadPoolExecutor() as pool, tracing:  # the first compiles while the second is traced
         like = jax.eval_shape(beginning(build_learner), *_arguments(traced, width))

@@ -26,7 +26,7 @@ class Field:
 
 
 @dataclasses.dataclass(frozen=True)
-class Layout:
+class VectorLayout:
     """Where everything is.
 
     inputs: the leaves of the arguments of a step: actor, state, keys, t, deterministic, alive.
@@ -80,7 +80,7 @@ class Layout:
         return self.inputs[-1]
 
 
-def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> Layout:
+def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> VectorLayout:
     """Returns where the lanes' values are.
 
     Args:
@@ -106,4 +106,4 @@ def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> Layout:
 
     inputs = [field(x.dtype, int(np.prod(x.shape, dtype=int))) for x in leaves]
     others = [field(np.int32, 1), *(field(np.int64, 1) for _ in range(3))]
-    return Layout(inputs, actor, state, *others, size=end)
+    return VectorLayout(inputs, actor, state, *others, size=end)

@@ -107,7 +107,7 @@ def _check_level(level: str, triple: str, features: dict[str, bool]) -> int:
     return LEVELS[level][0]
 
 
-def load(
+def load_module(
     source: str,
     write: Callable[[], str],
     names: tuple[str, ...],
@@ -129,11 +129,11 @@ def load(
     key = _key(source, names, machine)
     with _LOCK:
         if key not in _LOADED:
-            found = objects.read(folder, key) if folder else None
+            found = objects.read_object(folder, key) if folder else None
             data = found or _compile(write(), machine)
             _LOADED[key] = Code(key, _link(key, names, data), compiled=not found)
             if folder and not found:
-                objects.write(folder, key, data)
+                objects.write_object(folder, key, data)
         return _LOADED[key]
 
 
@@ -146,7 +146,7 @@ def loaded(key: str, names: tuple[str, ...], folder: Path) -> Code | None:
     """Returns the functions of a module by the key of their ``Code``; None if it is not on disk."""
     with _LOCK:
         if key not in _LOADED:
-            data = objects.read(folder, key)
+            data = objects.read_object(folder, key)
             if data is None:
                 return None
             _LOADED[key] = Code(key, _link(key, names, data), compiled=False)

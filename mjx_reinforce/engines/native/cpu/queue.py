@@ -11,7 +11,7 @@ from string import Template
 
 from mjx_reinforce.engines.native import plays
 from mjx_reinforce.engines.native.cpu import handler
-from mjx_reinforce.engines.native.cpu.lanes import Field, Layout
+from mjx_reinforce.engines.native.cpu.lanes import Field, VectorLayout
 
 #: The buffers of a call: so many arguments of its own, those of the actor and the state, the
 #: results, of which so many are records of steps.
@@ -19,7 +19,7 @@ NUM_CONTROLS, NUM_RECORDS = 3, 3
 _LENGTH, _BROKEN = 3, 4
 
 
-def queue_text(places: Layout, lanes: int) -> str:
+def queue_text(places: VectorLayout, lanes: int) -> str:
     """Returns ``@begin``, ``@finish`` and ``@settle`` for lanes whose values are at ``places``."""
     actor, state = places.actor_fields, places.state_fields
     first_state = NUM_CONTROLS + len(actor)

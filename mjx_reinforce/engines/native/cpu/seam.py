@@ -32,7 +32,7 @@ def call(
     Args:
       code: functions of ``handler.NAMES``.
       results: shapes and dtypes of what it returns, as ``handler.handler_text`` says.
-      args: arrays, likewise; vmapped, all get the new axis in front.
+      args: arrays, as ``handler.handler_text`` says; vmapped, all get the new axis in front.
     """
     if way(code) == "callback":
         play = functools.partial(_play, code, results)

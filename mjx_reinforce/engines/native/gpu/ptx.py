@@ -38,7 +38,9 @@ class Kernel(NamedTuple):
     compiled: bool
 
 
-def load(source: str, write: Callable[[], str], capability: str, folder: Path | None) -> Kernel:
+def load_kernel(
+    source: str, write: Callable[[], str], capability: str, folder: Path | None
+) -> Kernel:
     """Returns a kernel, compiled unless memory or disk has it.
 
     Args:
@@ -53,11 +55,11 @@ def load(source: str, write: Callable[[], str], capability: str, folder: Path | 
     key = _key(source, capability)
     with _LOCK:
         if key not in _LOADED:
-            found = objects.read(folder, key) if folder else None
+            found = objects.read_object(folder, key) if folder else None
             text = found.decode() if found else _compile(write(), capability)
             _LOADED[key] = Kernel(key, text, *_facts(text), compiled=not found)
             if folder and not found:
-                objects.write(folder, key, text.encode())
+                objects.write_object(folder, key, text.encode())
         return _LOADED[key]
 
 

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.engines.native.gpu import player, ptx
+from mjx_reinforce.engines.native.gpu import ptx
+from mjx_reinforce.engines.native.gpu.kernel import ENTRY
 
 #: XLA's name of what launches a kernel.
 PTX = "__gpu$xla.gpu.ptx"
@@ -42,7 +43,7 @@ _PROBE = """
 """
 
 
-def unavailable() -> str | None:
+def kernels_unavailable() -> str | None:
     """Returns why kernels of ours cannot run on this GPU, None if they can."""
     import llvmlite.binding as llvm
 
@@ -83,7 +84,7 @@ def compute_capability() -> str:
     return str(getattr(jax.devices()[0], "compute_capability", ""))
 
 
-def this_machine() -> str:
+def kernel_dependencies() -> str:
     """Returns what a program with kernels depends on."""
     processors = jax.devices()[0].core_count
     return f"compute capability {compute_capability()}, {processors} multiprocessors"
@@ -95,7 +96,7 @@ def launch(
     """Runs a kernel on a GPU; vmapped, it remains one launch.
 
     Args:
-      kernel: of ``player.kernel_text``.
+      kernel: of ``kernel.kernel_text``.
       record: shape and dtype of the observation, the action and the reward of a step.
       horizon: T, the steps of an episode at most.
       args: plays [N], keys [N, 2], and the leaves of the actor [...] and of the state [N, ...].
@@ -134,7 +135,7 @@ def _launch(
     grid = _grid(seeds * episodes, kernel.threads, kernel.blocks)
     words = kernel.scratch * math.prod(grid)
     scratch = [shape((words,), jnp.int32)] if words else []
-    return _call(kernel.text, player.ENTRY, grid, given, zeros, scratch)[: len(zeros) - 1]
+    return _call(kernel.text, ENTRY, grid, given, zeros, scratch)[: len(zeros) - 1]
 
 
 def _call(

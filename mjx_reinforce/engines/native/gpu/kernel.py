@@ -190,7 +190,7 @@ class _Kernel:
             self._end(goes_on, broken)
 
     def _keep(self, records: list[list[Any]], seed: str, carried: list[list[Any]]) -> None:
-        """Writes what a step leaves: records, and what goes on into the next."""
+        """Writes what a step leaves: records, and what the next step reads."""
         text = self.text
         self._record(records, seed)
         for leaf, to in zip(carried, self.own, strict=False):

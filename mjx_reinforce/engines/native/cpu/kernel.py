@@ -11,7 +11,7 @@ import numpy as np
 
 from mjx_reinforce.engines.native.cpu import handler
 from mjx_reinforce.engines.native.cpu.denormals import Flush
-from mjx_reinforce.engines.native.cpu.lanes import ALIGNMENT, Field, Layout, layout
+from mjx_reinforce.engines.native.cpu.lanes import ALIGNMENT, Field, VectorLayout, layout
 from mjx_reinforce.engines.native.cpu.queue import NUM_CONTROLS, NUM_RECORDS, queue_text
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.fused.backends.llvm import LLVM, Input
@@ -40,7 +40,7 @@ def player_text(step: scalarized.Scalarized, num_actor: int, lanes: int, flush: 
 class _Work:
     """Writes ``@work``; pointers are to the lane vectors of its memory."""
 
-    def __init__(self, text: Text, places: Layout):
+    def __init__(self, text: Text, places: VectorLayout):
         self.text, self.places = text, places
         self.room, self.memory = self._allocate()
         self.inputs = [self._pointer(field) for field in places.inputs]
