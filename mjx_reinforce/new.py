@@ -16,8 +16,6 @@ from mjx_reinforce.files import write_bytes
 from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 
 if TYPE_CHECKING:
-    import mujoco
-
     from mjx_reinforce.types import MjModel
 
 #: What is named in the class, by mjData's arrays whose rows it numbers.
@@ -205,6 +203,8 @@ def _name(name: str, kind: str, number: int) -> str:
 
 def _moved(model: "MjModel", number: int) -> str:
     """Returns the name of an actuator, or of the joint that it moves."""
+    import mujoco
+
     kinds: Any = mujoco
     joints = int(kinds.mjtTrn.mjTRN_JOINT), int(kinds.mjtTrn.mjTRN_JOINTINPARENT)
     name = model.actuator(number).name
