@@ -7,7 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.runs.state import Programs
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps.designs.groups import Group
 from mjx_reinforce.sweeps.history import History, Measured
@@ -129,7 +128,7 @@ class Chunk:
 
     def __init__(
         self,
-        programs: Programs,
+        programs: SlotPrograms,
         states: np.ndarray,
         history: History,
         observers: Sequence[Callable[[], None]],
