@@ -15,6 +15,8 @@ except ImportError as error:
         "(wsl --install)"
     ) from error
 
+#: What a kill leaves of the first file of a run or a sweep, which then was not begun.
+_FIRST = (".config.json.", ".sweep.json.")
 #: A disk with less room (bytes) is full: the files of a small run take about as much.
 _ROOM = 2**20
 
@@ -51,7 +53,7 @@ def make_directory(directory: Path, overwrite: bool) -> list[Path]:
                 made.insert(0, folder)
         # Where a run was killed as it wrote its first file, nothing was begun.
         names = [path.name for path in directory.iterdir()]
-        if any(not name.startswith(".config.json.") for name in names) and not overwrite:
+        if any(not name.startswith(_FIRST) for name in names) and not overwrite:
             raise ValueError(
                 f"the run directory {directory} is not empty; choose another --output, "
                 "or pass --overwrite to replace the run in it"

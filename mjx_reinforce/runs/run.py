@@ -107,6 +107,11 @@ def run(
       OSError: the last files of the run cannot be written.
     """
     check_kind("config", config, Config, 'mjx_reinforce.of_task("Hopper-v5")')
+    if not (isinstance(observers, Sequence) and all(map(callable, observers))):
+        raise ValueError(
+            "observers must be a list of functions of one Evaluation, such as "
+            f"[lambda evaluation: print(evaluation.seconds)], got {observers!r}"
+        )
     if config.resume is not None:
         raise ValueError(
             f"run() begins a run: go on with {config.resume} by python -m mjx_reinforce.train "

@@ -115,8 +115,7 @@ def _perform(
             if interrupt is not None:
                 interrupt.defer(display.say)
             if first:
-                files.open()
-                files.write(contents)
+                files.open(contents)
             processes.meet()
 
         if interrupt is not None:

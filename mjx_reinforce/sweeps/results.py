@@ -55,21 +55,28 @@ class SweepFiles:
         self._threshold = threshold
         self._columns = ("configuration", *configurations[0], *_MEASURED)
 
-    def open(self) -> None:
-        """Begins, or takes the files back to the parts that are there."""
-        (self._resume if self._going_on else self._begin)()
+    def open(self, contents: Mapping[str, Any]) -> None:
+        """Begins, or takes results.csv back to the parts that are there.
 
-    def _begin(self) -> None:
-        """Writes a results.csv without rows; removes an older sweep."""
+        Of a new sweep sweep.json is first: where that cannot be written, nothing was begun.
+
+        Args:
+          contents: of sweep.json.
+        """
+        if not self._going_on:
+            self._remove_older()
+        self.write(contents)
+        self._take_back()
+
+    def _remove_older(self) -> None:
+        """Removes an older sweep in the directory, all but its report, which is replaced."""
         for path in [*self.parts.glob("*.npz"), *self.parts.glob("*/*.npz")]:
             path.unlink()
         shutil.rmtree(self.directory / "policies", ignore_errors=True)
-        for name in _RESULTS[1:]:  # a report is replaced when there is a new one
+        for name in _RESULTS[1:]:
             (self.directory / name).unlink(missing_ok=True)
-        self.parts.mkdir(exist_ok=True)
-        files.create_csv(self.directory / "results.csv", self._columns)
 
-    def _resume(self) -> None:
+    def _take_back(self) -> None:
         """Takes results.csv back to the parts that are there, and removes what a crash left."""
         self.parts.mkdir(exist_ok=True)
         for folder, names in ((self.directory, _RESULTS), (self.parts, ("*.npz",))):

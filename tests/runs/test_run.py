@@ -85,6 +85,9 @@ def test_players_of_seeds(results):
 def test_what_makes_no_sense_is_refused(tmp_path):
     with pytest.raises(ValueError, match="config must be of type Config"):
         mjx_reinforce.run("Hopper-v5")
+    for observers in (print, [3]):
+        with pytest.raises(ValueError, match="observers must be a list of functions of one"):
+            mjx_reinforce.run(CONFIG, observers=observers)
     with pytest.raises(ValueError, match="run\\(\\) begins a run"):
         mjx_reinforce.run(dataclasses.replace(CONFIG, resume=tmp_path))
     with pytest.raises(ValueError, match="--num-seeds must be at least 1"):

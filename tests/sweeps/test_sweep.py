@@ -427,6 +427,21 @@ def test_a_sweep_that_crashed_goes_on(run, monkeypatch, where):
     assert run("--resume crashed --learning-rate 0.5") == 2
 
 
+def test_a_sweep_whose_first_file_cannot_be_written_was_not_begun(run, monkeypatch):
+    """The same command line begins it once there is room."""
+
+    def full(path, contents):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    command = f"{STEPS} --num-seeds 2 --output out"
+    with monkeypatch.context() as patch:
+        patch.setattr("mjx_reinforce.sweeps.results.write_json", full)
+        assert run(command) == 1
+    Path("out").mkdir(exist_ok=True)
+    (Path("out") / ".sweep.json.12ab").write_text("half")
+    assert run(command) == 0
+
+
 def test_what_a_kill_left_of_a_report_goes(tmp_path, monkeypatch):
     """A write that was killed leaves a file with a name of its own."""
     (tmp_path / "report").mkdir()
