@@ -130,8 +130,8 @@ def callee(eqn: Equation) -> Program | None:
         avals = [variable.aval for variable in eqn.invars]
         return program(jax.make_jaxpr(eqn.params["_prim"].expand)(*avals))
     if eqn.primitive.name == "random_bits":  # a key is an array of its words
-        key_type: Any = eqn.invars[0].aval.dtype
-        implementation = key_type._impl
+        key: Any = eqn.invars[0].aval
+        implementation = key.dtype._impl
         width, shape = eqn.params["bit_width"], eqn.params["shape"]
         words = jax.ShapeDtypeStruct(implementation.key_shape, np.uint32)
         return program(

@@ -12,8 +12,6 @@ from mjx_reinforce.export.player import Player
 from mjx_reinforce.playing.mjx_playing import Episode
 
 if TYPE_CHECKING:
-    import mujoco
-
     from mjx_reinforce.types import Environment, MjModel
 
 #: A push: when the first begins, how often another does, and how long it lasts (s).
@@ -95,6 +93,8 @@ def push_at(seconds: float, push: float) -> float:
 
 def pushed_body(model: "MjModel") -> int:
     """Returns the number of the body that is pushed: the highest in the model's pose."""
+    import mujoco
+
     kinds: Any = mujoco
     data = kinds.MjData(model)
     kinds.mj_kinematics(model, data)
