@@ -29,6 +29,7 @@ from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.store.ready import get_ready
 from mjx_reinforce.training.driver import Driver, Evaluation
+from mjx_reinforce.training.initial import last_actors
 
 
 class RunResults(NamedTuple):
@@ -128,6 +129,8 @@ def run(
             held.callback(remove_empty, make_directory(config.output, config.overwrite))
             held.enter_context(locked(config.output))
         ready = get_ready(config, config, envs.make(config.env))
+        if config.init_from is not None:
+            last_actors(config, ready.policy)  # refused before anything is compiled
         plan = make_plan(ready, config)
         display = Display()
         display.console.quiet = quiet

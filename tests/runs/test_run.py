@@ -95,6 +95,14 @@ def test_what_makes_no_sense_is_refused(tmp_path):
     assert [*tmp_path.iterdir()] == []
 
 
+def test_a_run_to_begin_from_is_looked_for_before_anything_is_compiled(tmp_path, monkeypatch):
+    monkeypatch.setattr("mjx_reinforce.runs.run.compile_driver", pytest.fail)
+    wanted = dataclasses.replace(CONFIG, init_from=str(tmp_path / "nowhere"))
+    with pytest.raises(ValueError, match="is no run directory"):
+        mjx_reinforce.run(wanted, output=tmp_path / "new", quiet=True)
+    assert [*tmp_path.iterdir()] == []
+
+
 def test_a_sweep_leaves_files_only_where_asked(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     swept = mjx_reinforce.sweep(CONFIG, {"discount": [0.9, 0.99]}, quiet=True)
