@@ -113,16 +113,14 @@ class RunSettings:
     )
     """Root of all randomness; the seeds' keys are split from it."""
     env_steps: int | None = setting(280_000, *TOTAL, Mark.BUDGET, Mark.NOT_COMPILED)
-    """Training budget of each seed in env steps. A seed stops after the update that reaches the
-    budget. If not given, the budget is about a minute of training on this machine. None: only
-    --max-updates ends training."""
+    """Training budget of each seed in env steps; a seed stops after the update that reaches it.
+    By default about a minute of training here. None: only --max-updates counts."""
     minutes: float | None = setting(
         None, Range.POSITIVE, Mark.BUDGET, Mark.NOT_COMPILED, once="it is for one run"
     )
-    """Approximate training time of all seeds together, in place of --env-steps. The first updates
-    show how many env steps that is. The number goes into config.json, so --like RUN repeats the run
-    to the last bit. If episodes grow longer, later steps are faster, above all on a GPU, and the
-    run ends early."""
+    """Training time of all seeds together, in place of --env-steps, which the first updates
+    measure and config.json keeps, so --like RUN repeats the run to the last bit. If episodes
+    grow, the run ends early."""
     max_updates: int | None = setting(None, *TOTAL, Mark.BUDGET, Mark.NOT_COMPILED)
     """Stop every seed after this many updates; with --num-episodes 1, as many episodes."""
     stop_when_solved: bool = setting(
@@ -135,25 +133,22 @@ class RunSettings:
     min_episodes: int = _for_reinforce(16, *SEVERAL, Reader.AUTO_EPISODES)
     """Minimum number of episodes of an update, with --num-episodes auto."""
     max_episodes: int = _for_reinforce(2048, *SEVERAL, Reader.AUTO_EPISODES)
-    """Maximum number of episodes of an update, with --num-episodes auto. Memory is reserved for
-    this number."""
+    """Maximum number of episodes of an update, with --num-episodes auto."""
     horizon: int | None = setting(None, *COUNT)
     """Time limit of an episode in env steps. If not given, the environment's own limit."""
     one_start: bool = False
-    """Begin all training episodes of a seed in one state; each seed has its own. Evaluations keep
-    their own starts, so they show what the policy does where it was not trained."""
+    """Begin all training episodes of a seed in one state; each seed has its own. Evaluations
+    keep their own starts."""
     engine: Literal["auto", "vmap", "fused", "native"] = setting(
         "auto", once="it changes no result but by rounding"
     )
-    """How episodes are played: vmap (the step mapped by jax.vmap), fused (the step written out as
-    scalar operations), native (whole episodes in machine code for this CPU or NVIDIA GPU), or auto,
-    the fastest here."""
+    """How episodes are played: vmap (the step mapped by jax.vmap), fused (written out as scalar
+    operations), native (machine code for this CPU or NVIDIA GPU), or auto, the fastest here."""
     like: Path | None = setting(None, Mark.PLACE, once="every configuration begins with it")
     """Take all settings from the run in this directory, except those on the command line."""
     init_from: str | None = setting(None, Mark.NOT_COMPILED, once="it is for one run")
-    """Start with the last policies of the run in this directory. The run must have the same policy
-    settings; its other settings may differ. Seed i starts with the policy of seed i modulo the
-    number of seeds of that run."""
+    """Start with the last policies of the run in this directory, which has the same policy
+    settings. Seed i starts with the policy of seed i modulo that run's seeds."""
     output: Path | None = setting(None, Mark.PLACE, once="it has one directory")
     """Directory of the run. If not given, runs/<env>-<time>."""
     overwrite: bool = setting(False, Reader.DIRECTORY, Mark.PLACE, once="it has one directory")
@@ -173,19 +168,17 @@ class PolicySettings:
     """Units of each tanh layer of the policy network. The flag without a number makes the policy
     linear."""
     shared_trunk: bool = True
-    """Compute means and stds in one network. Otherwise stds that depend on the state have a network
-    of their own."""
+    """Compute means and stds in one network; otherwise stds have their own."""
     initializer: Literal["orthogonal", "torch"] = "orthogonal"
-    """Initial weights. orthogonal: orthogonal matrices, scaled by 0.01 in the last layer, so that
-    an untrained policy acts alike in all states. torch: the uniform weights of torch.nn.Linear."""
+    """Initial weights. orthogonal: the last layer's scaled by 0.01, so that an untrained policy
+    acts alike everywhere. torch: the uniform weights of torch.nn.Linear."""
     initial_std: float = setting(0.5, *POSITIVE, Reader.STD, Mark.TRACED, Mark.LOG)
     """Standard deviation of the actions before training, in the action's unit."""
     final_std: float | None = _for_reinforce(
         None, *POSITIVE, Reader.DECAY_STEPS, Reader.FREE_STD, Mark.TRACED, Mark.LOG
     )
-    """Target of the standard deviation of the actions, reached over --decay-steps in addition to
-    what is learned. Without it, some policies learn to play well only with their noise. With
-    --max-kl the standard deviation may stay above the target. None: learned only."""
+    """Target of the standard deviation of the actions, reached over --decay-steps besides what
+    is learned. With --max-kl it may stay above. None: learned only."""
     rescale: bool = setting(True, Reader.CONTINUOUS)
     """Scale the mean so that an output of 1 is the end of the action's range. Otherwise the output
     of the network is the mean."""
@@ -195,9 +188,8 @@ class PolicySettings:
     normalize_min_std: float = setting(
         0.0, *NOT_NEGATIVE, Reader.NORMALIZATION, Mark.TRACED, Mark.LOG
     )
-    """Lower bound on the standard deviation that scales observations, in the observation's unit.
-    Without it, an entry that barely varies during the first steps is magnified for the rest of
-    training."""
+    """Lower bound on the std that scales observations, in the observation's unit: an entry that
+    barely varies in the first steps would be magnified."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -205,23 +197,20 @@ class EstimatorSettings:
     """What multiplies the gradient of an action's log-probability (reinforce)."""
 
     estimator: str = _for_reinforce("leave-one-out")
-    """What weights the gradient: total-return; reward-to-go; leave-one-out (reward-to-go minus the
-    mean of the other episodes); or value-baseline (reward-to-go minus a learned value).
-    mean-log-prob and normalized-returns reproduce published variants, which their docstrings
-    explain."""
+    """What weights the gradient: total-return; reward-to-go; leave-one-out (minus the mean of
+    the other episodes); value-baseline (minus a learned value). mean-log-prob and
+    normalized-returns are published variants; their docstrings explain them."""
     ended_episodes: Literal["zero", "skip"] = _for_reinforce("zero", Reader.LEAVE_ONE_OUT)
     """How leave-one-out counts other episodes that are over at a step. zero: as the 0 that they
-    still earn. skip: not at all, which is less noisy if episodes end at different times."""
+    still earn. skip: not at all, which may be less noisy."""
     discount: float = _for_reinforce(0.99, Range.SHARE, Mark.TRACED, Mark.LOG_OF_REST)
     """Discount of rewards, in [0, 1]."""
     final_discount: float | None = _for_reinforce(None, Range.SHARE, Mark.TRACED)
-    """Discount at the end of the budget. It changes evenly in the logarithm of 1 / (1 - discount),
-    the number of steps that it looks ahead: few suit noisy gradients, many suit precise ones. None:
-    the discount is constant."""
+    """Discount at the end of the budget. It changes evenly in the logarithm of 1 / (1 -
+    discount), the steps that it looks ahead. None: it is constant."""
     reward_shift: float = _for_reinforce(0.0, Range.FINITE, Mark.TRACED)
-    """Number subtracted from the reward of every step, in training only. An example is the bonus
-    for staying alive, which may keep a policy from moving (Mania et al. 2018). Reported returns do
-    not change."""
+    """Number subtracted from the reward of every step, in training only, such as the bonus for
+    staying alive (Mania et al. 2018). Reported returns do not change."""
     discount_weights: bool = _for_reinforce(False)
     """Multiply the weight at step t by discount^t. Most programs omit this factor."""
     standardize: bool = _for_reinforce(True)
@@ -237,10 +226,9 @@ class EstimatorSettings:
     value_fit: Literal["minibatches", "full-batch"] = _for_reinforce(
         "minibatches", Reader.VALUE_BASELINE
     )
-    """How the value network is trained. minibatches: the network reads the observation and the
-    time, and is fitted to steps drawn from the episodes, in units of the return's standard
-    deviation. full-batch, as in published programs: the network reads the observation only, and
-    each gradient step takes the whole rollout."""
+    """How the value network is trained. minibatches: it reads observation and time, and is
+    fitted to steps drawn from the episodes, in units of the return's std. full-batch, as in
+    published programs: it reads the observation only, and each step takes the whole rollout."""
     value_fits: int = _for_reinforce(32, *STEPS, Reader.VALUE_BASELINE)
     """Gradient steps of the value network in each update, on the squared error."""
     value_batch_size: int = _for_reinforce(
@@ -258,10 +246,10 @@ class UpdateSettings:
     update: Literal["full-batch", "natural-gradient", "minibatches", "each-step"] = _for_reinforce(
         "full-batch"
     )
-    """How a rollout changes the policy. full-batch: one optimizer step. natural-gradient: one step
-    along the natural gradient, whose length is --max-kl; a decay of the learning rate shortens it.
-    minibatches: several steps, each on env steps drawn from the rollout. each-step: one step for
-    each time step, in order. Only full-batch and natural-gradient measure gradient_snr."""
+    """How a rollout changes the policy. full-batch: one optimizer step. natural-gradient: one
+    step of length --max-kl, which a decay of the learning rate shortens. minibatches: several,
+    on steps drawn from the rollout. each-step: one for each time step, in order. Only the first
+    two measure gradient_snr."""
     natural_damping: float = _for_reinforce(0.1, *POSITIVE, Reader.NATURAL_GRADIENT, Mark.TRACED)
     """Number added to the diagonal of the Fisher matrix of natural-gradient. It shortens the step
     along directions in which the policy hardly changes."""
@@ -289,9 +277,8 @@ class UpdateSettings:
     )
     """Learning rate after the linear decay. If not given, a tenth of --learning-rate."""
     decay_steps: int | Literal["budget"] | None = _for_reinforce("budget", *TOTAL, Mark.TRACED)
-    """Env steps of a seed over which the learning rate decays, and with --final-std also the noise.
-    budget: the length of the run, by --env-steps or --max-updates. None: no decay, unless
-    --decay-updates gives one."""
+    """Env steps of a seed over which the learning rate decays, and with --final-std also the
+    noise. budget: the length of the run. None: no decay, unless --decay-updates gives one."""
     decay_updates: int | None = _for_reinforce(None, *COUNT)
     """Updates over which the learning rate decays. Requires --decay-steps None."""
     weight_decay: float = _for_reinforce(0.0, *NOT_NEGATIVE, Reader.OPTIMIZER)
@@ -303,9 +290,8 @@ class UpdateSettings:
     """Maximum Euclidean norm of the gradient; a longer gradient is scaled down. None: no
     maximum."""
     max_kl: float | None = _for_reinforce(None, *POSITIVE, Mark.TRACED, Mark.LOG)
-    """Approximate maximum of the mean KL divergence, in nats, between the policies before and after
-    an update, over the visited steps. A larger change is shortened. A new scale of the observations
-    is not counted. None: no maximum."""
+    """Approximate maximum of the mean KL divergence, in nats, between the policies before and
+    after an update, over the visited steps. A larger change is shortened. None: no maximum."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -334,8 +320,8 @@ class EvaluationSettings:
     eval_every: int = setting(5, *COUNT)
     """Updates between evaluations."""
     eval_episodes: int = setting(16, *COUNT)
-    """Episodes of an evaluation with the mode of the policy; as many are played with samples. Each
-    seed has its own starts, which are the same at every evaluation."""
+    """Episodes of an evaluation with the mode of the policy, and as many with samples. The
+    starts of a seed are the same at every evaluation."""
     test_episodes: int | None = setting(None, *COUNT, once="it has no test")
     """Episodes of the test at the end, from other starts than the evaluations. If not given,
     --eval-episodes. The test plays --eval-episodes at a time."""
@@ -350,8 +336,8 @@ class CheckpointSettings:
     checkpoint_every: int | None = setting(
         None, *COUNT, Mark.BUDGET, Mark.NOT_COMPILED, once="it is saved as a whole"
     )
-    """Updates between checkpoints, from which --resume continues. If not given, one is written
-    about every minute. Checkpoints are written after evaluations."""
+    """Updates between checkpoints, from which --resume continues; about a minute if not given.
+    They are written after evaluations."""
     resume: Path | None = setting(None, Mark.PLACE, once="it goes on as a whole")
     """Resume the run in this directory, with its own settings. Only the budget may change:
     --env-steps, --max-updates, --stop-when-solved, --checkpoint-every. If the environment is your

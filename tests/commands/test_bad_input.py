@@ -582,7 +582,7 @@ def test_help_is_of_some_hundred_lines_on_every_terminal(monkeypatch, capsys, co
     monkeypatch.setenv("COLUMNS", columns)
     with pytest.raises(SystemExit, match="0"):
         parse(["--help", "all"])
-    assert capsys.readouterr().out.count("\n") < 600
+    assert capsys.readouterr().out.count("\n") < 500
     assert os.environ["COLUMNS"] == columns
 
 
