@@ -71,7 +71,7 @@ def test_help_shows_the_defaults_of_the_task(capsys):
     for arguments, default in ((["--help"], "280000"), (["--help", "--env", "Ant-v5"], ant)):
         with pytest.raises(SystemExit):
             command_line.parse(arguments)
-        said = capsys.readouterr().out
+        said = " ".join(capsys.readouterr().out.replace("│", " ").split())
         assert f"(default: {default})" in said
         assert "Defaults depend on the task" in said
 
