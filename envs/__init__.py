@@ -76,6 +76,11 @@ def make(id: str, /, **kwargs: object) -> Any:
     return env
 
 
+def make_vec(env: Any, num_envs: int, **options: Any) -> Any:
+    """Makes N environments that play at once: ``mjx_reinforce.make_vec``, beside ``make``."""
+    return load_definition("mjx_reinforce.vector.environment:make_vec")(env, num_envs, **options)
+
+
 def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
     """Returns the class or function of an entry of the table, or of "module:Class"."""
     if ":" in id and not {"", os.getcwd()} & set(sys.path):  # python -m has it, a script has not

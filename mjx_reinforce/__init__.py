@@ -55,6 +55,8 @@ if TYPE_CHECKING:  # what type checkers and editors read in place of __getattr__
     from mjx_reinforce.training.driver import Evaluation
     from mjx_reinforce.training.evaluation import evaluate
     from mjx_reinforce.types import Box, Discrete, Environment, Trajectory
+    from mjx_reinforce.vector.environment import VectorEnv, make_vec
+    from mjx_reinforce.vector.episodes import VectorState
 
 _HOME = {
     "Config": "settings.config",
@@ -72,6 +74,9 @@ _HOME = {
     "probability_of_improvement": "reports.statistics.comparisons",
     "kaplan_meier": "reports.statistics.survival",
     "log_rank": "reports.statistics.survival",
+    "make_vec": "vector.environment",
+    "VectorEnv": "vector.environment",
+    "VectorState": "vector.episodes",
     "Learner": "learners.learner",
     "TrainState": "learners.learner",
     "reinforce": "learners.reinforce",
@@ -122,7 +127,7 @@ _HOME = {
 _MODULES = (
     *("console", "engines", "envs", "export", "files", "fused", "hosts", "learners", "physics"),
     *("playing", "policies", "registry", "reports", "runs", "settings", "store", "sweeps"),
-    *("training", "types"),
+    *("training", "types", "vector"),
 )
 
 __version__: str
@@ -143,6 +148,8 @@ __all__ = [
     "SweepResults",
     "TrainState",
     "Trajectory",
+    "VectorEnv",
+    "VectorState",
     "__version__",
     "act",
     "ars",
@@ -163,6 +170,7 @@ __all__ = [
     "load_policy",
     "log_rank",
     "make_optimizer",
+    "make_vec",
     "mean_interval",
     "mean_log_prob",
     "minibatches",

@@ -18,7 +18,18 @@ PACKAGE = ROOT / "mjx_reinforce"
 #: Folders and root modules from the ground up; a file imports from its own folder and those before.
 ORDER = (
     *("checks", "types", "registry", "files", "fused", "physics", "envs", "policies", "engines"),
-    *("learners", "console", "settings", "export", "reports", "training", "hosts", "store", "runs"),
+    *(
+        "learners",
+        "console",
+        "settings",
+        "vector",
+        "export",
+        "reports",
+        "training",
+        "hosts",
+        "store",
+        "runs",
+    ),
     *("playing", "report", "sweeps", "sweep", "train", "watch", "new", "__main__"),
 )
 #: Commands of folders, found where ``python -m`` looks for them. They use what comes later.
@@ -26,7 +37,7 @@ COMMANDS = {"envs.__main__"}
 #: Who may know that our environments exist; all others take any environment as an argument.
 MAY_IMPORT_ENVS = {
     *("envs", "settings", "training", "store", "runs", "playing", "sweeps"),
-    *("train", "watch", "new", "__main__"),
+    *("gym", "train", "vector", "watch", "new", "__main__"),
 }
 
 

@@ -17,6 +17,8 @@ _RULES = {
     **linear.RULES,
     **indexing.RULES,
 }
+#: What makes keys of words and words of keys.
+_KEYS_TO_WORDS = ("random_wrap", "random_unwrap")
 _CONTROL = {
     "while": loops.while_rule,
     "scan": loops.scan_rule,
@@ -69,6 +71,8 @@ def _apply(
         with graph.evaluating(eqn):
             return _CONTROL[name](graph, functools.partial(run, graph), eqn, used, *operands)
     if name in _RULES:
+        if name not in _KEYS_TO_WORDS and any(jaxprs.is_key(atom.aval) for atom in eqn.invars):
+            return _word_by_word(graph, eqn, operands)
         return _settled(eqn, _RULES[name](graph, eqn, *operands))
     program = jaxprs.callee(eqn)
     if program is not None:
@@ -78,6 +82,17 @@ def _apply(
     if all(map(arrays.is_numeric, operands)) and not makes_keys:
         return jaxprs.evaluate(eqn.primitive.bind, eqn.params, operands)
     raise no_rule(name, graph.source(eqn))
+
+
+def _word_by_word(graph: Graph, eqn: jaxprs.Equation, operands: list[np.ndarray]) -> list:
+    """Applies a rule that moves keys, whose words are their arrays' last axis."""
+    keys = [jaxprs.is_key(atom.aval) for atom in eqn.invars]
+    rule, one = _RULES[eqn.primitive.name], jaxprs.on_words(eqn)
+    planes = []
+    for k in range(operands[keys.index(True)].shape[-1]):
+        plane = [x[..., k] if key else x for x, key in zip(operands, keys, strict=True)]
+        planes.append(rule(graph, one, *plane))
+    return [np.stack(arrays.together(words), -1) for words in zip(*planes, strict=True)]
 
 
 def _settled(eqn: jaxprs.Equation, results: list[np.ndarray]) -> list[np.ndarray]:

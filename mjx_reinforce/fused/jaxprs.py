@@ -9,6 +9,7 @@ import hashlib
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -129,15 +130,63 @@ def callee(eqn: Equation) -> Program | None:
     if eqn.primitive.name == "call_hi_primitive":  # JAX 0.12: composite primitives
         avals = [variable.aval for variable in eqn.invars]
         return program(jax.make_jaxpr(eqn.params["_prim"].expand)(*avals))
-    if eqn.primitive.name == "random_bits":  # a key is an array of its words
-        key: Any = eqn.invars[0].aval
-        implementation = key.dtype._impl
-        width, shape = eqn.params["bit_width"], eqn.params["shape"]
-        words = jax.ShapeDtypeStruct(implementation.key_shape, np.uint32)
-        return program(
-            jax.make_jaxpr(lambda key: implementation.random_bits(key, width, shape))(words)
-        )
+    if eqn.primitive.name in _OF_KEYS:  # a key is an array of its words
+        return program(jax.make_jaxpr(_OF_KEYS[eqn.primitive.name](eqn))(*map(words, eqn.invars)))
     return None
+
+
+def words(atom: Atom) -> jax.ShapeDtypeStruct:
+    """Returns the shape of an operand, of which a key is an array of words."""
+    shape, dtype = atom.aval.shape, atom.aval.dtype
+    if is_key(atom.aval):
+        shape, dtype = (*shape, *_implementation(atom).key_shape), np.dtype(np.uint32)
+    return jax.ShapeDtypeStruct(shape, dtype)
+
+
+def on_words(eqn: Equation) -> Equation:
+    """Returns an equation that moves keys as one that moves a word of each."""
+
+    def word(atom: Atom) -> Any:
+        if not is_key(atom.aval):
+            return atom
+        return SimpleNamespace(aval=jax.ShapeDtypeStruct(atom.aval.shape, np.dtype(np.uint32)))
+
+    one: Any = SimpleNamespace(
+        primitive=eqn.primitive,
+        params=eqn.params,
+        invars=list(map(word, eqn.invars)),
+        outvars=list(map(word, eqn.outvars)),
+        source_info=eqn.source_info,
+    )
+    return one
+
+
+def _implementation(key: Atom) -> Any:
+    """Returns the generator of a key: functions of words."""
+    dtype: Any = key.aval.dtype
+    return dtype._impl
+
+
+def _random_bits(eqn: Equation) -> Callable[..., Any]:
+    bits, width = _implementation(eqn.invars[0]).random_bits, eqn.params["bit_width"]
+    return lambda key: bits(key, width, eqn.params["shape"])
+
+
+def _random_split(eqn: Equation) -> Callable[..., Any]:
+    split = _implementation(eqn.invars[0]).split
+    return lambda key: split(key, eqn.params["shape"])
+
+
+def _random_fold_in(eqn: Equation) -> Callable[..., Any]:
+    return _implementation(eqn.invars[0]).fold_in
+
+
+#: What is done to keys, as functions of their words.
+_OF_KEYS = {
+    "random_bits": _random_bits,
+    "random_split": _random_split,
+    "random_fold_in": _random_fold_in,
+}
 
 
 def default_platform(eqn: Any) -> int | None:

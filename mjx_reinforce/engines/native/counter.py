@@ -6,10 +6,12 @@ Written for ``jax_threefry_partitionable``, JAX's default.
 """
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
 from jax.extend import random
+from jax.typing import ArrayLike
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
 _PARITY = 0x1BD11BDA
@@ -35,7 +37,7 @@ def hash_pair(key: jax.Array, count: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def split(key: jax.Array) -> jax.Array:
     """Returns the data [2, 2] of the two keys that ``jax.random.split`` makes of a key [2]."""
-    return jnp.stack(hash_pair(key, jnp.arange(2, dtype=jnp.uint32)), axis=-1)
+    return _split(key, (2,))
 
 
 def at_counter(key: jax.Array, count: jax.Array) -> jax.Array:
@@ -48,17 +50,41 @@ def at_counter(key: jax.Array, count: jax.Array) -> jax.Array:
     return jax.random.wrap_key_data(jnp.append(key, count), impl=_implementation())
 
 
+def key_of(words: jax.Array) -> jax.Array:
+    """Returns a key that draws what JAX's draws, and can be split, within what is written out.
+
+    Args:
+      words: [2] uint32, the data of JAX's key.
+    """
+    return jax.random.wrap_key_data(words, impl=_written_out())
+
+
 def _bits(data: jax.Array, width: int, shape: tuple[int, ...]) -> jax.Array:
-    """Draws random bits, as JAX's generator does for arrays of any shape."""
-    size = 1
-    for length in shape:
-        size *= length
-    x, y = hash_pair(data[:2], data[2] + jnp.arange(size, dtype=jnp.uint32))
+    """Draws random bits, as JAX's generator does for arrays of any shape.
+
+    Args:
+      data: [2 or 3] uint32, a key and, if there is a third, how many numbers are skipped.
+      width: bits of a number.
+      shape: of the result.
+    """
+    count = jnp.arange(math.prod(shape), dtype=jnp.uint32)
+    x, y = hash_pair(data[:2], count + data[2] if data.size == 3 else count)
     if width == 64:
         bits = (x.astype(jnp.uint64) << jnp.uint64(32)) | y.astype(jnp.uint64)
     else:
         bits = (x ^ y).astype(f"uint{width}")
     return bits.reshape(shape)
+
+
+def _split(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Returns the data [*shape, 2] of the keys that JAX's generator makes of a key [2]."""
+    count = jnp.arange(math.prod(shape), dtype=jnp.uint32)
+    return jnp.stack(hash_pair(key, count), axis=-1).reshape(*shape, 2)
+
+
+def _fold_in(key: jax.Array, data: ArrayLike) -> jax.Array:
+    """Returns the data [2] of a key [2] with a number [] folded in."""
+    return jnp.stack(hash_pair(key, jnp.asarray(data, jnp.uint32)))
 
 
 def _refuse(*_: object) -> jax.Array:
@@ -75,4 +101,17 @@ def _implementation() -> object:
         fold_in=_refuse,
         name="threefry2x32 from a count",
         tag="count",
+    )
+
+
+@functools.cache
+def _written_out() -> object:
+    return random.define_prng_impl(
+        key_shape=(2,),
+        seed=_refuse,
+        split=_split,
+        random_bits=_bits,
+        fold_in=_fold_in,
+        name="threefry2x32 written out",
+        tag="written",
     )

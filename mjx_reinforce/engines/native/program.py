@@ -25,7 +25,7 @@ LOOPS = Limits(plain=1, arrays=1, unrollable=1)
 #: On GPUs a loop over few contacts is written out: an array that a loop reads is in memory there.
 GPU_LOOPS = LOOPS._replace(unrollable=scratch.WRITTEN_OUT)
 #: The folders whose files decide what is written for a step.
-_WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
+WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
 
 
 class NativeProgram(NamedTuple):
@@ -61,7 +61,7 @@ def build_program(
     if not on_cpu:  # a thread without an episode does not play
         function, examples = while_running(function), examples[:-1]
     traced, shapes = jaxprs.trace(function, *examples)
-    source = f"{jaxprs.fingerprint(traced)} {objects.source_digest(*_WRITERS)}"
+    source = f"{jaxprs.fingerprint(traced)} {objects.source_digest(*WRITERS)}"
     folder = objects.folder()
     target = machine.this_machine() if on_cpu else None
 

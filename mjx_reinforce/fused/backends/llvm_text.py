@@ -222,6 +222,21 @@ class Text:
         """Stores a lane vector."""
         self.line(f"store {self.type(dtype)} {value}, ptr {pointer}")
 
+    def gather(self, base: str, index: str, dtype: DTypeLike) -> str:
+        """Loads for each lane the entry at its own index of an array."""
+        scalar, kind, lanes = scalar_type(dtype), self.type(dtype), self.lanes
+        if lanes == 1:
+            place = self.let(f"getelementptr inbounds {scalar}, ptr {base}, i64 {index}")
+            return self.let(f"load {scalar}, ptr {place}")
+        places = self.let(f"getelementptr inbounds {scalar}, ptr {base}, <{lanes} x i64> {index}")
+        bits = {"float": "f32", "double": "f64"}.get(scalar, scalar)
+        name = f"@llvm.masked.gather.v{lanes}{bits}.v{lanes}p0"
+        pointers, bools = f"<{lanes} x ptr>", f"<{lanes} x i1>"
+        self.declared.add(f"declare {kind} {name}({pointers}, i32, {bools}, {kind})")
+        align, all_lanes = np.dtype(dtype).itemsize, self.constant(np.True_)
+        operands = f"{pointers} {places}, i32 {align}, {bools} {all_lanes}, {kind} poison"
+        return self.let(f"call {kind} {name}({operands})")
+
     def scatter(self, value: str, base: str, index: str, mask: str, dtype: DTypeLike) -> None:
         """Stores each lane's value at its own index of an array, where the mask is set."""
         scalar, kind, lanes = scalar_type(dtype), self.type(dtype), self.lanes

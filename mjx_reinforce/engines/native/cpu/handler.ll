@@ -30,7 +30,8 @@ size:
 done:
   %total = mul i64 %seeds, %episodes
   %megabytes = lshr i64 %sum.next, 20
-  %chunks = add i64 %megabytes, 1
+  %parts = add i64 %megabytes, 1
+  %chunks = mul i64 %parts, $zeroed
   %refs.at = getelementptr %Job, ptr %job, $refs
   store i64 1, ptr %refs.at
   %total.at = getelementptr %Job, ptr %job, $total
@@ -271,12 +272,12 @@ shapes:
   %threads.at = getelementptr ptr, ptr %args, i64 $threads_arg
   %threads = load ptr, ptr %threads.at
   %seeds = call i64 @elements(ptr %threads)
-  %keys.at = getelementptr ptr, ptr %args, i64 $keys_arg
-  %keys = load ptr, ptr %keys.at
-  %episodes = call i64 @dim_from_end(ptr %keys, i64 2)
-  %reward.at = getelementptr ptr, ptr %rets, i64 $reward_ret
-  %reward = load ptr, ptr %reward.at
-  %horizon = call i64 @dim_from_end(ptr %reward, i64 2)
+  %items.at = getelementptr ptr, ptr %args, i64 $items_arg
+  %items = load ptr, ptr %items.at
+  %episodes = call i64 @dim_from_end(ptr %items, i64 2)
+  %steps.at = getelementptr ptr, ptr %rets, i64 $steps_ret
+  %steps = load ptr, ptr %steps.at
+  %horizon = call i64 @dim_from_end(ptr %steps, i64 2)
   %job = call ptr @open(ptr %buffers, ptr %sizes, i64 %seeds, i64 %episodes, i64 %horizon)
   %total.at = getelementptr %Job, ptr %job, $total
   %total = load i64, ptr %total.at

@@ -2,13 +2,14 @@
 
 The player defines ``@work(ptr %job)``. All threads of a job call it once; it fetches items by
 adding 1 to ``next``, atomically, until that is ``total`` or more. Item k is episode
-k % ``episodes`` of seed k / ``episodes``. All results are zero when it starts; arrays are aligned
-to 16 bytes.
+k % ``episodes`` of seed k / ``episodes``. All results are zero when it starts, unless it writes
+each entry itself; arrays are aligned to 16 bytes.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
 from string import Template
+from typing import NamedTuple
 
 _TEXT = Path(__file__).with_name("handler.ll")
 #: The functions to be called from outside.
@@ -31,6 +32,23 @@ _POINTERS = ("data", "bytes")
 #: The arguments and results that mean something here.
 PLAYS, THREADS, KEYS = range(3)
 REWARD, SIMULATED = 2, 5
+
+
+class Positions(NamedTuple):
+    """Where a call's sizes are read from.
+
+    threads: the argument [*B] that says how many threads there are at most
+    items: the argument [*B, N, ...] of two axes behind B that says how many items a seed has
+    steps: the result [*B, T, ...] of two axes behind B that says how many steps an item has
+    """
+
+    threads: int
+    items: int
+    steps: int
+
+
+#: Of a rollout, whose items are episodes.
+EPISODES = Positions(THREADS, KEYS, REWARD)
 #: Bytes from the start of a struct to a member, in xla/ffi/api/c_api.h of major version 0.
 OFFSETS = {
     "XLA_FFI_CallFrame.extension_start": 8,
@@ -53,7 +71,13 @@ OFFSETS = {
 }
 
 
-def handler_text(num_args: int, result_bytes: Sequence[int], lanes: int = 1) -> str:
+def handler_text(
+    num_args: int,
+    result_bytes: Sequence[int],
+    lanes: int = 1,
+    positions: Positions = EPISODES,
+    zeroed: bool = True,
+) -> str:
     """Returns the IR of all but ``@work``; it defines %Job.
 
     ``@handler`` is for XLA. Others ``@open`` a job, ``@share`` it in any number of threads, and
@@ -66,6 +90,8 @@ def handler_text(num_args: int, result_bytes: Sequence[int], lanes: int = 1) -> 
       action [*B, T, N, A], reward [*B, T, N], length [*B, N], broken [*B, N],
       simulated [*B] int32.
       lanes: the items that a thread plays at once; fewer are not worth a thread.
+      positions: where other arguments and results than these have their sizes.
+      zeroed: whether results are zero when ``@work`` begins.
     """
     num_results = len(result_bytes)
     data_bytes, sizes_bytes = 8 * (num_args + num_results), 8 * num_results
@@ -84,8 +110,9 @@ def handler_text(num_args: int, result_bytes: Sequence[int], lanes: int = 1) -> 
         "fixed_bytes": job_bytes + data_bytes + sizes_bytes,
         "lanes": lanes,
         "lanes_less_1": lanes - 1,
-        "threads_arg": THREADS,
-        "keys_arg": KEYS,
-        "reward_ret": REWARD,
+        "threads_arg": positions.threads,
+        "items_arg": positions.items,
+        "steps_ret": positions.steps,
+        "zeroed": int(zeroed),
     }
     return Template(_TEXT.read_text("utf-8")).substitute(values)

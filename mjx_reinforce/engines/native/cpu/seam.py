@@ -25,7 +25,10 @@ _WAYS: dict[str, str] = {}
 
 
 def call(
-    code: Code, results: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
+    code: Code,
+    results: Sequence[jax.ShapeDtypeStruct],
+    *args: jax.Array,
+    positions: handler.Positions = handler.EPISODES,
 ) -> Sequence[jax.Array]:
     """Calls machine code under any transformation but differentiation.
 
@@ -33,9 +36,10 @@ def call(
       code: functions of ``handler.NAMES``.
       results: shapes and dtypes of what it returns, as ``handler.handler_text`` says.
       args: arrays, as ``handler.handler_text`` says; vmapped, all get the new axis in front.
+      positions: as for ``handler.handler_text``.
     """
     if way(code) == "callback":
-        play = functools.partial(_play, code, results)
+        play = functools.partial(_play, code, results, positions)
         return jax.pure_callback(play, results, *args, vmap_method="broadcast_all")
     return jax.ffi.ffi_call(_target(code.key), results, vmap_method="broadcast_all")(*args)
 
@@ -83,16 +87,18 @@ def _register(code: Code) -> bool:
 
 
 def _play(
-    code: Code, results: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
+    code: Code,
+    results: Sequence[jax.ShapeDtypeStruct],
+    positions: handler.Positions,
+    *args: jax.Array,
 ) -> list[np.ndarray]:
     """Plays without XLA: on threads of its own, from NumPy arrays."""
     given = [np.asarray(x, order="C") for x in args]
-    threads, keys = given[handler.THREADS], given[handler.KEYS]
-    mapped = threads.shape[: threads.ndim - len(results[handler.SIMULATED].shape)]
-    made: list[Any] = [np.empty(mapped + x.shape, x.dtype) for x in results]
+    threads, items = given[positions.threads], given[positions.items]
+    made: list[Any] = [np.empty(threads.shape + x.shape, x.dtype) for x in results]
     data = (ctypes.c_void_p * (len(given) + len(made)))(*(x.ctypes.data for x in [*given, *made]))
     sizes = (ctypes.c_int64 * len(made))(*(x.nbytes for x in made))
-    episodes, horizon = keys.shape[-2], made[handler.REWARD].shape[-2]
+    episodes, horizon = items.shape[-2], made[positions.steps].shape[-2]
     job = _function(code, "open", 2, 3)(data, sizes, threads.size, episodes, horizon)
     most = os.cpu_count() or 1
     count = min(int(threads.flat[0]) or most, most)

@@ -1,0 +1,97 @@
+"""A function of one example over a batch, in machine code: ``jax.vmap`` for simulations."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_reinforce.engines.native import available, objects
+from mjx_reinforce.engines.native.cpu import handler, machine, seam
+from mjx_reinforce.engines.native.cpu.denormals import flush
+from mjx_reinforce.engines.native.cpu.mapping import POSITIONS, mapping_text
+from mjx_reinforce.engines.native.program import LOOPS, WRITERS
+from mjx_reinforce.engines.native.step import BRANCH_COST, stored
+from mjx_reinforce.fused import jaxprs, scalarized
+from mjx_reinforce.types import PyTree
+
+
+def unavailable() -> str | None:
+    """Returns why functions cannot be mapped in machine code here, None if they can."""
+    if available.platform() != "cpu":
+        return f"it maps functions on CPUs, this is JAX on a {available.platform()}"
+    return available.unavailable()
+
+
+def machine_map(
+    function: Callable[..., Any],
+    *examples: PyTree,
+    check: Callable[[jaxprs.Program], None] | None = None,
+) -> Callable[..., Any]:
+    """Returns a function of a batch, compiled unless memory or disk has it.
+
+    What it returns is as ``jax.vmap(function)`` up to rounding, on all threads that XLA has. Call
+    it inside of any transformation but differentiation; vmapped, it remains one call.
+
+    Args:
+      function: of one example; pytrees of numbers of 32 or 64 bits and bools, in and out.
+      *examples: its arguments, or their shapes.
+      check: raises TooLarge where writing it out and compiling it takes too long.
+
+    Raises:
+      TooLarge: writing it out would take minutes.
+      UnsupportedPrimitive: it has an operation that cannot be written.
+      TypeError: numbers of another size.
+    """
+    leaves, tree = jax.tree.flatten(examples)
+    given = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+
+    def flat(*values: Any) -> list[Any]:
+        whole = [x != 0 if leaf.dtype == bool else x for x, leaf in zip(values, given, strict=True)]
+        return [stored(x) for x in jax.tree.leaves(function(*tree.unflatten(whole)))]
+
+    out = jax.eval_shape(function, *examples)
+    results, out_tree = jax.tree.flatten(out)
+    kept = [jax.eval_shape(stored, x) for x in given]
+    for leaf in (*kept, *map(jax.eval_shape, [stored] * len(results), results)):
+        if np.dtype(leaf.dtype).itemsize not in (4, 8):
+            raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
+    code = _code(flat, kept, check)
+
+    def mapped(*args: PyTree) -> Any:
+        values = jax.tree.leaves(args)
+        num = values[0].shape[0]
+        rows = [stored(x).reshape(num, -1) for x in values if x.size]
+        shapes = [
+            jax.ShapeDtypeStruct((num, x.size), jnp.int32 if x.dtype == bool else x.dtype)
+            for x in results
+            if x.size
+        ]
+        made = iter(seam.call(code, shapes, jnp.int32(0), *rows, positions=POSITIONS))
+        return out_tree.unflatten(
+            next(made).reshape(num, *x.shape).astype(x.dtype)
+            if x.size
+            else jnp.zeros((num, *x.shape), x.dtype)
+            for x in results
+        )
+
+    return mapped
+
+
+def _code(function: Callable[..., Any], examples: list[Any], check: Any) -> machine.Code:
+    """Returns the machine code that maps a function of leaves."""
+    traced, _ = jaxprs.trace(function, *examples)
+    target = machine.this_machine()
+
+    def write() -> str:  # not called where memory or disk has the code
+        if check is not None:
+            check(traced)
+        written = scalarized.build(function, examples, [True] * len(examples), BRANCH_COST, LOOPS)
+        num_args = 1 + sum(bool(np.prod(x.shape)) for x in written.in_avals)
+        sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals if np.prod(x.shape)]
+        entry = handler.handler_text(num_args, sizes, target.lanes, POSITIONS, zeroed=False)
+        return entry + mapping_text(written, target.lanes, flush(target.triple))
+
+    source = f"map {jaxprs.fingerprint(traced)} {objects.source_digest(*WRITERS)}"
+    return machine.load_module(source, write, handler.NAMES, target, objects.folder())

@@ -1,0 +1,19 @@
+"""Importing this tells Gymnasium our tasks.
+
+    import gymnasium, mjx_reinforce.gym
+    envs = gymnasium.make_vec("mjx_reinforce/HalfCheetah-v5", num_envs=4096)
+
+Gymnasium 1.0 and newer ask no package for its tasks by themselves, so this import is needed. The
+arguments of ``make_vec`` are those of ``vector.for_gymnasium.make``.
+"""
+
+import gymnasium
+
+from mjx_reinforce import envs
+
+for _id in envs.names():
+    gymnasium.register(
+        f"mjx_reinforce/{_id}",
+        vector_entry_point="mjx_reinforce.vector.for_gymnasium:make",
+        kwargs={"env": _id},
+    )

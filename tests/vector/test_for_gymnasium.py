@@ -1,0 +1,220 @@
+"""The environments under Gymnasium's interface: found by its name, and what its own tests ask."""
+
+import multiprocessing
+import pickle
+import subprocess
+import sys
+import threading
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+
+import mjx_reinforce.gym  # noqa: F401 (registers)
+from mjx_reinforce import envs
+from mjx_reinforce.vector import for_gymnasium
+
+CART, HOPPER = "mjx_reinforce/CartPole-v1", "mjx_reinforce/Hopper-v5"
+
+
+@pytest.fixture
+def cart():
+    env = gymnasium.make_vec(CART, num_envs=3)
+    yield env
+    env.close()
+
+
+def play(env, steps=30, seed=0):
+    env.action_space.seed(seed)
+    found = [env.reset(seed=seed)[0]]
+    for _ in range(steps):
+        found.append(env.step(env.action_space.sample())[0])
+    return np.stack(found)
+
+
+def test_gymnasium_knows_every_task():
+    """JAX is not imported before a task is made."""
+    code = (
+        "import gymnasium, sys, mjx_reinforce.gym; "
+        "ours = [id for id in gymnasium.registry if id.startswith('mjx_reinforce/')]; "
+        "print(len(ours), 'jax' in sys.modules)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert said.stdout.split() == [str(len(envs.names())), "False"]
+
+
+def test_shapes_spaces_and_metadata(cart):
+    assert cart.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
+    assert (cart.num_envs, cart.spec.id) == (3, CART)
+    assert cart.single_action_space == gymnasium.spaces.Discrete(2)
+    assert cart.observation_space.shape == (3, 4)
+    observation, info = cart.reset(seed=1)
+    assert info == {}
+    assert observation in cart.observation_space
+    observation, reward, terminated, truncated, info = cart.step(cart.action_space.sample())
+    assert observation in cart.observation_space
+    assert (reward.shape, terminated.dtype, truncated.dtype) == ((3,), bool, bool)
+    assert all(f"_{name}" in info for name in info if not name.startswith("_"))
+
+
+def test_seeds(cart):
+    first = play(cart)
+    np.testing.assert_array_equal(play(cart), first)
+    assert np.any(play(cart, seed=1) != first)
+    assert len(np.unique(first[0], axis=0)) == 3
+    one_each = cart.reset(seed=[5, 6, 5])[0]
+    np.testing.assert_array_equal(one_each[0], one_each[2])
+    assert np.any(one_each[0] != one_each[1])
+    assert np.any(cart.reset()[0] != one_each)  # goes on drawing
+
+
+def test_some_are_reset(cart):
+    cart.reset(seed=0)
+    before = cart.step(np.ones(3, int))[0]
+    mask = np.array([True, False, False])
+    after = cart.reset(seed=3, options={"reset_mask": mask})[0]
+    np.testing.assert_array_equal(after[1:], before[1:])
+    assert np.any(after[0] != before[0])
+    with pytest.raises(ValueError, match="must be a bool array"):
+        cart.reset(options={"reset_mask": [True]})
+
+
+def test_same_step_tells_the_last_observation():
+    env = gymnasium.make_vec(CART, num_envs=3, autoreset="same_step", max_episode_steps=4)
+    env.reset(seed=0)
+    for _ in range(3):
+        *_, info = env.step(np.array([0, 1, 0]))
+        assert "final_obs" not in info
+    observation, _, _, truncated, info = env.step(np.array([0, 1, 0]))
+    assert truncated.all()
+    assert info["_final_obs"].all()
+    assert info["final_obs"].dtype == object
+    assert np.all(np.abs(observation) <= 0.05)
+    assert np.abs(np.stack(info["final_obs"])).max() > 0.05
+
+
+def test_wrappers_of_gymnasium_count_episodes():
+    env = gymnasium.wrappers.vector.RecordEpisodeStatistics(
+        gymnasium.make_vec(CART, num_envs=8, max_episode_steps=20)
+    )
+    env.reset(seed=0)
+    for _ in range(19):
+        env.step(np.zeros(8, int))
+    lengths = list(env.length_queue)
+    assert lengths
+    assert all(8 <= length <= 11 for length in lengths)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "actions", "message"),
+    [
+        (HOPPER, np.full((2, 3), np.nan), r"must be finite numbers, got nan at \(0, 0\)"),
+        (HOPPER, np.zeros((2, 4)), r"must be \[2, 3\], got the shape \[2, 4\]"),
+        (CART, np.array([0, 2]), "must be 0 to 1, got 2"),
+        (CART, np.zeros(2), "must be int32, got float"),
+    ],
+)
+def test_bad_actions(env_id, actions, message):
+    env = gymnasium.make_vec(env_id, num_envs=2)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=message):
+        env.step(actions)
+
+
+def test_out_of_range_is_clamped_by_the_actuators_alone():
+    """As in Gymnasium: the body gets 1, the reward pays for 5."""
+    found = []
+    for size in (1.0, 5.0):
+        env = gymnasium.make_vec(HOPPER, num_envs=1)
+        env.reset(seed=0)
+        found.append(env.step(np.full((1, 3), size)))
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    np.testing.assert_allclose(found[1][4]["reward_ctrl"], -1e-3 * 75, rtol=1e-5)
+
+
+def test_wrong_order_and_bad_arguments(cart):
+    with pytest.raises(ValueError, match="call reset before step"):
+        cart.step(np.zeros(3, int))
+    with pytest.raises(ValueError, match="there must be 3 seeds"):
+        cart.reset(seed=[1, 2])
+    with pytest.raises(ValueError, match="render_mode"):
+        gymnasium.make_vec(CART, num_envs=1, render_mode="human")
+    with pytest.raises(ValueError, match="no MuJoCo model"):
+        gymnasium.make_vec(CART, num_envs=1, render_mode="rgb_array")
+    with pytest.raises(ValueError, match="arrays"):
+        for_gymnasium.make("CartPole-v1", 1, arrays="list")
+
+
+def test_closed_twice(cart):
+    cart.reset(seed=0)
+    cart.close()
+    cart.close()
+    with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="make another"):
+        cart.step(np.zeros(3, int))
+
+
+def test_pickled():
+    with pytest.raises(TypeError, match="make it where it is used"):
+        pickle.dumps(for_gymnasium.make("CartPole-v1", 1))
+
+
+def test_two_threads_with_an_environment_each():
+    found = {}
+
+    def run(name):
+        found[name] = play(for_gymnasium.make("CartPole-v1", 2))
+
+    threads = [threading.Thread(target=run, args=(k,)) for k in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    np.testing.assert_array_equal(found[0], found[1])
+
+
+def spawned(queue):
+    queue.put(play(for_gymnasium.make("CartPole-v1", 2)))
+
+
+def test_spawned():
+    context = multiprocessing.get_context("spawn")
+    queue = context.Queue()
+    process = context.Process(target=spawned, args=(queue,))
+    process.start()
+    there = queue.get(timeout=120)
+    process.join()
+    np.testing.assert_array_equal(there, play(for_gymnasium.make("CartPole-v1", 2)))
+
+
+def test_jax_arrays_are_handed_out_as_they_are():
+    env = for_gymnasium.make("InvertedPendulum-v5", 2, arrays="jax")
+    first, _ = env.reset(seed=0)
+    assert isinstance(first, jax.Array)
+    kept = np.array(first)
+    second, *_ = env.step(np.zeros((2, 1), np.float32))
+    assert env.state.obs is second
+    np.testing.assert_array_equal(first, kept)  # it was not written over
+
+
+def test_torch_tensors_are_not_copied():
+    torch = pytest.importorskip("torch")
+    env = for_gymnasium.make("InvertedPendulum-v5", 2, arrays="torch")
+    env.reset(seed=0)
+    observation, reward, *_ = env.step(torch.zeros((2, 1)))
+    assert isinstance(reward, torch.Tensor)
+    assert observation.data_ptr() == env.state.obs.unsafe_buffer_pointer()
+
+
+def test_rendered():
+    env = gymnasium.make_vec("mjx_reinforce/InvertedPendulum-v5", 2, render_mode="rgb_array")
+    env.reset(seed=0)
+    try:
+        (picture,) = env.render()
+    except Exception as error:  # MuJoCo raises what its OpenGL raises
+        pytest.skip(f"no OpenGL here: {error}")
+    assert picture.shape == (240, 320, 3)
+    for _ in range(8):
+        env.step(np.full((2, 1), 3.0))
+    assert np.any(env.render()[0] != picture)

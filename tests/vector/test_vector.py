@@ -1,0 +1,266 @@
+"""Many environments at once: episodes follow each other as Gymnasium says, on every engine."""
+
+import functools
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from toys import Drifting
+
+from mjx_reinforce import Box, envs, make_vec
+from mjx_reinforce.engines import mapping
+from mjx_reinforce.engines.native.counter import key_of
+from mjx_reinforce.engines.native.mapping import machine_map
+from mjx_reinforce.vector.episodes import AUTORESETS
+
+SPACE = Box(np.array([-3.0]), np.array([1.0]))
+ENGINES = ("native", "fused", "vmap")
+
+
+def play(vec, steps, seed=0, actions_seed=1):
+    """The states [steps, N, ...] behind the first one, under random actions, and the actions."""
+    actions = jax.vmap(vec.sample_actions)(jax.random.split(jax.random.key(actions_seed), steps))
+
+    @jax.jit
+    def all_steps(key, actions):
+        def step(state, action):
+            state = vec.step(state, action)
+            return state, state
+
+        start = vec.reset(key)
+        return start, jax.lax.scan(step, start, actions)[1]
+
+    start, states = all_steps(jax.random.key(seed), actions)
+    return start, states, actions
+
+
+def assert_close(got, want, rounding):
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+        np.testing.assert_allclose(x, y, rtol=rounding, atol=rounding)
+
+
+@pytest.mark.parametrize("autoreset", AUTORESETS)
+@pytest.mark.parametrize("engine", ENGINES)
+def test_episodes_follow_each_other(engine, autoreset):
+    """Against a loop over environments, one at a time, that does what Gymnasium documents."""
+    env, steps, num = Drifting(SPACE), 25, 5
+    vec = make_vec(env, num, autoreset=autoreset, max_episode_steps=7, engine=engine)
+    start, states, actions = play(vec, steps)
+    step, reset = jax.jit(env.step), jax.jit(env.reset)
+    keys = jax.vmap(functools.partial(jax.random.fold_in, jax.random.key(0)))(jnp.arange(num))
+    ends = 0
+    for i in range(num):
+        key, reset_key = jax.random.split(keys[i])
+        at = reset(reset_key)
+        np.testing.assert_allclose(start.obs[i], at.obs, rtol=1e-6)
+        length, total, over = 0, 0.0, False
+        for t in range(steps):
+            one = jax.tree.map(lambda x, i=i, t=t: x[t, i], states)
+            if over and autoreset != "disabled":
+                length, total = 0, 0.0
+            if over and autoreset == "next_step":
+                key, reset_key = jax.random.split(key)
+                at = reset(reset_key)
+                np.testing.assert_allclose(one.obs, at.obs, rtol=1e-5, atol=1e-6)
+                assert (float(one.reward), bool(one.done), int(one.episode_length)) == (0, False, 0)
+                over = False
+                continue
+            if over and autoreset == "disabled":
+                length, total = 0, 0.0
+            at = step(at, actions[t, i])
+            length, total = length + 1, total + float(at.reward)
+            over = bool(at.done) or length == 7
+            ends += over
+            np.testing.assert_allclose(one.final_obs, at.obs, rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(one.reward, at.reward, rtol=1e-5, atol=1e-6)
+            assert bool(one.terminated) == bool(at.done)
+            assert bool(one.truncated) == (length == 7)
+            assert int(one.episode_length) == length
+            np.testing.assert_allclose(one.episode_return, total, rtol=1e-5, atol=1e-5)
+            if over and autoreset == "same_step":
+                key, reset_key = jax.random.split(key)
+                at = reset(reset_key)
+            np.testing.assert_allclose(one.obs, at.obs, rtol=1e-5, atol=1e-6)
+    assert ends > 2 * num
+
+
+def test_machine_code_computes_the_same_for_any_number():
+    env = envs.make("InvertedPendulum-v5")
+    actions = jax.random.uniform(jax.random.key(1), (40, 37, 1), minval=-3, maxval=3)
+    found = []
+    for num in (3, 37):
+        vec = make_vec(env, num)
+        assert vec.engine.name == "native"
+        state = jax.jit(vec.reset)(jax.random.key(0))
+        step, kept = jax.jit(vec.step), []
+        for action in actions[:, :num]:
+            state = step(state, action)
+            kept.append(state)
+        found.append(jax.tree.map(lambda *x: np.stack(x)[:, :3], *kept))
+    assert np.any(found[0].terminated)
+    assert_close(*found, 0)
+
+
+def test_mapped_over_and_restarted():
+    vec = make_vec("CartPole-v1", 6)
+    keys = jax.random.split(jax.random.key(5), 2)
+    both = jax.jit(jax.vmap(vec.reset))(keys)
+    alone = jax.vmap(vec.reset)(keys[1:])
+    np.testing.assert_array_equal(both.obs[1], alone.obs[0])
+    action = jnp.ones((2, 6), jnp.int32)
+    after = jax.jit(jax.vmap(vec.step))(both, action)
+    assert_close(
+        jax.tree.map(lambda x: x[0], after),
+        vec.step(jax.tree.map(lambda x: x[0], both), action[0]),
+        0,
+    )
+    one = jax.tree.map(lambda x: x[0], after)
+    again = vec.restart(one, np.arange(6) < 2)
+    assert again.episode_length.tolist() == [0, 0, 1, 1, 1, 1]
+    np.testing.assert_array_equal(again.obs[2:], one.obs[2:])
+    assert np.all(again.obs[:2] != one.obs[:2])
+
+
+def test_a_number_that_is_not_finite_ends_the_episode():
+    vec = make_vec("InvertedPendulum-v5", 4)
+    state = jax.jit(vec.reset)(jax.random.key(0))
+    action = jnp.zeros((4, 1)).at[2].set(jnp.nan)
+    after = jax.jit(vec.step)(state, action)
+    assert after.nonfinite.tolist() == after.terminated.tolist() == [False, False, True, False]
+    assert after.reward.tolist() == [1, 1, 0, 1]
+    then = jax.jit(vec.step)(after, jnp.zeros((4, 1)))
+    assert np.all(np.isfinite(then.obs))
+    assert then.episode_length.tolist() == [2, 2, 0, 2]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_envs": 0}, "num_envs must be at least 1, got 0"),
+        ({"num_envs": 10**12}, "environments need .* make at most"),
+        ({"autoreset": "never"}, "autoreset"),
+        ({"engine": "fast"}, "engine"),
+        ({"max_episode_steps": 0}, "max_episode_steps must be at least 1, got 0"),
+        ({"reset_noise": 1}, "reset_noise"),
+        ({"env": "CartPole-v9"}, "CartPole-v9"),
+        ({"env": Drifting(SPACE), "reset_noise": 1}, "are for an id"),
+        ({"env": object()}, "reset"),
+    ],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make_vec(**({"env": "CartPole-v1", "num_envs": 2} | arguments))
+
+
+def test_bad_keys_actions_and_states():
+    vec = make_vec("InvertedPendulum-v5", 4)
+    state = vec.reset(jax.random.key(0))
+    for action, message in (
+        (jnp.zeros((4, 2)), r"must be \[4, 1\], got the shape \[4, 2\]"),
+        (jnp.zeros(4), r"must be \[4, 1\], got the shape \[4\]"),
+        (jnp.zeros((4, 1), complex), "must be float32, got complex64"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            vec.step(state, action)
+    with pytest.raises(ValueError, match="is of 4 environments, not of 5"):
+        make_vec("InvertedPendulum-v5", 5).step(state, jnp.zeros((5, 1)))
+    with pytest.raises(ValueError, match="must be a random key"):
+        vec.reset(7)
+    with pytest.raises(ValueError, match="the generator rbg"):
+        vec.reset(jax.random.key(0, impl="rbg"))
+    with pytest.raises(ValueError, match=r"must be int32, got float32"):
+        make_vec("CartPole-v1", 4).step(None, jnp.zeros(4))
+
+
+def test_why_an_engine_was_chosen():
+    assert make_vec("CartPole-v1", 2).engine.why == "machine code for this CPU"
+    assert make_vec("CartPole-v1", 2, engine="vmap").engine.why == "chosen by name"
+
+
+def test_what_cannot_be_machine_code_is_played_by_vmap():
+    class Sorting(Drifting):
+        def step(self, state, action):
+            state = super().step(state, action)
+            return state.replace(obs=jnp.fft.fft(state.obs).real)
+
+    vec = make_vec(Sorting(SPACE), 3)
+    assert vec.engine.name == "vmap"
+    assert "fft" in vec.engine.why
+    with pytest.raises(ValueError, match=r"the native engine cannot play this: .*fft"):
+        make_vec(Sorting(SPACE), 3, engine="native")
+
+
+def test_keys_are_drawn_from_as_jax_does():
+    """Split, folded, chosen and moved, in scalars and in machine code."""
+
+    def draw(words, wrap):
+        first, second = jax.random.split(wrap(words))
+        chosen = jax.random.fold_in(jnp.where(words[0] > np.uint32(2**31), first, second), 7)
+        several = jax.random.split(chosen, (2, 2))
+        keys = (first, chosen, several[1, 0], several.reshape(4)[3])
+        return [jax.random.normal(key, (3,)) for key in keys]
+
+    words = np.random.default_rng(0).integers(0, 2**32, (9, 2), dtype=np.uint32)
+    want = jax.vmap(functools.partial(draw, wrap=jax.random.wrap_key_data))(words)
+    written = functools.partial(draw, wrap=key_of)
+    got = machine_map(written, jax.ShapeDtypeStruct((2,), jnp.uint32))(jnp.asarray(words))
+    assert_close(got, want, 2e-6)
+    assert_close(mapping.map_function("fused", written, words[0]).call(words), want, 2e-6)
+
+
+class Peers:
+    """Gymnasium's own vector environment, whose resets take the states that ours drew."""
+
+    def __init__(self, env_id, num, mode):
+        self.starts = [None] * num
+        self.envs = gymnasium.vector.SyncVectorEnv(
+            [functools.partial(self.one, env_id, i) for i in range(num)], autoreset_mode=mode
+        )
+
+    def one(self, env_id, i):
+        env = gymnasium.make(env_id)
+        inner = env.unwrapped
+
+        def reset_model():
+            inner.set_state(*self.starts[i])
+            return inner._get_obs()
+
+        inner.reset_model = reset_model
+        return env
+
+    def take(self, physics):
+        self.starts = list(zip(np.asarray(physics.qpos), np.asarray(physics.qvel), strict=True))
+
+
+@pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
+@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "Hopper-v5"])
+def test_parity_with_gymnasium(env_id, autoreset):
+    """In double precision, step by step, through ends of episodes and resets."""
+    mode = gymnasium.vector.AutoresetMode[autoreset.upper()]
+    num, ends = 6, 0
+    with jax.enable_x64(True):
+        vec = make_vec(env_id, num, autoreset=autoreset, max_episode_steps=30)
+        peers = Peers(env_id, num, mode)
+        for env in peers.envs.envs:
+            env._max_episode_steps = 30
+        state = jax.jit(vec.reset)(jax.random.key(0))
+        peers.take(state.simulation.pipeline_state)
+        obs, _ = peers.envs.reset()
+        np.testing.assert_allclose(state.obs, obs, atol=1e-9)
+        step = jax.jit(vec.step)
+        for t in range(80):
+            action = np.asarray(vec.sample_actions(jax.random.key(t)))
+            state = step(state, action)
+            peers.take(state.simulation.pipeline_state)
+            obs, reward, terminated, truncated, info = peers.envs.step(action)
+            np.testing.assert_allclose(state.obs, obs, atol=1e-6)
+            np.testing.assert_allclose(state.reward, reward, atol=1e-6)
+            np.testing.assert_array_equal(state.terminated, terminated)
+            np.testing.assert_array_equal(state.truncated, truncated)
+            ends += int(state.done.sum())
+            if "final_obs" in info:
+                for i in np.flatnonzero(info["_final_obs"]):
+                    np.testing.assert_allclose(state.final_obs[i], info["final_obs"][i], atol=1e-6)
+    assert ends > num
