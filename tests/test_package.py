@@ -18,19 +18,9 @@ PACKAGE = ROOT / "mjx_reinforce"
 #: Folders and root modules from the ground up; a file imports from its own folder and those before.
 ORDER = (
     *("checks", "types", "registry", "files", "fused", "physics", "envs", "policies", "engines"),
-    *(
-        "learners",
-        "console",
-        "settings",
-        "vector",
-        "export",
-        "reports",
-        "training",
-        "hosts",
-        "store",
-        "runs",
-    ),
-    *("playing", "report", "sweeps", "sweep", "train", "watch", "new", "__main__"),
+    *("learners", "console", "settings", "vector", "gym", "export", "reports", "training"),
+    *("hosts", "store", "runs", "playing", "report", "sweeps", "sweep", "train", "watch", "new"),
+    "__main__",
 )
 #: Commands of folders, found where ``python -m`` looks for them. They use what comes later.
 COMMANDS = {"envs.__main__"}

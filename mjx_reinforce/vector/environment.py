@@ -204,15 +204,17 @@ def make_vec(
     check_count("num_envs", num_envs)
     check_name("autoreset", autoreset, dict.fromkeys(AUTORESETS))
     check_type("max_episode_steps", max_episode_steps, int | None)
+    made: Environment
     if isinstance(env, str):
-        env = envs.make(env, **settings)
+        made = envs.make(env, **settings)
     elif settings:
         raise ValueError(f"{sorted(settings)} are for an id; this environment is made already")
-    check_parts(env)
-    check_environment(env)
-    limit = (
-        getattr(env, "max_episode_steps", None) if max_episode_steps is None else max_episode_steps
-    )
-    if limit is not None:
-        check_count("max_episode_steps", limit)
-    return VectorEnv(env, num_envs, autoreset, limit, engine)
+    else:
+        made = env
+    check_parts(made)
+    check_environment(made)
+    if max_episode_steps is None:
+        max_episode_steps = getattr(made, "max_episode_steps", None)
+    else:
+        check_count("max_episode_steps", max_episode_steps)
+    return VectorEnv(made, num_envs, autoreset, max_episode_steps, engine)

@@ -95,7 +95,8 @@ def _play(
     """Plays without XLA: on threads of its own, from NumPy arrays."""
     given = [np.asarray(x, order="C") for x in args]
     threads, items = given[positions.threads], given[positions.items]
-    made: list[Any] = [np.empty(threads.shape + x.shape, x.dtype) for x in results]
+    mapped = threads.shape[: threads.ndim + 2 - len(results[positions.steps].shape)]
+    made: list[Any] = [np.empty(mapped + x.shape, x.dtype) for x in results]
     data = (ctypes.c_void_p * (len(given) + len(made)))(*(x.ctypes.data for x in [*given, *made]))
     sizes = (ctypes.c_int64 * len(made))(*(x.nbytes for x in made))
     episodes, horizon = items.shape[-2], made[positions.steps].shape[-2]
