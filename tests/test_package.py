@@ -1,6 +1,7 @@
 """The package's shape: imports point one way, the heavy ones wait, the README runs."""
 
 import ast
+import collections
 import graphlib
 import re
 import subprocess
@@ -73,6 +74,12 @@ def test_no_imports_in_a_circle():
     """Within a folder too: every file can be read after those it imports."""
     graph = {name: set(imported(path)) - {name} for name, path in FILES.items() if name}
     graphlib.TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
+
+
+def test_folders_are_small():
+    """A stranger sees at once what is in one."""
+    sizes = collections.Counter(p.parent for p in FILES.values() if p.name != "__init__.py")
+    assert {str(folder): n for folder, n in sizes.items() if n > 14} == {}
 
 
 def test_the_wheel_has_every_package():

@@ -20,7 +20,7 @@ from mjx_reinforce.engines.episode import Act
 from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.engines.rollouts import rollout
 from mjx_reinforce.fused.vmap import MAX_OPERATIONS, Mapped
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Environment, PyTree, Trajectory, null_action
 

@@ -5,10 +5,18 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays, branches, jaxprs, loops
+from mjx_reinforce.fused import arrays, jaxprs
 from mjx_reinforce.fused.errors import no_rule
 from mjx_reinforce.fused.graph import Graph
-from mjx_reinforce.fused.rules import elementwise, indexing, linear, reductions, structural
+from mjx_reinforce.fused.rules import (
+    branches,
+    elementwise,
+    indexing,
+    linear,
+    loops,
+    reductions,
+    structural,
+)
 
 _RULES = {
     **structural.RULES,

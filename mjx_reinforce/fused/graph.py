@@ -12,9 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike
 
-from mjx_reinforce.fused import arrays, folding, jaxprs, ops, simplify
+from mjx_reinforce.fused import arrays, jaxprs, ops
 from mjx_reinforce.fused.errors import TooLarge
 from mjx_reinforce.fused.nodes import Captured, Gate, Loop, Node, Scalar, Scope, identity
+from mjx_reinforce.fused.passes import folding, simplify
 from mjx_reinforce.fused.size import MAX_SCALARS
 
 _BOOL = np.dtype(bool)

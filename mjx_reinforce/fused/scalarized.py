@@ -8,11 +8,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_reinforce.fused import arrays, evaluate, jaxprs, liveness, size
+from mjx_reinforce.fused import arrays, evaluate, jaxprs, size
 from mjx_reinforce.fused.backends import BACKENDS
 from mjx_reinforce.fused.errors import no_keys
 from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import Scalar
+from mjx_reinforce.fused.passes import liveness
 from mjx_reinforce.registry import check_name, load_definition
 from mjx_reinforce.types import PyTree
 

@@ -33,6 +33,7 @@ from mjx_reinforce.learners.ars_increments import (
     paper_increment,
 )
 from mjx_reinforce.learners.diagnostics import nan_unless, signal_to_noise
+from mjx_reinforce.learners.estimators import replace_broken
 from mjx_reinforce.learners.learner import (
     Learner,
     Metrics,
@@ -41,13 +42,12 @@ from mjx_reinforce.learners.learner import (
     episode_metrics,
     keep_finite,
 )
-from mjx_reinforce.learners.returns import replace_broken
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.arguments import check_count, check_key, check_number
-from mjx_reinforce.policies.categorical import categorical
 from mjx_reinforce.policies.contract import check_policy
-from mjx_reinforce.policies.deterministic import deterministic
+from mjx_reinforce.policies.distributions.categorical import categorical
+from mjx_reinforce.policies.distributions.deterministic import deterministic
 from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.types import (
     Discrete,

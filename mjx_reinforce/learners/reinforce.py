@@ -41,10 +41,10 @@ from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_opt
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.arguments import check_count, check_key, check_number
-from mjx_reinforce.policies.categorical import categorical
 from mjx_reinforce.policies.contract import check_policy
-from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.policies.normal import normal
+from mjx_reinforce.policies.distributions.categorical import categorical
+from mjx_reinforce.policies.distributions.distribution import Distribution
+from mjx_reinforce.policies.distributions.normal import normal
 from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.types import (
     Box,

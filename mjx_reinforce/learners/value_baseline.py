@@ -13,8 +13,7 @@ from flax import linen as nn
 from jax import lax
 
 from mjx_reinforce.learners.estimators import Estimator, explained_variance, reward_to_go
-from mjx_reinforce.learners.gradients import accumulate_gradient, map_steps
-from mjx_reinforce.learners.samples import draw_steps
+from mjx_reinforce.learners.gradients import accumulate_gradient, draw_steps, map_steps
 from mjx_reinforce.policies.arguments import check_count
 from mjx_reinforce.policies.networks import MLP
 

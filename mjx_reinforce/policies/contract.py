@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_reinforce.checks import check_kind, explain
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.policies.policy import Policy
 from mjx_reinforce.types import Environment, PyTree, null_action
 

@@ -13,7 +13,7 @@ from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.ars import ars
 from mjx_reinforce.learners.ars_increments import document_increment
 from mjx_reinforce.policies import normalize
-from mjx_reinforce.policies.deterministic import deterministic
+from mjx_reinforce.policies.distributions.deterministic import deterministic
 from mjx_reinforce.types import Discrete
 
 

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays, folding, jaxprs, ops, simplify
+from mjx_reinforce.fused import arrays, jaxprs, ops
 from mjx_reinforce.fused.errors import no_rule
 from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.passes import folding, simplify
 
 
 def _elementwise(graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray) -> list[np.ndarray]:

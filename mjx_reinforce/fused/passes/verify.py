@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from mjx_reinforce.fused.backends.backend import Backend
-from mjx_reinforce.fused.iterate import varies
-from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar
 from mjx_reinforce.fused.ops import FACTS, Op
+from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
+from mjx_reinforce.fused.rules.iterate import varies
 from mjx_reinforce.fused.scalarized import Scalarized
 
 _BOOL = np.dtype(bool)

@@ -7,8 +7,8 @@ import numpy as np
 
 from mjx_reinforce.fused import arrays, jaxprs
 from mjx_reinforce.fused.graph import Graph
-from mjx_reinforce.fused.iterate import Step, iterate, varies
 from mjx_reinforce.fused.nodes import Gate, Loop, Node, Scalar, is_constant, same
+from mjx_reinforce.fused.rules.iterate import Step, iterate, varies
 
 
 def while_rule(
