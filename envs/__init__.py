@@ -20,12 +20,12 @@ silence_mjx()  # before any environment imports it
 #: What the system's loader says of a library for which there is no memory.
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory")
 _CART_POLE = "mjx_reinforce.envs.tasks.cart_pole:CartPole"
-_PENDULUM = "mjx_reinforce.envs.tasks.inverted_pendulum:InvertedPendulum"
+_INVERTED_PENDULUM = "mjx_reinforce.envs.tasks.inverted_pendulum:InvertedPendulum"
 
 #: id -> ("module:Class" or a callable, constructor arguments). One line a task.
 _TABLE: dict[str, tuple[str | Callable[..., Any], dict[str, Any]]] = {
-    "InvertedPendulum-v5": (_PENDULUM, {}),
-    "InvertedPendulum-v4": (_PENDULUM, {"reward_at_fall": 1.0}),
+    "InvertedPendulum-v5": (_INVERTED_PENDULUM, {}),
+    "InvertedPendulum-v4": (_INVERTED_PENDULUM, {"reward_at_fall": 1.0}),
     "InvertedDoublePendulum-v5": (
         "mjx_reinforce.envs.tasks.inverted_double_pendulum:InvertedDoublePendulum",
         {},

@@ -80,11 +80,11 @@ def choose(
       ValueError: the name is unknown, or the engine does not support the environment.
     """
     began = time.perf_counter()
-    engine = _choose(name, env, player, horizon)
+    engine = _choose_engine(name, env, player, horizon)
     return engine._replace(seconds=time.perf_counter() - began)
 
 
-def _choose(
+def _choose_engine(
     name: str, env: Environment, player: ActingPolicy | None, horizon: int | None
 ) -> Engine:
     check_name("engine", name, dict.fromkeys(ENGINES))

@@ -17,8 +17,9 @@ from mjx_reinforce.fused.rules import (
     reductions,
     structural,
 )
+from mjx_reinforce.types import is_key
 
-_RULES = {
+_ARRAY_RULES = {
     **structural.RULES,
     **elementwise.RULES,
     **reductions.RULES,
@@ -56,7 +57,7 @@ def run(
         values[variable] = graph.constant(const)
 
     def read(atom: Any) -> np.ndarray:
-        return jaxprs.literal(atom) if jaxprs.is_literal(atom) else values[atom]
+        return jaxprs.literal_value(atom) if jaxprs.is_literal(atom) else values[atom]
 
     for eqn, needed in jaxprs.live_equations(jaxpr, used):
         graph.may_unroll = may_unroll  # of this equation; programs inside have their own
@@ -76,15 +77,15 @@ def _apply(
     if name in _CONTROL:
         with graph.evaluating(eqn):
             return _CONTROL[name](graph, functools.partial(run, graph), eqn, used, *operands)
-    if name in _RULES:
-        return _settled(eqn, _RULES[name](graph, eqn, *operands))
+    if name in _ARRAY_RULES:
+        return _settled(eqn, _ARRAY_RULES[name](graph, eqn, *operands))
     program = jaxprs.callee(eqn)
     if program is not None:
         with graph.evaluating(eqn):
             return run(graph, program, operands, used, graph.may_unroll)
-    makes_keys = any(jaxprs.is_key(out.aval) for out in eqn.outvars)
+    makes_keys = any(is_key(out.aval) for out in eqn.outvars)
     if all(map(arrays.is_numeric, operands)) and not makes_keys:
-        return jaxprs.evaluate(eqn.primitive.bind, eqn.params, operands)
+        return jaxprs.compute_constants(eqn.primitive.bind, eqn.params, operands)
     raise no_rule(name, graph.source(eqn))
 
 

@@ -59,7 +59,7 @@ from mjx_reinforce.types import (
 _ESTIMATORS = tuple(f"mjx_reinforce.learners.{name}" for name in ("estimators", "value_baseline"))
 #: Episodes are short if none is longer than the horizon divided by this. An update passes over all
 #: steps that there may be, so it takes its time from the horizon, not from the episodes.
-_FEW = 8
+_SHORT = 8
 #: Updates of so many steps, of all seeds, are compiled for short episodes too. Measured on two CPU
 #: cores: that saves 70 ns for each of these steps in such an update, and takes 4 s to compile.
 _MANY = 2**19
@@ -315,7 +315,7 @@ class _Reinforce:
         """Learns; where all episodes, of many seeds, were short, from their first steps alone."""
         if self.auto is not None:
             trajectory = dataclasses.replace(trajectory, played=trajectory.mask[0])
-        few = len(trajectory.mask) // _FEW
+        few = len(trajectory.mask) // _SHORT
         if few < CHUNK_STEPS or self.num_seeds * trajectory.mask.size < _MANY:
             return self._learn_from(state, trajectory, key)
         return jax.lax.cond(
