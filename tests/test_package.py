@@ -102,6 +102,17 @@ def test_import_is_light():
     assert loaded.strip() == "[]"
 
 
+def test_pages_films_and_logs_wait():
+    """What draws and logs is imported when something is drawn or logged."""
+    late = ("altair", "vl_convert", "jinja2", "tensorboardX", "matplotlib", "PIL", "mediapy")
+    loaded = run(
+        "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.sweeps.main\n"
+        "import mjx_reinforce.runs.run, mjx_reinforce.runs.observers, mjx_reinforce.store.ready\n"
+        f"print([m for m in {late} if m in sys.modules])"
+    )
+    assert loaded.strip() == "[]"
+
+
 def test_every_public_name_exists():
     run("import mjx_reinforce as m\nfor name in m.__all__: getattr(m, name)")
 

@@ -13,7 +13,7 @@ from mjx_reinforce.settings.relevance import changed
 from mjx_reinforce.sweeps.designs import grid
 from mjx_reinforce.sweeps.designs.design import Design, SweepSettings, read_design
 
-_ABOUT = (
+_ABOUT_SWEEPS = (
     "Train many configurations, many seeds of each, side by side. Leaves sweep.json, results.csv "
     "(a row for each configuration and seed), curves.npz, report.html and policies/ (those of the "
     "best and the worst seed of each configuration) in the output directory. "
@@ -60,7 +60,7 @@ def _read_flags(
 ) -> tuple[Config, SweepSettings, ProcessSettings]:
     """Returns the settings of the runs, of the sweep, and of its processes; --help exits."""
     groups = {"sweep": SweepSettings, "hosts": ProcessSettings, **GROUPS}
-    parsed = read_groups(groups, flags, default, prog, _ABOUT, _MAIN)
+    parsed = read_groups(groups, flags, default, prog, _ABOUT_SWEEPS, _MAIN)
     settings, processes = parsed.pop("sweep"), parsed.pop("hosts")
     return join_groups(parsed), settings, processes
 

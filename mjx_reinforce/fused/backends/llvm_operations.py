@@ -205,7 +205,7 @@ def _write_conversion(
     return text.let(f"trunc {old} {x} to {new}")
 
 
-def _bitcast(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) -> str:
+def _write_bits(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) -> str:
     old, new = text.type(kinds[0]), text.type(dtype)
     return args[0] if old == new else text.let(f"bitcast {old} {args[0]} to {new}")
 
@@ -249,5 +249,5 @@ OPERATIONS: dict[str, Emit] = {
     "clz": _count_zeros,
     "population_count": _unary("llvm.ctpop"),
     "convert_element_type": _write_conversion,
-    "bitcast_convert_type": _bitcast,
+    "bitcast_convert_type": _write_bits,
 }

@@ -173,9 +173,9 @@ def speed_table(findings: Findings) -> dict[str, Any]:
             median, mean = each.solving.median, each.solving.mean
             cells.append((steps(median.value), interval_in_words(median, steps)))
             cells.append((steps(float(mean.value)), interval_in_words(mean, steps)))
-            cells.append((_against_best(speeds, i, order[0], "fastest"), ""))
+            cells.append((_p_against(speeds, i, order[0], "fastest"), ""))
         cells.append((number(float(each.area.value)), interval_in_words(each.area)))
-        cells.append((_against_best(areas, i, best_area, "greatest"), ""))
+        cells.append((_p_against(areas, i, best_area, "greatest"), ""))
         listed.append({"label": each.configuration.label, "cells": cells})
     return {"header": header, "rows": listed}
 
@@ -185,7 +185,7 @@ def _slowness(result: Result) -> float:
     return float(result.solving.mean.value if result.solving else -result.area.value)
 
 
-def _against_best(adjusted: dict[frozenset[int], float], i: int, best: int, said: str) -> str:
+def _p_against(adjusted: dict[frozenset[int], float], i: int, best: int, said: str) -> str:
     """Returns the p value of a result against the best, or what the best is."""
     if i == best:
         return said
