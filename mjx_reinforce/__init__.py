@@ -50,8 +50,7 @@ if TYPE_CHECKING:  # what type checkers and editors read in place of __getattr__
     from mjx_reinforce.runs.run import RunResults, run
     from mjx_reinforce.settings.config import Config
     from mjx_reinforce.settings.defaults import of_task
-    from mjx_reinforce.sweeps.reading import SweepResults
-    from mjx_reinforce.sweeps.run import sweep
+    from mjx_reinforce.sweeps.run import SweepResults, sweep
     from mjx_reinforce.training.driver import Evaluation
     from mjx_reinforce.training.evaluation import evaluate
     from mjx_reinforce.types import Box, Discrete, Environment, Trajectory
@@ -63,7 +62,7 @@ _HOME = {
     "RunResults": "runs.run",
     "Evaluation": "training.driver",
     "sweep": "sweeps.run",
-    "SweepResults": "sweeps.reading",
+    "SweepResults": "sweeps.run",
     "iqm": "reports.statistics",
     "iqm_interval": "reports.statistics",
     "mean_interval": "reports.statistics",
