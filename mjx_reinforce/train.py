@@ -208,7 +208,7 @@ def train(
             from mjx_reinforce.reports.curves import load_libraries
             from mjx_reinforce.runs.log import RunLog
             from mjx_reinforce.runs.observers import RunFiles, Screen
-            from mjx_reinforce.runs.training import compile_driver, draw, summarize
+            from mjx_reinforce.runs.training import compile_driver, draw, summary_of
 
             loading = threading.Thread(target=load_libraries, daemon=True)
             driver, seconds = compile_driver(
@@ -224,7 +224,7 @@ def train(
     files.end(driver)
     # A signal after that changes nothing: what is left takes a second or two.
     test = driver.test(lambda: interrupt.number is not None)
-    summary = summarize(driver, ready.engine, seconds, test)
+    summary = summary_of(driver, ready.engine, seconds, test)
     files.finish(driver, draw(driver), summary)
     with contextlib.suppress(OSError):  # as ``Display.say``
         print_summary(display.console, summary, directory)

@@ -11,7 +11,7 @@ from mjx_reinforce.policies.networks import MLP
 
 #: Units of one iteration. Their activations do not wait for each other, and the sums of the next
 #: layer stay in registers from one to the next.
-_TOGETHER = 4
+_UNITS_AT_ONCE = 4
 
 
 def unit_by_unit(
@@ -39,7 +39,7 @@ def unit_by_unit(
     while len(layers) > 1:
         first, second, *layers = layers
         size = len(first["bias"])
-        together = math.gcd(size, _TOGETHER)
+        together = math.gcd(size, _UNITS_AT_ONCE)
         weights = first["kernel"].T, first["bias"], second["kernel"]
         rows = [w.reshape(size // together, together, *w.shape[1:]) for w in weights]
         bias = second["bias"].astype(jnp.result_type(x, *weights, second["bias"]))

@@ -43,12 +43,12 @@ def lead(
     def gathered(mine: Arrays) -> list[Arrays]:
         others = processes.hear()
         assert others is not None, "a process left a run that had not ended"
-        return [mine, *(_decode(content)[1] for content in others)]
+        return [mine, *(_decode_message(content)[1] for content in others)]
 
     def ask(name: str, tree: PyTree, **common: np.ndarray) -> list[Arrays]:
-        leaves = _leaves(tree)
+        leaves = _numbered_leaves(tree)
         parts = [{k: x[each] for k, x in leaves.items()} | common for each in shares]
-        processes.tell(*(_encode(name, part) for part in parts[1:]))
+        processes.tell(*(_encode_message(name, part) for part in parts[1:]))
         return gathered(_answer(name, parts[0], programs, like))
 
     def advance(
@@ -60,7 +60,7 @@ def lead(
             [_part(x, group) for x in answers] for group in ("state", "metrics", "looked")
         )
         evaluation = _looked(before, _together(looked)) if look else None
-        return _state(_together(states), like), _together_in_time(metrics), evaluation
+        return _state_of(_together(states), like), _together_in_time(metrics), evaluation
 
     def evaluate(present: RunState) -> Looked:
         return _looked(present, _together(ask("evaluate", present)))
@@ -68,13 +68,13 @@ def lead(
     def test(actor: Actor) -> Arrays:
         return _together(ask("test", actor))
 
-    first = _state(_together(gathered(_leaves(state))), like)
+    first = _state_of(_together(gathered(_numbered_leaves(state))), like)
     return first, Programs(advance, evaluate, test)
 
 
 def end(processes: Processes, status: int) -> None:
     """Tells all others to end with that status."""
-    processes.tell(_encode(_END, {"status": np.array(status)}))
+    processes.tell(_encode_message(_END, {"status": np.array(status)}))
 
 
 def serve(processes: Processes, programs: Programs, state: RunState) -> int:
@@ -86,14 +86,14 @@ def serve(processes: Processes, programs: Programs, state: RunState) -> int:
       state: of these, before their first update.
     """
     like = jax.eval_shape(lambda: state)
-    processes.tell(_encode("state", _leaves(state)))
+    processes.tell(_encode_message("state", _numbered_leaves(state)))
     while True:
         heard = processes.hear()
         assert heard is not None, "process 0 left a run that had not ended"
-        name, given = _decode(heard[0])
+        name, given = _decode_message(heard[0])
         if name == _END:
             return int(given["status"])
-        processes.tell(_encode(name, _answer(name, given, programs, like)))
+        processes.tell(_encode_message(name, _answer(name, given, programs, like)))
 
 
 def _answer(name: str, given: Arrays, programs: Programs, like: RunState) -> Arrays:
@@ -105,7 +105,7 @@ def _answer(name: str, given: Arrays, programs: Programs, like: RunState) -> Arr
         before, look = restored(leaves, like), name != "advance"
         state, metrics, looked = programs.advance(before, look, Budget(*budget))
         measured = {} if looked is None else looked.measured
-        groups = {"state": _leaves(state), "metrics": metrics, "looked": measured}
+        groups = {"state": _numbered_leaves(state), "metrics": metrics, "looked": measured}
         return {f"{group}/{k}": x for group, arrays in groups.items() for k, x in arrays.items()}
     if name == "evaluate":
         return programs.evaluate(restored(leaves, like)).measured
@@ -118,12 +118,12 @@ def _looked(state: RunState, measured: Arrays) -> Looked:
     return Looked(actor, num_updates, measured)
 
 
-def _state(leaves: Arrays, like: RunState) -> RunState:
-    """Returns states on the host, from what ``_leaves`` returned."""
+def _state_of(leaves: Arrays, like: RunState) -> RunState:
+    """Returns states on the host, from what ``_numbered_leaves`` returned."""
     return restored([leaves[str(i)] for i in range(len(leaves))], like)
 
 
-def _leaves(tree: PyTree) -> Arrays:
+def _numbered_leaves(tree: PyTree) -> Arrays:
     """Returns the leaves of a pytree on the host by their numbers; keys as data."""
     leaves = jax.device_get(jax.tree.leaves(plain(tree)))
     return {str(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}
@@ -151,15 +151,15 @@ def _together_in_time(parts: Sequence[Arrays]) -> Arrays:
     }
 
 
-def _encode(name: str, arrays: Mapping[str, np.ndarray]) -> bytes:
+def _encode_message(name: str, arrays: Mapping[str, np.ndarray]) -> bytes:
     """Returns a message: a NumPy archive."""
     archive = io.BytesIO()
     np.savez(archive, allow_pickle=False, name=np.array(name), **arrays)
     return archive.getvalue()
 
 
-def _decode(message: bytes) -> tuple[str, Arrays]:
-    """Returns what ``_encode`` was given."""
+def _decode_message(message: bytes) -> tuple[str, Arrays]:
+    """Returns what ``_encode_message`` was given."""
     with np.load(io.BytesIO(message), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     return str(arrays.pop("name")), arrays

@@ -24,7 +24,7 @@ from mjx_reinforce.settings.relevance import changed, check_read
 from mjx_reinforce.training import resume
 
 #: What a run leaves in its directory.
-_FILES = (
+_LEFT_BEHIND = (
     "config.json",
     "metrics.csv",
     "returns.npz",
@@ -35,7 +35,7 @@ _FILES = (
 )
 _DESCRIPTION = (
     "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. "
-    f"Leaves {', '.join(_FILES)} in the run directory.\n\n"
+    f"Leaves {', '.join(_LEFT_BEHIND)} in the run directory.\n\n"
     "Defaults depend on the task and on the budget: --help shows those of InvertedPendulum-v5, "
     "--help --env ID those of another, for about a minute of training here, and with "
     "--env-steps N those for N env steps."
@@ -59,7 +59,7 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
         or is of the user's own environment, which is to be named again.
     """
     default, preset, flags, prog = start(arguments, command("train"))
-    config, processes = _read(flags, default, prog)
+    config, processes = _read_config(flags, default, prog)
     if config.minutes is not None and flag_value(flags, "--env-steps"):
         raise ValueError(
             f"--minutes {config.minutes:g} and --env-steps {config.env_steps} both say when the "
@@ -73,7 +73,7 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
     if preset is not None:
         raise ValueError(f"--resume has the run's own settings: leave the preset {preset} out")
     known = resume.read_settings(config.resume)
-    asked, _ = _read(flags, known, prog)
+    asked, _ = _read_config(flags, known, prog)
     resume.check_settings(known, asked)
     if resume.is_done(known, asked):
         print(
@@ -129,7 +129,9 @@ def _default(arguments: Sequence[str]) -> Config:
     return dataclasses.replace(known, resume=None)
 
 
-def _read(arguments: Sequence[str], default: Config, prog: str) -> tuple[Config, ProcessSettings]:
+def _read_config(
+    arguments: Sequence[str], default: Config, prog: str
+) -> tuple[Config, ProcessSettings]:
     """Returns the settings that flags ask for, with others as given; --help exits."""
     groups = {**GROUPS, "hosts": ProcessSettings}
     said = _DESCRIPTION if asks_brief_help(arguments) else f"{_DESCRIPTION}\n\n{_names()}"

@@ -59,7 +59,7 @@ def compile_driver(
     return Driver(known, programs, record, state, best), seconds
 
 
-def summarize(
+def summary_of(
     driver: Driver, engine: str, compile_seconds: float, test: dict[str, Any]
 ) -> dict[str, Any]:
     """Returns the contents of summary.json.

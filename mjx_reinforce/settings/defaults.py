@@ -208,7 +208,7 @@ _ENOUGH = {
 _EVALUATIONS = 50
 #: A default run trains for about so long (s) with as many seeds as a default run has, and never
 #: less than the task's settings above say.
-_SECONDS = 60.0
+_DEFAULT_SECONDS = 60.0
 
 
 def of_task(
@@ -236,7 +236,7 @@ def of_task(
     if env_steps is not None:
         chosen = next(config for least, config in reversed(rows) if env_steps >= least)
         return _with_budget(chosen, env_steps)
-    given, chosen = _in_time(seconds or _SECONDS, rows)
+    given, chosen = _in_time(seconds or _DEFAULT_SECONDS, rows)
     if seconds is None:
         given = min(given, _ENOUGH.get(env, given))
     return _with_budget(chosen, max(given, 1 if seconds else few.env_steps or 0))
@@ -313,7 +313,7 @@ def flag_value(arguments: Sequence[str], flag: str) -> str | None:
 def for_arguments(arguments: Sequence[str]) -> Config:
     """Returns the default settings for what a command line names: the task, seeds and budget."""
     env_steps, num_seeds = (
-        _count(flag_value(arguments, f)) for f in ("--env-steps", "--num-seeds")
+        _positive_number(flag_value(arguments, f)) for f in ("--env-steps", "--num-seeds")
     )
     minutes = flag_value(arguments, "--minutes") or ""
     try:
@@ -324,7 +324,7 @@ def for_arguments(arguments: Sequence[str]) -> Config:
     return of_task(named_task(arguments), env_steps, num_seeds or Config.num_seeds, known)
 
 
-def _count(text: str | None) -> int | None:
+def _positive_number(text: str | None) -> int | None:
     """Returns a number from a command line; None for none, and for what the parser refuses."""
     try:
         number = whole_number(text or "")

@@ -30,7 +30,7 @@ from mjx_reinforce.training.resume import recordable
 from mjx_reinforce.training.state import Budget, Parts, eval_keys_shape
 from mjx_reinforce.types import PyTree, plain
 
-_NAMES = ("start", "advance", "look")
+_PROGRAMS = ("start", "advance", "look")
 
 
 def key_of(config: Config, share: slice = slice(None)) -> str | None:
@@ -76,7 +76,7 @@ def keep(key: str, facts: dict[str, Any], parts: Parts) -> Parts:
         whole = {"facts": facts, "like": describe_tree(parts.like), "rides": parts.rides}
     except TypeError:
         return parts
-    _write(key, "facts", json.dumps(whole).encode())
+    _write_program(key, "facts", json.dumps(whole).encode())
     shapes, actor = _leaves(parts.like), _leaves(parts.like.train_states.actor)
     seed, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), (2,)))
     given = {
@@ -87,19 +87,19 @@ def keep(key: str, facts: dict[str, Any], parts: Parts) -> Parts:
     return parts._replace(
         **{
             name: functools.partial(_export, key, name, getattr(parts, name), given[name])
-            for name in _NAMES
+            for name in _PROGRAMS
         }
     )
 
 
 def read_programs(key: str) -> tuple[dict[str, Any], Parts] | None:
     """Returns the facts and the programs of a run; None unless all of them are on disk."""
-    read = {name: _read(key, name) for name in ("facts", *_NAMES)}
+    read = {name: _read_program(key, name) for name in ("facts", *_PROGRAMS)}
     found = {name: content for name, content in read.items() if content is not None}
     if len(found) < len(read) or not all(map(seam.restore, found.values())):
         return None
     whole = json.loads(found["facts"])
-    programs = {name: functools.partial(_program, found[name]) for name in _NAMES}
+    programs = {name: functools.partial(_program, found[name]) for name in _PROGRAMS}
     return whole["facts"], Parts(rebuild(whole["like"]), **programs, rides=whole["rides"])
 
 
@@ -120,7 +120,7 @@ def _export(
         content = bytes(own.serialize())
     except (ValueError, NotImplementedError):
         return program
-    _write(key, name, content)
+    _write_program(key, name, content)
     return _program(content)
 
 
@@ -129,12 +129,12 @@ def _leaves(tree: PyTree) -> list[jax.ShapeDtypeStruct]:
     return jax.tree.leaves(jax.eval_shape(plain, tree))
 
 
-def _read(key: str, name: str) -> bytes | None:
+def _read_program(key: str, name: str) -> bytes | None:
     folder = objects.folder()
     return None if folder is None else objects.read_object(folder, f"{key}-{name}")
 
 
-def _write(key: str, name: str, content: bytes) -> None:
+def _write_program(key: str, name: str, content: bytes) -> None:
     folder = objects.folder()
     if folder is not None:
         objects.write_object(folder, f"{key}-{name}", content)

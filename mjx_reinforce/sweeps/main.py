@@ -18,14 +18,14 @@ def main() -> None:
     accept_everything()
     silence_alarms()
     with Interrupt() as interrupt:
-        status = _main(sys.argv[1:], interrupt)
+        status = _sweep(sys.argv[1:], interrupt)
         if interrupt.number is not None:  # not at the end of a compiler's thread
             sys.stdout.flush()
             os._exit(status)
     sys.exit(status)
 
 
-def _main(arguments: Sequence[str], interrupt: Interrupt) -> int:
+def _sweep(arguments: Sequence[str], interrupt: Interrupt) -> int:
     """Returns the exit status of a command line."""
     made: list[Path] = []
     interrupt.on_exit(lambda: remove_empty(made))

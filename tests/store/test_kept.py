@@ -114,7 +114,7 @@ def test_a_program_that_launches_a_gpus_kernel_is_kept():
         return gpu._call(gpu._PROBE, "probe", (1, 1), [jnp.ones(1, jnp.int32)], [x])
 
     kept._export("key", "look", lambda: add, (jax.ShapeDtypeStruct((1,), np.int32),))
-    assert gpu.PTX.encode() in kept._read("key", "look")
+    assert gpu.PTX.encode() in kept._read_program("key", "look")
 
 
 def test_a_commit_that_changes_no_source_changes_nothing(monkeypatch):

@@ -31,8 +31,8 @@ from mjx_reinforce.sweeps.designs import plan, rungs, search
 from mjx_reinforce.sweeps.designs.design import Design, check_design
 from mjx_reinforce.sweeps.designs.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
-from mjx_reinforce.sweeps.reading import read_results
 from mjx_reinforce.sweeps.results import join_parts
+from mjx_reinforce.sweeps.run import read_results
 from mjx_reinforce.sweeps.slots import programs
 from mjx_reinforce.sweeps.slots.packing import pack_slots
 from mjx_reinforce.training.state import eval_keys, evaluation

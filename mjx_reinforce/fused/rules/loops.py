@@ -7,8 +7,8 @@ import numpy as np
 
 from mjx_reinforce.fused import arrays, jaxprs
 from mjx_reinforce.fused.graph import Graph
-from mjx_reinforce.fused.iterate import Step, iterate, varies
 from mjx_reinforce.fused.nodes import Gate, Loop, Node, Scalar, is_constant, same
+from mjx_reinforce.fused.rules.iterate import Iteration, iterate, varies
 
 
 def while_rule(
@@ -77,7 +77,7 @@ def _limit(graph: Graph, has_arrays: bool) -> int:
     return graph.limits.arrays if has_arrays else graph.limits.plain
 
 
-def _unroll(step: Step, state: list[Scalar], rows: list[list[Scalar]]) -> tuple[list, list]:
+def _unroll(step: Iteration, state: list[Scalar], rows: list[list[Scalar]]) -> tuple[list, list]:
     """Runs the iterations one by one; returns the final carry and the ys of each."""
     table = []
     for row in rows:
@@ -87,7 +87,7 @@ def _unroll(step: Step, state: list[Scalar], rows: list[list[Scalar]]) -> tuple[
 
 
 def _as_loop(
-    graph: Graph, step: Step, inits: list, rows: list[list[Scalar]], length: int
+    graph: Graph, step: Iteration, inits: list, rows: list[list[Scalar]], length: int
 ) -> tuple[list, list]:
     """Builds a scan's loop; returns the final carry and the ys of each iteration."""
     xs = [list(column) for column in zip(*rows, strict=True)]

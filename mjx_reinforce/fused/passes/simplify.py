@@ -15,9 +15,9 @@ from typing import Protocol
 
 import numpy as np
 
-from mjx_reinforce.fused import folding
 from mjx_reinforce.fused.nodes import Node, Scalar, is_constant
 from mjx_reinforce.fused.ops import Op
+from mjx_reinforce.fused.passes import folding
 
 # Greater powers are not faster as products than as ``pow``.
 _LARGEST_POWER = 8

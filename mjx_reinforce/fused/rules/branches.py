@@ -58,7 +58,7 @@ def by_engine_rule(
 def _choose_among(graph: Graph, branches: list[Branch], choice: Node) -> list[Scalar]:
     """Returns the results of the branch that each lane takes."""
     order = range(len(branches))
-    if len(branches) == 2 and _try(graph, branches[0], 0)[0]:
+    if len(branches) == 2 and _try_branch(graph, branches[0], 0)[0]:
         order = (1, 0)  # the cheap branch first: its results are what a skipped one falls back on
     results: list[Scalar] | None = None
     for k in order:
@@ -83,17 +83,17 @@ def _merge(
     graph: Graph, branch: Branch, k: int, needed: Scalar, fallback: list[Scalar] | None
 ) -> list[Scalar]:
     """Adds the results of branch k to those of the branches before it."""
-    expensive, dtypes = _try(graph, branch, k)
+    expensive, dtypes = _try_branch(graph, branch, k)
     if expensive and isinstance(needed, Node) and needed not in graph.certain:
         return _gate(graph, branch, needed, fallback or [dtype.type(0) for dtype in dtypes])
     results = branch()
-    return results if fallback is None else _select(graph, needed, results, fallback)
+    return results if fallback is None else _select_all(graph, needed, results, fallback)
 
 
 def _gate(graph: Graph, branch: Branch, needed: Node, cold: list[Scalar]) -> list[Scalar]:
     """Makes the branch one that is skipped where no lane needs it."""
     with graph.branch() as body, graph.assuming(needed):
-        hot = _select(graph, needed, branch(), cold)
+        hot = _select_all(graph, needed, branch(), cold)
     gate = Gate(graph.scope, graph.number(), needed, body, hot, cold)
     for position, (on, off) in enumerate(zip(hot, cold, strict=True)):
         varying = any(isinstance(value, Node) and value.varying for value in (on, off))
@@ -102,7 +102,7 @@ def _gate(graph: Graph, branch: Branch, needed: Node, cold: list[Scalar]) -> lis
     return [off if out is None else out for out, off in zip(gate.outs, cold, strict=True)]
 
 
-def _try(graph: Graph, branch: Branch, k: int) -> tuple[bool, list[np.dtype]]:
+def _try_branch(graph: Graph, branch: Branch, k: int) -> tuple[bool, list[np.dtype]]:
     """Returns whether branch k is expensive, and the dtypes of its results.
 
     What it makes is dropped. A branch that was expensive once remains so where less is assumed.
@@ -117,5 +117,5 @@ def _try(graph: Graph, branch: Branch, k: int) -> tuple[bool, list[np.dtype]]:
     return True, graph.learned[place]
 
 
-def _select(graph: Graph, needed: Scalar, on: list[Scalar], off: list[Scalar]) -> list[Scalar]:
+def _select_all(graph: Graph, needed: Scalar, on: list[Scalar], off: list[Scalar]) -> list[Scalar]:
     return [graph.select(needed, x, y) for x, y in zip(on, off, strict=True)]

@@ -7,14 +7,14 @@ from mjx_reinforce.fused.graph import Graph
 from mjx_reinforce.fused.nodes import Loop, Node, Scalar, same
 
 #: (carry, elements of xs) -> (carry after one iteration, ys)
-Step = Callable[[list[Scalar], list[Scalar]], tuple[list[Scalar], list[Scalar]]]
+Iteration = Callable[[list[Scalar], list[Scalar]], tuple[list[Scalar], list[Scalar]]]
 
 
 @dataclasses.dataclass(frozen=True)
 class _Plan:
     """What is to be repeated; the fields as in ``iterate``."""
 
-    step: Step
+    step: Iteration
     inits: list[Scalar]
     length: int | None
     active: int | None
@@ -23,7 +23,7 @@ class _Plan:
 
 def iterate(
     graph: Graph,
-    step: Step,
+    step: Iteration,
     inits: Sequence[Scalar],
     *,
     length: int | None = None,

@@ -4,10 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.policies.action_range import finite_box, middle_and_half_range
-from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.policies.gaussian import gaussian_outputs, normal_entropy, normal_log_density
-from mjx_reinforce.policies.normal_integrals import log_tail
+from mjx_reinforce.policies.distributions.action_range import finite_box, middle_and_half_range
+from mjx_reinforce.policies.distributions.distribution import Distribution
+from mjx_reinforce.policies.distributions.gaussian import (
+    gaussian_outputs,
+    normal_entropy,
+    normal_log_density,
+)
+from mjx_reinforce.policies.distributions.normal_integrals import log_tail
 from mjx_reinforce.types import Box, Discrete
 
 # float32 cannot recover a z much beyond the first number from tanh(z). Samples beyond it are all

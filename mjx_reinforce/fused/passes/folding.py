@@ -28,7 +28,7 @@ def fold(op: Op, operands: Sequence[Any], dtype: np.dtype) -> Any:
     elif (by_numpy := _EXCEPTIONS.get(name, FACTS[name].in_numpy)) is not None:
         result = by_numpy(*operands)
     else:
-        result = jaxprs.evaluate(jaxprs.operation(name), dict(op.params), operands)[0]
+        result = jaxprs.compute_constants(jaxprs.operation(name), dict(op.params), operands)[0]
     return np.asarray(result, dtype)[()]
 
 
@@ -51,7 +51,7 @@ def _are_integers(x: np.ndarray) -> bool:
     return np.issubdtype(np.asarray(x).dtype, np.integer)
 
 
-def _select(predicate: np.ndarray, *cases: np.ndarray) -> Any:
+def _choose_case(predicate: np.ndarray, *cases: np.ndarray) -> Any:
     """Picks the case that the predicate numbers."""
     return np.choose(np.asarray(predicate, int), cases)
 
@@ -70,7 +70,7 @@ def _rsqrt(x: np.ndarray) -> Any:
 #: What one function of NumPy does not compute. Rare operations that NumPy does not have at all JAX
 #: computes at once, in about 1 ms.
 _EXCEPTIONS: dict[str, Callable[..., Any]] = {
-    "select_n": _select,
+    "select_n": _choose_case,
     "div": _divide,
     "rem": _remainder,
     "rsqrt": _rsqrt,

@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from mjx_reinforce.fused.backends.backend import Backend
-from mjx_reinforce.fused.iterate import varies
-from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
-from mjx_reinforce.fused.nodes import Captured, Node, Scalar
+from mjx_reinforce.fused.nodes import BOOL, Captured, Node, Scalar
 from mjx_reinforce.fused.ops import FACTS, Op
+from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
+from mjx_reinforce.fused.rules.iterate import varies
 from mjx_reinforce.fused.scalarized import Scalarized
 
-_BOOL = np.dtype(bool)
-Values = dict[Node, np.dtype]
+Dtypes = dict[Node, np.dtype]
 
 
 def verify(written: Scalarized) -> None:
@@ -48,25 +47,25 @@ class _Verify(Backend[np.dtype]):
     def leaf(self, node: Node) -> np.dtype:
         """An input too; all else that is asked for here should have been computed."""
         is_input = node.op is None and (node.owner is None or isinstance(node.owner, Captured))
-        _check(is_input, f"{_name(node)} is read where it is not known")
+        _check(is_input, f"{_node_name(node)} is read where it is not known")
         return node.dtype
 
-    def value(self, scalar: Scalar, values: Values) -> np.dtype:
+    def value(self, scalar: Scalar, values: Dtypes) -> np.dtype:
         """Notes that a scalar is read."""
         self._read.add(scalar)
         return super().value(scalar, values)
 
     def node(self, node: Node, operands: list[np.dtype]) -> np.dtype:
         """Checks an operation."""
-        _check(node not in self._computed, f"{_name(node)} is computed twice")
+        _check(node not in self._computed, f"{_node_name(node)} is computed twice")
         self._computed.add(node)
-        _check(_fits(node, operands), f"{_name(node)} takes {operands} to {node.dtype}")
-        _check(node.varying == any(map(varies, node.args)), f"{_name(node)} varies otherwise")
+        _check(_fits(node, operands), f"{_node_name(node)} takes {operands} to {node.dtype}")
+        _check(node.varying == any(map(varies, node.args)), f"{_node_name(node)} varies otherwise")
         return node.dtype
 
-    def gate(self, gate: LiveGate, values: Values) -> Sequence[np.dtype]:
+    def gate(self, gate: LiveGate, values: Dtypes) -> Sequence[np.dtype]:
         """Checks a branch."""
-        _check(self.value(gate.predicate, values) == _BOOL, "a gate's predicate is no bool")
+        _check(self.value(gate.predicate, values) == BOOL, "a gate's predicate is no bool")
         cold = [self.value(out.cold, values) for out in gate.outs]
         inner = self.inside(gate.body, values)
         for out in gate.outs:
@@ -76,7 +75,7 @@ class _Verify(Backend[np.dtype]):
         return cold
 
     def loop(
-        self, loop: LiveLoop, values: Values
+        self, loop: LiveLoop, values: Dtypes
     ) -> tuple[Sequence[np.dtype], Sequence[Sequence[np.dtype]]]:
         """Checks a loop."""
         _check(loop.length is not None or loop.active is not None, "a loop never ends")
@@ -96,7 +95,7 @@ class _Verify(Backend[np.dtype]):
             _covers("a carry", carry.out, [carry.leaf])
         if loop.active is not None:
             switch = loop.carries[loop.active].leaf
-            _check(switch.dtype == _BOOL, "what ends a loop is no bool")
+            _check(switch.dtype == BOOL, "what ends a loop is no bool")
         for record in loop.records:
             self.value(record.value, inner)
             _check(len(record.outs) == loop.length, "a loop keeps too few records")
@@ -109,7 +108,7 @@ class _Verify(Backend[np.dtype]):
     def result(self, outputs: list[list[np.dtype]]) -> None:
         """Checks that nothing was computed in vain."""
         for node in self._computed - self._read:
-            raise AssertionError(f"{_name(node)} is computed and never read")
+            raise AssertionError(f"{_node_name(node)} is computed and never read")
 
 
 def _fits(node: Node, operands: list[np.dtype]) -> bool:
@@ -118,7 +117,7 @@ def _fits(node: Node, operands: list[np.dtype]) -> bool:
     facts, dtype = FACTS[op.name], node.dtype
     if op.name == "select_n":
         which, *cases = operands
-        enough = len(cases) == 2 if which == _BOOL else len(cases) >= 2 and which.kind in "iu"
+        enough = len(cases) == 2 if which == BOOL else len(cases) >= 2 and which.kind in "iu"
         return enough and set(cases) == {dtype}
     if len(operands) != facts.arity:
         return False
@@ -126,7 +125,7 @@ def _fits(node: Node, operands: list[np.dtype]) -> bool:
         return dict(op.params)["new_dtype"] == dtype
     if op.name == "pow":  # an exponent may be an integer under a float base
         return operands[0] == dtype
-    made = _BOOL if facts.is_predicate else operands[0]
+    made = BOOL if facts.is_predicate else operands[0]
     return len(set(operands)) == 1 and made == dtype
 
 
@@ -140,7 +139,7 @@ def _covers(what: str, leaf: Node, scalars: Sequence[Scalar]) -> None:
     _check(leaf.varying or not any(map(varies, scalars)), f"{what} does not vary, its value does")
 
 
-def _name(node: Node) -> str:
+def _node_name(node: Node) -> str:
     return f"{node.op.name if node.op else 'a leaf'} ({node.index})"
 
 

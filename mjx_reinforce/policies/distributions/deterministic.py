@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 
-from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.policies.gaussian import gaussian_outputs
+from mjx_reinforce.policies.distributions.distribution import Distribution
+from mjx_reinforce.policies.distributions.gaussian import gaussian_outputs
 from mjx_reinforce.types import Box, Discrete
 
 

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from mjx_reinforce.policies.action_range import continuous_box, middle_and_half_range
 from mjx_reinforce.policies.arguments import check_number, known_number
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.action_range import continuous_box, middle_and_half_range
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Box, Discrete
 
 LOG_SQRT_2PI = 0.5 * float(np.log(2.0 * np.pi))

@@ -3,10 +3,10 @@
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.policies import normal_integrals
-from mjx_reinforce.policies.action_range import bounds, finite_box
-from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.policies.gaussian import gaussian_outputs
+from mjx_reinforce.policies.distributions import normal_integrals
+from mjx_reinforce.policies.distributions.action_range import bounds, finite_box
+from mjx_reinforce.policies.distributions.distribution import Distribution
+from mjx_reinforce.policies.distributions.gaussian import gaussian_outputs
 from mjx_reinforce.types import Box, Discrete
 
 
@@ -21,7 +21,7 @@ def truncated_normal(
 
     Density, entropy and their gradients stay exact when the mean is far outside the
     range, and so does the sampling, by the inverse distribution function; see
-    ``mjx_reinforce.policies.normal_integrals``. The noise is uniform in (0, 1).
+    ``mjx_reinforce.policies.distributions.normal_integrals``. The noise is uniform in (0, 1).
 
     Args:
       space: the action bounds, [A] each, finite.

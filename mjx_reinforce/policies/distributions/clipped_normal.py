@@ -3,15 +3,15 @@
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.policies.action_range import bounds, finite_box
-from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.policies.gaussian import (
+from mjx_reinforce.policies.distributions.action_range import bounds, finite_box
+from mjx_reinforce.policies.distributions.distribution import Distribution
+from mjx_reinforce.policies.distributions.gaussian import (
     LOG_SQRT_2PI,
     gaussian_outputs,
     normal_entropy,
     normal_log_density,
 )
-from mjx_reinforce.policies.normal_integrals import log_tail
+from mjx_reinforce.policies.distributions.normal_integrals import log_tail
 from mjx_reinforce.types import Box, Discrete
 
 

@@ -3,8 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.policies.action_range import check_space
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.action_range import check_space
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Box, Discrete
 
 
