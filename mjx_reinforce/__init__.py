@@ -9,7 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read in place of __getattr__
-    from mjx_reinforce.engines.rollouts import rollout
+    from mjx_reinforce.engines.any_policy import rollout
     from mjx_reinforce.export.player import Player, load
     from mjx_reinforce.export.policy_files import load_policy, save_policy
     from mjx_reinforce.export.pretrained import pretrained
@@ -56,6 +56,7 @@ if TYPE_CHECKING:  # what type checkers and editors read in place of __getattr__
     from mjx_reinforce.types import Box, Discrete, Environment, Trajectory
     from mjx_reinforce.vector.environment import VectorEnv, make_vec
     from mjx_reinforce.vector.episodes import VectorState
+    from mjx_reinforce.vector.segments import Segment, unroll
 
 _HOME = {
     "Config": "settings.config",
@@ -76,6 +77,8 @@ _HOME = {
     "make_vec": "vector.environment",
     "VectorEnv": "vector.environment",
     "VectorState": "vector.episodes",
+    "Segment": "vector.segments",
+    "unroll": "vector.segments",
     "Learner": "learners.learner",
     "TrainState": "learners.learner",
     "reinforce": "learners.reinforce",
@@ -110,7 +113,7 @@ _HOME = {
     "Policy": "policies.policy",
     "mlp_policy": "policies.policy",
     "evaluate": "training.evaluation",
-    "rollout": "engines.rollouts",
+    "rollout": "engines.any_policy",
     "Box": "types",
     "Discrete": "types",
     "Environment": "types",
@@ -144,6 +147,7 @@ __all__ = [
     "Player",
     "Policy",
     "RunResults",
+    "Segment",
     "SweepResults",
     "TrainState",
     "Trajectory",
@@ -193,6 +197,7 @@ __all__ = [
     "total_return",
     "train_step",
     "truncated_normal",
+    "unroll",
     "value_baseline",
 ]
 
