@@ -37,7 +37,9 @@ def test_a_file_that_git_does_not_track_is_of_no_commit(tmp_path, monkeypatch):
     copy = shutil.copy(module.__file__, tmp_path / "provenance.py")
     monkeypatch.setattr(module, "__file__", str(copy))
     assert module._git_commit() is None
-    subprocess.run(["git", "-C", tmp_path, "init", "-q"], check=True)
+    git = ["git", "-C", tmp_path, "-c", "user.name=A", "-c", "user.email=a@example.org"]
+    subprocess.run([*git, "init", "-q"], check=True)
+    subprocess.run([*git, "commit", "-q", "--allow-empty", "-m", "another's"], check=True)
     assert module._git_commit() is None
 
 
