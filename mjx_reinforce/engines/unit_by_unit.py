@@ -1,9 +1,11 @@
 """A network of one observation as loops over its units, so that it is a short program."""
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 
@@ -29,13 +31,6 @@ def unit_by_unit(
     params = network.variables["params"]
     layers = [params[f"Dense_{i}"] for i in range(len(params))]
     x = args[0]
-
-    def add_units(sums, weights):
-        units = [jnp.tanh(jnp.dot(x, into) + bias) for into, bias in zip(*weights[:2], strict=True)]
-        for unit, out in zip(units, weights[2], strict=True):
-            sums = sums + unit * out
-        return sums, None
-
     while len(layers) > 1:
         first, second, *layers = layers
         size = len(first["bias"])
@@ -43,6 +38,15 @@ def unit_by_unit(
         weights = first["kernel"].T, first["bias"], second["kernel"]
         rows = [w.reshape(size // together, together, *w.shape[1:]) for w in weights]
         bias = second["bias"].astype(jnp.result_type(x, *weights, second["bias"]))
-        x, _ = lax.scan(add_units, bias, rows)
+        # Of a function that it knows, JAX takes the body that it traced before, with its x.
+        x, _ = lax.scan(functools.partial(_add_units, x), bias, rows)
         x = jnp.tanh(x) if layers else x
     return jnp.dot(x, layers[0]["kernel"]) + layers[0]["bias"] if layers else x
+
+
+def _add_units(x: jax.Array, sums: jax.Array, weights: Any) -> tuple[jax.Array, None]:
+    """Adds a few units of a layer to all units of the next."""
+    units = [jnp.tanh(jnp.dot(x, into) + bias) for into, bias in zip(*weights[:2], strict=True)]
+    for unit, out in zip(units, weights[2], strict=True):
+        sums = sums + unit * out
+    return sums, None
