@@ -67,7 +67,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             check_installed(config)
             common = {**resume.recordable(config), **versions()}
             processes = held.enter_context(joined(settings, interrupt, common))
-            share = processes.shares(config.num_seeds)[processes.index]
+            share = processes.share(config.num_seeds)
             directory = Path()
             if processes.index == 0:
                 directory, new = _directory(config)
@@ -141,11 +141,11 @@ def _start(
         return ready, None
     present = {**provenance(), "num_processes": processes.count}
     resume.check_program(config.resume, present)
-    like = ready.parts.like
+    like = ready.programs.like
     if config.minutes is not None:  # more than any checkpoint has used
         config = dataclasses.replace(config, env_steps=MAX_COUNT)
     if processes.count > 1:
-        from mjx_reinforce.hosts.shares import shape_of_all
+        from mjx_reinforce.training.state import shape_of_all
 
         like = shape_of_all(like, config.num_seeds)
     found = resume.newest_checkpoint(like, config, print)
@@ -160,9 +160,9 @@ def _start(
 def _serve(ready: "Ready", config: Config, processes: Processes, interrupt: Interrupt) -> int:
     """Trains seeds for process 0, which has the run's files; returns the exit status."""
     from mjx_reinforce.hosts.shares import serve
-    from mjx_reinforce.training.state import compile_parts
+    from mjx_reinforce.training.programs import compile_run
 
-    state, programs = compile_parts(ready.parts, config)
+    state, programs = compile_run(ready.programs, config, processes.share(config.num_seeds))
     interrupt.defer(lambda _: processes.stop(interrupt.number or 0))
     return serve(processes, programs, state)
 
