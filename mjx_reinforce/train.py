@@ -20,7 +20,7 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import accept_everything, silence_alarms
 from mjx_reinforce.hosts.processes import Processes, joined
-from mjx_reinforce.runs.command_line import parse_all, refuse, start
+from mjx_reinforce.runs.command_line import parse_all, refuse, refuse_full, start
 from mjx_reinforce.runs.directory import (
     check_writable,
     choose_directory,
@@ -96,17 +96,11 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
         status = train(ready, found, config, plan, directory, interrupt, processes)
         _end(processes, status)
         return status
-    except RuntimeError as error:  # XLA's
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        remedy = "lower --num-seeds, --num-episodes, --eval-episodes or --horizon"
-        refuse(f"this run does not fit into memory ({error}); {remedy}", made)
-    except OSError as error:
+    except (RuntimeError, OSError) as error:
         begun = (directory / "config.json").exists()
-        again = f"--resume {directory}{env_flag(config.env)}"
-        room = "make room, then " if error.errno else "then "  # W&B's have no number
-        remedy = room + (f"go on with {again}" if begun else "try again")
-        refuse(f"cannot write the files of this run ({error}); {remedy}", made, status=1)
+        resumed = f"go on with --resume {directory}{env_flag(config.env)}"
+        again = resumed if begun else "try again"
+        refuse_full(error, "this run", "this run", "--num-seeds", again, made)
 
 
 def _directory(config: Config) -> tuple[Path, Sequence[Path]]:

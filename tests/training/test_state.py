@@ -63,6 +63,17 @@ def test_evaluations_ride_with_the_updates_that_follow():
     assert counts.to_int(one.train_states.num_updates).tolist() == made.tolist()
 
 
+def test_a_seed_begins_alike_whichever_begin_with_it():
+    """So do the seeds that a process has, and those of a slot."""
+    config = dataclasses.replace(CONFIG, num_seeds=4, test_episodes=6)
+    begin = jax.jit(ready.made(envs.make(config.env), config).programs.begin)
+    every, all_keys = plain(begin(3, 5, np.arange(4, dtype=np.uint32), {}))
+    some, keys = plain(begin(3, 5, np.array([2, 0], np.uint32), {}))
+    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y[jnp.array([2, 0])]), some, every)
+    assert keys.shape == (3, 2, 2)
+    assert np.array_equal(keys, all_keys[:, [2, 0]])
+
+
 def test_runs_count_beyond_32_bits():
     """A budget that ends two updates beyond 2^32 env steps, and half of its schedules."""
     config = dataclasses.replace(CONFIG, env_steps=2**32 + 200, eval_every=50)
