@@ -22,7 +22,7 @@ from mjx_reinforce.sweeps.slots.layout import StateRows
 from mjx_reinforce.sweeps.slots.packing import pack_slots
 from mjx_reinforce.training.block import BuildLearner
 from mjx_reinforce.training.programs import Programs, compiling, programs_of
-from mjx_reinforce.training.state import Budget, RunState, Seed, budget_of, shape_of_all
+from mjx_reinforce.training.state import Budget, RunState, Seed, budget_of
 from mjx_reinforce.types import Environment, PyTree
 
 #: What ``history.Measured`` has of a run's counts since the start.
@@ -217,8 +217,8 @@ def _compile_first(
         return layout.traced_rows(programs.begin(seed, eval_seed, numbers, settings)[0])
 
     seed = devices.shapes(jax.ShapeDtypeStruct((), np.uint32), NONE)
-    settings = shape_of_all(programs.like, width).settings
-    given = devices.shapes((jax.ShapeDtypeStruct((width,), np.uint32), settings), RUNS)
+    numbers = jax.ShapeDtypeStruct((width,), np.uint32)
+    given = devices.shapes((numbers, layout.shapes(width).settings), RUNS)
     return devices.jit(first, (NONE, NONE, RUNS, RUNS), RUNS).lower(seed, seed, *given).compile()
 
 
