@@ -15,21 +15,17 @@ import numpy as np
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.hosts.processes import Processes
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.training.state import Budget, Looked, Programs, RunState, restored
+from mjx_reinforce.training.programs import Looked, RunPrograms
+from mjx_reinforce.training.state import Budget, RunState, restored
 from mjx_reinforce.types import PyTree, plain
 
-#: What a process is asked for, besides the names of ``Programs``.
+#: What a process is asked for, besides the names of ``RunPrograms``.
 _END = "end"
 
 
-def shape_of_all(like: RunState, num_seeds: int) -> RunState:
-    """Returns the shapes of the states of so many seeds, from those of some."""
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_seeds, *x.shape[1:]), x.dtype), like)
-
-
 def lead(
-    processes: Processes, programs: Programs, state: RunState, num_seeds: int
-) -> tuple[RunState, Programs]:
+    processes: Processes, programs: RunPrograms, state: RunState, num_seeds: int
+) -> tuple[RunState, RunPrograms]:
     """Returns the state of all seeds, and programs that move it on in all processes.
 
     Args:
@@ -69,7 +65,7 @@ def lead(
         return _together(ask("test", actor))
 
     first = _state_of(_together(gathered(_numbered_leaves(state))), like)
-    return first, Programs(advance, evaluate, test)
+    return first, RunPrograms(advance, evaluate, test)
 
 
 def end(processes: Processes, status: int) -> None:
@@ -77,7 +73,7 @@ def end(processes: Processes, status: int) -> None:
     processes.tell(_encode_message(_END, {"status": np.array(status)}))
 
 
-def serve(processes: Processes, programs: Programs, state: RunState) -> int:
+def serve(processes: Processes, programs: RunPrograms, state: RunState) -> int:
     """Does what process 0 asks for, until the end; returns the status to end with.
 
     Args:
@@ -96,7 +92,7 @@ def serve(processes: Processes, programs: Programs, state: RunState) -> int:
         processes.tell(_encode_message(name, _answer(name, given, programs, like)))
 
 
-def _answer(name: str, given: Arrays, programs: Programs, like: RunState) -> Arrays:
+def _answer(name: str, given: Arrays, programs: RunPrograms, like: RunState) -> Arrays:
     """Returns what a program makes of the leaves that it is given."""
     # In memory of the device's own, which may be donated.
     budget = given.pop("budget", None)

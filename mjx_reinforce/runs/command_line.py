@@ -187,6 +187,29 @@ def _names() -> str:
     )
 
 
+def refuse_full(
+    error: RuntimeError | OSError, what: str, part: str, flag: str, again: str, made: Sequence[Path]
+) -> NoReturn:
+    """Refuses what met a full memory or disk, as ``refuse``; raises any other error again.
+
+    Args:
+      error: XLA's where memory is full, or that of a file.
+      what: whose files they are.
+      part: what has to fit into memory.
+      flag: makes that part smaller.
+      again: what to do once there is room on the disk.
+      made: the folders that were made.
+    """
+    if isinstance(error, OSError):
+        room = "make room, then" if error.errno else "then"  # W&B's have no number
+        message = f"cannot write the files of {what} ({error}); {room} {again}"
+        refuse(message, made, status=1)
+    if "RESOURCE_EXHAUSTED" not in str(error):
+        raise error
+    flags = f"{flag}, --num-episodes, --eval-episodes or --horizon"
+    refuse(f"{part} does not fit into memory ({error}); lower {flags}", made)
+
+
 def refuse(message: str, made: Sequence[Path], status: int = 2) -> NoReturn:
     """Says in one line what is wrong, removes the empty folders that were made, and exits."""
     remove_empty(made)

@@ -14,8 +14,8 @@ from mjx_reinforce.training.driver import Driver
 from mjx_reinforce.training.initial import begin_with, last_actors
 from mjx_reinforce.training.minutes import env_steps_in
 from mjx_reinforce.training.nonfinite import HOPELESS
+from mjx_reinforce.training.programs import compile_run
 from mjx_reinforce.training.record import RunRecord
-from mjx_reinforce.training.state import compile_parts
 
 if TYPE_CHECKING:
     from mjx_reinforce.store.ready import Ready
@@ -41,7 +41,8 @@ def compile_driver(
       meanwhile: begins other work in Python; called once the rest of the time is XLA's.
     """
     started = time.perf_counter()
-    state, programs = compile_parts(ready.parts, config, meanwhile)
+    share = slice(None) if processes is None else processes.share(config.num_seeds)
+    state, programs = compile_run(ready.programs, config, share, meanwhile)
     if processes is not None and processes.count > 1:
         from mjx_reinforce.hosts.shares import lead
 
