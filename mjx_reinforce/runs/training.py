@@ -13,9 +13,9 @@ from mjx_reinforce.training.best import first_best
 from mjx_reinforce.training.driver import Driver
 from mjx_reinforce.training.initial import begin_with, last_actors
 from mjx_reinforce.training.minutes import env_steps_in
-from mjx_reinforce.training.nonfinite import HOPELESS
 from mjx_reinforce.training.programs import compile_run
-from mjx_reinforce.training.record import RunRecord
+from mjx_reinforce.training.records.nonfinite import HOPELESS
+from mjx_reinforce.training.records.record import RunRecord
 
 if TYPE_CHECKING:
     from mjx_reinforce.store.ready import Ready

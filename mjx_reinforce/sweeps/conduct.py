@@ -27,7 +27,7 @@ from mjx_reinforce.sweeps.results import SweepFiles
 from mjx_reinforce.sweeps.slots.ahead import Stopwatch, one_ahead
 from mjx_reinforce.sweeps.slots.programs import SlotPrograms, compile_programs
 from mjx_reinforce.training.driver import drive
-from mjx_reinforce.training.progress import Progress
+from mjx_reinforce.training.records.progress import Progress
 
 #: More than this share of a sweep is all of it, up to rounding.
 _ALL = 1 - 1e-6

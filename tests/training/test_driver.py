@@ -9,7 +9,7 @@ from mjx_reinforce.learners import counts
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.best import Best
 from mjx_reinforce.training.driver import Driver, drive
-from mjx_reinforce.training.record import RunRecord
+from mjx_reinforce.training.records.record import RunRecord
 from mjx_reinforce.training.state import Looked, Programs
 
 BLOCK = 2

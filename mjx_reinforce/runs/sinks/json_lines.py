@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from mjx_reinforce.files import append, finite, write_bytes
-from mjx_reinforce.training.rows import Cells, parse_cell
+from mjx_reinforce.training.records.rows import Cells, parse_cell
 
 NAME = "metrics.jsonl"
 

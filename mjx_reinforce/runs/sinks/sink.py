@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Protocol
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.rows import Cells
+from mjx_reinforce.training.records.rows import Cells
 
 #: Settings that need a package, and the package.
 _NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
