@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from mjx_reinforce.training.best import first_best, keep_best, shape_of_best
-from mjx_reinforce.training.state import Looked
+from mjx_reinforce.training.programs import Looked
 
 STATES = SimpleNamespace(
     actor={"w": np.arange(6.0).reshape(3, 2), "b": np.zeros(3)}, num_updates=np.zeros((3, 2), int)

@@ -9,8 +9,8 @@ from mjx_reinforce.learners import counts
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.best import Best
 from mjx_reinforce.training.driver import Driver, drive
+from mjx_reinforce.training.programs import Looked, RunPrograms
 from mjx_reinforce.training.records.record import RunRecord
-from mjx_reinforce.training.state import Looked, Programs
 
 BLOCK = 2
 CONFIG = Config(num_seeds=2, env_steps=None, max_updates=3 * BLOCK, eval_every=BLOCK)
@@ -47,7 +47,9 @@ class Steps:
         return begun(int(state.train_states.actor["w"][0]) + BLOCK), metrics, looked
 
     def programs(self):
-        return Programs(self.advance, self.look, lambda actor: {"eval_return": actor["w"] * 10.0})
+        return RunPrograms(
+            self.advance, self.look, lambda actor: {"eval_return": actor["w"] * 10.0}
+        )
 
 
 class Diary:
