@@ -76,7 +76,7 @@ def make(id: str, /, **kwargs: object) -> Any:
     return env
 
 
-def make_vec(env: Any, num_envs: int, **options: Any) -> Any:
+def make_vec(env: object, num_envs: int, **options: object) -> Any:
     """Makes N environments that play at once: ``mjx_reinforce.make_vec``, beside ``make``."""
     return load_definition("mjx_reinforce.vector.environment:make_vec")(env, num_envs, **options)
 

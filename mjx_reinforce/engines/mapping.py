@@ -10,7 +10,7 @@ from mjx_reinforce import fused
 from mjx_reinforce.checks import explain
 from mjx_reinforce.engines.choice import ENGINES
 from mjx_reinforce.engines.native import mapping as native
-from mjx_reinforce.fused import jaxprs
+from mjx_reinforce.engines.native.mapping import SizeCheck
 from mjx_reinforce.fused.vmap import MAX_OPERATIONS
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import PyTree
@@ -38,7 +38,7 @@ def map_function(
     name: str,
     function: Callable[..., Any],
     *examples: PyTree,
-    check: Callable[[jaxprs.Program], None] | None = None,
+    check: SizeCheck | None = None,
 ) -> MapEngine:
     """Returns a function of one environment mapped over many.
 
@@ -59,7 +59,7 @@ def map_function(
 
 
 def _map(
-    name: str, function: Callable[..., Any], examples: tuple[Any, ...], check: Any
+    name: str, function: Callable[..., Any], examples: tuple[Any, ...], check: SizeCheck | None
 ) -> MapEngine:
     makers: dict[str, Callable[[], Callable[..., Any] | str]] = {
         "native": lambda: _native(function, examples, check),
@@ -82,7 +82,7 @@ def _map(
 
 
 def _native(
-    function: Callable[..., Any], examples: tuple[Any, ...], check: Any
+    function: Callable[..., Any], examples: tuple[Any, ...], check: SizeCheck | None
 ) -> Callable[..., Any] | str:
     """Returns the function in machine code, or why that is not possible."""
     against = native.unavailable()

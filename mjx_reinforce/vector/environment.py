@@ -1,11 +1,11 @@
 """N environments in JAX, whose step is one call."""
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from mjx_reinforce import envs
 from mjx_reinforce.checks import check_parts, check_type
@@ -137,7 +137,7 @@ class VectorEnv:
             f"engine={self.engine.name})"
         )
 
-    def _advance(self, state: VectorState, action: Any, begins: Any) -> VectorState:
+    def _advance(self, state: VectorState, action: jax.Array, begins: ArrayLike) -> VectorState:
         rows = jax.tree.leaves(state)[0].shape[:1]
         if rows != (self.num_envs,):
             raise ValueError(f"the state is of {rows[0]} environments, not of {self.num_envs}")
@@ -146,7 +146,7 @@ class VectorEnv:
     def _null_actions(self) -> jax.Array:
         return jnp.zeros((self.num_envs, *self._null_action.shape), self._null_action.dtype)
 
-    def _checked(self, action: Any) -> jax.Array:
+    def _checked(self, action: ArrayLike) -> jax.Array:
         """Returns the actions, or raises ValueError where they are none."""
         expected = (self.num_envs, *self._null_action.shape)
         if jnp.shape(action) != expected:

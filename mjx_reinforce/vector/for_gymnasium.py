@@ -1,8 +1,7 @@
 """The environments as Gymnasium's ``VectorEnv``, with NumPy arrays, JAX's or torch's."""
 
-import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium
 import jax
@@ -12,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from mjx_reinforce.engines.native.available import GENERATOR
 from mjx_reinforce.registry import check_name
-from mjx_reinforce.types import Discrete, Environment
+from mjx_reinforce.types import Discrete, Environment, PyTree
 from mjx_reinforce.vector.environment import VectorEnv, make_vec
 from mjx_reinforce.vector.episodes import VectorState
 
@@ -21,6 +20,8 @@ _MODES = {
     "same_step": AutoresetMode.SAME_STEP,
     "disabled": AutoresetMode.DISABLED,
 }
+#: A seed of all environments, or one for each.
+Seeds: TypeAlias = int | Sequence[int | None] | None
 #: How arrays are handed out, by name; "torch" and "jax" stay on the device.
 _ARRAYS = ("numpy", "jax", "torch")
 
@@ -73,7 +74,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     def reset(
         self,
         *,
-        seed: int | Sequence[int | None] | None = None,
+        seed: Seeds = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
         """Begins new episodes.
@@ -97,7 +98,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.state = state
         return self._out(state.obs), {}
 
-    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+    def step(self, actions: PyTree) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Plays one step.
 
         Args:
@@ -138,7 +139,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         renderer.update_scene(data)
         return (renderer.render(),)
 
-    def close_extras(self, **kwargs: Any) -> None:
+    def close_extras(self, **kwargs: object) -> None:
         """Forgets the environments and the renderer."""
         if self._renderer is not None:
             self._renderer[0].close()
@@ -151,22 +152,20 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         if self.closed:
             raise gymnasium.error.ClosedEnvironmentError("it was closed; make another")
 
-    def _keys(self, seed: Any) -> jax.Array:
+    def _keys(self, seed: Seeds) -> jax.Array:
         """Returns a key, or one for each environment."""
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
-        if np.ndim(seed) == 0:
+        if not isinstance(seed, Sequence | np.ndarray):
             super().reset(seed=int(seed))
-            return jax.random.key(int(seed), impl=GENERATOR)
+            return _key(int(seed))
         if len(seed) != self.num_envs:
             raise ValueError(f"there must be {self.num_envs} seeds, one each, got {len(seed)}")
         drawn = np.random.SeedSequence().generate_state(self.num_envs)
-        whole = [int(d) if s is None else int(s) for s, d in zip(seed, drawn, strict=True)]
-        make_key = functools.partial(jax.random.key, impl=GENERATOR)
-        return jax.vmap(make_key)(np.array(whole, np.uint32))
+        return _key(*(int(d if s is None else s) for s, d in zip(seed, drawn, strict=True)))
 
-    def _reset_some(self, seed: Any, mask: Any) -> VectorState:
-        if getattr(mask, "shape", None) != (self.num_envs,) or mask.dtype != bool:
+    def _reset_some(self, seed: Seeds, mask: np.ndarray) -> VectorState:
+        if np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype.kind != "b":
             raise ValueError(
                 f"options['reset_mask'] must be a bool array [{self.num_envs}], got {mask!r}"
             )
@@ -179,7 +178,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             state = state.replace(keys=jnp.where(mask[:, None], keys, state.keys))  # pyright: ignore
         return self._restart(state, mask)
 
-    def _actions(self, actions: Any) -> Any:
+    def _actions(self, actions: PyTree) -> Any:
         """Returns actions as JAX takes them, or raises ValueError where they are none."""
         if type(actions).__module__.partition(".")[0] == "torch":
             actions = jnp.from_dlpack(actions.detach().contiguous())
@@ -247,6 +246,13 @@ def make(
         autoreset = next(name for name, mode in _MODES.items() if mode == autoreset)
     vec = make_vec(env, num_envs, autoreset=autoreset, **options)
     return GymnasiumVectorEnv(vec, arrays, render_mode)
+
+
+def _key(*seeds: int) -> jax.Array:
+    """Returns the key of a seed [], or those of several [N]; a seed has up to 64 bits."""
+    words = np.array([((s >> 32) & 0xFFFFFFFF, s & 0xFFFFFFFF) for s in seeds], np.uint32)
+    one = jnp.asarray(words if len(seeds) > 1 else words[0])
+    return jax.random.wrap_key_data(one, impl=GENERATOR)
 
 
 def _space(vec: VectorEnv) -> gymnasium.Space:

@@ -32,7 +32,7 @@ def test_elements_are_moved(name):
     assert_folds(MOVES[name], X)
 
 
-@pytest.mark.parametrize("name", set(MOVES) - {"stack"})  # which multiplies
+@pytest.mark.parametrize("name", sorted(set(MOVES) - {"stack"}))  # which multiplies
 def test_nothing_is_computed(name):
     assert count(MOVES[name], jnp.asarray(X)) == 0
 

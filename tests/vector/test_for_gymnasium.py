@@ -218,3 +218,13 @@ def test_rendered():
     for _ in range(8):
         env.step(np.full((2, 1), 3.0))
     assert np.any(env.render()[0] != picture)
+
+
+def test_seeds_of_64_bits(cart):
+    """Those below 2^32 are `jax.random.key` of them; others are not those less 2^32."""
+    vec = for_gymnasium.make("CartPole-v1", 3).vec
+    np.testing.assert_array_equal(cart.reset(seed=7)[0], vec.reset(jax.random.key(7)).obs)
+    assert np.any(cart.reset(seed=2**32 + 7)[0] != cart.reset(seed=7)[0])
+    several = cart.reset(seed=[7, 2**32 + 7, 7])[0]
+    np.testing.assert_array_equal(several[0], several[2])
+    assert np.any(several[0] != several[1])

@@ -1,7 +1,7 @@
 """A function of one example over a batch, in machine code: ``jax.vmap`` for simulations."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,9 @@ from mjx_reinforce.engines.native.step import BRANCH_COST, stored
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.types import PyTree
 
+#: Raises TooLarge for a program that takes too long to write and compile.
+SizeCheck: TypeAlias = Callable[[jaxprs.Program], None]
+
 
 def unavailable() -> str | None:
     """Returns why functions cannot be mapped in machine code here, None if they can."""
@@ -27,7 +30,7 @@ def unavailable() -> str | None:
 def machine_map(
     function: Callable[..., Any],
     *examples: PyTree,
-    check: Callable[[jaxprs.Program], None] | None = None,
+    check: SizeCheck | None = None,
 ) -> Callable[..., Any]:
     """Returns a function of a batch, compiled unless memory or disk has it.
 
@@ -47,7 +50,7 @@ def machine_map(
     leaves, tree = jax.tree.flatten(examples)
     given = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
 
-    def flat(*values: Any) -> list[Any]:
+    def flat(*values: jax.Array) -> list[Any]:
         whole = [x != 0 if leaf.dtype == bool else x for x, leaf in zip(values, given, strict=True)]
         return [stored(x) for x in jax.tree.leaves(function(*tree.unflatten(whole)))]
 
@@ -79,7 +82,9 @@ def machine_map(
     return mapped
 
 
-def _code(function: Callable[..., Any], examples: list[Any], check: Any) -> machine.Code:
+def _code(
+    function: Callable[..., Any], examples: list[Any], check: SizeCheck | None
+) -> machine.Code:
     """Returns the machine code that maps a function of leaves."""
     traced, _ = jaxprs.trace(function, *examples)
     target = machine.this_machine()

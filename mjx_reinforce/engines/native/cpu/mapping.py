@@ -10,7 +10,7 @@ import numpy as np
 
 from mjx_reinforce.engines.native.cpu import handler
 from mjx_reinforce.engines.native.cpu.denormals import Flush
-from mjx_reinforce.fused import scalarized
+from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.fused.backends.llvm import LLVM, Input
 from mjx_reinforce.fused.backends.llvm_text import Text
 
@@ -110,5 +110,5 @@ class _Work:
         return self.text.let(f"load ptr, ptr {place}")
 
 
-def _size(leaf: Any) -> int:
+def _size(leaf: jaxprs.Shape) -> int:
     return int(np.prod(leaf.shape, dtype=int))
