@@ -12,7 +12,6 @@ from mjx_reinforce.checks import check_kind, check_parts
 from mjx_reinforce.engines import choice, rollouts
 from mjx_reinforce.engines.episode import Act
 from mjx_reinforce.engines.mapping import map_function
-from mjx_reinforce.engines.native import mapping
 from mjx_reinforce.policies.arguments import check_count, check_key
 from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Environment, PyTree, Trajectory, null_action
@@ -93,7 +92,7 @@ def _player(
 ) -> Callable[..., Trajectory]:
     """Returns what plays."""
     large = sum(np.size(x) for x in jax.tree.leaves(params)) > _MOST_PARAMETERS
-    if engine == "auto" and large and mapping.unavailable() is None:
+    if engine == "auto" and large:
         examples = jax.eval_shape(env.reset, jax.random.key(0)), null_action(env)
         step = map_function("auto", env.step, *examples)
         if step.name == "native":

@@ -9,11 +9,15 @@ import jax
 from mjx_reinforce import fused
 from mjx_reinforce.checks import explain
 from mjx_reinforce.engines.choice import ENGINES
+from mjx_reinforce.engines.native import available
 from mjx_reinforce.engines.native import mapping as native
 from mjx_reinforce.engines.native.mapping import SizeCheck
 from mjx_reinforce.fused.vmap import MAX_OPERATIONS
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import PyTree
+
+#: Why machine code for a GPU is not chosen by itself.
+_UNTRIED = "its kernels for a step were run on no GPU yet; engine='native' asks for them"
 
 
 class MapEngine(NamedTuple):
@@ -73,7 +77,8 @@ def _map(
         return MapEngine(name, "chosen by name", made)
     reasons = []
     for engine, make in makers.items():
-        made = make()
+        untried = engine == "native" and available.platform() == "gpu"
+        made = _UNTRIED if untried else make()
         if not isinstance(made, str):
             why = "; ".join(reasons) or f"machine code for this {jax.default_backend().upper()}"
             return MapEngine(engine, why, made)
@@ -85,7 +90,7 @@ def _native(
     function: Callable[..., Any], examples: tuple[Any, ...], check: SizeCheck | None
 ) -> Callable[..., Any] | str:
     """Returns the function in machine code, or why that is not possible."""
-    against = native.unavailable()
+    against = available.unavailable()
     if against:
         return against
     try:

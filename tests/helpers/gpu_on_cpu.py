@@ -129,7 +129,7 @@ def emulate(monkeypatch, threads=1, block=None):
     monkeypatch.setattr(available, "platform", lambda: "gpu")
     monkeypatch.setattr(seam, "kernels_unavailable", lambda: None)
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
-    monkeypatch.setattr(seam, "_grid", lambda items, most, blocks: (1, min(items, most)))
+    monkeypatch.setattr(seam, "_grid", lambda items, most, blocks: (1, threads))
     monkeypatch.setattr(ptx, "load_kernel", load)
     monkeypatch.setattr(seam, "_call", call)
 

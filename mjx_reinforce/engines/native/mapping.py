@@ -1,6 +1,6 @@
 """A function of one example over a batch, in machine code: ``jax.vmap`` for simulations."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 import jax
@@ -11,20 +11,17 @@ from mjx_reinforce.engines.native import available, objects
 from mjx_reinforce.engines.native.cpu import handler, machine, seam
 from mjx_reinforce.engines.native.cpu.denormals import flush
 from mjx_reinforce.engines.native.cpu.mapping import POSITIONS, mapping_text
-from mjx_reinforce.engines.native.program import LOOPS, WRITERS
+from mjx_reinforce.engines.native.gpu import ptx
+from mjx_reinforce.engines.native.gpu import seam as gpu_seam
+from mjx_reinforce.engines.native.gpu.mapping import mapping_text as gpu_mapping_text
+from mjx_reinforce.engines.native.program import GPU_LOOPS, LOOPS, WRITERS
 from mjx_reinforce.engines.native.step import BRANCH_COST, stored
 from mjx_reinforce.fused import jaxprs, scalarized
+from mjx_reinforce.fused.graph import Limits
 from mjx_reinforce.types import PyTree
 
 #: Raises TooLarge for a program that takes too long to write and compile.
 SizeCheck: TypeAlias = Callable[[jaxprs.Program], None]
-
-
-def unavailable() -> str | None:
-    """Returns why functions cannot be mapped in machine code here, None if they can."""
-    if available.platform() != "cpu":
-        return f"it maps functions on CPUs, this is JAX on a {available.platform()}"
-    return available.unavailable()
 
 
 def machine_map(
@@ -34,8 +31,9 @@ def machine_map(
 ) -> Callable[..., Any]:
     """Returns a function of a batch, compiled unless memory or disk has it.
 
-    What it returns is as ``jax.vmap(function)`` up to rounding, on all threads that XLA has. Call
-    it inside of any transformation but differentiation; vmapped, it remains one call.
+    What it returns is as ``jax.vmap(function)`` up to rounding. All threads that XLA has compute
+    it, or those of the GPU. Call it inside of any transformation except differentiation; vmapped,
+    it remains one call.
 
     Args:
       function: of one example; pytrees of numbers of 32 or 64 bits and bools, in and out.
@@ -71,7 +69,7 @@ def machine_map(
             for x in results
             if x.size
         ]
-        made = iter(seam.call(code, shapes, jnp.int32(0), *rows, positions=POSITIONS))
+        made = iter(_run(code, shapes, rows))
         return out_tree.unflatten(
             next(made).reshape(num, *x.shape).astype(x.dtype)
             if x.size
@@ -82,21 +80,42 @@ def machine_map(
     return mapped
 
 
+def _run(
+    code: machine.Code | ptx.Kernel, shapes: list[jax.ShapeDtypeStruct], rows: list[jax.Array]
+) -> Sequence[jax.Array]:
+    """Runs the code on arrays [N, ...] and returns those of these shapes."""
+    if isinstance(code, machine.Code):
+        return seam.call(code, shapes, jnp.int32(0), *rows, positions=POSITIONS)
+    return gpu_seam.launch_map(code, shapes, *rows)
+
+
 def _code(
     function: Callable[..., Any], examples: list[Any], check: SizeCheck | None
-) -> machine.Code:
+) -> machine.Code | ptx.Kernel:
     """Returns the machine code that maps a function of leaves."""
     traced, _ = jaxprs.trace(function, *examples)
-    target = machine.this_machine()
+    on_cpu = available.platform() == "cpu"
+    source = f"map {jaxprs.fingerprint(traced)} {objects.source_digest(*WRITERS)}"
 
-    def write() -> str:  # not called where memory or disk has the code
+    def written(limits: Limits) -> scalarized.Scalarized:
         if check is not None:
             check(traced)
-        written = scalarized.build(function, examples, [True] * len(examples), BRANCH_COST, LOOPS)
-        num_args = 1 + sum(bool(np.prod(x.shape)) for x in written.in_avals)
-        sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals if np.prod(x.shape)]
-        entry = handler.handler_text(num_args, sizes, target.lanes, POSITIONS, zeroed=False)
-        return entry + mapping_text(written, target.lanes, flush(target.triple))
+        return scalarized.build(function, examples, [True] * len(examples), BRANCH_COST, limits)
 
-    source = f"map {jaxprs.fingerprint(traced)} {objects.source_digest(*WRITERS)}"
+    if not on_cpu:
+        return ptx.load_kernel(
+            source,
+            lambda: gpu_mapping_text(written(GPU_LOOPS)),  # where memory or disk has no code
+            gpu_seam.compute_capability(),
+            objects.folder(),
+        )
+    target = machine.this_machine()
+
+    def write() -> str:
+        step = written(LOOPS)
+        num_args = 1 + sum(bool(np.prod(x.shape)) for x in step.in_avals)
+        sizes = [np.dtype(x.dtype).itemsize for x in step.out_avals if np.prod(x.shape)]
+        entry = handler.handler_text(num_args, sizes, target.lanes, POSITIONS, zeroed=False)
+        return entry + mapping_text(step, target.lanes, flush(target.triple))
+
     return machine.load_module(source, write, handler.NAMES, target, objects.folder())

@@ -6,6 +6,7 @@ for any number of threads.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,6 +35,14 @@ _BUFFER_ALIGN = 16
 _ATTRIBUTES = """attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
   "nvvm.maxntid"="{}" "nvvm.minctasm"="{}" }}
 """
+
+
+def entry_text(text: ScratchText, parameters: Sequence[str], written: scalarized.Scalarized) -> str:
+    """Returns the kernel of a body, with the bounds of its threads."""
+    parameters = [*parameters, *(["ptr noalias %scratch"] if text.words else [])]
+    blocks = _LONG_BLOCKS if operations(written.schedule) > LONG else _SHORT_BLOCKS
+    kernel = text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
+    return kernel + _ATTRIBUTES.format(*blocks)
 
 
 class _Leaf(NamedTuple):
@@ -118,10 +127,7 @@ class _Kernel:
         written = [f"%{name}" for name in RESULTS]
         parameters = [f"ptr noalias readonly {x}" for x in pointers]
         parameters += [f"ptr {x}" for x in [*unread, *written]]
-        parameters += ["ptr noalias %scratch"] if text.words else []
-        blocks = _LONG_BLOCKS if operations(self.step.schedule) > LONG else _SHORT_BLOCKS
-        kernel = text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
-        return kernel + _ATTRIBUTES.format(*blocks)
+        return entry_text(text, parameters, self.step)
 
     def _fetch(self, items: str) -> None:
         """Writes how a thread takes the next episode that is played, if there is one."""

@@ -138,6 +138,39 @@ def _launch(
     return _call(kernel.text, ENTRY, grid, given, zeros, scratch)[: len(zeros) - 1]
 
 
+def launch_map(
+    kernel: ptx.Kernel, results: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
+) -> Sequence[jax.Array]:
+    """Runs a kernel that maps a function; vmapped, it remains one launch.
+
+    Args:
+      kernel: of ``mapping.mapping_text``.
+      results: shape [N, ...] and dtype of what it returns.
+      args: its arguments [N, ...].
+    """
+
+    @jax.custom_batching.custom_vmap
+    def play(*args):  # [N, ...]
+        examples = len(args[0])
+        grid = _grid(examples, kernel.threads, kernel.blocks)
+        given = [jnp.array([examples, math.prod(grid)], jnp.int32), *args]
+        made = [jnp.zeros((examples, *x.shape[1:]), x.dtype) for x in results]
+        words = kernel.scratch * math.prod(grid)
+        scratch = [jax.ShapeDtypeStruct((words,), jnp.int32)] if words else []
+        return _call(kernel.text, ENTRY, grid, given, made, scratch)[: len(made)]
+
+    @play.def_vmap
+    def _(size, mapped, *args):
+        along = [
+            x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
+            for x, is_mapped in zip(args, mapped, strict=True)
+        ]
+        made = play(*(x.reshape(-1, *x.shape[2:]) for x in along))
+        return [x.reshape(size, -1, *x.shape[1:]) for x in made], [True] * len(made)
+
+    return play(*args)
+
+
 def _call(
     text: str,
     entry: str,
