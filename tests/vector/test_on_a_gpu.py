@@ -28,7 +28,9 @@ def play(env, steps=25, num=5, engine="native"):
 
 
 @pytest.mark.parametrize("threads", [1, 3, 8])
-@pytest.mark.parametrize("env", [TOY, "InvertedPendulum-v5", "CartPole-v1"], ids=str)
+@pytest.mark.parametrize(
+    "env", [TOY, "InvertedPendulum-v5", "CartPole-v1"], ids=["toy", "pendulum", "cart"]
+)
 def test_the_same_steps_as_on_a_cpu(monkeypatch, env, threads):
     """Also where threads have several environments each, or none."""
     want = play(env)
