@@ -112,12 +112,20 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
           ValueError: the actions have another shape or kind, or are not finite numbers.
         """
+        state = self.advance(actions)
+        flags = self._out(state.terminated), self._out(state.truncated)
+        return self._out(state.obs), self._out(state.reward), *flags, self._info(state)
+
+    def advance(self, actions: Any) -> VectorState:
+        """Plays one step as ``step`` does, and returns the environments in JAX.
+
+        Where ``arrays`` is "numpy", the next step writes into their memory.
+        """
         self._check_open()
         if self.state is None:
             raise ValueError("call reset before step")
         state = self.state = self._step(self.state, self._actions(actions))
-        flags = self._out(state.terminated), self._out(state.truncated)
-        return self._out(state.obs), self._out(state.reward), *flags, self._info(state)
+        return state
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns a picture [height, width, 3] uint8 of the first environment; None without a mode.
@@ -163,7 +171,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         drawn = np.random.SeedSequence().generate_state(self.num_envs)
         whole = [int(d) if s is None else int(s) for s, d in zip(seed, drawn, strict=True)]
         make_key = functools.partial(jax.random.key, impl=GENERATOR)
-        return jax.vmap(make_key)(np.array(whole, np.uint32))
+        return jax.vmap(make_key)(np.array(whole).astype(np.uint32))
 
     def _reset_some(self, seed: Any, mask: Any) -> VectorState:
         if getattr(mask, "shape", None) != (self.num_envs,) or mask.dtype != bool:
