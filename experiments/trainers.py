@@ -42,7 +42,7 @@ class _Run:
 
     num_envs: int = 8
     """Environments that play at once, on either side."""
-    rollout: int = 512
+    rollout: int = 2048
     """Env steps between updates, of all environments together."""
     env_steps: int = 100_000
     """Of a training; the program ends with the rollout that reaches it."""
@@ -54,7 +54,7 @@ class _Run:
 
 @dataclasses.dataclass(frozen=True)
 class Sb3(_Run):
-    """Stable-Baselines3's PPO with the settings of its zoo."""
+    """Stable-Baselines3's PPO with its default settings, and normalised as in its zoo."""
 
     task: str = "Hopper-v5"
     """An id of Gymnasium's MuJoCo tasks."""
@@ -68,8 +68,6 @@ class CleanRl(_Run):
     """CleanRL's cleanrl/ppo_continuous_action.py, as downloaded."""
     task: str = "HalfCheetah-v5"
     """An id of Gymnasium's MuJoCo tasks."""
-    rollout: int = 2048
-    """Env steps between updates, of all environments together."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +105,10 @@ def compare(
     program: str, libraries: tuple[str, ...], train: Callable[..., Any], told: Sb3 | CleanRl
 ) -> None:
     """Trains each seed on both sides, and adds their rows."""
+    from mjx_reinforce.console.jax_setup import configure_jax
     from trainers_sides import SIDES
+
+    configure_jax()
 
     versions = {name: importlib.metadata.version(name) for name in (*libraries, "gymnasium", "jax")}
     shared = benchmark_rows.facts(_now(), _commit())
