@@ -1,13 +1,15 @@
-"""Others' PPO programs on our environments and on Gymnasium's: equal env steps, return, seconds.
+"""Others' PPO programs on our environments and on Gymnasium's: return and seconds of both.
 
     pip install -e ".[dev]" stable-baselines3 tensorboard
-    python experiments/trainers.py run:stable-baselines3 --task Hopper-v5
-    python experiments/trainers.py run:clean-rl --program ppo_continuous_action.py
+    python experiments/trainers.py stable-baselines3 --num-envs 64
+    python experiments/trainers.py clean-rl --program ppo_continuous_action.py
+    python experiments/trainers.py brax
     python experiments/trainers.py table
 
-``run`` trains each seed on Gymnasium's environments and then on ours, so that a busy machine
-slows both, and adds a row for each to docs/trainers.csv. ``table`` prints the table of
-docs/vector.md. CleanRL's program is the user's to download (``trainers_cleanrl.py``).
+trains each seed on Gymnasium's environments and then on ours, so that a busy machine slows both,
+and adds a row for each to docs/trainers.csv; brax, which knows no Gymnasium, trains on our task
+under its own wrappers in its place. ``table`` prints the table of docs/vector.md. CleanRL's program
+is the user's to download (``trainers_cleanrl.py``).
 """
 
 import csv
@@ -33,6 +35,8 @@ COLUMNS: tuple[str, ...] = (
     *("date", "commit", "machine", "program", "libraries", "task", "environment", "num_envs"),
     *("seed", "env_steps", "mean_return", "start_seconds", "seconds", "cpu_seconds", "settings"),
 )
+#: Whose environments, in the rows of ours.
+OURS = "mjx_reinforce"
 _NUMBERS = ("env_steps", "mean_return", "start_seconds", "seconds", "cpu_seconds")
 
 
@@ -71,6 +75,18 @@ class CleanRl(_Run):
 
 
 @dataclasses.dataclass(frozen=True)
+class Brax(_Run):
+    """brax's PPO with its settings for the task, under brax's own wrappers and on ours."""
+
+    task: str = "HalfCheetah-v5"
+    """An id of ours for which brax has settings."""
+    num_envs: int = 256
+    """Environments that play at once, on either side."""
+    rollout: int = 10_240
+    """Env steps between updates, of all environments together."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Table:
     """Print the table of docs/vector.md."""
 
@@ -81,6 +97,7 @@ class Table:
 _Command = (
     Annotated[Sb3, tyro.conf.subcommand("stable-baselines3")]
     | Annotated[CleanRl, tyro.conf.subcommand("clean-rl")]
+    | Annotated[Brax, tyro.conf.subcommand("brax")]
     | Annotated[Table, tyro.conf.subcommand("table")]
 )
 
@@ -93,6 +110,10 @@ def main(command: _Command) -> None:
         import trainers_sb3
 
         compare("Stable-Baselines3", ("stable_baselines3", "torch"), trainers_sb3.train, command)
+    elif isinstance(command, Brax):
+        import trainers_brax
+
+        compare("brax", ("brax",), trainers_brax.train, command, ("brax", OURS))
     else:
         import trainers_cleanrl
 
@@ -102,11 +123,14 @@ def main(command: _Command) -> None:
 
 
 def compare(
-    program: str, libraries: tuple[str, ...], train: Callable[..., Any], told: Sb3 | CleanRl
+    program: str,
+    libraries: tuple[str, ...],
+    train: Callable[..., Any],
+    told: Sb3 | CleanRl | Brax,
+    sides: tuple[str, str] = ("gymnasium", OURS),
 ) -> None:
     """Trains each seed on both sides, and adds their rows."""
     from mjx_reinforce.console.jax_setup import configure_jax
-    from trainers_sides import SIDES
 
     configure_jax()
 
@@ -115,7 +139,7 @@ def compare(
     known = {name: shared[name] for name in ("date", "commit", "machine")}
     known |= {"program": program, "libraries": peers_rows.words(versions)}
     for seed in told.seeds:
-        for side in SIDES:
+        for side in sides:
             found = train(
                 side, told.task, told.num_envs, seed, told.env_steps, rollout=told.rollout
             )
@@ -161,17 +185,14 @@ def table(rows: list[dict[str, Any]]) -> str:
     The return is the mean over seeds with its 95 % interval; seconds are medians over seeds.
     """
     lines = [
-        "| program | task | environments | env steps | return on Gymnasium | return on ours "
-        "| seconds on Gymnasium | seconds on ours |",
+        "| program | task | environments | env steps | return on theirs | return on ours "
+        "| seconds on theirs | seconds on ours |",
         "|---|---|---:|---:|---:|---:|---:|---:|",
     ]
     cases = dict.fromkeys((row["program"], row["task"], row["num_envs"]) for row in rows)
     for case in cases:
         some = [row for row in rows if (row["program"], row["task"], row["num_envs"]) == case]
-        sides = [
-            [row for row in some if row["environment"] == side]
-            for side in ("gymnasium", "mjx_reinforce")
-        ]
+        sides = [[row for row in some if (row["environment"] == OURS) == ours] for ours in (0, 1)]
         cells = [*case, f"{some[0]['env_steps']:,.0f}", *map(_return, sides), *map(_time, sides)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)

@@ -6,63 +6,19 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env, State
 from brax.training.agents.ppo import train as ppo
 
 import peers_brax
 import peers_rows
-from mjx_reinforce import VectorEnv, VectorState, envs, make_vec
+from mjx_reinforce import envs
+from mjx_reinforce.vector import for_brax
+from mjx_reinforce.vector.for_brax import BraxVectorEnv
 from peers_settings import BRAX
 from trainers_sides import LAST, Trained
 
 #: Updates at the start that are not timed, since they compile.
 _FIRST = 2
 _MINIBATCHES = 8
-
-
-class Batched(Env):
-    """Many environments whose step is one call, with the actions and infos that brax's PPO knows.
-
-    Each begins its next episode in the step that ends one, from a start of its own; brax's
-    ``AutoResetWrapper`` goes back to the first one.
-    """
-
-    def __init__(self, vec: VectorEnv):
-        """Takes environments with ``autoreset="same_step"`` and actions that have bounds."""
-        self.vec = vec
-
-    def reset(self, rng: jax.Array) -> State:
-        """Begins N episodes from keys [N]."""
-        return self._state(self.vec.reset(rng))
-
-    def step(self, state: State, action: jax.Array) -> State:
-        """Plays a step with actions [N, A] from -1 to 1."""
-        low, high = self.vec.action_space
-        vector: Any = state.pipeline_state
-        return self._state(self.vec.step(vector, low + (action + 1) / 2 * (high - low)))
-
-    @property
-    def observation_size(self) -> int:
-        """O."""
-        return self.vec.observation_size
-
-    @property
-    def action_size(self) -> int:
-        """A."""
-        return self.vec.action_size
-
-    @property
-    def backend(self) -> str:
-        """Brax asks for it."""
-        return "mjx"
-
-    def _state(self, vector: VectorState) -> State:
-        done = vector.done.astype(vector.reward.dtype)
-        told = {"sum_reward": vector.episode_return, "length": vector.episode_length}
-        cut = (vector.truncated & ~vector.terminated).astype(done.dtype)
-        info = {"truncation": cut, "episode_done": done, "episode_metrics": told}
-        simulation: Any = vector  # brax passes it on
-        return State(simulation, vector.obs, vector.reward, done, {}, info)
 
 
 def train(
@@ -73,7 +29,7 @@ def train(
     The return is of episodes of the last policy without noise.
 
     Args:
-      side: "brax.vmap" for brax's own wrappers, "mjx_reinforce" for ``make_vec``.
+      side: "brax" for its own wrappers, "mjx_reinforce" for ``make_vec``.
       task: an id of ours that brax has settings for.
       num_envs: N.
       seed: of all that is random.
@@ -83,9 +39,8 @@ def train(
     if not hasattr(jax, "device_put_replicated"):  # brax 0.14.2 needs it; JAX 0.10 has it no more
         jax.device_put_replicated = peers_brax._replicated  # pyright: ignore
     began = time.perf_counter()
-    vec = make_vec(task, num_envs, autoreset="same_step")
-    ours = side == "mjx_reinforce"
-    env = Batched(vec) if ours else peers_brax.Rescaled(envs.make(task))
+    ours, single = side == "mjx_reinforce", envs.make(task)
+    env = for_brax.make(single, num_envs) if ours else peers_brax.Rescaled(single)
     arguments = dict(BRAX[task].arguments)
     batch = rollout // _MINIBATCHES // arguments["unroll_length"]
     arguments |= {"num_envs": num_envs, "num_minibatches": _MINIBATCHES, "batch_size": batch}
@@ -100,23 +55,23 @@ def train(
         num_eval_envs=num_envs,  # they are made nevertheless
         wrap_env=not ours,
         policy_params_fn=lambda *_: times.append((time.perf_counter(), time.process_time())),
-        episode_length=vec.max_episode_steps,
+        episode_length=single.max_episode_steps,
         seed=seed,
         max_devices_per_host=1,
         **arguments,
     )
     timed = times[-updates:]
     (wall, cpu), (last_wall, last_cpu) = timed[_FIRST - 1], timed[-1]
-    returns = play(make_vec(task, LAST), make_policy(params, deterministic=True), seed)
+    returns = play(for_brax.make(task, LAST), make_policy(params, deterministic=True), seed)
     start_seconds, settings = wall - began, peers_rows.words(arguments)
     return Trained(
         returns, start_seconds, last_wall - wall, last_cpu - cpu, updates * update, settings
     )
 
 
-def play(vec: VectorEnv, policy: Any, seed: int) -> list[float]:
+def play(env: BraxVectorEnv, policy: Any, seed: int) -> list[float]:
     """Returns the returns of an episode of each environment under a policy of brax's."""
-    env = Batched(vec)
+    vec = env.vec
 
     def step(carry: Any, _: Any) -> tuple[Any, None]:
         state, total, running = carry

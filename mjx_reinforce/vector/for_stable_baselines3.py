@@ -1,8 +1,10 @@
-"""The environments as Stable-Baselines3's ``VecEnv``: ``pip install stable-baselines3``.
+"""The environments as Stable-Baselines3's ``VecEnv``.
 
-from stable_baselines3 import PPO
-from mjx_reinforce.vector import for_stable_baselines3
-PPO("MlpPolicy", for_stable_baselines3.make("Hopper-v5", 64)).learn(1_000_000)
+    from stable_baselines3 import PPO
+    from mjx_reinforce.vector import for_stable_baselines3
+    PPO("MlpPolicy", for_stable_baselines3.make("Hopper-v5", 64)).learn(1_000_000)
+
+``pip install stable-baselines3`` installs that library, which this package does not need.
 """
 
 import time

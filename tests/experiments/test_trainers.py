@@ -1,12 +1,8 @@
 """Others' programs on our environments: what is changed in them, and that they train."""
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import trainers
-from mjx_reinforce import envs, make_vec
 
 ROW = dict.fromkeys(trainers.COLUMNS, "") | {"program": "P", "task": "T-v1", "num_envs": 8}
 PROGRAM = """
@@ -44,41 +40,6 @@ def test_the_table_tells_means_with_intervals_and_median_seconds(tmp_path):
     assert theirs.startswith("30 (")
     assert ours.startswith("1,010 (1,")
     assert seconds == "2.5 (9.0 of a core)"
-
-
-def test_brax_sees_the_environments_as_its_wrappers_show_them():
-    """The same starts and actions: its rewards, ends and observations, until an episode ends."""
-    from brax.envs.wrappers.training import wrap
-
-    import peers_brax
-    import trainers_brax
-
-    vec = make_vec("InvertedPendulum-v5", 4, autoreset="same_step", max_episode_steps=9)
-    ours = trainers_brax.Batched(vec)
-    theirs = wrap(peers_brax.Rescaled(envs.make("InvertedPendulum-v5")), episode_length=9)
-    keys = jax.random.split(jax.random.PRNGKey(0), 4)  # brax knows no others
-    mine = ours.reset(keys)
-    other = theirs.reset(jax.vmap(lambda key: jax.random.split(key)[1])(keys))
-    assert (ours.observation_size, ours.action_size) == (4, 1)
-    np.testing.assert_allclose(mine.obs, other.obs, atol=1e-6)
-    action = jnp.array([[0.0], [0.01], [-0.01], [1.0]])
-    step, their_step = jax.jit(ours.step), jax.jit(theirs.step)
-    running = np.ones(4, bool)
-    cut = 0
-    for _ in range(9):
-        mine, other = step(mine, action), their_step(other, action)
-        for name in ("reward", "done"):
-            found, expected = getattr(mine, name), getattr(other, name)
-            np.testing.assert_allclose(found[running], expected[running], atol=1e-5)
-        for name in ("truncation", "episode_done"):
-            np.testing.assert_array_equal(mine.info[name][running], other.info[name][running])
-        found, expected = (x.info["episode_metrics"] for x in (mine, other))
-        for name in ("sum_reward", "length"):
-            np.testing.assert_allclose(found[name][running], expected[name][running], atol=1e-4)
-        cut += int(mine.info["truncation"][running].sum())
-        running &= np.asarray(mine.done) == 0
-        np.testing.assert_allclose(mine.obs[running], other.obs[running], atol=1e-4)
-    assert 0 < cut < 4
 
 
 @pytest.mark.filterwarnings("ignore")
