@@ -19,29 +19,29 @@ silence_mjx()  # before any environment imports it
 
 #: What the system's loader says of a library for which there is no memory.
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory")
-_CART_POLE = "mjx_reinforce.envs.cart_pole:CartPole"
-_PENDULUM = "mjx_reinforce.envs.inverted_pendulum:InvertedPendulum"
+_CART_POLE = "mjx_reinforce.envs.tasks.cart_pole:CartPole"
+_INVERTED_PENDULUM = "mjx_reinforce.envs.tasks.inverted_pendulum:InvertedPendulum"
 
 #: id -> ("module:Class" or a callable, constructor arguments). One line a task.
 _TABLE: dict[str, tuple[str | Callable[..., Any], dict[str, Any]]] = {
-    "InvertedPendulum-v5": (_PENDULUM, {}),
-    "InvertedPendulum-v4": (_PENDULUM, {"reward_at_fall": 1.0}),
+    "InvertedPendulum-v5": (_INVERTED_PENDULUM, {}),
+    "InvertedPendulum-v4": (_INVERTED_PENDULUM, {"reward_at_fall": 1.0}),
     "InvertedDoublePendulum-v5": (
-        "mjx_reinforce.envs.inverted_double_pendulum:InvertedDoublePendulum",
+        "mjx_reinforce.envs.tasks.inverted_double_pendulum:InvertedDoublePendulum",
         {},
     ),
-    "Reacher-v5": ("mjx_reinforce.envs.reacher:Reacher", {}),
-    "Pusher-v5": ("mjx_reinforce.envs.pusher:Pusher", {}),
-    "Swimmer-v5": ("mjx_reinforce.envs.swimmer:Swimmer", {}),
-    "HalfCheetah-v5": ("mjx_reinforce.envs.half_cheetah:HalfCheetah", {}),
-    "Hopper-v5": ("mjx_reinforce.envs.hopper:Hopper", {}),
-    "Walker2d-v5": ("mjx_reinforce.envs.walker2d:Walker2d", {}),
-    "Ant-v5": ("mjx_reinforce.envs.ant:Ant", {}),
-    "Humanoid-v5": ("mjx_reinforce.envs.humanoid:Humanoid", {}),
-    "HumanoidStandup-v5": ("mjx_reinforce.envs.humanoid_standup:HumanoidStandup", {}),
+    "Reacher-v5": ("mjx_reinforce.envs.tasks.reacher:Reacher", {}),
+    "Pusher-v5": ("mjx_reinforce.envs.tasks.pusher:Pusher", {}),
+    "Swimmer-v5": ("mjx_reinforce.envs.tasks.swimmer:Swimmer", {}),
+    "HalfCheetah-v5": ("mjx_reinforce.envs.tasks.half_cheetah:HalfCheetah", {}),
+    "Hopper-v5": ("mjx_reinforce.envs.tasks.hopper:Hopper", {}),
+    "Walker2d-v5": ("mjx_reinforce.envs.tasks.walker2d:Walker2d", {}),
+    "Ant-v5": ("mjx_reinforce.envs.tasks.ant:Ant", {}),
+    "Humanoid-v5": ("mjx_reinforce.envs.tasks.humanoid:Humanoid", {}),
+    "HumanoidStandup-v5": ("mjx_reinforce.envs.tasks.humanoid_standup:HumanoidStandup", {}),
     "CartPole-v1": (_CART_POLE, {}),
     "CartPole-v0": (_CART_POLE, {"max_episode_steps": 200, "reward_threshold": 195.0}),
-    "ContinuousCartPole-v0": ("mjx_reinforce.envs.cart_pole:ContinuousCartPole", {}),
+    "ContinuousCartPole-v0": ("mjx_reinforce.envs.tasks.cart_pole:ContinuousCartPole", {}),
 }
 
 

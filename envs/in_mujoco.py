@@ -18,7 +18,7 @@ from mjx_reinforce.envs.base import Before, MujocoEnv
 from mjx_reinforce.physics.mjx_internals import Simulation
 from mjx_reinforce.types import Environment
 
-_REMEDY = "leave --backend mujoco out"
+_LEAVE_OUT = "leave --backend mujoco out"
 
 
 class _Recorder(Simulation):
@@ -30,7 +30,7 @@ class _Recorder(Simulation):
     def __getattr__(self, name: str) -> jax.Array:
         shape = getattr(self.sizes, name)
         if not hasattr(shape, "dtype"):
-            raise ValueError(f"the task reads {name}, which is no array of mjData; {_REMEDY}")
+            raise ValueError(f"the task reads {name}, which is no array of mjData; {_LEAVE_OUT}")
         self.read.add(name)
         return jnp.zeros(shape.shape, shape.dtype)
 
@@ -57,7 +57,7 @@ class InMujoco:
             MujocoEnv.step,
         ):
             raise ValueError(
-                f"{own.__name__} has steps of its own, which MuJoCo does not know; {_REMEDY}"
+                f"{own.__name__} has steps of its own, which MuJoCo does not know; {_LEAVE_OUT}"
             )
         self.env, self.data = env, MjData(env.mj_model)
         self._sizes = Simulation(jax.eval_shape(lambda: models.make_data(env.mj_model)))
@@ -117,7 +117,8 @@ class InMujoco:
         shape, value = getattr(self._sizes, name), np.array(getattr(self.data, name))
         if value.size != np.prod(shape.shape, dtype=int):
             raise ValueError(
-                f"the task reads {name}, whose size in MuJoCo changes from step to step; {_REMEDY}"
+                f"the task reads {name}, whose size in MuJoCo changes from step to step; "
+                f"{_LEAVE_OUT}"
             )
         return value.reshape(shape.shape).astype(shape.dtype)
 

@@ -85,13 +85,13 @@ def load_model(xml_file: str) -> Any:
       ValueError: there is no such file, MuJoCo cannot compile it, or nothing in it can be moved.
     """
     if is_own(xml_file):
-        model = _compile(MjModel.from_xml_path, xml_file, xml_file)
+        model = _compile_model(MjModel.from_xml_path, xml_file, xml_file)
     else:
         with warnings.catch_warnings():
             # HalfCheetah's total mass is given as Gymnasium gives it, which MuJoCo deprecates.
             warnings.filterwarnings("ignore", ".*'settotalmass' is deprecated")
             text = _asset(xml_file)
-            model = _compile(lambda text: MjSpec.from_string(text).compile(), text, xml_file)
+            model = _compile_model(lambda text: MjSpec.from_string(text).compile(), text, xml_file)
     if not model.nu:
         raise ValueError(f"the model {xml_file!r} has no actuators; add an <actuator> element")
     model.opt.enableflags &= ~_ONLY_REPORTS
@@ -109,8 +109,8 @@ def is_own(xml_file: str) -> bool:
 def spec(xml_file: str) -> Any:
     """Returns a model before it is compiled, an ``MjSpec``; otherwise as ``load_model``."""
     if is_own(xml_file):
-        return _compile(MjSpec.from_file, xml_file, xml_file)
-    return _compile(MjSpec.from_string, _asset(xml_file), xml_file)
+        return _compile_model(MjSpec.from_file, xml_file, xml_file)
+    return _compile_model(MjSpec.from_string, _asset(xml_file), xml_file)
 
 
 def _asset(xml_file: str) -> str:
@@ -124,7 +124,7 @@ def _asset(xml_file: str) -> str:
     return asset.read_text(encoding="utf-8")
 
 
-def _compile(compiler: Callable[[str], Any], source: str, xml_file: str) -> Any:
+def _compile_model(compiler: Callable[[str], Any], source: str, xml_file: str) -> Any:
     """Returns the model, or raises ValueError with the file's name and what MuJoCo says."""
     try:
         return compiler(source)

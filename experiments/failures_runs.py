@@ -18,7 +18,7 @@ from mjx_reinforce.learners.reinforce import reinforce
 from mjx_reinforce.learners.schedules import decay_rate
 from mjx_reinforce.learners.updates import clip_by_norm
 from mjx_reinforce.policies import normalize
-from mjx_reinforce.policies.normal import normal
+from mjx_reinforce.policies.distributions.normal import normal
 from mjx_reinforce.policies.policy import mlp_policy
 from mjx_reinforce.training.evaluation import evaluate
 from mjx_reinforce.types import Trajectory, action_space

@@ -27,7 +27,8 @@ from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.presets import PRESETS
 from mjx_reinforce.store.build import build, policy_settings
-from mjx_reinforce.training.state import budget_of, compile_parts, parts_of
+from mjx_reinforce.training.programs import compile_run, programs_of
+from mjx_reinforce.training.state import budget_of
 from reproduce_cases import CASES, Case, limit, load_reference
 from reproduce_figures import draw
 from reproduce_mistakes import STALE, clamped, stale_starts
@@ -160,7 +161,8 @@ def train(
     learner, horizon = build(env, config, policy)
     if stale:
         learner = stale_starts(lambda env: build(env, config, policy)[0], env)
-    state, programs = compile_parts(parts_of(env, learner, horizon, config), config)
+    traced = programs_of(env, lambda _: learner, horizon, config, config.num_seeds)
+    state, programs = compile_run(traced, config)
     compiled, budget = time.perf_counter(), budget_of(config)
     scores, env_steps, columns = [], 0, Progress.get_default_columns()
     with Progress(*columns, MofNCompleteColumn(), TimeElapsedColumn()) as progress:

@@ -62,7 +62,7 @@ def _words(groups: Sequence[kept.Group]) -> str:
     )
     changed = "".join(f"; {words}" for commit, words in _SINCE.items() if commit in commits)
     return (
-        "The settings are those that a budget of that size selected (`settings/defaults.py`), at\n"
+        "The settings are those that a budget of that size selected (`settings/tuned.py`), at\n"
         f"commit {commits}{changed}.\n"
         "On a GPU that is `python -m mjx_reinforce.train --env TASK --num-seeds 16 --seed ROOT\n"
         "--env-steps N` with the seeds and env steps of the table.\n"

@@ -14,7 +14,7 @@ from mjx_reinforce.files import csv_bytes, read_json, write_bytes, write_json
 from mjx_reinforce.reports.run_source import PROVENANCE, read_columns, read_metrics
 from mjx_reinforce.reports.statistics import finite_or_nan, iqm, iqm_interval, steps_to_solve
 from mjx_reinforce.reports.statistics.aggregates import wilson
-from mjx_reinforce.sweeps.reading import read_results
+from mjx_reinforce.sweeps.run import read_results
 from results_measures import QUANTILES, curves, least_share_solved
 from results_runs import FACTOR, ended, swept
 from results_tasks import Task

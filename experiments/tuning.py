@@ -24,7 +24,7 @@ from mjx_reinforce.reports.statistics import steps_to_solve
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.perform import perform
-from mjx_reinforce.sweeps.reading import SweepResults, read_results
+from mjx_reinforce.sweeps.run import SweepResults, read_results
 from results_measures import least_share_solved, solved_within
 
 KEPT = Path(__file__).parent / "tuning"

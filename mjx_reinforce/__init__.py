@@ -9,7 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what type checkers and editors read in place of __getattr__
-    from mjx_reinforce.engines.rollouts import rollout
+    from mjx_reinforce.engines.any_policy import rollout
     from mjx_reinforce.export.player import Player, load
     from mjx_reinforce.export.policy_files import load_policy, save_policy
     from mjx_reinforce.export.pretrained import pretrained
@@ -32,14 +32,14 @@ if TYPE_CHECKING:  # what type checkers and editors read in place of __getattr__
     from mjx_reinforce.learners.updates import each_step, full_batch, make_optimizer, minibatches
     from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
     from mjx_reinforce.policies.actor import Actor, act
-    from mjx_reinforce.policies.categorical import categorical
-    from mjx_reinforce.policies.clipped_normal import clipped_normal
-    from mjx_reinforce.policies.deterministic import deterministic
-    from mjx_reinforce.policies.distribution import Distribution
-    from mjx_reinforce.policies.normal import normal
+    from mjx_reinforce.policies.distributions.categorical import categorical
+    from mjx_reinforce.policies.distributions.clipped_normal import clipped_normal
+    from mjx_reinforce.policies.distributions.deterministic import deterministic
+    from mjx_reinforce.policies.distributions.distribution import Distribution
+    from mjx_reinforce.policies.distributions.normal import normal
+    from mjx_reinforce.policies.distributions.tanh_normal import tanh_normal
+    from mjx_reinforce.policies.distributions.truncated_normal import truncated_normal
     from mjx_reinforce.policies.policy import Policy, mlp_policy
-    from mjx_reinforce.policies.tanh_normal import tanh_normal
-    from mjx_reinforce.policies.truncated_normal import truncated_normal
     from mjx_reinforce.reports.statistics import iqm, iqm_interval, mean_interval
     from mjx_reinforce.reports.statistics.comparisons import (
         compare_all,
@@ -50,13 +50,13 @@ if TYPE_CHECKING:  # what type checkers and editors read in place of __getattr__
     from mjx_reinforce.runs.run import RunResults, run
     from mjx_reinforce.settings.config import Config
     from mjx_reinforce.settings.defaults import of_task
-    from mjx_reinforce.sweeps.reading import SweepResults
-    from mjx_reinforce.sweeps.run import sweep
+    from mjx_reinforce.sweeps.run import SweepResults, sweep
     from mjx_reinforce.training.driver import Evaluation
     from mjx_reinforce.training.evaluation import evaluate
     from mjx_reinforce.types import Box, Discrete, Environment, Trajectory
     from mjx_reinforce.vector.environment import VectorEnv, make_vec
     from mjx_reinforce.vector.episodes import VectorState
+    from mjx_reinforce.vector.segments import Segment, unroll
 
 _HOME = {
     "Config": "settings.config",
@@ -65,7 +65,7 @@ _HOME = {
     "RunResults": "runs.run",
     "Evaluation": "training.driver",
     "sweep": "sweeps.run",
-    "SweepResults": "sweeps.reading",
+    "SweepResults": "sweeps.run",
     "iqm": "reports.statistics",
     "iqm_interval": "reports.statistics",
     "mean_interval": "reports.statistics",
@@ -77,19 +77,21 @@ _HOME = {
     "make_vec": "vector.environment",
     "VectorEnv": "vector.environment",
     "VectorState": "vector.episodes",
+    "Segment": "vector.segments",
+    "unroll": "vector.segments",
     "Learner": "learners.learner",
     "TrainState": "learners.learner",
     "reinforce": "learners.reinforce",
     "AutoEpisodes": "learners.pace",
     "train_step": "learners.learner",
     "ars": "learners.ars",
-    "Distribution": "policies.distribution",
-    "categorical": "policies.categorical",
-    "clipped_normal": "policies.clipped_normal",
-    "deterministic": "policies.deterministic",
-    "normal": "policies.normal",
-    "tanh_normal": "policies.tanh_normal",
-    "truncated_normal": "policies.truncated_normal",
+    "Distribution": "policies.distributions.distribution",
+    "categorical": "policies.distributions.categorical",
+    "clipped_normal": "policies.distributions.clipped_normal",
+    "deterministic": "policies.distributions.deterministic",
+    "normal": "policies.distributions.normal",
+    "tanh_normal": "policies.distributions.tanh_normal",
+    "truncated_normal": "policies.distributions.truncated_normal",
     "Estimator": "learners.estimators",
     "total_return": "learners.estimators",
     "reward_to_go": "learners.estimators",
@@ -111,7 +113,7 @@ _HOME = {
     "Policy": "policies.policy",
     "mlp_policy": "policies.policy",
     "evaluate": "training.evaluation",
-    "rollout": "engines.rollouts",
+    "rollout": "engines.any_policy",
     "Box": "types",
     "Discrete": "types",
     "Environment": "types",
@@ -145,6 +147,7 @@ __all__ = [
     "Player",
     "Policy",
     "RunResults",
+    "Segment",
     "SweepResults",
     "TrainState",
     "Trajectory",
@@ -194,6 +197,7 @@ __all__ = [
     "total_return",
     "train_step",
     "truncated_normal",
+    "unroll",
     "value_baseline",
 ]
 

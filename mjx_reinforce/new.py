@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mjx_reinforce.types import MjModel
 
 #: What is named in the class, by mjData's arrays whose rows it numbers.
-_NAMED = {"site": "site_xpos", "body": "xpos"}
+_POSITION_OF = {"site": "site_xpos", "body": "xpos"}
 _TEMPLATE = '''"""{title}: what the robot should do.
 
 Train it in this folder, and film what it learned:
@@ -170,7 +170,7 @@ def _title(module: str) -> str:
 def _constants(model: "MjModel") -> Iterable[str]:
     """Yields a line for each named site and body: its number, by which outcome finds it."""
     taken = set()
-    for kind, array in _NAMED.items():
+    for kind, array in _POSITION_OF.items():
         count = {"site": model.nsite, "body": model.nbody}[kind]
         for number in range(count):
             name = getattr(model, kind)(number).name
@@ -183,11 +183,12 @@ def _constants(model: "MjModel") -> Iterable[str]:
 def _about(model: "MjModel") -> str:
     """Returns the docstring of the class: what its positions and actions are."""
     joints = _listed(
-        f"{_name(model.joint(i).name, 'joint', i)} at qpos[{int(model.jnt_qposadr[i])}]"
+        f"{_safe_name(model.joint(i).name, 'joint', i)} at qpos[{int(model.jnt_qposadr[i])}]"
         for i in range(model.njnt)
     )
     actions = _listed(
-        f"{_name(_moved(model, i), 'actuator', i)}{_range(model, i)}" for i in range(model.nu)
+        f"{_safe_name(_moved(model, i), 'actuator', i)}{_control_range(model, i)}"
+        for i in range(model.nu)
     )
     return f"What it should do.\n\n    Joints:\n{joints}\n    Actions:\n{actions}    "
 
@@ -196,7 +197,7 @@ def _listed(lines: Iterable[str]) -> str:
     return "".join(f"      {line}\n" for line in lines)
 
 
-def _name(name: str, kind: str, number: int) -> str:
+def _safe_name(name: str, kind: str, number: int) -> str:
     """Returns a name that is safe in a docstring, or what has none."""
     return re.sub(r'["\\\n]', "_", name) or f"{kind} {number}"
 
@@ -213,7 +214,7 @@ def _moved(model: "MjModel", number: int) -> str:
     return name
 
 
-def _range(model: "MjModel", number: int) -> str:
+def _control_range(model: "MjModel", number: int) -> str:
     low, high = model.actuator_ctrlrange[number]
     return f" in [{low:g}, {high:g}]" if model.actuator_ctrllimited[number] else ", unlimited"
 

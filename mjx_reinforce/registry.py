@@ -8,14 +8,14 @@ from typing import Any
 
 #: Action distributions: name -> "module:function" of an action space.
 DISTRIBUTIONS = {
-    "normal": "mjx_reinforce.policies.normal:normal",
-    "normal-softplus": "mjx_reinforce.policies.normal:normal_softplus",
-    "normal-sigmoid": "mjx_reinforce.policies.normal:normal_sigmoid",
-    "truncated-normal": "mjx_reinforce.policies.truncated_normal:truncated_normal",
-    "clipped-normal": "mjx_reinforce.policies.clipped_normal:clipped_normal",
-    "tanh-normal": "mjx_reinforce.policies.tanh_normal:tanh_normal",
-    "deterministic": "mjx_reinforce.policies.deterministic:deterministic",
-    "categorical": "mjx_reinforce.policies.categorical:categorical",
+    "normal": "mjx_reinforce.policies.distributions.normal:normal",
+    "normal-softplus": "mjx_reinforce.policies.distributions.normal:normal_softplus",
+    "normal-sigmoid": "mjx_reinforce.policies.distributions.normal:normal_sigmoid",
+    "truncated-normal": "mjx_reinforce.policies.distributions.truncated_normal:truncated_normal",
+    "clipped-normal": "mjx_reinforce.policies.distributions.clipped_normal:clipped_normal",
+    "tanh-normal": "mjx_reinforce.policies.distributions.tanh_normal:tanh_normal",
+    "deterministic": "mjx_reinforce.policies.distributions.deterministic:deterministic",
+    "categorical": "mjx_reinforce.policies.distributions.categorical:categorical",
 }
 
 #: Gradient estimators: name -> "module:function" of a discount.

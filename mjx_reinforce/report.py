@@ -128,7 +128,7 @@ def write_sweep(directory: Path, output: Path) -> WrittenReport:
     """Does what ``write_report`` does for one sweep, and returns what the page says first."""
     started = time.perf_counter()
     findings = compute_findings(sources.read_experiment([directory]))
-    _write(findings, output, started)
+    _write_page(findings, output, started)
     return WrittenReport(
         time.perf_counter() - started, learning.headline(findings), findings.order[0]
     )
@@ -154,7 +154,7 @@ def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = 
     """Writes the page of one task, or that of several, with a page of each beside it."""
     started = time.perf_counter()
     if len(experiments) == 1:
-        _write(compute_findings(experiments[0]), output, started, film=film)
+        _write_page(compute_findings(experiments[0]), output, started, film=film)
         return time.perf_counter() - started
     tasks = find_tasks(experiments)
     beside = _beside(output)
@@ -164,7 +164,7 @@ def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = 
         name = re.sub(r"[^\w.-]", "_", each.env)
         page = beside / f"{name}.html"
         whole = len(shared.results) == len(each.configurations)
-        _write(shared if whole else compute_findings(each), page, started)
+        _write_page(shared if whole else compute_findings(each), page, started)
         pages.append((page.name, f"{beside.name}/{page.name}"))
     drawn, data = tasks_page.tasks_figures(tasks), tasks_page.tasks_chart_tables(tasks)
     labels = tasks_page.labels(tasks)
@@ -173,7 +173,7 @@ def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = 
     for name, content in {**files, **texts, **latex.tables(tasks_page.listed(tasks))}.items():
         write_bytes(beside / name, encoded(content))
     for figure in drawn:
-        _draw(figure, data, labels, figure.title, beside)
+        _write_figure(figure, data, labels, figure.title, beside)
     seconds = time.perf_counter() - started
     text = tasks_page.render_tasks(tasks, drawn, data, files, pages, _ours(), seconds)
     write_bytes(output, encoded(text))
@@ -184,7 +184,7 @@ def _ours() -> str:
     return version("mjx-reinforce") or "not installed"
 
 
-def _write(findings: Findings, output: Path, started: float, *, film: bool = False) -> None:
+def _write_page(findings: Findings, output: Path, started: float, *, film: bool = False) -> None:
     """Writes the page of one task; ``film`` shows a run's median seed, too."""
     experiment = findings.experiment
     drawn, data = figures(findings), tables.chart_tables(findings)
@@ -196,13 +196,13 @@ def _write(findings: Findings, output: Path, started: float, *, film: bool = Fal
         files["pairs.csv"] = columns.pairs_csv(findings)
     if findings.learning.levels:
         files["effects.csv"] = columns.effects_csv(findings)
-    beside, labels = _beside(output), [each.configuration.label for each in findings.results]
+    beside, labels = _beside(output), findings.labels
     beside.mkdir(exist_ok=True)
     texts = {**files, **_tables(findings, data), **latex.tables(listings(findings))}
     for name, content in texts.items():
         write_bytes(beside / name, encoded(content))
     for figure in drawn:
-        _draw(figure, data, labels, findings.experiment.title, beside)
+        _write_figure(figure, data, labels, findings.experiment.title, beside)
     shown = _film(experiment, beside / "film.gif") if film else None
     seconds = time.perf_counter() - started
     watch = how_to_watch(experiment, findings)
@@ -223,11 +223,11 @@ def _beside(output: Path) -> Path:
 
 
 def _tables(findings: Findings, data: Mapping[str, columns.Table]) -> dict[str, str]:
-    labels = [each.configuration.label for each in findings.results]
+    labels = findings.labels
     return {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
 
 
-def _draw(
+def _write_figure(
     figure: Figure,
     data: Mapping[str, columns.Table],
     labels: Sequence[str],

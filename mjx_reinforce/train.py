@@ -20,7 +20,7 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import accept_everything, silence_alarms
 from mjx_reinforce.hosts.processes import Processes, joined
-from mjx_reinforce.runs.command_line import parse_all, refuse, start
+from mjx_reinforce.runs.command_line import parse_all, refuse, refuse_full, start
 from mjx_reinforce.runs.directory import (
     check_writable,
     choose_directory,
@@ -67,7 +67,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             check_installed(config)
             common = {**resume.recordable(config), **versions()}
             processes = held.enter_context(joined(settings, interrupt, common))
-            share = processes.shares(config.num_seeds)[processes.index]
+            share = processes.share(config.num_seeds)
             directory = Path()
             if processes.index == 0:
                 directory, new = _directory(config)
@@ -96,17 +96,11 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
         status = train(ready, found, config, plan, directory, interrupt, processes)
         _end(processes, status)
         return status
-    except RuntimeError as error:  # XLA's
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        remedy = "lower --num-seeds, --num-episodes, --eval-episodes or --horizon"
-        refuse(f"this run does not fit into memory ({error}); {remedy}", made)
-    except OSError as error:
+    except (RuntimeError, OSError) as error:
         begun = (directory / "config.json").exists()
-        again = f"--resume {directory}{env_flag(config.env)}"
-        room = "make room, then " if error.errno else "then "  # W&B's have no number
-        remedy = room + (f"go on with {again}" if begun else "try again")
-        refuse(f"cannot write the files of this run ({error}); {remedy}", made, status=1)
+        resumed = f"go on with --resume {directory}{env_flag(config.env)}"
+        again = resumed if begun else "try again"
+        refuse_full(error, "this run", "this run", "--num-seeds", again, made)
 
 
 def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
@@ -141,11 +135,11 @@ def _start(
         return ready, None
     present = {**provenance(), "num_processes": processes.count}
     resume.check_program(config.resume, present)
-    like = ready.parts.like
+    like = ready.programs.like
     if config.minutes is not None:  # more than any checkpoint has used
         config = dataclasses.replace(config, env_steps=MAX_COUNT)
     if processes.count > 1:
-        from mjx_reinforce.hosts.shares import shape_of_all
+        from mjx_reinforce.training.state import shape_of_all
 
         like = shape_of_all(like, config.num_seeds)
     found = resume.newest_checkpoint(like, config, print)
@@ -160,9 +154,9 @@ def _start(
 def _serve(ready: "Ready", config: Config, processes: Processes, interrupt: Interrupt) -> int:
     """Trains seeds for process 0, which has the run's files; returns the exit status."""
     from mjx_reinforce.hosts.shares import serve
-    from mjx_reinforce.training.state import compile_parts
+    from mjx_reinforce.training.programs import compile_run
 
-    state, programs = compile_parts(ready.parts, config)
+    state, programs = compile_run(ready.programs, config, processes.share(config.num_seeds))
     interrupt.defer(lambda _: processes.stop(interrupt.number or 0))
     return serve(processes, programs, state)
 
@@ -208,7 +202,7 @@ def train(
             from mjx_reinforce.reports.curves import load_libraries
             from mjx_reinforce.runs.log import RunLog
             from mjx_reinforce.runs.observers import RunFiles, Screen
-            from mjx_reinforce.runs.training import compile_driver, draw, summarize
+            from mjx_reinforce.runs.training import compile_driver, draw, summary_of
 
             loading = threading.Thread(target=load_libraries, daemon=True)
             driver, seconds = compile_driver(
@@ -224,7 +218,7 @@ def train(
     files.end(driver)
     # A signal after that changes nothing: what is left takes a second or two.
     test = driver.test(lambda: interrupt.number is not None)
-    summary = summarize(driver, ready.engine, seconds, test)
+    summary = summary_of(driver, ready.engine, seconds, test)
     files.finish(driver, draw(driver), summary)
     with contextlib.suppress(OSError):  # as ``Display.say``
         print_summary(display.console, summary, directory)

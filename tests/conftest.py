@@ -32,7 +32,7 @@ import pytest
 from command_lines import added_environments, run_command
 
 from mjx_reinforce.fused import scalarized
-from mjx_reinforce.fused.verify import verify
+from mjx_reinforce.fused.passes.verify import verify
 
 SLOW = Path(__file__).with_name("slow.txt")
 _STALE = pytest.StashKey[list[str]]()

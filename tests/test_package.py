@@ -1,6 +1,7 @@
 """The package's shape: imports point one way, the heavy ones wait, the README runs."""
 
 import ast
+import collections
 import graphlib
 import re
 import subprocess
@@ -76,6 +77,12 @@ def test_no_imports_in_a_circle():
     graphlib.TopologicalSorter(graph).prepare()  # raises CycleError, which names the circle
 
 
+def test_folders_are_small():
+    """A stranger sees at once what is in one."""
+    sizes = collections.Counter(p.parent for p in FILES.values() if p.name != "__init__.py")
+    assert {str(folder): n for folder, n in sizes.items() if n > 14} == {}
+
+
 def test_the_wheel_has_every_package():
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]
     packages = (name for name, path in FILES.items() if path.name == "__init__.py")
@@ -92,6 +99,17 @@ def test_import_is_light():
     loaded = run(
         "import sys, mjx_reinforce, mjx_reinforce.envs, mjx_reinforce.settings.config\n"
         "print([m for m in ('jax', 'brax', 'mujoco', 'flax', 'scipy') if m in sys.modules])"
+    )
+    assert loaded.strip() == "[]"
+
+
+def test_pages_films_and_logs_wait():
+    """What draws and logs is imported when something is drawn or logged."""
+    late = ("altair", "vl_convert", "jinja2", "tensorboardX", "matplotlib", "PIL", "mediapy")
+    loaded = run(
+        "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.sweeps.main\n"
+        "import mjx_reinforce.runs.run, mjx_reinforce.runs.observers, mjx_reinforce.store.ready\n"
+        f"print([m for m in {late} if m in sys.modules])"
     )
     assert loaded.strip() == "[]"
 

@@ -34,7 +34,7 @@ class Interrupt:
         self._told.setblocking(False)
         self._descriptor = signal.set_wakeup_fd(self._told.fileno(), warn_on_full_buffer=False)
         self._handlers = {number: signal.signal(number, _nothing) for number in _SIGNALS}
-        _start(self._listen)
+        _start_thread(self._listen)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -77,7 +77,7 @@ class Interrupt:
         _try(self._actions)
         last = self._screen_actions + ([] if say is None else [say])
         # Not for long: the screen may be a pipe that nobody reads.
-        _start(functools.partial(_try, last)).join(timeout=1)
+        _start_thread(functools.partial(_try, last)).join(timeout=1)
         os._exit(status)
 
     def _listen(self) -> None:
@@ -93,7 +93,7 @@ class Interrupt:
             self.leave(128 + number)
         self.number = number
         said = "stopping after the present block of updates or test; Ctrl-C again stops at once"
-        _start(functools.partial(self._say, said))
+        _start_thread(functools.partial(self._say, said))
 
 
 def _try(actions: Iterable[Callable[[], Any]]) -> None:
@@ -102,7 +102,7 @@ def _try(actions: Iterable[Callable[[], Any]]) -> None:
             action()
 
 
-def _start(action: Callable[[], Any]) -> threading.Thread:
+def _start_thread(action: Callable[[], Any]) -> threading.Thread:
     thread = threading.Thread(target=action, daemon=True)
     thread.start()
     return thread

@@ -6,7 +6,7 @@ import textwrap
 from typing import TextIO
 
 #: Columns where nobody knows how many there are.
-_COLUMNS = 80
+_DEFAULT_WIDTH = 80
 #: A terminal with fewer wraps by itself.
 _LEAST_COLUMNS = 20
 
@@ -51,7 +51,7 @@ def columns_of(stream: TextIO) -> int:
     columns = int(given) if given.isdecimal() else 0
     if not columns and stream.isatty():
         columns = os.get_terminal_size(stream.fileno()).columns
-    return max(columns or _COLUMNS, _LEAST_COLUMNS)
+    return max(columns or _DEFAULT_WIDTH, _LEAST_COLUMNS)
 
 
 def say_error(message: str) -> None:

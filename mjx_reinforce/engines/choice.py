@@ -20,7 +20,7 @@ from mjx_reinforce.engines.episode import Act
 from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.engines.rollouts import rollout
 from mjx_reinforce.fused.vmap import MAX_OPERATIONS, Mapped
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Environment, PyTree, Trajectory, null_action
 
@@ -80,11 +80,11 @@ def choose(
       ValueError: the name is unknown, or the engine does not support the environment.
     """
     began = time.perf_counter()
-    engine = _choose(name, env, player, horizon)
+    engine = _choose_engine(name, env, player, horizon)
     return engine._replace(seconds=time.perf_counter() - began)
 
 
-def _choose(
+def _choose_engine(
     name: str, env: Environment, player: ActingPolicy | None, horizon: int | None
 ) -> Engine:
     check_name("engine", name, dict.fromkeys(ENGINES))

@@ -10,7 +10,7 @@ from jax import lax
 
 from mjx_reinforce.engines.episode import draw_noise
 from mjx_reinforce.fused import any_lane
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import PyTree
 
 LoopState = TypeVar("LoopState")

@@ -28,7 +28,7 @@ def check_environment(env: Environment) -> None:
     _check_action_space(name, env)
     start = _shapes(name, "reset", env.reset, jax.random.key(0))
     _check_state(name, start)
-    after = _shapes(name, "step", env.step, start, _action(env))
+    after = _shapes(name, "step", env.step, start, _action_shape(env))
     _check_same(name, start, after)
 
 
@@ -103,7 +103,7 @@ def _shapes(name: str, what: str, function: Callable[..., Any], *arguments: PyTr
         raise BadEnvironmentError(f"{name}.{what} fails: {explain(error)}{remedy}") from error
 
 
-def _action(env: Environment) -> jax.ShapeDtypeStruct:
+def _action_shape(env: Environment) -> jax.ShapeDtypeStruct:
     if isinstance(action_space(env), Discrete):
         return jax.ShapeDtypeStruct((), jnp.int32)
     return jax.ShapeDtypeStruct((env.action_size,), jnp.result_type(float))

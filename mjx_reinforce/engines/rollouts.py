@@ -12,7 +12,7 @@ from mjx_reinforce.checks import check_kind, check_parts
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.chunks import play_chunks
 from mjx_reinforce.policies.arguments import check_count, check_key
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Environment, PyTree, Trajectory
 
 

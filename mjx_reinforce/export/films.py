@@ -22,7 +22,7 @@ _COLORS, _FEWER_COLORS = 255, (128, 64, 32, 16, 8)
 #: What MuJoCo's backends need that are not EGL.
 _NEEDS = {"glfw": "a screen", "osmesa": "the library OSMesa"}
 #: Pictures, spread over a film, whose colours it has.
-_SAMPLES = 4
+SAMPLES = 4
 #: The colour of an arrow: red, green, blue, opacity.
 _ARROW = (0.95, 0.35, 0.1, 1.0)
 
@@ -156,7 +156,7 @@ def write_small_gif(path: Path, frames: Sequence[np.ndarray], rate: float, most_
     Raises:
       ValueError: the film is larger with the fewest colours.
     """
-    film, samples = b"", frames[:: -(-len(frames) // _SAMPLES)]
+    film, samples = b"", frames[:: -(-len(frames) // SAMPLES)]
     for colors in _FEWER_COLORS:
         film = gif(frames, rate, samples, colors)
         if len(film) <= most_bytes:

@@ -2,7 +2,7 @@
 
 from mjx_reinforce.export.arithmetic import Arithmetic
 
-_TEMPLATE = '''"""A trained policy's deterministic action, written by mjx_reinforce.export.
+_PLAYER = '''"""A trained policy's deterministic action, written by mjx_reinforce.export.
 
 It needs NumPy, and {name}.npz beside this file:
 
@@ -40,11 +40,11 @@ def numpy_source(plain: Arithmetic, name: str, env: str, seed: int) -> str:
     shapes = f"[{size}] -> [{out}], or [N, {size}] -> [N, {out}]"
     if plain.head == "argmax":
         shapes = f"[{size}] -> an integer, or [N, {size}] -> [N]"
-    body = "\n    ".join(_lines(plain))
-    return _TEMPLATE.format(name=name, shapes=shapes, env=ascii(env), seed=seed, body=body)
+    body = "\n    ".join(_statements(plain))
+    return _PLAYER.format(name=name, shapes=shapes, env=ascii(env), seed=seed, body=body)
 
 
-def _lines(plain: Arithmetic) -> list[str]:
+def _statements(plain: Arithmetic) -> list[str]:
     """Returns the statements that make the action of the observation x."""
     lines = []
     if plain.normalized:

@@ -10,7 +10,7 @@ import numpy as np
 from mjx_reinforce.files import Header
 
 #: No layer, observation or action of a policy has more entries.
-_MAX_SIZE = 2**20
+_MOST_ENTRIES = 2**20
 
 
 def check_policy_settings(settings: Mapping[str, Any]) -> None:
@@ -23,7 +23,7 @@ def check_policy_settings(settings: Mapping[str, Any]) -> None:
     for name in ("policy", "hidden_sizes", "initial_std", "observation_size", *space):
         if name not in settings:
             raise ValueError(f"{name} is missing")
-    for name, (holds, rule) in _RULES.items():
+    for name, (holds, rule) in _FIELD_RULES.items():
         if name in settings and not holds(settings[name]):
             raise ValueError(f"{name} must be {rule}, got {reprlib.repr(settings[name])}")
     if "num_actions" not in settings:
@@ -83,7 +83,7 @@ def check_finite(arrays: Mapping[str, np.ndarray], seed: int | None) -> None:
 
 
 def _is_size(value: object) -> bool:
-    return type(value) is int and 1 <= value <= _MAX_SIZE
+    return type(value) is int and 1 <= value <= _MOST_ENTRIES
 
 
 def is_number(value: Any) -> bool:
@@ -91,13 +91,13 @@ def is_number(value: Any) -> bool:
     return type(value) in (int, float) and abs(value) < 1e300 and math.isfinite(value)
 
 
-def _are_bounds(value: object) -> bool:
+def _is_bounds_list(value: object) -> bool:
     return isinstance(value, list) and bool(value) and all(x is None or is_number(x) for x in value)
 
 
-_SIZE_RULE = f"a whole number from 1 to {_MAX_SIZE}"
+_SIZE_RULE = f"a whole number from 1 to {_MOST_ENTRIES}"
 #: What must hold of an entry, and how to say it.
-_RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
+_FIELD_RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "policy": (lambda x: isinstance(x, str), "the name of a distribution"),
     "hidden_sizes": (
         lambda x: isinstance(x, list) and all(map(_is_size, x)),
@@ -106,8 +106,8 @@ _RULES: dict[str, tuple[Callable[[Any], bool], str]] = {
     "initial_std": (is_number, "a number"),
     "observation_size": (_is_size, _SIZE_RULE),
     "num_actions": (_is_size, _SIZE_RULE),
-    "action_low": (_are_bounds, "a list of numbers, null where unbounded"),
-    "action_high": (_are_bounds, "a list of numbers, null where unbounded"),
+    "action_low": (_is_bounds_list, "a list of numbers, null where unbounded"),
+    "action_high": (_is_bounds_list, "a list of numbers, null where unbounded"),
     "shared_trunk": (lambda x: isinstance(x, bool), "true or false"),
     "initializer": (lambda x: isinstance(x, str), "the name of an initialiser"),
     "rescale": (lambda x: isinstance(x, bool), "true or false"),

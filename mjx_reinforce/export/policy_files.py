@@ -85,13 +85,13 @@ def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
     """Reads what ``save_policy`` wrote, as ``load_policy``, with all that it says."""
     settings_path, actor_path = Path(directory) / "policy.json", Path(directory) / "actor.npz"
     settings = read_json(settings_path)
-    with _damage_in(settings_path):
+    with _naming_damage(settings_path):
         check_policy_settings(settings)
         policy = build_policy(settings)
-    shapes = _shapes(policy, settings["observation_size"])
+    shapes = _array_shapes(policy, settings["observation_size"])
 
     def check(found: Mapping[str, Header | np.ndarray]) -> int:
-        with _damage_in(actor_path):
+        with _naming_damage(actor_path):
             return check_arrays({k: x for k, x in found.items() if k != _CHECKSUM}, shapes)
 
     arrays = read_arrays(actor_path, check, stored=True)
@@ -99,7 +99,7 @@ def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
     if seed is not None and not 0 <= seed < num_seeds:
         seeds = f"its seeds are 0 to {num_seeds - 1}" if num_seeds > 1 else "it has seed 0 alone"
         raise ValueError(f"{directory} has no seed {seed}: {seeds}")
-    with _damage_in(actor_path):
+    with _naming_damage(actor_path):
         check_finite(arrays, seed)
     # Files from before there was a checksum have none. It finds damage, not ill will: who changes
     # the files can compute it again.
@@ -113,7 +113,7 @@ def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
 
 
 @contextlib.contextmanager
-def _damage_in(path: Path) -> Iterator[None]:
+def _naming_damage(path: Path) -> Iterator[None]:
     """Names the file in the ValueErrors of a block."""
     try:
         yield
@@ -132,7 +132,7 @@ def actor_of(arrays: dict[str, Any]) -> Actor:
     return Actor(params=tree["params"], normalizer=normalize.Normalizer(**tree["normalizer"]))
 
 
-def _shapes(policy: Policy, observation_size: int) -> dict[str, tuple[int, ...]]:
+def _array_shapes(policy: Policy, observation_size: int) -> dict[str, tuple[int, ...]]:
     """Returns the shapes of one seed's arrays, under their names in the archive."""
 
     def first():

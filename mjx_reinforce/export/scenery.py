@@ -30,7 +30,7 @@ def dress(spec: "MjSpec", *, replace: bool) -> Any:
     import mujoco
 
     kinds: Any = mujoco
-    lowest, length, middle = _extent(_compile(spec))
+    lowest, length, middle = _extent(_compile_scene(spec))
     skies = [x for x in spec.textures if x.type == kinds.mjtTexture.mjTEXTURE_SKYBOX]
     planes = [x for x in spec.geoms if x.type == kinds.mjtGeom.mjGEOM_PLANE]
     if replace:
@@ -65,10 +65,10 @@ def dress(spec: "MjSpec", *, replace: bool) -> Any:
             spec.delete(light)
     if not spec.lights:
         _add_light(spec, kinds, length)
-    return _compile(spec)
+    return _compile_scene(spec)
 
 
-def _compile(spec: "MjSpec") -> Any:
+def _compile_scene(spec: "MjSpec") -> Any:
     with warnings.catch_warnings():  # what MuJoCo deprecates in a model
         warnings.simplefilter("ignore")
         return spec.compile()

@@ -7,14 +7,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.export.films import Renderer
+from mjx_reinforce.export.films import SAMPLES, Renderer
 
 #: Frames a second at most: what a film shows, and what GIF viewers play.
 MAX_RATE = 30
 #: How long a push, which lasts a few frames, is drawn (s).
 _PUSH_SHOWN = 0.4
-#: Frames, spread over a film, whose colours it has.
-_SAMPLES = 4
 #: Heights of the strip that the words stand in, and of the words, in heights of the picture.
 _STRIP, _WORDS, _LEAST = 1 / 13, 1 / 19, 10
 _INK, _PAPER = (235, 240, 245), (28, 38, 48)
@@ -97,7 +95,7 @@ def side_by_side(
         return np.concatenate([np.concatenate(row, axis=1) for row in rows])
 
     length = max(1, math.ceil(lasting / interval - 1e-6))
-    samples = [*range(0, length, -(-length // _SAMPLES))]
+    samples = [*range(0, length, -(-length // SAMPLES))]
     for take in takes:
         if take.pushes is not None and take.pushes.any():
             first = 1 + int(np.flatnonzero(take.pushes)[0])

@@ -43,7 +43,7 @@ def by_engine(one: Callable, many: Callable, *args: PyTree, may_unroll: bool = F
     (first, shapes), (second, others) = (
         jaxprs.trace(lambda *flat, f=f: f(*tree.unflatten(flat)), *leaves) for f in (one, many)
     )
-    if _described(shapes) != _described(others):
+    if _signature(shapes) != _signature(others):
         raise TypeError(f"by_engine got two different results, {shapes} and {others}")
     consts = [*first.consts, *second.consts]
     start, end = len(first.consts), len(consts)
@@ -57,7 +57,7 @@ def by_engine(one: Callable, many: Callable, *args: PyTree, may_unroll: bool = F
     return jax.tree.structure(shapes).unflatten(results)
 
 
-def _described(shapes: Any) -> tuple[Any, list[tuple]]:
+def _signature(shapes: Any) -> tuple[Any, list[tuple]]:
     leaves, tree = jax.tree.flatten(shapes)
     return tree, [(leaf.shape, np.dtype(leaf.dtype)) for leaf in leaves]
 

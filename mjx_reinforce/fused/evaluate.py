@@ -5,12 +5,21 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays, branches, jaxprs, loops
+from mjx_reinforce.fused import arrays, jaxprs
 from mjx_reinforce.fused.errors import no_rule
 from mjx_reinforce.fused.graph import Graph
-from mjx_reinforce.fused.rules import elementwise, indexing, linear, reductions, structural
+from mjx_reinforce.fused.rules import (
+    branches,
+    elementwise,
+    indexing,
+    linear,
+    loops,
+    reductions,
+    structural,
+)
+from mjx_reinforce.types import is_key
 
-_RULES = {
+_ARRAY_RULES = {
     **structural.RULES,
     **elementwise.RULES,
     **reductions.RULES,
@@ -50,7 +59,7 @@ def run(
         values[variable] = graph.constant(const)
 
     def read(atom: Any) -> np.ndarray:
-        return jaxprs.literal(atom) if jaxprs.is_literal(atom) else values[atom]
+        return jaxprs.literal_value(atom) if jaxprs.is_literal(atom) else values[atom]
 
     for eqn, needed in jaxprs.live_equations(jaxpr, used):
         graph.may_unroll = may_unroll  # of this equation; programs inside have their own
@@ -70,24 +79,24 @@ def _apply(
     if name in _CONTROL:
         with graph.evaluating(eqn):
             return _CONTROL[name](graph, functools.partial(run, graph), eqn, used, *operands)
-    if name in _RULES:
-        if name not in _KEYS_TO_WORDS and any(jaxprs.is_key(atom.aval) for atom in eqn.invars):
+    if name in _ARRAY_RULES:
+        if name not in _KEYS_TO_WORDS and any(is_key(atom.aval) for atom in eqn.invars):
             return _word_by_word(graph, eqn, operands)
-        return _settled(eqn, _RULES[name](graph, eqn, *operands))
+        return _settled(eqn, _ARRAY_RULES[name](graph, eqn, *operands))
     program = jaxprs.callee(eqn)
     if program is not None:
         with graph.evaluating(eqn):
             return run(graph, program, operands, used, graph.may_unroll)
-    makes_keys = any(jaxprs.is_key(out.aval) for out in eqn.outvars)
+    makes_keys = any(is_key(out.aval) for out in eqn.outvars)
     if all(map(arrays.is_numeric, operands)) and not makes_keys:
-        return jaxprs.evaluate(eqn.primitive.bind, eqn.params, operands)
+        return jaxprs.compute_constants(eqn.primitive.bind, eqn.params, operands)
     raise no_rule(name, graph.source(eqn))
 
 
 def _word_by_word(graph: Graph, eqn: jaxprs.Equation, operands: list[np.ndarray]) -> list:
     """Applies a rule that moves keys, whose words are their arrays' last axis."""
-    keys = [jaxprs.is_key(atom.aval) for atom in eqn.invars]
-    rule, one = _RULES[eqn.primitive.name], jaxprs.on_words(eqn)
+    keys = [is_key(atom.aval) for atom in eqn.invars]
+    rule, one = _ARRAY_RULES[eqn.primitive.name], jaxprs.on_words(eqn)
     planes = []
     for k in range(operands[keys.index(True)].shape[-1]):
         plane = [x[..., k] if key else x for x, key in zip(operands, keys, strict=True)]

@@ -12,12 +12,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike
 
-from mjx_reinforce.fused import arrays, folding, jaxprs, ops, simplify
+from mjx_reinforce.fused import arrays, jaxprs, ops
 from mjx_reinforce.fused.errors import TooLarge
-from mjx_reinforce.fused.nodes import Captured, Gate, Loop, Node, Scalar, Scope, identity
+from mjx_reinforce.fused.nodes import BOOL, Captured, Gate, Loop, Node, Scalar, Scope, identity
+from mjx_reinforce.fused.passes import folding, simplify
 from mjx_reinforce.fused.size import MAX_SCALARS
-
-_BOOL = np.dtype(bool)
 
 
 class Limits(NamedTuple):
@@ -161,7 +160,7 @@ class Graph:
     def call(self, name: str, *args: Scalar) -> Scalar:
         """Applies one of the named operations to scalars."""
         predicate = ops.FACTS[name].is_predicate
-        return self.apply(ops.Op(name), args, _BOOL if predicate else args[-1].dtype)
+        return self.apply(ops.Op(name), args, BOOL if predicate else args[-1].dtype)
 
     def convert(self, value: Scalar, dtype: DTypeLike) -> Scalar:
         """Converts a scalar to another dtype."""

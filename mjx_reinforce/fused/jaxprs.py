@@ -21,7 +21,7 @@ from jax.interpreters import partial_eval
 
 from mjx_reinforce.fused.errors import no_keys
 from mjx_reinforce.fused.ops import FACTS
-from mjx_reinforce.types import PyTree
+from mjx_reinforce.types import PyTree, is_key
 
 # The parameter under which a call-like primitive keeps the jaxpr that it calls.
 _CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
@@ -209,9 +209,9 @@ def depends(closed: Any, given: Iterable[bool]) -> list[bool]:
     jaxpr = program(closed).jaxpr
     found = {variable for variable, is_given in zip(jaxpr.invars, given, strict=True) if is_given}
     for eqn in jaxpr.eqns:
-        if any(_named(atom) and atom in found for atom in eqn.invars):
+        if any(_is_variable(atom) and atom in found for atom in eqn.invars):
             found.update(eqn.outvars)
-    return [_named(out) and out in found for out in jaxpr.outvars]
+    return [_is_variable(out) and out in found for out in jaxpr.outvars]
 
 
 def scan_parts(eqn: Equation) -> ScanParts:
@@ -227,7 +227,7 @@ def is_literal(atom: Any) -> bool:
     return isinstance(atom, core.Literal)
 
 
-def literal(atom: Any) -> np.ndarray:
+def literal_value(atom: Any) -> np.ndarray:
     """Returns a literal's value in its own dtype."""
     return np.asarray(atom.val, atom.aval.dtype)
 
@@ -266,12 +266,14 @@ def live_equations(jaxpr: core.Jaxpr, used: Iterable[bool]) -> list[Any]:
     Equations are pure here: one with an effect (a print, a callback) is dropped like any other
     when nothing reads it.
     """
-    needed = {out for out, use in zip(jaxpr.outvars, used, strict=True) if use and _named(out)}
+    needed = {
+        out for out, use in zip(jaxpr.outvars, used, strict=True) if use and _is_variable(out)
+    }
     kept = []
     for eqn in reversed(jaxpr.eqns):
         if any(out in needed for out in eqn.outvars):
             kept.append((eqn, [out in needed for out in eqn.outvars]))
-            needed.update(atom for atom in eqn.invars if _named(atom))
+            needed.update(atom for atom in eqn.invars if _is_variable(atom))
     return kept[::-1]
 
 
@@ -289,17 +291,14 @@ def source(eqn: Equation) -> str:
     return "" if line.startswith(str(Path(__file__).parent)) else line
 
 
-def is_key(aval: Any) -> bool:
-    """Returns whether an abstract value is an array of typed PRNG keys."""
-    return jax.numpy.issubdtype(aval.dtype, jax.dtypes.prng_key)
-
-
 def operation(name: str) -> Callable[..., Any]:
     """Returns JAX's function for an operation of the scalar graph."""
     return getattr(lax, FACTS[name].in_jax or name)
 
 
-def evaluate(function: Callable, params: dict, operands: Sequence[Any]) -> list[np.ndarray]:
+def compute_constants(
+    function: Callable, params: dict, operands: Sequence[Any]
+) -> list[np.ndarray]:
     """Computes an operation of JAX on constants at once; takes about 1 ms."""
     with jax.ensure_compile_time_eval():
         arrays = [jax.numpy.asarray(operand) for operand in operands]
@@ -308,6 +307,6 @@ def evaluate(function: Callable, params: dict, operands: Sequence[Any]) -> list[
         return [np.asarray(result) for result in results]
 
 
-def _named(atom: Any) -> bool:
+def _is_variable(atom: Any) -> bool:
     """Returns whether an atom is a variable (literals are not hashable in every release)."""
     return not is_literal(atom)

@@ -15,6 +15,8 @@ from mjx_reinforce.fused.ops import Op
 
 Scalar = Any  # np.generic or Node
 
+BOOL = np.dtype(bool)
+
 
 @dataclasses.dataclass(eq=False, slots=True)
 class Scope:

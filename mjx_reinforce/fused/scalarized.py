@@ -8,13 +8,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from mjx_reinforce.fused import arrays, evaluate, jaxprs, liveness, size
+from mjx_reinforce.fused import arrays, evaluate, jaxprs, size
 from mjx_reinforce.fused.backends import BACKENDS
 from mjx_reinforce.fused.errors import no_keys
 from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import Scalar
+from mjx_reinforce.fused.passes import liveness
 from mjx_reinforce.registry import check_name, load_definition
-from mjx_reinforce.types import PyTree
+from mjx_reinforce.types import PyTree, is_key
 
 #: Looks at every program that was written out. The tests set it to ``verify``; users leave it.
 inspect: Callable[["Scalarized"], None] | None = None
@@ -88,12 +89,12 @@ def build(
       UnsupportedPrimitive: it uses a primitive that has no rule.
     """
     program, out_shape = jaxprs.trace(fn, *examples)
-    if any(jaxprs.is_key(variable.aval) for variable in program.jaxpr.invars):
+    if any(is_key(variable.aval) for variable in program.jaxpr.invars):
         raise no_keys()
     size.check_size(program)
     graph = Graph(branch_cost, limits)
     inputs = [
-        _inputs(graph, number, variable.aval, varies)
+        _input_array(graph, number, variable.aval, varies)
         for number, (variable, varies) in enumerate(zip(program.jaxpr.invars, varying, strict=True))
     ]
     with np.errstate(all="ignore"):
@@ -113,7 +114,7 @@ def build(
     return written
 
 
-def _inputs(graph: Graph, number: int, aval: Any, varying: bool) -> np.ndarray:
+def _input_array(graph: Graph, number: int, aval: Any, varying: bool) -> np.ndarray:
     size = int(np.prod(aval.shape, dtype=int))
     leaves = [graph.leaf(aval.dtype, varying, position=(number, k)) for k in range(size)]
     return arrays.pack(leaves, aval.shape, aval.dtype)

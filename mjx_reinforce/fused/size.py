@@ -34,10 +34,10 @@ def num_scalars(program: jaxprs.Program) -> int:
         for eqn in program.jaxpr.eqns
         if eqn.primitive.name == "platform_index"
     }
-    return sum(_size(eqn, default) for eqn in program.jaxpr.eqns)
+    return sum(_equation_size(eqn, default) for eqn in program.jaxpr.eqns)
 
 
-def _size(eqn: Any, default: Mapping[Any, int | None]) -> int:
+def _equation_size(eqn: Any, default: Mapping[Any, int | None]) -> int:
     """Returns the size of one equation."""
     name, params = eqn.primitive.name, eqn.params
     if name == "cond":

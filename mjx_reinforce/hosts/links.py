@@ -87,11 +87,11 @@ def send(connection: socket.socket, kind: bytes, content: bytes) -> None:
 
 def receive(connection: socket.socket) -> tuple[bytes, bytes]:
     """Returns the kind and the content of the next message; OSError where there is none."""
-    kind, length = _HEAD.unpack(_read(connection, _HEAD.size))
-    return kind, _read(connection, length)
+    kind, length = _HEAD.unpack(_receive_bytes(connection, _HEAD.size))
+    return kind, _receive_bytes(connection, length)
 
 
-def _read(connection: socket.socket, length: int) -> bytes:
+def _receive_bytes(connection: socket.socket, length: int) -> bytes:
     parts = []
     while length:
         part = connection.recv(min(length, 2**20))

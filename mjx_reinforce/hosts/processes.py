@@ -85,6 +85,10 @@ class Processes:
         ends = [i * num_seeds // self.count for i in range(self.count + 1)]
         return [slice(*pair) for pair in itertools.pairwise(ends)]
 
+    def share(self, num_seeds: int) -> slice:
+        """Returns the seeds of this process, see ``shares``."""
+        return self.shares(num_seeds)[self.index]
+
     def stop(self, number: int) -> None:
         """Asks all others to stop, as that signal does."""
         for link in self.links.values():

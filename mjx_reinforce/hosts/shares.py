@@ -15,21 +15,17 @@ import numpy as np
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.hosts.processes import Processes
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.training.state import Budget, Looked, Programs, RunState, restored
+from mjx_reinforce.training.programs import Looked, RunPrograms
+from mjx_reinforce.training.state import Budget, RunState, restored
 from mjx_reinforce.types import PyTree, plain
 
-#: What a process is asked for, besides the names of ``Programs``.
+#: What a process is asked for, besides the names of ``RunPrograms``.
 _END = "end"
 
 
-def shape_of_all(like: RunState, num_seeds: int) -> RunState:
-    """Returns the shapes of the states of so many seeds, from those of some."""
-    return jax.tree.map(lambda x: jax.ShapeDtypeStruct((num_seeds, *x.shape[1:]), x.dtype), like)
-
-
 def lead(
-    processes: Processes, programs: Programs, state: RunState, num_seeds: int
-) -> tuple[RunState, Programs]:
+    processes: Processes, programs: RunPrograms, state: RunState, num_seeds: int
+) -> tuple[RunState, RunPrograms]:
     """Returns the state of all seeds, and programs that move it on in all processes.
 
     Args:
@@ -43,12 +39,12 @@ def lead(
     def gathered(mine: Arrays) -> list[Arrays]:
         others = processes.hear()
         assert others is not None, "a process left a run that had not ended"
-        return [mine, *(_decode(content)[1] for content in others)]
+        return [mine, *(_decode_message(content)[1] for content in others)]
 
     def ask(name: str, tree: PyTree, **common: np.ndarray) -> list[Arrays]:
-        leaves = _leaves(tree)
+        leaves = _numbered_leaves(tree)
         parts = [{k: x[each] for k, x in leaves.items()} | common for each in shares]
-        processes.tell(*(_encode(name, part) for part in parts[1:]))
+        processes.tell(*(_encode_message(name, part) for part in parts[1:]))
         return gathered(_answer(name, parts[0], programs, like))
 
     def advance(
@@ -60,7 +56,7 @@ def lead(
             [_part(x, group) for x in answers] for group in ("state", "metrics", "looked")
         )
         evaluation = _looked(before, _together(looked)) if look else None
-        return _state(_together(states), like), _together_in_time(metrics), evaluation
+        return _state_of(_together(states), like), _together_in_time(metrics), evaluation
 
     def evaluate(present: RunState) -> Looked:
         return _looked(present, _together(ask("evaluate", present)))
@@ -68,16 +64,16 @@ def lead(
     def test(actor: Actor) -> Arrays:
         return _together(ask("test", actor))
 
-    first = _state(_together(gathered(_leaves(state))), like)
-    return first, Programs(advance, evaluate, test)
+    first = _state_of(_together(gathered(_numbered_leaves(state))), like)
+    return first, RunPrograms(advance, evaluate, test)
 
 
 def end(processes: Processes, status: int) -> None:
     """Tells all others to end with that status."""
-    processes.tell(_encode(_END, {"status": np.array(status)}))
+    processes.tell(_encode_message(_END, {"status": np.array(status)}))
 
 
-def serve(processes: Processes, programs: Programs, state: RunState) -> int:
+def serve(processes: Processes, programs: RunPrograms, state: RunState) -> int:
     """Does what process 0 asks for, until the end; returns the status to end with.
 
     Args:
@@ -86,17 +82,17 @@ def serve(processes: Processes, programs: Programs, state: RunState) -> int:
       state: of these, before their first update.
     """
     like = jax.eval_shape(lambda: state)
-    processes.tell(_encode("state", _leaves(state)))
+    processes.tell(_encode_message("state", _numbered_leaves(state)))
     while True:
         heard = processes.hear()
         assert heard is not None, "process 0 left a run that had not ended"
-        name, given = _decode(heard[0])
+        name, given = _decode_message(heard[0])
         if name == _END:
             return int(given["status"])
-        processes.tell(_encode(name, _answer(name, given, programs, like)))
+        processes.tell(_encode_message(name, _answer(name, given, programs, like)))
 
 
-def _answer(name: str, given: Arrays, programs: Programs, like: RunState) -> Arrays:
+def _answer(name: str, given: Arrays, programs: RunPrograms, like: RunState) -> Arrays:
     """Returns what a program makes of the leaves that it is given."""
     # In memory of the device's own, which may be donated.
     budget = given.pop("budget", None)
@@ -105,7 +101,7 @@ def _answer(name: str, given: Arrays, programs: Programs, like: RunState) -> Arr
         before, look = restored(leaves, like), name != "advance"
         state, metrics, looked = programs.advance(before, look, Budget(*budget))
         measured = {} if looked is None else looked.measured
-        groups = {"state": _leaves(state), "metrics": metrics, "looked": measured}
+        groups = {"state": _numbered_leaves(state), "metrics": metrics, "looked": measured}
         return {f"{group}/{k}": x for group, arrays in groups.items() for k, x in arrays.items()}
     if name == "evaluate":
         return programs.evaluate(restored(leaves, like)).measured
@@ -118,12 +114,12 @@ def _looked(state: RunState, measured: Arrays) -> Looked:
     return Looked(actor, num_updates, measured)
 
 
-def _state(leaves: Arrays, like: RunState) -> RunState:
-    """Returns states on the host, from what ``_leaves`` returned."""
+def _state_of(leaves: Arrays, like: RunState) -> RunState:
+    """Returns states on the host, from what ``_numbered_leaves`` returned."""
     return restored([leaves[str(i)] for i in range(len(leaves))], like)
 
 
-def _leaves(tree: PyTree) -> Arrays:
+def _numbered_leaves(tree: PyTree) -> Arrays:
     """Returns the leaves of a pytree on the host by their numbers; keys as data."""
     leaves = jax.device_get(jax.tree.leaves(plain(tree)))
     return {str(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}
@@ -151,15 +147,15 @@ def _together_in_time(parts: Sequence[Arrays]) -> Arrays:
     }
 
 
-def _encode(name: str, arrays: Mapping[str, np.ndarray]) -> bytes:
+def _encode_message(name: str, arrays: Mapping[str, np.ndarray]) -> bytes:
     """Returns a message: a NumPy archive."""
     archive = io.BytesIO()
     np.savez(archive, allow_pickle=False, name=np.array(name), **arrays)
     return archive.getvalue()
 
 
-def _decode(message: bytes) -> tuple[str, Arrays]:
-    """Returns what ``_encode`` was given."""
+def _decode_message(message: bytes) -> tuple[str, Arrays]:
+    """Returns what ``_encode_message`` was given."""
     with np.load(io.BytesIO(message), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     return str(arrays.pop("name")), arrays

@@ -33,6 +33,7 @@ from mjx_reinforce.learners.ars_increments import (
     paper_increment,
 )
 from mjx_reinforce.learners.diagnostics import nan_unless, signal_to_noise
+from mjx_reinforce.learners.estimators import replace_broken
 from mjx_reinforce.learners.learner import (
     Learner,
     Metrics,
@@ -41,13 +42,12 @@ from mjx_reinforce.learners.learner import (
     episode_metrics,
     keep_finite,
 )
-from mjx_reinforce.learners.returns import replace_broken
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.arguments import check_count, check_key, check_number
-from mjx_reinforce.policies.categorical import categorical
 from mjx_reinforce.policies.contract import check_policy
-from mjx_reinforce.policies.deterministic import deterministic
+from mjx_reinforce.policies.distributions.categorical import categorical
+from mjx_reinforce.policies.distributions.deterministic import deterministic
 from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.types import (
     Discrete,
@@ -107,11 +107,11 @@ def ars(
     check_number("normalize_steps", normalize_steps, finite=False)
     check_number("normalize_min_std", normalize_min_std)
     top = num_directions if top_directions is None else top_directions
-    _check(num_directions, top, step_size, noise_std, update)
+    _check_numbers(num_directions, top, step_size, noise_std, update)
     size = observation_size(env)
     if policy is not None:
         check_policy(policy, env, size)
-    search = _Search(
+    search = _RandomSearch(
         env=env,
         policy=policy or _zero_policy(env, size),
         engine=choice.choose(engine, env),
@@ -141,7 +141,7 @@ class Trial(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
-class _Search:
+class _RandomSearch:
     """The arguments of ``ars``, and what it does with them; ``observation_size`` is O."""
 
     env: Environment
@@ -180,7 +180,7 @@ class _Search:
         directions_key, episodes_key = jax.random.split(key)
         keys = jax.random.split(episodes_key)
         keys = keys[jnp.array([0, 0])] if self.shared_starts else keys
-        directions = _draw(directions_key, state.actor.params, self.num_directions)
+        directions = _draw_directions(directions_key, state.actor.params, self.num_directions)
         params = self._perturb(state.actor.params, directions)
 
         def one_way(params, key):
@@ -196,7 +196,7 @@ class _Search:
                 active=active,
             )
 
-        return Trial(directions, _side_by_side(jax.vmap(one_way)(params, keys)))
+        return Trial(directions, _join_rollouts(jax.vmap(one_way)(params, keys)))
 
     def learn(self, state: TrainState, trial: Trial, key: jax.Array) -> tuple[TrainState, Metrics]:
         del key
@@ -223,7 +223,7 @@ class _Search:
             "return_std": jnp.std(returns),
         }
         if self.num_directions > 1:
-            diagnostics["gradient_snr"] = _signal_to_noise(trial.directions, returns)
+            diagnostics["gradient_snr"] = _step_signal_to_noise(trial.directions, returns)
         sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
         metrics = episode_metrics(trajectory) | nan_unless(sound, diagnostics)
         return dataclasses.replace(state, actor=actor), metrics | {"skipped_update": skipped}
@@ -248,7 +248,7 @@ class _Search:
         return jax.vmap(jax.vmap(self._tie))(jax.tree.map(jnp.add, params, moves))
 
 
-def _draw(key: jax.Array, params: Params, num_directions: int) -> Any:
+def _draw_directions(key: jax.Array, params: Params, num_directions: int) -> Any:
     """Returns standard Normal directions, like the params with a leading axis [D]."""
     leaves, tree = jax.tree.flatten(params)
     keys = jax.random.split(key, len(leaves))
@@ -259,7 +259,7 @@ def _draw(key: jax.Array, params: Params, num_directions: int) -> Any:
     return jax.tree.unflatten(tree, drawn)
 
 
-def _signal_to_noise(directions: Params, returns: jax.Array) -> jax.Array:
+def _step_signal_to_noise(directions: Params, returns: jax.Array) -> jax.Array:
     """Returns the signal-to-noise ratio [] over all directions [D] of the mean step.
 
     See ``diagnostics.signal_to_noise``; a direction's share is (r_plus - r_minus) delta. Where only
@@ -271,7 +271,7 @@ def _signal_to_noise(directions: Params, returns: jax.Array) -> jax.Array:
     return signal_to_noise(mean, each, len(difference))
 
 
-def _side_by_side(trajectory: Trajectory) -> Trajectory:
+def _join_rollouts(trajectory: Trajectory) -> Trajectory:
     """Returns [T, 2 D, ...] from two rollouts stacked [2, T, D, ...]."""
 
     def join(x):
@@ -300,7 +300,7 @@ def _zero_policy(env: Environment, size: int) -> Policy:
     return policy._replace(init=init)
 
 
-def _check(
+def _check_numbers(
     num_directions: int, top: int, step_size: object, noise_std: object, update: str
 ) -> None:
     """Raises ValueError for numbers that make no sense; traced ones are taken on trust."""

@@ -14,7 +14,7 @@ from mjx_reinforce.learners.natural_gradient import natural_gradient
 from mjx_reinforce.types import Environment, Trajectory, null_action
 
 #: Steps and episodes of the trajectory that an estimator is tried on: no two axes have one size.
-_STEPS = 5
+_NUM_STEPS = 5
 
 
 def check_optimizer(name: str, value: optax.GradientTransformation) -> None:
@@ -47,7 +47,7 @@ def check_estimator(
             f"this estimator needs at least {estimator.min_episodes} episodes an update, "
             f"got num_episodes={num_episodes}"
         )
-    shape, action = (_STEPS, num_episodes), null_action(env)
+    shape, action = (_NUM_STEPS, num_episodes), null_action(env)
     number = jnp.result_type(float)
     trajectory = Trajectory(
         observation=_shaped((*shape, observation_size), number),

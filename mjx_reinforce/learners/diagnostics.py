@@ -15,7 +15,7 @@ from optax import Params
 
 from mjx_reinforce.learners.pace import Noise
 from mjx_reinforce.policies.actor import Actor, act
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.policies.policy import Policy
 from mjx_reinforce.types import Trajectory
 

@@ -12,7 +12,7 @@ its gradient has another length, and is no longer exactly unbiased. ``mean_log_p
 ``normalized_returns`` come from published programs, and say what they follow instead.
 
 An episode in which the simulation left the finite numbers counts as the worst of the others: at
-each step its G[t] is the least of theirs (``returns.replace_broken``). In ``mean_log_prob`` and
+each step its G[t] is the least of theirs (``replace_broken``). In ``mean_log_prob`` and
 ``normalized_returns``, where an episode is compared with itself, its weight is.
 """
 
@@ -25,7 +25,6 @@ import jax
 import jax.numpy as jnp
 
 from mjx_reinforce.checks import check_kind
-from mjx_reinforce.learners.returns import discounted_returns, replace_broken
 from mjx_reinforce.policies.arguments import check_number, known_number
 from mjx_reinforce.types import Trajectory
 
@@ -36,7 +35,7 @@ class Estimator(NamedTuple):
     init: (key, observation_size) -> state; consumes the key
     update: (state, trajectory) -> (weight [T, N], next state, metrics); the weight
       is zero outside the mask, and the trajectory's observations are normalised; what an episode
-      earned that broke (``trajectory.nonfinite``) is no return, see ``returns.replace_broken``
+      earned that broke (``trajectory.nonfinite``) is no return, see ``replace_broken``
     min_episodes: the least N that ``update`` accepts
     """
 
@@ -273,3 +272,53 @@ def _check_discount(discount: float | jax.Array) -> None:
     number = known_number(discount)
     if not (number is None or 0.0 <= number <= 1.0):
         raise ValueError(f"the discount must lie in [0, 1], got {discount!r}")
+
+
+def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Array:
+    """Returns G [T, N] with ``G[t] = reward[t] + discount * G[t + 1]`` and ``G[T] = 0``.
+
+    Args:
+      reward: [T, N], zero where the episode is over.
+      discount: in [0, 1].
+    """
+    # Products of matrices, in blocks of about sqrt(T) steps: within each block, then over the
+    # blocks. A scan takes T steps one after the other, and an associative scan compiles for long.
+    discount = jnp.asarray(discount, reward.dtype)
+    horizon, num_episodes = reward.shape
+    length = math.isqrt(horizon - 1) + 1
+    count = -(-horizon // length)
+    blocks = jnp.pad(reward, ((0, count * length - horizon), (0, 0)))
+    blocks = blocks.reshape(count, length, num_episodes)
+    own = _discounted_sums(blocks, discount)
+    total = _discounted_sums(own[:, 0], jnp.power(discount, length))
+    later = jnp.pad(total[1:], ((0, 1), (0, 0)))
+    steps_left = jnp.arange(length, 0, -1, dtype=reward.dtype)
+    returns = own + jnp.power(discount, steps_left)[:, None] * later[:, None]
+    return returns.reshape(-1, num_episodes)[:horizon]
+
+
+def replace_broken(
+    returns: jax.Array, broken: jax.Array, played: jax.Array | None = None
+) -> jax.Array:
+    """Returns the returns, of an episode that broke the least of the others'.
+
+    What it earned until the simulation left the finite numbers is no return: where rewards are
+    negative, it would speak for breaking early. So would leaving it out: the gradient of what
+    remains is that of an episode which earned 0.
+
+    Args:
+      returns: [..., N] such as G [T, N]; the others are those of the same step.
+      broken: [N] ``Trajectory.nonfinite``; where all are, all returns are infinite.
+      played: [N] ``Trajectory.played``.
+    """
+    without = broken if played is None else broken | ~played
+    least = jnp.min(jnp.where(without, jnp.inf, returns), axis=-1, keepdims=True)
+    return jnp.where(broken, least, returns)
+
+
+def _discounted_sums(x: jax.Array, discount: jax.Array) -> jax.Array:
+    """Returns y [..., T, N] with ``y[t] = x[t] + discount * y[t + 1]`` and ``y[T] = 0``."""
+    time = jnp.arange(x.shape[-2], dtype=x.dtype)
+    ahead = time - time[:, None]
+    factors = jnp.where(ahead < 0, 0, jnp.power(discount, jnp.maximum(ahead, 0)))
+    return jnp.matmul(factors, x, precision="highest")

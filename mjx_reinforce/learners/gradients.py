@@ -1,4 +1,4 @@
-"""Sums and maps over the steps of episodes in chunks: bounded memory, dead chunks are skipped."""
+"""Sums, maps and draws over the steps of episodes; dead chunks of time are skipped."""
 
 from collections.abc import Callable
 from typing import Any
@@ -88,6 +88,23 @@ def map_steps(function: Callable[[Any], jax.Array], data: tuple[Any, ...]) -> ja
     zeros = jnp.zeros((needed.size, *one.shape), one.dtype)
     values = while_any(_more(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
     return values.reshape(data[-1].shape)
+
+
+def draw_steps(key: jax.Array, mask: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Draws steps with replacement, every one inside the mask alike.
+
+    Args:
+      key: consumed.
+      mask: [T, N] or [T * N] True where there is a step.
+      shape: of what is returned.
+
+    Returns:
+      Indices int32 [*shape] into arrays [T * N, ...]; where there is no step, that of any.
+    """
+    ranks = jnp.cumsum(mask.reshape(-1))
+    drawn = jax.random.randint(key, shape, 1, 1 + jnp.maximum(ranks[-1], 1))
+    # Where the first, second, ... step inside the mask is; ``drawn`` counts from 1.
+    return jnp.searchsorted(ranks, drawn)
 
 
 def _in_chunks(data: tuple[Any, ...]) -> tuple[tuple[Any, ...], jax.Array]:

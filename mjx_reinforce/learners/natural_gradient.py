@@ -17,8 +17,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from mjx_reinforce.checks import check_kind
-from mjx_reinforce.learners.gradients import accumulate
-from mjx_reinforce.learners.samples import draw_steps
+from mjx_reinforce.learners.gradients import accumulate, draw_steps
 from mjx_reinforce.learners.updates import Problem, Update, whole_rollout
 from mjx_reinforce.policies.arguments import check_count, check_number
 from mjx_reinforce.policies.policy import Policy

@@ -41,10 +41,10 @@ from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_opt
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.arguments import check_count, check_key, check_number
-from mjx_reinforce.policies.categorical import categorical
 from mjx_reinforce.policies.contract import check_policy
-from mjx_reinforce.policies.distribution import Distribution
-from mjx_reinforce.policies.normal import normal
+from mjx_reinforce.policies.distributions.categorical import categorical
+from mjx_reinforce.policies.distributions.distribution import Distribution
+from mjx_reinforce.policies.distributions.normal import normal
 from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.types import (
     Box,
@@ -59,7 +59,7 @@ from mjx_reinforce.types import (
 _ESTIMATORS = tuple(f"mjx_reinforce.learners.{name}" for name in ("estimators", "value_baseline"))
 #: Episodes are short if none is longer than the horizon divided by this. An update passes over all
 #: steps that there may be, so it takes its time from the horizon, not from the episodes.
-_FEW = 8
+_SHORT = 8
 #: Updates of so many steps, of all seeds, are compiled for short episodes too. Measured on two CPU
 #: cores: that saves 70 ns for each of these steps in such an update, and takes 4 s to compile.
 _MANY = 2**19
@@ -315,7 +315,7 @@ class _Reinforce:
         """Learns; where all episodes, of many seeds, were short, from their first steps alone."""
         if self.auto is not None:
             trajectory = dataclasses.replace(trajectory, played=trajectory.mask[0])
-        few = len(trajectory.mask) // _FEW
+        few = len(trajectory.mask) // _SHORT
         if few < CHUNK_STEPS or self.num_seeds * trajectory.mask.size < _MANY:
             return self._learn_from(state, trajectory, key)
         return jax.lax.cond(

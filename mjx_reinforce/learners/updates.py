@@ -17,8 +17,7 @@ from optax import Params
 
 from mjx_reinforce.engines.chunks import while_any
 from mjx_reinforce.learners.diagnostics import noise_of_groups, signal_to_noise
-from mjx_reinforce.learners.gradients import accumulate_gradient
-from mjx_reinforce.learners.samples import draw_steps
+from mjx_reinforce.learners.gradients import accumulate_gradient, draw_steps
 from mjx_reinforce.learners.schedules import Clock
 from mjx_reinforce.policies.arguments import check_count, check_number
 from mjx_reinforce.registry import check_name

@@ -13,13 +13,12 @@ from flax import linen as nn
 from jax import lax
 
 from mjx_reinforce.learners.estimators import Estimator, explained_variance, reward_to_go
-from mjx_reinforce.learners.gradients import accumulate_gradient, map_steps
-from mjx_reinforce.learners.samples import draw_steps
+from mjx_reinforce.learners.gradients import accumulate_gradient, draw_steps, map_steps
 from mjx_reinforce.policies.arguments import check_count
 from mjx_reinforce.policies.networks import MLP
 
 #: The share that an update has in the running mean and variance of the returns.
-_SHARE = 0.1
+_UPDATE_SHARE = 0.1
 
 
 class Critic(NamedTuple):
@@ -72,7 +71,7 @@ def value_baseline(
     """
     for name, count in (("horizon", horizon), ("num_fits", num_fits), ("batch_size", batch_size)):
         check_count(name, count)
-    to_go, network, fitter = _parts(discount, network, optimizer)
+    to_go, network, fitter = _defaults(discount, network, optimizer)
 
     def value(params, observation, time):
         share = jnp.asarray(time, observation.dtype) / horizon
@@ -149,7 +148,7 @@ def full_batch_value_baseline(
       ValueError: ``num_fits`` is less than one or the discount is not in [0, 1].
     """
     check_count("num_fits", num_fits)
-    to_go, network, fitter = _parts(discount, network, optimizer)
+    to_go, network, fitter = _defaults(discount, network, optimizer)
 
     def value(params, observation):
         return jnp.asarray(network.apply(params, observation))[..., 0]
@@ -181,7 +180,7 @@ def full_batch_value_baseline(
     return Estimator(init, update)
 
 
-def _parts(
+def _defaults(
     discount: float | jax.Array,
     network: nn.Module | None,
     optimizer: optax.GradientTransformation | None,
@@ -221,7 +220,7 @@ def _moments(
     """
     steps = jnp.sum(mask)
     updates = critic.updates + (steps > 0)
-    share = jnp.where(steps > 0, jnp.maximum(1 / jnp.maximum(updates, 1), _SHARE), 0.0)
+    share = jnp.where(steps > 0, jnp.maximum(1 / jnp.maximum(updates, 1), _UPDATE_SHARE), 0.0)
 
     def mean(x):
         return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(steps, 1)

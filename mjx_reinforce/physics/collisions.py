@@ -8,7 +8,7 @@ from mjx_reinforce.physics.mjx_internals import geom_pairs
 if TYPE_CHECKING:
     from mujoco import mjx
 
-_NAMED = 3
+_LISTED = 3
 
 
 def advice(model: "mjx.Model") -> str:
@@ -19,7 +19,7 @@ def advice(model: "mjx.Model") -> str:
     bodies = Counter(int(body) for pair in pairs for body in {*model.geom_bodyid[list(pair)]})
     named = [
         f"{model.body(body).name or f'number {body}'!r} ({count})"
-        for body, count in bodies.most_common(_NAMED)
+        for body, count in bodies.most_common(_LISTED)
     ]
     return (
         f"its geoms can meet in {len(pairs):,} pairs, most of them at the bodies "

@@ -110,7 +110,7 @@ _OURS = {
     (mjx.GeomType.SPHERE, mjx.GeomType.CAPSULE): sphere_capsule,
     (mjx.GeomType.CAPSULE, mjx.GeomType.CAPSULE): capsule_capsule,
 }
-_ROUND = (
+_ROUND_GEOMS = (
     mjx.GeomType.SPHERE,
     mjx.GeomType.CAPSULE,
     mjx.GeomType.ELLIPSOID,
@@ -118,7 +118,7 @@ _ROUND = (
 )
 _collision = collision_with(
     lambda table: {
-        pair: one_by_one(function) if set(pair) <= set(_ROUND) else function
+        pair: one_by_one(function) if set(pair) <= set(_ROUND_GEOMS) else function
         for pair, function in (table | _OURS).items()
     }
 )

@@ -151,7 +151,7 @@ def fenced(fn: Callable[..., Any]) -> Callable[..., Any]:
         with (
             _lock,
             _swapped(scan, "_nvmap", _fenced_level),
-            _swapped(collision_sdf, "_gradient_descent", _descend),
+            _swapped(collision_sdf, "_gradient_descent", _descend_gradient),
         ):
             return fn(*args)
 
@@ -163,7 +163,9 @@ def _fenced_level(*inputs: Any) -> Any:
     return jax.lax.optimization_barrier(_level(*inputs))
 
 
-def _descend(objective: Callable[..., Any], x: jax.Array, niter: int) -> tuple[Any, jax.Array]:
+def _descend_gradient(
+    objective: Callable[..., Any], x: jax.Array, niter: int
+) -> tuple[Any, jax.Array]:
     """Returns the least distance found [] and where [3], as MJX's ``_gradient_descent``."""
 
     @jax.jit  # not inlined: JAX vmaps it once for all iterations

@@ -10,7 +10,7 @@ from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from types import ModuleType
 
 #: The module of MJX that looks for Warp.
-_NAME = "mujoco.mjx.warp"
+_WARP = "mujoco.mjx.warp"
 
 
 class _Loader(SourceFileLoader):
@@ -29,7 +29,7 @@ class _Finder(PathFinder):
     def find_spec(
         cls, fullname: str, path: Sequence[str] | None = None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        spec = super().find_spec(fullname, path, target) if fullname == _NAME else None
+        spec = super().find_spec(fullname, path, target) if fullname == _WARP else None
         if spec is not None and spec.origin is not None:
             spec.loader = _Loader(fullname, spec.origin)
         return spec

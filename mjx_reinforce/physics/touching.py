@@ -25,7 +25,7 @@ Solution = tuple[jax.Array, jax.Array, jax.Array]
 #: (model, data with rows, whether loops over contacts may be written out) -> solution
 Solver = Callable[..., Solution]
 #: Loops over more contacts are not written out, whatever the engine.
-_FEW = 6
+_UNROLLABLE = 6
 
 
 def solve_touching(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
@@ -65,7 +65,7 @@ def _with_few(
     """Solves; the kinds are the numbers of the contacts of each dimension."""
     contact = jax_fields(data).contact
     touching = ~(contact.dist - contact.includemargin >= 0)  # a NaN counts as touching
-    may_unroll = room <= _FEW
+    may_unroll = room <= _UNROLLABLE
     num_others = jax_fields(data).efc_D.size - sum(_rows_of_one(contact, k) * k.size for k in kinds)
 
     def few() -> Solution:

@@ -94,7 +94,7 @@ def gymnasium_simulator(player: Player, horizon: int) -> tuple[str, Callable[[in
       ValueError: Gymnasium is not installed, or has no such environment.
     """
     gymnasium = import_gymnasium()
-    env = _make(gymnasium, player, horizon)
+    env = _make_env(gymnasium, player, horizon)
 
     def play(episode: int, noise: bool) -> Episode:
         rng = np.random.default_rng(episode) if noise else None
@@ -110,7 +110,7 @@ def gymnasium_simulator(player: Player, horizon: int) -> tuple[str, Callable[[in
     return gymnasium.__version__, play
 
 
-def _make(gymnasium: Any, player: Player, horizon: int) -> Any:
+def _make_env(gymnasium: Any, player: Player, horizon: int) -> Any:
     """Returns Gymnasium's environment; raises ValueError as ``gymnasium_simulator``."""
     if ":" in player.env:  # to Gymnasium, "module:id" is a module to import
         raise ValueError(f"{player.env} is not Gymnasium's; leave --backend gymnasium out")

@@ -1,1 +1,1 @@
-"""Policies: action distributions, networks, and the statistics that scale observations."""
+"""Policies: networks to action distributions, and the statistics that scale observations."""

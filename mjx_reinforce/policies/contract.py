@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from mjx_reinforce.checks import check_kind, explain
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.policies.policy import Policy
 from mjx_reinforce.types import Environment, PyTree, null_action
 
@@ -28,16 +28,16 @@ def check_policy(
     check_kind(
         "policy.distribution", distribution, Distribution, "mjx_reinforce.normal(env.action_space)"
     )
-    params = _shapes("policy.init(key)", policy.init, jax.random.key(0))
+    params = _shapes_returned("policy.init(key)", policy.init, jax.random.key(0))
     observation = jax.ShapeDtypeStruct((2, observation_size), jnp.result_type(float))
     given = f"policy.apply(params, observation [2, {observation_size}])"
-    outputs = _shapes(given, policy.apply, params, observation)
+    outputs = _shapes_returned(given, policy.apply, params, observation)
     count, constants = distribution.num_outputs, len(distribution.constants)
     if getattr(outputs, "shape", None) != (2, count + constants):
         fixed = f", then distribution.constants [2, {constants}], as parameters" * bool(constants)
         raise ValueError(
             f"{given} must return [2, {count + constants}]: what a network computes [2, {count}]"
-            f"{fixed}; got {_described(outputs)}"
+            f"{fixed}; got {_shape_or_type(outputs)}"
         )
     if not jnp.issubdtype(outputs.dtype, jnp.floating):
         raise ValueError(f"{given} must return floating-point numbers, got {outputs.dtype}")
@@ -45,18 +45,21 @@ def check_policy(
     def draw(outputs):
         return distribution.sample(outputs, distribution.noise(jax.random.key(0), (2,)))
 
-    action, expected = _shapes("policy.distribution.sample", draw, outputs), null_action(env)
+    action, expected = (
+        _shapes_returned("policy.distribution.sample", draw, outputs),
+        null_action(env),
+    )
     if getattr(action, "shape", None) != (2, *expected.shape):
         raise ValueError(
-            f"policy.distribution draws actions {_described(action)} for two observations, "
+            f"policy.distribution draws actions {_shape_or_type(action)} for two observations, "
             f"{type(env).__name__} takes [2{''.join(f', {n}' for n in expected.shape)}]; make it "
             "for the actions of this environment"
         )
     if likelihood:
-        _shapes("policy.distribution.log_prob", distribution.log_prob, outputs, action)
+        _shapes_returned("policy.distribution.log_prob", distribution.log_prob, outputs, action)
 
 
-def _shapes(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> Any:
+def _shapes_returned(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> Any:
     """Returns the shapes of what a user's function returns."""
     try:
         return jax.eval_shape(function, *arguments)
@@ -64,6 +67,6 @@ def _shapes(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> A
         raise ValueError(f"{name} fails: {explain(error)}") from error
 
 
-def _described(value: Any) -> str:
+def _shape_or_type(value: Any) -> str:
     """Returns the shape of an array, or the type of what is none."""
     return str(list(value.shape)) if hasattr(value, "shape") else f"a {type(value).__name__}"

@@ -6,7 +6,7 @@ from flax import struct
 
 #: Scaled observations are clipped to plus or minus this many standard deviations.
 CLIP = 10.0
-_MIN_STD = 1e-4
+_LEAST_STD = 1e-4
 
 
 @struct.dataclass(kw_only=True)
@@ -84,4 +84,4 @@ def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
 def standard_deviation(normalizer: Normalizer) -> jax.Array:
     """Returns what ``apply`` divides by, [O]: the standard deviation, and 1e-4 at least."""
     variance = normalizer.m2 / jnp.maximum(normalizer.count, 1.0)
-    return jnp.maximum(jnp.sqrt(variance), _MIN_STD)
+    return jnp.maximum(jnp.sqrt(variance), _LEAST_STD)

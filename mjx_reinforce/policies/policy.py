@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from mjx_reinforce.checks import check_kind, check_type
 from mjx_reinforce.policies.arguments import check_count
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.policies.networks import INITIALIZERS, MLP
 from mjx_reinforce.registry import check_name
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 #: So long is waited for a film (s); a humanoid takes a minute to compile on few cores.
-_PATIENCE = 600
+_TIMEOUT = 600
 #: Length (s) and size (pixels) of the film: the page holds it, so that it has to be small.
 _FORM = ("--seconds", "8", "--width", "360", "--height", "270")
 
@@ -30,10 +30,10 @@ def film_of_median(run: Path, output: Path) -> PageFilm:
     command += [*_FORM, "--output", str(output), "--overwrite"]
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=_PATIENCE
+            command, capture_output=True, text=True, errors="replace", timeout=_TIMEOUT
         )
     except subprocess.TimeoutExpired:
-        return PageFilm(f"There is no film: it was not ready after {_PATIENCE} s.")
+        return PageFilm(f"There is no film: it was not ready after {_TIMEOUT} s.")
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"watch exited with {done.returncode}"]
         return PageFilm(f"There is no film: {lines[-1].removeprefix('error: ')}.")

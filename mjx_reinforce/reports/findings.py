@@ -25,7 +25,7 @@ from mjx_reinforce.reports.statistics.survival import (
 #: Env steps at which curves are read off.
 _GRID_POINTS = 60
 #: Ends that are so close are those of one budget.
-_ALIKE = 0.9
+_SAME_BUDGET = 0.9
 #: Seeds with which people compare, and of which the page says how often they err.
 FEW = (3, 5, 10)
 
@@ -59,13 +59,18 @@ class Findings(NamedTuple):
     few: Few | None
     learning: Learning
 
+    @property
+    def labels(self) -> list[str]:
+        """The names of the configurations, the best first."""
+        return [each.configuration.label for each in self.results]
+
 
 def compute_findings(experiment: Experiment) -> Findings:
     """Computes all figures of a report."""
     parts = experiment.configurations
     ends = [int(part.env_steps[-1].min()) for part in parts]
     # A seed stops after the update that reaches its budget, so that ends differ a little.
-    grid = _grid(parts, min(end for end in ends if end >= _ALIKE * max(ends)))
+    grid = _curve_steps(parts, min(end for end in ends if end >= _SAME_BUDGET * max(ends)))
     curves = [
         np.where((grid <= end)[:, None], on_grid(grid, part.env_steps, part.eval_return), np.nan)
         for part, end in zip(parts, ends, strict=True)
@@ -75,18 +80,18 @@ def compute_findings(experiment: Experiment) -> Findings:
     worst = min(finals[np.isfinite(finals)], default=math.nan)
     results = [
         _result(part, band, seeds, worst, min(ends))._replace(
-            solving=_solving(part, experiment, min(ends))
+            solving=_solving_of(part, experiment, min(ends))
         )
         for part, band, seeds in zip(parts, bands, curves, strict=True)
     ]
     order = sorted(range(len(results)), key=lambda i: _rank(results[i]))
     ranked = [results[i] for i in order]
-    comparisons = _compare(ranked[:COMPARED])
+    comparisons = _compare_pairs(ranked[:COMPARED])
     learning = compare_learning(ranked, min(ends))
-    return Findings(experiment, ranked, order, grid, comparisons, _few(ranked), learning)
+    return Findings(experiment, ranked, order, grid, comparisons, _ask_few(ranked), learning)
 
 
-def _grid(parts: Sequence[Configuration], end: int) -> np.ndarray:
+def _curve_steps(parts: Sequence[Configuration], end: int) -> np.ndarray:
     """Returns env steps from 0 to the end: evenly, and with more at the start for a log axis."""
     first = min(int(part.env_steps[min(1, len(part.env_steps) - 1)].max()) for part in parts)
     even = np.linspace(0, end, _GRID_POINTS - 12)
@@ -132,7 +137,7 @@ def _result(
     )
 
 
-def _solving(part: Configuration, experiment: Experiment, until: int) -> Solving | None:
+def _solving_of(part: Configuration, experiment: Experiment, until: int) -> Solving | None:
     if experiment.threshold is None:
         return None
     returns, threshold = part.eval_return, experiment.threshold
@@ -157,7 +162,7 @@ def _rank(result: Result) -> tuple[float, float]:
     return math.inf if math.isnan(mean) else -mean, math.inf if math.isnan(speed) else speed
 
 
-def _compare(results: Sequence[Result]) -> list[Comparison]:
+def _compare_pairs(results: Sequence[Result]) -> list[Comparison]:
     """Compares all pairs on the seeds that all of them have."""
     shared = shared_seeds(results)
     if len(results) < 2 or len(shared) < 2:
@@ -165,7 +170,7 @@ def _compare(results: Sequence[Result]) -> list[Comparison]:
     return compare_all([each.scores[np.isin(each.configuration.seed, shared)] for each in results])
 
 
-def _few(results: Sequence[Result]) -> Few | None:
+def _ask_few(results: Sequence[Result]) -> Few | None:
     """Returns what few seeds would have said of the two best, where there are many seeds."""
     if len(results) < 2 or min(len(each.final) for each in results[:2]) < 10 * FEW[0]:
         return None

@@ -14,7 +14,7 @@ PROVENANCE = (
     *("python", "packages", "git_commit", "device", "cpu", "machine_code", "jax_settings"),
     *("num_devices", "num_processes", "cpu_count", "cores", "x64", "xla_flags", "resumed"),
 )
-_COLUMNS = {"seed": np.int64, "env_steps": np.int64, "eval_return": np.float64}
+_METRICS_COLUMNS = {"seed": np.int64, "env_steps": np.int64, "eval_return": np.float64}
 
 
 def read_run_source(directory: Path) -> Source:
@@ -37,7 +37,7 @@ def read_run_source(directory: Path) -> Source:
         settings={},
         eval_return=columns["eval_return"],
         env_steps=columns["env_steps"],
-        nonfinite=_nonfinite(summary, path, num_seeds),
+        nonfinite=_count_nonfinite(summary, path, num_seeds),
         seed=np.arange(num_seeds),
     )
     return Source(
@@ -61,7 +61,7 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
       ValueError: the file cannot be read, a column is missing, an entry is no number, or the rows
         are not in the order of the seeds.
     """
-    columns = read_columns(path, _COLUMNS)
+    columns = read_columns(path, _METRICS_COLUMNS)
     seed = columns["seed"]
     if not len(seed):
         raise ValueError(f"{path} has no evaluation yet; wait for the first, or train again")
@@ -108,14 +108,14 @@ def read_columns(path: Path, kinds: dict[str, Any]) -> dict[str, np.ndarray]:
         try:
             found[name] = np.array(texts, dtype=kind)
         except ValueError:
-            line = next(n for n, text in enumerate(texts, start=2) if not _is(kind, text))
+            line = next(n for n, text in enumerate(texts, start=2) if not _reads_as(kind, text))
             raise ValueError(
                 f"{path} is damaged: {name} in line {line} is {texts[line - 2]!r}"
             ) from None
     return found
 
 
-def _is(kind: Any, text: str) -> bool:
+def _reads_as(kind: Any, text: str) -> bool:
     try:
         np.array([text], dtype=kind)
     except ValueError:
@@ -123,7 +123,7 @@ def _is(kind: Any, text: str) -> bool:
     return True
 
 
-def _nonfinite(summary: dict[str, Any], path: Path, num_seeds: int) -> np.ndarray:
+def _count_nonfinite(summary: dict[str, Any], path: Path, num_seeds: int) -> np.ndarray:
     """Returns how many updates of each seed met numbers that are not finite."""
     events = summary.get("nonfinite", [])
     try:

@@ -60,7 +60,7 @@ def _experiment(found: Sequence[Source]) -> Experiment:
     """Returns the experiment of sources of one task."""
     configurations = _told_apart(found)
     thresholds = [source.threshold for source in found if source.threshold is not None]
-    provenance, disagree = _side_by_side(found)
+    provenance, disagree = _merge_provenance(found)
     timings = sum((Counter(source.timings) for source in found), Counter())
     env = found[0].env
     return Experiment(
@@ -105,12 +105,12 @@ def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
         own = {name: settings.get(name) for name in differ}
         parts.append(
             part._replace(
-                settings=own, label=settings_in_words(own) or _name(source.directory.name)
+                settings=own, label=settings_in_words(own) or _path_in_words(source.directory.name)
             )
         )
     repeated = {label for label, times in Counter(p.label for p in parts).items() if times > 1}
     return [
-        part._replace(label=f"{part.label} in {_name(source.directory)}")
+        part._replace(label=f"{part.label} in {_path_in_words(source.directory)}")
         if part.label in repeated
         else part
         for (source, _), part in zip(pairs, parts, strict=True)
@@ -127,7 +127,7 @@ def _in_common(settings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _side_by_side(sources: Sequence[Source]) -> tuple[dict[str, Any], list[str]]:
+def _merge_provenance(sources: Sequence[Source]) -> tuple[dict[str, Any], list[str]]:
     """Returns what the sources say of their provenance, and where they do not agree.
 
     An entry in which they differ holds the answer of each directory.
@@ -143,6 +143,6 @@ def _side_by_side(sources: Sequence[Source]) -> tuple[dict[str, Any], list[str]]
     return merged, disagree
 
 
-def _name(path: Path | str) -> str:
+def _path_in_words(path: Path | str) -> str:
     """Returns a path for people, with escapes for bytes that a locale of ASCII cannot read."""
     return str(path).encode(errors="backslashreplace").decode()

@@ -118,7 +118,7 @@ def find_tasks(experiments: Sequence[Experiment]) -> Tasks:
     found = [compute_findings(_only(each, shared)) for each in experiments]
     scales = [scale(each) for each in found]
     overall = [_overall(label, found, scales) for label in shared]
-    overall.sort(key=lambda each: (-_number(each.mean), -_number(each.area)))
+    overall.sort(key=lambda each: (-_or_least(each.mean), -_or_least(each.area)))
     left_out = [label for some in names for label in some if label not in shared]
     return Tasks(found, scales, overall, _faster(found, overall), list(dict.fromkeys(left_out)))
 
@@ -140,7 +140,7 @@ def scale(findings: Findings) -> Scale:
     first = np.concatenate([part.eval_return[0] for part in experiment.configurations])
     zero = float(np.mean(first[np.isfinite(first)])) if np.isfinite(first).any() else math.nan
     solved = experiment.threshold is not None
-    one = experiment.threshold if solved else max(_number(each.mean) for each in findings.results)
+    one = experiment.threshold if solved else max(_or_least(each.mean) for each in findings.results)
     if not (one is not None and one > zero):
         raise ValueError(
             f"{experiment.env} has no normalized score: untrained policies return {zero:.4g}, and "
@@ -205,6 +205,6 @@ def _faster(found: Sequence[Findings], overall: Sequence[Overall]) -> list[Faste
     ]
 
 
-def _number(estimate: Estimate) -> float:
+def _or_least(estimate: Estimate) -> float:
     value = float(estimate.value)
     return -math.inf if math.isnan(value) else value

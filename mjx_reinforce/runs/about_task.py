@@ -33,10 +33,10 @@ def about_task(id: str) -> str:
     env, config = envs.make(id), of_task(id)
     doc = inspect.cleandoc(type(env).__doc__ or "").replace("``", "`")
     said = (" ".join(paragraph.split()) for paragraph in doc.split("\n\n") if paragraph)
-    return "\n\n".join([id, _facts(id, env), *said, *_training(config)])
+    return "\n\n".join([id, _sizes(id, env), *said, *_how_to_train(config)])
 
 
-def _facts(id: str, env: "MujocoEnv") -> str:
+def _sizes(id: str, env: "MujocoEnv") -> str:
     """Returns the sizes of a task, a line each."""
     from mjx_reinforce.types import observation_size
 
@@ -47,7 +47,7 @@ def _facts(id: str, env: "MujocoEnv") -> str:
     seconds = f", of {env.dt:g} s each" if hasattr(env, "dt") else ""
     facts = {
         "observation": f"{observation} numbers",
-        "action": _action(env),
+        "action": _action_in_words(env),
         "episode": f"at most {limit:,} env steps{seconds}" if limit else "give --horizon a number",
         "solved": "the task names no return"
         if threshold is None
@@ -56,7 +56,7 @@ def _facts(id: str, env: "MujocoEnv") -> str:
     return "\n".join(f"  {name:11}  {fact}" for name, fact in facts.items())
 
 
-def _action(env: Environment) -> str:
+def _action_in_words(env: Environment) -> str:
     from mjx_reinforce.types import Discrete, action_space
 
     space = action_space(env)
@@ -68,12 +68,12 @@ def _action(env: Environment) -> str:
     return f"{count} number{'s' * (count > 1)} in {ranges}"
 
 
-def _training(config: Config) -> list[str]:
+def _how_to_train(config: Config) -> list[str]:
     """Returns how to train on a task, how long that takes here, and with which settings."""
     said = [
         f"To train {config.num_seeds} seeds for {config.env_steps:,} env steps each:",
         f"  {command('train')} --env {config.env}",
-        _time(config),
+        _time_here(config),
     ]
     differing = (name for name in changed(config, Config()) if name not in _SAID)
     names = [name for name in differing if is_read(name, config)]
@@ -83,7 +83,7 @@ def _training(config: Config) -> list[str]:
     return said
 
 
-def _time(config: Config) -> str:
+def _time_here(config: Config) -> str:
     """Returns how long a run takes on this machine, as the run itself says."""
     machine = plan.this_hardware()
     task, speed = measured.TASKS.get(config.env), machine.speeds.get(config.env)

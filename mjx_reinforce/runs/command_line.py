@@ -24,7 +24,7 @@ from mjx_reinforce.settings.relevance import changed, check_read
 from mjx_reinforce.training import resume
 
 #: What a run leaves in its directory.
-_FILES = (
+_LEFT_BEHIND = (
     "config.json",
     "metrics.csv",
     "returns.npz",
@@ -35,7 +35,7 @@ _FILES = (
 )
 _DESCRIPTION = (
     "Train policies by REINFORCE on MuJoCo, many seeds at once, and report over the seeds. "
-    f"Leaves {', '.join(_FILES)} in the run directory.\n\n"
+    f"Leaves {', '.join(_LEFT_BEHIND)} in the run directory.\n\n"
     "Defaults depend on the task and on the budget: --help shows those of InvertedPendulum-v5, "
     "--help --env ID those of another, for about a minute of training here, and with "
     "--env-steps N those for N env steps."
@@ -59,7 +59,7 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
         or is of the user's own environment, which is to be named again.
     """
     default, preset, flags, prog = start(arguments, command("train"))
-    config, processes = _read(flags, default, prog)
+    config, processes = _read_config(flags, default, prog)
     if config.minutes is not None and flag_value(flags, "--env-steps"):
         raise ValueError(
             f"--minutes {config.minutes:g} and --env-steps {config.env_steps} both say when the "
@@ -73,7 +73,7 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
     if preset is not None:
         raise ValueError(f"--resume has the run's own settings: leave the preset {preset} out")
     known = resume.read_settings(config.resume)
-    asked, _ = _read(flags, known, prog)
+    asked, _ = _read_config(flags, known, prog)
     resume.check_settings(known, asked)
     if resume.is_done(known, asked):
         print(
@@ -129,7 +129,9 @@ def _default(arguments: Sequence[str]) -> Config:
     return dataclasses.replace(known, resume=None)
 
 
-def _read(arguments: Sequence[str], default: Config, prog: str) -> tuple[Config, ProcessSettings]:
+def _read_config(
+    arguments: Sequence[str], default: Config, prog: str
+) -> tuple[Config, ProcessSettings]:
     """Returns the settings that flags ask for, with others as given; --help exits."""
     groups = {**GROUPS, "hosts": ProcessSettings}
     said = _DESCRIPTION if asks_brief_help(arguments) else f"{_DESCRIPTION}\n\n{_names()}"
@@ -183,6 +185,29 @@ def _names() -> str:
         f"Presets, published programs whose settings replace the defaults:\n{presets}\n\n"
         f"Environments: {', '.join(envs.names())}."
     )
+
+
+def refuse_full(
+    error: RuntimeError | OSError, what: str, part: str, flag: str, again: str, made: Sequence[Path]
+) -> NoReturn:
+    """Refuses what met a full memory or disk, as ``refuse``; raises any other error again.
+
+    Args:
+      error: XLA's where memory is full, or that of a file.
+      what: whose files they are.
+      part: what has to fit into memory.
+      flag: makes that part smaller.
+      again: what to do once there is room on the disk.
+      made: the folders that were made.
+    """
+    if isinstance(error, OSError):
+        room = "make room, then" if error.errno else "then"  # W&B's have no number
+        message = f"cannot write the files of {what} ({error}); {room} {again}"
+        refuse(message, made, status=1)
+    if "RESOURCE_EXHAUSTED" not in str(error):
+        raise error
+    flags = f"{flag}, --num-episodes, --eval-episodes or --horizon"
+    refuse(f"{part} does not fit into memory ({error}); lower {flags}", made)
 
 
 def refuse(message: str, made: Sequence[Path], status: int = 2) -> NoReturn:

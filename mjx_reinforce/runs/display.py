@@ -21,7 +21,7 @@ from mjx_reinforce.console.heartbeat import heartbeat
 from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.runs.plan import duration
 from mjx_reinforce.settings.own_code import env_flag
-from mjx_reinforce.training import nonfinite, progress
+from mjx_reinforce.training.records import nonfinite, progress
 
 
 class _Bar(Progress):
@@ -105,13 +105,13 @@ class Display:
 
     def show_progress(self, now: progress.Progress) -> None:
         """Shows how far the run is and how well it does."""
-        self._bar.line, left = _numbers(now), _time_left(now)
+        self._bar.line, left = _returns_and_speed(now), _time_left(now)
         done = percent_done(min(now.fraction, 1.0))
         self._bar.update(self._task, completed=now.fraction, done=done, left=left)
         if not self.console.is_terminal:
             self.say(
                 f"update {now.updates:5d}  {now.env_steps:12,.0f} env steps a seed  "
-                f"{_numbers(now)}  {done}  {left}".rstrip()
+                f"{_returns_and_speed(now)}  {done}  {left}".rstrip()
             )
 
     def show_nonfinite(self, updates: dict[str, np.ndarray], num_seeds: int) -> None:
@@ -120,7 +120,7 @@ class Display:
             self.say(nonfinite.describe_nonfinite(updates, num_seeds), "yellow")
 
 
-def _numbers(now: progress.Progress) -> str:
+def _returns_and_speed(now: progress.Progress) -> str:
     """Returns the returns and, after a block of updates, the speed."""
     text = f"return {now.iqm:7.1f}  worst {now.worst:7.1f}"
     if now.failed:

@@ -13,8 +13,9 @@ from mjx_reinforce.files import write_arrays, write_bytes, write_json
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.runs.sinks import sink
 from mjx_reinforce.store.provenance import provenance
-from mjx_reinforce.training import checkpoint, rows
+from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.checkpoint import Checkpoint
+from mjx_reinforce.training.records import rows
 
 #: The files of a run, besides those in ``checkpoint/``.
 _POLICY = ("policy/actor.npz", "policy/policy.json")

@@ -12,8 +12,8 @@ from mjx_reinforce.runs.sinks.sink import Queue, open_sinks
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.driver import Driver, Evaluation
+from mjx_reinforce.training.records.rows import Cells
 from mjx_reinforce.training.resume import recordable
-from mjx_reinforce.training.rows import Cells
 from mjx_reinforce.training.saving import Attempts, SaveDue
 
 #: Once so much of the budget is used, the time that is left can be trusted: before, episodes may be

@@ -24,7 +24,7 @@ from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.observers import Callbacks, RunFiles, Screen
 from mjx_reinforce.runs.plan import make_plan
 from mjx_reinforce.runs.sinks.sink import check_installed
-from mjx_reinforce.runs.training import compile_driver, draw, summarize
+from mjx_reinforce.runs.training import compile_driver, draw, summary_of
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.store.ready import get_ready
@@ -149,13 +149,13 @@ def run(
         if files is not None:
             files.end(driver)
         test = driver.test(lambda: False)
-        summary = summarize(driver, ready.engine, seconds, test)
+        summary = summary_of(driver, ready.engine, seconds, test)
         if files is not None:
             files.finish(driver, draw(driver), summary)
-    return _results(driver, build_policy(ready.policy), summary)
+    return _results_of(driver, build_policy(ready.policy), summary)
 
 
-def _results(driver: Driver, policy: Policy, summary: dict[str, Any]) -> RunResults:
+def _results_of(driver: Driver, policy: Policy, summary: dict[str, Any]) -> RunResults:
     history = driver.record.history()
     return RunResults(
         config=driver.config,

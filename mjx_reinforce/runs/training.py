@@ -13,9 +13,9 @@ from mjx_reinforce.training.best import first_best
 from mjx_reinforce.training.driver import Driver
 from mjx_reinforce.training.initial import begin_with, last_actors
 from mjx_reinforce.training.minutes import env_steps_in
-from mjx_reinforce.training.nonfinite import HOPELESS
-from mjx_reinforce.training.record import RunRecord
-from mjx_reinforce.training.state import compile_parts
+from mjx_reinforce.training.programs import compile_run
+from mjx_reinforce.training.records.nonfinite import HOPELESS
+from mjx_reinforce.training.records.record import RunRecord
 
 if TYPE_CHECKING:
     from mjx_reinforce.store.ready import Ready
@@ -41,7 +41,8 @@ def compile_driver(
       meanwhile: begins other work in Python; called once the rest of the time is XLA's.
     """
     started = time.perf_counter()
-    state, programs = compile_parts(ready.parts, config, meanwhile)
+    share = slice(None) if processes is None else processes.share(config.num_seeds)
+    state, programs = compile_run(ready.programs, config, share, meanwhile)
     if processes is not None and processes.count > 1:
         from mjx_reinforce.hosts.shares import lead
 
@@ -59,7 +60,7 @@ def compile_driver(
     return Driver(known, programs, record, state, best), seconds
 
 
-def summarize(
+def summary_of(
     driver: Driver, engine: str, compile_seconds: float, test: dict[str, Any]
 ) -> dict[str, Any]:
     """Returns the contents of summary.json.

@@ -24,7 +24,7 @@ Form = TypeVar("Form")
 #: Columns that --help is written for at least: of 20 columns tyro makes thousands of lines.
 _LEAST_WIDTH = 60
 #: What tyro says of a value -> what we say.
-_PLAIN = {
+_OUR_WORDS = {
     r"Error parsing (PATH|\[.*\]): .*": "'' is no path",  # without a flag
     r"Missing value for argument '(\S+)'.*": r"\1 needs a value after it",
     r"Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]": (
@@ -48,7 +48,11 @@ _READERS = ConstructorRegistry()
 @_READERS.primitive_rule
 def _reader(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     """Returns how a number or a path is read: 1e6 is a whole number, and "" is no path."""
-    readers = {int: ("INT", whole_number), float: ("FLOAT", _real_number), Path: ("PATH", _path)}
+    readers = {
+        int: ("INT", whole_number),
+        float: ("FLOAT", _real_number),
+        Path: ("PATH", _read_path),
+    }
     if kind.type not in readers:
         return None
     metavar, reader = readers[kind.type]
@@ -68,7 +72,7 @@ def _real_number(text: str) -> float:
         raise ValueError(f"takes a number, such as 0.5, got {text!r}") from None
 
 
-def _path(text: str) -> Path:
+def _read_path(text: str) -> Path:
     if not text:
         raise ValueError("takes a path, got ''")
     return Path(text)
@@ -96,7 +100,7 @@ def read_command_line(
     """
     box, page = io.StringIO(), _Page(sys.stdout)
     brief = bool(main) and asks_brief_help(arguments)
-    asked = _only(form, main) if brief else _with_help(form)
+    asked = _few_fields(form, main) if brief else _with_help(form)
     options: dict[str, Any] = {"prog": prog, "description": "", "registry": _READERS}
     options["config"] = (tyro.conf.OmitArgPrefixes,)
     try:
@@ -104,16 +108,16 @@ def read_command_line(
             parsed, unknown = tyro.cli(asked, args=arguments, return_unknown_args=True, **options)
     except SystemExit as stop:
         if not stop.code:
-            print(_described(page.getvalue(), description), end="")
+            print(_with_description(page.getvalue(), description), end="")
             if brief:
                 print(f"\n--help all shows all {len(known(form))} settings.")
             raise
         if wrong := unknown_flags(arguments, form):
             raise ValueError(about_unknown(wrong, arguments, form, prog)) from stop
-        raise ValueError(f"{_plain(box.getvalue(), form, prog)} (see --help)") from stop
+        raise ValueError(f"{_in_our_words(box.getvalue(), form, prog)} (see --help)") from stop
     if unknown:
         raise ValueError(about_unknown(unknown, arguments, form, prog))
-    return _as(form, parsed)
+    return _as_form(form, parsed)
 
 
 def asks_brief_help(arguments: Sequence[str]) -> bool:
@@ -176,7 +180,7 @@ def _with_help(form: type) -> type:
     )
 
 
-def _only(form: type, names: Sequence[str]) -> type:
+def _few_fields(form: type, names: Sequence[str]) -> type:
     """Returns a dataclass with a few fields of the dataclasses in another, for --help."""
     groups = [field.default for field in dataclasses.fields(_with_help(form))]
     hints = {
@@ -188,24 +192,24 @@ def _only(form: type, names: Sequence[str]) -> type:
     return dataclasses.make_dataclass(form.__name__, made, frozen=True, kw_only=True)
 
 
-def _as(form: type[Form], parsed: Any) -> Form:
+def _as_form(form: type[Form], parsed: Any) -> Form:
     """Returns what was read as the dataclass that was asked for."""
     hints = get_type_hints(form)
     values = {
-        name: _as(hints[name], value) if dataclasses.is_dataclass(value) else value
+        name: _as_form(hints[name], value) if dataclasses.is_dataclass(value) else value
         for name, value in vars(parsed).items()
     }
     return form(**values)
 
 
-def _described(page: str, description: str) -> str:
+def _with_description(page: str, description: str) -> str:
     """Returns tyro's help with a description after its first line, which says the usage."""
     usage, _, rest = page.partition("\n\n")
     columns = max(columns_of(sys.stdout), _LEAST_WIDTH)
     return "\n\n".join([usage, wrapped(description, columns), rest])
 
 
-def _plain(box: str, form: type, prog: str) -> str:
+def _in_our_words(box: str, form: type, prog: str) -> str:
     """Returns a message of tyro's in our words."""
     text = _first_section(box)
     if text.startswith("Missing from"):
@@ -221,7 +225,7 @@ def _plain(box: str, form: type, prog: str) -> str:
         value, flag, choices = found.groups()
         names = sorted(set(re.findall(r"'(.*?)'", choices)) - {"None"})
         return f"{flag} takes {' or '.join(names)}, got {value}"
-    for pattern, replacement in _PLAIN.items():
+    for pattern, replacement in _OUR_WORDS.items():
         text = re.sub(pattern, replacement, text)
     return text
 

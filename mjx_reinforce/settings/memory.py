@@ -93,17 +93,17 @@ def parts(config: Config, task: Task) -> list[MemoryPart]:
 
 def num_parameters(config: Config, task: Task) -> int:
     """Returns how many parameters the policy has, about: mean and std have outputs of their own."""
-    return _weights([task.observation, *config.hidden_sizes, 2 * task.action])
+    return _num_weights([task.observation, *config.hidden_sizes, 2 * task.action])
 
 
 def critic_parameters(config: Config, task: Task) -> int:
     """Returns how many parameters the value network has, 0 where there is none."""
     if config.algorithm != "reinforce" or config.estimator != "value-baseline":
         return 0
-    return _weights([task.observation, *config.value_hidden_sizes, 1])
+    return _num_weights([task.observation, *config.value_hidden_sizes, 1])
 
 
-def _weights(widths: Sequence[int]) -> int:
+def _num_weights(widths: Sequence[int]) -> int:
     """Returns how many parameters a network has whose layers are so wide, the input first."""
     return sum((n + 1) * m for n, m in itertools.pairwise(widths))
 

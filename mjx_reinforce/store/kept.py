@@ -6,11 +6,10 @@ begins with (its seeds) and when it ends are inputs of its programs.
 """
 
 import dataclasses
-import functools
 import hashlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -22,15 +21,18 @@ from mjx_reinforce.engines.native import objects
 from mjx_reinforce.engines.native.available import made_for, platform
 from mjx_reinforce.engines.native.cpu import seam
 from mjx_reinforce.engines.native.gpu.seam import PTX
+from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.settings.config import Config, marked
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.store.provenance import provenance, version
 from mjx_reinforce.store.trees import describe_tree, rebuild
+from mjx_reinforce.training.block import Block
+from mjx_reinforce.training.programs import Programs
 from mjx_reinforce.training.resume import recordable
-from mjx_reinforce.training.state import Budget, Parts, eval_keys_shape
-from mjx_reinforce.types import PyTree, plain
+from mjx_reinforce.training.state import Budget, RunState, restored
+from mjx_reinforce.types import plain
 
-_NAMES = ("start", "advance", "look")
+_PROGRAMS = ("begin", "advance", "evaluate")
 
 
 def key_of(config: Config, share: slice = slice(None)) -> str | None:
@@ -62,7 +64,7 @@ def key_of(config: Config, share: slice = slice(None)) -> str | None:
     return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
 
 
-def keep(key: str, facts: dict[str, Any], parts: Parts) -> Parts:
+def keep(key: str, facts: dict[str, Any], programs: Programs) -> Programs:
     """Returns programs that are written to disk when they are traced.
 
     A program that JAX cannot export, such as one that calls Python, is not kept.
@@ -70,37 +72,78 @@ def keep(key: str, facts: dict[str, Any], parts: Parts) -> Parts:
     Args:
       key: of ``key_of``.
       facts: what else a run needs, in JSON's types.
-      parts: its programs.
+      programs: of the run.
     """
+    like = programs.like
     try:
-        whole = {"facts": facts, "like": describe_tree(parts.like), "rides": parts.rides}
+        whole = {"facts": facts, "like": describe_tree(like), "rides": programs.rides}
     except TypeError:
-        return parts
-    _write(key, "facts", json.dumps(whole).encode())
-    shapes, actor = _leaves(parts.like), _leaves(parts.like.train_states.actor)
-    seed, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), (2,)))
+        return programs
+    _write_program(key, "facts", json.dumps(whole).encode())
+    leaves = jax.tree.leaves(jax.eval_shape(plain, like))
+    actor, keys = jax.tree.leaves(like.train_states.actor), jax.eval_shape(plain, like.eval_keys)
+    seed, numbers, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), keys.shape[:1], (2,)))
     given = {
-        "start": (seed, seed),
-        "advance": (shapes, (count,) * len(Budget._fields), jax.ShapeDtypeStruct((), bool)),
-        "look": (actor, eval_keys_shape(parts.like)),
+        "begin": (seed, seed, numbers),
+        "advance": (leaves, (count,) * len(Budget._fields), jax.ShapeDtypeStruct((), bool)),
+        "evaluate": (actor, keys),
     }
-    return parts._replace(
-        **{
-            name: functools.partial(_export, key, name, getattr(parts, name), given[name])
-            for name in _NAMES
-        }
-    )
+    flat = _on_leaves(programs)
+
+    def load(name: str) -> Callable[..., Any]:
+        return _export(key, name, flat[name], given[name])
+
+    return _on_states(load, like, programs.rides)
 
 
-def read_programs(key: str) -> tuple[dict[str, Any], Parts] | None:
+def read_programs(key: str) -> tuple[dict[str, Any], Programs] | None:
     """Returns the facts and the programs of a run; None unless all of them are on disk."""
-    read = {name: _read(key, name) for name in ("facts", *_NAMES)}
+    read = {name: _read_program(key, name) for name in ("facts", *_PROGRAMS)}
     found = {name: content for name, content in read.items() if content is not None}
     if len(found) < len(read) or not all(map(seam.restore, found.values())):
         return None
     whole = json.loads(found["facts"])
-    programs = {name: functools.partial(_program, found[name]) for name in _NAMES}
-    return whole["facts"], Parts(rebuild(whole["like"]), **programs, rides=whole["rides"])
+    like = rebuild(whole["like"])
+    return whole["facts"], _on_states(lambda name: _program(found[name]), like, whole["rides"])
+
+
+def _on_leaves(programs: Programs) -> dict[str, Callable[..., Any]]:
+    """Returns the programs of a run on lists of leaves, with data in the place of keys.
+
+    They are kept so: JAX exports no class of this package.
+    """
+    like = programs.like
+
+    def begin(seed: jax.Array, eval_seed: jax.Array, numbers: jax.Array) -> Any:
+        first, keys = programs.begin(seed, eval_seed, numbers, {})
+        return jax.tree.leaves(plain(first)), plain(keys)
+
+    def advance(leaves: list[jax.Array], budget: Sequence[jax.Array], look: jax.Array) -> Any:
+        after, block = programs.advance(restored(leaves, like), Budget(*budget), look)
+        return jax.tree.leaves(plain(after)), tuple(block)
+
+    def evaluate(leaves: list[jax.Array], keys: jax.Array) -> dict[str, jax.Array]:
+        actor = restored(leaves, like.train_states.actor)
+        return programs.evaluate(actor, jax.random.wrap_key_data(keys))
+
+    return {"begin": begin, "advance": advance, "evaluate": evaluate}
+
+
+def _on_states(load: Callable[[str], Callable[..., Any]], like: RunState, rides: bool) -> Programs:
+    """Returns the programs of which ``load`` returns those on leaves, when they are traced."""
+
+    def begin(*given: Any) -> tuple[RunState, jax.Array]:
+        leaves, keys = load("begin")(*given[:3])  # a run has no settings that are traced
+        return restored(leaves, like), jax.random.wrap_key_data(keys)
+
+    def advance(before: RunState, budget: Budget, look: jax.Array) -> tuple[RunState, Block]:
+        leaves, block = load("advance")(jax.tree.leaves(plain(before)), tuple(budget), look)
+        return restored(leaves, like), Block(*block)
+
+    def evaluate(actor: Actor, keys: jax.Array) -> dict[str, jax.Array]:
+        return load("evaluate")(jax.tree.leaves(actor), plain(keys))
+
+    return Programs(begin, advance, evaluate, rides, like)
 
 
 def _program(content: bytes) -> Callable[..., Any]:
@@ -108,10 +151,9 @@ def _program(content: bytes) -> Callable[..., Any]:
 
 
 def _export(
-    key: str, name: str, part: Callable[[], Callable[..., Any]], given: tuple[Any, ...]
+    key: str, name: str, program: Callable[..., Any], given: tuple[Any, ...]
 ) -> Callable[..., Any]:
     """Returns a program as it is kept, or as it was where JAX cannot export it."""
-    program = part()
     unsafe = [export.DisabledSafetyCheck.custom_call(x) for x in (*seam.targets(), PTX)]
     try:
         exported = export.export(jax.jit(program), disabled_checks=unsafe)(*given)
@@ -120,21 +162,16 @@ def _export(
         content = bytes(own.serialize())
     except (ValueError, NotImplementedError):
         return program
-    _write(key, name, content)
+    _write_program(key, name, content)
     return _program(content)
 
 
-def _leaves(tree: PyTree) -> list[jax.ShapeDtypeStruct]:
-    """Returns the shapes of the leaves, with the data of keys in their place."""
-    return jax.tree.leaves(jax.eval_shape(plain, tree))
-
-
-def _read(key: str, name: str) -> bytes | None:
+def _read_program(key: str, name: str) -> bytes | None:
     folder = objects.folder()
     return None if folder is None else objects.read_object(folder, f"{key}-{name}")
 
 
-def _write(key: str, name: str, content: bytes) -> None:
+def _write_program(key: str, name: str, content: bytes) -> None:
     folder = objects.folder()
     if folder is not None:
         objects.write_object(folder, f"{key}-{name}", content)

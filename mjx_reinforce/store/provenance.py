@@ -8,7 +8,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-_PACKAGES = ("mjx-reinforce", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "optax", "flax")
+_RECORDED = ("mjx-reinforce", "jax", "jaxlib", "mujoco", "mujoco-mjx", "brax", "optax", "flax")
 
 
 def provenance() -> dict[str, Any]:
@@ -35,7 +35,7 @@ def provenance() -> dict[str, Any]:
 
 def versions() -> dict[str, str | None]:
     """Returns the versions of the packages that compute."""
-    return {name: version(name) for name in _PACKAGES}
+    return {name: version(name) for name in _RECORDED}
 
 
 def version(package: str) -> str | None:

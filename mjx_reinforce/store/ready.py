@@ -8,7 +8,7 @@ from mjx_reinforce.settings.config import Config, check_step_count
 from mjx_reinforce.settings.relevance import check_read_by_policy
 from mjx_reinforce.store import kept
 from mjx_reinforce.store.build import build, policy_settings
-from mjx_reinforce.training.state import Parts, parts_of
+from mjx_reinforce.training.programs import Programs, programs_of
 from mjx_reinforce.types import Environment
 
 
@@ -21,7 +21,7 @@ class Ready(NamedTuple):
     engine: the name of what plays the episodes
     why: the reason it was chosen, for people
     engine_seconds: wall time that making it took
-    parts: its programs
+    programs: before they are compiled
     """
 
     horizon: int
@@ -30,7 +30,7 @@ class Ready(NamedTuple):
     engine: str
     why: str
     engine_seconds: float
-    parts: Parts
+    programs: Programs
 
 
 def get_ready(
@@ -53,8 +53,8 @@ def get_ready(
         ready = made(envs.make(config.env) if env is None else env, config, share)
         if key is not None:
             facts = ready._asdict()
-            del facts["parts"], facts["engine_seconds"]
-            ready = ready._replace(parts=kept.keep(key, facts, ready.parts))
+            del facts["programs"], facts["engine_seconds"]
+            ready = ready._replace(programs=kept.keep(key, facts, ready.programs))
     if config.resume is None and config.policy == "auto":
         check_read_by_policy(config, default, ready.policy["policy"])
     return ready
@@ -71,9 +71,9 @@ def _found(key: str, config: Config, share: slice) -> Ready | None:
             return None
     if found is None:
         return None
-    facts, parts = found
+    facts, programs = found
     check_step_count(config, facts["horizon"])
-    return Ready(**facts, engine_seconds=0.0, parts=parts)
+    return Ready(**facts, engine_seconds=0.0, programs=programs)
 
 
 def made(env: Environment, config: Config, share: slice = slice(None)) -> Ready:
@@ -83,6 +83,7 @@ def made(env: Environment, config: Config, share: slice = slice(None)) -> Ready:
       ValueError: the settings do not fit the environment.
     """
     learner, horizon = build(env, config)
+    num_seeds = len(range(config.num_seeds)[share])
     threshold = getattr(env, "reward_threshold", None)
     return Ready(
         horizon=horizon,
@@ -91,5 +92,5 @@ def made(env: Environment, config: Config, share: slice = slice(None)) -> Ready:
         engine=learner.engine.name,
         why=learner.engine.why,
         engine_seconds=learner.engine.seconds,
-        parts=parts_of(env, learner, horizon, config, share),
+        programs=programs_of(env, lambda _: learner, horizon, config, num_seeds),
     )

@@ -61,7 +61,7 @@ def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
 def initial_states(programs: SlotPrograms, group: Group, runs: Runs) -> np.ndarray:
     """Returns the states [R, B] of the runs of a chunk before their first update."""
     settings = {name: values[runs.place] for name, values in group.settings.items()}
-    return programs.begin(programs.keys[runs.seed], programs.eval_keys[runs.seed], settings)
+    return programs.begin(runs.seed, settings)
 
 
 class Saver:
@@ -103,11 +103,12 @@ class Saver:
         checkpoint.save(self._folder, content, even=False)
         self._due.saved(_updates(history))
 
-    def find(self, like: Callable[[], RunState], history: History) -> np.ndarray | None:
-        """Returns the newest states that were saved, with their history restored, or None."""
-        if not self._folder.exists():
-            return None
-        for found in checkpoint.read_checkpoints(self._folder, like(), self._say):
+    def find(self, like: RunState, history: History) -> np.ndarray | None:
+        """Returns the newest states that were saved, with their history restored, or None.
+
+        ``like`` has the shapes of the states.
+        """
+        for found in checkpoint.read_checkpoints(self._folder, like, self._say):
             history.restore(found.record)
             self._due.saved(_updates(history))
             return self._layout.rows(found.state)

@@ -13,7 +13,7 @@ from mjx_reinforce.settings.relevance import changed
 from mjx_reinforce.sweeps.designs import grid
 from mjx_reinforce.sweeps.designs.design import Design, SweepSettings, read_design
 
-_DESCRIPTION = (
+_ABOUT_SWEEPS = (
     "Train many configurations, many seeds of each, side by side. Leaves sweep.json, results.csv "
     "(a row for each configuration and seed), curves.npz, report.html and policies/ (those of the "
     "best and the worst seed of each configuration) in the output directory. "
@@ -38,7 +38,7 @@ def parse_design(arguments: Sequence[str]) -> Design:
       ValueError: see ``runs.command_line.parse`` and ``grid.read_over``.
     """
     default, preset, flags, prog = start(arguments, command("sweep"))
-    base, settings, processes = _read(flags, default, prog)
+    base, settings, processes = _read_flags(flags, default, prog)
     if base.resume is None:
         return Design(
             base=base,
@@ -55,12 +55,12 @@ def parse_design(arguments: Sequence[str]) -> Design:
     return _resumed(flags, base.resume, prog)
 
 
-def _read(
+def _read_flags(
     flags: Sequence[str], default: Config, prog: str
 ) -> tuple[Config, SweepSettings, ProcessSettings]:
     """Returns the settings of the runs, of the sweep, and of its processes; --help exits."""
     groups = {"sweep": SweepSettings, "hosts": ProcessSettings, **GROUPS}
-    parsed = read_groups(groups, flags, default, prog, _DESCRIPTION, _MAIN)
+    parsed = read_groups(groups, flags, default, prog, _ABOUT_SWEEPS, _MAIN)
     settings, processes = parsed.pop("sweep"), parsed.pop("hosts")
     return join_groups(parsed), settings, processes
 
@@ -68,7 +68,7 @@ def _read(
 def _resumed(flags: Sequence[str], directory: Path, prog: str) -> Design:
     """Returns the sweep in a directory; raises ValueError if flags would change it."""
     design = read_design(directory)
-    base, settings, processes = _read(flags, design.base, prog)
+    base, settings, processes = _read_flags(flags, design.base, prog)
     if dataclasses.replace(base, resume=None) != design.base or settings != SweepSettings():
         raise ValueError(f"the sweep in {directory} goes on as it is: give --resume alone")
     check_resumed(base.env, flags, directory)

@@ -25,9 +25,9 @@ from mjx_reinforce.sweeps.designs.rungs import Rung
 from mjx_reinforce.sweeps.history import History
 from mjx_reinforce.sweeps.results import SweepFiles
 from mjx_reinforce.sweeps.slots.ahead import Stopwatch, one_ahead
-from mjx_reinforce.sweeps.slots.programs import SlotPrograms, compile_programs, shape_of_states
+from mjx_reinforce.sweeps.slots.programs import SlotPrograms, compile_programs
 from mjx_reinforce.training.driver import drive
-from mjx_reinforce.training.progress import Progress
+from mjx_reinforce.training.records.progress import Progress
 
 #: More than this share of a sweep is all of it, up to rounding.
 _ALL = 1 - 1e-6
@@ -212,8 +212,7 @@ class Conductor:
         config = dataclasses.replace(stage.group.config, num_seeds=len(runs.seed))
         history, layout = History(config), programs.layout
         saver = Saver(self._files.checkpoints(runs.name), config, layout, self._display.say)
-        like = functools.partial(programs.shape_of, len(runs.seed))
-        states = saver.find(like, history)
+        states = saver.find(layout.shapes(len(runs.seed)), history)
         if states is None:
             states = self._begin(rung, stage, programs, runs, history)
 
@@ -245,9 +244,8 @@ class Conductor:
         if rung.before is None:
             return chunks.initial_states(programs, stage.group, runs)
         before = next(old for old in self._before if old.number == stage.number)
-        build = learner_builder(self._prepared.env, before.group.config)
-        shape_of = functools.partial(shape_of_states, build, tuple(before.group.settings))
-        states = carry.last_states(self._files, before.chunks, shape_of, self._display.say)
+        shapes = programs.layout.shapes
+        states = carry.last_states(self._files, before.chunks, shapes, self._display.say)
         states = carry.select_runs(states, before.chunks, runs)
         history.now["updates"] = counts.to_int(states.train_states.num_updates)
         history.now["env_steps"] = counts.to_int(states.train_states.env_steps)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, silence_alarms
-from mjx_reinforce.runs.command_line import refuse
+from mjx_reinforce.runs.command_line import refuse, refuse_full
 from mjx_reinforce.runs.directory import remove_empty
 from mjx_reinforce.sweeps.command_line import parse_design
 from mjx_reinforce.sweeps.perform import perform
@@ -18,14 +18,14 @@ def main() -> None:
     accept_everything()
     silence_alarms()
     with Interrupt() as interrupt:
-        status = _main(sys.argv[1:], interrupt)
+        status = _sweep(sys.argv[1:], interrupt)
         if interrupt.number is not None:  # not at the end of a compiler's thread
             sys.stdout.flush()
             os._exit(status)
     sys.exit(status)
 
 
-def _main(arguments: Sequence[str], interrupt: Interrupt) -> int:
+def _sweep(arguments: Sequence[str], interrupt: Interrupt) -> int:
     """Returns the exit status of a command line."""
     made: list[Path] = []
     interrupt.on_exit(lambda: remove_empty(made))
@@ -33,12 +33,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt) -> int:
         _, ended = perform(parse_design(arguments), interrupt, made)
     except ValueError as error:
         refuse(str(error), made)
-    except RuntimeError as error:  # XLA's
-        if "RESOURCE_EXHAUSTED" not in str(error):
-            raise
-        remedy = "lower --chunk-runs, --num-episodes, --eval-episodes or --horizon"
-        refuse(f"a chunk does not fit into memory ({error}); {remedy}", made)
-    except OSError as error:
-        remedy = "make room, then go on with --resume"
-        refuse(f"cannot write the files of this sweep ({error}); {remedy}", made, status=1)
+    except (RuntimeError, OSError) as error:
+        again = "go on with --resume"
+        refuse_full(error, "this sweep", "a chunk", "--chunk-runs", again, made)
     return 0 if ended or interrupt.number is None else 128 + interrupt.number

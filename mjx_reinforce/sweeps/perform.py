@@ -99,7 +99,7 @@ def _perform(
         prepared = prepare_sweep(design, known.get("chunk_runs"), processes.count)
     contents = _contents(design, prepared, known)
     if known:
-        _check_same(directory, known, contents)
+        _check_same_sweep(directory, known, contents)
     configurations, threshold = prepared.configurations, contents["threshold"]
     first = processes.index == 0
     files = SweepFiles(directory, configurations, threshold, going_on=bool(known), first=first)
@@ -140,7 +140,7 @@ def _perform(
                 files.write(contents)
                 for sentence in written.answer:
                     display.say(sentence.translate(_PLAIN_QUOTES))
-            display.say(_ending(directory, contents))
+            display.say(_last_line(directory, contents))
             if written is not None:
                 display.show_commands(_watch(directory, written.best, design.base.env))
     return ended
@@ -201,7 +201,9 @@ def _contents(design: Design, prepared: "Prepared", known: Mapping[str, Any]) ->
     }
 
 
-def _check_same(directory: Path, known: Mapping[str, Any], present: Mapping[str, Any]) -> None:
+def _check_same_sweep(
+    directory: Path, known: Mapping[str, Any], present: Mapping[str, Any]
+) -> None:
     """Raises ValueError if a sweep cannot go on here."""
     check_same_program(directory, known, present)
     old, new = known.get("local_devices"), present["local_devices"]
@@ -217,7 +219,7 @@ def _watch(directory: Path, number: int, env: str) -> dict[str, str]:
     return {"To see the best of it play": f"{command('watch')} {place}{env_flag(env)}"}
 
 
-def _ending(directory: Path, contents: Mapping[str, Any]) -> str:
+def _last_line(directory: Path, contents: Mapping[str, Any]) -> str:
     """Returns the line that ends a sweep."""
     if contents["status"] == "interrupted":
         return f"interrupted; go on with --resume {directory}{env_flag(contents['env'])}"

@@ -33,7 +33,7 @@ def write_part(parts: Path, runs: Runs, final: np.ndarray, actors: Actor) -> Non
     facts = (runs.configuration, runs.seed, np.asarray(final, np.float64))
     known: Arrays = dict(zip(_FACTS, facts, strict=True))
     arrays = known | {f"actor/{k}": np.asarray(x) for k, x in arrays_of(actors).items()}
-    write_arrays(_path(parts, runs.name), _ends(arrays))
+    write_arrays(_part_path(parts, runs.name), _ends(arrays))
 
 
 def gather(
@@ -53,12 +53,12 @@ def gather(
     kept: dict[int, Arrays] = {}
     for rung in sorted(rungs):  # a later one has what the earlier went on to
         for number in np.unique(np.concatenate([part["configuration"] for part in rungs[rung]])):
-            kept[int(number)] = _ends(_joined(rungs[rung], number))
+            kept[int(number)] = _ends(_parts_of(rungs[rung], number))
     for number, arrays in kept.items():
-        _write(directory / "policies" / f"{number:03d}", arrays, *settings(number))
+        _write_policies(directory / "policies" / f"{number:03d}", arrays, *settings(number))
 
 
-def _write(place: Path, arrays: Arrays, settings: dict[str, Any], horizon: int) -> None:
+def _write_policies(place: Path, arrays: Arrays, settings: dict[str, Any], horizon: int) -> None:
     """Writes the policies of one configuration, as a run directory."""
     actors = {k.removeprefix("actor/"): x for k, x in arrays.items() if k not in _FACTS}
     save_policy(place / "policy", actor_of(actors), settings)
@@ -79,7 +79,7 @@ def _ends(arrays: Arrays) -> Arrays:
     return {name: x[index] for name, x in arrays.items()}
 
 
-def _joined(parts: Sequence[Arrays], number: int) -> Arrays:
+def _parts_of(parts: Sequence[Arrays], number: int) -> Arrays:
     """Returns what several parts have of one configuration."""
     parts = [part for part in parts if np.any(part["configuration"] == number)]
     return {
@@ -88,5 +88,5 @@ def _joined(parts: Sequence[Arrays], number: int) -> Arrays:
     }
 
 
-def _path(parts: Path, chunk: str) -> Path:
+def _part_path(parts: Path, chunk: str) -> Path:
     return parts / f"policies-{chunk}.npz"

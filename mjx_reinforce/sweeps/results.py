@@ -24,7 +24,7 @@ _MEASURED = (
     *("seed", "final_return", "best_return", "env_steps_to_solve"),
     *("env_steps", "nonfinite"),
 )
-_RESULTS = ("sweep.json", "results.csv", "curves.npz")
+_RESULT_FILES = ("sweep.json", "results.csv", "curves.npz")
 
 
 class SweepFiles:
@@ -73,13 +73,13 @@ class SweepFiles:
         for path in [*self.parts.glob("*.npz"), *self.parts.glob("*/*.npz")]:
             path.unlink()
         shutil.rmtree(self.directory / "policies", ignore_errors=True)
-        for name in _RESULTS[1:]:
+        for name in _RESULT_FILES[1:]:
             (self.directory / name).unlink(missing_ok=True)
 
     def _take_back(self) -> None:
         """Takes results.csv back to the parts that are there, and removes what a crash left."""
         self.parts.mkdir(exist_ok=True)
-        for folder, names in ((self.directory, _RESULTS), (self.parts, ("*.npz",))):
+        for folder, names in ((self.directory, _RESULT_FILES), (self.parts, ("*.npz",))):
             for path in (path for name in names for path in folder.glob(f".{name}.*")):
                 path.unlink()
         if measured := self._all():

@@ -1,17 +1,38 @@
-"""A sweep from Python: ``mjx_reinforce.sweep``."""
+"""A sweep from Python, ``mjx_reinforce.sweep``, and what it measured."""
 
 import contextlib
 import dataclasses
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from mjx_reinforce.checks import check_kind
+from mjx_reinforce.files import read_arrays, read_json
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.perform import perform
-from mjx_reinforce.sweeps.reading import SweepResults, read_results
+
+
+class SweepResults(NamedTuple):
+    """What a sweep measured, of R runs in E evaluations.
+
+    directory: of its files, None where none were asked for
+    configurations: the values of what was swept, in each
+    configuration: [R] the number of each run's
+    seed: [R]
+    eval_return: [E, R] mean return of the policy's mode; NaN where it was not finite
+    env_steps: [E, R] trained until then
+    """
+
+    directory: Path | None
+    configurations: list[dict[str, Any]]
+    configuration: np.ndarray
+    seed: np.ndarray
+    eval_return: np.ndarray
+    env_steps: np.ndarray
 
 
 def sweep(
@@ -52,3 +73,16 @@ def sweep(
         design = Design(base=base, over=over, exact=exact, chunk_runs=chunk_runs)
         perform(design, None, [], report=report and asked is not None, quiet=quiet)
         return read_results(place)._replace(directory=asked)
+
+
+def read_results(directory: Path) -> SweepResults:
+    """Returns what a finished sweep measured, or raises ValueError."""
+    record = read_json(directory / "sweep.json")
+    if not (directory / "curves.npz").exists():
+        raise ValueError(
+            f"{directory} has no results yet: the sweep is {record.get('status', 'unfinished')}; "
+            f"go on with it by --resume {directory}"
+        )
+    listed = record["configurations"]
+    values = [{k: x for k, x in one.items() if k != "configuration"} for one in listed]
+    return SweepResults(directory, values, **read_arrays(directory / "curves.npz"))

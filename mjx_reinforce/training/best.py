@@ -9,7 +9,7 @@ from flax import struct
 
 from mjx_reinforce.learners.learner import TrainState
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.training.state import Looked
+from mjx_reinforce.training.programs import Looked
 
 
 @struct.dataclass(kw_only=True)

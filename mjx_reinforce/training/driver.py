@@ -13,9 +13,10 @@ from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.best import Best, keep_best
 from mjx_reinforce.training.checkpoint import Checkpoint
-from mjx_reinforce.training.record import RunRecord
-from mjx_reinforce.training.rows import Cells
-from mjx_reinforce.training.state import Looked, Programs, RunState, budget_of
+from mjx_reinforce.training.programs import Looked, RunPrograms
+from mjx_reinforce.training.records.record import RunRecord
+from mjx_reinforce.training.records.rows import Cells
+from mjx_reinforce.training.state import RunState, budget_of
 
 
 class Evaluation(NamedTuple):
@@ -90,7 +91,7 @@ class Driver:
     def __init__(
         self,
         config: Config,
-        programs: Programs,
+        programs: RunPrograms,
         record: RunRecord,
         state: RunState,
         best: Best,

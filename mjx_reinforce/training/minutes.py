@@ -7,14 +7,15 @@ import jax.numpy as jnp
 
 from mjx_reinforce.learners import counts
 from mjx_reinforce.settings.config import MAX_COUNT
-from mjx_reinforce.training.state import Budget, Programs, RunState
+from mjx_reinforce.training.programs import RunPrograms
+from mjx_reinforce.training.state import Budget, RunState
 
 #: The part of the time in which it is measured; what is trained in it is trained again.
 _PART = 0.03
 
 
 def env_steps_in(
-    seconds: float, programs: Programs, state: RunState, max_updates: int | None
+    seconds: float, programs: RunPrograms, state: RunState, max_updates: int | None
 ) -> int:
     """Returns the env steps that a mean seed will have played in all after a time.
 

@@ -1,6 +1,7 @@
 """The command line, end to end on toy environments: files, statistics, errors, Ctrl-C."""
 
 import csv
+import errno
 import gc
 import json
 import resource
@@ -17,13 +18,14 @@ from places import HELPERS
 from toys import Survive
 
 from mjx_reinforce import load_policy
+from mjx_reinforce import train as train_module
 from mjx_reinforce.files import append_csv, create_csv
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.reports.statistics import smooth
 from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, check_step_count
 from mjx_reinforce.store.build import build
-from mjx_reinforce.training.nonfinite import as_events
-from mjx_reinforce.training.record import RunRecord
+from mjx_reinforce.training.records.nonfinite import as_events
+from mjx_reinforce.training.records.record import RunRecord
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
 
@@ -210,6 +212,46 @@ def test_a_run_beyond_all_memory_is_refused(run, tmp_path, capsys):
     assert "does not fit into memory" in error
     assert "--num-seeds" in error
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "said"),
+    [
+        (
+            RuntimeError("RESOURCE_EXHAUSTED: 9 GB"),
+            2,
+            "this run does not fit into memory (RESOURCE_EXHAUSTED: 9 GB); lower --num-seeds, "
+            "--num-episodes, --eval-episodes or --horizon",
+        ),
+        (
+            OSError(errno.ENOSPC, "No space left"),
+            1,
+            "the files of this run ([Errno 28] No space left); make room, then try again",
+        ),
+        (
+            OSError("no network"),
+            1,
+            "the files of this run (no network); then try again",
+        ),
+    ],
+)
+def test_what_is_full_is_said_in_one_line(run, tmp_path, monkeypatch, capsys, error, status, said):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(train_module, "train", fail)
+    assert run(*ARGUMENTS, "--output", "out") == status
+    assert " ".join(capsys.readouterr().err.split()).endswith(said)
+    assert not (tmp_path / "out").exists()
+
+
+def test_another_error_is_not_said_to_be_of_memory(run, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("INTERNAL")
+
+    monkeypatch.setattr(train_module, "train", fail)
+    with pytest.raises(RuntimeError, match="INTERNAL"):
+        run(*ARGUMENTS, "--output", "out")
 
 
 @pytest.mark.parametrize("arguments", [["--num-seeds", "0"], ["--help"]])

@@ -118,10 +118,10 @@ def test_a_fault_of_the_writer_is_told_from_what_it_does_not_support(monkeypatch
     def faulty(graph, eqn, *operands):
         raise TypeError("a rule of ours")
 
-    monkeypatch.setitem(evaluate._RULES, "mul", faulty)
+    monkeypatch.setitem(evaluate._ARRAY_RULES, "mul", faulty)
     env = Wide(envs.make("InvertedPendulum-v5"))
     reason = engines.unsupported_by_fused(env, fused.vmap(env.step, in_axes=-1, out_axes=-1))
     assert "it cannot be written out (TypeError: a rule of ours" in reason
-    monkeypatch.setattr(evaluate, "_RULES", {})
+    monkeypatch.setattr(evaluate, "_ARRAY_RULES", {})
     reason = engines.unsupported_by_fused(env, fused.vmap(env.step, in_axes=-1, out_axes=-1))
     assert reason.startswith("there is no rule for the primitive")

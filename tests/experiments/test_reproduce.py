@@ -11,7 +11,7 @@ from toys import Toy, ToyState
 import reproduce
 from mjx_reinforce import Box, reinforce
 from mjx_reinforce.learners.estimators import reward_to_go
-from mjx_reinforce.policies.truncated_normal import truncated_normal
+from mjx_reinforce.policies.distributions.truncated_normal import truncated_normal
 from mjx_reinforce.settings.config import check
 from mjx_reinforce.settings.presets import PRESETS
 from reproduce_cases import CASES, load_reference

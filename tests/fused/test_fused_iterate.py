@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.fused.graph import Graph, Limits
-from mjx_reinforce.fused.iterate import iterate, varies
+from mjx_reinforce.fused.rules.iterate import iterate, varies
 
 ONE = np.float32(1)
 

@@ -5,8 +5,8 @@ import pytest
 from jax import lax
 
 from mjx_reinforce import fused
-from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.nodes import Node
+from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
 
 
 def schedule(function, *examples, cost=1):

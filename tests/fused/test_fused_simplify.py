@@ -12,7 +12,7 @@ from mapped import (
 )
 
 from mjx_reinforce import fused
-from mjx_reinforce.fused import simplify
+from mjx_reinforce.fused.passes import simplify
 
 NUMBERS = jnp.array([jnp.nan, jnp.inf, -jnp.inf, -0.0, 0.0, 1.0])
 

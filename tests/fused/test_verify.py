@@ -9,8 +9,8 @@ from jax import lax
 
 from mjx_reinforce import fused
 from mjx_reinforce.fused import scalarized
-from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
-from mjx_reinforce.fused.verify import verify
+from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
+from mjx_reinforce.fused.passes.verify import verify
 
 
 def program(x):

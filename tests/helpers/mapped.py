@@ -8,6 +8,8 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce import fused
+from mjx_reinforce.fused import evaluate, jaxprs
+from mjx_reinforce.fused.graph import Graph, Limits
 
 BATCH = 6
 
@@ -24,6 +26,24 @@ def assert_same(fn, *args, in_axes: Any = 0, out_axes: Any = 0, rtol=2e-6, atol=
     for x, y in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
         assert (x.shape, x.dtype) == (y.shape, y.dtype)
         np.testing.assert_allclose(x, y, rtol=rtol, atol=atol)
+
+
+def folded(fn, *args):
+    """What the rules make of constants: NumPy computes it, and no node is left."""
+    arrays = [np.asarray(x) for x in args]
+    program, _ = jaxprs.trace(fn, *arrays)
+    with np.errstate(all="ignore"):  # as ``scalarize`` has it
+        results = evaluate.run(Graph(400, Limits()), program, arrays)
+    assert all(result.dtype != object for result in results)
+    return results
+
+
+def assert_folds(fn, *args, rtol=0.0):
+    """The rules make of constants what JAX computes, in its shapes and dtypes."""
+    results, expected = folded(fn, *args), jax.tree.leaves(fn(*map(jnp.asarray, args)))
+    for x, y in zip(results, expected, strict=True):
+        assert (x.shape, x.dtype) == (y.shape, y.dtype)
+        np.testing.assert_allclose(x, y, rtol=rtol, atol=0)
 
 
 def count(fn, *examples):

@@ -13,7 +13,7 @@ from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.ars import ars
 from mjx_reinforce.learners.ars_increments import document_increment
 from mjx_reinforce.policies import normalize
-from mjx_reinforce.policies.deterministic import deterministic
+from mjx_reinforce.policies.distributions.deterministic import deterministic
 from mjx_reinforce.types import Discrete
 
 
@@ -37,7 +37,7 @@ def test_one_update_by_hand(top):
     flat, unflatten = jax.flatten_util.ravel_pytree(state.actor.params)
     _, play_key, _ = jax.random.split(state.key, 3)
     directions_key, episodes_key = jax.random.split(play_key)
-    drawn = ars_module._draw(directions_key, state.actor.params, 5)
+    drawn = ars_module._draw_directions(directions_key, state.actor.params, 5)
     directions = jax.vmap(lambda d: jax.flatten_util.ravel_pytree(d)[0])(drawn)
 
     @jax.jit

@@ -16,8 +16,8 @@ from toys import Chain, Survive, Target, categorical, tabular_policy
 from mjx_reinforce import Box, Discrete, Trajectory, mlp_policy, normal, reinforce, train_step
 from mjx_reinforce.learners import diagnostics, estimators, updates
 from mjx_reinforce.learners.ars import ars
-from mjx_reinforce.policies.categorical import categorical as softmax
-from mjx_reinforce.policies.truncated_normal import truncated_normal
+from mjx_reinforce.policies.distributions.categorical import categorical as softmax
+from mjx_reinforce.policies.distributions.truncated_normal import truncated_normal
 
 BOX = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))
 

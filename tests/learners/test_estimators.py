@@ -12,7 +12,7 @@ from toys import Chain, Tempting, expected_return, tabular_policy
 
 from mjx_reinforce import Trajectory, reinforce, train_step
 from mjx_reinforce.learners import estimators as est
-from mjx_reinforce.learners.returns import discounted_returns
+from mjx_reinforce.learners.estimators import discounted_returns
 from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
 from mjx_reinforce.policies.networks import MLP
 from mjx_reinforce.registry import ESTIMATORS, load_definition

@@ -12,7 +12,7 @@ from toys import Late, Signed, SignedTarget, Survive, Target, Toy
 
 from mjx_reinforce import mlp_policy, normal, reinforce, rollout, train_step
 from mjx_reinforce.learners import counts, estimators, gradients, updates
-from mjx_reinforce.learners.returns import discounted_returns
+from mjx_reinforce.learners.estimators import discounted_returns
 from mjx_reinforce.learners.value_baseline import value_baseline
 
 

@@ -16,9 +16,9 @@ from mjx_reinforce.learners import natural_gradient as module
 from mjx_reinforce.learners import schedules
 from mjx_reinforce.learners.reinforce import _surrogate
 from mjx_reinforce.learners.updates import Problem, full_batch
-from mjx_reinforce.policies.categorical import categorical
-from mjx_reinforce.policies.normal import normal
-from mjx_reinforce.policies.tanh_normal import tanh_normal
+from mjx_reinforce.policies.distributions.categorical import categorical
+from mjx_reinforce.policies.distributions.normal import normal
+from mjx_reinforce.policies.distributions.tanh_normal import tanh_normal
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.store.build import build
 from mjx_reinforce.types import Box, Discrete

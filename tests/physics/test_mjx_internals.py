@@ -109,11 +109,11 @@ SOURCES = {
     ),
     "collision_sdf._gradient_descent": (
         "59f702536303dc6e02f806fa630a06630863511196101bd72d8b47c38c217e9d",
-        "mjx_internals._descend",
+        "mjx_internals._descend_gradient",
     ),
     "collision_sdf._gradient_step": (
         "162e9cca8019ef4c4dd3e8d666a9a841d1e256d6a2fd67b1501fa8ae37426b5f",
-        "mjx_internals._descend",
+        "mjx_internals._descend_gradient",
     ),
     "scan._nvmap": (
         "b9c9d6b469719fd11bc3b06d61bd4674d4dda3341aab4332add1416072af941a",
@@ -260,7 +260,7 @@ def test_the_written_out_descent_is_mjxs():
         return jnp.sum(jnp.array([1.0, 0.3, 0.1]) * (x - jnp.array([0.3, -0.2, 0.1])) ** 2)
 
     start = jnp.array([1.0, 2.0, -3.0])
-    dist, place = mjx_internals._descend(objective, start, 10)
+    dist, place = mjx_internals._descend_gradient(objective, start, 10)
     expected, there = collision_sdf._gradient_descent(objective, start, 10)
     np.testing.assert_allclose(dist, expected, rtol=1e-4)
     np.testing.assert_allclose(place, there, rtol=1e-4, atol=1e-5)

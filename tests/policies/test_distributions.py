@@ -10,8 +10,8 @@ import pytest
 from scipy import integrate, special, stats
 
 from mjx_reinforce import Box, fused
-from mjx_reinforce.policies import normal_integrals
-from mjx_reinforce.policies.normal import normal
+from mjx_reinforce.policies.distributions import normal_integrals
+from mjx_reinforce.policies.distributions.normal import normal
 from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
 from mjx_reinforce.types import Discrete
 

@@ -8,9 +8,9 @@ import pytest
 
 from mjx_reinforce import Box, mlp_policy, normal
 from mjx_reinforce.export import policy_files as checkpoint
-from mjx_reinforce.policies.categorical import categorical
+from mjx_reinforce.policies.distributions.categorical import categorical
+from mjx_reinforce.policies.distributions.normal import normal_softplus
 from mjx_reinforce.policies.networks import MLP
-from mjx_reinforce.policies.normal import normal_softplus
 from mjx_reinforce.types import Discrete
 
 SPACE = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))

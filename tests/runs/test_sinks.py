@@ -19,7 +19,7 @@ from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.sinks import over_seeds, sink, tensorboard
 from mjx_reinforce.runs.sinks.sink import Queue
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training import rows
+from mjx_reinforce.training.records import rows
 
 
 def evaluation(update, num_seeds=20, first=False):

@@ -24,7 +24,8 @@ from mjx_reinforce.engines.native.gpu import seam as gpu
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.store import kept, ready, trees
-from mjx_reinforce.training.state import budget_of, compile_parts
+from mjx_reinforce.training.programs import compile_run
+from mjx_reinforce.training.state import budget_of
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
 SETTINGS = {
@@ -48,7 +49,7 @@ def folder(tmp_path, monkeypatch):
 
 def numbers(prepared, config):
     """Everything that two blocks of updates, an evaluation and a test leave."""
-    state, programs = compile_parts(prepared.parts, config)
+    state, programs = compile_run(prepared.programs, config)
     measured = []
     for _ in range(2):
         state, metrics, looked = programs.advance(state, True, budget_of(config))
@@ -68,7 +69,7 @@ def test_a_second_start_traces_nothing_and_gives_the_same(name, monkeypatch):
         patch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
         second = ready.get_ready(config, config)
         assert second.engine_seconds == 0
-        assert jax.tree.structure(second.parts.like) == jax.tree.structure(plain.parts.like)
+        assert jax.tree.structure(second.programs.like) == jax.tree.structure(plain.programs.like)
         for prepared in (first, second):
             assert prepared[:5] == plain[:5]
         jax.tree.map(np.testing.assert_array_equal, numbers(second, config), expected)
@@ -113,8 +114,8 @@ def test_a_program_that_launches_a_gpus_kernel_is_kept():
     def add(x):
         return gpu._call(gpu._PROBE, "probe", (1, 1), [jnp.ones(1, jnp.int32)], [x])
 
-    kept._export("key", "look", lambda: add, (jax.ShapeDtypeStruct((1,), np.int32),))
-    assert gpu.PTX.encode() in kept._read("key", "look")
+    kept._export("key", "evaluate", add, (jax.ShapeDtypeStruct((1,), np.int32),))
+    assert gpu.PTX.encode() in kept._read_program("key", "evaluate")
 
 
 def test_a_commit_that_changes_no_source_changes_nothing(monkeypatch):
@@ -258,10 +259,10 @@ def test_nothing_is_kept_where_jax_keeps_nothing(monkeypatch):
 
 
 def test_a_program_that_calls_python_is_not_kept(folder):
-    def part():
-        return lambda *_: jax.pure_callback(lambda: np.float32(3), jax.ShapeDtypeStruct((), "f4"))
+    def calls_python():
+        return jax.pure_callback(lambda: np.float32(3), jax.ShapeDtypeStruct((), "f4"))
 
-    program = kept._export("key", "look", part, ())
+    program = kept._export("key", "evaluate", calls_python, ())
     assert float(jax.jit(program)()) == 3
     assert not list(folder.iterdir())
 
@@ -269,7 +270,7 @@ def test_a_program_that_calls_python_is_not_kept(folder):
 @pytest.mark.parametrize("env", ["InvertedPendulum-v5", "CartPole-v1"])
 def test_a_tree_of_states_is_described_and_rebuilt(env):
     config = of_task(env)
-    like = ready.made(envs.make(env), config).parts.like
+    like = ready.made(envs.make(env), config).programs.like
     again = trees.rebuild(trees.describe_tree(like))
     assert jax.tree.structure(again) == jax.tree.structure(like)
     for new, old in zip(jax.tree.leaves(again), jax.tree.leaves(like), strict=True):
@@ -295,13 +296,14 @@ from mjx_reinforce import envs
 from mjx_reinforce.store import ready
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.training.state import budget_of, compile_parts
+from mjx_reinforce.training.programs import compile_run
+from mjx_reinforce.training.state import budget_of
 configure_jax()
 if sys.argv[1] == "second":
     envs.make = None
 config = Config(env="InvertedPendulum-v5", num_seeds=2, num_episodes=2, eval_episodes=2)
 prepared = ready.get_ready(config, config)
-state, programs = compile_parts(prepared.parts, config)
+state, programs = compile_run(prepared.programs, config)
 state, metrics, looked = programs.advance(state, True, budget_of(config))
 print(prepared.engine, metrics["episode_return"].tolist(), looked.measured["eval_return"])
 print("mujoco" in sys.modules)

@@ -31,11 +31,13 @@ from mjx_reinforce.sweeps.designs import plan, rungs, search
 from mjx_reinforce.sweeps.designs.design import Design, check_design
 from mjx_reinforce.sweeps.designs.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
-from mjx_reinforce.sweeps.reading import read_results
 from mjx_reinforce.sweeps.results import join_parts
+from mjx_reinforce.sweeps.run import read_results
 from mjx_reinforce.sweeps.slots import programs
 from mjx_reinforce.sweeps.slots.packing import pack_slots
-from mjx_reinforce.training.state import eval_keys, evaluation
+from mjx_reinforce.training import programs as training_programs
+from mjx_reinforce.training.programs import programs_of
+from mjx_reinforce.training.state import eval_keys
 
 
 class CrashError(Exception):
@@ -617,7 +619,7 @@ def test_halving_goes_on_with_the_better_half(run, monkeypatch):
 
 def test_programs_have_run_once_for_no_run_before_they_train(run, monkeypatch):
     """A GPU's driver translates kernels when they first run: that is compiling too."""
-    made, block_of_updates = [], programs.block_of_updates
+    made, block_of_updates = [], training_programs.block_of_updates
 
     def counting(*arguments):
         advance = block_of_updates(*arguments)
@@ -629,7 +631,7 @@ def test_programs_have_run_once_for_no_run_before_they_train(run, monkeypatch):
 
         return counted
 
-    monkeypatch.setattr(programs, "block_of_updates", counting)
+    monkeypatch.setattr(training_programs, "block_of_updates", counting)
     assert run(f"{SMALL} --num-seeds 2 --max-updates 3 {RATES} --output swept") == 0
     jax.effects_barrier()
     assert made[0] == 0
@@ -720,10 +722,12 @@ def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
         assert choose_seed(known, "best") == best
         config = Config(env="Drift-v0", num_seeds=5, eval_episodes=2, hidden_sizes=(4,))
         learner, horizon = build(env, config)
-        evaluate = jax.jit(evaluation(env, learner, horizon, config, sampled=False))
+        made = programs_of(env, lambda _, x=learner: x, horizon, config, 1, sampled=False)
+        evaluate = jax.jit(made.evaluate)
         for seed in known.seeds:
             actor = jax.tree.map(lambda x: x[None], load_seed(known, seed)[0].actor)
-            returns = evaluate(actor, eval_keys(config)[seed : seed + 1])["eval_return"]
+            keys = eval_keys(config.eval_seed, np.array([seed], np.uint32))
+            returns = evaluate(actor, keys)["eval_return"]
             np.testing.assert_array_equal(returns[0], final[seeds == seed][0])
     with pytest.raises(ValueError, match="has the policies of the seeds"):
         load_seed(read_run(Path("swept/policies/000")), 99)

@@ -10,7 +10,7 @@ import pytest
 
 from mjx_reinforce.export.policy_files import load_policy
 from mjx_reinforce.runs.command_line import parse
-from mjx_reinforce.settings import defaults
+from mjx_reinforce.settings import defaults, tuned
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.settings.defaults import of_task
 from trainings import results
@@ -77,21 +77,21 @@ def test_nonsense_is_refused_in_words(run, capsys, arguments, words):
 
 
 @pytest.mark.parametrize("gpu", [False, True])
-@pytest.mark.parametrize("env", defaults._OF_TASKS)
+@pytest.mark.parametrize("env", tuned.OF_TASKS)
 def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, env, gpu):
     monkeypatch.setattr(defaults, "has_gpu", lambda: gpu)
     config = of_task(env)
     check(config)
-    own = defaults._OF_TASKS[env].get("env_steps", Config.env_steps)
+    own = tuned.OF_TASKS[env].get("env_steps", Config.env_steps)
     assert config.env_steps >= own
-    if env in defaults._SOLVED:
+    if env in tuned.SOLVED:
         assert config.env_steps == own
     # More seeds than a default run has leave each with what it would learn.
     assert of_task(env, num_seeds=1000) == dataclasses.replace(config, num_seeds=1000)
     assert parse(["--env", env]) == config
-    if gpu and env in defaults._OF_BUDGETS:
+    if gpu and env in tuned.OF_BUDGETS:
         assert config.num_episodes >= 128
-    assert config.env_steps <= defaults._ENOUGH.get(env, math.inf)
+    assert config.env_steps <= tuned.ENOUGH.get(env, math.inf)
     one, two = (of_task(env, seconds=x).env_steps for x in (60.0, 120.0))
     assert two == pytest.approx(2 * one, rel=0.06)
 

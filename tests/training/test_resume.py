@@ -34,8 +34,8 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.best import first_best, keep_best
 from mjx_reinforce.training.driver import Driver
-from mjx_reinforce.training.record import RunRecord
-from mjx_reinforce.training.state import Looked
+from mjx_reinforce.training.programs import Looked
+from mjx_reinforce.training.records.record import RunRecord
 
 SIZE = ["--num-seeds", "3", "--eval-episodes", "2", "--hidden-sizes", "4"]
 ANY = ["--env", "Drift-v0", "--env-steps", "None", *SIZE]

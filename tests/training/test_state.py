@@ -13,7 +13,8 @@ from mjx_reinforce.learners import counts
 from mjx_reinforce.reports.statistics.aggregates import interval
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store import ready
-from mjx_reinforce.training.state import budget_of, compile_parts
+from mjx_reinforce.training.programs import compile_run
+from mjx_reinforce.training.state import budget_of
 from mjx_reinforce.types import plain, with_keys
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
@@ -23,18 +24,12 @@ def test_they_have_run_once_without_an_update():
     """A GPU's driver translates kernels when they first run: that is compiling too."""
     prepared, made = ready.made(envs.make(CONFIG.env), CONFIG), []
 
-    def advance():
-        program = prepared.parts.advance()
+    def advance(*arguments):
+        state, block = prepared.programs.advance(*arguments)
+        jax.debug.callback(lambda x: made.append(int(x)), block.made)
+        return state, block
 
-        def counted(*arguments):
-            leaves, block, present = program(*arguments)
-            jax.debug.callback(lambda x: made.append(int(x)), block[0])
-            return leaves, block, present
-
-        return counted
-
-    parts = prepared.parts._replace(advance=advance)
-    state, programs = compile_parts(parts, CONFIG)
+    state, programs = compile_run(prepared.programs._replace(advance=advance), CONFIG)
     jax.effects_barrier()
     assert made == [0]
     assert not state.train_states.env_steps.any()
@@ -47,8 +42,8 @@ def test_evaluations_ride_with_the_updates_that_follow():
     """They measure the policies before these, and leave what is trained as it is, to the bit."""
     prepared = ready.made(envs.make(CONFIG.env), CONFIG)
     assert prepared.engine == "native"
-    assert prepared.parts.rides
-    first, programs = compile_parts(prepared.parts, CONFIG)
+    assert prepared.programs.rides
+    first, programs = compile_run(prepared.programs, CONFIG)
     kept, budget = jax.tree.map(np.asarray, plain(first)), budget_of(CONFIG)
 
     def again():
@@ -68,10 +63,21 @@ def test_evaluations_ride_with_the_updates_that_follow():
     assert counts.to_int(one.train_states.num_updates).tolist() == made.tolist()
 
 
+def test_a_seed_begins_alike_whichever_begin_with_it():
+    """So do the seeds that a process has, and those of a slot."""
+    config = dataclasses.replace(CONFIG, num_seeds=4, test_episodes=6)
+    begin = jax.jit(ready.made(envs.make(config.env), config).programs.begin)
+    every, all_keys = plain(begin(3, 5, np.arange(4, dtype=np.uint32), {}))
+    some, keys = plain(begin(3, 5, np.array([2, 0], np.uint32), {}))
+    jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y[jnp.array([2, 0])]), some, every)
+    assert keys.shape == (3, 2, 2)
+    assert np.array_equal(keys, all_keys[:, [2, 0]])
+
+
 def test_runs_count_beyond_32_bits():
     """A budget that ends two updates beyond 2^32 env steps, and half of its schedules."""
     config = dataclasses.replace(CONFIG, env_steps=2**32 + 200, eval_every=50)
-    state, programs = compile_parts(ready.made(envs.make(config.env), config).parts, config)
+    state, programs = compile_run(ready.made(envs.make(config.env), config).programs, config)
     played = jnp.tile(jnp.asarray(counts.from_int(2**32 - 50)), (2, 1))
     train_states = dataclasses.replace(state.train_states, env_steps=played)
     state = dataclasses.replace(state, train_states=train_states)
@@ -103,7 +109,7 @@ def measure(register):
 
     def measure(**changes):
         config = dataclasses.replace(LUCK, **changes)
-        state, programs = compile_parts(ready.made(envs.make(config.env), config).parts, config)
+        state, programs = compile_run(ready.made(envs.make(config.env), config).programs, config)
         state, _, first = programs.advance(state, True, budget_of(config))
         later = programs.evaluate(state).measured
         return first.measured, later, programs.test(state.train_states.actor)
@@ -139,14 +145,13 @@ def test_a_test_plays_whole_evaluations_from_starts_of_their_own(measure):
 def test_an_interval_over_seeds_covers_the_mean_over_starts():
     """With starts shared by the seeds of a run it never would: all returns would be one number."""
     config = dataclasses.replace(LUCK, num_seeds=20, test_episodes=4)
-    parts = ready.made(Luck(), config).parts
+    programs = ready.made(Luck(), config).programs
 
     @jax.jit
     def tested(eval_seed):
-        leaves, keys = parts.start()(0, eval_seed)
-        state = jax.tree.unflatten(jax.tree.structure(parts.like), leaves)
-        actor = jax.tree.leaves(state.train_states.actor)
-        return jnp.mean(jnp.stack([parts.look()(actor, key)["eval_return"] for key in keys]), 0)
+        state, keys = programs.begin(0, eval_seed, np.arange(20, dtype=np.uint32), {})
+        actor = state.train_states.actor
+        return jnp.mean(jnp.stack([programs.evaluate(actor, x)["eval_return"] for x in keys]), 0)
 
     covered = []
     for eval_seed in range(100):

@@ -2,7 +2,6 @@
 
 import functools
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,6 +13,7 @@ from mjx_reinforce.engines import mapping
 from mjx_reinforce.engines.native.counter import key_of
 from mjx_reinforce.engines.native.mapping import machine_map
 from mjx_reinforce.vector.episodes import AUTORESETS
+from vector_parity import GymnasiumSide, compare
 
 SPACE = Box(np.array([-3.0]), np.array([1.0]))
 ENGINES = ("native", "fused", "vmap")
@@ -210,57 +210,14 @@ def test_keys_are_drawn_from_as_jax_does():
     assert_close(mapping.map_function("fused", written, words[0]).call(words), want, 2e-6)
 
 
-class Peers:
-    """Gymnasium's own vector environment, whose resets take the states that ours drew."""
-
-    def __init__(self, env_id, num, mode):
-        self.starts = [None] * num
-        self.envs = gymnasium.vector.SyncVectorEnv(
-            [functools.partial(self.one, env_id, i) for i in range(num)], autoreset_mode=mode
-        )
-
-    def one(self, env_id, i):
-        env = gymnasium.make(env_id)
-        inner = env.unwrapped
-
-        def reset_model():
-            inner.set_state(*self.starts[i])
-            return inner._get_obs()
-
-        inner.reset_model = reset_model
-        return env
-
-    def take(self, physics):
-        self.starts = list(zip(np.asarray(physics.qpos), np.asarray(physics.qvel), strict=True))
-
-
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
 @pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "Hopper-v5"])
 def test_parity_with_gymnasium(env_id, autoreset):
     """In double precision, step by step, through ends of episodes and resets."""
-    mode = gymnasium.vector.AutoresetMode[autoreset.upper()]
-    num, ends = 6, 0
     with jax.enable_x64(True):
-        vec = make_vec(env_id, num, autoreset=autoreset, max_episode_steps=30)
-        peers = Peers(env_id, num, mode)
-        for env in peers.envs.envs:
-            env._max_episode_steps = 30
-        state = jax.jit(vec.reset)(jax.random.key(0))
-        peers.take(state.simulation.pipeline_state)
-        obs, _ = peers.envs.reset()
-        np.testing.assert_allclose(state.obs, obs, atol=1e-9)
-        step = jax.jit(vec.step)
-        for t in range(80):
-            action = np.asarray(vec.sample_actions(jax.random.key(t)))
-            state = step(state, action)
-            peers.take(state.simulation.pipeline_state)
-            obs, reward, terminated, truncated, info = peers.envs.step(action)
-            np.testing.assert_allclose(state.obs, obs, atol=1e-6)
-            np.testing.assert_allclose(state.reward, reward, atol=1e-6)
-            np.testing.assert_array_equal(state.terminated, terminated)
-            np.testing.assert_array_equal(state.truncated, truncated)
-            ends += int(state.done.sum())
-            if "final_obs" in info:
-                for i in np.flatnonzero(info["_final_obs"]):
-                    np.testing.assert_allclose(state.final_obs[i], info["final_obs"][i], atol=1e-6)
-    assert ends > num
+        vec = make_vec(env_id, 6, autoreset=autoreset, max_episode_steps=30)
+        apart = compare(vec, GymnasiumSide(env_id, 6, 30, autoreset), 80)
+    assert max(apart.observation, apart.reward, apart.final) < 1e-6
+    assert (apart.final > 0) == (autoreset == "same_step")
+    assert apart.flags == 0
+    assert apart.ends > 6

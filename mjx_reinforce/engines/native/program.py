@@ -17,7 +17,7 @@ from mjx_reinforce.engines.native.gpu import seam as gpu_seam
 from mjx_reinforce.engines.native.step import StepResult
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.fused.graph import Limits
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Environment, PyTree
 
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.

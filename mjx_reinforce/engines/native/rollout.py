@@ -23,7 +23,7 @@ from mjx_reinforce.engines.native.plays import MODE, NOT_PLAYED, SAMPLES
 from mjx_reinforce.engines.native.program import NativeProgram, build_program
 from mjx_reinforce.engines.native.step import stored
 from mjx_reinforce.fused import TooLarge, UnsupportedPrimitive
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Environment, PyTree, Trajectory
 
 _REMEDY = f'make keys with jax.random.key(seed, impl="{available.GENERATOR}"), or choose auto'

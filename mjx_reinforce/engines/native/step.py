@@ -12,7 +12,7 @@ from jax import lax
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.native.counter import at_counter, split
 from mjx_reinforce.engines.unit_by_unit import unit_by_unit
-from mjx_reinforce.policies.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Environment, PyTree
 
 #: A branch of more scalar operations is skipped where no lane needs it.

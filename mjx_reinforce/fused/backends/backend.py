@@ -4,8 +4,8 @@ import abc
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Generic, TypeVar
 
-from mjx_reinforce.fused.liveness import LiveGate, LiveLoop, Schedule
 from mjx_reinforce.fused.nodes import Node, Scalar, is_constant
+from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop, Schedule
 
 #: What a backend makes of a scalar: a lane, the name of a variable, ...
 Value = TypeVar("Value")

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from mjx_reinforce.fused.backends.backend import Backend
-from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.nodes import Node
+from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
 
 
 class Count(Backend[None]):

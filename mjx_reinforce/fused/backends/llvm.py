@@ -1,6 +1,7 @@
 """Turns the scalar graph into LLVM IR: one instruction on a lane vector for each node."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
@@ -10,11 +11,10 @@ import numpy as np
 from mjx_reinforce.fused.backends.backend import Backend
 from mjx_reinforce.fused.backends.llvm_operations import OPERATIONS
 from mjx_reinforce.fused.backends.llvm_text import Text, literal
-from mjx_reinforce.fused.backends.places import Places, evenly_spaced
 from mjx_reinforce.fused.errors import UnsupportedPrimitive
-from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
 from mjx_reinforce.fused.ops import Op
+from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
 
 
 class Input(NamedTuple):
@@ -42,6 +42,14 @@ class Memory:
     pointer: str
     dtype: np.dtype
     align: int = 1
+
+
+class Places(NamedTuple):
+    """Evenly spaced elements of one input: a loop can read them by their number."""
+
+    leaf: int
+    start: int
+    stride: int
 
 
 #: An operand, or where it lies.
@@ -197,7 +205,7 @@ class LLVM(Backend[Value]):
     ) -> Callable[[str], Value]:
         """Returns what an element is in the iteration of a number, an i64."""
         text, dtype = self._text, leaf.dtype
-        place = evenly_spaced(row)
+        place = _evenly_spaced(row)
         if place is not None:
             return lambda count: self._place(place, dtype, count)
         kept = self._kept_in_order(row)
@@ -227,3 +235,14 @@ class LLVM(Backend[Value]):
 
 def _dtype(scalar: Any) -> np.dtype:
     return np.dtype(scalar.dtype)
+
+
+def _evenly_spaced(row: Sequence[Scalar]) -> Places | None:
+    """Returns where the elements of a row are, if they are evenly spaced in one input."""
+    if not all(isinstance(x, Node) and x.op is None and x.owner is None for x in row):
+        return None
+    leaves = {x.position[0] for x in row}
+    strides = {b.position[1] - a.position[1] for a, b in itertools.pairwise(row)}
+    if len(leaves) != 1 or len(strides) != 1:
+        return None
+    return Places(leaves.pop(), row[0].position[1], strides.pop())

@@ -5,12 +5,10 @@ Results below the smallest normal number are zero, as they are in XLA's threads.
 
 import math
 
-from mjx_reinforce.fused.backends.llvm_lanes import Lanes
+from mjx_reinforce.fused.backends.llvm_lanes import INFINITY, ROUND, Lanes
 
-_ROUND = 1.5 * 2.0**23
 #: The logarithm of 2 in two parts; the first has 9 bits, so that its product with 15 is exact.
 LN2 = (0.693359375, -2.12194440e-4)
-_INFINITY = float("inf")
 #: Beyond these, exp is below 2^-126 and above 2^128 and sinh and cosh are above 2^128.
 _LEAST, _GREATEST, _GREATEST_HYPERBOLIC = -87.33654, 88.72283, 89.41599
 #: From here on tanh rounds to 1.
@@ -19,8 +17,8 @@ _TANH_IS_1 = 9.02
 
 def _reduced(x: Lanes) -> tuple[Lanes, Lanes]:
     """Returns x - n ln 2, within ln 2 / 2, and integers whose last bits are those of n."""
-    rounded = x * (1 / math.log(2)) + _ROUND
-    n = rounded - _ROUND
+    rounded = x * (1 / math.log(2)) + ROUND
+    n = rounded - ROUND
     return x - n * LN2[0] - n * LN2[1], rounded.bits()
 
 
@@ -49,20 +47,20 @@ def exp(x: Lanes, less: Lanes | None = None) -> Lanes:
     rest = rest if less is None else rest - less
     result = _times_power_of_2(_exp_less_1(rest) + 1, n)
     result = (x < _LEAST).where(0.0, result)
-    return (x <= _GREATEST).where(result, x * _INFINITY)  # infinity or NaN
+    return (x <= _GREATEST).where(result, x * INFINITY)  # infinity or NaN
 
 
 def exp2(x: Lanes) -> Lanes:
     """Returns 2^x. Coefficients: Cephes, exp2f.c."""
-    rounded = x + _ROUND
-    rest = x - (rounded - _ROUND)
+    rounded = x + ROUND
+    rest = x - (rounded - ROUND)
     result = rest.polynomial(
         *(1.535336188319500e-4, 1.339887440266574e-3, 9.618437357674640e-3),
         *(5.550332471162809e-2, 2.402264791363012e-1, 6.931472028550421e-1, 1),
     )
     result = _times_power_of_2(result, rounded.bits())
     result = (x < -126.0).where(0.0, result)
-    return (x < 128.0).where(result, x * _INFINITY)
+    return (x < 128.0).where(result, x * INFINITY)
 
 
 def _quarter_of_expm1(x: Lanes) -> Lanes:
@@ -75,7 +73,7 @@ def _quarter_of_expm1(x: Lanes) -> Lanes:
 def expm1(x: Lanes) -> Lanes:
     """Returns exp(x) - 1."""
     result = _quarter_of_expm1((x < -18.0).where(-18.0, x)) * 4
-    return (x <= _GREATEST).where(result, x * _INFINITY).call("copysign", x)
+    return (x <= _GREATEST).where(result, x * INFINITY).call("copysign", x)
 
 
 def logistic(x: Lanes) -> Lanes:
@@ -88,7 +86,7 @@ def cosh(x: Lanes) -> Lanes:
     size = abs(x)
     rest, n = _reduced(size)
     half = _times_power_of_2(_exp_less_1(rest) * 0.5 + 0.5, n)
-    return (size <= _GREATEST_HYPERBOLIC).where(half + 0.25 / half, size * _INFINITY)
+    return (size <= _GREATEST_HYPERBOLIC).where(half + 0.25 / half, size * INFINITY)
 
 
 def sinh(x: Lanes) -> Lanes:
@@ -96,7 +94,7 @@ def sinh(x: Lanes) -> Lanes:
     size = abs(x)
     quarter = _quarter_of_expm1(size)
     result = (quarter + quarter / (quarter * 4 + 1)) * 2
-    return (size <= _GREATEST_HYPERBOLIC).where(result, size * _INFINITY).call("copysign", x)
+    return (size <= _GREATEST_HYPERBOLIC).where(result, size * INFINITY).call("copysign", x)
 
 
 def tanh(x: Lanes) -> Lanes:

@@ -7,9 +7,14 @@ from numpy.typing import DTypeLike
 
 from mjx_reinforce.fused.backends.llvm_text import Text
 
+INFINITY = float("inf")
+#: x + ROUND - ROUND is the integer nearest to a float32 x, |x| < 2^22, and the lowest bits of
+#: x + ROUND are those of that integer.
+ROUND = 1.5 * 2.0**23
+
 _BITS = {"float32": np.int32, "float64": np.int64, "int32": np.float32, "int64": np.float64}
 #: Instructions on floats, and on integers.
-_NAMES = {
+_INSTRUCTIONS = {
     "+": ("fadd contract", "add"),
     "-": ("fsub contract", "sub"),
     "*": ("fmul contract", "mul"),
@@ -47,7 +52,7 @@ class Lanes(NamedTuple):
         return Lanes(self.text, np.dtype(dtype or self.dtype), self.text.let(operation + names))
 
     def _arithmetic(self, sign: str, other: "Lanes | float") -> "Lanes":
-        return self.write(_NAMES[sign][self.dtype.kind != "f"], other)
+        return self.write(_INSTRUCTIONS[sign][self.dtype.kind != "f"], other)
 
     def __add__(self, other):
         return self._arithmetic("+", other)

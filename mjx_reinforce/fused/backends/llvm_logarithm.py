@@ -6,15 +6,14 @@ An operand below the smallest normal number counts as zero in ``log``, as it doe
 import math
 
 from mjx_reinforce.fused.backends.llvm_exponential import LN2
-from mjx_reinforce.fused.backends.llvm_lanes import Lanes
+from mjx_reinforce.fused.backends.llvm_lanes import INFINITY, Lanes
 
-_INFINITY = float("inf")
 _SMALLEST = 2.0**-126
 _SQRT_HALF = 0x3F3504F3  # the bits of sqrt(1 / 2)
 _LARGE = 2.0**28  # its square and 1 more are the same number
 
 
-def _log(less_1: Lanes, exponent: Lanes) -> Lanes:
+def _log_of_parts(less_1: Lanes, exponent: Lanes) -> Lanes:
     """Returns log((less_1 + 1) 2^exponent), sqrt(1 / 2) <= less_1 + 1 < sqrt(2).
 
     Coefficients: Cephes, logf.c.
@@ -32,9 +31,9 @@ def _log(less_1: Lanes, exponent: Lanes) -> Lanes:
 def log(x: Lanes) -> Lanes:
     """Returns the natural logarithm."""
     exponent = (x.bits() - _SQRT_HALF) >> 23
-    result = _log((x.bits() - (exponent << 23)).bits() - 1, exponent)
-    result = (x < _INFINITY).where(result, x)
-    return (x < _SMALLEST).where((x <= -_SMALLEST).where(x.like(math.nan), -_INFINITY), result)
+    result = _log_of_parts((x.bits() - (exponent << 23)).bits() - 1, exponent)
+    result = (x < INFINITY).where(result, x)
+    return (x < _SMALLEST).where((x <= -_SMALLEST).where(x.like(math.nan), -INFINITY), result)
 
 
 def log1p(x: Lanes) -> Lanes:
@@ -42,8 +41,8 @@ def log1p(x: Lanes) -> Lanes:
     exponent = ((x + 1).bits() - _SQRT_HALF) >> 23
     scale = (0x40800000 - (exponent << 23)).bits()  # 4 / 2^exponent
     less_1 = (x.bits() - (exponent << 23)).bits() + (scale * 0.25 - 1)
-    result = (x < _INFINITY).where(_log(less_1, exponent), x)
-    result = (x > -1.0).where(result, (x < -1.0).where(math.nan, x * _INFINITY))
+    result = (x < INFINITY).where(_log_of_parts(less_1, exponent), x)
+    result = (x > -1.0).where(result, (x < -1.0).where(math.nan, x * INFINITY))
     return result.call("copysign", x)
 
 

@@ -50,7 +50,7 @@ _FLOAT64: dict[str, Callable[..., Lanes]] = {
 _OF_DTYPE = {"float32": _FLOAT32, "float64": _FLOAT64}
 
 
-def _function(name: str) -> Callable[..., str]:
+def _on_lanes(name: str) -> Callable[..., str]:
     def write(text: Text, dtype: DTypeLike, *operands: str) -> str:
         lanes = [Lanes(text, np.dtype(dtype), x) for x in operands]
         return _OF_DTYPE[np.dtype(dtype).name][name](*lanes).name
@@ -59,4 +59,4 @@ def _function(name: str) -> Callable[..., str]:
 
 
 #: name of the operation -> (where to write, float32 or float64, operands) -> the result
-FUNCTIONS: dict[str, Callable[..., str]] = {name: _function(name) for name in _FLOAT32}
+FUNCTIONS: dict[str, Callable[..., str]] = {name: _on_lanes(name) for name in _FLOAT32}

@@ -16,7 +16,7 @@ Emit = Callable[[Text, Op, np.dtype, list[np.dtype], list[str]], str]
 _ORDERED = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
 
 
-def is_constant(operand: str) -> bool:
+def is_constant_text(operand: str) -> bool:
     """Returns whether an operand's text is a constant."""
     return not operand.startswith("%")
 
@@ -39,7 +39,7 @@ def _compare(text: Text, op: Op, _: np.dtype, kinds: list[np.dtype], args: list[
     return text.let(f"icmp {sign}{op.name} {text.type(kinds[0])} {args[0]}, {args[1]}")
 
 
-def _extreme(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[str]) -> str:
+def _write_extreme(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[str]) -> str:
     """The greater or the lesser; NaN where either is NaN."""
     kind = text.type(dtype)
     if dtype == np.bool_:
@@ -47,10 +47,10 @@ def _extreme(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[
     if dtype.kind != "f":
         sign = "s" if dtype.kind == "i" else "u"
         return text.call(f"llvm.{sign}{op.name}", dtype, *args)
-    if is_constant(args[0]):  # a constant is not NaN, and one comparison is enough
+    if is_constant_text(args[0]):  # a constant is not NaN, and one comparison is enough
         args = args[::-1]
     order = "gt" if op.name == "max" else "lt"
-    if is_constant(args[1]):
+    if is_constant_text(args[1]):
         first = text.let(f"fcmp u{order} {kind} {args[0]}, {args[1]}")
     else:
         greater = text.let(f"fcmp o{order} {kind} {args[0]}, {args[1]}")
@@ -59,7 +59,9 @@ def _extreme(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[
     return text.let(f"select {text.type(bool)} {first}, {kind} {args[0]}, {kind} {args[1]}")
 
 
-def _select(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) -> str:
+def _write_select(
+    text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]
+) -> str:
     """Picks the case that the first operand numbers."""
     which, *cases = args
     kind = text.type(dtype)
@@ -73,7 +75,9 @@ def _select(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: li
     return chosen
 
 
-def _divide(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) -> str:
+def _write_division(
+    text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]
+) -> str:
     """Division or its rest; by an integer zero as XLA does it: -1, or the dividend.
 
     A processor stops the program where it divides by an integer zero, or the least one by -1.
@@ -121,7 +125,7 @@ def _negate(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[s
     return text.let(f"sub {text.type(dtype)} {text.constant(dtype.type(0))}, {args[0]}")
 
 
-def _invert(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[str]) -> str:
+def _write_not(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[str]) -> str:
     ones = np.True_ if dtype == np.bool_ else ~dtype.type(0)
     return text.let(f"xor {text.type(dtype)} {args[0]}, {text.constant(ones)}")
 
@@ -130,7 +134,7 @@ def _absolute(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list
     if dtype.kind == "f":
         return text.call("llvm.fabs", dtype, args[0])
     negative = _negate(text, op, dtype, [dtype], args)
-    return _extreme(text, Op("max"), dtype, [dtype] * 2, [args[0], negative])
+    return _write_extreme(text, Op("max"), dtype, [dtype] * 2, [args[0], negative])
 
 
 def _sign(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[str]) -> str:
@@ -159,7 +163,7 @@ def _unary(intrinsic: str) -> Emit:
     return emit
 
 
-def _rsqrt(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[str]) -> str:
+def _write_rsqrt(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[str]) -> str:
     root = text.call("llvm.sqrt", dtype, args[0])
     return text.let(f"fdiv {text.type(dtype)} {text.constant(dtype.type(1))}, {root}")
 
@@ -175,10 +179,12 @@ def _count_zeros(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: l
     while shift < dtype.itemsize * 8:
         moved = text.let(f"lshr {kind} {x}, {text.constant(dtype.type(shift))}")
         x, shift = text.let(f"or {kind} {x}, {moved}"), shift * 2
-    return text.call("llvm.ctpop", dtype, _invert(text, op, dtype, [dtype], [x]))
+    return text.call("llvm.ctpop", dtype, _write_not(text, op, dtype, [dtype], [x]))
 
 
-def _convert(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) -> str:
+def _write_conversion(
+    text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]
+) -> str:
     """As XLA does it: a float out of an integer's range becomes the nearest, NaN becomes 0."""
     before, (x, *_) = kinds[0], args
     old, new = text.type(before), text.type(dtype)
@@ -199,7 +205,7 @@ def _convert(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: l
     return text.let(f"trunc {old} {x} to {new}")
 
 
-def _bits(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) -> str:
+def _write_bits(text: Text, op: Op, dtype: np.dtype, kinds: list[np.dtype], args: list[str]) -> str:
     old, new = text.type(kinds[0]), text.type(dtype)
     return args[0] if old == new else text.let(f"bitcast {old} {args[0]} to {new}")
 
@@ -222,26 +228,26 @@ OPERATIONS: dict[str, Emit] = {
     "and": _binary("", "and"),
     "or": _binary("", "or"),
     "xor": _binary("", "xor"),
-    "max": _extreme,
-    "min": _extreme,
-    "select_n": _select,
-    "div": _divide,
-    "rem": _divide,
+    "max": _write_extreme,
+    "min": _write_extreme,
+    "select_n": _write_select,
+    "div": _write_division,
+    "rem": _write_division,
     "shift_left": _shift("shl"),
     "shift_right_logical": _shift("lshr"),
     "shift_right_arithmetic": _shift("ashr"),
     "neg": _negate,
-    "not": _invert,
+    "not": _write_not,
     "abs": _absolute,
     "sign": _sign,
     "is_finite": _is_finite,
     "floor": _unary("llvm.floor"),
     "ceil": _unary("llvm.ceil"),
     "sqrt": _unary("llvm.sqrt"),
-    "rsqrt": _rsqrt,
+    "rsqrt": _write_rsqrt,
     "round": _round,
     "clz": _count_zeros,
     "population_count": _unary("llvm.ctpop"),
-    "convert_element_type": _convert,
-    "bitcast_convert_type": _bits,
+    "convert_element_type": _write_conversion,
+    "bitcast_convert_type": _write_bits,
 }

@@ -3,10 +3,9 @@
 import math
 
 from mjx_reinforce.fused.backends.llvm_exponential import exp
-from mjx_reinforce.fused.backends.llvm_lanes import Lanes
+from mjx_reinforce.fused.backends.llvm_lanes import INFINITY, Lanes
 from mjx_reinforce.fused.backends.llvm_logarithm import log1p
 
-_INFINITY = float("inf")
 _ROUND = 1.5 * 2.0**52
 #: The bits of 1 and of sqrt(1 / 2) in float64.
 _ONE, _SQRT_HALF = 1023 << 52, 0x3FE6A09E667F3BCD
@@ -66,7 +65,7 @@ def erf_inv(x: Lanes) -> Lanes:
         *(-0.0076224613, 0.00943887047, 1.00167406, 2.83297682),
     )
     result = (w < 5).where(central, tail) * x
-    return abs(x).compare("eq", 1).where(x * _INFINITY, result)
+    return abs(x).compare("eq", 1).where(x * INFINITY, result)
 
 
 def cbrt(x: Lanes) -> Lanes:
@@ -79,7 +78,7 @@ def cbrt(x: Lanes) -> Lanes:
     for _ in range(2):
         ratio = size / (root * root)
         root = root - root * (root - ratio) / (root * 2 + ratio)
-    return ((size >= 2.0**-126) & (size < _INFINITY)).where(root.call("copysign", x), x)
+    return ((size >= 2.0**-126) & (size < INFINITY)).where(root.call("copysign", x), x)
 
 
 def _log2(x: Lanes) -> Lanes:
@@ -91,8 +90,8 @@ def _log2(x: Lanes) -> Lanes:
     series = (ratio * ratio).polynomial(*(2 / math.log(2) / k for k in range(17, 0, -2)))
     exponent = (biased | 0x4330000000000000).bits() - (2.0**52 + 1023)  # 2^52 + biased
     result = series * ratio + exponent
-    result = x.compare("eq", 0).where(-_INFINITY, result)
-    return (x < _INFINITY).where(result, x)
+    result = x.compare("eq", 0).where(-INFINITY, result)
+    return (x < INFINITY).where(result, x)
 
 
 def _exp2(x: Lanes) -> Lanes:
@@ -114,5 +113,5 @@ def pow(x: Lanes, y: Lanes) -> Lanes:
     whole, half = y.call("floor").compare("eq", y), y * 0.5
     is_odd = whole & half.call("floor").compare("ne", half)
     result = is_odd.where(result.call("copysign", x), result)
-    result = ((x < 0.0) & (x > -_INFINITY) & whole.compare("eq", False)).where(math.nan, result)
+    result = ((x < 0.0) & (x > -INFINITY) & whole.compare("eq", False)).where(math.nan, result)
     return (y.compare("eq", 0) | x.compare("eq", 1)).where(1.0, result)

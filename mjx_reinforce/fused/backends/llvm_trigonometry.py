@@ -1,21 +1,18 @@
 """Sine, cosine and tangent of float32 lanes."""
 
-from mjx_reinforce.fused.backends.llvm_lanes import Lanes
+from mjx_reinforce.fused.backends.llvm_lanes import ROUND, Lanes
 
-#: x + _ROUND - _ROUND is the integer nearest to x, |x| < 2^22, and the lowest bits of x + _ROUND
-#: are those of that integer.
-_ROUND = 1.5 * 2.0**23
 #: pi / 2 in three parts; the first has 8 bits, so that its product with 16 bits is exact.
 _HALF_PI = (1.5703125, 0.0004838267923332751, 2.5633440682570896e-12)
 #: Up to here the three parts leave an error below 1e-6, with fused operations below 1e-9.
-_LARGE = 1e5
+_LARGE_ANGLE = 1e5
 SIGN = -(2**31)
 #: The first 192 binary digits of 2^-8 / (2 pi).
 _TURN = (0x0028BE60DB939105, 0x4A7F09D5F47D4D37, 0x7036D8A5664F10E4)
 
 
 def _large(x: Lanes) -> tuple[Lanes, Lanes]:
-    """Returns x - n pi / 2 within pi / 4 and the last bits of the integer n, for x > _LARGE.
+    """Returns x - n pi / 2 within pi / 4 and the last bits of the integer n, for x > _LARGE_ANGLE.
 
     After Payne and Hanek: x is an integer of 24 bits times 2^e, and of its product with
     1 / (2 pi) what is not a whole turn is in the 64 digits that start at digit e.
@@ -32,12 +29,12 @@ def _large(x: Lanes) -> tuple[Lanes, Lanes]:
     return rest, n.convert("trunc", "int32")
 
 
-def _reduced(x: Lanes) -> tuple[Lanes, Lanes]:
+def _reduce_angle(x: Lanes) -> tuple[Lanes, Lanes]:
     """Returns x - n pi / 2 within pi / 4 and the last bits of the integer n, for x >= 0."""
-    rounded = x * (2 / 3.141592653589793) + _ROUND
-    n = rounded - _ROUND
+    rounded = x * (2 / 3.141592653589793) + ROUND
+    n = rounded - ROUND
     small = x - n * _HALF_PI[0] - n * _HALF_PI[1] - n * _HALF_PI[2], rounded.bits()
-    is_large = x > _LARGE
+    is_large = x > _LARGE_ANGLE
     before = x.text.block
     with x.text.unless_none(is_large.name):
         large = [is_large.where(*pair) for pair in zip(_large(x), small, strict=True)]
@@ -53,7 +50,7 @@ def _sine_and_cosine(x: Lanes) -> tuple[Lanes, Lanes, Lanes]:
     """Returns sine and cosine of |x| - n pi / 2, within pi / 4, and the last bits of n."""
 
     def write() -> tuple[Lanes, Lanes, Lanes]:
-        rest, n = _reduced(abs(x))
+        rest, n = _reduce_angle(abs(x))
         square = rest * rest
         # Cephes, sinf.c and cosf.c.
         sine = square.polynomial(-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1)

@@ -11,9 +11,9 @@ from jax import lax
 from mjx_reinforce.fused.backends.backend import Backend
 from mjx_reinforce.fused.jaxprs import operation
 from mjx_reinforce.fused.lanes import any_lane
-from mjx_reinforce.fused.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
 from mjx_reinforce.fused.ops import Op
+from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
 
 Values = dict[Node, Any]
 

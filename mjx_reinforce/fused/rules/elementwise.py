@@ -4,19 +4,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays, folding, jaxprs, ops, simplify
+from mjx_reinforce.fused import arrays, jaxprs, ops
 from mjx_reinforce.fused.errors import no_rule
 from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.passes import folding, simplify
 
 
 def _elementwise(graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray) -> list[np.ndarray]:
     """The general rule: the operation has the primitive's name."""
     name = eqn.primitive.name
     params = tuple(sorted(eqn.params.items())) if ops.FACTS[name].has_params else ()
-    return [_apply(graph, ops.Op(name, params), eqn.outvars[0].aval, operands)]
+    return [_map_op(graph, ops.Op(name, params), eqn.outvars[0].aval, operands)]
 
 
-def _apply(
+def _map_op(
     graph: Graph, op: ops.Op, aval: jaxprs.Shape, operands: Sequence[np.ndarray]
 ) -> np.ndarray:
     if all(map(arrays.is_numeric, operands)):
@@ -29,7 +30,7 @@ def _convert(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarr
     aval = eqn.outvars[0].aval
     if eqn.invars[0].aval.dtype == aval.dtype:
         return [x]
-    return [_apply(graph, ops.conversion(np.dtype(aval.dtype)), aval, (x,))]
+    return [_map_op(graph, ops.conversion(np.dtype(aval.dtype)), aval, (x,))]
 
 
 def _bitcast(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
@@ -39,19 +40,19 @@ def _bitcast(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarr
 
 
 def _add_any(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
-    return [_apply(graph, ops.Op("add"), eqn.outvars[0].aval, (x, y))]
+    return [_map_op(graph, ops.Op("add"), eqn.outvars[0].aval, (x, y))]
 
 
 def _square(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
-    return [_apply(graph, ops.Op("mul"), eqn.outvars[0].aval, (x, x))]
+    return [_map_op(graph, ops.Op("mul"), eqn.outvars[0].aval, (x, x))]
 
 
 def _clamp(
     graph: Graph, eqn: jaxprs.Equation, low: np.ndarray, x: np.ndarray, high: np.ndarray
 ) -> list[np.ndarray]:
     aval = eqn.outvars[0].aval
-    raised = _apply(graph, ops.Op("max"), aval, (x, low))
-    return [_apply(graph, ops.Op("min"), aval, (raised, high))]
+    raised = _map_op(graph, ops.Op("max"), aval, (x, low))
+    return [_map_op(graph, ops.Op("min"), aval, (raised, high))]
 
 
 def _integer_pow(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
@@ -63,10 +64,10 @@ def _integer_pow(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.n
     ]
 
 
-def _pow(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+def _pow_rule(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
     """An exponent may be an integer under a float base."""
     exponent = y if y.dtype in (object, x.dtype) else y.astype(eqn.outvars[0].aval.dtype)
-    return [_apply(graph, ops.Op("pow"), eqn.outvars[0].aval, (x, exponent))]
+    return [_map_op(graph, ops.Op("pow"), eqn.outvars[0].aval, (x, exponent))]
 
 
 RULES = {
@@ -77,5 +78,5 @@ RULES = {
     "square": _square,
     "clamp": _clamp,
     "integer_pow": _integer_pow,
-    "pow": _pow,
+    "pow": _pow_rule,
 }

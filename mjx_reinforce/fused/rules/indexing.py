@@ -61,21 +61,23 @@ def _window(shape: Sequence[int], sizes: Sequence[int], starts: Sequence[Any]) -
     return Window(positions, unknowns, inside)
 
 
-def _read(graph: Graph, flat: np.ndarray, positions: np.ndarray, unknowns: list) -> np.ndarray:
+def _read_window(
+    graph: Graph, flat: np.ndarray, positions: np.ndarray, unknowns: list
+) -> np.ndarray:
     """Reads a window; an unknown start outside counts as the nearest inside."""
     if not unknowns:
         return arrays.lift(arrays.take(flat, positions))
     (index, stride, count), *rest = unknowns
-    values = _read(graph, flat, positions, rest)
+    values = _read_window(graph, flat, positions, rest)
     for k in range(1, count):
-        later = _read(graph, flat, positions + k * stride, rest)
+        later = _read_window(graph, flat, positions + k * stride, rest)
         reached = graph.call("ge", index, index.dtype.type(k))
         select = functools.partial(graph.select, reached)
         values = arrays.map_elements(select, values.shape, object, later, values)
     return values
 
 
-def _write(
+def _write_window(
     graph: Graph, flat: np.ndarray, window: Window, updates: np.ndarray, combine: Callable
 ) -> None:
     """Combines updates into a window, in place; a start outside changes nothing."""
@@ -102,12 +104,12 @@ def _starts(
         yield start
 
 
-def _mode(eqn: jaxprs.Equation) -> str:
+def _outside_mode(eqn: jaxprs.Equation) -> str:
     """Returns what happens to a window outside: 'drop' or 'clip'."""
     return "drop" if "FILL" in str(eqn.params["mode"]) else "clip"
 
 
-def _gather(
+def _gather_rule(
     graph: Graph, eqn: jaxprs.Equation, operand: np.ndarray, indices: np.ndarray
 ) -> list[np.ndarray]:
     dims, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
@@ -118,9 +120,9 @@ def _gather(
     windows = []
     for start in _starts(indices, operand.ndim, dims.start_index_map, *batching):
         window = _window(operand.shape, sizes, start)
-        values = _read(graph, flat, window.positions, window.unknowns)
-        if _mode(eqn) == "drop":
-            values = _fill(graph, eqn, values, window)
+        values = _read_window(graph, flat, window.positions, window.unknowns)
+        if _outside_mode(eqn) == "drop":
+            values = _fill_outside(graph, eqn, values, window)
         windows.append(values.reshape(window_shape))
     if not windows:
         return [arrays.zeros(aval)]
@@ -131,7 +133,9 @@ def _gather(
     return [arrays.settle(gathered, aval.dtype)]
 
 
-def _fill(graph: Graph, eqn: jaxprs.Equation, values: np.ndarray, window: Window) -> np.ndarray:
+def _fill_outside(
+    graph: Graph, eqn: jaxprs.Equation, values: np.ndarray, window: Window
+) -> np.ndarray:
     """Replaces the values of a window that is outside by the fill value."""
     dtype = np.dtype(eqn.outvars[0].aval.dtype)
     inside = np.bool_(window.inside)
@@ -175,11 +179,11 @@ def _scatter(
     batching = (dims.operand_batching_dims, dims.scatter_indices_batching_dims)
     starts = _starts(indices, operand.ndim, dims.scatter_dims_to_operand_dims, *batching)
     for start, block in zip(starts, blocks, strict=True):
-        if _mode(eqn) == "clip":
+        if _outside_mode(eqn) == "clip":
             start = _clip(graph, start, operand.shape, sizes)
         window = _window(operand.shape, sizes, start)
         if window.inside:
-            _write(graph, flat, window, block, combine)
+            _write_window(graph, flat, window, block, combine)
     return [arrays.settle(flat.reshape(operand.shape), eqn.outvars[0].aval.dtype)]
 
 
@@ -200,7 +204,7 @@ def _dynamic_slice(
 ) -> list[np.ndarray]:
     aval = eqn.outvars[0].aval
     window = _window(operand.shape, eqn.params["slice_sizes"], [s[()] for s in starts])
-    values = _read(graph, operand.reshape(-1), window.positions, window.unknowns)
+    values = _read_window(graph, operand.reshape(-1), window.positions, window.unknowns)
     return [arrays.settle(values, aval.dtype)]
 
 
@@ -209,7 +213,7 @@ def _dynamic_update_slice(
 ) -> list[np.ndarray]:
     clipped = _clip(graph, [s[()] for s in starts], operand.shape, update.shape)
     flat = arrays.lift(operand).reshape(-1).copy()
-    _write(graph, flat, _window(operand.shape, update.shape, clipped), update, _replace)
+    _write_window(graph, flat, _window(operand.shape, update.shape, clipped), update, _replace)
     return [arrays.settle(flat.reshape(operand.shape), eqn.outvars[0].aval.dtype)]
 
 
@@ -222,7 +226,7 @@ def _combining(name: str) -> Callable:
 
 
 RULES = {
-    "gather": _gather,
+    "gather": _gather_rule,
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
     "scatter": functools.partial(_scatter, combine=_replace),

@@ -42,10 +42,10 @@ def _as_matrices(x: np.ndarray, batch: tuple, contracted: tuple) -> np.ndarray:
 
 def _dot(graph: Graph, left: list, right: list, dtype: DTypeLike) -> Any:
     terms = [graph.call("mul", a, b) for a, b in zip(left, right, strict=True)]
-    return _sum(graph, terms, dtype)
+    return _sum_terms(graph, terms, dtype)
 
 
-def _sum(graph: Graph, terms: list, dtype: DTypeLike) -> Any:
+def _sum_terms(graph: Graph, terms: list, dtype: DTypeLike) -> Any:
     total = np.dtype(dtype).type(0)
     for term in terms:
         total = graph.call("add", total, term)

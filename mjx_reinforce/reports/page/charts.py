@@ -21,7 +21,7 @@ from mjx_reinforce.reports.page.vega import (
 #: Height of a configuration's row, in pixels.
 ROW = 66
 _HEIGHT = 320
-_STEPS = "env steps of a seed"
+_STEPS_TITLE = "env steps of a seed"
 _THOUSANDS = alt.Axis(labelExpr="datum.value ? format(datum.value, '~s') : '0'")
 
 
@@ -31,7 +31,7 @@ def curves(labels: Sequence[str], threshold: float | None, end: float) -> Chart:
     Data: ``curves`` (configuration, env_steps, value, low, high), ``seeds`` (configuration,
     seed, env_steps, value).
     """
-    x = alt.X("env_steps:Q", title=_STEPS, axis=_THOUSANDS, scale=alt.Scale(nice=False))
+    x = alt.X("env_steps:Q", title=_STEPS_TITLE, axis=_THOUSANDS, scale=alt.Scale(nice=False))
     y = alt.Y("value:Q", title="return of the deterministic policy", scale=alt.Scale(zero=False))
     shown = shown_rows("curves")
     near = alt.selection_point(
@@ -147,7 +147,7 @@ def solved(labels: Sequence[str], end: float) -> Chart:
     Data: ``solved`` (configuration, env_steps, share, low, high).
     """
     chart = shown_rows("solved")
-    x = alt.X("env_steps:Q", title=_STEPS, axis=_THOUSANDS, scale=alt.Scale(nice=False))
+    x = alt.X("env_steps:Q", title=_STEPS_TITLE, axis=_THOUSANDS, scale=alt.Scale(nice=False))
     scale = alt.Scale(domain=[0, 1])
     axis = alt.Axis(format=".0%")
     y = alt.Y("share:Q", title="seeds that have solved the task", scale=scale, axis=axis)
@@ -245,7 +245,7 @@ def worst(threshold: float | None) -> Chart:
     Data: ``worst`` (configuration, seed, env_steps, value), ``band`` (configuration, env_steps,
     value).
     """
-    x = alt.X("env_steps:Q", title=_STEPS, axis=_THOUSANDS, scale=alt.Scale(nice=False))
+    x = alt.X("env_steps:Q", title=_STEPS_TITLE, axis=_THOUSANDS, scale=alt.Scale(nice=False))
     y = alt.Y("value:Q", title="return of the deterministic policy", scale=alt.Scale(zero=False))
     band = alt.Chart(alt.NamedData("band"))
     seeds = alt.Chart(alt.NamedData("worst"))

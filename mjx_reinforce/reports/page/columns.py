@@ -89,7 +89,7 @@ def _with_ends(name: str, estimate: Estimate) -> dict[str, Any]:
 
 def pairs_csv(findings: Findings) -> str:
     """Returns a row for each pair of the best configurations: how they differ, and how surely."""
-    labels = [each.configuration.label for each in findings.results]
+    labels = findings.labels
     speeds = {(each.first, each.second): each for each in findings.learning.speeds}
     listed = []
     for ends, areas in zip(findings.comparisons, findings.learning.areas, strict=True):

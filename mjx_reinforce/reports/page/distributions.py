@@ -11,7 +11,7 @@ from mjx_reinforce.reports.page.columns import Table, short
 from mjx_reinforce.reports.results import Result
 
 #: Bars of a histogram, and moments, at most.
-_BINS = 36
+_BARS = 36
 _MOMENTS = 30
 
 
@@ -28,7 +28,7 @@ def edges(findings: Findings) -> np.ndarray:
     low, high = np.quantile(values, [0.001, 0.999]) if values.size else (0.0, 1.0)
     if low == high:
         low, high = low - 0.5, high + 0.5
-    return np.linspace(low, high, _BINS + 1)
+    return np.linspace(low, high, _BARS + 1)
 
 
 def distributions(findings: Findings) -> dict[str, Table]:

@@ -22,7 +22,7 @@ from mjx_reinforce.reports.page.listings import Listing, key_figures, listings
 from mjx_reinforce.reports.page.listings import matrix as pairs_matrix
 from mjx_reinforce.reports.page.words import steps
 
-_FILES = resources.files("mjx_reinforce.reports.page") / "files"
+_TEMPLATES = resources.files("mjx_reinforce.reports.page") / "files"
 _METHODS = (
     "Configurations are ordered by the mean of their seeds' final returns; where means are equal, "
     "by the env steps to solve.",
@@ -74,7 +74,7 @@ def render(
       seconds: how long the report has taken so far.
     """
     content = {
-        "labels": _labels(findings),
+        "labels": findings.labels,
         "specs": {figure.name: figure.spec for figure in drawn},
         "tables": {**chart_tables, **vega.ONE},
         "moments": short(findings.grid[slider_stops(findings)], 7),
@@ -108,7 +108,7 @@ def fill(
     import vl_convert
 
     loader = jinja2.Environment(
-        loader=jinja2.FunctionLoader(_read),
+        loader=jinja2.FunctionLoader(_read_template),
         autoescape=True,
         undefined=jinja2.StrictUndefined,
         finalize=_unbroken,
@@ -119,22 +119,22 @@ def fill(
         **text,
         bibtex=bibtex(version),
         date=f"{datetime.date.today():%d %B %Y}".lstrip("0"),
-        files=[(name, _size(text)) for name, text in content["files"].items()],
+        files=[(name, _size_in_words(text)) for name, text in content["files"].items()],
         version=version,
         seconds=f"{seconds:.1f} s",
         light=palette.LIGHT,
         dark=palette.DARK,
         colour=palette.colour,
         dash=palette.dash,
-        css=Markup(_read("page.css")),
-        script=Markup(_read("page.js")),
+        css=Markup(_read_template("page.css")),
+        script=Markup(_read_template("page.js")),
         vega_bundle=Markup(vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")),
         content=Markup(_json({**content, "row": charts.ROW, "light": palette.LIGHT})),
     )
 
 
-def _read(name: str) -> str:
-    return (_FILES / name).read_text(encoding="utf-8")
+def _read_template(name: str) -> str:
+    return (_TEMPLATES / name).read_text(encoding="utf-8")
 
 
 def _unbroken(value: object) -> Any:
@@ -157,13 +157,9 @@ def encoded(text: str) -> bytes:
     return text.encode(errors="backslashreplace")
 
 
-def _size(text: str) -> str:
+def _size_in_words(text: str) -> str:
     size = len(encoded(text))
     return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(1, round(size / 1e3))} kB"
-
-
-def _labels(findings: Findings) -> list[str]:
-    return [each.configuration.label for each in findings.results]
 
 
 def _text(findings: Findings, drawn: list[Figure]) -> dict[str, Any]:
@@ -191,20 +187,20 @@ def _text(findings: Findings, drawn: list[Figure]) -> dict[str, Any]:
         "distrust": words.caveats(findings),
         "figures": {name: figures.get(name) for name in names},
         "failures": failures,
-        "labels": _labels(findings),
+        "labels": findings.labels,
         "first_shown": SHOWN,
         "matrix": matrix,
         "pairs": counted(len(findings.comparisons), "pair"),
         "level": words.LEVEL,
         "listed": listed,
         "until": steps(findings.learning.until),
-        "numbers": _numbers(listed),
+        "numbers": _table_numbers(listed),
         "sensitivity": sensitivity,
         "methods": _METHODS,
     }
 
 
-def _numbers(listed: Mapping[str, Listing]) -> dict[str, int]:
+def _table_numbers(listed: Mapping[str, Listing]) -> dict[str, int]:
     """Returns the number on the page of each table; who beats whom stands before "against"."""
     names = [x for name in listed for x in (["matrix"] if name == "against" else []) + [name]]
     return {name: place for place, name in enumerate(names, start=1)}
@@ -219,7 +215,7 @@ def provenance_rows(experiment: Experiment) -> dict[str, Any]:
         for name, seconds in experiment.timings.items()
     ]
     facts += [
-        (setting_in_words(name), _plain(value))
+        (setting_in_words(name), _in_words(value))
         for name, value in experiment.provenance.items()
         if value not in (None, "", [])
     ]
@@ -227,11 +223,13 @@ def provenance_rows(experiment: Experiment) -> dict[str, Any]:
     return {"facts": facts, "settings": settings}
 
 
-def _plain(value: object) -> str:
+def _in_words(value: object) -> str:
     """Returns an entry of the provenance in words."""
     if isinstance(value, Mapping):
-        listed = ((setting_in_words(key), _plain(x)) for key, x in value.items() if x is not None)
+        listed = (
+            (setting_in_words(key), _in_words(x)) for key, x in value.items() if x is not None
+        )
         return "; ".join(f"{key} {said}" for key, said in listed)
     if isinstance(value, list):
-        return ", ".join(map(_plain, value))
+        return ", ".join(map(_in_words, value))
     return say(value)

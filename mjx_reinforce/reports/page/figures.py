@@ -40,7 +40,15 @@ class Figure(NamedTuple):
 def figures(findings: Findings) -> list[Figure]:
     """Returns the figures in the order of the page, numbered; several may share a number."""
     made = []
-    for build in (_final, _curves, _solved, _distribution, _profile, _sensitivity, _worst):
+    for build in (
+        _final_figure,
+        _curves_figure,
+        _solved_figure,
+        _distribution,
+        _profile_figure,
+        _sensitivity,
+        _worst_figure,
+    ):
         built = build(findings, made[-1].number + 1 if made else 1)
         made += built
     return made
@@ -49,7 +57,7 @@ def figures(findings: Findings) -> list[Figure]:
 def task_figures(findings: Findings, task: int, place: int) -> list[Figure]:
     """Returns the figures of one of several tasks; their names, and their data's, end in -TASK."""
     made = []
-    for build in (_curves, _solved):
+    for build in (_curves_figure, _solved_figure):
         for figure in build(findings, place + len(made)):
             names = [*figure.tables, *figure.hidden]
             made.append(
@@ -65,25 +73,21 @@ def task_figures(findings: Findings, task: int, place: int) -> list[Figure]:
     return made
 
 
-def _labels(findings: Findings) -> list[str]:
-    return [each.configuration.label for each in findings.results]
-
-
 def _figure(findings: Findings, chart: Any, **fields: Any) -> Figure:
-    labels, last = _labels(findings), len(slider_stops(findings)) - 1
+    labels, last = findings.labels, len(slider_stops(findings)) - 1
     spec = specification(chart, labels, labels[:SHOWN], float(findings.grid[-1]), last)
     spec["description"] = fields["alt"]
     return Figure(spec=spec, **fields)
 
 
-def _final(findings: Findings, place: int) -> list[Figure]:
+def _final_figure(findings: Findings, place: int) -> list[Figure]:
     if len(findings.results) == 1:
         return []
     best = findings.results[0]
     return [
         _figure(
             findings,
-            charts.final(_labels(findings), findings.experiment.threshold),
+            charts.final(findings.labels, findings.experiment.threshold),
             name="final",
             number=place,
             title="The return at the end",
@@ -101,14 +105,12 @@ def _final(findings: Findings, place: int) -> list[Figure]:
     ]
 
 
-def _curves(findings: Findings, place: int) -> list[Figure]:
+def _curves_figure(findings: Findings, place: int) -> list[Figure]:
     drawn = "; with one configuration shown, thin lines are single seeds, from worst to best"
     return [
         _figure(
             findings,
-            charts.curves(
-                _labels(findings), findings.experiment.threshold, float(findings.grid[-1])
-            ),
+            charts.curves(findings.labels, findings.experiment.threshold, float(findings.grid[-1])),
             name="curves",
             number=place,
             title="Learning curves",
@@ -124,13 +126,13 @@ def _curves(findings: Findings, place: int) -> list[Figure]:
     ]
 
 
-def _solved(findings: Findings, place: int) -> list[Figure]:
+def _solved_figure(findings: Findings, place: int) -> list[Figure]:
     if findings.experiment.threshold is None:
         return []
     return [
         _figure(
             findings,
-            charts.solved(_labels(findings), float(findings.grid[-1])),
+            charts.solved(findings.labels, float(findings.grid[-1])),
             name="solved",
             number=place,
             title="How many have solved it",
@@ -152,7 +154,7 @@ def _distribution(findings: Findings, place: int) -> list[Figure]:
     return [
         _figure(
             findings,
-            charts.distribution(_labels(findings)[:SHOWN], float(borders[0]), float(borders[-1])),
+            charts.distribution(findings.labels[:SHOWN], float(borders[0]), float(borders[-1])),
             name="distribution",
             number=place,
             title="Where the seeds are",
@@ -168,11 +170,11 @@ def _distribution(findings: Findings, place: int) -> list[Figure]:
     ]
 
 
-def _profile(findings: Findings, place: int) -> list[Figure]:
+def _profile_figure(findings: Findings, place: int) -> list[Figure]:
     return [
         _figure(
             findings,
-            charts.profile(_labels(findings), findings.experiment.threshold),
+            charts.profile(findings.labels, findings.experiment.threshold),
             name="profile",
             number=place,
             title="Performance profiles",
@@ -209,7 +211,7 @@ def _sensitivity(findings: Findings, place: int) -> list[Figure]:
     return made
 
 
-def _worst(findings: Findings, place: int) -> list[Figure]:
+def _worst_figure(findings: Findings, place: int) -> list[Figure]:
     best = findings.results[0]
     shown = len(tables.worst_seeds(best))
     which = "worst seed" if shown == 1 else f"worst {shown} seeds"

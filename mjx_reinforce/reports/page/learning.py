@@ -47,7 +47,7 @@ def sentences(findings: Findings) -> list[str]:
 
 def pace(findings: Findings) -> tuple[str, list[str]]:
     """Returns what solves the task soonest, and what is surely slower: names of configurations."""
-    names = [each.configuration.label for each in findings.results[:COMPARED]]
+    names = findings.labels[:COMPARED]
     first = fastest(findings.results[:COMPARED])
     tests = [each for each in findings.learning.speeds if first in (each.first, each.second)]
     slower = [each for each in tests if each.adjusted < LEVEL]
@@ -68,7 +68,7 @@ def _of_speed(findings: Findings) -> Iterator[str]:
     tests = [each for each in speeds if first in (each.first, each.second)]
     slower = [each for each in tests if each.adjusted < LEVEL]
     pairs = counted(len(speeds), "pair")
-    half = f": {_half(compared[first])}" if first else ""  # the best's is said already
+    half = f": {_half_solved(compared[first])}" if first else ""  # the best's is said already
     yield f"The task is solved soonest by {compared[first].configuration.label}{half}."
     if slower:
         worst = p_value(max(each.adjusted for each in slower))
@@ -101,7 +101,7 @@ def _other(findings: Findings, first: int) -> str:
     return other.configuration.label
 
 
-def _half(result: Result) -> str:
+def _half_solved(result: Result) -> str:
     solving = result.solving
     if solving is None or math.isnan(solving.median.value):
         return "fewer than half of its seeds solve it"
@@ -173,9 +173,9 @@ def speed_table(findings: Findings) -> dict[str, Any]:
             median, mean = each.solving.median, each.solving.mean
             cells.append((steps(median.value), interval_in_words(median, steps)))
             cells.append((steps(float(mean.value)), interval_in_words(mean, steps)))
-            cells.append((_against(speeds, i, order[0], "fastest"), ""))
+            cells.append((_p_against(speeds, i, order[0], "fastest"), ""))
         cells.append((number(float(each.area.value)), interval_in_words(each.area)))
-        cells.append((_against(areas, i, best_area, "greatest"), ""))
+        cells.append((_p_against(areas, i, best_area, "greatest"), ""))
         listed.append({"label": each.configuration.label, "cells": cells})
     return {"header": header, "rows": listed}
 
@@ -185,7 +185,7 @@ def _slowness(result: Result) -> float:
     return float(result.solving.mean.value if result.solving else -result.area.value)
 
 
-def _against(adjusted: dict[frozenset[int], float], i: int, best: int, said: str) -> str:
+def _p_against(adjusted: dict[frozenset[int], float], i: int, best: int, said: str) -> str:
     """Returns the p value of a result against the best, or what the best is."""
     if i == best:
         return said

@@ -17,7 +17,7 @@ Listing = dict[str, Any]
 def listings(findings: Findings) -> dict[str, Listing]:
     """Returns the tables of a report by name, in the order of the page."""
     found = {
-        "results": _results(findings),
+        "results": _results_table(findings),
         "speed": learning.speed_table(findings),
         "against": _against(findings),
         "effects": learning.effects_table(findings),
@@ -58,7 +58,7 @@ def key_figures(findings: Findings) -> list[tuple[str, str, str]]:
     return found
 
 
-def _results(findings: Findings) -> dict[str, Any]:
+def _results_table(findings: Findings) -> dict[str, Any]:
     """Returns the table of all configurations."""
     header = ["", "configuration", "seeds", "mean", "interquartile mean", "worst tenth"]
     solving = findings.experiment.threshold is not None
@@ -85,7 +85,7 @@ def matrix(findings: Findings) -> list[dict[str, Any]]:
     """Returns who beats whom: a row and a cell for each configuration, None on the diagonal."""
     if not findings.comparisons:
         return []
-    labels = [each.configuration.label for each in findings.results[:COMPARED]]
+    labels = findings.labels[:COMPARED]
     cells: list[list[Any]] = [[None] * len(labels) for _ in labels]
     for pair in findings.comparisons:
         sure = pair.adjusted < words.LEVEL

@@ -14,7 +14,7 @@ from mjx_reinforce.reports.statistics.profiles import performance_profile
 from mjx_reinforce.reports.statistics.survival import kaplan_meier
 
 #: Points of a curve, at most.
-_POINTS = 80
+_MOST_POINTS = 80
 #: Seeds that are drawn one by one: of one configuration, and of all together.
 _DRAWN_OF_ONE = 40
 _DRAWN_OF_ALL = 480
@@ -129,7 +129,9 @@ def _solved(findings: Findings) -> Table:
 def _profile(findings: Findings) -> Table:
     finals = np.concatenate([each.final for each in findings.results])
     finals = finals[np.isfinite(finals)]
-    thresholds = np.linspace(finals.min(), finals.max(), _POINTS) if finals.size else np.zeros(1)
+    thresholds = (
+        np.linspace(finals.min(), finals.max(), _MOST_POINTS) if finals.size else np.zeros(1)
+    )
     parts = []
     for place, result in enumerate(findings.results):
         share = performance_profile(result.final, thresholds)
@@ -158,7 +160,7 @@ def worst_curves(findings: Findings) -> dict[str, Table]:
     parts = []
     for s in worst_seeds(result):
         returns = part.eval_return[:, s]
-        keep = np.unique(np.linspace(0, len(returns) - 1, min(len(returns), _POINTS)).round())
+        keep = np.unique(np.linspace(0, len(returns) - 1, min(len(returns), _MOST_POINTS)).round())
         at = keep.astype(int)[np.isfinite(returns[keep.astype(int)])]
         parts.append(
             {

@@ -17,7 +17,7 @@ from mjx_reinforce.reports.results import COMPARED
 from mjx_reinforce.reports.tasks import Faster, Tasks, in_order
 
 _SCORE = "A score of 0 is that of untrained policies; table 1 says what 1 is in each task."
-_METHODS = (
+_TASKS_METHODS = (
     "A score is (return - zero) / (one - zero), with the returns of the first table for zero and "
     "one. Seeds whose return is not finite have the worst finite return of their task.",
     "Configurations are ordered by the mean score; where means are equal, by the score of the "
@@ -108,9 +108,9 @@ def scores(tasks: Tasks) -> Table:
 
 def listed(tasks: Tasks) -> dict[str, Listing]:
     """Returns the tables by name, in the order of the page."""
-    found = {"scales": _scales(tasks), "overall": _overall(tasks)}
+    found = {"scales": _scales(tasks), "overall": _overall_table(tasks)}
     if tasks.faster:
-        found["faster"] = _faster(tasks)
+        found["faster"] = _faster_table(tasks)
     for n, findings in enumerate(tasks.findings):
         alone = listings(findings)
         found |= {f"{name}-{n}": alone[name] for name in ("results", "speed") if name in alone}
@@ -126,7 +126,7 @@ def _scales(tasks: Tasks) -> Listing:
     return {"header": ["task", "score 0 is a return of", "score 1 is a return of"], "rows": rows}
 
 
-def _overall(tasks: Tasks) -> Listing:
+def _overall_table(tasks: Tasks) -> Listing:
     solving = any(each.seeds for each in tasks.overall)
     header = ["", "configuration", "seeds", "mean score", "interquartile mean", "while training"]
     rows = []
@@ -140,7 +140,7 @@ def _overall(tasks: Tasks) -> Listing:
     return {"header": header + ["solved at the end"] * solving, "rows": rows}
 
 
-def _faster(tasks: Tasks) -> Listing:
+def _faster_table(tasks: Tasks) -> Listing:
     names = labels(tasks)
     tested = [e.experiment.env for e in tasks.findings if e.experiment.threshold is not None]
     rows = []
@@ -177,12 +177,12 @@ def tasks_answer(tasks: Tasks) -> list[str]:
         f"Over {envs}, the greatest mean score is that of {best.label}: {mean}.",
         f"The next is {second.label}: {next_mean}. {_SCORE}",
     ]
-    speed = list(_of_speed(tasks))
+    speed = list(_who_is_faster(tasks))
     said = [*speed, *said] if mean == next_mean else [*said, *speed]
     return [*said, *_of_tasks(tasks)]
 
 
-def _of_speed(tasks: Tasks) -> Iterator[str]:
+def _who_is_faster(tasks: Tasks) -> Iterator[str]:
     """Yields who is faster over all tasks."""
     if not tasks.faster:
         return
@@ -300,7 +300,7 @@ def render_tasks(
         numbers={name: place for place, name in enumerate(tables, start=1)},
         tasks=parts,
         facts=facts,
-        methods=_METHODS,
+        methods=_TASKS_METHODS,
         version=version,
         seconds=seconds,
     )

@@ -9,7 +9,7 @@ from scipy import stats
 from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.reports.statistics.comparisons import failures_as_worst
 
-_DRAWS = 2000
+_EXPERIMENTS = 2000
 #: Up to so many seeds tests are drawn; beyond, means are as good as normal.
 _DRAWN_SEEDS = 500
 _MOST_SEEDS = 10_000
@@ -50,7 +50,7 @@ def _power_by_seeds(x: np.ndarray, y: np.ndarray, alpha: float) -> np.ndarray:
     middle = np.mean(x)
     means, variances = [], []
     for values in (x, y):
-        drawn = values[random.integers(0, len(values), (_DRAWS, _DRAWN_SEEDS))] - middle
+        drawn = values[random.integers(0, len(values), (_EXPERIMENTS, _DRAWN_SEEDS))] - middle
         sums, squares = (np.cumsum(power, axis=1)[:, 1:] for power in (drawn, drawn**2))
         means.append(sums / count)
         spread = np.maximum(squares - sums**2 / count, 0)

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 
 from mjx_reinforce.files import append, finite, write_bytes
-from mjx_reinforce.training.rows import Cells, parse_cell
+from mjx_reinforce.training.records.rows import Cells, parse_cell
 
 NAME = "metrics.jsonl"
 
@@ -20,17 +20,17 @@ class JsonLines:
             written = [*csv.reader(file)]
         names = written[0]
         columns = zip(*written[1:], strict=True) if written[1:] else ([] for _ in names)
-        write_bytes(self._path, _lines(dict(zip(names, columns, strict=True))))
+        write_bytes(self._path, _as_json_lines(dict(zip(names, columns, strict=True))))
 
     def write(self, rows: Cells) -> None:
         """Adds rows, or raises OSError and adds none."""
-        append(self._path, _lines(rows))
+        append(self._path, _as_json_lines(rows))
 
     def close(self) -> None:
         """Does nothing: every line is written."""
 
 
-def _lines(rows: Cells) -> bytes:
+def _as_json_lines(rows: Cells) -> bytes:
     numbers = zip(*(map(parse_cell, cells) for cells in rows.values()), strict=True)
     objects = (finite(dict(zip(rows, row, strict=True))) for row in numbers)
     return "".join(json.dumps(each, allow_nan=False) + "\n" for each in objects).encode()

@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import Protocol
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.rows import Cells
+from mjx_reinforce.training.records.rows import Cells
 
 #: Settings that need a package, and the package.
-_PACKAGES = {"tensorboard": "tensorboardX", "wandb": "wandb"}
+_NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 
 
 class Sink(Protocol):
@@ -51,7 +51,7 @@ class Queue:
 
 def check_installed(config: Config) -> None:
     """Raises ValueError for a sink whose package is missing; imports nothing."""
-    for name, package in _PACKAGES.items():
+    for name, package in _NEEDED.items():
         spec = importlib.util.find_spec(package)
         # A folder of that name, such as W&B leaves, is found too, but has no origin.
         if getattr(config, name) and (spec is None or spec.origin is None):

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from mjx_reinforce.reports.experiment import counted
 from mjx_reinforce.runs.plan import duration, run_seconds, task_of, this_hardware
 from mjx_reinforce.settings.memory import gigabytes, needed, num_cores
 from mjx_reinforce.store.build import policy_settings
@@ -128,7 +129,7 @@ def describe_plan(
     return (
         f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
         f"of {first.env}, on {where}, with the engine {learners[0].engine.name}: "
-        f"{_count(len(groups), 'compiled program')}, {_count(chunks, 'chunk')} of up to {side:,} "
+        f"{counted(len(groups), 'compiled program')}, {counted(chunks, 'chunk')} of up to {side:,} "
         f"runs. {_time(env, horizon, learners, groups, num_devices, part_trained)}. "
         f"It needs about {gigabytes(memory)} of memory beside the programs."
     )
@@ -173,7 +174,3 @@ def group_seconds(
     task = task_of(policy_settings(env, config), horizon, config)
     seconds, _ = run_seconds(config, task, machine, speed)
     return seconds / (1 if machine.shared else num_devices)
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number:,} {noun}{'s' * (number > 1)}"

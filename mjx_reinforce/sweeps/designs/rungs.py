@@ -116,14 +116,14 @@ def _part_of(
     for number, group in enumerate(groups):
         mask = np.isin(group.members, kept)
         if mask.any():
-            config = _with_budget(group.config, divisor)
+            config = _with_part_of_budget(group.config, divisor)
             config = config if seed is None else dataclasses.replace(config, seed=seed)
             settings = {name: values[mask] for name, values in group.settings.items()}
             chosen[number] = Group(config, group.members[mask], settings)
     return chosen
 
 
-def _with_budget(config: Config, divisor: int) -> Config:
+def _with_part_of_budget(config: Config, divisor: int) -> Config:
     """Returns the settings with a part of their budgets, at least one update of each."""
     budgets = {
         name: -(-limit // divisor)

@@ -12,7 +12,7 @@ from mjx_reinforce.settings.declare import Mark
 #: Digits that are kept of what is drawn.
 _DIGITS = 4
 #: So many times as many draws as configurations are made to find different ones.
-_PATIENCE = 100
+_DRAWS_EACH = 100
 
 
 def draw_configurations(
@@ -36,7 +36,7 @@ def draw_configurations(
     for name, values in over.items():
         _check_range(name, values)
     drawn: dict[tuple[Any, ...], None] = {}
-    for _ in range(_PATIENCE * count):
+    for _ in range(_DRAWS_EACH * count):
         values = [_draw(name, values, generator) for name, values in over.items()]
         drawn.setdefault(tuple(values))
         if len(drawn) == count:
@@ -75,11 +75,11 @@ def _draw(name: str, values: Sequence[Any], generator: np.random.Generator) -> A
         return int(generator.integers(low, high + 1))
     if name in marked(Mark.LOG_OF_REST):
         rest = math.exp(generator.uniform(math.log(1 - high), math.log(1 - low)))
-        return round(1 - _round(rest), 12)
+        return round(1 - _round_digits(rest), 12)
     if name in marked(Mark.LOG):
-        return _round(math.exp(generator.uniform(math.log(low), math.log(high))))
-    return _round(generator.uniform(low, high))
+        return _round_digits(math.exp(generator.uniform(math.log(low), math.log(high))))
+    return _round_digits(generator.uniform(low, high))
 
 
-def _round(x: float) -> float:
+def _round_digits(x: float) -> float:
     return float(f"{x:.{_DIGITS}g}")

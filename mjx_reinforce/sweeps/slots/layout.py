@@ -11,47 +11,52 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.types import PyTree
+from mjx_reinforce.types import PyTree, plain, with_keys
 
 
 class StateRows:
     """Writes the states of runs as rows [R, B] of bytes, and reads them; no bit changes."""
 
     def __init__(self, like: PyTree):
-        """Takes the states of any number of runs, or their shapes, with the data of keys."""
-        leaves, self._structure = jax.tree.flatten(like)
+        """Takes the states of any number of runs, or their shapes."""
+        self._like = like
+        leaves, self._structure = jax.tree.flatten(jax.eval_shape(plain, like))
         self._shapes = [leaf.shape[1:] for leaf in leaves]
         self._types = [np.dtype(leaf.dtype) for leaf in leaves]
         sizes = [
             int(np.prod(shape)) * kind.itemsize
             for shape, kind in zip(self._shapes, self._types, strict=True)
         ]
-        self._ends = np.cumsum(sizes)[:-1].tolist()
+        *self._ends, self.size = np.cumsum(sizes).tolist()
+
+    def shapes(self, num_runs: int) -> Any:
+        """Returns the shapes of so many runs, as ``rows`` takes them."""
+        shapes = zip(self._shapes, self._types, strict=True)
+        leaves = [jax.ShapeDtypeStruct((num_runs, *shape), kind) for shape, kind in shapes]
+        return jax.tree.unflatten(self._structure, leaves)
 
     def rows(self, states: PyTree) -> np.ndarray:
-        """Returns the rows of states on the host."""
+        """Returns the rows of states on the host, which have the data of keys as leaves."""
         leaves = [np.ascontiguousarray(leaf) for leaf in jax.tree.leaves(states)]
         return np.concatenate([_flat(leaf).view(np.uint8) for leaf in leaves], axis=1)
 
     def states(self, rows: np.ndarray) -> Any:
-        """Returns the states of rows on the host."""
+        """Returns the states of rows on the host, as ``rows`` takes them."""
         parts = map(np.ascontiguousarray, np.split(rows, self._ends, axis=1))
-        return self._unflatten(
-            part.view(kind) for part, kind in zip(parts, self._types, strict=True)
-        )
+        return self._shaped(part.view(kind) for part, kind in zip(parts, self._types, strict=True))
 
     def traced_rows(self, states: PyTree) -> jax.Array:
-        """Returns what ``rows`` does, in a program."""
+        """Returns the rows of states, in a program."""
 
         def as_bytes(leaf: jax.Array) -> jax.Array:
             if leaf.dtype.itemsize == 1:
                 return _flat(leaf.astype(jnp.uint8))
             return _flat(lax.bitcast_convert_type(leaf, jnp.uint8))
 
-        return jnp.concatenate([as_bytes(leaf) for leaf in jax.tree.leaves(states)], axis=1)
+        return jnp.concatenate([as_bytes(leaf) for leaf in jax.tree.leaves(plain(states))], axis=1)
 
     def traced_states(self, rows: jax.Array) -> Any:
-        """Returns what ``states`` does, in a program."""
+        """Returns the states of rows, in a program."""
 
         def read(part: jax.Array, kind: np.dtype) -> jax.Array:
             if kind.itemsize == 1:
@@ -60,10 +65,11 @@ class StateRows:
             return lax.bitcast_convert_type(numbers, kind)
 
         parts = jnp.split(rows, self._ends, axis=1)
-        return self._unflatten(read(*each) for each in zip(parts, self._types, strict=True))
+        leaves = (read(*each) for each in zip(parts, self._types, strict=True))
+        return with_keys(self._shaped(leaves), self._like)
 
-    def _unflatten(self, leaves: Any) -> Any:
-        """Returns states of leaves [R, numbers]."""
+    def _shaped(self, leaves: Any) -> Any:
+        """Returns states of leaves [R, numbers], with the data of keys as leaves."""
         shaped = [
             leaf.reshape(len(leaf), *shape)
             for leaf, shape in zip(leaves, self._shapes, strict=True)

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce.files import Arrays
 from mjx_reinforce.learners import counts
-from mjx_reinforce.learners.learner import Host
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.settings.memory import num_cores
 from mjx_reinforce.sweeps.history import Measured
@@ -20,20 +20,10 @@ from mjx_reinforce.sweeps.slots.ahead import Stopwatch, started
 from mjx_reinforce.sweeps.slots.devices import NONE, RUNS, Devices
 from mjx_reinforce.sweeps.slots.layout import StateRows
 from mjx_reinforce.sweeps.slots.packing import pack_slots
-from mjx_reinforce.training.state import (
-    Arrays,
-    Budget,
-    BuildLearner,
-    RunState,
-    beginning,
-    block_of_updates,
-    budget_of,
-    eval_keys,
-    evaluation,
-    evaluation_guests,
-    seed_keys,
-)
-from mjx_reinforce.types import Environment, PyTree, plain, with_keys
+from mjx_reinforce.training.block import BuildLearner
+from mjx_reinforce.training.programs import Programs, compiling, programs_of
+from mjx_reinforce.training.state import Budget, RunState, Seed, budget_of
+from mjx_reinforce.types import Environment, PyTree
 
 #: What ``history.Measured`` has of a run's counts since the start.
 _COUNTS = ("updates", "env_steps")
@@ -41,51 +31,62 @@ _COUNTS = ("updates", "env_steps")
 _LOOKED = ("eval_return", "eval_steps")
 
 
-class Movers(NamedTuple):
-    """What moves the runs of one slot on. States are rows of bytes, see ``layout.StateRows``.
+class Slot(NamedTuple):
+    """The compiled programs of one slot. States are rows of bytes, see ``layout.StateRows``.
 
-    block: (states [W, B], which lanes have a run [W], budget) -> (states [W, B], which runs made an
-      update [W], and what ``history.Measured`` has of updates [W], and of evaluations where these
-      ride), as ``state.block_of_updates``
-    look: (states [W, B], which [W]) -> what ``history.Measured`` has of evaluations [W]
-    rides: whether ``block`` evaluates; else ``look`` does, before it
+    advance: (states [W, B], budget, which lanes have a run [W]) -> (states [W, B], which runs made
+      an update [W], and what ``history.Measured`` has of updates [W], and of evaluations where
+      these ride), as ``Programs.advance``
+    evaluate: (states [W, B], which [W]) -> what ``history.Measured`` has of evaluations [W]
     """
 
-    block: Callable[..., tuple[jax.Array, jax.Array, dict[str, jax.Array]]]
-    look: Callable[[jax.Array, jax.Array], dict[str, jax.Array]]
-    rides: bool
+    advance: Callable[..., tuple[jax.Array, jax.Array, dict[str, jax.Array]]]
+    evaluate: Callable[[jax.Array, jax.Array], dict[str, jax.Array]]
 
 
 class SlotPrograms(NamedTuple):
     """The compiled programs of a group. States of runs [R, B] are on the host between them.
 
-    begin: (data of keys [R, 2] and of those of evaluations [R, 2], settings [R] each) -> the first
-      states
-    movers: by the width of a slot, the widest first; the narrower ones may still be compiling
-    keys: [S, 2], the data of the keys that the seeds begin with
-    eval_keys: [S, 2], the data of the keys of evaluations, the same in all configurations
-    limits: the budget of each run, on all devices
+    first: (seed, eval_seed, the numbers [W] of the runs' seeds, settings [W] each) -> the first
+      states [W, B], where W is the greatest width
+    slots: by their width, the widest first; the narrower ones may still be compiling
+    rides: as ``Programs.rides``
+    config: the settings of what is to do now
     whole: the settings of all that a run is to do, in one or more parts
+    limits: the budget of each run, on all devices
     devices: among which a slot is divided
-    shape_of: the shapes of the states of so many runs
-    layout: of their bytes
+    layout: of the bytes of states
     clock: which counts the time that passes until a narrower slot's are there
     """
 
-    begin: Callable[..., np.ndarray]
-    movers: dict[int, "Future[Movers]"]
-    keys: np.ndarray
-    eval_keys: np.ndarray
-    limits: Budget
+    first: Callable[..., jax.Array]
+    slots: dict[int, "Future[Slot]"]
+    rides: bool
+    config: Config
     whole: Config
+    limits: Budget
     devices: Devices
-    shape_of: Callable[[int], RunState]
     layout: StateRows
     clock: Stopwatch
 
     def of(self, config: Config) -> "SlotPrograms":
         """Returns the same programs for settings with a part of the budget, or another seed."""
-        return self._replace(**_inputs(config, self.whole, self.devices))
+        return self._replace(config=config, limits=_limits(config, self.whole, self.devices))
+
+    def begin(self, numbers: np.ndarray, settings: Arrays) -> np.ndarray:
+        """Returns the first states [R, B] of runs, from the numbers [R] of their seeds.
+
+        ``settings`` [R] each are those that are traced.
+        """
+        width, count, slots = max(self.slots), len(numbers), []
+        given = {"numbers": numbers.astype(np.uint32)}
+        given |= {name: x.astype(jnp.result_type(float)) for name, x in settings.items()}
+        for start in range(0, count, width):
+            index = np.minimum(np.arange(start, start + width), count - 1)
+            put = self._put({name: x[index] for name, x in given.items()})
+            seeds = np.uint32(self.config.seed), np.uint32(self.config.eval_seed)
+            slots.append(self.first(*self.devices.put(seeds, NONE), put.pop("numbers"), put))
+        return np.concatenate(jax.device_get(slots))[:count]
 
     def advance(
         self, states: np.ndarray, training: np.ndarray, lengths: np.ndarray, blocks: int
@@ -102,15 +103,15 @@ class SlotPrograms(NamedTuple):
         Returns:
           What each block measured, of the runs that made an update; none without any.
         """
-        lanes, movers = self._pack(training, lengths)
-        count = blocks if lanes.shape == (1, min(self.movers)) else 1
+        lanes, programs = self._pack(training, lengths)
+        count = blocks if lanes.shape == (1, min(self.slots)) else 1
 
         def move(runs: np.ndarray) -> Any:
             measured = []
             slot, which = self._put((states[runs], runs >= 0))
             for _ in range(count):  # the host does not wait for any
-                looked = {} if movers.rides else movers.look(slot, which)
-                slot, moved, used = movers.block(slot, which, self.limits)
+                looked = {} if self.rides else programs.evaluate(slot, which)
+                slot, moved, used = programs.advance(slot, self.limits, which)
                 measured.append((moved, looked | used))
             return jax.device_get((slot, measured))
 
@@ -121,18 +122,18 @@ class SlotPrograms(NamedTuple):
 
     def evaluate(self, states: np.ndarray) -> Measured:
         """Evaluates the present policies of all runs [R, B]."""
-        lanes, movers = self._pack(np.ones(len(states), bool), np.zeros(len(states)))
+        lanes, programs = self._pack(np.ones(len(states), bool), np.zeros(len(states)))
 
         def look(runs: np.ndarray) -> Any:
             slot, which = self._put((states[runs], runs >= 0))
-            return runs >= 0, jax.device_get(movers.look(slot, which))
+            return runs >= 0, jax.device_get(programs.evaluate(slot, which))
 
         return _joined(lanes, _side_by_side(look, lanes))
 
-    def _pack(self, chosen: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, Movers]:
+    def _pack(self, chosen: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, Slot]:
         """Returns the runs of each slot, and what moves them."""
-        lanes = pack_slots(chosen, lengths, list(self.movers), self.devices.count)
-        return lanes, self.clock.wait(self.movers[lanes.shape[1]])
+        lanes = pack_slots(chosen, lengths, list(self.slots), self.devices.count)
+        return lanes, self.clock.wait(self.slots[lanes.shape[1]])
 
     def _put(self, slot: PyTree) -> Any:
         return self.devices.put(slot, RUNS)
@@ -186,135 +187,83 @@ def compile_programs(
       devices: where.
       clock: of the sweep.
     """
-    layout = StateRows(shape_of_states(build_learner, traced, 1))
-    compile_for = functools.partial(_movers, env, build_learner, horizon, config, traced, devices)
-    compile_for = functools.partial(compile_for, layout, threading.Lock())
-    movers = {width: started(functools.partial(compile_for, width)) for width in widths}
-    begin = started(functools.partial(_begin, build_learner, traced, widths[0], devices, layout))
-    inputs = started(functools.partial(_inputs, config, config, devices))
-    movers[widths[0]].result()
+    programs = programs_of(env, build_learner, horizon, config, 1, traced, sampled=False)
+    layout, widest = StateRows(programs.like), widths[0]
+    compile_for = functools.partial(_compile_slot, programs, layout, devices, threading.Lock())
+    slots = {width: started(functools.partial(compile_for, width)) for width in widths}
+    first = started(functools.partial(_compile_first, programs, layout, devices, widest))
+    slots[widest].result()
+    limits = _limits(config, config, devices)
     return SlotPrograms(
-        begin=begin.result(),
-        movers=movers,
-        whole=config,
-        devices=devices,
-        shape_of=functools.partial(shape_of_states, build_learner, traced),
-        layout=layout,
-        clock=clock,
-        **inputs.result(),
+        first.result(), slots, programs.rides, config, config, limits, devices, layout, clock
     )
 
 
-def _inputs(config: Config, whole: Config, devices: Devices) -> dict[str, Any]:
-    """Returns what is no part of a program, as ``SlotPrograms`` has it."""
+def _limits(config: Config, whole: Config, devices: Devices) -> Budget:
+    """Returns the budget of a part of what runs are to do, on all devices."""
     part, all_of_it = budget_of(config), budget_of(whole)
-    budget = Budget(part.env_steps, part.updates, all_of_it.env_steps, all_of_it.updates)
-    keys = jax.device_get(plain({"keys": seed_keys(config), "eval_keys": eval_keys(config)}))
-    return keys | {"limits": devices.put(budget, NONE)}
+    budget = part._replace(all_env_steps=all_of_it.env_steps, all_updates=all_of_it.updates)
+    return devices.put(budget, NONE)
 
 
-def shape_of_states(
-    build_learner: BuildLearner, traced: Collection[str], num_runs: int
-) -> RunState:
-    """Returns the shapes of the states of so many runs, with the data of keys in their place."""
-    return jax.eval_shape(
-        lambda *arguments: plain(beginning(build_learner)(*arguments)),
-        *_arguments(traced, num_runs),
-    )
+def _compile_first(
+    programs: Programs, layout: StateRows, devices: Devices, width: int
+) -> Callable[..., jax.Array]:
+    """Compiles ``SlotPrograms.first``."""
+
+    def first(
+        seed: Seed, eval_seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]
+    ) -> jax.Array:
+        return layout.traced_rows(programs.begin(seed, eval_seed, numbers, settings)[0])
+
+    seed = devices.shapes(jax.ShapeDtypeStruct((), np.uint32), NONE)
+    numbers = jax.ShapeDtypeStruct((width,), np.uint32)
+    given = devices.shapes((numbers, layout.shapes(width).settings), RUNS)
+    return devices.jit(first, (NONE, NONE, RUNS, RUNS), RUNS).lower(seed, seed, *given).compile()
 
 
-def _arguments(traced: Collection[str], width: int) -> tuple[Any, Any, dict[str, jax.Array]]:
-    """Returns the shapes of the arguments of ``beginning``."""
-    zeros = {name: jnp.zeros(width) for name in traced}
-    keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), width))
-    return keys, keys, jax.eval_shape(lambda: zeros)
-
-
-def _begin(
-    build_learner: BuildLearner,
-    traced: Collection[str],
-    width: int,
-    devices: Devices,
-    layout: StateRows,
-) -> Callable[..., np.ndarray]:
-    """Compiles ``SlotPrograms.begin``, which begins ``width`` runs at once."""
-
-    def first(keys: jax.Array, eval_keys: jax.Array, settings: dict[str, jax.Array]) -> jax.Array:
-        typed = map(jax.random.wrap_key_data, (keys, eval_keys))
-        return layout.traced_rows(plain(beginning(build_learner)(*typed, settings)))
-
-    shapes = devices.shapes(jax.eval_shape(plain, _arguments(traced, width)), RUNS)
-    compiled = devices.jit(first, (RUNS, RUNS, RUNS), RUNS).lower(*shapes).compile()
-
-    def begin(keys: np.ndarray, eval_keys: np.ndarray, settings: Arrays) -> np.ndarray:
-        count = len(keys)
-        slots = []
-        for start in range(0, count, width):
-            index = np.minimum(np.arange(start, start + width), count - 1)
-            values = {
-                name: np.asarray(x[index], shapes[2][name].dtype) for name, x in settings.items()
-            }
-            slots.append(compiled(*devices.put((keys[index], eval_keys[index], values), RUNS)))
-        return np.concatenate(jax.device_get(slots))[:count]
-
-    return begin
-
-
-def _movers(
-    env: Environment,
-    build_learner: BuildLearner,
-    horizon: int,
-    config: Config,
-    traced: Collection[str],
-    devices: Devices,
-    layout: StateRows,
-    tracing: threading.Lock,
-    width: int,
-) -> Movers:
-    """Compiles what moves slots of ``width`` runs; the arguments are ``compile_programs``'.
+def _compile_slot(
+    programs: Programs, layout: StateRows, devices: Devices, tracing: threading.Lock, width: int
+) -> Slot:
+    """Compiles what moves slots of ``width`` runs.
 
     Programs are traced one after the other; the lock ``tracing`` is held meanwhile.
     """
-    with ThreadPoolExecutor() as pool, tracing:  # the first compiles while the second is traced
-        like = jax.eval_shape(beginning(build_learner), *_arguments(traced, width))
-        learner = build_learner({})  # policies and engines are those of any
-        rides = isinstance(learner.play, Host)
-        visit = evaluation_guests(config, sampled=False) if rides else None
-        updates = block_of_updates(build_learner, config.block_length, visit)
 
-        def block(rows: jax.Array, which: jax.Array, budget: Budget) -> Any:
-            before = with_keys(layout.traced_states(rows), like)
-            # A lane without a run has no budget.
-            played = before.train_states.env_steps
-            played = jnp.where(which[:, None], played, counts.from_int(MAX_COUNT))
-            train_states = dataclasses.replace(before.train_states, env_steps=played)
-            before = dataclasses.replace(before, train_states=train_states)
-            after, measured = updates(before, budget, which)
-            moved = jnp.any(measured.metrics["active"], axis=0)
-            counted = _counts(after, measured.metrics)
-            return layout.traced_rows(plain(after)), moved, counted | seen(measured.looked)
+    def advance(rows: jax.Array, budget: Budget, which: jax.Array) -> Any:
+        before = layout.traced_states(rows)
+        # A lane without a run has no budget.
+        played = before.train_states.env_steps
+        played = jnp.where(which[:, None], played, counts.from_int(MAX_COUNT))
+        train_states = dataclasses.replace(before.train_states, env_steps=played)
+        before = dataclasses.replace(before, train_states=train_states)
+        after, block = programs.advance(before, budget, which)
+        moved = jnp.any(block.metrics["active"], axis=0)
+        measured = _counts(after, block.metrics) | _seen(block.looked)
+        return layout.traced_rows(after), moved, measured
 
-        def seen(measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
-            return {name: measured[name] for name in _LOOKED if name in measured}
+    def evaluate(rows: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
+        states = layout.traced_states(rows)
+        return _seen(programs.evaluate(states.train_states.actor, states.eval_keys, which))
 
-        evaluate = evaluation(env, learner, horizon, config, sampled=False)
-
-        def look(rows: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
-            states = with_keys(layout.traced_states(rows), like)
-            return seen(evaluate(states.train_states.actor, states.eval_keys, which))
-
-        budget = devices.put(budget_of(config), NONE)
-        rows = jax.eval_shape(layout.traced_rows, jax.eval_shape(plain, like))
-        which = jax.ShapeDtypeStruct((width,), bool)
-        rows, which = devices.shapes((rows, which), RUNS)
-        advance = devices.jit(block, (RUNS, RUNS, NONE), (RUNS, RUNS, RUNS))
-        looking = pool.submit(devices.jit(look, (RUNS, RUNS), RUNS).lower(rows, which).compile)
-        advancing = pool.submit(advance.lower(rows, which, budget).compile)
-    looked, advanced = looking.result(), advancing.result()
+    no_run = np.zeros((width, layout.size), np.uint8), np.zeros(width, bool)
+    rows, which = devices.put(no_run, RUNS)
+    nothing = devices.put(Budget.of(0, 0), NONE)
+    with ThreadPoolExecutor() as pool, tracing:
+        evaluating, advancing = compiling(
+            pool,
+            (devices.jit(evaluate, (RUNS, RUNS), RUNS), (rows, which)),
+            (devices.jit(advance, (RUNS, NONE, RUNS), (RUNS,) * 3), (rows, nothing, which)),
+        )
+    slot = Slot(advancing.result(), evaluating.result())
     # No run: a GPU's driver translates the kernels of a program when it first runs.
-    none = devices.put((np.zeros(rows.shape, rows.dtype), np.zeros(width, bool)), RUNS)
-    jax.block_until_ready(advanced(*none, budget))
-    return Movers(advanced, looked, rides)
+    jax.block_until_ready(slot.advance(rows, nothing, which))
+    return slot
+
+
+def _seen(measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
+    """Returns what ``history.Measured`` has of an evaluation."""
+    return {name: measured[name] for name in _LOOKED if name in measured}
 
 
 def _counts(after: RunState, metrics: dict[str, jax.Array]) -> dict[str, jax.Array]:

@@ -12,8 +12,8 @@ import numpy as np
 from mjx_reinforce.engines.native.gpu.scratch import ScratchText
 from mjx_reinforce.fused.backends.llvm import LLVM, Input, Value
 from mjx_reinforce.fused.backends.llvm_text import Text
-from mjx_reinforce.fused.liveness import LiveGate, LiveLoop, Schedule
 from mjx_reinforce.fused.nodes import Node
+from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop, Schedule
 
 #: Gates and loops of more operations are entered by all threads of a block at once.
 LONG = 3_000

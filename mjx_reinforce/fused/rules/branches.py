@@ -1,0 +1,121 @@
+"""The rules for choices.
+
+Of ``cond``, cheap branches are both evaluated, and expensive ones skipped if unneeded. Of
+``by_engine``, the program for one episode is taken.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mjx_reinforce.fused import arrays, jaxprs
+from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.nodes import Gate, Node, Scalar, is_constant, same
+
+#: A branch that evaluates itself in the graph's innermost scope.
+Branch = Callable[[], list[Scalar]]
+
+
+def cond_rule(
+    graph: Graph,
+    run: Callable,
+    eqn: jaxprs.Equation,
+    used: list[bool],
+    index: np.ndarray,
+    *operands: np.ndarray,
+) -> list[np.ndarray]:
+    """Evaluates the branches that lanes may take and picks each lane's own.
+
+    Args:
+      graph: where nodes are made.
+      run: (program, arguments, which results are used) -> results.
+      eqn: the equation.
+      used: which of its results are used.
+      index: [] which branch is taken.
+      *operands: the arguments of every branch.
+    """
+    programs = [jaxprs.program(branch) for branch in eqn.params["branches"]]
+    (choice,) = arrays.elements(index)
+    if is_constant(choice):
+        taken = programs[min(max(int(choice), 0), len(programs) - 1)]
+        return run(taken, list(operands), used)
+    layout = arrays.Layout([out.aval for out in eqn.outvars])
+
+    def branch(program: jaxprs.Program) -> Branch:
+        return lambda: layout.unpack(run(program, list(operands), used))
+
+    return layout.pack(_choose_among(graph, [branch(program) for program in programs], choice))
+
+
+def by_engine_rule(
+    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: list[bool], *operands: np.ndarray
+) -> list[np.ndarray]:
+    """Takes the program for an engine that writes out; see ``by_engine``."""
+    program = jaxprs.program(eqn.params["one"])
+    return run(program, list(operands), used, may_unroll=eqn.params["may_unroll"])
+
+
+def _choose_among(graph: Graph, branches: list[Branch], choice: Node) -> list[Scalar]:
+    """Returns the results of the branch that each lane takes."""
+    order = range(len(branches))
+    if len(branches) == 2 and _try_branch(graph, branches[0], 0)[0]:
+        order = (1, 0)  # the cheap branch first: its results are what a skipped one falls back on
+    results: list[Scalar] | None = None
+    for k in order:
+        needed = _takes(graph, choice, k, len(branches))
+        results = _merge(graph, branches[k], k, needed, results)
+    return results or []
+
+
+def _takes(graph: Graph, choice: Node, k: int, count: int) -> Scalar:
+    """Returns which lanes take branch k; a choice out of range takes the nearest."""
+    if choice.dtype == np.bool_:
+        return choice if k else graph.call("not", choice)
+    number = choice.dtype.type
+    if k == 0:
+        return graph.call("lt", choice, number(1))
+    if k == count - 1:
+        return graph.call("ge", choice, number(k))
+    return graph.call("eq", choice, number(k))
+
+
+def _merge(
+    graph: Graph, branch: Branch, k: int, needed: Scalar, fallback: list[Scalar] | None
+) -> list[Scalar]:
+    """Adds the results of branch k to those of the branches before it."""
+    expensive, dtypes = _try_branch(graph, branch, k)
+    if expensive and isinstance(needed, Node) and needed not in graph.certain:
+        return _gate(graph, branch, needed, fallback or [dtype.type(0) for dtype in dtypes])
+    results = branch()
+    return results if fallback is None else _select_all(graph, needed, results, fallback)
+
+
+def _gate(graph: Graph, branch: Branch, needed: Node, cold: list[Scalar]) -> list[Scalar]:
+    """Makes the branch one that is skipped where no lane needs it."""
+    with graph.branch() as body, graph.assuming(needed):
+        hot = _select_all(graph, needed, branch(), cold)
+    gate = Gate(graph.scope, graph.number(), needed, body, hot, cold)
+    for position, (on, off) in enumerate(zip(hot, cold, strict=True)):
+        varying = any(isinstance(value, Node) and value.varying for value in (on, off))
+        leaf = None if same(on, off) else graph.leaf(on.dtype, varying, gate, position)
+        gate.outs.append(leaf)
+    return [off if out is None else out for out, off in zip(gate.outs, cold, strict=True)]
+
+
+def _try_branch(graph: Graph, branch: Branch, k: int) -> tuple[bool, list[np.dtype]]:
+    """Returns whether branch k is expensive, and the dtypes of its results.
+
+    What it makes is dropped. A branch that was expensive once remains so where less is assumed.
+    """
+    place = (graph.path, "expensive", k)
+    if place not in graph.learned:
+        with graph.branch() as scope:
+            dtypes = [result.dtype for result in branch()]
+        if not scope.has_loop and scope.cost <= graph.branch_cost:
+            return False, dtypes
+        graph.learned[place] = dtypes
+    return True, graph.learned[place]
+
+
+def _select_all(graph: Graph, needed: Scalar, on: list[Scalar], off: list[Scalar]) -> list[Scalar]:
+    return [graph.select(needed, x, y) for x, y in zip(on, off, strict=True)]

@@ -1,0 +1,107 @@
+"""Builds loops of the scalar graph, whose carry is only what changes."""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.nodes import Loop, Node, Scalar, same
+
+#: (carry, elements of xs) -> (carry after one iteration, ys)
+Iteration = Callable[[list[Scalar], list[Scalar]], tuple[list[Scalar], list[Scalar]]]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Plan:
+    """What is to be repeated; the fields as in ``iterate``."""
+
+    step: Iteration
+    inits: list[Scalar]
+    length: int | None
+    active: int | None
+    xs: list[list[Scalar]]
+
+
+def iterate(
+    graph: Graph,
+    step: Iteration,
+    inits: Sequence[Scalar],
+    *,
+    length: int | None = None,
+    active: int | None = None,
+    xs: Sequence[list[Scalar]] = (),
+) -> Loop:
+    """Builds a loop.
+
+    Every carry is first assumed to keep its initial value. The body is evaluated on that
+    assumption, carries that break it are dropped from it, and so on until it holds: then it holds
+    in every iteration. The same is done for 'all lanes agree'. Where this loop was built before, as
+    part of an outer loop's body, that begins with what was found then.
+
+    Args:
+      graph: where the loop is made.
+      step: evaluates one iteration in the graph's innermost scope.
+      inits: what the carry starts from.
+      length: the number of iterations, or None for no limit.
+      active: the position in the carry of the bool that ends the loop when no lane has it.
+      xs: for each element, its value in each iteration.
+    """
+    plan = _Plan(step, list(inits), length, active, list(xs))
+    place = (graph.path, active)
+    fixed, varying = graph.learned.get(place) or (
+        [True] * len(plan.inits),
+        [False] * len(plan.inits),
+    )
+    varying = [v or varies(init) for v, init in zip(varying, plan.inits, strict=True)]
+    while True:
+        loop = _trace_body(graph, plan, fixed, varying)
+        moved = [f and not same(n, i) for f, n, i in zip(fixed, loop.nexts, inits, strict=True)]
+        spread = [varies(n) and not v for n, v in zip(loop.nexts, varying, strict=True)]
+        fixed = [f and not m for f, m in zip(fixed, moved, strict=True)]
+        varying = [v or s for v, s in zip(varying, spread, strict=True)]
+        if not any(moved) and not any(s and not f for s, f in zip(spread, fixed, strict=True)):
+            graph.learned[place] = fixed, varying
+            return _close(graph, loop, varying)
+
+
+def varies(scalar: Scalar) -> bool:
+    """Returns whether each lane has a value of its own."""
+    return isinstance(scalar, Node) and scalar.varying
+
+
+def _trace_body(graph: Graph, plan: _Plan, fixed: list[bool], varying: list[bool]) -> Loop:
+    """Evaluates one iteration under the present assumptions."""
+    scope = graph.scope
+    with graph.loop_body() as body:
+        loop = Loop(scope, 0, plan.length, plan.inits, plan.active, plan.xs, body)
+        for i, (init, same_throughout, v) in enumerate(
+            zip(plan.inits, fixed, varying, strict=True)
+        ):
+            leaf = None if same_throughout else graph.leaf(init.dtype, v, loop, ("carry", i))
+            loop.carries.append(leaf)
+        for j, row in enumerate(plan.xs):
+            same_throughout = all(same(x, row[0]) for x in row)
+            v = any(map(varies, row))
+            leaf = None if same_throughout else graph.leaf(row[0].dtype, v, loop, ("element", j))
+            loop.elements.append(leaf)
+        state = [init if c is None else c for init, c in zip(plan.inits, loop.carries, strict=True)]
+        parts = [row[0] if e is None else e for row, e in zip(plan.xs, loop.elements, strict=True)]
+        # Where all lanes are done, no iteration runs.
+        with graph.assuming(None if plan.active is None else state[plan.active]):
+            loop.nexts, loop.ys = plan.step(state, parts)
+    return loop
+
+
+def _close(graph: Graph, loop: Loop, varying: list[bool]) -> Loop:
+    """Gives the loop its place and its results."""
+    loop.index = graph.number()
+    graph.scope.has_loop = True
+    loop.outs = [
+        None if carry is None else graph.leaf(carry.dtype, v, loop, ("out", i))
+        for i, (carry, v) in enumerate(zip(loop.carries, varying, strict=True))
+    ]
+    for j, y in enumerate(loop.ys):
+        inside = isinstance(y, Node) and y.scope is loop.body
+        times = range(loop.length or 0) if inside else ()
+        leaves = [graph.leaf(y.dtype, y.varying, loop, ("y", j, t)) for t in times]
+        loop.stacked.append(leaves)
+    return loop

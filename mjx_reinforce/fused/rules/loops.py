@@ -1,0 +1,134 @@
+"""Rules for ``while`` and ``scan``: loops that end when no lane needs another iteration."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.fused import arrays, jaxprs
+from mjx_reinforce.fused.graph import Graph
+from mjx_reinforce.fused.nodes import Gate, Loop, Node, Scalar, is_constant, same
+from mjx_reinforce.fused.rules.iterate import Iteration, iterate, varies
+
+
+def while_rule(
+    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: Any, *operands: np.ndarray
+) -> list:
+    """Makes a loop; a lane that is done keeps its values while others go on."""
+    num_cond, num_body = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
+    cond_consts, body_consts = operands[:num_cond], operands[num_cond : num_cond + num_body]
+    carry = arrays.Layout([out.aval for out in eqn.outvars])
+    cond, body = (jaxprs.program(eqn.params[name]) for name in ("cond_jaxpr", "body_jaxpr"))
+
+    def goes_on(state: list[Scalar]) -> Scalar:
+        return run(cond, [*cond_consts, *carry.pack(state)])[0][()]
+
+    def step(state: list[Scalar], _: list[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
+        active, *old = state
+        new = carry.unpack(run(body, [*body_consts, *carry.pack(old)]))
+        if varies(active):
+            new = [graph.select(active, n, o) for n, o in zip(new, old, strict=True)]
+            return [graph.call("and", active, goes_on(new)), *new], []
+        return [goes_on(new), *new], []
+
+    start = carry.unpack(operands[num_cond + num_body :])
+    active = goes_on(start)
+    if is_constant(active) and not active:
+        return carry.pack(start)
+    loop = iterate(graph, step, [active, *start], active=0)
+    return carry.pack(loop.results()[0][1:])
+
+
+def scan_rule(
+    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: Any, *operands: np.ndarray
+) -> list:
+    """Writes a short scan out; makes a loop of a longer one, which may end early."""
+    length, parts = eqn.params["length"], jaxprs.scan_parts(eqn)
+    body = jaxprs.program(eqn.params["jaxpr"])
+    split = parts.num_consts + parts.num_carry
+    consts, init = list(operands[: parts.num_consts]), operands[parts.num_consts : split]
+    carry = arrays.Layout([out.aval for out in eqn.outvars[: parts.num_carry]])
+    outs = arrays.Layout([out.aval for out in body.jaxpr.outvars[parts.num_carry :]])
+    ins = arrays.Layout([var.aval for var in body.jaxpr.invars[split:]])
+    order = range(length)[::-1] if eqn.params["reverse"] else range(length)
+
+    def step(state: list[Scalar], row: list[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
+        results = run(body, [*consts, *carry.pack(state), *ins.pack(row)])
+        return carry.unpack(results[: parts.num_carry]), outs.unpack(results[parts.num_carry :])
+
+    rows = [ins.unpack([x[t : t + 1] for x in operands[split:]]) for t in order]
+    has_arrays = len(operands) > split or len(eqn.outvars) > parts.num_carry
+    if length <= max(_limit(graph, has_arrays), eqn.params["unroll"]):
+        final, table = _unroll(step, carry.unpack(init), rows)
+    else:
+        final, table = _as_loop(graph, step, carry.unpack(init), rows, length)
+    table = [table[k] for k in np.argsort(order)] if length else []
+    stacked = [outs.pack(row) for row in table]
+    ys = [np.stack(arrays.together(column)) for column in zip(*stacked, strict=True)]
+    if not table:
+        ys = [arrays.zeros(out.aval) for out in eqn.outvars[parts.num_carry :]]
+    return [*carry.pack(final), *ys]
+
+
+def _limit(graph: Graph, has_arrays: bool) -> int:
+    """Returns up to which length a scan is written out."""
+    if graph.may_unroll:
+        return graph.limits.unrollable
+    return graph.limits.arrays if has_arrays else graph.limits.plain
+
+
+def _unroll(step: Iteration, state: list[Scalar], rows: list[list[Scalar]]) -> tuple[list, list]:
+    """Runs the iterations one by one; returns the final carry and the ys of each."""
+    table = []
+    for row in rows:
+        state, ys = step(state, row)
+        table.append(ys)
+    return state, table
+
+
+def _as_loop(
+    graph: Graph, step: Iteration, inits: list, rows: list[list[Scalar]], length: int
+) -> tuple[list, list]:
+    """Builds a scan's loop; returns the final carry and the ys of each iteration."""
+    xs = [list(column) for column in zip(*rows, strict=True)]
+    loop = iterate(graph, step, inits, length=length, xs=xs)
+    switch = None if xs or loop.ys else _switch(loop)
+    if switch is not None:
+        loop = iterate(graph, step, inits, length=length, active=switch)
+    final, columns = loop.results()
+    return final, [list(row) for row in zip(*columns, strict=True)] or [[]] * length
+
+
+def _switch(loop: Loop) -> int | None:
+    """Finds a bool carry that, once False in a lane, leaves that lane's whole carry as it is.
+
+    MJX's line search is such a scan: its body is cond(active, iterate, identity).
+    """
+    changing = [i for i, carry in enumerate(loop.carries) if carry is not None]
+    for i in changing:
+        switch = loop.carries[i]
+        if switch is None or switch.dtype != np.bool_:
+            continue
+        off = [_when_false(loop.nexts[k], switch) for k in changing]
+        kept = [np.False_ if k == i else loop.carries[k] for k in changing]
+        if all(same(value, before) for value, before in zip(off, kept, strict=True)):
+            return i
+    return None
+
+
+def _when_false(value: Scalar, switch: Node) -> Scalar:
+    """Returns what a scalar is where the switch is False, or itself where that is not known."""
+    if value is switch:
+        return np.False_
+    if not isinstance(value, Node):
+        return value
+    gate = value.owner
+    if isinstance(gate, Gate) and gate.predicate is switch:
+        return _when_false(gate.cold[value.position], switch)
+    if value.op is not None and value.op.name == "select_n" and value.args[0] is switch:
+        return _when_false(value.args[1], switch)
+    if value.op is not None and value.op.name == "and":
+        sides = [_when_false(arg, switch) for arg in value.args]
+        if any(is_constant(side) and not side for side in sides):
+            return np.False_
+    return value

@@ -1,0 +1,268 @@
+"""What a run has measured so far, and what follows from it.
+
+Blocks of training metrics and evaluations come in; rows of metrics.csv, curves, and the
+summary come out. Nothing here prints, writes a file, or reads a clock.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.files import Arrays
+from mjx_reinforce.reports.statistics import summarize
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training.budget import used
+from mjx_reinforce.training.records import nonfinite, rows
+from mjx_reinforce.training.records.progress import BLOCKS, Progress, measure_progress
+
+
+class GrowingTable:
+    """Named columns [rows, ...] that grow by blocks of rows."""
+
+    def __init__(self, columns: Arrays):
+        """Begins with columns, which may be without rows, or with none at all."""
+        self._blocks = [columns] if columns else []
+
+    def append(self, block: Arrays) -> None:
+        """Takes in rows: every column, [rows, ...] each."""
+        self._blocks.append(block)
+
+    def columns(self) -> Arrays:
+        """Returns all rows."""
+        if len(self._blocks) > 1:
+            self._blocks = [_joined(self._blocks)]
+        return dict(self._blocks[0]) if self._blocks else {}
+
+    def latest(self, count: int, *names: str) -> Arrays:
+        """Returns the last ``count`` rows, of blocks none of which is empty, or all there are.
+
+        Args:
+          count: how many rows.
+          names: of the columns; all if none is named.
+        """
+        if not self._blocks:
+            return {}
+        tails = [{name: b[name][-count:] for name in names or b} for b in self._blocks[-count:]]
+        return {name: x[-count:] for name, x in _joined(tails).items()}
+
+
+def _joined(blocks: list[Arrays]) -> Arrays:
+    """Returns the rows of all blocks, in order."""
+    return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+
+
+class RunRecord:
+    """Everything that a run has measured so far.
+
+    updates: [S] int64, how many each seed has made
+    env_steps: [S] int64, how many each seed has played in training
+    episodes: [S] int64, how many each seed has played in training
+    seconds: wall time from the end of compilation to the last evaluation
+    threshold: the return that counts as solved, if any
+    """
+
+    def __init__(self, config: Config, threshold: float | None):
+        """Begins before the first update.
+
+        Args:
+          config: the settings of the run.
+          threshold: the return that counts as solved, if any.
+        """
+        self._config, self.threshold = config, threshold
+        self.updates = np.zeros(config.num_seeds, np.int64)
+        self.env_steps = np.zeros(config.num_seeds, np.int64)
+        self.episodes = np.zeros(config.num_seeds, np.int64)
+        self.seconds = 0.0
+        kinds = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
+        self._tables = {
+            "evaluations": GrowingTable({}),
+            "training": GrowingTable(
+                {k: np.zeros((0, config.num_seeds), x) for k, x in kinds.items()}
+            ),
+            "nonfinite": GrowingTable(
+                {k: np.zeros(0, x) for k, x in nonfinite.EVENT_COLUMNS.items()}
+            ),
+        }
+        self._last: Arrays = {}
+        self._broken_in_a_row = np.zeros(config.num_seeds, np.int64)
+        self._simulated = self._evaluated = 0
+
+    def arrays(self) -> Arrays:
+        """Returns all that was measured, by name, for ``restore``."""
+        kept = {
+            "updates": self.updates,
+            "env_steps": self.env_steps,
+            "episodes": self.episodes,
+            "seconds": np.asarray(self.seconds, np.float64),
+            "broken_in_a_row": self._broken_in_a_row,
+            "simulated": np.asarray(self._simulated, np.int64),
+            "evaluated": np.asarray(self._evaluated, np.int64),
+        }
+        tables = {name: table.columns() for name, table in self._tables.items()}
+        for group, columns in (tables | {"last": self._last}).items():
+            kept |= {f"{group}.{name}": values for name, values in columns.items()}
+        return kept
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Goes back to what a record of the same settings had measured.
+
+        Args:
+          arrays: from its ``arrays``.
+        """
+        groups: dict[str, Arrays] = {"last": {}} | {name: {} for name in self._tables}
+        for key, values in arrays.items():
+            group, _, name = key.rpartition(".")
+            if group:
+                groups[group][name] = values
+        self.updates, self.env_steps = arrays["updates"], arrays["env_steps"]
+        self.episodes = arrays["episodes"]
+        self.seconds, self._simulated = float(arrays["seconds"]), int(arrays["simulated"])
+        self._evaluated = int(arrays["evaluated"])
+        self._broken_in_a_row = arrays["broken_in_a_row"]
+        self._last = groups.pop("last")
+        self._tables = {name: GrowingTable(columns) for name, columns in groups.items()}
+
+    def add_updates(self, metrics: Arrays) -> Arrays:
+        """Takes in a block of updates.
+
+        A training return is NaN if one of its episodes left the finite numbers.
+
+        Args:
+          metrics: [K, S] each, of K updates: those of ``Learner.step`` and of
+            ``state.Programs.advance``.
+
+        Returns:
+          The updates in it that met numbers which are not finite, see
+          ``nonfinite.nonfinite_updates``.
+        """
+        active, played = metrics["active"], metrics["episodes"]
+        finite = metrics["nonfinite_episodes"] == 0
+        env_steps = self.env_steps + np.cumsum(metrics["env_steps"], axis=0, dtype=np.int64)
+        updates = self.updates + np.cumsum(active, axis=0, dtype=np.int64)
+        episodes = self.episodes + np.cumsum(active * played, axis=0, dtype=np.int64)
+        made = active.any(axis=1)
+        returns = np.where(finite, metrics["episode_return"], np.nan)
+        training = {
+            "episode_return": np.where(active, returns, np.nan),
+            "env_steps": env_steps,
+            "episodes": episodes,
+        }
+        self._tables["training"].append({name: x[made] for name, x in training.items()})
+        self.env_steps, self.updates = env_steps[-1], updates[-1]
+        self.episodes = episodes[-1]
+        self._simulated += _sum(metrics["simulated_steps"])
+        self._broken_in_a_row = nonfinite.broken_in_a_row(self._broken_in_a_row, metrics)
+        met = nonfinite.nonfinite_updates(metrics, updates)
+        self._tables["nonfinite"].append(met)
+        self._remember(metrics | {"episode_return": returns})
+        return met
+
+    def _remember(self, metrics: Arrays) -> None:
+        """Keeps each seed's metrics of its last update; a seed that stands still makes none."""
+        made = metrics["active"].sum(axis=0)
+        last = np.maximum(made - 1, 0)
+        for name, values in metrics.items():
+            newest = np.take_along_axis(values, last[None], axis=0)[0]
+            self._last[name] = np.asarray(np.where(made > 0, newest, self._last.get(name, newest)))
+
+    def add_evaluation(self, result: Arrays, seconds: float) -> rows.Cells:
+        """Takes in an evaluation [S] of the present policies.
+
+        Args:
+          result: what ``evaluation.evaluate`` returns, for each seed.
+          seconds: wall time since compilation ended.
+
+        Returns:
+          The cells of its rows in metrics.csv, see ``rows``.
+        """
+        counts = {"env_steps": self.env_steps, "episodes": self.episodes, "updates": self.updates}
+        row = result | counts | {"seconds": np.asarray(seconds, np.float64)}
+        self._tables["evaluations"].append({name: x[None] for name, x in row.items()})
+        self._count(result)
+        self.seconds = seconds
+        return rows.of_evaluation(
+            result, self._last, self.updates, self.episodes, self.env_steps, seconds
+        )
+
+    def add_test(self, result: Arrays) -> None:
+        """Counts what a test of final policies simulated, of ``evaluation.evaluate``."""
+        self._count(result)
+
+    def _count(self, result: Arrays) -> None:
+        self._simulated += _sum(result["simulated_steps"])
+        self._evaluated += _sum(result["eval_steps"])
+
+    def evaluated(self) -> bool:
+        """Returns whether the present policies have been evaluated."""
+        last = self._tables["evaluations"].latest(1)
+        return bool(last) and np.array_equal(last["updates"][0], self.updates)
+
+    def begun(self) -> bool:
+        """Returns whether there is an evaluation."""
+        return bool(self._tables["evaluations"].latest(1))
+
+    def finished(self) -> bool:
+        """Returns whether the budget is used, or all seeds are solved and that was to end it.
+
+        Raises:
+          KeyError: solved seeds were to end it, and there is no evaluation.
+        """
+        if used(self._config, self.env_steps, self.updates).min() >= 1.0:
+            return True
+        if not self._config.stop_when_solved or self.threshold is None:
+            return False
+        last = self._tables["evaluations"].latest(1, "eval_return")["eval_return"]
+        return bool(np.all(last >= self.threshold))
+
+    def hopeless(self) -> bool:
+        """Returns whether all seeds that still train were broken throughout a block of updates."""
+        share = used(self._config, self.env_steps, self.updates)
+        return nonfinite.hopeless(self._broken_in_a_row, share, self._config.eval_every)
+
+    def progress(self) -> Progress:
+        """Returns how far the run is, as of its last evaluation."""
+        names = ("eval_return", "env_steps", "updates", "seconds")
+        past = self._tables["evaluations"].latest(BLOCKS + 1, *names)
+        fractions = used(self._config, past["env_steps"], past["updates"]).min(axis=-1)
+        return measure_progress(past, fractions)
+
+    def history(self) -> Arrays:
+        """Returns ``eval_return``, and ``env_steps`` and ``episodes`` until then, [E, S] each."""
+        past = self._tables["evaluations"].columns()
+        return {name: past[name] for name in ("eval_return", "env_steps", "episodes")}
+
+    def training(self) -> Arrays:
+        """Returns ``episode_return`` and the ``env_steps`` and ``episodes`` after it, [U, S].
+
+        A return is NaN where the seed stood still or an episode left the finite numbers.
+        """
+        return self._tables["training"].columns()
+
+    def summary(self, engine: str, compile_seconds: float, run_seconds: float) -> dict[str, Any]:
+        """Returns what summary.json says.
+
+        Args:
+          engine: the name of the engine that played.
+          compile_seconds: wall time of compiling.
+          run_seconds: wall time since then.
+        """
+        env_steps = self.env_steps.sum()
+        return {
+            "env": self._config.env,
+            "engine": engine,
+            "num_seeds": self._config.num_seeds,
+            "threshold": self.threshold,
+            **summarize(self.history(), self.threshold),
+            "env_steps": self.env_steps.tolist(),
+            "compile_seconds": compile_seconds,
+            "run_seconds": run_seconds,
+            "env_steps_per_second": float(env_steps / run_seconds),
+            "useful_step_fraction": float((env_steps + self._evaluated) / max(self._simulated, 1)),
+            "nonfinite": nonfinite.as_events(self._tables["nonfinite"].columns()),
+        }
+
+
+def _sum(steps: np.ndarray) -> int:
+    """Returns the sum of counts that may be too many for their own type."""
+    return int(steps.sum(dtype=np.int64))

@@ -1,0 +1,52 @@
+"""Tables by columns, and what of them a spreadsheet reads."""
+
+import csv
+import io
+
+import numpy as np
+import pytest
+
+from mjx_reinforce.reports.page import columns
+
+TABLE = {"configuration": [1, 0], "value": [2.5, None]}
+
+
+def test_rows_have_the_labels_of_their_configurations():
+    assert columns.rows(TABLE, ["first", "second"]) == [
+        {"configuration": "second", "value": 2.5},
+        {"configuration": "first", "value": None},
+    ]
+    assert columns.rows({"value": [1]}, []) == [{"value": 1}]
+
+
+def test_numbers_have_a_few_digits_and_what_is_not_finite_is_none():
+    assert columns.short([1234567.0, 0.123456789, np.nan, np.inf, 3.0]) == [
+        1234600,
+        0.12346,
+        None,
+        None,
+        3,
+    ]
+    assert columns.short(0.123456789, 2) == [0.12]
+    assert [type(x) for x in columns.short([2.0, 2.5])] == [int, float]
+
+
+def test_tables_are_joined_row_after_row():
+    assert columns.join_tables([TABLE, TABLE])["configuration"] == [1, 0, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("label", "cell"),
+    [
+        ("plain", "plain"),
+        ("=HYPERLINK(1)", "'=HYPERLINK(1)"),
+        ("@sum", "'@sum"),
+        ("+1+1", "'+1+1"),
+        ("-inf", "'-inf"),
+        ("-1.5", "-1.5"),
+        ("\t=1", "'\t=1"),
+    ],
+)
+def test_no_name_is_a_formula(label, cell):
+    text = columns.table_csv({"configuration": [0], "value": [-2]}, [label])
+    assert list(csv.reader(io.StringIO(text))) == [["configuration", "value"], [cell, "-2"]]

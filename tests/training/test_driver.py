@@ -1,0 +1,174 @@
+"""The loop of a run: in which order it trains and evaluates, who sees it, and when it ends."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from mjx_reinforce.learners import counts
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training.best import Best
+from mjx_reinforce.training.driver import Driver, drive
+from mjx_reinforce.training.programs import Looked, RunPrograms
+from mjx_reinforce.training.records.record import RunRecord
+
+BLOCK = 2
+CONFIG = Config(num_seeds=2, env_steps=None, max_updates=3 * BLOCK, eval_every=BLOCK)
+
+
+class Steps:
+    """Programs of a run whose state is a number of updates; policies return ``returns(number)``."""
+
+    def __init__(self, returns=lambda updates: [updates, -updates], broken=False):
+        self.returns, self.broken, self.looks = returns, broken, []
+
+    def look(self, state):
+        number = state.train_states.actor["w"]
+        measured = {
+            name: np.asarray(self.returns(int(number[0])), np.float32)
+            for name in ("eval_return", "eval_return_stochastic", "eval_length")
+        }
+        zeros = {name: np.zeros(2, np.int32) for name in ("simulated_steps", "eval_steps")}
+        made = np.stack([np.asarray(counts.from_int(int(x))) for x in number])
+        return Looked({"w": number}, made, measured | zeros)
+
+    def advance(self, state, look, budget):
+        del budget
+        self.looks.append(look)
+        looked = self.look(state) if look else None
+        ones = np.ones((BLOCK, 2), np.int32)
+        metrics = dict.fromkeys(("env_steps", "episodes", "simulated_steps"), ones)
+        metrics |= {
+            "active": ones.astype(bool),
+            "episode_return": ones.astype(np.float32),
+            "nonfinite_episodes": ones * self.broken,
+            "skipped_update": ones * self.broken,
+        }
+        return begun(int(state.train_states.actor["w"][0]) + BLOCK), metrics, looked
+
+    def programs(self):
+        return RunPrograms(
+            self.advance, self.look, lambda actor: {"eval_return": actor["w"] * 10.0}
+        )
+
+
+class Diary:
+    """Notes what happens, and asks for the end after so many evaluations."""
+
+    def __init__(self, until=99):
+        self.notes, self.until = [], until
+
+    def updated(self, driver, met):
+        self.notes.append(f"updated {driver.updates()}")
+
+    def evaluated(self, driver, evaluation, rows):
+        self.notes.append(f"evaluated {evaluation.updates[0]}")
+        driver.ended = self.notes.count("evaluated 0") + len(self.notes) > self.until
+
+
+def begun(updates=0):
+    return SimpleNamespace(train_states=SimpleNamespace(actor={"w": np.full(2, updates)}))
+
+
+def driver_of(steps, *observers, config=CONFIG, threshold=None):
+    worst = np.full(2, -np.inf, np.float32)
+    best = Best(actor={"w": np.zeros(2, int)}, eval_return=worst, num_updates=np.zeros((2, 2), int))
+    record = RunRecord(config, threshold)
+    record.add_test = lambda result: None
+    return Driver(config, steps.programs(), record, begun(), best, observers)
+
+
+def never():
+    return False
+
+
+def after(number):
+    """Interrupts after so many questions."""
+    answers = iter([False] * number)
+    return lambda: next(answers, True)
+
+
+def test_policies_are_evaluated_with_the_updates_that_follow_and_the_last_alone():
+    steps, diary = Steps(), Diary()
+    driver = driver_of(steps, diary)
+    driver.drive(never)
+    assert steps.looks == [True, True, True]
+    assert diary.notes == [
+        *("evaluated 0", "updated 2", "evaluated 2", "updated 4", "evaluated 4", "updated 6"),
+        "evaluated 6",
+    ]
+    assert driver.record.history()["eval_return"][:, 0].tolist() == [0, 2, 4, 6]
+
+
+def test_the_best_policy_is_each_seed_s_own():
+    driver = driver_of(Steps())
+    driver.drive(never)
+    assert driver.best.eval_return.tolist() == [6, 0]
+    assert driver.best.actor["w"].tolist() == [6, 0]
+    assert driver.test(never) == {
+        "final_test_returns": [60.0, 60.0],
+        "best_test_returns": [60.0, 0.0],
+    }
+
+
+def test_an_interrupted_block_is_not_evaluated_unless_nothing_was():
+    steps, diary = Steps(), Diary()
+    driver_of(steps, diary).drive(after(2))
+    assert diary.notes[-1] == "updated 4"
+    first = Diary()
+    driver_of(Steps(), first).drive(after(0))
+    assert first.notes == ["evaluated 0"]
+
+
+def test_an_interrupted_test_says_nothing():
+    driver = driver_of(Steps())
+    assert driver.test(after(0)) == driver.test(after(1)) == {}
+
+
+def test_an_observer_ends_the_run():
+    diary = Diary(until=3)
+    driver = driver_of(Steps(), diary)
+    driver.drive(never)
+    assert driver.ended
+    assert driver.updates() == 4
+    assert diary.notes[-1] == "evaluated 4"
+
+
+def test_returns_that_decide_are_measured_before_the_next_block():
+    config = Config(**{**vars(CONFIG), "stop_when_solved": True})
+    steps, diary = Steps(returns=lambda updates: [updates, updates]), Diary()
+    driver = driver_of(steps, diary, config=config, threshold=4.0)
+    driver.drive(never)
+    assert steps.looks == [False, False]
+    assert diary.notes == ["evaluated 0", "updated 2", "evaluated 2", "updated 4", "evaluated 4"]
+
+
+def test_a_run_without_a_finite_update_ends():
+    config = Config(**{**vars(CONFIG), "max_updates": 100})
+    driver = driver_of(Steps(broken=True), config=config)
+    driver.drive(never)
+    assert driver.updates() == 6  # five are enough
+
+
+def test_a_restored_run_goes_on_where_it_was():
+    half, rest = Steps(), Steps()
+    first = driver_of(half)
+    first.drive(after(2))
+    found = SimpleNamespace(
+        state=(first.state, first.best), record=first.record.arrays(), seconds=100.0
+    )
+    second = driver_of(rest)
+    second.restore(found)
+    assert second.updates() == 4
+    assert second.seconds() >= 100.0
+    second.drive(never)
+    assert rest.looks == [True]
+    assert second.record.history()["eval_return"][:, 0].tolist() == [0, 2, 4, 6]
+
+
+@pytest.mark.parametrize(("blocks", "asked", "ended"), [(2, 9, True), (3, 2, False), (0, 9, True)])
+def test_what_goes_on_block_by_block(blocks, asked, ended):
+    left = [None] * blocks
+    training = SimpleNamespace(over=lambda: not left, advance=left.pop)
+    assert drive(training, after(asked)) == ended
+    assert len(left) == (0 if ended else blocks - asked)
