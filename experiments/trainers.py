@@ -182,11 +182,12 @@ def read(path: Path) -> list[dict[str, Any]]:
 def table(rows: list[dict[str, Any]]) -> str:
     """Returns a line for each program, task and number of environments, as Markdown.
 
-    The return is the mean over seeds with its 95 % interval; seconds are medians over seeds.
+    The return is the mean over seeds with its 95 % interval. Seconds are medians over seeds: by the
+    clock, and of computing on any core.
     """
     lines = [
         "| program | task | environments | env steps | return on theirs | return on ours "
-        "| seconds on theirs | seconds on ours |",
+        "| seconds (CPU) on theirs | seconds (CPU) on ours |",
         "|---|---|---:|---:|---:|---:|---:|---:|",
     ]
     cases = dict.fromkeys((row["program"], row["task"], row["num_envs"]) for row in rows)
@@ -206,7 +207,7 @@ def _return(rows: list[dict[str, Any]]) -> str:
 
 def _time(rows: list[dict[str, Any]]) -> str:
     wall, cpu = (np.median([row[name] for row in rows]) for name in ("seconds", "cpu_seconds"))
-    return f"{wall:,.1f} ({cpu:,.1f} of a core)"
+    return f"{wall:,.0f} ({cpu:,.0f})"
 
 
 def _now() -> str:

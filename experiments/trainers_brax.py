@@ -36,8 +36,7 @@ def train(
       env_steps: of the training.
       rollout: env steps between updates, of all environments together.
     """
-    if not hasattr(jax, "device_put_replicated"):  # brax 0.14.2 needs it; JAX 0.10 has it no more
-        jax.device_put_replicated = peers_brax._replicated  # pyright: ignore
+    peers_brax.mend_jax()
     began = time.perf_counter()
     ours, single = side == "mjx_reinforce", envs.make(task)
     env = for_brax.make(single, num_envs) if ours else peers_brax.Rescaled(single)

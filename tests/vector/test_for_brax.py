@@ -8,6 +8,7 @@ from brax.envs.wrappers.training import wrap
 from brax.training.agents.ppo import train as ppo
 from toys import Drifting
 
+import peers_brax
 from mjx_reinforce import Box, Discrete, envs
 from mjx_reinforce.vector import for_brax
 
@@ -58,11 +59,8 @@ def test_actions_have_bounds():
             for_brax.make(Drifting(space), 2)
 
 
-def test_its_ppo_trains(monkeypatch):
-    import peers_brax
-
-    # brax 0.14.2 needs it; JAX 0.10 has it no more
-    monkeypatch.setattr(jax, "device_put_replicated", peers_brax._replicated, raising=False)
+def test_its_ppo_trains():
+    peers_brax.mend_jax()
     told = []
     ppo.train(
         for_brax.make("ContinuousCartPole-v0", 16),
