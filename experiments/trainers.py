@@ -194,6 +194,8 @@ def table(rows: list[dict[str, Any]]) -> str:
     for case in cases:
         some = [row for row in rows if (row["program"], row["task"], row["num_envs"]) == case]
         sides = [[row for row in some if (row["environment"] == OURS) == ours] for ours in (0, 1)]
+        if not all(sides):  # the second is still being trained
+            continue
         cells = [*case, f"{some[0]['env_steps']:,.0f}", *map(_return, sides), *map(_time, sides)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
