@@ -107,16 +107,16 @@ class StableBaselinesVecEnv(VecEnv):
 
     def _tell(self, state: VectorState, done: np.ndarray, infos: list[dict[str, Any]]) -> None:
         """Fills the infos of the environments whose episodes have ended."""
+        ended = np.flatnonzero(done)
         # Where the simulation broke, a learner that stores it as the next one gets numbers.
-        final = np.nan_to_num(np.asarray(state.final_obs), posinf=0, neginf=0)
+        final = np.nan_to_num(np.asarray(state.final_obs)[ended], posinf=0, neginf=0)
         cut = np.asarray(state.truncated) & ~np.asarray(state.terminated)
         returns, lengths = np.asarray(state.episode_return), np.asarray(state.episode_length)
         seconds = round(time.time() - self._began, 6)
-        for i in np.flatnonzero(done):
-            episode = {"r": round(float(returns[i]), 6), "l": int(lengths[i]), "t": seconds}
-            infos[i] |= {
-                "episode": episode,
-                "terminal_observation": final[i],
+        for i, observation in zip(ended, final, strict=True):
+            infos[i] = {
+                "episode": {"r": round(float(returns[i]), 6), "l": int(lengths[i]), "t": seconds},
+                "terminal_observation": observation,
                 "TimeLimit.truncated": bool(cut[i]),
             }
 
