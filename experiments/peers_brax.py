@@ -87,8 +87,7 @@ def train_on(
     The clock starts after the second update, since the first two can compile: the peer has their
     env steps for nothing.
     """
-    if not hasattr(jax, "device_put_replicated"):  # brax 0.14.2 needs it; JAX 0.10 has it no more
-        jax.device_put_replicated = _replicated  # pyright: ignore[reportAttributeAccessIssue]
+    mend_jax()
     budgets, clock = Budgets(seconds), Clock()
     arguments = settings.arguments
     update = arguments["batch_size"] * arguments["unroll_length"] * arguments["num_minibatches"]
@@ -148,6 +147,12 @@ def play(env: Env, policy: Callable[..., Any], keys: jax.Array, horizon: int) ->
     state = jax.vmap(env.reset)(keys)
     start = state, jnp.zeros(len(keys)), jnp.ones(len(keys), bool)
     return jax.lax.scan(step, start, length=horizon)[0][1]
+
+
+def mend_jax() -> None:
+    """Gives JAX back ``device_put_replicated``, which brax 0.14.2 needs and JAX 0.10 has not."""
+    if not hasattr(jax, "device_put_replicated"):
+        jax.device_put_replicated = _replicated  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _replicated(tree: Any, devices: Sequence[Any]) -> Any:

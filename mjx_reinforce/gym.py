@@ -3,8 +3,9 @@
     import gymnasium, mjx_reinforce.gym
     envs = gymnasium.make_vec("mjx_reinforce/HalfCheetah-v5", num_envs=4096)
 
-Gymnasium 1.0 and newer ask no package for its tasks by themselves, so this import is needed. The
-arguments of ``make_vec`` are those of ``vector.for_gymnasium.make``.
+Gymnasium 1.0 and newer ask no package for its tasks by themselves, so this import is needed, or the
+id asks for it: "mjx_reinforce.gym:mjx_reinforce/HalfCheetah-v5". The arguments of ``make_vec`` are
+those of ``vector.for_gymnasium.make``.
 """
 
 import gymnasium

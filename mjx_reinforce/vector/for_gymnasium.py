@@ -113,12 +113,20 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
           ValueError: the actions have another shape or kind, or are not finite numbers.
         """
+        state = self.advance(actions)
+        flags = self._out(state.terminated), self._out(state.truncated)
+        return self._out(state.obs), self._out(state.reward), *flags, self._info(state)
+
+    def advance(self, actions: Any) -> VectorState:
+        """Plays one step as ``step`` does, and returns the environments in JAX.
+
+        Where ``arrays`` is "numpy", the next step writes into their memory.
+        """
         self._check_open()
         if self.state is None:
             raise ValueError("call reset before step")
         state = self.state = self._step(self.state, self._actions(actions))
-        flags = self._out(state.terminated), self._out(state.truncated)
-        return self._out(state.obs), self._out(state.reward), *flags, self._info(state)
+        return state
 
     def render(self) -> tuple[np.ndarray, ...] | None:
         """Returns a picture [height, width, 3] uint8 of the first environment; None without a mode.

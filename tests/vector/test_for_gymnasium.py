@@ -45,6 +45,15 @@ def test_gymnasium_knows_every_task():
     assert said.stdout.split() == [str(len(envs.names())), "False"]
 
 
+def test_an_id_can_name_the_module():
+    code = (
+        "import gymnasium; "
+        "print(gymnasium.make_vec('mjx_reinforce.gym:mjx_reinforce/CartPole-v1', 2).spec.id)"
+    )
+    said = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert said.stdout.split() == [CART]
+
+
 def test_shapes_spaces_and_metadata(cart):
     assert cart.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     assert (cart.num_envs, cart.spec.id) == (3, CART)

@@ -1,0 +1,58 @@
+"""Others' programs on our environments: what is changed in them, and that they train."""
+
+import pytest
+
+import trainers
+
+ROW = dict.fromkeys(trainers.COLUMNS, "") | {"program": "P", "task": "T-v1", "num_envs": 8}
+PROGRAM = """
+if __name__ == "__main__":
+    args = tyro.cli(Args)
+    envs = gym.vector.SyncVectorEnv(
+        [make_env(args.env_id, i) for i in range(args.num_envs)]
+    )
+    assert envs
+"""
+
+
+def test_one_statement_is_changed():
+    pytest.importorskip("torch")
+    import trainers_cleanrl
+
+    changed = trainers_cleanrl.changed(PROGRAM).splitlines()
+    before = PROGRAM.splitlines()
+    assert changed == [*before[:3], "    " + trainers_cleanrl.LINE, before[-1]]
+    for text in ("x = 1\n", PROGRAM + "    envs = 1\n"):
+        with pytest.raises(ValueError, match=r"in [02] places; expected one"):
+            trainers_cleanrl.changed(text)
+
+
+def test_the_table_tells_means_with_intervals_and_median_seconds(tmp_path):
+    path = tmp_path / "rows.csv"
+    for side, returns in (("gymnasium", (10, 20, 60)), ("mjx_reinforce", (1000, 1010, 1020))):
+        for seed, value in enumerate(returns):
+            told = {"env_steps": 2048, "mean_return": value, "start_seconds": 1}
+            times = {"seconds": seed + 1.2, "cpu_seconds": seed * 9}
+            trainers.append(path, ROW | told | times | {"environment": side, "seed": seed})
+    line = trainers.table(trainers.read(path)).splitlines()[2]
+    program, task, num_envs, steps, theirs, ours, seconds, _ = line.strip("| ").split(" | ")
+    assert (program, task, num_envs, steps) == ("P", "T-v1", "8", "2,048")
+    assert theirs.startswith("30 (")
+    assert ours.startswith("1,010 (1,")
+    assert seconds == "2 (9)"
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_stable_baselines3_is_trained_on_both_sides(tmp_path, capsys):
+    pytest.importorskip("stable_baselines3")
+    path = tmp_path / "rows.csv"
+    told = {"task": "InvertedPendulum-v5", "rollout": 256, "env_steps": 500, "seeds": (0, 1)}
+    trainers.main(trainers.Sb3(**told, rows=path))
+    rows = trainers.read(path)
+    assert [(row["environment"], row["seed"]) for row in rows] == [
+        *(("gymnasium", "0"), ("mjx_reinforce", "0")),
+        *(("gymnasium", "1"), ("mjx_reinforce", "1")),
+    ]
+    assert all(row["env_steps"] == 512 and row["mean_return"] > 3 for row in rows)
+    trainers.main(trainers.Table(rows=path))
+    assert "| Stable-Baselines3 | InvertedPendulum-v5 | 8 | 512 | " in capsys.readouterr().out
