@@ -186,9 +186,9 @@ def table(rows: list[dict[str, Any]]) -> str:
     clock, and of computing on any core.
     """
     lines = [
-        "| program | task | environments | env steps | return on theirs | return on ours "
+        "| program | task | environments | env steps | seeds | return on theirs | return on ours "
         "| seconds (CPU) on theirs | seconds (CPU) on ours |",
-        "|---|---|---:|---:|---:|---:|---:|---:|",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
     cases = dict.fromkeys((row["program"], row["task"], row["num_envs"]) for row in rows)
     for case in cases:
@@ -196,7 +196,8 @@ def table(rows: list[dict[str, Any]]) -> str:
         sides = [[row for row in some if (row["environment"] == OURS) == ours] for ours in (0, 1)]
         if not all(sides):  # the second is still being trained
             continue
-        cells = [*case, f"{some[0]['env_steps']:,.0f}", *map(_return, sides), *map(_time, sides)]
+        played, seeds = f"{some[0]['env_steps']:,.0f}", str(len(sides[1]))
+        cells = [*case, played, seeds, *map(_return, sides), *map(_time, sides)]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
