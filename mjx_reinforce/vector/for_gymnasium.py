@@ -207,13 +207,12 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Returns what Gymnasium keeps apart: entries by name, each with a mask behind "_"."""
         told = {name: self._out(x) for name, x in state.metrics.items()}
         everywhere = np.ones(self.num_envs, bool)
-        if self.vec.autoreset != "same_step":
-            info = told | {f"_{name}": everywhere for name in told}
-        else:
-            ended = np.asarray(state.done)
-            info = {"final_info": told | {f"_{name}": ended for name in told}, "_final_info": ended}
+        ended = np.asarray(state.done) & (self.vec.autoreset == "same_step")
+        info: dict[str, Any] = told | {f"_{name}": ~ended for name in told}
+        if ended.any():
+            final = told | {f"_{name}": ended for name in told}
+            info |= {"final_info": final, "_final_info": ended}
             info |= {"final_obs": self._final(state, ended), "_final_obs": ended}
-            info = info if ended.any() else {}
         broken = np.asarray(state.nonfinite)
         return info | {"nonfinite": broken, "_nonfinite": everywhere} if broken.any() else info
 

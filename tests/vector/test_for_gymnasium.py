@@ -104,6 +104,20 @@ def test_same_step_tells_the_last_observation():
     assert np.abs(np.stack(info["final_obs"])).max() > 0.05
 
 
+def test_same_step_tells_the_terms_of_every_step():
+    """Those of a step that ended an episode are apart, as Gymnasium has it."""
+    make = {"num_envs": 2, "autoreset": "same_step", "max_episode_steps": 3}
+    env = gymnasium.make_vec("mjx_reinforce/InvertedPendulum-v5", **make)
+    env.reset(seed=0)
+    for t in range(1, 7):
+        *_, info = env.step(np.zeros((2, 1)))
+        ended = t % 3 == 0
+        assert info["_reward_survive"].tolist() == [not ended] * 2
+        assert ("final_info" in info) == ended
+        told = info["final_info"] if ended else info
+        assert told["reward_survive"].tolist() == [1, 1]
+
+
 def test_wrappers_of_gymnasium_count_episodes():
     env = gymnasium.wrappers.vector.RecordEpisodeStatistics(
         gymnasium.make_vec(CART, num_envs=8, max_episode_steps=20)
