@@ -15,6 +15,7 @@ from mjx_reinforce import envs
 for _id in envs.names():
     gymnasium.register(
         f"mjx_reinforce/{_id}",
+        entry_point="mjx_reinforce.vector.for_gymnasium:only_many",
         vector_entry_point="mjx_reinforce.vector.for_gymnasium:make",
         kwargs={"env": _id},
     )

@@ -61,13 +61,13 @@ def rollout(
     Raises:
       ValueError: an argument makes no sense, or the engine cannot play this.
     """
+    if hasattr(env, "num_envs"):
+        raise ValueError("rollout takes one environment, and this is many: pass its env, vec.env")
     check_parts(env)
-    if not callable(act):
-        raise ValueError(f"act must be a function, such as learner.act, got a {type(act).__name__}")
-    check_kind("distribution", distribution, Distribution, "learner.policy.distribution")
     check_key(key)
     check_count("num_episodes", num_episodes)
     check_count("horizon", horizon)
+    check_policy(act, params, distribution, jax.eval_shape(env.reset, jax.random.key(0)).obs)
     play = _player(engine, env, act, params, distribution, horizon)
     return play(
         env,
@@ -80,6 +80,31 @@ def rollout(
         deterministic=deterministic,
         active=active,
     )
+
+
+def check_policy(
+    act: Act, params: PyTree, distribution: Distribution, observation: jax.ShapeDtypeStruct
+) -> None:
+    """Raises ValueError for a policy whose outputs are not the distribution's parameters.
+
+    Args:
+      act: (params, observation [O]) -> outputs [K].
+      params: what ``act`` reads.
+      distribution: the family whose parameters the outputs are.
+      observation: shape and dtype of one.
+    """
+    if not callable(act):
+        raise ValueError(f"act must be a function, such as learner.act, got a {type(act).__name__}")
+    check_kind("distribution", distribution, Distribution, "learner.policy.distribution")
+    of_network, constants = distribution.num_outputs, len(distribution.constants)
+    found = jax.eval_shape(act, params, observation).shape
+    if found != (of_network + constants,):
+        behind = f", and behind them {constants} that no observation changes" if constants else ""
+        raise ValueError(
+            f"act must return [{of_network + constants}] outputs of one observation: {of_network} "
+            f"that a network computes{behind} (they start at distribution.constants); it returns "
+            f"the shape {list(found)}"
+        )
 
 
 def _player(

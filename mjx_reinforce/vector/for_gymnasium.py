@@ -1,5 +1,6 @@
 """The environments as Gymnasium's ``VectorEnv``, with NumPy arrays, JAX's or torch's."""
 
+import os
 from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
@@ -64,7 +65,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         batch = gymnasium.vector.utils.batch_space
         self.observation_space = batch(self.single_observation_space, self.num_envs)
         self.action_space = batch(self.single_action_space, self.num_envs)
-        self._arrays = arrays
+        self._arrays, self._process = arrays, os.getpid()
         self._out = _converter(arrays)
         self._reset, self._restart = jax.jit(vec.reset), jax.jit(vec.restart)
         # What is handed out without a copy must outlive the next step.
@@ -88,9 +89,12 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
           The observations [N, O] and an empty dict.
         """
         self._check_open()
-        mask = (options or {}).get("reset_mask")
+        options = {} if options is None else dict(options)
+        mask = options.pop("reset_mask", None)
+        if options:
+            raise ValueError(f"unknown option {', '.join(map(repr, options))}; known: 'reset_mask'")
         if mask is not None:
-            state = self._reset_some(seed, mask)
+            state = self._reset_some(seed, np.asarray(mask))
         elif seed is None and self.state is not None:
             state = self._restart(self.state, np.ones(self.num_envs, bool))
         else:
@@ -159,21 +163,28 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     def _check_open(self) -> None:
         if self.closed:
             raise gymnasium.error.ClosedEnvironmentError("it was closed; make another")
+        if os.getpid() != self._process:
+            raise RuntimeError(
+                f"it was made in process {self._process}, and this is {os.getpid()}: make it where "
+                "it is used, and start processes by spawn"
+            )
 
     def _keys(self, seed: Seeds) -> jax.Array:
         """Returns a key, or one for each environment."""
         if seed is None:
             seed = int(np.random.SeedSequence().generate_state(1)[0])
-        if not isinstance(seed, Sequence | np.ndarray):
+        if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
             super().reset(seed=int(seed))
             return _key(int(seed))
-        if len(seed) != self.num_envs:
-            raise ValueError(f"there must be {self.num_envs} seeds, one each, got {len(seed)}")
+        if not isinstance(seed, list | tuple | np.ndarray) or len(seed) != self.num_envs:
+            raise ValueError(
+                f"seed must be a whole number, or a list of {self.num_envs}, one each, got {seed!r}"
+            )
         drawn = np.random.SeedSequence().generate_state(self.num_envs)
         return _key(*(int(d if s is None else s) for s, d in zip(seed, drawn, strict=True)))
 
     def _reset_some(self, seed: Seeds, mask: np.ndarray) -> VectorState:
-        if np.shape(mask) != (self.num_envs,) or np.asarray(mask).dtype.kind != "b":
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
             raise ValueError(
                 f"options['reset_mask'] must be a bool array [{self.num_envs}], got {mask!r}"
             )
@@ -193,6 +204,11 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         if isinstance(actions, jax.Array):
             return actions
         actions = np.asarray(actions)
+        if actions.dtype.kind not in "biuf":
+            raise ValueError(
+                f"actions must be numbers {list(self.action_space.shape or ())}, they are of "
+                f"{actions.dtype}"
+            )
         space = self.single_action_space
         if isinstance(space, gymnasium.spaces.Discrete):
             wrong = (actions < 0) | (actions >= space.n)
@@ -249,10 +265,16 @@ def make(
     Raises:
       ValueError: as of ``make_vec``.
     """
-    if isinstance(autoreset, AutoresetMode):
-        autoreset = next(name for name, mode in _MODES.items() if mode == autoreset)
     vec = make_vec(env, num_envs, autoreset=autoreset, **options)
     return GymnasiumVectorEnv(vec, arrays, render_mode)
+
+
+def only_many(env: str, **options: object) -> gymnasium.Env:
+    """Raises ValueError: Gymnasium's ``make`` asks for one environment."""
+    raise ValueError(
+        f"these are many at once: gymnasium.make_vec('mjx_reinforce/{env}', num_envs=...); one of "
+        f"Gymnasium's own is gymnasium.make('{env}')"
+    )
 
 
 def _key(*seeds: int) -> jax.Array:

@@ -8,6 +8,7 @@ from flax import struct
 from jax import lax
 
 from mjx_reinforce.checks import check_kind
+from mjx_reinforce.engines.any_policy import check_policy
 from mjx_reinforce.engines.episode import Act
 from mjx_reinforce.policies.arguments import check_count, check_key
 from mjx_reinforce.policies.distributions.distribution import Distribution
@@ -26,6 +27,7 @@ class Segment:
     reward: [T, N] what that earned
     terminated: [T, N] bool, whether the task ended the episode by it
     truncated: [T, N] bool, whether the time limit did
+    nonfinite: [T, N] bool, whether it left the finite numbers, which terminates the episode
     next_observation: [T, N, O] what it led to, before any reset: its value belongs to a truncated
       episode
     played: [T, N] bool, False where ``next_step`` spent the step on a reset: leave it out of losses
@@ -40,6 +42,7 @@ class Segment:
     reward: jax.Array
     terminated: jax.Array
     truncated: jax.Array
+    nonfinite: jax.Array
     next_observation: jax.Array
     played: jax.Array
     metrics: dict[str, jax.Array]
@@ -81,9 +84,12 @@ def unroll(
     Raises:
       ValueError: an argument makes no sense.
     """
-    check_kind("distribution", distribution, Distribution, "mjx_reinforce.normal(space)")
+    check_kind("vec", vec, VectorEnv, "mjx_reinforce.make_vec(id, num_envs)")
+    vec.check_state(state)
     check_key(key)
     check_count("num_steps", num_steps)
+    one = jax.ShapeDtypeStruct(state.obs.shape[1:], state.obs.dtype)
+    check_policy(act, params, distribution, one)
     waits = vec.autoreset == "next_step"
 
     def step(state: VectorState, key: jax.Array) -> tuple[VectorState, Segment]:
@@ -98,6 +104,7 @@ def unroll(
             reward=after.reward,
             terminated=after.terminated,
             truncated=after.truncated,
+            nonfinite=after.nonfinite,
             next_observation=after.final_obs,
             played=~over if waits else jnp.ones_like(over),
             metrics=after.metrics,

@@ -140,6 +140,21 @@ def test_bad_arguments(change, message):
         any_policy.rollout(env, **(right | change))
 
 
+def test_outputs_that_are_not_the_distributions():
+    vec = make_vec("InvertedPendulum-v5", 2)
+    state, family = vec.reset(KEY), normal(vec.action_space)
+    message = r"must return \[2\] outputs of one observation: 1 that a network computes, .* \[1\]"
+    act = lambda params, x: x[:1]  # noqa: E731
+    with pytest.raises(ValueError, match=message):
+        unroll(vec, act, None, family, state, KEY, 3)
+    with pytest.raises(ValueError, match=message):
+        rollout(vec.env, act, None, family, KEY, num_episodes=2, horizon=3)
+    with pytest.raises(ValueError, match=r"pass its env, vec\.env"):
+        rollout(vec, act, None, family, KEY, num_episodes=2, horizon=3)
+    with pytest.raises(ValueError, match="vec must be"):
+        unroll(vec.env, act, None, family, state, KEY, 3)
+
+
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])
 def test_segments_go_on(autoreset):
     """Two of 20 steps are one of 40; what they say fits together."""

@@ -88,6 +88,8 @@ def test_some_are_reset(cart):
     assert np.any(after[0] != before[0])
     with pytest.raises(ValueError, match="must be a bool array"):
         cart.reset(options={"reset_mask": [True]})
+    with pytest.raises(ValueError, match="unknown option 'reset_maks'; known: 'reset_mask'"):
+        cart.reset(options={"reset_maks": mask})
 
 
 def test_same_step_tells_the_last_observation():
@@ -137,6 +139,7 @@ def test_wrappers_of_gymnasium_count_episodes():
         (HOPPER, np.zeros((2, 4)), r"must be \[2, 3\], got the shape \[2, 4\]"),
         (CART, np.array([0, 2]), "must be 0 to 1, got 2"),
         (CART, np.zeros(2), "must be int32, got float"),
+        (CART, np.array(["left", "right"]), "must be numbers"),
     ],
 )
 def test_bad_actions(env_id, actions, message):
@@ -160,7 +163,7 @@ def test_out_of_range_is_clamped_by_the_actuators_alone():
 def test_wrong_order_and_bad_arguments(cart):
     with pytest.raises(ValueError, match="call reset before step"):
         cart.step(np.zeros(3, int))
-    with pytest.raises(ValueError, match="there must be 3 seeds"):
+    with pytest.raises(ValueError, match="or a list of 3, one each"):
         cart.reset(seed=[1, 2])
     with pytest.raises(ValueError, match="render_mode"):
         gymnasium.make_vec(CART, num_envs=1, render_mode="human")
@@ -168,6 +171,25 @@ def test_wrong_order_and_bad_arguments(cart):
         gymnasium.make_vec(CART, num_envs=1, render_mode="rgb_array")
     with pytest.raises(ValueError, match="arrays"):
         for_gymnasium.make("CartPole-v1", 1, arrays="list")
+
+
+def test_one_at_a_time_is_not_made():
+    with pytest.raises(ValueError, match=r"gymnasium\.make_vec\('mjx_reinforce/CartPole-v1'"):
+        gymnasium.make(CART)
+
+
+@pytest.mark.parametrize("seed", [1.5, True, "abc"])
+def test_seeds_that_are_none(cart, seed):
+    with pytest.raises(ValueError, match="seed must be a whole number"):
+        cart.reset(seed=seed)
+
+
+def test_in_another_process(cart, monkeypatch):
+    cart.reset(seed=0)
+    here = cart.unwrapped._process
+    monkeypatch.setattr(for_gymnasium.os, "getpid", lambda: here + 1)
+    with pytest.raises(RuntimeError, match="start processes by spawn"):
+        cart.step(np.zeros(3, int))
 
 
 def test_closed_twice(cart):

@@ -2,6 +2,7 @@
 
 import functools
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -172,6 +173,23 @@ def test_bad_keys_actions_and_states():
         vec.reset(jax.random.key(0, impl="rbg"))
     with pytest.raises(ValueError, match=r"must be int32, got float32"):
         make_vec("CartPole-v1", 4).step(None, jnp.zeros(4))
+    other = make_vec("CartPole-v1", 4).reset(jax.random.key(0))
+    for wrong, message in (
+        (state.obs, "must be what reset or step returned, got a"),
+        (None, "got a NoneType"),
+        ((state, 1), "got a tuple"),
+        (other, "is of another task than InvertedPendulum"),
+        (state.replace(final_obs=state.final_obs[:, :2]), "or was changed"),
+        (state.replace(reward=state.reward.astype(int)), "or was changed"),
+        (jax.tree.map(lambda x: x[0], state), "is of one environment, not of 4"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            jax.jit(vec.step)(wrong, jnp.zeros((4, 1)))
+
+
+def test_gymnasiums_own_names_of_autoreset():
+    mode = gymnasium.vector.AutoresetMode.SAME_STEP
+    assert make_vec("CartPole-v1", 1, autoreset=mode).autoreset == "same_step"
 
 
 def test_why_an_engine_was_chosen():
