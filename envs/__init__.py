@@ -8,7 +8,7 @@ directly. Nothing heavy is imported before ``make``.
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from mjx_reinforce.checks import BadEnvironmentError, check_parts, explain
@@ -74,6 +74,25 @@ def make(id: str, /, **kwargs: object) -> Any:
         raise ValueError(f"cannot build the environment {id!r}: {explain(error)}") from error
     check_parts(env)
     return env
+
+
+def make_set(id: str, words: Sequence[str] = ()) -> Any:
+    """Builds an environment with settings as ``--env-set`` has them, such as "frame_skip=2".
+
+    Args:
+      id: as for ``make``.
+      words: NAME=VALUE each, see ``settings.read_settings``.
+
+    Raises:
+      ValueError: as ``make``; or a name or a value is none of the environment's settings.
+    """
+    if not words:
+        return make(id)
+    check_id(id)
+    task = _import(id, id if ":" in id else _TABLE[id][0])
+    from mjx_reinforce.envs.settings import read_settings
+
+    return make(id, **read_settings(task, words))
 
 
 def make_vec(env: Any, num_envs: int, **options: Any) -> Any:

@@ -75,7 +75,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
                 made = new
                 interrupt.on_exit(lambda: remove_empty(made))
             # A module of the user's is imported before JAX starts, which it may set up.
-            env = None if envs.is_ours(config.env) else envs.make(config.env)
+            env = None if envs.is_ours(config.env) else envs.make_set(config.env, config.env_set)
             configure_jax()
             with heartbeat(to_screen, None, "writing the simulation out"):
                 default = start(arguments, "train")[0]

@@ -129,7 +129,7 @@ def film(settings: WatchSettings) -> None:
     from mjx_reinforce.playing.simulations import check_observations
 
     roles = cast(settings, source)
-    env = envs.make(source.env)
+    env = envs.make_set(source.env, source.run.env_set if source.run else ())
     check_observations(env, roles[-1].player, source)
     if settings.live:
         from mjx_reinforce.playing.live import live

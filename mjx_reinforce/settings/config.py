@@ -7,6 +7,7 @@ import reprlib
 
 from mjx_reinforce import envs
 from mjx_reinforce.checks import changed_fields, check_type
+from mjx_reinforce.envs.settings import split_words
 from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS, check_name
 from mjx_reinforce.settings.declare import MAX_COUNT, MAX_OF_UPDATE, Range
 from mjx_reinforce.settings.groups import (
@@ -87,6 +88,7 @@ def check_each(config: Config) -> None:
     for field in dataclasses.fields(Config):
         check_type(flag(field.name), getattr(config, field.name), field.type)
     envs.check_id(config.env)
+    split_words(config.env_set)
     check_name("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
     check_name("estimator", config.estimator, ESTIMATORS)
     for rule in Range:

@@ -100,6 +100,9 @@ class RunSettings:
     )
     """Environment id, or module:Class for your own environment. `python -m mjx_reinforce.envs`
     lists the ids."""
+    env_set: tuple[str, ...] = ()
+    """Settings of the environment, each NAME=VALUE, such as ctrl_cost_weight=0.1 (bounds: 0.2,1).
+    `python -m mjx_reinforce.envs ID` lists them."""
     algorithm: Literal["reinforce", "ars"] = "reinforce"
     """reinforce follows the policy gradient; ars (augmented random search, Mania et al. 2018) tries
     out changes of the parameters. Its own settings are in the group "search" below."""

@@ -154,9 +154,13 @@ def _finish(
     from mjx_reinforce.sweeps.designs.grid import configure
     from mjx_reinforce.sweeps.designs.rungs import winner
 
-    def settings(number: int) -> tuple[dict[str, Any], int]:
+    def settings(number: int) -> tuple[dict[str, Any], dict[str, Any]]:
         [config] = configure(design.base, [prepared.configurations[number]])
-        return policy_settings(prepared.env, config), prepared.horizon
+        group = next(i for i, each in enumerate(prepared.groups) if number in each.members)
+        run = {"env": config.env, "horizon": prepared.horizon}
+        if config.env_set:
+            run["env_set"] = list(config.env_set)
+        return policy_settings(prepared.envs[group], config), run
 
     files.finish()
     if contents["status"] == "finished":
@@ -183,7 +187,7 @@ def _contents(design: Design, prepared: "Prepared", known: Mapping[str, Any]) ->
     return {
         "status": "running",
         "env": design.base.env,
-        "threshold": getattr(prepared.env, "reward_threshold", None),
+        "threshold": getattr(prepared.envs[0], "reward_threshold", None),
         **as_record(design),
         "num_seeds": design.base.num_seeds,
         "configurations": [
