@@ -57,6 +57,8 @@ class WatchSettings:
     env: str | None = None
     """Needed where a run was trained on module:Class, code of your own or of another: that name
     again, for then it is run."""
+    policy: str | None = None
+    """Needed where the distribution of a run is module:name, as --env is."""
     seed: SeedChoice = "best"
     """Which of the run's seeds plays: best, worst or median by its final evaluation, or a number.
     """
@@ -181,7 +183,7 @@ def _check_env(settings: WatchSettings, source: PolicySource) -> None:
     """Raises ValueError for another environment than the run's, or where one must be named."""
     if settings.env not in (None, source.env):
         raise ValueError(f"--env is {settings.env}, but {settings.run} was trained on {source.env}")
-    check_named(source.env, settings.env, settings.run)
+    check_named({"env": source.env}, {"env": settings.env}, settings.run)
 
 
 def _waiting(what: str) -> AbstractContextManager[Any]:
