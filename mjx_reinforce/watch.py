@@ -260,7 +260,7 @@ def scene(env: "MujocoEnv") -> Any:
     """
     settings = getattr(env, "settings", None)
     xml_file = getattr(env, "scene", None) or getattr(settings, "xml_file", None)
-    if xml_file is not None:
+    if xml_file is not None and not hasattr(xml_file, "nbody"):  # no compiled model
         from mjx_reinforce.envs import models
         from mjx_reinforce.export.scenery import dress
 

@@ -91,8 +91,8 @@ def check_each(config: Config) -> None:
     split_words(config.env_set)
     if config.algorithm not in ALGORITHMS and not is_own(config.algorithm):
         raise ValueError(
-            f"--algorithm takes {' or '.join(sorted(ALGORITHMS))}, got {config.algorithm!r}; your "
-            "own is named module:name"
+            f"--algorithm must be {' or '.join(sorted(ALGORITHMS))}, or module:name for your own, "
+            f"got {config.algorithm!r}"
         )
     check_choice("algorithm", config.algorithm, ALGORITHMS)
     check_choice("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
