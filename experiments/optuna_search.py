@@ -45,7 +45,8 @@ def train(trial: optuna.Trial, base: Config) -> float | None:
 def search(base: Config, trials: int) -> optuna.Study:
     """Returns a study with so many trials."""
     sampler = optuna.samplers.TPESampler(seed=0)
-    study = optuna.create_study(direction="maximize", sampler=sampler)
+    pruner = optuna.pruners.MedianPruner(n_warmup_steps=MOMENTS // 4)  # until then all are alike
+    study = optuna.create_study(direction="maximize", sampler=sampler, pruner=pruner)
     for _ in range(trials):
         trial = study.ask()
         value = train(trial, base)

@@ -47,7 +47,8 @@ def module(monkeypatch):
         Trial=Trial,
         Study=Study,
         samplers=types.SimpleNamespace(TPESampler=lambda seed: None),
-        create_study=lambda direction, sampler: Study(),
+        pruners=types.SimpleNamespace(MedianPruner=lambda n_warmup_steps: None),
+        create_study=lambda direction, sampler, pruner: Study(),
         trial=types.SimpleNamespace(TrialState=types.SimpleNamespace(PRUNED="pruned")),
     )
     monkeypatch.setitem(sys.modules, "optuna", fake)
