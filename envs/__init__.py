@@ -5,20 +5,16 @@ An environment is a ``brax.envs.base.Env`` whose ``reset`` and ``step`` call MJX
 directly. Nothing heavy is imported before ``make``.
 """
 
-import os
 import re
-import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from mjx_reinforce.checks import BadEnvironmentError, check_parts, explain
 from mjx_reinforce.physics.quiet import silence_mjx
-from mjx_reinforce.registry import check_name, load_definition
+from mjx_reinforce.registry import check_name, load_definition, load_ours, load_own
 
 silence_mjx()  # before any environment imports it
 
-#: What the system's loader says of a library for which there is no memory.
-_NO_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory")
 _CART_POLE = "mjx_reinforce.envs.tasks.cart_pole:CartPole"
 _INVERTED_PENDULUM = "mjx_reinforce.envs.tasks.inverted_pendulum:InvertedPendulum"
 
@@ -76,6 +72,25 @@ def make(id: str, /, **kwargs: object) -> Any:
     return env
 
 
+def make_set(id: str, words: Sequence[str] = ()) -> Any:
+    """Builds an environment with settings as ``--env-set`` has them, such as "frame_skip=2".
+
+    Args:
+      id: as for ``make``.
+      words: NAME=VALUE each, see ``settings.read_settings``.
+
+    Raises:
+      ValueError: as ``make``; or a name or a value is none of the environment's settings.
+    """
+    if not words:
+        return make(id)
+    check_id(id)
+    task = _import(id, id if ":" in id else _TABLE[id][0])
+    from mjx_reinforce.envs.settings import read_settings
+
+    return make(id, **read_settings(task, words))
+
+
 def make_vec(env: object, num_envs: int, **options: object) -> Any:
     """Makes N environments that play at once: ``mjx_reinforce.make_vec``, beside ``make``."""
     return load_definition("mjx_reinforce.vector.environment:make_vec")(env, num_envs, **options)
@@ -83,25 +98,9 @@ def make_vec(env: object, num_envs: int, **options: object) -> Any:
 
 def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
     """Returns the class or function of an entry of the table, or of "module:Class"."""
-    if ":" in id and not {"", os.getcwd()} & set(sys.path):  # python -m has it, a script has not
-        sys.path.insert(0, os.getcwd())
-    try:
-        build = load_definition(entry)
-    except (Exception, SystemExit) as error:  # an import runs the user's code
-        remedy = "write module:Class of a module that is in this folder or installed"
-        if isinstance(error, MemoryError) or any(text in str(error) for text in _NO_MEMORY):
-            remedy = "there is not enough memory for the libraries: see ulimit -v"
-        elif ":" not in id:
-            remedy = "see whether what this package needs is installed: pip check"
-        raise ValueError(
-            f"cannot import the environment {id!r}: {explain(error)}; {remedy}"
-        ) from error
-    if not callable(build):
-        raise ValueError(
-            f"the environment {id!r} is no class or function, but of type {type(build).__name__}; "
-            "write module:Class"
-        )
-    return build
+    if ":" in id:
+        return load_own("environment", id, form="module:Class")
+    return load_ours("environment", id, entry)
 
 
 def check_id(id: str) -> None:

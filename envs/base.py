@@ -14,7 +14,8 @@ from mujoco import mjx
 
 from mjx_reinforce.checks import changed_fields
 from mjx_reinforce.envs import models
-from mjx_reinforce.envs.outcomes import check_outcome, check_shape, check_start
+from mjx_reinforce.envs.outcomes import check_episode, check_outcome, check_shape, check_start
+from mjx_reinforce.envs.parts import Named, View
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings, check_positive
 from mjx_reinforce.fused import prune
 from mjx_reinforce.physics import mjx_internals
@@ -36,6 +37,7 @@ class Physics:
     act: [na] activations of the actuators that have a state
     qacc_warmstart: [nv] where the constraint solver starts (m/s^2, rad/s^2)
     carried: fields of the last step's mjx.Data that the next outcome reads, by their names
+    episode: what ``MujocoEnv.randomize`` returned
     """
 
     time: jax.Array
@@ -44,14 +46,16 @@ class Physics:
     act: jax.Array
     qacc_warmstart: jax.Array
     carried: dict[str, jax.Array] = struct.field(default_factory=dict)
+    episode: dict[str, jax.Array] = struct.field(default_factory=dict)
 
 
-class Before(Simulation):
+class Before(Named, Simulation):
     """What is known of the start of an env step, under MuJoCo's own names."""
 
-    def __init__(self, known: dict[str, jax.Array]):
+    def __init__(self, known: dict[str, jax.Array], mj_model: Any, episode: dict[str, Any]):
         """Shows the given fields of mjData; any other raises AttributeError when it is read."""
         vars(self).update(known)
+        self.mj_model, self.episode = mj_model, episode
 
     def __getattr__(self, name: str) -> Any:
         raise AttributeError(
@@ -80,8 +84,9 @@ class MujocoEnv(Env):
     class Settings(EpisodeSettings):
         """Arguments of every task on a MuJoCo model."""
 
-        xml_file: str
-        """The model: a file of this package's assets, or a path with a folder in it."""
+        xml_file: str | models.MjSpec | models.MjModel
+        """The model: a file of this package's assets, or a path with a folder in it; or an
+        ``mujoco.MjSpec`` or ``mujoco.MjModel``, which is copied."""
         frame_skip: int
         """Physics steps an env step; the model says how many seconds a physics step lasts."""
         solver: str = "exact"
@@ -127,10 +132,9 @@ class MujocoEnv(Env):
         # Tracing the physics takes a second of Python; jit does it once.
         forward = physics.forward if self.settings.solver == "exact" else mjx.forward
         forward = mjx_internals.fenced(forward)
+        self._evaluate = forward
         self._forward = jax.jit(functools.partial(forward, self.model))
-        exact = functools.partial(physics.step, evaluate=self._forward)
-        step = exact if self.settings.solver == "exact" else mjx.step
-        self._physics_step = jax.jit(functools.partial(step, self.model))
+        self._physics_step = jax.jit(self._step_of(self.model, self._forward))
         self._start = jax.jit(prune(self._forward_state))
         low, high = np.array(self.mj_model.actuator_ctrlrange).T
         limited = np.array(self.mj_model.actuator_ctrllimited, bool)
@@ -142,43 +146,90 @@ class MujocoEnv(Env):
 
     @abc.abstractmethod
     def outcome(
-        self, before: Before, data: Simulation, action: jax.Array
+        self, before: Before, data: View, action: jax.Array
     ) -> tuple[float | jax.Array, bool | jax.Array, dict[str, Any]]:
         """Returns the reward [], whether the episode terminated [], and the reward's terms.
 
         Args:
           before: the simulation at the start of the env step. It has time, qpos, qvel, act, and
             the fields in ``carried``: "ctrl" there is what was applied in the env step before.
-          data: the simulation after the env step; it has every field of mjData.
+          data: the simulation after the env step; it has every field of mjData, parts by their
+            names, as ``data.site("tip").xpos`` (see ``parts.Named``), and ``data.episode``.
           action: [A] as the policy gave it.
         """
 
-    def observe(self, data: Simulation) -> jax.Array:
+    def randomize(self, rng: jax.Array) -> dict[str, Any]:
+        """Draws what differs from episode to episode; by default nothing. Consumes the key.
+
+        Returns:
+          Numbers and arrays by name, such as a goal or a command, which ``outcome`` and ``observe``
+          read as ``data.episode["goal"]``. Those with a name of ``models.RANDOM``, such as
+          ``geom_friction`` [ngeom, 3] or ``body_mass`` [nbody], take the place of that field of
+          the model in this episode. What MuJoCo computes from a field when it compiles a model,
+          such as ``dof_invweight0``, stays that of the model.
+        """
+        return {}
+
+    def observe(self, data: View) -> jax.Array:
         """Returns the observation [O]; by default qpos, then qvel."""
         return jnp.concatenate([data.qpos, data.qvel])
 
     def reset(self, rng: jax.Array) -> State:
         """Returns the start of an episode; consumes the key."""
-        sizes = self.mj_model.nq, self.mj_model.nv
-        return self.set_state(*check_start(type(self).__name__, self.initial(rng), sizes))
+        episode, start = self.draw(rng)
+        return self.set_state(*start, episode)
 
-    def set_state(self, qpos: jax.Array, qvel: jax.Array) -> State:
+    def draw(self, rng: jax.Array) -> tuple[dict[str, jax.Array], tuple[jax.Array, jax.Array]]:
+        """Returns what ``randomize`` and ``initial`` return, checked; consumes the key."""
+        name, episode = type(self).__name__, {}
+        if type(self).randomize is not MujocoEnv.randomize:
+            key, rng = jax.random.split(rng)
+            episode = check_episode(name, self.randomize(key), self.model)
+        sizes = self.mj_model.nq, self.mj_model.nv
+        return episode, check_start(name, self.initial(rng), sizes)
+
+    def set_state(
+        self, qpos: jax.Array, qvel: jax.Array, episode: dict[str, jax.Array] | None = None
+    ) -> State:
         """Returns the state at given positions and velocities, as Gymnasium's ``set_state``.
 
         Args:
           qpos: [nq] generalised positions (m, rad).
           qvel: [nv] generalised velocities (m/s, rad/s).
+          episode: what the task's ``randomize`` returns, where it has one.
         """
         check_shape("qpos", qpos, (self.mj_model.nq,))
         check_shape("qvel", qvel, (self.mj_model.nv,))
-        return self._start(qpos, qvel)
+        return self._start(qpos, qvel, episode or {})
 
-    def _forward_state(self, qpos: jax.Array, qvel: jax.Array) -> State:
+    def _step_of(self, model: mjx.Model, forward: Any) -> Any:
+        """Returns a physics step of a model, of which ``forward`` is the forward pass."""
+        if self.settings.solver == "exact":
+            return functools.partial(physics.step, model, evaluate=forward)
+        return functools.partial(mjx.step, model)
+
+    def _physics_of(self, episode: dict[str, jax.Array]) -> tuple[Any, Any]:
+        """Returns the forward pass and the step of the model as it is in an episode."""
+        fields = {name: value for name, value in episode.items() if name in models.RANDOM}
+        if not fields:
+            return self._forward, self._physics_step
+        model = self.model.replace(**fields)
+        forward = functools.partial(self._evaluate, model)
+        return forward, self._step_of(model, forward)
+
+    def _view(self, data: mjx.Data, episode: dict[str, jax.Array]) -> View:
+        """Returns a simulation as the task reads it."""
+        return View(data, self.mj_model, episode)
+
+    def _forward_state(
+        self, qpos: jax.Array, qvel: jax.Array, episode: dict[str, jax.Array]
+    ) -> State:
         """Returns the state at positions and velocities, from one forward pass."""
         start = models.make_data(self.mj_model).replace(qpos=qpos, qvel=qvel)
         # MJX normalises quaternions in qpos itself; MuJoCo does so when it steps.
-        data = physics.like(self._forward(start).replace(qpos=qpos), start)
-        state, view = self._physics(data), Simulation(data)
+        forward, _ = self._physics_of(episode)
+        data = physics.like(forward(start).replace(qpos=qpos), start)
+        state, view = self._physics(data, episode), self._view(data, episode)
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
         terms = self._checked_outcome(self._before(state, start), view, action)[2]
@@ -189,39 +240,42 @@ class MujocoEnv(Env):
         check_shape("the action", action, (self.action_size,))
         before = cast(Any, state.pipeline_state)
         start = models.make_data(self.mj_model).replace(**_carried(before))
+        _, physics_step = self._physics_of(before.episode)
         data = jax.lax.fori_loop(
             0,
             self.frame_skip,
-            lambda _, data: physics.like(self._physics_step(data), data),
+            lambda _, data: physics.like(physics_step(data), data),
             start.replace(ctrl=jnp.asarray(action, start.ctrl.dtype)),
         )
         if self.contact_forces:
-            data = mjx.rne_postconstraint(self.model, data)
-        view = Simulation(data)
+            fields = {k: v for k, v in before.episode.items() if k in models.RANDOM}
+            data = mjx.rne_postconstraint(self.model.replace(**fields), data)
+        view = self._view(data, before.episode)
         reward, terminated, terms = self._checked_outcome(self._before(before, start), view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
-            pipeline_state=self._physics(data),
+            pipeline_state=self._physics(data, before.episode),
             obs=self.observe(view),
             reward=jnp.asarray(reward, dtype),
             done=jnp.asarray(terminated, dtype),
             metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
         )
 
-    def _checked_outcome(self, before: Before, data: Simulation, action: jax.Array) -> Any:
+    def _checked_outcome(self, before: Before, data: View, action: jax.Array) -> Any:
         """Returns what ``outcome`` returns, or raises ValueError where it is no outcome."""
         return check_outcome(type(self).__name__, self.outcome(before, data, action))
 
     def _before(self, state: Physics, start: mjx.Data) -> Before:
         """Returns the start of an env step as ``outcome`` may read it."""
         constant = {name: getattr(start, name) for name in models.CONSTANT}
-        return Before(constant | state.carried | _carried(state))
+        known = constant | state.carried | _carried(state)
+        return Before(known, self.mj_model, state.episode)
 
-    def _physics(self, data: mjx.Data) -> Physics:
+    def _physics(self, data: mjx.Data, episode: dict[str, jax.Array]) -> Physics:
         """Returns what the next env step needs to know of a simulation."""
         kept = {name: getattr(Simulation(data), name) for name in self.carried}
-        return Physics(**_carried(data), carried=kept)
+        return Physics(**_carried(data), carried=kept, episode=episode)
 
     @property
     def num_contacts(self) -> int:

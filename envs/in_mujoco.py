@@ -1,6 +1,6 @@
 """A task stepped by C MuJoCo: one episode plays at once, where JAX would compile for a minute."""
 
-import types
+import copy
 from typing import Any
 
 import jax
@@ -15,16 +15,18 @@ from mujoco import (  # a C extension
 
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
+from mjx_reinforce.envs.parts import Named, View
 from mjx_reinforce.physics.mjx_internals import Simulation
 from mjx_reinforce.types import Environment
 
 _LEAVE_OUT = "leave --backend mujoco out"
 
 
-class _Recorder(Simulation):
+class _Recorder(View):
     """An mjData of zeros that remembers which of its fields were read."""
 
-    def __init__(self, sizes: Simulation):
+    def __init__(self, sizes: Simulation, mj_model: Any):
+        super().__init__(None, mj_model, {})
         self.sizes, self.read = sizes, set()
 
     def __getattr__(self, name: str) -> jax.Array:
@@ -33,6 +35,16 @@ class _Recorder(Simulation):
             raise ValueError(f"the task reads {name}, which is no array of mjData; {_LEAVE_OUT}")
         self.read.add(name)
         return jnp.zeros(shape.shape, shape.dtype)
+
+
+class _Fields(Named):
+    """Some fields of mjData, as attributes."""
+
+    def __init__(self, fields: dict[str, Any], mj_model: Any, episode: dict[str, Any]):
+        vars(self).update(fields, mj_model=mj_model, episode=episode)
+
+    def __getattr__(self, name: str) -> Any:  # for type checkers
+        raise AttributeError(name)
 
 
 class InMujoco:
@@ -59,31 +71,32 @@ class InMujoco:
             raise ValueError(
                 f"{own.__name__} has steps of its own, which MuJoCo does not know; {_LEAVE_OUT}"
             )
-        self.env, self.data = env, MjData(env.mj_model)
+        self.env, self.model, self.data = env, env.mj_model, MjData(env.mj_model)
+        self._episode, _ = jax.eval_shape(env.draw, jax.random.key(0))
         self._sizes = Simulation(jax.eval_shape(lambda: models.make_data(env.mj_model)))
-        recorder = _Recorder(self._sizes)
-        jax.eval_shape(
-            lambda before, action: (
-                env.outcome(Before(before), recorder, action),
-                env.observe(recorder),
-            ),
-            self._kept(),
-            jnp.zeros(env.action_size),
-        )
+        recorder = _Recorder(self._sizes, env.mj_model)
+
+        def read(before, episode, action):
+            recorder.episode = episode
+            outcome = env.outcome(Before(before, env.mj_model, episode), recorder, action)
+            return outcome, env.observe(recorder)
+
+        jax.eval_shape(read, self._kept(), self._episode, jnp.zeros(env.action_size))
         self._read = sorted(recorder.read)
         self._fields()  # raises for those of another size
-        self._start = jax.jit(env.initial)
-        self._observe = jax.jit(lambda fields: env.observe(_data(fields)))
+        self._start = jax.jit(env.draw)
+        self._observe = jax.jit(lambda fields, episode: env.observe(self._view(fields, episode)))
         self._advance = jax.jit(self._outcome)
 
     def reset(self, rng: jax.Array) -> np.ndarray:
         """Begins an episode and returns its first observation [O]; consumes the key."""
-        qpos, qvel = self._start(rng)
-        model, data = self.env.mj_model, MjData(self.env.mj_model)
+        self._episode, (qpos, qvel) = self._start(rng)
+        self.model = _with_fields(self.env.mj_model, self._episode)
+        model, data = self.model, MjData(self.model)
         data.qpos[:], data.qvel[:] = qpos, qvel
         mj_forward(model, data)
         self.data = data
-        return np.asarray(self._observe(self._fields()))
+        return np.asarray(self._observe(self._fields(), self._episode))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
         """Returns the next observation [O], the reward, and whether the episode ended.
@@ -93,16 +106,21 @@ class InMujoco:
         """
         before = self._kept()
         self.data.ctrl[:] = action
-        mj_step(self.env.mj_model, self.data, self.env.frame_skip)
+        mj_step(self.model, self.data, self.env.frame_skip)
         if self.env.contact_forces:
-            mj_rnePostConstraint(self.env.mj_model, self.data)
-        observation, reward, ended = self._advance(before, self._fields(), jnp.asarray(action))
+            mj_rnePostConstraint(self.model, self.data)
+        given = before, self._fields(), self._episode, jnp.asarray(action)
+        observation, reward, ended = self._advance(*given)
         return np.asarray(observation), float(reward), bool(ended)
 
-    def _outcome(self, before, fields, action):
-        data = _data(fields)
-        reward, ended, _ = self.env.outcome(Before(before), data, action)
+    def _outcome(self, before, fields, episode, action):
+        data, before = self._view(fields, episode), Before(before, self.env.mj_model, episode)
+        reward, ended, _ = self.env.outcome(before, data, action)
         return self.env.observe(data), reward, ended
+
+    def _view(self, fields: dict[str, Any], episode: dict[str, Any]) -> Any:
+        """Returns fields of mjData as the task reads them."""
+        return _Fields(fields, self.env.mj_model, episode)
 
     def _fields(self) -> dict[str, np.ndarray]:
         """Returns what the task reads of the simulation, in the shapes that MJX has."""
@@ -123,6 +141,12 @@ class InMujoco:
         return value.reshape(shape.shape).astype(shape.dtype)
 
 
-def _data(fields: dict[str, Any]) -> Any:
-    """Returns fields of mjData as attributes."""
-    return types.SimpleNamespace(**fields)
+def _with_fields(model: Any, episode: dict[str, jax.Array]) -> Any:
+    """Returns a model with the fields that an episode replaces."""
+    fields = {name: value for name, value in episode.items() if name in models.RANDOM}
+    if not fields:
+        return model
+    model = copy.copy(model)
+    for name, value in fields.items():
+        getattr(model, name)[:] = value
+    return model

@@ -1,5 +1,6 @@
 """From MJCF to a model that MJX runs, or a clear error."""
 
+import copy
 import importlib.resources
 import warnings
 from collections.abc import Callable, Iterator
@@ -27,6 +28,11 @@ CARRIED = ("time", "qpos", "qvel", "act", "qacc_warmstart")
 GIVEN = ("ctrl",)
 #: What stays as the model has it, since no task changes it.
 CONSTANT = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
+#: Fields of a model that ``MujocoEnv.randomize`` may replace in an episode.
+RANDOM = (
+    *("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_damping", "dof_armature"),
+    *("jnt_stiffness", "actuator_gainprm", "actuator_biasprm", "actuator_gear"),
+)
 #: What MJX does not carry: its size in the model, what it is, and how to do without.
 NOT_CARRIED = {
     "history": ("nhistory", "delays", "remove delay and interval from actuators and sensors"),
@@ -75,16 +81,21 @@ _ONLY_REPORTS = int(mjtEnableBit.mjENBL_ENERGY | mjtEnableBit.mjENBL_FWDINV)
 _ELSE = "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
 
 
-def load_model(xml_file: str) -> Any:
+def load_model(xml_file: Any) -> Any:
     """Compiles an MJCF file of the package's assets, or the user's own by a path.
 
     Args:
-      xml_file: the name of an asset, or a path with a folder in it, such as "./mine.xml".
+      xml_file: the name of an asset, or a path with a folder in it, such as "./mine.xml"; or an
+        ``MjSpec`` or ``MjModel``, of which a copy is taken.
 
     Raises:
       ValueError: there is no such file, MuJoCo cannot compile it, or nothing in it can be moved.
     """
-    if is_own(xml_file):
+    if isinstance(xml_file, MjModel):
+        model = copy.copy(xml_file)
+    elif isinstance(xml_file, MjSpec):
+        model = _compile_model(lambda spec: spec.copy().compile(), xml_file, xml_file)
+    elif is_own(xml_file):
         model = _compile_model(MjModel.from_xml_path, xml_file, xml_file)
     else:
         with warnings.catch_warnings():
@@ -98,16 +109,20 @@ def load_model(xml_file: str) -> Any:
     return model
 
 
-def is_own(xml_file: str) -> bool:
+def is_own(xml_file: Any) -> bool:
     """Returns whether a model is the user's, by a path; raises ValueError where no file is."""
+    if not isinstance(xml_file, str):
+        return True
     own = "/" in xml_file or "\\" in xml_file
     if own and not Path(xml_file).is_file():
         raise ValueError(f"there is no model {xml_file!r} in {Path.cwd()}")
     return own
 
 
-def spec(xml_file: str) -> Any:
+def spec(xml_file: Any) -> Any:
     """Returns a model before it is compiled, an ``MjSpec``; otherwise as ``load_model``."""
+    if isinstance(xml_file, MjSpec):
+        return xml_file.copy()
     if is_own(xml_file):
         return _compile_model(MjSpec.from_file, xml_file, xml_file)
     return _compile_model(MjSpec.from_string, _asset(xml_file), xml_file)
@@ -124,7 +139,7 @@ def _asset(xml_file: str) -> str:
     return asset.read_text(encoding="utf-8")
 
 
-def _compile_model(compiler: Callable[[str], Any], source: str, xml_file: str) -> Any:
+def _compile_model(compiler: Callable[[Any], Any], source: Any, xml_file: Any) -> Any:
     """Returns the model, or raises ValueError with the file's name and what MuJoCo says."""
     try:
         return compiler(source)
@@ -137,7 +152,7 @@ def make_data(model: "mjx.Model") -> mjx.Data:
     return mjx.make_data(model, impl="jax", device=jax.local_devices()[0])
 
 
-def to_mjx(model: Any, xml_file: str) -> mjx.Model:
+def to_mjx(model: Any, xml_file: Any) -> mjx.Model:
     """Returns MJX's version of a compiled model.
 
     Args:

@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 
 from mjx_reinforce.checks import BadEnvironmentError
+from mjx_reinforce.envs.models import RANDOM
 
 
 def check_start(name: str, start: object, sizes: tuple[int, int]) -> tuple[Any, Any]:
@@ -30,6 +32,41 @@ def check_start(name: str, start: object, sizes: tuple[int, int]) -> tuple[Any, 
             )
     qpos, qvel = (jnp.asarray(x, jnp.result_type(x, float)) for x in start)  # also of integers
     return qpos, qvel
+
+
+def check_episode(name: str, episode: object, model: Any) -> dict[str, jax.Array]:
+    """Returns what ``randomize`` returned, as arrays, if it is quantities by their names.
+
+    Args:
+      name: of the task.
+      episode: what it returned.
+      model: the ``mjx.Model`` of which it may replace fields.
+
+    Raises:
+      ValueError: it is something else, or replaces what cannot be replaced.
+    """
+    if not isinstance(episode, dict) or not all(isinstance(key, str) for key in episode):
+        raise BadEnvironmentError(
+            f"{name}.randomize must return a dict of quantities by their names, "
+            f"got {_shape_in_words(episode)}"
+        )
+    arrays = {}
+    for key, value in episode.items():
+        if _shape(value) is None:
+            raise BadEnvironmentError(
+                f"{key!r} of {name}.randomize must be an array, got {_shape_in_words(value)}"
+            )
+        arrays[key] = jnp.asarray(value)
+        if key in RANDOM:
+            field = getattr(model, key)
+            check_shape(f"{key!r} of {name}.randomize", value, field.shape)
+            arrays[key] = arrays[key].astype(field.dtype)
+        elif hasattr(model, key):
+            raise BadEnvironmentError(
+                f"{name}.randomize cannot replace {key} of the model; it can replace "
+                f"{', '.join(RANDOM)}; a quantity of another kind needs another name"
+            )
+    return arrays
 
 
 def check_shape(name: str, value: object, expected: tuple[int, ...]) -> None:

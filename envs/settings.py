@@ -5,9 +5,11 @@ Each argument stands once, with its default, unit and check, in the class that r
 """
 
 import dataclasses
+import typing
+from collections.abc import Sequence
 from typing import Any
 
-from mjx_reinforce.checks import check_type, is_nan
+from mjx_reinforce.checks import check_type, is_nan, read_as, spoken_kind
 from mjx_reinforce.registry import check_name
 
 Interval = tuple[float, float]
@@ -53,6 +55,59 @@ def build_settings(env: Any, arguments: dict[str, Any]) -> Any:
         if is_nan(value):
             raise ValueError(f"{name} of {task} must be a number, got nan")
     return env.Settings(**arguments)
+
+
+def split_words(words: Sequence[str]) -> dict[str, str]:
+    """Returns the texts of settings by their names, from words NAME=VALUE.
+
+    Raises:
+      ValueError: a word is of another form, or a name stands twice.
+    """
+    texts: dict[str, str] = {}
+    for word in words:
+        name, equals, text = word.partition("=")
+        name = name.replace("-", "_")
+        if not (equals and name.isidentifier() and text):
+            raise ValueError(
+                f"--env-set takes NAME=VALUE, such as ctrl_cost_weight=0.1, got {word!r}"
+            )
+        if name in texts:
+            raise ValueError(f"--env-set has {name} twice: {texts[name]} and {text}")
+        texts[name] = text
+    return texts
+
+
+def read_settings(task: Any, words: Sequence[str]) -> dict[str, Any]:
+    """Returns arguments of a task's constructor, from words NAME=VALUE.
+
+    Args:
+      task: the class, with the dataclass ``Settings`` whose annotations say how texts are read:
+        numbers, text, None, True or False, and tuples as 0.2,1.
+      words: as ``--env-set`` has them.
+
+    Raises:
+      ValueError: a name is unknown, or a text is not of its type.
+    """
+    texts = split_words(words)
+    called = getattr(task, "__name__", str(task))
+    form = getattr(task, "Settings", None)
+    if not dataclasses.is_dataclass(form):
+        raise ValueError(
+            f"--env-set {' '.join(words)} has no effect on {called}: it is no class with a "
+            "dataclass Settings, as MujocoEnv has"
+        )
+    kinds = typing.get_type_hints(form)
+    known = {field.name: kinds[field.name] for field in dataclasses.fields(form) if field.init}
+    for name in texts:
+        check_name(f"setting of {called}", name, known)
+    read = {}
+    for name, text in texts.items():
+        try:
+            read[name] = read_as(known[name], text)
+        except (ValueError, TypeError):
+            said = spoken_kind(known[name])
+            raise ValueError(f"--env-set {name} of {called} must be {said}, got {text!r}") from None
+    return read
 
 
 def _needed(field: dataclasses.Field[Any]) -> bool:

@@ -1,5 +1,6 @@
 """Checks of what users give, and one line for what their code, or a library, raised."""
 
+import contextlib
 import dataclasses
 import decimal
 import math
@@ -67,7 +68,7 @@ def check_type(name: str, value: object, kind: object) -> None:
         unions of these, only classes are checked.
     """
     if not fits(value, kind):
-        raise ValueError(f"{name} must be {_spoken(kind)}, got {value!r}")
+        raise ValueError(f"{name} must be {spoken_kind(kind)}, got {value!r}")
 
 
 def fits(value: object, kind: object) -> bool:
@@ -94,18 +95,46 @@ def alternatives(kind: object) -> tuple[Any, ...]:
     return typing.get_args(kind) if union else (kind,)
 
 
-def _spoken(kind: object) -> str:
+def spoken_kind(kind: object) -> str:
     """Returns an annotation in words."""
     if len(kinds := alternatives(kind)) > 1:
-        return " or ".join(map(_spoken, kinds))
+        return " or ".join(map(spoken_kind, kinds))
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
     if origin is typing.Literal:
         return f"one of {', '.join(map(repr, inner))}"
     if origin is tuple and inner[-1] is ...:
-        return f"a tuple, each entry {_spoken(inner[0])}"
+        return f"a tuple, each entry {spoken_kind(inner[0])}"
     if origin is tuple:
-        return f"({', '.join(map(_spoken, inner))})"
+        return f"({', '.join(map(spoken_kind, inner))})"
     return _KINDS[kind][1] if kind in _KINDS else getattr(kind, "__name__", str(kind))
+
+
+def read_as(kind: Any, word: str) -> Any:
+    """Returns a text as a value of an annotation, of a union the first that fits.
+
+    Raises:
+      ValueError: it is none.
+    """
+    if len(kinds := alternatives(kind)) > 1:
+        for each in kinds:
+            with contextlib.suppress(ValueError):
+                return read_as(each, word)
+        raise ValueError(word)
+    if kind is type(None):
+        return {"none": None}[word.lower()] if word.lower() == "none" else _no(word)
+    if kind is bool:
+        words = {"true": True, "false": False}
+        return words[word.lower()] if word.lower() in words else _no(word)
+    if typing.get_origin(kind) is typing.Literal:
+        return word if word in typing.get_args(kind) else _no(word)
+    if typing.get_origin(kind) is tuple:
+        inner = typing.get_args(kind)[0]
+        return tuple(read_as(inner, part) for part in word.split(",")) if word != "none" else ()
+    return whole_number(word) if kind is int else kind(word)
+
+
+def _no(word: str) -> Any:
+    raise ValueError(word)
 
 
 def check_kind(name: str, value: object, kind: type, example: str) -> None:

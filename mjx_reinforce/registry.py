@@ -2,9 +2,13 @@
 
 import difflib
 import importlib
+import os
 import re
+import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
+
+from mjx_reinforce.checks import explain
 
 #: Action distributions: name -> "module:function" of an action space.
 DISTRIBUTIONS = {
@@ -28,6 +32,14 @@ ESTIMATORS = {
     "normalized-returns": "mjx_reinforce.learners.estimators:normalized_returns",
 }
 
+#: Ways to learn: name -> "module:function" of an environment, see ``store.build``.
+ALGORITHMS = {
+    "reinforce": "mjx_reinforce.learners.reinforce:reinforce",
+    "ars": "mjx_reinforce.learners.ars:ars",
+}
+
+#: What the system's loader says of a library for which there is no memory.
+_NO_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory")
 #: How alike names are, as ``difflib`` counts, of which a third of the letters differ.
 _ALIKE = 0.66
 
@@ -45,6 +57,72 @@ def check_name(kind: str, name: str, known: Mapping[str, Any]) -> None:
     near = nearest(name, known)
     hint = f" Did you mean {near!r}?" if near else ""
     raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(known))}.")
+
+
+def is_own(name: str) -> bool:
+    """Returns whether a name is that of the user's own code, module:name."""
+    return ":" in name
+
+
+def check_choice(kind: str, name: str, known: Mapping[str, Any]) -> None:
+    """Raises ValueError for what is neither a known name nor of the form module:name."""
+    if not is_own(name):
+        check_name(kind, name, known)
+    elif not re.fullmatch(r"\w+(\.\w+)*:\w+", name):
+        raise ValueError(
+            f"the {kind} {name!r} is not of the form module:name, such as mine:make for the "
+            "function make in mine.py"
+        )
+
+
+def load_choice(kind: str, name: str, known: Mapping[str, Any]) -> Callable[..., Any]:
+    """Returns the definition of a known name, or the user's own by module:name.
+
+    Raises:
+      ValueError: as ``check_choice`` and ``load_own``.
+    """
+    check_choice(kind, name, known)
+    return load_own(kind, name) if is_own(name) else load_definition(known[name])
+
+
+def load_own(kind: str, name: str, *, form: str = "module:name") -> Callable[..., Any]:
+    """Returns the user's own class or function, imported from the current folder or elsewhere.
+
+    Args:
+      kind: what it is, for messages.
+      name: "module:name".
+      form: what is called so, for messages.
+
+    Raises:
+      ValueError: it cannot be imported, or is no class or function.
+    """
+    if not {"", os.getcwd()} & set(sys.path):  # python -m has it, a script has not
+        sys.path.insert(0, os.getcwd())
+    remedy = f"write {form} of a module that is in this folder or installed"
+    made = _imported(kind, name, name, remedy)
+    if not callable(made):
+        raise ValueError(
+            f"the {kind} {name!r} is no class or function, but of type {type(made).__name__}; "
+            f"write {form}"
+        )
+    return made
+
+
+def load_ours(kind: str, name: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:
+    """Returns the definition of an entry of a table; ValueError if it cannot be imported."""
+    remedy = "see whether what this package needs is installed: pip check"
+    return _imported(kind, name, entry, remedy)
+
+
+def _imported(kind: str, name: str, entry: Any, remedy: str) -> Callable[..., Any]:
+    try:
+        return load_definition(entry)
+    except (Exception, SystemExit) as error:  # an import runs the user's code
+        if isinstance(error, MemoryError) or any(text in str(error) for text in _NO_MEMORY):
+            remedy = "there is not enough memory for the libraries: see ulimit -v"
+        raise ValueError(
+            f"cannot import the {kind} {name!r}: {explain(error)}; {remedy}"
+        ) from error
 
 
 def nearest(name: str, known: Iterable[str]) -> str | None:

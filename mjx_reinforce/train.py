@@ -31,7 +31,7 @@ from mjx_reinforce.runs.plan import Plan, make_plan
 from mjx_reinforce.runs.sinks.sink import check_installed
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.memory import check_memory
-from mjx_reinforce.settings.own_code import env_flag
+from mjx_reinforce.settings.own_code import code_flags
 from mjx_reinforce.store.provenance import versions
 from mjx_reinforce.training import resume
 
@@ -75,7 +75,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
                 made = new
                 interrupt.on_exit(lambda: remove_empty(made))
             # A module of the user's is imported before JAX starts, which it may set up.
-            env = None if envs.is_ours(config.env) else envs.make(config.env)
+            env = None if envs.is_ours(config.env) else envs.make_set(config.env, config.env_set)
             configure_jax()
             with heartbeat(to_screen, None, "writing the simulation out"):
                 default = start(arguments, "train")[0]
@@ -98,7 +98,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
         return status
     except (RuntimeError, OSError) as error:
         begun = (directory / "config.json").exists()
-        resumed = f"go on with --resume {directory}{env_flag(config.env)}"
+        resumed = f"go on with --resume {directory}{code_flags(vars(config))}"
         again = resumed if begun else "try again"
         refuse_full(error, "this run", "this run", "--num-seeds", again, made)
 

@@ -57,6 +57,8 @@ class WatchSettings:
     env: str | None = None
     """Needed where a run was trained on module:Class, code of your own or of another: that name
     again, for then it is run."""
+    policy: str | None = None
+    """Needed where the distribution of a run is module:name, as --env is."""
     seed: SeedChoice = "best"
     """Which of the run's seeds plays: best, worst or median by its final evaluation, or a number.
     """
@@ -129,7 +131,7 @@ def film(settings: WatchSettings) -> None:
     from mjx_reinforce.playing.simulations import check_observations
 
     roles = cast(settings, source)
-    env = envs.make(source.env)
+    env = envs.make_set(source.env, source.run.env_set if source.run else ())
     check_observations(env, roles[-1].player, source)
     if settings.live:
         from mjx_reinforce.playing.live import live
@@ -181,7 +183,7 @@ def _check_env(settings: WatchSettings, source: PolicySource) -> None:
     """Raises ValueError for another environment than the run's, or where one must be named."""
     if settings.env not in (None, source.env):
         raise ValueError(f"--env is {settings.env}, but {settings.run} was trained on {source.env}")
-    check_named(source.env, settings.env, settings.run)
+    check_named({"env": source.env}, {"env": settings.env}, settings.run)
 
 
 def _waiting(what: str) -> AbstractContextManager[Any]:
@@ -258,7 +260,7 @@ def scene(env: "MujocoEnv") -> Any:
     """
     settings = getattr(env, "settings", None)
     xml_file = getattr(env, "scene", None) or getattr(settings, "xml_file", None)
-    if xml_file is not None:
+    if xml_file is not None and not hasattr(xml_file, "nbody"):  # no compiled model
         from mjx_reinforce.envs import models
         from mjx_reinforce.export.scenery import dress
 

@@ -76,7 +76,9 @@ class Player(NamedTuple):
         return np.array(action) if action.ndim else int(action)
 
 
-def load(run: str | Path, seed: SeedChoice = "best", *, which: Which = "last") -> Player:
+def load(
+    run: str | Path, seed: SeedChoice = "best", *, which: Which = "last", policy: str | None = None
+) -> Player:
     """Loads a trained policy to play, in Gymnasium or elsewhere.
 
     Args:
@@ -86,21 +88,23 @@ def load(run: str | Path, seed: SeedChoice = "best", *, which: Which = "last") -
       seed: "best", "worst" or "median" in the run's final evaluation, or a number.
       which: "last" for the policy at the end of training, "best" for the one that did best on
         the way, where the run kept it.
+      policy: "module:name" where the distribution of the run is of that code, which is imported
+        then.
 
     Raises:
       ValueError: there is no such run, task or seed, the run has not ended, or a file is damaged.
     """
-    return load_saved(run, seed, which)[0]
+    return load_saved(run, seed, which, policy)[0]
 
 
 def load_saved(
-    run: str | Path, seed: SeedChoice = "best", which: Which = "last"
+    run: str | Path, seed: SeedChoice = "best", which: Which = "last", policy: str | None = None
 ) -> tuple[Player, SavedPolicy]:
     """Loads a policy, as ``load``, with what its files say."""
     check_type("run", run, str | Path)
     if is_pretrained(run):
         return load_pretrained(str(run), seed, which)
-    return load_seed(read_run(run), seed, which)
+    return load_seed(read_run(run), seed, which, policy)
 
 
 def load_pretrained(
@@ -116,10 +120,12 @@ def load_pretrained(
     return Player(name, provenance_of(name)["seed"], saved.policy, saved.actor), saved
 
 
-def load_seed(run: Run, seed: SeedChoice, which: Which = "last") -> tuple[Player, SavedPolicy]:
+def load_seed(
+    run: Run, seed: SeedChoice, which: Which = "last", policy: str | None = None
+) -> tuple[Player, SavedPolicy]:
     """Loads one seed, as ``load``, with what its files say."""
     folder, number = policy_folder(run, which), choose_seed(run, seed, which)
-    saved = read_policy(folder, run.place(number))
+    saved = read_policy(folder, run.place(number), policy)
     if isinstance(seed, str):
         ranked = len(final_returns(run, which))
         if ranked != saved.num_seeds:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import serialization, traverse_util
 
+from mjx_reinforce.checks import check_kind, explain
 from mjx_reinforce.export.policy_checks import check_arrays, check_finite, check_policy_settings
 from mjx_reinforce.files import (
     Header,
@@ -23,12 +24,15 @@ from mjx_reinforce.files import (
 )
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.policies.policy import Policy, mlp_policy
-from mjx_reinforce.registry import DISTRIBUTIONS, check_name, load_definition
+from mjx_reinforce.registry import DISTRIBUTIONS, check_choice, is_own, load_choice
 from mjx_reinforce.types import Box, Discrete
 
 #: The name in the archive of what says that it belongs to the settings beside it.
 _CHECKSUM = "checksum"
+#: What a family takes beside the action space, and what holds where a file does not say it.
+_FAMILY_ARGUMENTS = {"initial_std": None, "rescale": True}
 
 
 class SavedPolicy(NamedTuple):
@@ -81,12 +85,28 @@ def load_policy(directory: str | Path, seed: int | None = None) -> tuple[Policy,
     return saved.policy, saved.actor
 
 
-def read_policy(directory: str | Path, seed: int | None = None) -> SavedPolicy:
-    """Reads what ``save_policy`` wrote, as ``load_policy``, with all that it says."""
+def read_policy(
+    directory: str | Path, seed: int | None = None, own: str | None = None
+) -> SavedPolicy:
+    """Reads what ``save_policy`` wrote, as ``load_policy``, with all that it says.
+
+    Args:
+      directory: as ``load_policy``.
+      seed: as ``load_policy``.
+      own: "module:name" of a distribution that may be imported; what only a file names is not.
+    """
     settings_path, actor_path = Path(directory) / "policy.json", Path(directory) / "actor.npz"
     settings = read_json(settings_path)
     with _naming_damage(settings_path):
         check_policy_settings(settings)
+        check_choice("policy", settings["policy"], DISTRIBUTIONS)
+    if is_own(settings["policy"]) and settings["policy"] != own:
+        raise ValueError(
+            f"{settings_path} names the distribution {settings['policy']}, and this would run that "
+            f"code; if you trust it, add --policy {settings['policy']} to watch, or give "
+            f"mjx_reinforce.load(..., policy={settings['policy']!r})"
+        )
+    with _naming_damage(settings_path):
         policy = build_policy(settings)
     shapes = _array_shapes(policy, settings["observation_size"])
 
@@ -160,12 +180,16 @@ def build_policy(settings: dict[str, Any]) -> Policy:
     What an older file does not say is as it was then: one trunk, orthogonal
     weights, means scaled to the action's range.
     """
-    check_name("policy", settings["policy"], DISTRIBUTIONS)
-    distribution = load_definition(DISTRIBUTIONS[settings["policy"]])(
-        saved_action_space(settings),
-        initial_std=settings["initial_std"],
-        rescale=settings.get("rescale", True),
-    )
+    family = settings["policy"]
+    make = load_choice("policy", family, DISTRIBUTIONS)
+    arguments = {k: settings.get(k, default) for k, default in _FAMILY_ARGUMENTS.items()}
+    try:
+        distribution = make(saved_action_space(settings), **arguments)
+    except (Exception, SystemExit) as error:
+        if not is_own(family):
+            raise
+        raise ValueError(f"cannot build the policy {family!r}: {explain(error)}") from error
+    check_kind(f"what {family} returns", distribution, Distribution, "mjx_reinforce.normal(space)")
     return mlp_policy(
         settings["observation_size"],
         distribution,

@@ -27,12 +27,14 @@ class Run(NamedTuple):
     env: the id of its environment
     horizon: the time limit in env steps
     seeds: the numbers of the seeds whose policies are here, where a sweep kept a few; else all are
+    env_set: settings of the environment, NAME=VALUE each
     """
 
     directory: Path
     env: str
     horizon: int
     seeds: tuple[int, ...] | None = None
+    env_set: tuple[str, ...] = ()
 
     def place(self, seed: int) -> int:
         """Returns where among the policies that of a seed is; ValueError if it was not kept."""
@@ -77,7 +79,11 @@ def read_run(directory: str | Path) -> Run:
         isinstance(seeds, list) and all(type(seed) is int for seed in seeds)
     ):
         raise ValueError(f"{path} is damaged: seeds must be whole numbers, got {seeds!r}")
-    return Run(directory, env_id, horizon, None if seeds is None else tuple(seeds))
+    env_set = settings.get("env_set", [])  # runs from before --env-set have none
+    if not (isinstance(env_set, list) and all(isinstance(word, str) for word in env_set)):
+        raise ValueError(f"{path} is damaged: env_set must be a list of texts, got {env_set!r}")
+    kept = None if seeds is None else tuple(seeds)
+    return Run(directory, env_id, horizon, kept, tuple(env_set))
 
 
 def _packaged(name: str) -> str:

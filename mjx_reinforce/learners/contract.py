@@ -10,11 +10,17 @@ from numpy.typing import DTypeLike
 from mjx_reinforce.checks import check_kind, explain
 from mjx_reinforce.learners import updates
 from mjx_reinforce.learners.estimators import Estimator
+from mjx_reinforce.learners.learner import Learner
 from mjx_reinforce.learners.natural_gradient import natural_gradient
-from mjx_reinforce.types import Environment, Trajectory, null_action
+from mjx_reinforce.types import Environment, PyTree, Trajectory, null_action
 
 #: Steps and episodes of the trajectory that an estimator is tried on: no two axes have one size.
 _NUM_STEPS = 5
+#: Metrics without which no run can be recorded.
+_METRICS = (
+    *("episodes", "episode_return", "episode_length", "env_steps", "simulated_steps"),
+    *("nonfinite_episodes", "skipped_update"),
+)
 
 
 def check_optimizer(name: str, value: optax.GradientTransformation) -> None:
@@ -81,6 +87,37 @@ def check_estimator(
         raise ValueError(
             f"estimator.update must return its metrics as a dict, got {type(returned[2]).__name__}"
         )
+
+
+def check_learner(name: str, learner: Learner) -> None:
+    """Raises ValueError for a learner that a run cannot train, in one line that says why.
+
+    Args:
+      name: of the function that returned it.
+      learner: what it returned. Its functions are traced.
+    """
+    check_kind(f"what {name} returns", learner, Learner, "mjx_reinforce.reinforce(env)")
+    try:
+        state = jax.eval_shape(learner.init, jax.random.key(0))
+        after, metrics = jax.eval_shape(learner.step, state)
+    except Exception as error:  # it is the user's code, which may raise anything
+        raise ValueError(f"the learner of {name} fails: {explain(error)}") from error
+    if _shapes(after) != _shapes(state):
+        raise ValueError(
+            f"learn of the learner of {name} must return a state of the structure, shapes and "
+            "dtypes of the one that it gets"
+        )
+    if missing := [each for each in _METRICS if each not in metrics]:
+        raise ValueError(
+            f"learn of the learner of {name} must also return the metrics {', '.join(missing)}: "
+            "see mjx_reinforce.train_step"
+        )
+
+
+def _shapes(tree: PyTree) -> Any:
+    """Returns the structure of a tree, and the shape and dtype of each leaf."""
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, [(x.shape, x.dtype) for x in leaves]
 
 
 def _shaped(shape: tuple[int, ...], dtype: DTypeLike) -> Any:

@@ -87,7 +87,7 @@ def _role(seed: Any, settings: Any, source: PolicySource) -> Role:
 
     if source.run is None:
         return Role(source.env, "the package's policy", load_pretrained(source.env)[0])
-    player, _ = load_seed(source.run, seed, settings.which)
+    player, _ = load_seed(source.run, seed, settings.which, settings.policy)
     rank = f" ({seed})" if isinstance(seed, str) else ""
     return Role(f"seed {player.seed}{rank}", f"seed {player.seed}", player)
 

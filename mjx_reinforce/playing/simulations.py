@@ -37,6 +37,11 @@ def simulators(
         return {"mujoco": mujoco_simulator(env, player, horizon, push)}
     found: dict[str, Callable[[int, bool], Episode]] = {"mjx": simulator(env, player, horizon)}
     if backend == "gymnasium":
+        if source.run is not None and source.run.env_set:
+            raise ValueError(
+                f"--backend gymnasium plays {source.env} as it is, and {source.run.directory} was "
+                f"trained with --env-set {' '.join(source.run.env_set)}: choose --backend mujoco"
+            )
         version, play = gymnasium_simulator(player, horizon)
         found[f"gymnasium {version}"] = play
     return found

@@ -80,7 +80,8 @@ def setting_in_words(name: str) -> str:
 def say(value: object) -> str:
     """Returns the value of a setting in words; sizes of layers as 32-32."""
     if isinstance(value, list | tuple):
-        return "-".join(map(say, value)) or "none"
+        between = " " if any(isinstance(x, str) for x in value) else "-"
+        return between.join(map(say, value)) or "none"
     if isinstance(value, bool):
         return "on" if value else "off"
     if isinstance(value, float):

@@ -93,7 +93,8 @@ def _read_source(directory: Path) -> Source:
 def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
     """Returns all configurations, each with a label of its own and the settings that differ."""
     pairs = [(source, part) for source in sources for part in source.configurations]
-    full = [source.settings | part.settings for source, part in pairs]
+    # Runs of version 0.1 have no setting env_set.
+    full = [{"env_set": []} | source.settings | part.settings for source, part in pairs]
     names = dict.fromkeys(name for settings in full for name in settings)
     differ = [
         name

@@ -1,5 +1,6 @@
 """What a task is, for people: its sizes, its rules, its default settings, and how long it takes."""
 
+import dataclasses
 import inspect
 from typing import TYPE_CHECKING
 
@@ -33,7 +34,7 @@ def about_task(id: str) -> str:
     env, config = envs.make(id), of_task(id)
     doc = inspect.cleandoc(type(env).__doc__ or "").replace("``", "`")
     said = (" ".join(paragraph.split()) for paragraph in doc.split("\n\n") if paragraph)
-    return "\n\n".join([id, _sizes(id, env), *said, *_how_to_train(config)])
+    return "\n\n".join([id, _sizes(id, env), *said, *_settings(env), *_how_to_train(config)])
 
 
 def _sizes(id: str, env: "MujocoEnv") -> str:
@@ -54,6 +55,21 @@ def _sizes(id: str, env: "MujocoEnv") -> str:
         else f"at a return of {threshold:,g}",
     }
     return "\n".join(f"  {name:11}  {fact}" for name, fact in facts.items())
+
+
+def _settings(env: Environment) -> list[str]:
+    """Returns the settings of a task and their values, one a line, if it has any."""
+    settings = getattr(env, "settings", None)
+    if not dataclasses.is_dataclass(settings):
+        return []
+    fields = dataclasses.fields(settings)
+    lines = [f"  {f.name}={_as_text(getattr(settings, f.name))}" for f in fields if f.init]
+    return ["\n".join(["Its settings, which --env-set NAME=VALUE changes:", *lines])]
+
+
+def _as_text(value: object) -> str:
+    """Returns the value of a setting as ``--env-set`` reads it."""
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
 def _action_in_words(env: Environment) -> str:

@@ -14,7 +14,7 @@ from mjx_reinforce.hosts.processes import ProcessSettings, check_processes
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs.directory import remove_empty
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.defaults import flag_value, for_arguments, named_task
+from mjx_reinforce.settings.defaults import flag_value, for_arguments, named_code
 from mjx_reinforce.settings.flags import asks_brief_help, read_command_line
 from mjx_reinforce.settings.groups import GROUPS, MAIN
 from mjx_reinforce.settings.hints import about_word
@@ -81,19 +81,19 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
             "--minutes"
         )
         sys.exit(0)
-    check_resumed(known.env, arguments, config.resume)
+    check_resumed(known, arguments, config.resume)
     return asked, processes
 
 
-def check_resumed(env: str, arguments: Sequence[str], directory: Path) -> None:
+def check_resumed(known: Config, arguments: Sequence[str], directory: Path) -> None:
     """Raises ValueError if going on would run code that the command line does not name.
 
     Args:
-      env: the environment of the run or sweep that is resumed.
+      known: the settings of the run or sweep that is resumed.
       arguments: the command line.
       directory: of the run or sweep that is resumed.
     """
-    check_named(env, named_task(arguments), directory)
+    check_named(vars(known), named_code(arguments), directory)
 
 
 def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequence[str], str]:
@@ -125,7 +125,7 @@ def _default(arguments: Sequence[str]) -> Config:
     if not (Path(like) / "config.json").is_file():
         raise ValueError(f"--like {like}: there is no run, for it has no config.json")
     known = resume.read_settings(Path(like))
-    check_resumed(known.env, arguments, Path(like))
+    check_resumed(known, arguments, Path(like))
     return dataclasses.replace(known, resume=None)
 
 

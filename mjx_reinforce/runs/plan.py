@@ -236,6 +236,7 @@ def task_of(policy: Mapping[str, Any], horizon: int, config: Config) -> Task:
       config: the settings.
     """
     if config.env in measured.TASKS:
-        return measured.TASKS[config.env]
+        known = measured.TASKS[config.env]
+        return known._replace(observation=policy["observation_size"]) if config.env_set else known
     entries = 1 if "num_actions" in policy else len(policy["action_low"])
     return Task(policy["observation_size"], entries, horizon, 1.0, _BASE_MEMORY)

@@ -128,7 +128,7 @@ def run(
         if config.output is not None:
             held.callback(remove_empty, make_directory(config.output, config.overwrite))
             held.enter_context(locked(config.output))
-        ready = get_ready(config, config, envs.make(config.env))
+        ready = get_ready(config, config, envs.make_set(config.env, config.env_set))
         if config.init_from is not None:
             last_actors(config, ready.policy)  # refused before anything is compiled
         plan = make_plan(ready, config)

@@ -7,7 +7,8 @@ import reprlib
 
 from mjx_reinforce import envs
 from mjx_reinforce.checks import changed_fields, check_type
-from mjx_reinforce.registry import DISTRIBUTIONS, ESTIMATORS, check_name
+from mjx_reinforce.envs.settings import split_words
+from mjx_reinforce.registry import ALGORITHMS, DISTRIBUTIONS, ESTIMATORS, check_choice, is_own
 from mjx_reinforce.settings.declare import MAX_COUNT, MAX_OF_UPDATE, Range
 from mjx_reinforce.settings.groups import (
     CheckpointSettings,
@@ -87,8 +88,15 @@ def check_each(config: Config) -> None:
     for field in dataclasses.fields(Config):
         check_type(flag(field.name), getattr(config, field.name), field.type)
     envs.check_id(config.env)
-    check_name("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
-    check_name("estimator", config.estimator, ESTIMATORS)
+    split_words(config.env_set)
+    if config.algorithm not in ALGORITHMS and not is_own(config.algorithm):
+        raise ValueError(
+            f"--algorithm must be {' or '.join(sorted(ALGORITHMS))}, or module:name for your own, "
+            f"got {config.algorithm!r}"
+        )
+    check_choice("algorithm", config.algorithm, ALGORITHMS)
+    check_choice("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
+    check_choice("estimator", config.estimator, ESTIMATORS)
     for rule in Range:
         for name in marked(rule):
             value = getattr(config, name)
@@ -100,7 +108,10 @@ def check_together(config: Config) -> None:
     """Raises ValueError for settings that do not go together."""
     if config.env_steps is None and config.max_updates is None:
         raise ValueError("nothing would end this run: give --env-steps or --max-updates a number")
-    (_check_reinforce if config.algorithm == "reinforce" else _check_ars)(config)
+    if config.algorithm == "reinforce":
+        _check_reinforce(config)
+    elif config.algorithm == "ars":
+        _check_ars(config)
 
 
 def flag(name: str) -> str:

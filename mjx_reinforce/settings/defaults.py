@@ -13,6 +13,7 @@ from mjx_reinforce.checks import whole_number
 from mjx_reinforce.settings import measured, tuned
 from mjx_reinforce.settings.config import Config, spoken
 from mjx_reinforce.settings.memory import cpu_factor, has_gpu
+from mjx_reinforce.settings.own_code import CODE
 
 #: Where a budget is large, it has about so many evaluations.
 _EVALUATIONS = 50
@@ -108,6 +109,11 @@ def check_task(env: str) -> None:
 def named_task(arguments: Sequence[str]) -> str:
     """Returns the environment that a command line names with ``--env``, or the default one."""
     return flag_value(arguments, "--env") or Config().env
+
+
+def named_code(arguments: Sequence[str]) -> dict[str, str | None]:
+    """Returns what a command line says of the settings that may name code."""
+    return {name: flag_value(arguments, f"--{name}") for name in CODE}
 
 
 def flag_value(arguments: Sequence[str], flag: str) -> str | None:

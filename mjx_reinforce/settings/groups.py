@@ -37,8 +37,9 @@ class Reader(enum.Enum):
     def __init__(self, said: str, holds: Callable[[Any], bool]):
         self.said, self.holds = said, holds
 
-    REINFORCE = "--algorithm reinforce", lambda c: c.algorithm == "reinforce"
-    ARS = "--algorithm ars", lambda c: c.algorithm == "ars"
+    # An algorithm of the user's own may read all of them.
+    REINFORCE = "--algorithm reinforce", lambda c: c.algorithm != "ars"
+    ARS = "--algorithm ars", lambda c: c.algorithm != "reinforce"
     VALUE_BASELINE = "--estimator value-baseline", lambda c: c.estimator == "value-baseline"
     VALUE_MINIBATCHES = "--value-fit minibatches", lambda c: c.value_fit == "minibatches"
     LEAVE_ONE_OUT = "--estimator leave-one-out", lambda c: c.estimator == "leave-one-out"
@@ -100,9 +101,11 @@ class RunSettings:
     )
     """Environment id, or module:Class for your own environment. `python -m mjx_reinforce.envs`
     lists the ids."""
-    algorithm: Literal["reinforce", "ars"] = "reinforce"
+    env_set: tuple[str, ...] = ()
+    """Settings of the environment, such as frame_skip=4; `envs ID` lists them."""
+    algorithm: str = "reinforce"
     """reinforce follows the policy gradient; ars (augmented random search, Mania et al. 2018) tries
-    out changes of the parameters. Its own settings are in the group "search" below."""
+    out changes of the parameters; its settings are in the group "search". Or module:name."""
     num_seeds: int = setting(4, Range.AT_LEAST_1, once="every configuration has as many seeds")
     """Number of independent seeds, trained together in one compiled program."""
     seed: int = setting(
@@ -163,7 +166,7 @@ class PolicySettings:
     """Action distribution: normal (one trained std), normal-softplus and normal-sigmoid (std from
     the state), truncated-normal, clipped-normal, tanh-normal (on the action bounds), categorical
     (discrete actions), deterministic (ars only); auto is categorical where the actions are
-    discrete, else normal, or deterministic for ars."""
+    discrete, else normal, or deterministic for ars. Or module:name."""
     hidden_sizes: tuple[int, ...] = setting((32, 32), *LAYERS)
     """Units of each tanh layer of the policy network. The flag without a number makes the policy
     linear."""
@@ -199,7 +202,7 @@ class EstimatorSettings:
     estimator: str = _for_reinforce("leave-one-out")
     """What weights the gradient: total-return; reward-to-go; leave-one-out (minus the mean of
     the other episodes); value-baseline (minus a learned value). mean-log-prob and
-    normalized-returns are published variants; their docstrings explain them."""
+    normalized-returns are published variants; their docstrings explain them. Or module:name."""
     ended_episodes: Literal["zero", "skip"] = _for_reinforce("zero", Reader.LEAVE_ONE_OUT)
     """How leave-one-out counts other episodes that are over at a step. zero: as the 0 that they
     still earn. skip: not at all, which may be less noisy."""
@@ -340,8 +343,8 @@ class CheckpointSettings:
     They are written after evaluations."""
     resume: Path | None = setting(None, Mark.PLACE, once="it goes on as a whole")
     """Resume the run in this directory, with its own settings. Only the budget may change:
-    --env-steps, --max-updates, --stop-when-solved, --checkpoint-every. If the environment is your
-    own module:Class, give --env again."""
+    --env-steps, --max-updates, --stop-when-solved, --checkpoint-every. Names of your own code,
+    module:Class or module:name, are to be given again."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

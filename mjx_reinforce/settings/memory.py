@@ -60,7 +60,7 @@ def parts(config: Config, task: Task) -> list[MemoryPart]:
     steps = seeds * horizon * episodes
     values = task.observation + task.action + 3
     evaluated = seeds * horizon * 2 * config.eval_episodes
-    follows = config.algorithm == "reinforce"  # a gradient; else it searches with many policies
+    follows = config.algorithm != "ars"  # a gradient; else it searches with many policies
     room = "--max-episodes" if config.num_episodes == "auto" else "--num-episodes"
     fewer = room if follows else "--num-directions"
     held = seeds * (min(horizon, _CHUNK) if follows else 1) * episodes * sum(config.hidden_sizes)

@@ -4,6 +4,8 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from mjx_reinforce.checks import check_kind, explain
+from mjx_reinforce.registry import ALGORITHMS, ESTIMATORS, is_own, load_choice, load_definition
 from mjx_reinforce.settings.config import Config, check_step_count
 
 if TYPE_CHECKING:
@@ -52,6 +54,8 @@ def build(
         "normalize_min_std": config.normalize_min_std,
         "engine": config.engine,
     }
+    if is_own(config.algorithm):
+        return _build_own(env, config, shared), horizon
     build_one = _build_ars if config.algorithm == "ars" else _build_reinforce
     return build_one(env, config, shared), horizon
 
@@ -64,7 +68,7 @@ def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
     if isinstance(space, Discrete):
         family, described = "categorical", {"num_actions": space.num_actions}
     else:
-        family = "normal" if config.algorithm == "reinforce" else "deterministic"
+        family = "deterministic" if config.algorithm == "ars" else "normal"
         described = {"action_low": space.low.tolist(), "action_high": space.high.tolist()}
     return {
         "env": config.env,
@@ -119,6 +123,27 @@ def _build_ars(env: "Environment", config: Config, shared: dict[str, Any]) -> "L
     )
 
 
+def _build_own(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
+    """Returns the learner of the user's own algorithm, a function of ``env``, ``config`` and these.
+
+    ``shared`` are the keywords that ``reinforce`` and ``ars`` have in common.
+    """
+    from mjx_reinforce.learners.contract import check_learner
+
+    learner = _made_by_user("algorithm", config.algorithm, ALGORITHMS, env, config, **shared)
+    check_learner(config.algorithm, learner)
+    return learner
+
+
+def _made_by_user(kind: str, name: str, known: dict[str, str], *arguments: Any, **more: Any) -> Any:
+    """Returns what the user's own function returns, or raises ValueError with what it raised."""
+    make = load_choice(kind, name, known)
+    try:
+        return make(*arguments, **more)
+    except (Exception, SystemExit) as error:  # the user's code may raise anything
+        raise ValueError(f"cannot build the {kind} {name!r}: {explain(error)}") from error
+
+
 def _build_estimator(
     config: Config, horizon: int
 ) -> "Estimator | Callable[[jax.Array], Estimator]":
@@ -134,10 +159,13 @@ def _build_estimator(
 def _estimator(config: Config, horizon: int, discount: "float | jax.Array") -> "Estimator":
     from mjx_reinforce.learners import estimators
     from mjx_reinforce.policies.arguments import known_number
-    from mjx_reinforce.registry import ESTIMATORS, load_definition
 
     if config.estimator == "value-baseline":
         estimator = _build_value_baseline(config, horizon, discount)
+    elif is_own(config.estimator):
+        estimator = _made_by_user("estimator", config.estimator, ESTIMATORS, discount)
+        example = "mjx_reinforce.reward_to_go(0.99)"
+        check_kind(f"what {config.estimator} returns", estimator, estimators.Estimator, example)
     else:
         settings = {"ended": config.ended_episodes} if config.estimator == "leave-one-out" else {}
         estimator = load_definition(ESTIMATORS[config.estimator])(discount, **settings)

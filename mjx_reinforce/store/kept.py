@@ -21,9 +21,12 @@ from mjx_reinforce.engines.native import objects
 from mjx_reinforce.engines.native.available import made_for, platform
 from mjx_reinforce.engines.native.cpu import seam
 from mjx_reinforce.engines.native.gpu.seam import PTX
+from mjx_reinforce.envs.settings import split_words
 from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import Config, marked
 from mjx_reinforce.settings.declare import Mark
+from mjx_reinforce.settings.own_code import CODE
 from mjx_reinforce.store.provenance import provenance, version
 from mjx_reinforce.store.trees import describe_tree, rebuild
 from mjx_reinforce.training.block import Block
@@ -38,11 +41,14 @@ _PROGRAMS = ("begin", "advance", "evaluate")
 def key_of(config: Config, share: slice = slice(None)) -> str | None:
     """Returns a name for all that the programs of a run depend on, for all seeds or a share.
 
-    None where nothing is kept: on what is neither a CPU nor a GPU, of an environment of the user's,
-    and where JAX is to look for NaNs, which it cannot in a program that is not traced.
+    None where nothing is kept: on what is neither a CPU nor a GPU, of code or a model of the
+    user's, and where JAX is to look for NaNs, which it cannot in a program that is not traced.
     """
     looks = any(jax.config.values[name] for name in ("jax_debug_nans", "jax_debug_infs"))
-    if looks or objects.folder() is None or not envs.is_ours(config.env):
+    own = not envs.is_ours(config.env) or any(is_own(getattr(config, name)) for name in CODE)
+    if looks or objects.folder() is None or own:
+        return None
+    if "xml_file" in split_words(config.env_set):  # the file may change
         return None
     if platform() not in ("cpu", "gpu"):
         return None

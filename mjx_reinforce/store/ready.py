@@ -50,7 +50,8 @@ def get_ready(
     key = kept.key_of(config, share)
     ready = None if key is None else _found(key, config, share)
     if ready is None:
-        ready = made(envs.make(config.env) if env is None else env, config, share)
+        built = envs.make_set(config.env, config.env_set) if env is None else env
+        ready = made(built, config, share)
         if key is not None:
             facts = ready._asdict()
             del facts["programs"], facts["engine_seconds"]

@@ -71,5 +71,5 @@ def _resumed(flags: Sequence[str], directory: Path, prog: str) -> Design:
     base, settings, processes = _read_flags(flags, design.base, prog)
     if dataclasses.replace(base, resume=None) != design.base or settings != SweepSettings():
         raise ValueError(f"the sweep in {directory} goes on as it is: give --resume alone")
-    check_resumed(base.env, flags, directory)
+    check_resumed(base, flags, directory)
     return dataclasses.replace(design, processes=processes, resume=directory)

@@ -139,8 +139,9 @@ class Conductor:
     def _seconds(self, rung: Rung, stage: Stage) -> float | None:
         """Returns about how long a run of a stage takes (s), None where that is not known."""
         prepared, group = self._prepared, stage.group
+        env = prepared.envs[stage.number]
         seconds = group_seconds(
-            prepared.env, prepared.horizon, prepared.engine, group, prepared.devices.count
+            env, prepared.horizon, prepared.engine, group, prepared.devices.count
         )
         runs = len(group.members) * group.config.num_seeds
         return None if seconds is None else rung.added * seconds / runs
@@ -186,7 +187,8 @@ class Conductor:
     def _compile(self, stage: Stage) -> SlotPrograms:
         """Returns the programs of a group, which are those of its runs in the first rung."""
         if stage.number not in self._compiled:
-            env, whole = self._prepared.env, self._prepared.groups[stage.number]
+            number = stage.number
+            env, whole = self._prepared.envs[number], self._prepared.groups[number]
             programs = compile_programs(
                 env,
                 learner_builder(env, whole.config),

@@ -13,7 +13,7 @@ from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.files import read_json, write_json
 from mjx_reinforce.hosts.processes import Processes, joined
 from mjx_reinforce.runs.directory import choose_directory, locked, make_directory
-from mjx_reinforce.settings.own_code import env_flag
+from mjx_reinforce.settings.own_code import code_flags
 from mjx_reinforce.store.provenance import versions
 from mjx_reinforce.sweeps.designs.design import Design, as_record, check_design, flat
 from mjx_reinforce.training.resume import check_same_program
@@ -142,7 +142,7 @@ def _perform(
                     display.say(sentence.translate(_PLAIN_QUOTES))
             display.say(_last_line(directory, contents))
             if written is not None:
-                display.show_commands(_watch(directory, written.best, design.base.env))
+                display.show_commands(_watch(directory, written.best, vars(design.base)))
     return ended
 
 
@@ -154,9 +154,13 @@ def _finish(
     from mjx_reinforce.sweeps.designs.grid import configure
     from mjx_reinforce.sweeps.designs.rungs import winner
 
-    def settings(number: int) -> tuple[dict[str, Any], int]:
+    def settings(number: int) -> tuple[dict[str, Any], dict[str, Any]]:
         [config] = configure(design.base, [prepared.configurations[number]])
-        return policy_settings(prepared.env, config), prepared.horizon
+        group = next(i for i, each in enumerate(prepared.groups) if number in each.members)
+        run = {"env": config.env, "horizon": prepared.horizon}
+        if config.env_set:
+            run["env_set"] = list(config.env_set)
+        return policy_settings(prepared.envs[group], config), run
 
     files.finish()
     if contents["status"] == "finished":
@@ -183,7 +187,7 @@ def _contents(design: Design, prepared: "Prepared", known: Mapping[str, Any]) ->
     return {
         "status": "running",
         "env": design.base.env,
-        "threshold": getattr(prepared.env, "reward_threshold", None),
+        "threshold": getattr(prepared.envs[0], "reward_threshold", None),
         **as_record(design),
         "num_seeds": design.base.num_seeds,
         "configurations": [
@@ -213,16 +217,17 @@ def _check_same_sweep(
         )
 
 
-def _watch(directory: Path, number: int, env: str) -> dict[str, str]:
+def _watch(directory: Path, number: int, settings: Mapping[str, Any]) -> dict[str, str]:
     """Returns the command that plays the best policy of a configuration, after what it does."""
     place = shlex.quote(str(directory / "policies" / f"{number:03d}"))
-    return {"To see the best of it play": f"{command('watch')} {place}{env_flag(env)}"}
+    named = code_flags({name: settings[name] for name in ("env", "policy")})
+    return {"To see the best of it play": f"{command('watch')} {place}{named}"}
 
 
 def _last_line(directory: Path, contents: Mapping[str, Any]) -> str:
     """Returns the line that ends a sweep."""
     if contents["status"] == "interrupted":
-        return f"interrupted; go on with --resume {directory}{env_flag(contents['env'])}"
+        return f"interrupted; go on with --resume {directory}{code_flags(contents['settings'])}"
     took = (
         f"compiling took {contents['compile_seconds']:.1f} s, training and evaluating "
         f"{contents['run_seconds']:.1f} s"

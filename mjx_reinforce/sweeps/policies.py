@@ -37,14 +37,15 @@ def write_part(parts: Path, runs: Runs, final: np.ndarray, actors: Actor) -> Non
 
 
 def gather(
-    directory: Path, parts: Path, settings: Callable[[int], tuple[dict[str, Any], int]]
+    directory: Path, parts: Path, settings: Callable[[int], tuple[dict[str, Any], dict[str, Any]]]
 ) -> None:
     """Writes DIR/policies from the parts; raises OSError if that fails.
 
     Args:
       directory: of the sweep.
       parts: the folder of its parts.
-      settings: the number of a configuration -> those of its policy, and its horizon.
+      settings: the number of a configuration -> those of its policy, and what config.json says
+        beside its seeds.
     """
     shutil.rmtree(directory / "policies", ignore_errors=True)
     rungs: dict[int, list[Arrays]] = {}
@@ -58,13 +59,15 @@ def gather(
         _write_policies(directory / "policies" / f"{number:03d}", arrays, *settings(number))
 
 
-def _write_policies(place: Path, arrays: Arrays, settings: dict[str, Any], horizon: int) -> None:
+def _write_policies(
+    place: Path, arrays: Arrays, settings: dict[str, Any], run: dict[str, Any]
+) -> None:
     """Writes the policies of one configuration, as a run directory."""
     actors = {k.removeprefix("actor/"): x for k, x in arrays.items() if k not in _FACTS}
     save_policy(place / "policy", actor_of(actors), settings)
     seeds, returns = arrays["seed"].tolist(), arrays["final_return"].tolist()
     write_json(place / "summary.json", {"status": "finished", "final_returns": returns})
-    write_json(place / "config.json", {"env": settings["env"], "horizon": horizon, "seeds": seeds})
+    write_json(place / "config.json", run | {"seeds": seeds})
 
 
 def _ends(arrays: Arrays) -> Arrays:

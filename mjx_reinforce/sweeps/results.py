@@ -124,7 +124,9 @@ class SweepFiles:
             del joined["nonfinite"]
             write_arrays(self.directory / "curves.npz", joined, compressed=True)
 
-    def gather_policies(self, settings: Callable[[int], tuple[dict[str, Any], int]]) -> None:
+    def gather_policies(
+        self, settings: Callable[[int], tuple[dict[str, Any], dict[str, Any]]]
+    ) -> None:
         """Writes the folder ``policies`` of a sweep that ended, see ``policies.gather``."""
         policies.gather(self.directory, self.parts, settings)
 

@@ -33,7 +33,7 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
     assert config.init_from is not None
     directory = Path(config.init_from)
     run = read_run(directory)
-    saved = read_policy(directory / "policy")
+    saved = read_policy(directory / "policy", own=config.policy)
     settings = {field.name for field in dataclasses.fields(Config)}
     for name in sorted(policy, key=lambda name: name in settings):  # what no flag sets goes first
         value, old = policy[name], saved.settings.get(name, policy[name])

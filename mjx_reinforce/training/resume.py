@@ -24,6 +24,8 @@ _PROGRAM = (
     *("packages", "git_commit", "device", "cpu", "cores", "machine_code", "jax_settings"),
     *("x64", "xla_flags", "num_processes"),
 )
+#: Settings that files of version 0.1 lack; there the default held.
+_LATER = ("env_set",)
 _OTHER = "damaged, or of another version of the program; resume with the version that wrote it"
 
 
@@ -68,6 +70,8 @@ def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
     settings = {}
     for field in dataclasses.fields(Config):
         if field.name in PLACES:
+            continue
+        if field.name not in recorded and field.name in _LATER:
             continue
         if field.name not in recorded:
             raise ValueError(f"{path} does not say {field.name}: it is {_OTHER}")

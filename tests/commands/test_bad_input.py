@@ -209,7 +209,10 @@ def test_settings_that_would_do_nothing_are_refused(refused, arguments, message)
         ("--num-sedes=3", "unknown flag '--num-sedes'. Did you mean '--num-seeds'?"),
         ("--no-such-thing", "unknown flag '--no-such-thing'."),
         ("-x", "unknown flag '-x'."),
-        ("--algorithm ppo", "--algorithm takes ars or reinforce, got 'ppo'"),
+        (
+            "--algorithm ppo",
+            "--algorithm must be ars or reinforce, or module:name for your own, got 'ppo'",
+        ),
         ("--hidden-sizes a", "--hidden-sizes"),
         ("--hidden-sizes 4.5", "--hidden-sizes"),
         ("--learning-rate fast", "--learning-rate"),

@@ -272,7 +272,7 @@ MISTAKES = {
     "train --hidden-sizes 64,64": "takes whole numbers with spaces between them, such as 32 32",
     "train --standardize False": "it takes no value, got 'False'; --no-standardize switches it off",
     "train --num-seeds 3 4": "no flag takes '4': --num-seeds takes one value",
-    "train --algorithm PPO": "--algorithm takes ars or reinforce, got 'PPO'",
+    "train --algorithm PPO": "ars or reinforce, or module:name for your own, got 'PPO'",
     "watch Hopper-v5 --backend isaac": "--backend takes gymnasium or mjx or mujoco, got 'isaac'",
     "watch Hopper-v5 --beside x": "or None or untrained or best or worst or median, got 'x'",
     "train --output=": "--output takes a path or None, got ''",

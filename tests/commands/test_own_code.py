@@ -94,6 +94,34 @@ def test_another_environment_than_the_runs_is_refused(folder, said, env):
     assert not (folder / "ran").exists()
 
 
+@pytest.mark.parametrize("name", ["algorithm", "estimator", "policy"])
+@pytest.mark.parametrize("command", GOING_ON[:3])
+def test_other_code_that_only_a_file_names_is_not_run(folder, said, command, name):
+    own = {"env": "CartPole-v1", name: "evil_module:make"}
+    write(folder / "run" / "config.json", recordable(Config(horizon=60, **own)))
+    rates = {"learning_rate": [1e-3, 3e-3]}
+    record = json.loads(json.dumps(as_record(Design(base=Config(**own), over=rates))))
+    change(folder / "rates" / "sweep.json", **record)
+    error, status = said(command)
+    assert status == 2
+    assert not (folder / "ran").exists()
+    assert error.endswith(f"if you trust it, add --{name} evil_module:make to the command\n")
+
+
+def test_a_distribution_that_only_a_file_names_is_not_run(folder, said):
+    change(folder / "run" / "config.json", env="CartPole-v1")
+    change(folder / "run" / "policy" / "policy.json", env="CartPole-v1", policy="evil_module:make")
+    error, status = said("watch run --seed 0")
+    assert status == 2
+    assert "add --policy evil_module:make to watch" in error
+    with pytest.raises(ValueError, match="names the distribution evil_module:make"):
+        load("run", 0)
+    assert not (folder / "ran").exists()
+    error, _ = said("watch run --seed 0 --policy evil_module:make")
+    assert (folder / "ran").exists()
+    assert "cannot import the policy 'evil_module:make'" in error
+
+
 def test_what_is_no_name_is_not_proposed(folder, said):
     change(folder / "run" / "config.json", env="x:y; touch ran; echo ")
     for command in ("train --resume run", "watch run"):

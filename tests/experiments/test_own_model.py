@@ -10,7 +10,7 @@ import pytest
 from mujoco import mjx
 from places import ROOT
 
-from mjx_reinforce import envs
+from mjx_reinforce import envs, registry
 from mjx_reinforce.envs import models
 
 SCRIPT = ROOT / "experiments" / "own_model.py"
@@ -129,6 +129,6 @@ def test_the_remedy_is_that_of_what_is_wrong(monkeypatch, id, error, remedy):
     def fail(entry):
         raise error
 
-    monkeypatch.setattr(envs, "load_definition", fail)
+    monkeypatch.setattr(registry, "load_definition", fail)
     with pytest.raises(ValueError, match=f"cannot import the environment '{id}'.*{remedy}"):
         envs.make(id)

@@ -8,7 +8,7 @@ import pytest
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps import chunks
 from mjx_reinforce.sweeps.designs import grid, plan, rungs, search
-from mjx_reinforce.sweeps.designs.groups import Group
+from mjx_reinforce.sweeps.designs.groups import Group, make_groups
 
 CONFIG = Config(env_steps=1000, max_updates=7, num_seeds=3, num_episodes=16)
 
@@ -118,6 +118,35 @@ def test_every_run_is_in_one_chunk_and_every_chunk_has_its_share(num_chunks):
         number = np.bincount(part.place, minlength=5)
         assert number.max() - number.min() <= 1
     assert len({part.name for part in parts}) == num_chunks
+
+
+# Settings of the environment.
+
+
+def test_settings_of_the_environment_are_swept_as_words():
+    over = grid.read_over([("env-set.frame_skip", "2", "1e1"), ("env-set.solver", "mjx", "fast")])
+    assert over == {"env_set.frame_skip": [2, 10], "env_set.solver": ["mjx", "fast"]}
+    base = Config(env="Hopper-v5", env_set=("reset_noise_scale=0.1", "frame_skip=4"))
+    grid.check_over(base, over)
+    configs = grid.configure(base, grid.grid(over))
+    kept = "reset_noise_scale=0.1"
+    assert configs[1].env_set == (kept, "frame_skip=2", "solver=fast")
+    assert configs[2].env_set == (kept, "frame_skip=10", "solver=mjx")
+    assert len(make_groups(configs, tuple(over), exact=False)) == 4
+
+
+@pytest.mark.parametrize(
+    ("over", "said"),
+    [
+        ({"env_set.max_episode_steps": [5, 6]}, "--over horizon"),
+        ({"env_set.reward_threshold": [5, 6]}, "one return"),
+        ({"env_set.frame_skip": [5]}, "pass --env-set frame_skip=5"),
+        ({"env_sets.frame_skip": [5, 6]}, "unknown setting"),
+    ],
+)
+def test_a_setting_of_the_environment_that_cannot_be_swept_is_refused(over, said):
+    with pytest.raises(ValueError, match=said):
+        grid.check_over(Config(), over)
 
 
 # The rungs.

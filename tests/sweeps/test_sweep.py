@@ -28,7 +28,7 @@ from mjx_reinforce.store.build import build
 from mjx_reinforce.sweeps import chunks, conduct, perform
 from mjx_reinforce.sweeps import main as sweep_command
 from mjx_reinforce.sweeps.designs import plan, rungs, search
-from mjx_reinforce.sweeps.designs.design import Design, check_design
+from mjx_reinforce.sweeps.designs.design import Design, check_design, read_design
 from mjx_reinforce.sweeps.designs.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
 from mjx_reinforce.sweeps.results import join_parts
@@ -731,3 +731,28 @@ def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
             np.testing.assert_array_equal(returns[0], final[seeds == seed][0])
     with pytest.raises(ValueError, match="has the policies of the seeds"):
         load_seed(read_run(Path("swept/policies/000")), 99)
+
+
+def test_each_setting_of_an_environment_has_its_own_program_and_policies(tmp_path):
+    """With this reward CartPole earns 1 a step, or nothing until it falls."""
+    base = Config(
+        env="CartPole-v1",
+        engine="vmap",
+        hidden_sizes=(4,),
+        num_seeds=2,
+        num_episodes=2,
+        eval_episodes=2,
+        env_steps=None,
+        max_updates=2,
+        env_set=("max_episode_steps=9",),
+    )
+    over = {"env_set.sutton_barto_reward": ["false", "true"]}
+    found = mjx_reinforce.sweep(base, over, output=tmp_path / "out", report=False, quiet=True)
+    last = found.eval_return[-1]
+    assert np.all(last[found.configuration == 0] > 5)
+    assert np.all(last[found.configuration == 1] <= 0)
+    run = read_run(tmp_path / "out" / "policies" / "001")
+    assert run.env_set == ("max_episode_steps=9", "sutton_barto_reward=true")
+    assert run.horizon == 9
+    resumed = read_design(tmp_path / "out")
+    assert (resumed.base, resumed.over) == (base, over)

@@ -1,12 +1,13 @@
 """The configurations of a grid: every combination of the values of its settings."""
 
+import contextlib
 import dataclasses
 import itertools
 import typing
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from mjx_reinforce.checks import alternatives, whole_number
+from mjx_reinforce.checks import alternatives, read_as
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.registry import check_name, nearest
 from mjx_reinforce.settings.config import Config, check, flag, spoken
@@ -15,6 +16,13 @@ from mjx_reinforce.settings.hints import other_names
 from mjx_reinforce.settings.relevance import check_read
 
 _FIELDS = {field.name: field for field in dataclasses.fields(Config)}
+#: What comes before the name of a setting of the environment, such as env_set.frame_skip.
+_ENV_SET = "env_set."
+#: Settings of an environment that all configurations of a sweep share, and why.
+_ENV_ONCE = {
+    "max_episode_steps": "--over horizon says how long episodes are",
+    "reward_threshold": "its report has one return that counts as solved",
+}
 _EXAMPLE = "such as --over learning-rate 1e-3 1e-2"
 
 
@@ -32,12 +40,18 @@ def read_over(given: Sequence[Sequence[str]]) -> dict[str, list[Any]]:
         if not words:
             raise ValueError(f"--over needs a setting and its values, {_EXAMPLE}")
         name = words[0].removeprefix("--").replace("-", "_")
-        if name not in _FIELDS:
+        if name not in _FIELDS and not _of_env(name):
             raise ValueError(_unknown(words[0].removeprefix("--")))
         if name in over:
             raise ValueError(f"--over {words[0]} is given twice: put all values behind one of them")
         over[name] = [_value(name, word) for word in words[1:]]
     return over
+
+
+def _of_env(name: str) -> str | None:
+    """Returns the setting of the environment that a name after --over means, if it is one."""
+    own = name.removeprefix(_ENV_SET)
+    return own if own != name and own.isidentifier() else None
 
 
 def _unknown(word: str) -> str:
@@ -72,11 +86,16 @@ def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
             f"configuration by {command('train')}"
         )
     for name, values in over.items():
-        check_name("setting", name, _FIELDS)
-        if why := _FIELDS[name].metadata.get("once"):
+        if own := _of_env(name):
+            why = _ENV_ONCE.get(own)
+        else:
+            check_name("setting", name, _FIELDS)
+            why = _FIELDS[name].metadata.get("once")
+        if why:
             raise ValueError(f"a sweep cannot go over {spoken(name)}: {why}")
         if len(values) < 2:
-            one = f"; for one value pass {flag(name)}" if values else f", {_EXAMPLE}"
+            passed = f"--env-set {own}={values[0]}" if own and values else flag(name)
+            one = f"; for one value pass {passed}" if values else f", {_EXAMPLE}"
             raise ValueError(f"--over {spoken(name)} needs two values or more{one}")
         twice = [x for i, x in enumerate(values) if x in values[:i]]
         if twice:
@@ -97,7 +116,7 @@ def configure(
       ValueError: the settings of a configuration make no sense; it does not read a setting that is
         swept; or none of them reads one that was given.
     """
-    configs = [dataclasses.replace(base, **values) for values in configurations]
+    configs = [_with_values(base, values) for values in configurations]
     for config, values in zip(configs, configurations, strict=True):
         check(config)
         check_read(config, values)
@@ -106,6 +125,17 @@ def configure(
         if len(idle) == len(configs):
             raise idle[0]
     return configs
+
+
+def _with_values(base: Config, values: Mapping[str, Any]) -> Config:
+    """Returns settings with other values, also of settings of the environment."""
+    plain = {name: value for name, value in values.items() if not _of_env(name)}
+    config = dataclasses.replace(base, **plain)
+    given = {own: f"{own}={value}" for name, value in values.items() if (own := _of_env(name))}
+    if not given:
+        return config
+    kept = [word for word in config.env_set if word.partition("=")[0] not in given]
+    return dataclasses.replace(config, env_set=(*kept, *given.values()))
 
 
 def _not_read(config: Config, name: str) -> ValueError | None:
@@ -118,36 +148,16 @@ def _not_read(config: Config, name: str) -> ValueError | None:
 
 
 def _value(name: str, word: str) -> Any:
-    """Returns a word of the command line as a value of a setting's type."""
-    kinds = alternatives(_FIELDS[name].type)
-    for kind in kinds:
-        try:
-            return _as(kind, word)
-        except ValueError:
-            continue
+    """Returns a word of the command line as a value of a setting's type.
+
+    The environment reads its own settings; a range needs numbers.
+    """
+    kind = (int | float | str) if _of_env(name) else _FIELDS[name].type
+    with contextlib.suppress(ValueError):
+        return read_as(kind, word)
     spaces = "; write spaces between values" if "," in word else ""
-    raise ValueError(
-        f"--over {spoken(name)} has the value {word!r}, which is no {_kind(kinds)}{spaces}"
-    )
-
-
-def _as(kind: Any, word: str) -> Any:
-    """Returns a word as a value of a type, or raises ValueError."""
-    if kind is type(None):
-        return {"none": None}[word.lower()] if word.lower() == "none" else _no(word)
-    if kind is bool:
-        words = {"true": True, "false": False}
-        return words[word.lower()] if word.lower() in words else _no(word)
-    if typing.get_origin(kind) is Literal:
-        return word if word in typing.get_args(kind) else _no(word)
-    if typing.get_origin(kind) is tuple:
-        inner = typing.get_args(kind)[0]
-        return tuple(_as(inner, part) for part in word.split(",")) if word != "none" else ()
-    return whole_number(word) if kind is int else kind(word)
-
-
-def _no(word: str) -> Any:
-    raise ValueError(word)
+    said = _kind(alternatives(kind))
+    raise ValueError(f"--over {spoken(name)} has the value {word!r}, which is no {said}{spaces}")
 
 
 def _kind(kinds: Sequence[Any]) -> str:

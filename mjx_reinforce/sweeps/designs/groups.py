@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import Config, marked
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.groups import Reader
@@ -50,6 +51,8 @@ def make_groups(configs: Sequence[Config], swept: Collection[str], *, exact: boo
 
 def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, float]:
     """Returns the numbers of a configuration that its programs take as arguments."""
+    if is_own(config.algorithm):
+        return {}
     other = Reader.ARS if config.algorithm == "reinforce" else Reader.REINFORCE
     names = set(marked(Mark.TRACED)).difference(marked(other))
     if not (Reader.REINFORCE.holds(config) and Reader.FREE_STD.holds(config)):
@@ -76,7 +79,7 @@ def learner_builder(env: Environment, config: Config) -> Callable[[dict[str, Any
     """
     from mjx_reinforce.store.build import build
 
-    if config.algorithm == "ars":
+    if config.algorithm != "reinforce":
         return lambda settings: build(env, dataclasses.replace(config, **settings))[0]
     plain = build(env, config)[0]
 

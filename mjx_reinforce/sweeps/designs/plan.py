@@ -91,7 +91,7 @@ def _capacity(env: Environment, horizon: int, group: Group, num_devices: int) ->
 
 
 def describe_plan(
-    env: Environment,
+    envs: Sequence[Environment],
     horizon: int,
     learners: Sequence[Any],
     groups: Sequence[Group],
@@ -102,7 +102,7 @@ def describe_plan(
     """Returns a paragraph on what a sweep will do.
 
     Args:
-      env: what is trained on.
+      envs: what each group trains on.
       horizon: the time limit of an episode in steps.
       learners: one of each group.
       groups: of configurations.
@@ -120,7 +120,7 @@ def describe_plan(
     )
     memory = max(
         needed(dataclasses.replace(group.config, num_seeds=at_once * part.widths[0]), task)
-        for group, part in zip(groups, parts, strict=True)
+        for env, group, part in zip(envs, groups, parts, strict=True)
         for task in (task_of(policy_settings(env, group.config), horizon, group.config),)
     )
     where = machine.name
@@ -130,13 +130,13 @@ def describe_plan(
         f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
         f"of {first.env}, on {where}, with the engine {learners[0].engine.name}: "
         f"{counted(len(groups), 'compiled program')}, {counted(chunks, 'chunk')} of up to {side:,} "
-        f"runs. {_time(env, horizon, learners, groups, num_devices, part_trained)}. "
+        f"runs. {_time(envs, horizon, learners, groups, num_devices, part_trained)}. "
         f"It needs about {gigabytes(memory)} of memory beside the programs."
     )
 
 
 def _time(
-    env: Environment,
+    envs: Sequence[Environment],
     horizon: int,
     learners: Sequence[Any],
     groups: Sequence[Group],
@@ -145,7 +145,7 @@ def _time(
 ) -> str:
     """Returns about how long the training takes, where that is known."""
     total = 0.0
-    for learner, group in zip(learners, groups, strict=True):
+    for env, learner, group in zip(envs, learners, groups, strict=True):
         seconds = group_seconds(env, horizon, learner.engine.name, group, num_devices)
         if seconds is None:
             return "How long this takes here is not known"

@@ -16,7 +16,7 @@ from mjx_reinforce.sweeps.slots.devices import Devices
 class Prepared(NamedTuple):
     """All that a sweep is made of.
 
-    env: what is trained on
+    envs: what each group trains on
     horizon: the time limit of an episode in steps
     devices: where
     configurations: the values of what is swept, in each
@@ -27,7 +27,7 @@ class Prepared(NamedTuple):
     plan: a paragraph for people
     """
 
-    env: Any
+    envs: list[Any]
     horizon: int
     devices: Devices
     configurations: list[dict[str, Any]]
@@ -51,21 +51,24 @@ def prepare_sweep(design: Design, limits: Sequence[int] | None, num_processes: i
     """
     configurations = design.configurations()
     configs = configure(design.base, configurations)
-    env = envs.make(design.base.env)
     # A program for several devices need not round as the one for a single device does.
     devices = Devices(1 if design.exact else None)
     groups = make_groups(configs, tuple(design.over), exact=design.exact)
-    built = [build(env, group.config) for group in groups]
+    made = [envs.make_set(group.config.env, group.config.env_set) for group in groups]
+    built = [build(env, group.config) for env, group in zip(made, groups, strict=True)]
     horizon = built[0][1]
     if limits is None:
         share = devices.count, num_processes
-        limits = [chunk_limit(env, horizon, group, design.chunk_runs, *share) for group in groups]
+        limits = [
+            chunk_limit(env, horizon, group, design.chunk_runs, *share)
+            for env, group in zip(made, groups, strict=True)
+        ]
     parts = [
         divide(group, limit, devices.count, exact=design.exact)
         for group, limit in zip(groups, limits, strict=True)
     ]
     learners = [learner for learner, _ in built]
     trained = part_trained(design.search, len(configurations))
-    plan = describe_plan(env, horizon, learners, groups, parts, devices.count, trained)
+    plan = describe_plan(made, horizon, learners, groups, parts, devices.count, trained)
     engine = learners[0].engine.name, sum(learner.engine.seconds for learner in learners)
-    return Prepared(env, horizon, devices, configurations, groups, list(limits), *engine, plan)
+    return Prepared(made, horizon, devices, configurations, groups, list(limits), *engine, plan)

@@ -1,0 +1,111 @@
+"""Parts of a simulation by their names in the model, such as ``data.site("tip")``."""
+
+from typing import Any
+
+import jax
+
+from mjx_reinforce.physics.mjx_internals import Simulation
+from mjx_reinforce.registry import check_name
+
+#: Kind -> what comes before the name of a field of mjData, such as in ``site_xpos``.
+_PREFIXES = {
+    "body": "",
+    "geom": "geom_",
+    "site": "site_",
+    "camera": "cam_",
+    "tendon": "ten_",
+    "actuator": "actuator_",
+}
+#: Fields of mjData with a row for each joint; others that a joint has are those of its dofs.
+_OF_JOINTS = ("xanchor", "xaxis")
+#: Kind -> how many of it a model has.
+_COUNTS = {
+    "body": "nbody",
+    "geom": "ngeom",
+    "site": "nsite",
+    "camera": "ncam",
+    "tendon": "ntendon",
+    "actuator": "nu",
+    "joint": "njnt",
+    "sensor": "nsensor",
+}
+
+
+class Part:
+    """A body, joint, geom, ... of a simulation: its rows of the fields of mjData."""
+
+    def __init__(self, data: Any, model: Any, kind: str, name: str):
+        """Finds the part; raises ValueError for a name that the model has not."""
+        names = [getattr(model, kind)(i).name for i in range(getattr(model, _COUNTS[kind]))]
+        check_name(kind, name, dict.fromkeys(filter(None, names)))
+        self._data, self._model, self._kind, self.id = data, model, kind, names.index(name)
+
+    def __getattr__(self, field: str) -> jax.Array:
+        data, model = self._data, self._model
+        if self._kind == "sensor":
+            start, size = int(model.sensor_adr[self.id]), int(model.sensor_dim[self.id])
+            return getattr(data, f"sensor{field}")[start : start + size]
+        if self._kind == "joint" and field not in _OF_JOINTS:
+            return getattr(data, field)[self._rows(field)]
+        plain = self._kind == "joint" or field == "ctrl"
+        return getattr(data, field if plain else f"{_PREFIXES[self._kind]}{field}")[self.id]
+
+    def _rows(self, field: str) -> slice:
+        """Returns the rows of a joint in ``qpos``, or in a field of the degrees of freedom."""
+        model = self._model
+        of_qpos = model.jnt_qposadr, model.nq
+        starts, size = of_qpos if field == "qpos" else (model.jnt_dofadr, model.nv)
+        ends = [*starts[1:], size]
+        return slice(int(starts[self.id]), int(ends[self.id]))
+
+
+class Named:
+    """Has the fields of mjData; their rows by name, and what was drawn for the episode.
+
+    mj_model: whose names they are
+    episode: what ``MujocoEnv.randomize`` returned for this episode
+    """
+
+    mj_model: Any
+    episode: dict[str, Any]
+
+    def body(self, name: str) -> Part:
+        """Returns a body: ``xpos`` [3], ``xquat`` [4], ``xmat``, ``cvel``, ..., as in mjData."""
+        return Part(self, self.mj_model, "body", name)
+
+    def joint(self, name: str) -> Part:
+        """Returns a joint: ``qpos`` [1], [4] or [7], ``qvel`` [1], [3] or [6], ``xaxis``, ..."""
+        return Part(self, self.mj_model, "joint", name)
+
+    def geom(self, name: str) -> Part:
+        """Returns a geom: ``xpos`` [3], ``xmat`` [3, 3]."""
+        return Part(self, self.mj_model, "geom", name)
+
+    def site(self, name: str) -> Part:
+        """Returns a site: ``xpos`` [3], ``xmat`` [3, 3]."""
+        return Part(self, self.mj_model, "site", name)
+
+    def camera(self, name: str) -> Part:
+        """Returns a camera: ``xpos`` [3], ``xmat`` [3, 3]."""
+        return Part(self, self.mj_model, "camera", name)
+
+    def tendon(self, name: str) -> Part:
+        """Returns a tendon: ``length`` [], ``velocity`` []."""
+        return Part(self, self.mj_model, "tendon", name)
+
+    def actuator(self, name: str) -> Part:
+        """Returns an actuator: ``ctrl`` [], ``force`` [], ``length`` [], ``velocity`` []."""
+        return Part(self, self.mj_model, "actuator", name)
+
+    def sensor(self, name: str) -> Part:
+        """Returns a sensor: ``data`` [n]."""
+        return Part(self, self.mj_model, "sensor", name)
+
+
+class View(Named, Simulation):
+    """A simulation as a task reads it: every field of mjData, and parts by their names."""
+
+    def __init__(self, data: Any, mj_model: Any, episode: dict[str, Any]):
+        """Shows an ``mjx.Data``."""
+        super().__init__(data)
+        self.mj_model, self.episode = mj_model, episode

@@ -1,0 +1,217 @@
+"""Models that are objects, parts by their names, and what differs from episode to episode."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_reinforce import reinforce
+from mjx_reinforce.envs import models
+from mjx_reinforce.envs.base import MujocoEnv
+from mjx_reinforce.envs.in_mujoco import InMujoco
+
+SOURCE = """
+<mujoco><option timestep="0.01"/><worldbody><geom name="floor" type="plane" size="5 5 1"/>
+  <body name="box" pos="0 0 0.1"><joint name="x" type="slide" axis="1 0 0"/>
+    <joint name="z" type="slide" axis="0 0 1"/>
+    <geom name="ball" type="sphere" size="0.1" mass="1"/><site name="tip" pos="0.1 0 0"/>
+    <body name="flag" pos="0 0 0.2"><joint name="turn" axis="0 1 0" damping="0.1"/>
+      <geom type="capsule" size="0.02 0.1" mass="0.1"/></body></body></worldbody>
+  <actuator><motor name="push" joint="x" gear="60"/></actuator>
+  <sensor><jointpos name="where" joint="x"/><jointvel name="speed" joint="turn"/></sensor>
+</mujoco>"""
+SPEC = mujoco.MjSpec.from_string(SOURCE)  # pyright: ignore[reportAttributeAccessIssue]
+MODEL = SPEC.compile()
+
+
+class Box(MujocoEnv):
+    """Push a box to a goal."""
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(MujocoEnv.Settings):
+        """Arguments of Box."""
+
+        frame_skip: int = 2
+        max_episode_steps: int = 20
+        reward_threshold: float | None = None
+
+    def initial(self, rng):
+        """Begins near the middle."""
+        qpos = 0.05 * jax.random.normal(rng, (self.mj_model.nq,)).at[1].set(0.0)
+        return qpos, jnp.zeros(self.mj_model.nv)
+
+    def outcome(self, before, data, action):
+        """Rewards what moves."""
+        moved = data.site("tip").xpos[0] - before.joint("x").qpos[0]
+        return moved, False, {}
+
+
+class Reach(Box):
+    """The goal, the command, the friction, the mass, the damping and the gear are drawn."""
+
+    def randomize(self, rng):
+        """Draws one of each kind."""
+        keys = jax.random.split(rng, 4)
+        friction = self.model.geom_friction * jax.random.uniform(keys[1], (), minval=0.1)
+        return {
+            "goal": jax.random.uniform(keys[0], (), minval=-1.0),
+            "command": jax.random.randint(keys[2], (), 0, 3),
+            "geom_friction": friction,
+            "body_mass": self.model.body_mass * (1 + jax.random.uniform(keys[3], ())),
+            "dof_damping": self.model.dof_damping * 3,
+            "actuator_gear": self.model.actuator_gear * 0.5,
+        }
+
+    def observe(self, data):
+        """Shows goal and command."""
+        own = jnp.stack([data.episode["goal"], data.episode["command"].astype(float)])
+        return jnp.concatenate([data.qpos, data.qvel, own])
+
+    def outcome(self, before, data, action):
+        """Costs the distance; the goal is that of the whole episode."""
+        away = data.body("box").xpos[0] - data.episode["goal"]
+        return -jnp.abs(away) + 0 * before.episode["goal"], jnp.abs(away) > 3, {}
+
+
+@pytest.mark.parametrize("source", ["file", "spec", "model"])
+def test_a_model_may_be_a_file_a_spec_or_a_model(tmp_path, source):
+    path = tmp_path / "box.xml"
+    path.write_text(SOURCE)
+    env = Box(xml_file={"file": str(path), "spec": SPEC, "model": MODEL}[source])
+    assert env.mj_model is not MODEL
+    assert env.mj_model.nq == 3
+    state = jax.jit(env.step)(jax.jit(env.reset)(jax.random.key(0)), jnp.ones(1))
+    other = Box(xml_file=MODEL)
+    like = jax.jit(other.step)(jax.jit(other.reset)(jax.random.key(0)), jnp.ones(1))
+    np.testing.assert_array_equal(state.obs, like.obs)
+    if source != "model":
+        assert models.spec(env.settings.xml_file).compile().nq == 3
+
+
+def test_what_is_no_model_is_refused():
+    with pytest.raises(ValueError, match="xml_file of Box must be text or MjSpec or MjModel"):
+        Box(xml_file=3)
+    other = mujoco.MjSpec.from_string("<mujoco/>")  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(ValueError, match="has no actuators"):
+        Box(xml_file=other)
+
+
+def test_parts_are_those_of_mujoco_by_their_names():
+    """Every part that MuJoCo's Python has, after a step, in its numbers."""
+    read = {
+        "body": ("box", ("xpos", "xquat", "xipos", "cvel")),
+        "geom": ("ball", ("xpos",)),
+        "site": ("tip", ("xpos",)),
+        "joint": ("turn", ("qpos", "qvel", "xaxis", "xanchor")),
+        "actuator": ("push", ("ctrl", "force", "length", "velocity")),
+        "sensor": ("speed", ("data",)),
+    }
+
+    class Shown(Box):
+        """Observes all of them."""
+
+        def observe(self, data):
+            """Returns them one after the other."""
+            parts = [getattr(data, kind)(name) for kind, (name, _) in read.items()]
+            pairs = zip(parts, (fields for _, fields in read.values()), strict=True)
+            return jnp.concatenate(
+                [jnp.ravel(getattr(part, field)) for part, fields in pairs for field in fields]
+            )
+
+    env = Shown(xml_file=SPEC)
+    observed = jax.jit(env.step)(jax.jit(env.reset)(jax.random.key(1)), jnp.ones(1)).obs
+    peer = InMujoco(env)
+    peer.reset(jax.random.key(1))
+    np.testing.assert_allclose(peer.step(np.ones(1))[0], observed, rtol=1e-4, atol=1e-4)
+    theirs = [
+        np.ravel(getattr(getattr(peer.data, kind)(name), field))
+        for kind, (name, fields) in read.items()
+        for field in fields
+    ]
+    np.testing.assert_allclose(np.concatenate(theirs), observed, rtol=1e-4, atol=1e-4)
+
+
+def test_an_unknown_name_says_which_are_known():
+    class Wrong(Box):
+        """Reads a site that is not there."""
+
+        def observe(self, data):
+            """Misspells it."""
+            return data.site("tipp").xpos
+
+    with pytest.raises(ValueError, match=r"unknown site 'tipp'. Did you mean 'tip'.*Known: tip"):
+        jax.eval_shape(Wrong(xml_file=SPEC).reset, jax.random.key(0))
+
+
+def test_an_episode_keeps_what_was_drawn():
+    env = Reach(xml_file=SPEC)
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    states = [reset(jax.random.key(i)) for i in range(2)]
+    drawn = [jax.device_get(state.pipeline_state.episode) for state in states]
+    assert drawn[0]["goal"] != drawn[1]["goal"]
+    state = states[0]
+    for _ in range(3):
+        state = step(state, jnp.ones(1))
+        goal, command = state.obs[-2:]
+        assert (goal, command) == (drawn[0]["goal"], drawn[0]["command"])
+        away = state.pipeline_state.qpos[0] - goal
+        np.testing.assert_allclose(state.reward, -abs(away), atol=0.05)
+
+
+def test_fields_of_the_model_are_those_of_mujoco_with_the_same_fields():
+    """With the model's own friction, mass and gear the box would be elsewhere."""
+    env = Reach(xml_file=SPEC)
+
+    class Plain(Reach):
+        """Replaces no field."""
+
+        def randomize(self, rng):
+            """Draws what is no field."""
+            drawn = super().randomize(rng)
+            return {name: x for name, x in drawn.items() if name not in models.RANDOM}
+
+    plain = Plain(xml_file=SPEC)
+    peer, key = InMujoco(env), jax.random.key(4)
+    observed = {}
+    for one in (env, plain):
+        state, step = jax.jit(one.reset)(key), jax.jit(one.step)
+        for _ in range(10):
+            state = step(state, jnp.ones(1))
+        observed[one] = state.obs
+    peer.reset(key)
+    for _ in range(10):
+        last = peer.step(np.ones(1))
+    np.testing.assert_allclose(last[0], observed[env], rtol=2e-3, atol=2e-3)
+    assert np.abs(observed[plain] - observed[env]).max() > 0.05
+
+
+@pytest.mark.parametrize("engine", ["fused", "native"])
+def test_engines_play_what_was_drawn(engine):
+    """The same episodes as ``vmap``: with other goals, frictions and masses they would differ."""
+    env = Reach(xml_file=SPEC)
+    learner = reinforce(env, num_episodes=4, horizon=8, engine=engine)
+    like = reinforce(env, num_episodes=4, horizon=8, engine="vmap")
+    key, state = jax.random.key(2), learner.init(jax.random.key(0))
+    played, expected = (jax.jit(x.play)(state, key) for x in (learner, like))
+    np.testing.assert_allclose(played.observation, expected.observation, rtol=2e-3, atol=2e-3)
+    np.testing.assert_allclose(played.reward, expected.reward, rtol=2e-3, atol=2e-3)
+    goals = np.asarray(played.observation[0, :, -2])
+    assert len(set(goals.tolist())) == 4
+
+
+@pytest.mark.parametrize(
+    ("drawn", "said"),
+    [
+        (3, "randomize must return a dict of quantities by their names, got the shape"),
+        ({"goal": "far"}, "'goal' of Drawn.randomize must be an array, got 'far'"),
+        ({"body_mass": jnp.ones(2)}, r"'body_mass' of Drawn.randomize must be \[3\]"),
+        ({"jnt_limited": jnp.ones(3)}, "cannot replace jnt_limited.*it can replace body_mass"),
+    ],
+)
+def test_what_is_no_quantity_is_refused(drawn, said):
+    task = type("Drawn", (Box,), {"randomize": lambda self, rng: drawn})
+    with pytest.raises(ValueError, match=said):
+        jax.eval_shape(task(xml_file=SPEC).reset, jax.random.key(0))
