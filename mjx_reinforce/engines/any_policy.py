@@ -24,7 +24,7 @@ _MOST_PARAMETERS = 8_000
 def rollout(
     env: Environment,
     act: Act,
-    params: PyTree,
+    actor: PyTree,
     distribution: Distribution,
     key: jax.Array,
     *,
@@ -41,10 +41,10 @@ def rollout(
 
     Args:
       env: what is played.
-      act: (params, observation [O]) -> outputs [K] of the distribution: any function that JAX can
+      act: (actor, observation [O]) -> outputs [K] of the distribution: any function that JAX can
         trace, of one observation. Of a flax.linen module it is ``module.apply``; of others see
         docs/vector.md.
-      params: what ``act`` reads, a pytree of arrays.
+      actor: what ``act`` reads, a pytree of arrays, such as the parameters of a network.
       distribution: the family whose parameters the outputs are, ours or your own.
       key: consumed; [N] the episodes' own, or [] and that of episode i is this one folded with i.
       num_episodes: N.
@@ -67,12 +67,12 @@ def rollout(
     check_key(key)
     check_count("num_episodes", num_episodes)
     check_count("horizon", horizon)
-    check_policy(act, params, distribution, jax.eval_shape(env.reset, jax.random.key(0)).obs)
-    play = _player(engine, env, act, params, distribution, horizon)
+    check_policy(act, actor, distribution, jax.eval_shape(env.reset, jax.random.key(0)).obs)
+    play = _player(engine, env, act, actor, distribution, horizon)
     return play(
         env,
         _of_any_batch(act),
-        params,
+        actor,
         distribution,
         key,
         num_episodes=num_episodes,

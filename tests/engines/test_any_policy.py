@@ -130,7 +130,7 @@ def test_bad_arguments(change, message):
     env = envs.make("InvertedPendulum-v5")
     right = {
         "act": plain(4, 2)[1],
-        "params": plain(4, 2)[0](4),
+        "actor": plain(4, 2)[0](4),
         "distribution": normal(env.action_space),
         "key": KEY,
         "num_episodes": 1,
