@@ -22,7 +22,7 @@ from mjx_reinforce.physics import mjx_internals
 from mjx_reinforce.physics import step as physics
 from mjx_reinforce.physics.mjx_internals import Simulation
 from mjx_reinforce.registry import check_name
-from mjx_reinforce.types import Box
+from mjx_reinforce.types import Box, MjModel
 
 SOLVERS = ("exact", "mjx", "fast")
 
@@ -52,7 +52,7 @@ class Physics:
 class Before(Named, Simulation):
     """What is known of the start of an env step, under MuJoCo's own names."""
 
-    def __init__(self, known: dict[str, jax.Array], mj_model: Any, episode: dict[str, Any]):
+    def __init__(self, known: dict[str, jax.Array], mj_model: MjModel, episode: dict[str, Any]):
         """Shows the given fields of mjData; any other raises AttributeError when it is read."""
         vars(self).update(known)
         self.mj_model, self.episode = mj_model, episode

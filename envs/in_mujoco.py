@@ -17,7 +17,7 @@ from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
 from mjx_reinforce.envs.parts import Named, View
 from mjx_reinforce.physics.mjx_internals import Simulation
-from mjx_reinforce.types import Environment
+from mjx_reinforce.types import Environment, MjModel
 
 _LEAVE_OUT = "leave --backend mujoco out"
 
@@ -25,7 +25,7 @@ _LEAVE_OUT = "leave --backend mujoco out"
 class _Recorder(View):
     """An mjData of zeros that remembers which of its fields were read."""
 
-    def __init__(self, sizes: Simulation, mj_model: Any):
+    def __init__(self, sizes: Simulation, mj_model: MjModel):
         super().__init__(None, mj_model, {})
         self.sizes, self.read = sizes, set()
 
@@ -40,7 +40,7 @@ class _Recorder(View):
 class _Fields(Named):
     """Some fields of mjData, as attributes."""
 
-    def __init__(self, fields: dict[str, Any], mj_model: Any, episode: dict[str, Any]):
+    def __init__(self, fields: dict[str, Any], mj_model: MjModel, episode: dict[str, Any]):
         vars(self).update(fields, mj_model=mj_model, episode=episode)
 
     def __getattr__(self, name: str) -> Any:  # for type checkers
@@ -141,7 +141,7 @@ class InMujoco:
         return value.reshape(shape.shape).astype(shape.dtype)
 
 
-def _with_fields(model: Any, episode: dict[str, jax.Array]) -> Any:
+def _with_fields(model: MjModel, episode: dict[str, jax.Array]) -> Any:
     """Returns a model with the fields that an episode replaces."""
     fields = {name: value for name, value in episode.items() if name in models.RANDOM}
     if not fields:

@@ -5,7 +5,7 @@ import importlib.resources
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax
 import numpy as np
@@ -79,9 +79,11 @@ _REMEDIES = {
 #: What MJX refuses and no step depends on: the energy, and a check of the inverse dynamics.
 _ONLY_REPORTS = int(mjtEnableBit.mjENBL_ENERGY | mjtEnableBit.mjENBL_FWDINV)
 _ELSE = "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
+#: The name of a file, an ``MjSpec`` or an ``MjModel``, which MuJoCo does not declare.
+ModelSource: TypeAlias = Any
 
 
-def load_model(xml_file: Any) -> Any:
+def load_model(xml_file: ModelSource) -> Any:
     """Compiles an MJCF file of the package's assets, or the user's own by a path.
 
     Args:
@@ -109,7 +111,7 @@ def load_model(xml_file: Any) -> Any:
     return model
 
 
-def is_own(xml_file: Any) -> bool:
+def is_own(xml_file: ModelSource) -> bool:
     """Returns whether a model is the user's, by a path; raises ValueError where no file is."""
     if not isinstance(xml_file, str):
         return True
@@ -119,7 +121,7 @@ def is_own(xml_file: Any) -> bool:
     return own
 
 
-def spec(xml_file: Any) -> Any:
+def spec(xml_file: ModelSource) -> Any:
     """Returns a model before it is compiled, an ``MjSpec``; otherwise as ``load_model``."""
     if isinstance(xml_file, MjSpec):
         return xml_file.copy()
@@ -139,7 +141,9 @@ def _asset(xml_file: str) -> str:
     return asset.read_text(encoding="utf-8")
 
 
-def _compile_model(compiler: Callable[[Any], Any], source: Any, xml_file: Any) -> Any:
+def _compile_model(
+    compiler: Callable[[Any], Any], source: ModelSource, xml_file: ModelSource
+) -> Any:
     """Returns the model, or raises ValueError with the file's name and what MuJoCo says."""
     try:
         return compiler(source)
@@ -152,7 +156,7 @@ def make_data(model: "mjx.Model") -> mjx.Data:
     return mjx.make_data(model, impl="jax", device=jax.local_devices()[0])
 
 
-def to_mjx(model: Any, xml_file: Any) -> mjx.Model:
+def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
     """Returns MJX's version of a compiled model.
 
     Args:
@@ -181,7 +185,7 @@ def to_mjx(model: Any, xml_file: Any) -> mjx.Model:
     return converted
 
 
-def _ignored(model: Any) -> Iterator[tuple[str, str]]:
+def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     """Yields what MJX would ignore in silence, and how to do without it."""
     for field, feature, remedy in (*NOT_CARRIED.values(), *_IGNORED):
         if np.any(getattr(model, field)):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from mjx_reinforce.checks import BadEnvironmentError
 from mjx_reinforce.envs.models import RANDOM
+from mjx_reinforce.types import MjModel
 
 
 def check_start(name: str, start: object, sizes: tuple[int, int]) -> tuple[Any, Any]:
@@ -34,7 +35,7 @@ def check_start(name: str, start: object, sizes: tuple[int, int]) -> tuple[Any, 
     return qpos, qvel
 
 
-def check_episode(name: str, episode: object, model: Any) -> dict[str, jax.Array]:
+def check_episode(name: str, episode: object, model: MjModel) -> dict[str, jax.Array]:
     """Returns what ``randomize`` returned, as arrays, if it is quantities by their names.
 
     Args:

@@ -6,6 +6,7 @@ import jax
 
 from mjx_reinforce.physics.mjx_internals import Simulation
 from mjx_reinforce.registry import check_name
+from mjx_reinforce.types import MjModel
 
 #: Kind -> what comes before the name of a field of mjData, such as in ``site_xpos``.
 _PREFIXES = {
@@ -34,7 +35,7 @@ _COUNTS = {
 class Part:
     """A body, joint, geom, ... of a simulation: its rows of the fields of mjData."""
 
-    def __init__(self, data: Any, model: Any, kind: str, name: str):
+    def __init__(self, data: Any, model: MjModel, kind: str, name: str):
         """Finds the part; raises ValueError for a name that the model has not."""
         names = [getattr(model, kind)(i).name for i in range(getattr(model, _COUNTS[kind]))]
         check_name(kind, name, dict.fromkeys(filter(None, names)))
@@ -66,7 +67,7 @@ class Named:
     episode: what ``MujocoEnv.randomize`` returned for this episode
     """
 
-    mj_model: Any
+    mj_model: MjModel
     episode: dict[str, Any]
 
     def body(self, name: str) -> Part:
@@ -105,7 +106,7 @@ class Named:
 class View(Named, Simulation):
     """A simulation as a task reads it: every field of mjData, and parts by their names."""
 
-    def __init__(self, data: Any, mj_model: Any, episode: dict[str, Any]):
+    def __init__(self, data: Any, mj_model: MjModel, episode: dict[str, Any]):
         """Shows an ``mjx.Data``."""
         super().__init__(data)
         self.mj_model, self.episode = mj_model, episode

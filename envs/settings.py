@@ -77,7 +77,7 @@ def split_words(words: Sequence[str]) -> dict[str, str]:
     return texts
 
 
-def read_settings(task: Any, words: Sequence[str]) -> dict[str, Any]:
+def read_settings(task: object, words: Sequence[str]) -> dict[str, Any]:
     """Returns arguments of a task's constructor, from words NAME=VALUE.
 
     Args:

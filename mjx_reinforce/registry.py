@@ -114,7 +114,9 @@ def load_ours(kind: str, name: str, entry: str | Callable[..., Any]) -> Callable
     return _imported(kind, name, entry, remedy)
 
 
-def _imported(kind: str, name: str, entry: Any, remedy: str) -> Callable[..., Any]:
+def _imported(
+    kind: str, name: str, entry: str | Callable[..., Any], remedy: str
+) -> Callable[..., Any]:
     try:
         return load_definition(entry)
     except (Exception, SystemExit) as error:  # an import runs the user's code

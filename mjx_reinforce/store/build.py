@@ -135,7 +135,9 @@ def _build_own(env: "Environment", config: Config, shared: dict[str, Any]) -> "L
     return learner
 
 
-def _made_by_user(kind: str, name: str, known: dict[str, str], *arguments: Any, **more: Any) -> Any:
+def _made_by_user(
+    kind: str, name: str, known: dict[str, str], *arguments: object, **more: object
+) -> Any:
     """Returns what the user's own function returns, or raises ValueError with what it raised."""
     make = load_choice(kind, name, known)
     try:

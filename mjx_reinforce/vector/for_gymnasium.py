@@ -121,7 +121,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         flags = self._out(state.terminated), self._out(state.truncated)
         return self._out(state.obs), self._out(state.reward), *flags, self._info(state)
 
-    def advance(self, actions: Any) -> VectorState:
+    def advance(self, actions: PyTree) -> VectorState:
         """Plays one step as ``step`` does, and returns the environments in JAX.
 
         Where ``arrays`` is "numpy", the next step writes into their memory.

@@ -77,32 +77,36 @@ class StableBaselinesVecEnv(VecEnv):
         """Returns a picture of the first environment, where ``render_mode`` is "rgb_array"."""
         return self.envs.render() or ()
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: object = None) -> list[Any]:
         """Returns an attribute, once for each environment: of Gymnasium's, or of the task's own."""
         owner = self.envs if hasattr(self.envs, attr_name) else self.envs.vec.env
         return self._each(getattr(owner, attr_name), indices)
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
         """Raises NotImplementedError: the environments are compiled as they were made."""
         raise NotImplementedError(
             f"{attr_name} cannot be set: the environments are compiled; make others"
         )
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+        self,
+        method_name: str,
+        *method_args: object,
+        indices: object = None,
+        **method_kwargs: object,
     ) -> list[Any]:
         """Calls a method of the task once; returns what it returned, once for each environment."""
         found = getattr(self.envs.vec.env, method_name)(*method_args, **method_kwargs)
         return self._each(found, indices)
 
-    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: object = None) -> list[bool]:
         """Returns, for each environment, whether it tells what a wrapper would: ``Monitor`` alone.
 
         Therefore ``evaluate_policy`` reads the returns of whole episodes.
         """
         return self._each(wrapper_class is Monitor, indices)
 
-    def _each(self, value: Any, indices: Any) -> list[Any]:
+    def _each(self, value: object, indices: object) -> list[Any]:
         return [value for _ in self._get_indices(indices)]
 
     def _tell(self, state: VectorState, done: np.ndarray, infos: list[dict[str, Any]]) -> None:
