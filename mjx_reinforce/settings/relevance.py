@@ -2,7 +2,6 @@
 
 import dataclasses
 from collections.abc import Collection
-from typing import Any
 
 from mjx_reinforce.settings.config import Config, flag, marked
 from mjx_reinforce.settings.groups import Reader
@@ -53,12 +52,12 @@ def changed(config: Config, default: Config) -> tuple[str, ...]:
     return tuple(name for name in names if getattr(config, name) != getattr(default, name))
 
 
-def as_flag(name: str, value: Any) -> str:
+def as_flag(name: str, value: object) -> str:
     """Returns a setting as it stands on the command line."""
     return " ".join(as_words(name, value))
 
 
-def as_words(name: str, value: Any) -> list[str]:
+def as_words(name: str, value: object) -> list[str]:
     """Returns the words of a setting on the command line; None, text, numbers or lists of them."""
     if isinstance(value, bool):
         return [flag(name if value else f"no_{name}")]
