@@ -141,7 +141,7 @@ class Conductor:
         prepared, group = self._prepared, stage.group
         env = prepared.envs[stage.number]
         seconds = group_seconds(
-            env, prepared.horizon, prepared.engine, group, prepared.devices.count
+            env, prepared.horizons[stage.number], prepared.engine, group, prepared.devices.count
         )
         runs = len(group.members) * group.config.num_seeds
         return None if seconds is None else rung.added * seconds / runs
@@ -192,7 +192,7 @@ class Conductor:
             programs = compile_programs(
                 env,
                 learner_builder(env, whole.config),
-                self._prepared.horizon,
+                self._prepared.horizons[number],
                 whole.config,
                 tuple(whole.settings),
                 self._divide(stage.number, whole).widths,

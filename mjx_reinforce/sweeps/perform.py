@@ -157,7 +157,7 @@ def _finish(
     def settings(number: int) -> tuple[dict[str, Any], dict[str, Any]]:
         [config] = configure(design.base, [prepared.configurations[number]])
         group = next(i for i, each in enumerate(prepared.groups) if number in each.members)
-        run = {"env": config.env, "horizon": prepared.horizon}
+        run = {"env": config.env, "horizon": prepared.horizons[group]}
         if config.env_set:
             run["env_set"] = list(config.env_set)
         return policy_settings(prepared.envs[group], config), run

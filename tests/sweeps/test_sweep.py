@@ -756,3 +756,13 @@ def test_each_setting_of_an_environment_has_its_own_program_and_policies(tmp_pat
     assert run.horizon == 9
     resumed = read_design(tmp_path / "out")
     assert (resumed.base, resumed.over) == (base, over)
+
+
+def test_each_horizon_is_evaluated_to_its_own_end():
+    """Where evaluations are calls of their own; the episodes here earn 1 a step."""
+    shape = {"num_seeds": 2, "num_episodes": 2, "eval_episodes": 2}
+    config = Config(env="toys:Survive", engine="vmap", **shape)
+    config = dataclasses.replace(config, max_updates=1, env_steps=None)
+    found = mjx_reinforce.sweep(config, over={"horizon": [5, 20]})
+    ended = dict(zip(found.configuration.tolist(), found.eval_return[-1].tolist(), strict=True))
+    assert ended == {0: 5.0, 1: 20.0}

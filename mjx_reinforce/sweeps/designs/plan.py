@@ -92,7 +92,7 @@ def _capacity(env: Environment, horizon: int, group: Group, num_devices: int) ->
 
 def describe_plan(
     envs: Sequence[Environment],
-    horizon: int,
+    horizons: Sequence[int],
     learners: Sequence[Any],
     groups: Sequence[Group],
     parts: Sequence[GroupPlan],
@@ -103,7 +103,7 @@ def describe_plan(
 
     Args:
       envs: what each group trains on.
-      horizon: the time limit of an episode in steps.
+      horizons: the time limit of an episode in steps, of each group.
       learners: one of each group.
       groups: of configurations.
       parts: how the runs of each are divided.
@@ -120,7 +120,7 @@ def describe_plan(
     )
     memory = max(
         needed(dataclasses.replace(group.config, num_seeds=at_once * part.widths[0]), task)
-        for env, group, part in zip(envs, groups, parts, strict=True)
+        for env, horizon, group, part in zip(envs, horizons, groups, parts, strict=True)
         for task in (task_of(policy_settings(env, group.config), horizon, group.config),)
     )
     where = machine.name
@@ -130,14 +130,14 @@ def describe_plan(
         f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
         f"of {first.env}, on {where}, with the engine {learners[0].engine.name}: "
         f"{counted(len(groups), 'compiled program')}, {counted(chunks, 'chunk')} of up to {side:,} "
-        f"runs. {_time(envs, horizon, learners, groups, num_devices, part_trained)}. "
+        f"runs. {_time(envs, horizons, learners, groups, num_devices, part_trained)}. "
         f"It needs about {gigabytes(memory)} of memory beside the programs."
     )
 
 
 def _time(
     envs: Sequence[Environment],
-    horizon: int,
+    horizons: Sequence[int],
     learners: Sequence[Any],
     groups: Sequence[Group],
     num_devices: int,
@@ -145,7 +145,7 @@ def _time(
 ) -> str:
     """Returns about how long the training takes, where that is known."""
     total = 0.0
-    for env, learner, group in zip(envs, learners, groups, strict=True):
+    for env, horizon, learner, group in zip(envs, horizons, learners, groups, strict=True):
         seconds = group_seconds(env, horizon, learner.engine.name, group, num_devices)
         if seconds is None:
             return "How long this takes here is not known"

@@ -17,7 +17,7 @@ class Prepared(NamedTuple):
     """All that a sweep is made of.
 
     envs: what each group trains on
-    horizon: the time limit of an episode in steps
+    horizons: the time limit of an episode in steps, of each group
     devices: where
     configurations: the values of what is swept, in each
     groups: of configurations
@@ -28,7 +28,7 @@ class Prepared(NamedTuple):
     """
 
     envs: list[Any]
-    horizon: int
+    horizons: list[int]
     devices: Devices
     configurations: list[dict[str, Any]]
     groups: list[Group]
@@ -56,19 +56,18 @@ def prepare_sweep(design: Design, limits: Sequence[int] | None, num_processes: i
     groups = make_groups(configs, tuple(design.over), exact=design.exact)
     made = [envs.make_set(group.config.env, group.config.env_set) for group in groups]
     built = [build(env, group.config) for env, group in zip(made, groups, strict=True)]
-    horizon = built[0][1]
+    learners, horizons = [list(x) for x in zip(*built, strict=True)]
     if limits is None:
         share = devices.count, num_processes
         limits = [
             chunk_limit(env, horizon, group, design.chunk_runs, *share)
-            for env, group in zip(made, groups, strict=True)
+            for env, horizon, group in zip(made, horizons, groups, strict=True)
         ]
     parts = [
         divide(group, limit, devices.count, exact=design.exact)
         for group, limit in zip(groups, limits, strict=True)
     ]
-    learners = [learner for learner, _ in built]
     trained = part_trained(design.search, len(configurations))
-    plan = describe_plan(made, horizon, learners, groups, parts, devices.count, trained)
+    plan = describe_plan(made, horizons, learners, groups, parts, devices.count, trained)
     engine = learners[0].engine.name, sum(learner.engine.seconds for learner in learners)
-    return Prepared(made, horizon, devices, configurations, groups, list(limits), *engine, plan)
+    return Prepared(made, horizons, devices, configurations, groups, list(limits), *engine, plan)
