@@ -11,7 +11,8 @@ import numpy as np
 from mjx_reinforce.checks import check_kind, check_parts
 from mjx_reinforce.engines import choice, rollouts
 from mjx_reinforce.engines.episode import Act
-from mjx_reinforce.engines.mapping import map_function
+from mjx_reinforce.engines.mapping import machine_code
+from mjx_reinforce.engines.native import available
 from mjx_reinforce.policies.arguments import check_count, check_key
 from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Environment, PyTree, Trajectory, null_action
@@ -117,11 +118,11 @@ def _player(
 ) -> Callable[..., Trajectory]:
     """Returns what plays."""
     large = sum(np.size(x) for x in jax.tree.leaves(params)) > _MOST_PARAMETERS
-    if engine == "auto" and large:
+    if engine == "auto" and large and available.platform() == "cpu":
         examples = jax.eval_shape(env.reset, jax.random.key(0)), null_action(env)
-        step = map_function("auto", env.step, *examples)
-        if step.name == "native":
-            return functools.partial(rollouts.rollout, env_step=_episodes_last(step.call))
+        step = machine_code(env, env.step, *examples)
+        if not isinstance(step, str):
+            return functools.partial(rollouts.rollout, env_step=_episodes_last(step))
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
     player = choice.ActingPolicy(act, shapes, distribution)
     return choice.choose(engine, env, player, horizon).rollout

@@ -10,12 +10,11 @@ import functools
 import time
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
 
 from mjx_reinforce import fused
-from mjx_reinforce.checks import explain
 from mjx_reinforce.engines.episode import Act
 from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.engines.rollouts import rollout
@@ -28,6 +27,11 @@ from mjx_reinforce.types import Environment, PyTree, Trajectory, null_action
 MAX_ENTRIES = 200
 #: On a CPU, branches of more operations are skipped where no episode needs them.
 _CPU_BRANCH_COST = 32
+
+
+#: What an engine plays with: a rollout, or a function of many environments.
+Made = TypeVar("Made")
+Rollout: TypeAlias = Callable[..., Trajectory]
 
 
 class ActingPolicy(NamedTuple):
@@ -54,7 +58,7 @@ class Engine(NamedTuple):
 
     name: str
     why: str
-    rollout: Callable[..., Trajectory]
+    rollout: Rollout
     seconds: float = 0.0
 
     def __repr__(self) -> str:
@@ -70,7 +74,7 @@ def choose(
     """Returns an engine by name; "auto" is the fastest that supports the environment.
 
     Args:
-      name: one of ``NAMES``.
+      name: one of ``ENGINES``.
       env: what is played.
       player: who plays it; None where every episode has parameters of its own, which
       machine code cannot hold.
@@ -87,44 +91,69 @@ def choose(
 def _choose_engine(
     name: str, env: Environment, player: ActingPolicy | None, horizon: int | None
 ) -> Engine:
+    def in_machine_code() -> Rollout | str:
+        if player is None or horizon is None:
+            return "every episode has a policy of its own"
+        play = _from_any_key if name == "auto" else native.rollout
+        return native.unsupported(env, *player, horizon) or play
+
+    def in_scalars() -> Rollout | str:
+        step = fused.vmap(env.step, in_axes=-1, out_axes=-1, branch_cost=branch_cost())
+        return unsupported_by_fused(env, step) or functools.partial(rollout, env_step=step)
+
+    return Engine(*pick(name, env, in_machine_code, in_scalars, rollout))
+
+
+def pick(
+    name: str,
+    env: Environment,
+    in_machine_code: Callable[[], Made | str],
+    in_scalars: Callable[[], Made | str],
+    by_vmap: Made,
+) -> tuple[str, str, Made]:
+    """Returns an engine's name, the reason it was chosen, and what it made.
+
+    Args:
+      name: one of ``ENGINES``.
+      env: what is played.
+      in_machine_code: returns what plays, or why machine code cannot.
+      in_scalars: the same of ``fused``.
+      by_vmap: what plays with ``vmap``.
+
+    Raises:
+      ValueError: the name is unknown, or the engine cannot play this.
+    """
     check_name("engine", name, dict.fromkeys(ENGINES))
-    why = "chosen by name"
+    why, instead = "chosen by name", ""
     if name == "vmap":
-        return Engine(name, why, rollout)
-    against = _against_native(name, env, player, horizon)
-    if not against:
-        device = "CPU" if jax.default_backend() == "cpu" else "GPU"
-        why = f"machine code for this {device}" if name == "auto" else why
-        return Engine("native", why, _from_any_key if name == "auto" else native.rollout)
-    if name == "native":
-        raise ValueError(f"the native engine cannot play this: {against}; choose auto")
-    instead = f"; machine code cannot play this: {against}" if name == "auto" else ""
+        return name, why, by_vmap
+    if name in ("auto", "native"):
+        made = in_machine_code()
+        if not isinstance(made, str):
+            device = "CPU" if jax.default_backend() == "cpu" else "GPU"
+            return "native", f"machine code for this {device}" if name == "auto" else why, made
+        if name == "native":
+            raise ValueError(f"the native engine cannot play this: {made}; choose auto")
+        instead = f"; machine code cannot play this: {made}"
     contacts = getattr(env, "num_contacts", 0)
     if name == "auto" and contacts:
         why = f"the fastest of the others for models with contacts, here up to {contacts}"
-        return Engine("vmap", why + instead, rollout)
-    # On a GPU a real branch makes the host wait for its predicate; computing both sides is cheap.
-    cost = _CPU_BRANCH_COST if jax.default_backend() == "cpu" else MAX_OPERATIONS
-    step = fused.vmap(env.step, in_axes=-1, out_axes=-1, branch_cost=cost)
-    reason = unsupported_by_fused(env, step)
-    if not reason:
+        return "vmap", why + instead, by_vmap
+    made = in_scalars()
+    if not isinstance(made, str):
         why = "the env step is small enough to write out" if name == "auto" else why
-        return Engine("fused", why + instead, functools.partial(rollout, env_step=step))
+        return "fused", why + instead, made
     if name == "fused":
-        raise ValueError(f"the fused engine does not support this environment: {reason}")
-    why = f"fused does not support this environment: {reason}"
-    return Engine("vmap", why + instead, rollout)
+        raise ValueError(f"the fused engine does not support this environment: {made}")
+    return "vmap", f"fused does not support this environment: {made}{instead}", by_vmap
 
 
-def _against_native(
-    name: str, env: Environment, player: ActingPolicy | None, horizon: int | None
-) -> str | None:
-    """Returns why machine code must not play this; None if it can."""
-    if name not in ("auto", "native"):
-        return "another engine was chosen"
-    if player is None or horizon is None:
-        return "every episode has a policy of its own"
-    return native.unsupported(env, *player, horizon)
+def branch_cost() -> int:
+    """Returns from how many operations on ``fused`` skips a branch here.
+
+    On a GPU a real branch makes the host wait for its predicate; computing both sides is cheap.
+    """
+    return _CPU_BRANCH_COST if jax.default_backend() == "cpu" else MAX_OPERATIONS
 
 
 def _from_any_key(
@@ -158,15 +187,23 @@ def unsupported_by_fused(env: Environment, step: Mapped) -> str | None:
         return states, null_action(env)[..., None]
 
     entries = jax.eval_shape(env.reset, jax.random.key(0)).obs.size
+    return against_writing(step, entries, *jax.eval_shape(one))
+
+
+def against_writing(mapped: Mapped, entries: int, *batch: PyTree) -> str | None:
+    """Returns why a mapped function does not run, or not well, on ``fused``; None if it does.
+
+    Args:
+      mapped: ``fused.vmap`` of it.
+      entries: of an observation.
+      *batch: its arguments, or their shapes.
+    """
     if entries > MAX_ENTRIES:
         return f"its observation has {entries:,} entries, more than {MAX_ENTRIES:,}"
     try:
-        written = step.write(*jax.eval_shape(one))
-    except (fused.TooLarge, fused.UnsupportedPrimitive) as error:
-        return " ".join(str(error).split())
+        count = sum(mapped.write(*batch).operations.values())
     except Exception as error:  # whatever it is, another engine may play this
-        return f"it cannot be written out ({explain(error)})"
-    count = sum(written.operations.values())
+        return fused.refusal(error)
     if count > MAX_OPERATIONS:
         return f"one env step takes {count:,} scalar operations, more than {MAX_OPERATIONS:,}"
     return None

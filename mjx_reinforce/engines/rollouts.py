@@ -8,10 +8,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from mjx_reinforce.checks import check_kind, check_parts
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.chunks import play_chunks
-from mjx_reinforce.policies.arguments import check_count, check_key
 from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Environment, PyTree, Trajectory
 
@@ -66,13 +64,6 @@ def rollout(
     Raises:
       ValueError: an argument makes no sense.
     """
-    check_parts(env)
-    if not callable(act):
-        raise ValueError(f"act must be a function, such as learner.act, got a {type(act).__name__}")
-    check_kind("distribution", distribution, Distribution, "learner.policy.distribution")
-    check_key(key)
-    check_count("num_episodes", num_episodes)
-    check_count("horizon", horizon)
     episode.check_shapes((), (num_episodes,), deterministic=deterministic, active=active)
     if env_step is None:
         env_step = jax.vmap(env.step, in_axes=-1, out_axes=-1)

@@ -38,7 +38,7 @@ So ``(x - x) == 0`` is true for every x; ``jnp.isfinite`` is what tells whether 
 """
 
 from mjx_reinforce.fused.by_engine import by_engine
-from mjx_reinforce.fused.errors import TooLarge, UnsupportedPrimitive
+from mjx_reinforce.fused.errors import TooLarge, UnsupportedPrimitive, refusal
 from mjx_reinforce.fused.jaxprs import prune
 from mjx_reinforce.fused.lanes import any_lane
 from mjx_reinforce.fused.scalarized import Scalarized, scalarize
@@ -51,6 +51,7 @@ __all__ = [
     "any_lane",
     "by_engine",
     "prune",
+    "refusal",
     "scalarize",
     "vmap",
 ]

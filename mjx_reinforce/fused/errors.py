@@ -1,4 +1,6 @@
-"""What the fused evaluator raises."""
+"""What the fused evaluator raises, and what is said of it."""
+
+from mjx_reinforce.checks import explain
 
 
 class UnsupportedPrimitive(NotImplementedError):  # noqa: N818 (reads as what it is)
@@ -28,3 +30,10 @@ def no_rule(name: str, source: str) -> UnsupportedPrimitive:
         f"there is no rule for the primitive {name!r}, used at {source}; use jax.vmap for this "
         "function, or add a rule in mjx_reinforce/fused/rules"
     )
+
+
+def refusal(error: Exception) -> str:
+    """Returns in one line why a function cannot be written out, from what was raised."""
+    if isinstance(error, (TooLarge, UnsupportedPrimitive)):
+        return " ".join(str(error).split())
+    return f"it cannot be written out ({explain(error)})"

@@ -1,7 +1,6 @@
 """N environments in JAX, whose step is one call."""
 
 import enum
-import functools
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +13,6 @@ from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.engines.mapping import MapEngine, map_function
 from mjx_reinforce.engines.native.available import GENERATOR
-from mjx_reinforce.engines.native.outlook import check_seconds
 from mjx_reinforce.policies.arguments import check_count, check_key
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.settings.memory import gigabytes, host_memory
@@ -61,9 +59,8 @@ class VectorEnv:
         self._check_memory()
         advance = advance_function(env, max_episode_steps, autoreset)
         flag = jax.ShapeDtypeStruct((), bool)
-        check = functools.partial(check_seconds, env, entries=self.observation_size)
         self.engine: MapEngine = map_function(
-            engine, advance, self._blank, self._null_action, flag, check=check
+            engine, env, advance, self._blank, self._null_action, flag
         )
 
     def reset(self, key: jax.Array) -> VectorState:
@@ -127,11 +124,14 @@ class VectorEnv:
         space, shape = self.action_space, (self.num_envs, self.action_size)
         if isinstance(space, Discrete):
             return jax.random.randint(key, shape[:1], 0, space.num_actions)
-        uniform = jax.random.uniform(key, shape)
+        uniform_key, normal_key = jax.random.split(key)
+        uniform = jax.random.uniform(uniform_key, shape)
         bounded = np.isfinite(space.low) & np.isfinite(space.high)
         low, high = np.where(bounded, space.low, 0), np.where(bounded, space.high, 1)
         within = jnp.asarray(low) + uniform * (high - low)
-        return jnp.where(bounded, within, jax.random.normal(key, shape)).astype(uniform.dtype)
+        return jnp.where(bounded, within, jax.random.normal(normal_key, shape)).astype(
+            uniform.dtype
+        )
 
     def check_state(self, state: object) -> None:
         """Raises ValueError for what is no state of these environments: machine code trusts it."""

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
+from mjx_reinforce.engines.episode import episode_keys
 from mjx_reinforce.engines.native.available import GENERATOR
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Discrete, Environment, PyTree
@@ -175,13 +176,13 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             seed = int(np.random.SeedSequence().generate_state(1)[0])
         if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
             super().reset(seed=int(seed))
-            return _key(int(seed))
+            return _keys_of([int(seed)])[0]
         if not isinstance(seed, list | tuple | np.ndarray) or len(seed) != self.num_envs:
             raise ValueError(
                 f"seed must be a whole number, or a list of {self.num_envs}, one each, got {seed!r}"
             )
         drawn = np.random.SeedSequence().generate_state(self.num_envs)
-        return _key(*(int(d if s is None else s) for s, d in zip(seed, drawn, strict=True)))
+        return _keys_of([int(d if s is None else s) for s, d in zip(seed, drawn, strict=True)])
 
     def _reset_some(self, seed: Seeds, mask: np.ndarray) -> VectorState:
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
@@ -192,8 +193,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError("the first reset must be of all environments: leave reset_mask out")
         state = self.state
         if seed is not None:
-            keys = jax.random.key_data(self._keys(seed))
-            keys = jnp.broadcast_to(keys, state.keys.shape) if keys.ndim == 1 else keys
+            keys = jax.random.key_data(episode_keys(self._keys(seed), self.num_envs))
             state = state.replace(keys=jnp.where(mask[:, None], keys, state.keys))  # pyright: ignore
         return self._restart(state, mask)
 
@@ -277,11 +277,10 @@ def only_many(env: str, **options: object) -> gymnasium.Env:
     )
 
 
-def _key(*seeds: int) -> jax.Array:
-    """Returns the key of a seed [], or those of several [N]; a seed has up to 64 bits."""
+def _keys_of(seeds: Sequence[int]) -> jax.Array:
+    """Returns the keys [N] of seeds, of up to 64 bits each."""
     words = np.array([((s >> 32) & 0xFFFFFFFF, s & 0xFFFFFFFF) for s in seeds], np.uint32)
-    one = jnp.asarray(words if len(seeds) > 1 else words[0])
-    return jax.random.wrap_key_data(one, impl=GENERATOR)
+    return jax.random.wrap_key_data(jnp.asarray(words), impl=GENERATOR)
 
 
 def _space(vec: VectorEnv) -> gymnasium.Space:

@@ -92,6 +92,22 @@ def test_some_are_reset(cart):
         cart.reset(options={"reset_maks": mask})
 
 
+def test_a_seed_of_some_gives_each_a_start_of_its_own(cart):
+    """The one that it would have if all were reset."""
+    whole = cart.reset(seed=5)[0]
+    cart.reset(seed=0)
+    some = cart.reset(seed=5, options={"reset_mask": np.array([True, False, True])})[0]
+    np.testing.assert_array_equal(some[[0, 2]], whole[[0, 2]])
+    assert np.any(some[0] != some[2])
+
+
+def test_a_seed_of_one_is_that_of_its_environment(cart):
+    """However many there are."""
+    alone = gymnasium.make_vec(CART, num_envs=1)
+    several = cart.reset(seed=[4, 5, 6])[0]
+    np.testing.assert_array_equal(alone.reset(seed=[4])[0][0], several[0])
+
+
 def test_same_step_tells_the_last_observation():
     env = gymnasium.make_vec(CART, num_envs=3, autoreset="same_step", max_episode_steps=4)
     env.reset(seed=0)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from toys import Drifting
 
-from mjx_reinforce import Box, envs, make_vec
-from mjx_reinforce.engines import mapping
+from mjx_reinforce import Box, envs, fused, make_vec
 from mjx_reinforce.engines.native.counter import key_of
 from mjx_reinforce.engines.native.mapping import machine_map
 from mjx_reinforce.vector.episodes import AUTORESETS
@@ -225,7 +224,7 @@ def test_keys_are_drawn_from_as_jax_does():
     written = functools.partial(draw, wrap=key_of)
     got = machine_map(written, jax.ShapeDtypeStruct((2,), jnp.uint32))(jnp.asarray(words))
     assert_close(got, want, 2e-6)
-    assert_close(mapping.map_function("fused", written, words[0]).call(words), want, 2e-6)
+    assert_close(jax.jit(fused.vmap(written))(words), want, 2e-6)
 
 
 @pytest.mark.parametrize("autoreset", ["next_step", "same_step"])

@@ -47,7 +47,7 @@ def at_counter(key: jax.Array, count: jax.Array) -> jax.Array:
       key: [2] uint32, the data of the other key.
       count: [] uint32, how many numbers are skipped.
     """
-    return jax.random.wrap_key_data(jnp.append(key, count), impl=_implementation())
+    return jax.random.wrap_key_data(jnp.append(key, count), impl=_from_a_count())
 
 
 def key_of(words: jax.Array) -> jax.Array:
@@ -92,7 +92,8 @@ def _refuse(*_: object) -> jax.Array:
 
 
 @functools.cache
-def _implementation() -> object:
+def _from_a_count() -> object:
+    """Returns the generator of keys that skip numbers, which cannot be split."""
     return random.define_prng_impl(
         key_shape=(3,),
         seed=_refuse,
@@ -106,6 +107,7 @@ def _implementation() -> object:
 
 @functools.cache
 def _written_out() -> object:
+    """Returns JAX's generator, in operations that can be written out."""
     return random.define_prng_impl(
         key_shape=(2,),
         seed=_refuse,

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce import fused
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.native import available, objects, outlook, step
 from mjx_reinforce.engines.native.cpu import handler, kernel, machine, queue
@@ -76,6 +77,15 @@ def build_program(
     else:
         code = machine.load_module(source, write, handler.NAMES, target, folder)
     return NativeProgram(code, shapes.record)
+
+
+def refusal(error: Exception) -> str:
+    """Returns in one line why machine code cannot be made, from what was raised."""
+    if isinstance(error, TypeError):
+        return " ".join(str(error).split())
+    if type(error) is RuntimeError:
+        return f"LLVM refuses its program: {' '.join(str(error).split())}"
+    return fused.refusal(error)
 
 
 def while_running(function: Callable[..., StepResult]) -> Any:

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.checks import explain
 from mjx_reinforce.engines import episode
 from mjx_reinforce.engines.chunks import chunk_length
 from mjx_reinforce.engines.native import available
@@ -20,7 +19,7 @@ from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.cpu import seam as cpu
 from mjx_reinforce.engines.native.gpu import seam as gpu
 from mjx_reinforce.engines.native.plays import MODE, NOT_PLAYED, SAMPLES
-from mjx_reinforce.engines.native.program import NativeProgram, build_program
+from mjx_reinforce.engines.native.program import NativeProgram, build_program, refusal
 from mjx_reinforce.engines.native.step import stored
 from mjx_reinforce.fused import TooLarge, UnsupportedPrimitive
 from mjx_reinforce.policies.distributions.distribution import Distribution
@@ -109,12 +108,8 @@ def unsupported(
         return reason
     try:
         build_program(env, act, actor, distribution, chunk_length(horizon))
-    except (TooLarge, UnsupportedPrimitive, TypeError) as error:
-        return " ".join(str(error).split())
     except Exception as error:  # whatever it is, another engine may play this
-        if type(error) is RuntimeError:
-            return f"LLVM refuses its program: {' '.join(str(error).split())}"
-        return f"it cannot be written out ({explain(error)})"
+        return refusal(error)
     return None
 
 
