@@ -54,17 +54,17 @@ def words(settings: Mapping[str, Any]) -> str:
     return ", ".join(f"{name}={value}" for name, value in settings.items())
 
 
-def append(path: Path, row: Mapping[str, Any]) -> None:
+def append(path: Path, row: Mapping[str, Any], columns: Sequence[str] = COLUMNS) -> None:
     """Adds a row to a CSV file, in one write; a new file gets its first line.
 
     Raises:
       ValueError: the row has a column that the file has not, or lacks one.
     """
-    if set(row) != set(COLUMNS):
-        raise ValueError(f"columns that do not fit: {sorted(set(row) ^ set(COLUMNS))}")
+    if set(row) != set(columns):
+        raise ValueError(f"columns that do not fit: {sorted(set(row) ^ set(columns))}")
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("a", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, list(COLUMNS), lineterminator="\n")
+        writer = csv.DictWriter(file, list(columns), lineterminator="\n")
         if file.tell() == 0:
             writer.writeheader()
         writer.writerow(row)

@@ -155,21 +155,12 @@ def compare(
                 "cpu_seconds": f"{found.cpu_seconds:.2f}",
                 "settings": found.settings,
             }
-            append(told.rows, row)
+            peers_rows.append(told.rows, row, COLUMNS)
             print(
                 f"{program} {told.task} on {side}, seed {seed}: return {row['mean_return']} after "
                 f"{found.env_steps:,} env steps and {row['seconds']} s",
                 flush=True,
             )
-
-
-def append(path: Path, row: dict[str, Any]) -> None:
-    """Adds a row to a CSV file, in one write; a new file gets its first line."""
-    with path.open("a", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, list(COLUMNS), lineterminator="\n")
-        if file.tell() == 0:
-            writer.writeheader()
-        writer.writerow(row)
 
 
 def read(path: Path) -> list[dict[str, Any]]:

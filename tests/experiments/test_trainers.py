@@ -2,6 +2,7 @@
 
 import pytest
 
+import peers_rows
 import trainers
 
 ROW = dict.fromkeys(trainers.COLUMNS, "") | {"program": "P", "task": "T-v1", "num_envs": 8}
@@ -33,7 +34,8 @@ def test_the_table_tells_means_with_intervals_and_median_seconds(tmp_path):
         for seed, value in enumerate(returns):
             told = {"env_steps": 2048, "mean_return": value, "start_seconds": 1}
             times = {"seconds": seed + 1.2, "cpu_seconds": seed * 9}
-            trainers.append(path, ROW | told | times | {"environment": side, "seed": seed})
+            row = ROW | told | times | {"environment": side, "seed": seed}
+            peers_rows.append(path, row, trainers.COLUMNS)
     line = trainers.table(trainers.read(path)).splitlines()[2]
     *case, steps, seeds, theirs, ours, seconds, _ = line.strip("| ").split(" | ")
     assert [*case, steps, seeds] == ["P", "T-v1", "8", "2,048", "3"]
