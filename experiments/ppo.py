@@ -1,7 +1,7 @@
-"""PPO on the engine's pieces: the whole training is one compiled program.
+r"""PPO on the engine's pieces: the whole training is one compiled program.
 
     python experiments/ppo.py                                  # HalfCheetah, about two minutes
-    python experiments/ppo.py --env Hopper-v5 --discount 0.99 --trace 0.95 --learning-rate 3e-4 \\
+    python experiments/ppo.py --env Hopper-v5 --discount 0.99 --trace 0.95 --learning-rate 3e-4 \
         --env-steps 5000000 --seeds 3 --csv rows.csv
 
 An example of ``make_vec`` and ``unroll``; REINFORCE is what this project is about. The algorithm is
