@@ -2,6 +2,7 @@
 
     python experiments/vector_speed.py                                 # four tasks, some minutes
     python experiments/vector_speed.py --envs Hopper-v5 --csv rows.csv
+    python experiments/vector_speed.py --num-envs 32768 --steps 1000 --engines native fused --alone
 
 Ours in float32, within one compiled loop, as single calls from Python, and through Gymnasium's
 interface with NumPy arrays; Gymnasium's vector environments and C MuJoCo's rollout in float64;
@@ -43,13 +44,17 @@ class Settings:
     """Steps of each environment in one timing, fewer where they are slow."""
     repeats: int = 5
     """Timings of each; the median is shown."""
+    engines: tuple[str, ...] = ("auto",)
+    """What steps ours, one after the other."""
+    alone: bool = False
+    """Leaves out what people use otherwise."""
     csv: Path | None = None
     """File for the rows."""
 
 
-def ours(env_id: str, num: int, steps: int) -> Iterator[Candidate]:
+def ours(env_id: str, num: int, steps: int, engine: str) -> Iterator[Candidate]:
     """`make_vec` in a compiled loop, in single calls, and under Gymnasium's interface."""
-    vec = make_vec(env_id, num)
+    vec = make_vec(env_id, num, engine=engine)
     row = {"task": env_id, "batch": num, "engine": f"ours, {vec.engine.name}"}
     one = jax.jit(vec.step)
     state, actions = jax.jit(vec.reset)(jax.random.key(0)), vec.sample_actions(jax.random.key(1))
@@ -120,7 +125,13 @@ def main(settings: Settings) -> None:
     rows = []
     for env_id in settings.envs:
         steps = settings.steps // 10 if "Humanoid" in env_id else settings.steps
-        candidates = [*ours(env_id, settings.num_envs, steps), *others(env_id, settings.num_envs)]
+        candidates = [
+            candidate
+            for engine in settings.engines
+            for candidate in ours(env_id, settings.num_envs, steps, engine)
+        ]
+        if not settings.alone:
+            candidates += others(env_id, settings.num_envs)
         for row in measure(candidates, settings.repeats):
             speed = float(np.median(row.pop("env_steps_per_second")))
             row = {name: row[name] for name in ("task", "engine", "what", "batch")}
