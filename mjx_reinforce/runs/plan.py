@@ -150,7 +150,9 @@ def training_seconds(config: Config, task: Task, speed: Speed) -> tuple[float, b
     """Returns how long the networks that were measured take (s), and whether at most so long."""
     steps, bounded = _steps(config, task, useful_part(task, speed))
     episodes = config.fewest_episodes  # with more, evaluations take less of it
-    evaluated = 2 * config.eval_episodes / (config.eval_every * episodes)
+    whole = config.horizon or task.horizon
+    played = config.eval_every * episodes * config.training_horizon(whole)
+    evaluated = 2 * config.eval_episodes * whole / played
     total = config.num_seeds * steps * (1 + evaluated)
     return speed.seconds(total, config.num_seeds * episodes), bounded
 
@@ -160,7 +162,7 @@ def _steps(config: Config, task: Task, useful: float) -> tuple[float, bool]:
 
     It is where the number of updates ends the run: nobody knows how long their episodes are.
     """
-    horizon = config.horizon or task.horizon
+    horizon = config.training_horizon(task.horizon)
     bounds = []
     if config.env_steps is not None:
         bounds.append((config.env_steps / useful, False))

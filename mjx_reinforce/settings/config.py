@@ -54,6 +54,15 @@ class Config(
         auto = self.algorithm == "reinforce" and self.num_episodes == "auto"
         return self.min_episodes if auto else self.episodes_per_update
 
+    def training_horizon(self, horizon: int) -> int:
+        """Returns the time limit of a training episode of a task, in env steps.
+
+        Args:
+          horizon: the task's own time limit.
+        """
+        whole = self.horizon or horizon
+        return min(whole, self.train_horizon or whole)
+
     @property
     def block_length(self) -> int:
         """How many updates a block between two evaluations has room for.
@@ -134,6 +143,7 @@ def check_step_count(config: Config, horizon: int) -> None:
       config: the settings; at least one of the two budgets is given.
       horizon: the time limit of an episode in steps.
     """
+    horizon = config.training_horizon(horizon)
     an_update = config.episodes_per_update * horizon
     bounds = []
     if config.env_steps is not None:
@@ -144,12 +154,12 @@ def check_step_count(config: Config, horizon: int) -> None:
     if an_update > MAX_OF_UPDATE:
         raise ValueError(
             f"an update may play {an_update:,} env steps of a seed ({each}), more than the "
-            "2^31 - 1 that can be counted; lower --num-episodes or --horizon"
+            "2^31 - 1 that can be counted; lower --num-episodes or --train-horizon"
         )
     if min(bounds) > MAX_COUNT:
         raise ValueError(
             f"a seed may play {min(bounds):,} env steps ({each}), more than the 2^53 that can be "
-            "counted; give --env-steps, or lower --max-updates or --horizon"
+            "counted; give --env-steps, or lower --max-updates or --train-horizon"
         )
 
 

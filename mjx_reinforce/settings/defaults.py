@@ -80,7 +80,8 @@ def _with_budget(config: Config, env_steps: int) -> Config:
         config = dataclasses.replace(config, decay_steps="budget")
     if config.env not in measured.TASKS:
         return config
-    played = config.episodes_per_update * measured.TASKS[config.env].horizon
+    horizon = config.training_horizon(measured.TASKS[config.env].horizon)
+    played = config.episodes_per_update * horizon
     every = env_steps // played // _EVALUATIONS
     return dataclasses.replace(config, eval_every=max(config.eval_every, every))
 

@@ -139,6 +139,9 @@ class RunSettings:
     """Maximum number of episodes of an update, with --num-episodes auto."""
     horizon: int | None = setting(None, *COUNT)
     """Time limit of an episode in env steps. If not given, the environment's own limit."""
+    train_horizon: int | None = setting(None, *COUNT)
+    """Cut the episodes of training after this many env steps; evaluations play whole ones. Updates
+    take less time, and follow the gradient of the return until the cut."""
     one_start: bool = False
     """Begin all training episodes of a seed in one state; each seed has its own. Evaluations
     keep their own starts."""

@@ -53,13 +53,13 @@ def parts(config: Config, task: Task) -> list[MemoryPart]:
 
     Args:
       config: the settings.
-      task: the sizes of the task; ``config.horizon`` goes over its time limit.
+      task: the sizes of the task; ``config`` may have another time limit.
     """
-    horizon = config.horizon or task.horizon
+    horizon = config.training_horizon(task.horizon)
     seeds, episodes = config.num_seeds, config.episodes_per_update
     steps = seeds * horizon * episodes
     values = task.observation + task.action + 3
-    evaluated = seeds * horizon * 2 * config.eval_episodes
+    evaluated = seeds * (config.horizon or task.horizon) * 2 * config.eval_episodes
     follows = config.algorithm != "ars"  # a gradient; else it searches with many policies
     room = "--max-episodes" if config.num_episodes == "auto" else "--num-episodes"
     fewer = room if follows else "--num-directions"
@@ -80,11 +80,11 @@ def parts(config: Config, task: Task) -> list[MemoryPart]:
             _FLOAT * fitted * (config.value_fits + values + _ACTIVATIONS * sum(critic)),
             "--value-batch-size, --value-fits or --num-seeds",
         ),
-        MemoryPart(_FLOAT * _COPIES * steps * values, f"--num-seeds, {fewer} or --horizon"),
+        MemoryPart(_FLOAT * _COPIES * steps * values, f"--num-seeds, {fewer} or --train-horizon"),
         MemoryPart(_FLOAT * network, f"--hidden-sizes, --num-seeds or {fewer}"),
         MemoryPart(
             _FLOAT * (_ACTIVATIONS * valued * sum(critic) + critics),
-            "--value-hidden-sizes, --num-seeds or --horizon",
+            "--value-hidden-sizes, --num-seeds or --train-horizon",
         ),
         MemoryPart(_EVALUATED * evaluated, "--eval-episodes, --num-seeds or --horizon"),
         MemoryPart(_FLOAT * _METRICS * seeds * config.block_length, "--eval-every or --num-seeds"),

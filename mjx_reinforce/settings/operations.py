@@ -22,12 +22,12 @@ def per_step(config: Config, task: Task) -> float:
 
     Args:
       config: the settings.
-      task: the sizes of the task; ``config.horizon`` goes over its time limit.
+      task: the sizes of the task; ``config`` may have another time limit.
     """
     policy = num_parameters(config, task)
     if config.algorithm == "ars":
         return _FORWARDS * policy
-    steps = config.fewest_episodes * (config.horizon or task.horizon)
+    steps = config.fewest_episodes * config.training_horizon(task.horizon)
     learned = 1.0
     if config.update == "minibatches":
         learned = config.minibatch_updates * config.minibatch_size / steps

@@ -49,7 +49,7 @@ def build(
     forever = config.normalize_steps is None
     shared = {
         "policy": build_policy(policy_settings(env, config)) if policy is None else policy,
-        "horizon": horizon,
+        "horizon": _training_horizon(config, horizon),
         "normalize_steps": math.inf if forever else config.normalize_steps,
         "normalize_min_std": config.normalize_min_std,
         "engine": config.engine,
@@ -58,6 +58,17 @@ def build(
         return _build_own(env, config, shared), horizon
     build_one = _build_ars if config.algorithm == "ars" else _build_reinforce
     return build_one(env, config, shared), horizon
+
+
+def _training_horizon(config: Config, horizon: int) -> int:
+    """Returns the env steps of an episode of training at most, or raises ValueError."""
+    asked = config.train_horizon
+    if asked is not None and asked >= horizon:
+        raise ValueError(
+            f"--train-horizon {asked:,} would do nothing: an episode has at most {horizon:,} env "
+            "steps; lower it or leave it out"
+        )
+    return config.training_horizon(horizon)
 
 
 def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:

@@ -98,7 +98,7 @@ def programs_of(
       sampled: as for ``evaluation.evaluate``.
     """
     learner = build_learner({})  # policies and engines are those of any
-    rides = isinstance(learner.play, Host)
+    rides = isinstance(learner.play, Host) and config.training_horizon(horizon) == horizon
 
     def first(key: jax.Array, settings: dict[str, jax.Array]) -> TrainState:
         return build_learner(settings).init(key)

@@ -87,13 +87,13 @@ def test_what_was_measured_are_our_tasks():
     ("settings", "remedy"),
     [
         ({"num_seeds": 10**6}, "lower --num-seeds"),
-        ({"horizon": 10**9}, "or --horizon"),
+        ({"horizon": 10**9}, "or --train-horizon"),
         ({"num_episodes": 10**6}, "--num-episodes"),
         ({"hidden_sizes": (400_000,)}, "lower --hidden-sizes"),
         ({"hidden_sizes": (100_000, 100_000)}, "lower --hidden-sizes"),
         ({"eval_episodes": 10**7}, "lower --eval-episodes"),
         ({"eval_every": 10**9, "env_steps": None, "max_updates": 10**9}, "lower --eval-every"),
-        ({"algorithm": "ars", "num_directions": 10**6}, "--num-directions or --horizon"),
+        ({"algorithm": "ars", "num_directions": 10**6}, "--num-directions or --train-horizon"),
         ({"estimator": "value-baseline", "value_hidden_sizes": (10**6,)}, "--value-hidden-sizes"),
         (
             {"value_hidden_sizes": (30_000, 30_000), "num_episodes": 1, "horizon": 2}
@@ -192,6 +192,9 @@ def test_the_time_of_a_run_by_hand():
     # Two updates of 5 episodes of at most 100 steps are fewer.
     config = dataclasses.replace(config, max_updates=2)
     assert plan.training_seconds(config, task, speed) == (pytest.approx(4000 / 10 * 0.02), True)
+    # Cut after 25 steps, they take 250 steps; an evaluation plays 10 episodes, which are whole.
+    config = dataclasses.replace(config, train_horizon=25)
+    assert plan.training_seconds(config, task, speed) == (pytest.approx(2500 / 10 * 0.02), True)
 
 
 def test_the_operations_of_networks_by_hand():

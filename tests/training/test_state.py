@@ -158,3 +158,28 @@ def test_an_interval_over_seeds_covers_the_mean_over_starts():
         found = interval("mean", np.asarray(tested(np.uint32(eval_seed))))
         covered.append(found.low <= 0 <= found.high)
     assert 0.88 <= np.mean(covered) <= 1  # 95 %, with a standard error of 2.2
+
+
+def test_training_is_cut_and_evaluations_are_whole():
+    """The updates are those of episodes that short; evaluations play to the time limit."""
+    env = envs.make(CONFIG.env)
+    cut = dataclasses.replace(CONFIG, train_horizon=6)
+    short = dataclasses.replace(CONFIG, horizon=6)
+    prepared = ready.made(env, cut)
+    assert prepared.horizon == 500
+    assert not prepared.programs.rides
+    (first, programs), (other, shorter) = (
+        compile_run(ready.made(env, x).programs, x) for x in (cut, short)
+    )
+    after, metrics, looked = programs.advance(first, True, budget_of(cut))
+    same, those, seen = shorter.advance(other, True, budget_of(short))
+    jax.tree.map(np.testing.assert_array_equal, plain(after), plain(same))
+    np.testing.assert_array_equal(metrics["env_steps"], those["env_steps"])
+    assert np.all(seen.measured["eval_length"] <= 6)
+    assert np.all(looked.measured["eval_length"] > 6)
+
+
+def test_a_cut_that_does_nothing_is_refused():
+    for settings in ({"train_horizon": 500}, {"horizon": 100, "train_horizon": 100}):
+        with pytest.raises(ValueError, match=r"--train-horizon \d+ would do nothing.*lower it"):
+            ready.made(envs.make(CONFIG.env), dataclasses.replace(CONFIG, **settings))
