@@ -41,9 +41,9 @@ def train(part: str, settings: argparse.Namespace) -> None:
     from mjx_reinforce import envs
     from mjx_reinforce.console.jax_setup import configure_jax
     from mjx_reinforce.settings.defaults import of_task
-    from mjx_reinforce.store.build import build
+    from mjx_reinforce.store.ready import made
     from mjx_reinforce.training.division import Division
-    from mjx_reinforce.training.programs import compile_run, programs_of
+    from mjx_reinforce.training.programs import compile_run
     from mjx_reinforce.training.state import Budget
 
     configure_jax()
@@ -60,11 +60,7 @@ def train(part: str, settings: argparse.Namespace) -> None:
     def prepare(count: int) -> tuple[Any, Any, float]:
         began = time.perf_counter()
         division = Division(**{part: count})
-        devices = division.devices() if division.episodes > 1 else None
-        learner, horizon = build(env, config, devices=devices)
-        width = division.width(num_seeds)
-        programs = programs_of(env, lambda _: learner, horizon, config, width, division=division)
-        state, run = compile_run(programs, config)
+        state, run = compile_run(made(env, config, division=division).programs, config)
         return state, run, time.perf_counter() - began
 
     say(f"{part}: {num_seeds} seeds of {task}, {num_episodes:,} episodes an update")

@@ -74,21 +74,33 @@ def _found(key: str, config: Config, share: slice) -> Ready | None:
     if found is None:
         return None
     facts, programs = found
-    programs = programs._replace(division=division_of(config, share))
+    programs = programs._replace(division=_division(config, share))
     check_step_count(config, facts["horizon"])
     return Ready(**facts, engine_seconds=0.0, programs=programs)
 
 
-def made(env: Environment, config: Config, share: slice = slice(None)) -> Ready:
+def made(
+    env: Environment,
+    config: Config,
+    share: slice = slice(None),
+    division: Division | None = None,
+) -> Ready:
     """Returns what the settings come to in an environment, for all seeds or a share of them.
+
+    Args:
+      env: what is trained on.
+      config: the settings.
+      share: of the seeds.
+      division: among which devices they are divided; by default as ``divide_run`` says.
 
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    division = division_of(config, share)
+    if division is None:
+        division = _division(config, share)
     devices = division.devices() if division.episodes > 1 else None
     learner, horizon = build(env, config, devices=devices)
-    width = division.width(len(range(config.num_seeds)[share]))
+    width = division.width(_size(config, share))
     threshold = getattr(env, "reward_threshold", None)
     return Ready(
         horizon=horizon,
@@ -101,6 +113,9 @@ def made(env: Environment, config: Config, share: slice = slice(None)) -> Ready:
     )
 
 
-def division_of(config: Config, share: slice) -> Division:
-    """Returns how a share of a run's seeds is divided among the devices of this process."""
-    return divide_run(config, len(range(config.num_seeds)[share]))
+def _division(config: Config, share: slice) -> Division:
+    return divide_run(config, _size(config, share))
+
+
+def _size(config: Config, share: slice) -> int:
+    return len(range(config.num_seeds)[share])

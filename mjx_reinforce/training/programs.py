@@ -216,7 +216,8 @@ def compile_run(
     def tested(actor: Actor) -> Arrays:
         placed = place(actor)
         keys = map(jax.random.wrap_key_data, jax.device_get(jax.random.key_data(test_keys)))
-        return _joined([_to_numpy(evaluating(placed, place(each))) for each in keys])
+        every = jax.device_get([evaluating(placed, place(each)) for each in keys])
+        return {name: x[:num_seeds] for name, x in _joined(every).items()}
 
     return first, RunPrograms(advanced, evaluated, tested)
 
@@ -229,8 +230,3 @@ def _joined(evaluations: Sequence[Arrays]) -> Arrays:
         )
         for name in evaluations[0]
     }
-
-
-def _to_numpy(tree: dict[str, jax.Array]) -> Arrays:
-    """Returns arrays on the host; waits for them."""
-    return {name: np.asarray(value) for name, value in jax.device_get(tree).items()}
