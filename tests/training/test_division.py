@@ -108,6 +108,18 @@ def test_a_run_goes_on_on_fewer_devices(tmp_path):
             np.testing.assert_allclose(*values, rtol=1e-3)
 
 
+@pytest.mark.cpu
+def test_programs_of_several_devices_are_kept(tmp_path):
+    """The second start reads them, and trains to the bit what the first did."""
+    command = "-m mjx_reinforce.train --env CartPole-v1 --num-episodes 8 --eval-episodes 2"
+    command += " --num-seeds 1 --env-steps None --max-updates 2 --output"
+    for name in ("first", "second"):
+        on_devices(2, tmp_path, *command.split(), name)
+    for ours, theirs in zip(rows(tmp_path / "first"), rows(tmp_path / "second"), strict=True):
+        del ours["wall_seconds"], theirs["wall_seconds"]
+        assert ours == theirs
+
+
 def test_flags_of_xla_but_the_number_of_devices_keep_a_run_from_going_on(tmp_path):
     several = "--xla_a=1 --xla_force_host_platform_device_count=8"
     recorded = {"xla_flags": several}
