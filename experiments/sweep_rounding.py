@@ -32,12 +32,12 @@ def train(width: int, output: Path) -> None:
 
     from mjx_reinforce import envs
     from mjx_reinforce.console.jax_setup import configure_jax
+    from mjx_reinforce.devices import Devices
     from mjx_reinforce.settings.defaults import of_task
     from mjx_reinforce.sweeps.chunks import initial_states, split_runs
     from mjx_reinforce.sweeps.designs.grid import configure, grid
     from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
     from mjx_reinforce.sweeps.slots.ahead import Stopwatch
-    from mjx_reinforce.sweeps.slots.devices import Devices
     from mjx_reinforce.sweeps.slots.programs import compile_programs
 
     configure_jax()

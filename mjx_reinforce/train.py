@@ -129,19 +129,16 @@ def _start(
     """
     from mjx_reinforce.store.provenance import provenance
     from mjx_reinforce.store.ready import get_ready
+    from mjx_reinforce.training.state import shape_of_all
 
     ready = get_ready(config, default, env, share)
     if config.resume is None or processes.index:
         return ready, None
     present = {**provenance(), "num_processes": processes.count}
     resume.check_program(config.resume, present)
-    like = ready.programs.like
+    like = shape_of_all(ready.programs.like, config.num_seeds)
     if config.minutes is not None:  # more than any checkpoint has used
         config = dataclasses.replace(config, env_steps=MAX_COUNT)
-    if processes.count > 1:
-        from mjx_reinforce.training.state import shape_of_all
-
-        like = shape_of_all(like, config.num_seeds)
     found = resume.newest_checkpoint(like, config, print)
     if found is None and config.minutes is not None:
         raise ValueError(

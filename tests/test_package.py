@@ -18,7 +18,18 @@ TESTS = ROOT / "tests"
 PACKAGE = ROOT / "mjx_reinforce"
 #: Folders and root modules from the ground up; a file imports from its own folder and those before.
 ORDER = (
-    *("checks", "types", "registry", "files", "fused", "physics", "envs", "policies", "engines"),
+    *(
+        "checks",
+        "types",
+        "registry",
+        "files",
+        "devices",
+        "fused",
+        "physics",
+        "envs",
+        "policies",
+        "engines",
+    ),
     *("learners", "console", "settings", "vector", "gym", "export", "reports", "training"),
     *("hosts", "store", "runs", "playing", "report", "sweeps", "sweep", "train", "watch", "new"),
     "__main__",

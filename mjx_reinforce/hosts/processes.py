@@ -27,7 +27,7 @@ _PATIENCE, _PAUSE, _GREETING = 300.0, 0.1, 10.0
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ProcessSettings:
-    """Several hosts, or GPUs, with a process each. Each trains a part of the seeds."""
+    """Several hosts with a process each: it trains a part of the seeds, on all GPUs it sees."""
 
     distributed: bool = False
     """Start the same command on every host. SLURM, Open MPI and Kubernetes say by themselves who is

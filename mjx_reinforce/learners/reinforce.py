@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optax
 
 from mjx_reinforce.checks import check_type
+from mjx_reinforce.devices import NONE, RUNS, SECOND, Devices
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.chunks import CHUNK_STEPS
@@ -64,6 +65,12 @@ _SHORT = 8
 #: cores: that saves 70 ns for each of these steps in such an update, and takes 4 s to compile.
 _MANY = 2**19
 
+#: How the episodes of an update are divided among devices.
+_specs: Any = Trajectory
+_EPISODES = _specs(
+    observation=SECOND, action=SECOND, reward=SECOND, mask=SECOND, nonfinite=RUNS, simulated=NONE
+)
+
 
 def default_distribution(space: Box | Discrete) -> Distribution:
     """Returns a Normal with a trained std, or a categorical distribution if discrete."""
@@ -87,6 +94,7 @@ def reinforce(
     one_start: bool = False,
     num_seeds: int = 1,
     engine: str = "auto",
+    devices: Devices | None = None,
 ) -> Learner:
     """Builds REINFORCE for an environment.
 
@@ -129,6 +137,9 @@ def reinforce(
         rounding.
       engine: how episodes are played: "auto", "vmap", "fused" or "native", see
         ``engines.choice``.
+      devices: among which the episodes of an update are divided; they stay where they are played,
+        and XLA divides what is computed from them. Their count divides every number of episodes
+        that an update has room for. None plays where ``jax.jit`` computes.
 
     Raises:
       ValueError: an argument makes no sense for this environment.
@@ -175,6 +186,7 @@ def reinforce(
         normalize_min_std=normalize_min_std,
         one_start=one_start,
         num_seeds=num_seeds,
+        devices=devices,
         observation_size=size,
     ).learner(engine)
 
@@ -209,6 +221,7 @@ class _Reinforce:
     normalize_min_std: float | jax.Array
     one_start: bool
     num_seeds: int
+    devices: Devices | None
     observation_size: int
 
     def __post_init__(self):
@@ -230,9 +243,10 @@ class _Reinforce:
 
     def _with_engine(self, engine: Engine) -> Learner:
         play: Any = functools.partial(self._play, engine)
+        with_guests: Any = functools.partial(self._play_all, engine)
         if engine.name == "native" and not self.one_start:
             # Elsewhere an episode that is not played still takes its place.
-            play = Host(play, functools.partial(self._play_with, engine))
+            play = Host(play, with_guests)
         room = self.num_episodes
         return Learner(self._init, play, self._learn, self.policy, engine, room=room)
 
@@ -267,16 +281,7 @@ class _Reinforce:
     def _play(
         self, engine: Engine, state: TrainState, key: jax.Array, active: bool | jax.Array = True
     ) -> Trajectory:
-        return engine.rollout(
-            self.env if state.start_key is None else _OneStart(self.env, state.start_key),
-            self._act,
-            state.actor,
-            self.policy.distribution,
-            key,
-            num_episodes=self.num_episodes,
-            horizon=self.horizon,
-            active=self._chosen(state, active),
-        )
+        return self._play_all(engine, state, key, active, None)[0]
 
     def _chosen(self, state: TrainState, active: bool | jax.Array) -> Any:
         """Returns which episodes are played, [] or [N]."""
@@ -284,29 +289,58 @@ class _Reinforce:
             return active
         return (jnp.arange(self.num_episodes) < state.pace.num_episodes) & active
 
-    def _play_with(
+    def _play_all(
         self,
         engine: Engine,
         state: TrainState,
         key: jax.Array,
         active: bool | jax.Array,
-        guests: Guests,
-    ) -> tuple[Trajectory, Trajectory]:
-        """Plays as ``_play``, with guests before its own episodes."""
-        count, own = len(guests.keys), jnp.zeros(self.num_episodes, bool)
-        played = engine.rollout(
-            self.env,
-            self._act,
-            state.actor,
-            self.policy.distribution,
-            jnp.concatenate([guests.keys, episode_keys(key, self.num_episodes)]),
-            num_episodes=count + self.num_episodes,
-            horizon=self.horizon,
-            deterministic=jnp.concatenate([guests.deterministic(), own]),
-            active=jnp.concatenate(
-                [jnp.broadcast_to(guests.active, count), own | self._chosen(state, active)]
-            ),
+        guests: Guests | None,
+    ) -> tuple[Trajectory, Trajectory | None]:
+        """Plays the episodes of an update, with guests before them if there are any."""
+        play = functools.partial(self._play_part, engine)
+        visitors = None if guests is None else (guests.keys, guests.deterministic(), guests.active)
+        chosen = jnp.broadcast_to(self._chosen(state, active), self.num_episodes)
+        keys = episode_keys(key, self.num_episodes)
+        given = state.actor, state.start_key, visitors, keys, chosen
+        if self.devices is None:
+            return play(*given)
+        specs = _EPISODES, None if guests is None else _EPISODES
+        divided = self.devices.map(
+            functools.partial(_part, self.devices, play), (NONE, NONE, NONE, RUNS, RUNS), specs
         )
+        own, looked = divided(*given)
+        # Those of the first device; the others played none.
+        return own, None if guests is None else looked.episodes(slice(len(guests.keys)))
+
+    def _play_part(
+        self, engine: Engine, actor: Actor, start_key: Any, visitors: Any, keys: Any, chosen: Any
+    ) -> tuple[Trajectory, Trajectory | None]:
+        """Plays episodes of these keys, as far as they are chosen, with guests before them.
+
+        ``visitors`` are the keys of the guests, whether each takes the mode, and whether they are
+        played; None without any.
+        """
+        count, modes = 0, False
+        if visitors is not None:
+            guest_keys, guest_modes, guest_active = visitors
+            count = len(guest_keys)
+            modes = jnp.concatenate([guest_modes, jnp.zeros(len(keys), bool)])
+            chosen = jnp.concatenate([jnp.broadcast_to(guest_active, count), chosen])
+            keys = jnp.concatenate([guest_keys, keys])
+        played = engine.rollout(
+            self.env if start_key is None else _OneStart(self.env, start_key),
+            self._act,
+            actor,
+            self.policy.distribution,
+            keys,
+            num_episodes=len(keys),
+            horizon=self.horizon,
+            deterministic=modes,
+            active=chosen,
+        )
+        if visitors is None:
+            return played, None
         return played.episodes(slice(count, None)), played.episodes(slice(count))
 
     def _learn(
@@ -372,6 +406,21 @@ class _Reinforce:
         if trajectory.played is None:
             return self.num_episodes
         return jnp.maximum(trajectory.num_played(), 1)
+
+
+def _part(devices: Devices, play: Callable[..., Any], *given: Any) -> tuple[Any, Any]:
+    """Returns what ``_play_part`` plays of one device's part, guests on the first device alone."""
+    actor, start_key, visitors, keys, chosen = given
+    if visitors is not None:
+        *others, active = visitors
+        visitors = *others, active & (devices.number() == 0)
+    played = play(actor, start_key, visitors, keys, chosen)
+    simulated = devices.sum(played[0].simulated)
+    return jax.tree.map(
+        lambda x: dataclasses.replace(x, simulated=simulated),
+        played,
+        is_leaf=lambda x: isinstance(x, Trajectory),
+    )
 
 
 class _OneStart:

@@ -20,6 +20,7 @@ from mjx_reinforce.settings.memory import (
 
 if TYPE_CHECKING:
     from mjx_reinforce.store.ready import Ready
+    from mjx_reinforce.training.division import Division
 
 #: The figures are good to this factor.
 _ACCURACY = 2.0
@@ -91,6 +92,9 @@ def make_plan(ready: "Ready", config: Config, num_processes: int = 1) -> Plan:
     what = _what(config)
     config = dataclasses.replace(config, num_seeds=-(-config.num_seeds // num_processes))
     task, machine = task_of(ready.policy, ready.horizon, config), this_hardware()
+    division = ready.programs.division
+    if not machine.shared:
+        config = division.of_each(config, config.num_seeds)
     base = task.base_memory if machine.shared else 0.0
     check_fits(config, task, machine.memory, base)
     speed = machine.speeds.get(config.env)
@@ -108,8 +112,9 @@ def make_plan(ready: "Ready", config: Config, num_processes: int = 1) -> Plan:
         if not bounded and useful_part(task, speed) < 1:
             time += ", more if some seeds' episodes stay short, since all wait for the last"
     memory = gigabytes(base + needed(config, task))
+    where = _where(machine, num_processes, division)
     text = (
-        f"Training {what} on {_where(machine, num_processes)}, with the engine {ready.engine}: "
+        f"Training {what} on {where}, with the engine {ready.engine}: "
         f"{ready.why}. {time}. It needs about {memory} of memory."
     )
     return Plan(text, compiling, seconds, bounded)
@@ -135,14 +140,17 @@ def run_seconds(config: Config, task: Task, machine: Hardware, speed: Speed) -> 
     return (seconds + steps * beyond / rate) / machine.faster, bounded
 
 
-def _where(machine: Hardware, num_processes: int) -> str:
-    """Returns on what a run trains: one device of each process."""
+def _where(machine: Hardware, num_processes: int, division: "Division") -> str:
+    """Returns on what a run trains: these devices of each process."""
     import jax
 
-    here = jax.local_device_count()
-    name = machine.name
-    if here > 1 and not machine.shared:
-        name += f", the first of the {here} here (a sweep trains on all),"
+    here, name = jax.local_device_count(), machine.name
+    if division.count > 1:
+        each = f"of {name}" if machine.shared else f"({name} each)"
+        what = "seeds" if division.seeds > 1 else "episodes of an update"
+        name = f"{division.count} devices {each}, which share the {what}"
+    elif here > 1 and not machine.shared:
+        name += f", the first of the {here} here (more would not make so few episodes faster),"
     return name if num_processes == 1 else f"{num_processes} processes, each on {name}"
 
 

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     import jax
     import optax
 
+    from mjx_reinforce.devices import Devices
     from mjx_reinforce.learners.estimators import Estimator
     from mjx_reinforce.learners.learner import Learner
     from mjx_reinforce.learners.updates import Update
@@ -20,7 +21,10 @@ if TYPE_CHECKING:
 
 
 def build(
-    env: "Environment", config: Config, policy: "Policy | None" = None
+    env: "Environment",
+    config: Config,
+    policy: "Policy | None" = None,
+    devices: "Devices | None" = None,
 ) -> "tuple[Learner, int]":
     """Builds the learner that the settings describe.
 
@@ -28,6 +32,7 @@ def build(
       env: what it learns on.
       config: the settings.
       policy: a ready policy, in place of the one that the settings describe.
+      devices: among which the episodes of an update are divided, of ``reinforce`` alone.
 
     Returns:
       The learner, and the horizon in env steps.
@@ -56,8 +61,9 @@ def build(
     }
     if is_own(config.algorithm):
         return _build_own(env, config, shared), horizon
-    build_one = _build_ars if config.algorithm == "ars" else _build_reinforce
-    return build_one(env, config, shared), horizon
+    if config.algorithm == "ars":
+        return _build_ars(env, config, shared), horizon
+    return _build_reinforce(env, config, {**shared, "devices": devices}), horizon
 
 
 def _training_horizon(config: Config, horizon: int) -> int:

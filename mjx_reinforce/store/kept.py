@@ -99,7 +99,8 @@ def keep(key: str, facts: dict[str, Any], programs: Programs) -> Programs:
     def load(name: str) -> Callable[..., Any]:
         return _export(key, name, flat[name], given[name])
 
-    return _on_states(load, like, programs.rides)
+    kept = _on_states(load, like, programs.rides)
+    return kept._replace(division=programs.division)
 
 
 def read_programs(key: str) -> tuple[dict[str, Any], Programs] | None:

@@ -8,6 +8,7 @@ from mjx_reinforce.settings.config import Config, check_step_count
 from mjx_reinforce.settings.relevance import check_read_by_policy
 from mjx_reinforce.store import kept
 from mjx_reinforce.store.build import build, policy_settings
+from mjx_reinforce.training.division import Division, divide_run
 from mjx_reinforce.training.programs import Programs, programs_of
 from mjx_reinforce.types import Environment
 
@@ -73,18 +74,33 @@ def _found(key: str, config: Config, share: slice) -> Ready | None:
     if found is None:
         return None
     facts, programs = found
+    programs = programs._replace(division=_division(config, share))
     check_step_count(config, facts["horizon"])
     return Ready(**facts, engine_seconds=0.0, programs=programs)
 
 
-def made(env: Environment, config: Config, share: slice = slice(None)) -> Ready:
+def made(
+    env: Environment,
+    config: Config,
+    share: slice = slice(None),
+    division: Division | None = None,
+) -> Ready:
     """Returns what the settings come to in an environment, for all seeds or a share of them.
+
+    Args:
+      env: what is trained on.
+      config: the settings.
+      share: of the seeds.
+      division: among which devices they are divided; by default as ``divide_run`` says.
 
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    learner, horizon = build(env, config)
-    num_seeds = len(range(config.num_seeds)[share])
+    if division is None:
+        division = _division(config, share)
+    devices = division.devices() if division.episodes > 1 else None
+    learner, horizon = build(env, config, devices=devices)
+    width = division.width(_size(config, share))
     threshold = getattr(env, "reward_threshold", None)
     return Ready(
         horizon=horizon,
@@ -93,5 +109,13 @@ def made(env: Environment, config: Config, share: slice = slice(None)) -> Ready:
         engine=learner.engine.name,
         why=learner.engine.why,
         engine_seconds=learner.engine.seconds,
-        programs=programs_of(env, lambda _: learner, horizon, config, num_seeds),
+        programs=programs_of(env, lambda _: learner, horizon, config, width, division=division),
     )
+
+
+def _division(config: Config, share: slice) -> Division:
+    return divide_run(config, _size(config, share))
+
+
+def _size(config: Config, share: slice) -> int:
+    return len(range(config.num_seeds)[share])

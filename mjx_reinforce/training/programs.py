@@ -4,6 +4,7 @@
 them for slots, see ``sweeps.slots.programs``.
 """
 
+import functools
 from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -12,14 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce.devices import NONE, RUNS, SECOND
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.learners.learner import Guests, Host, TrainState
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import state
 from mjx_reinforce.training.block import Block, BuildLearner, block_of_updates
+from mjx_reinforce.training.division import ALONE, Division
 from mjx_reinforce.training.evaluation import evaluate, guests_of
-from mjx_reinforce.training.state import Budget, RunState, Seed, budget_of
+from mjx_reinforce.training.state import Budget, RunState, Seed
 from mjx_reinforce.types import Environment
 
 
@@ -36,6 +39,7 @@ class Programs(NamedTuple):
       ``evaluation.evaluate`` returns, [R] each
     rides: whether ``advance`` evaluates; else ``evaluate`` does, before it
     like: the shapes of a ``RunState``
+    division: among which devices the runs are divided; R are those of one device
     """
 
     begin: Callable[..., tuple[RunState, jax.Array]]
@@ -43,6 +47,7 @@ class Programs(NamedTuple):
     evaluate: Callable[..., dict[str, jax.Array]]
     rides: bool
     like: RunState
+    division: Division = ALONE
 
 
 class Looked(NamedTuple):
@@ -85,6 +90,7 @@ def programs_of(
     traced: Collection[str] = (),
     *,
     sampled: bool = True,
+    division: Division = ALONE,
 ) -> Programs:
     """Returns the programs of runs.
 
@@ -93,9 +99,10 @@ def programs_of(
       build_learner: called while the settings of one run are traced, and without any.
       horizon: T, the time limit of an episode in steps.
       config: the settings, in which those that are traced stand for any value.
-      num_runs: R, of the shapes.
+      num_runs: R, of the shapes; those of one device.
       traced: the names of the settings that differ from run to run.
       sampled: as for ``evaluation.evaluate``.
+      division: among which devices the runs are divided.
     """
     learner = build_learner({})  # policies and engines are those of any
     rides = isinstance(learner.play, Host) and config.training_horizon(horizon) == horizon
@@ -130,6 +137,7 @@ def programs_of(
         evaluate=jax.vmap(look),
         rides=rides,
         like=jax.eval_shape(begin, np.uint32(0), np.uint32(0), numbers, settings)[0],
+        division=division,
     )
 
 
@@ -152,48 +160,64 @@ def compile_run(
       share: which of its seeds they are for; all by default.
       meanwhile: begins other work in Python; called once the rest of the time is XLA's.
     """
-    like, numbers = programs.like, np.arange(config.num_seeds, dtype=np.uint32)[share]
+    numbers = np.arange(config.num_seeds, dtype=np.uint32)[share]
+    division, num_seeds = programs.division, len(numbers)
+    place, view = division.place, functools.partial(division.view, num_seeds=num_seeds)
+    like = division.shapes(programs.like, num_seeds)
 
     def present(states: RunState) -> tuple[Actor, jax.Array]:
         return states.train_states.actor, states.train_states.num_updates
 
     def advance(before: RunState, budget: Budget, look: jax.Array) -> Any:
-        return *programs.advance(before, budget, look), present(before)
+        after, block = programs.advance(before, budget, look)
+        return after, block.made[None], block.metrics, (present(before), block.looked)
 
-    given = np.uint32(config.seed), np.uint32(config.eval_seed), numbers, {}
+    beginning = division.jit(programs.begin, (NONE, NONE, RUNS, NONE), (RUNS, SECOND))
+    evaluating = division.jit(programs.evaluate, (RUNS, RUNS), RUNS)
+    results = RUNS, RUNS, SECOND, RUNS
+    advancing = division.jit(
+        advance, (RUNS, NONE, NONE), results, by_episodes=True, donate_argnums=0
+    )
+    seeds = place((np.uint32(config.seed), np.uint32(config.eval_seed)), NONE)
+    nothing = place((Budget.of(0, 0), np.bool_(False)), NONE)
     with ThreadPoolExecutor() as pool:
-        beginning = pool.submit(jax.jit(programs.begin), *given)
+        begun = pool.submit(beginning, *seeds, place(numbers), {})
         evaluating, advancing = compiling(
             pool,
-            (jax.jit(programs.evaluate), (like.train_states.actor, like.eval_keys)),
-            (jax.jit(advance, donate_argnums=0), (like, budget_of(config), np.bool_(False))),
+            (evaluating, (like.train_states.actor, like.eval_keys)),
+            (advancing, (like, *nothing)),
         )
         meanwhile()
         advancing, evaluating = advancing.result(), evaluating.result()
-        first, test_keys = beginning.result()
+        first, test_keys = begun.result()
     # No update: a GPU's driver translates a program's kernel, also the evaluation's, at first use.
-    first = jax.block_until_ready(advancing(first, Budget.of(0, 0), np.bool_(False))[0])
+    first = view(jax.block_until_ready(advancing(first, *nothing)[0]))
 
     def advanced(
         before: RunState, look: bool, budget: Budget
     ) -> tuple[RunState, Arrays, Looked | None]:
+        before = place(before)
         looked = evaluated(before) if look and not programs.rides else None
-        after, block, policies = advancing(before, budget, np.bool_(look))
-        metrics = {name: x[: int(block.made)] for name, x in _to_numpy(block.metrics).items()}
+        after, made, metrics, seen = advancing(before, *place((budget, np.bool_(look)), NONE))
+        made, metrics = jax.device_get((made, metrics))
+        metrics = {name: x[: made.max(), :num_seeds] for name, x in metrics.items()}
         if look and programs.rides:
-            looked = on_host(policies, block.looked)
-        return after, metrics, looked
+            looked = on_host(*seen)
+        return view(after), metrics, looked
 
     def evaluated(states: RunState) -> Looked:
+        states = place(states)
         return on_host(present(states), evaluating(states.train_states.actor, states.eval_keys))
 
     def on_host(policies: Any, measured: dict[str, jax.Array]) -> Looked:
-        actor, num_updates = jax.device_get(policies)
-        return Looked(actor, num_updates, _to_numpy(measured))
+        seen = jax.tree.map(lambda x: x[:num_seeds], jax.device_get((*policies, measured)))
+        return Looked(*seen)
 
     def tested(actor: Actor) -> Arrays:
+        placed = place(actor)
         keys = map(jax.random.wrap_key_data, jax.device_get(jax.random.key_data(test_keys)))
-        return _joined([_to_numpy(evaluating(actor, each)) for each in keys])
+        every = jax.device_get([evaluating(placed, place(each)) for each in keys])
+        return {name: x[:num_seeds] for name, x in _joined(every).items()}
 
     return first, RunPrograms(advanced, evaluated, tested)
 
@@ -206,8 +230,3 @@ def _joined(evaluations: Sequence[Arrays]) -> Arrays:
         )
         for name in evaluations[0]
     }
-
-
-def _to_numpy(tree: dict[str, jax.Array]) -> Arrays:
-    """Returns arrays on the host; waits for them."""
-    return {name: np.asarray(value) for name, value in jax.device_get(tree).items()}

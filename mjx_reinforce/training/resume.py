@@ -24,6 +24,7 @@ _PROGRAM = (
     *("packages", "git_commit", "device", "cpu", "cores", "machine_code", "jax_settings"),
     *("x64", "xla_flags", "num_processes"),
 )
+_DEVICES = "--xla_force_host_platform_device_count"
 #: Settings that files of version 0.1 lack; there the default held.
 _LATER = ("env_set",)
 _OTHER = "damaged, or of another version of the program; resume with the version that wrote it"
@@ -151,6 +152,8 @@ def check_same_program(
     """Raises ValueError as ``check_program``, of what a file in the directory recorded."""
     for name in (name for name in _PROGRAM if name in present):
         old, new = recorded.get(name), present[name]
+        if name == "xla_flags":
+            old, new = _without_devices(old), _without_devices(new)
         if isinstance(old, dict) and isinstance(new, dict):
             changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]
             if changed:
@@ -165,6 +168,12 @@ def check_same_program(
                 f"{directory} was begun with {name} {old}, and here it is {new}, so its numbers "
                 "would change; resume where it was begun, or start another run"
             )
+
+
+def _without_devices(flags: Any) -> str:
+    """Returns XLA_FLAGS without the number of a CPU's devices, with which a run may go on."""
+    kept = (x for x in str(flags or "").split() if not x.startswith(f"{_DEVICES}="))
+    return " ".join(kept)
 
 
 def newest_checkpoint(like: "RunState", config: Config, say: Callable[[str], None]) -> Any:

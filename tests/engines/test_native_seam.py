@@ -111,7 +111,7 @@ items.check(items.play(items.load(lanes=16), [1, 0, 1, 1], 0, 1), [1, 0, 1, 1], 
 def test_on_eight_devices_at_once(pool):
     run(
         """
-from mjx_reinforce.sweeps.slots.devices import RUNS, Devices
+from mjx_reinforce.devices import RUNS, Devices
 devices, code = Devices(), items.load()
 assert devices.count == 8
 active = jax.numpy.arange(16) % 3

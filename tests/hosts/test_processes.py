@@ -98,9 +98,14 @@ def test_two_processes_share_a_sweep(tmp_path):
 
 
 @pytest.mark.cpu
-def test_two_processes_share_a_run(tmp_path):
+@pytest.mark.parametrize("devices", [1, 2])
+def test_two_processes_share_a_run(tmp_path, monkeypatch, devices):
+    """Of two devices each, those of the first share its seed's episodes, the others two seeds."""
     command = f"{PENDULUM} --num-seeds 3"
-    assert finish(tmp_path, train_two(tmp_path, "train", f"{command} --output two")) == [0, 0]
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={devices}"
+    with monkeypatch.context() as patch:
+        patch.setenv("XLA_FLAGS", flags)
+        assert finish(tmp_path, train_two(tmp_path, "train", f"{command} --output two")) == [0, 0]
     assert "on 2 processes, each on" in said(tmp_path, 0)
     train_alone(tmp_path, "train", f"{command} --output one")
     one, two = (list(csv.DictReader((tmp_path / x / "metrics.csv").open())) for x in ("one", "two"))

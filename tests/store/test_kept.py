@@ -110,6 +110,12 @@ def test_programs_depend_on_what_jax_is_told(monkeypatch):
     assert None in keys
 
 
+def test_programs_depend_on_the_number_of_devices(monkeypatch):
+    key = kept.key_of(CONFIG)
+    monkeypatch.setattr(jax, "device_count", lambda: 8)
+    assert kept.key_of(CONFIG) != key
+
+
 def test_a_program_that_launches_a_gpus_kernel_is_kept():
     def add(x):
         return gpu._call(gpu._PROBE, "probe", (1, 1), [jnp.ones(1, jnp.int32)], [x])

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from mjx_reinforce import envs
+from mjx_reinforce.devices import Devices
 from mjx_reinforce.store.build import build
 from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.designs.grid import configure
 from mjx_reinforce.sweeps.designs.groups import Group, make_groups
 from mjx_reinforce.sweeps.designs.plan import chunk_limit, describe_plan, divide
 from mjx_reinforce.sweeps.designs.rungs import part_trained
-from mjx_reinforce.sweeps.slots.devices import Devices
 
 
 class Prepared(NamedTuple):

@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce.devices import NONE, RUNS, Devices
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.learners import counts
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.settings.memory import num_cores
 from mjx_reinforce.sweeps.history import Measured
 from mjx_reinforce.sweeps.slots.ahead import Stopwatch, started
-from mjx_reinforce.sweeps.slots.devices import NONE, RUNS, Devices
 from mjx_reinforce.sweeps.slots.layout import StateRows
 from mjx_reinforce.sweeps.slots.packing import pack_slots
 from mjx_reinforce.training.block import BuildLearner

@@ -1,0 +1,128 @@
+"""Runs on several devices: what is divided, and that nothing else changes."""
+
+import csv
+import json
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+from places import PYTHONPATH, ROOT
+
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training import resume
+from mjx_reinforce.training.division import ALONE, Division, divide_run
+
+EPISODES, SEEDS = [{"episodes": 2}, {"episodes": 8}], [{"seeds": 2}, {"seeds": 3}]
+VARIANTS = {
+    "plain": ({}, [*EPISODES, *SEEDS]),
+    "value-baseline": ({"estimator": "value-baseline"}, EPISODES[1:]),
+    "natural-gradient": ({"update": "natural-gradient", "max_kl": 0.01}, EPISODES[1:]),
+    "minibatches": ({"update": "minibatches", "minibatch_size": 16}, EPISODES[:1]),
+    "each-step": ({"update": "each-step"}, EPISODES[:1]),
+    "auto": ({"num_episodes": "auto", "min_episodes": 8, "max_episodes": 32}, EPISODES[1:]),
+    "one-start": ({"one_start": True, "max_kl": 0.01}, EPISODES[:1]),
+    "vmap": ({"engine": "vmap", "standardize": False}, [*EPISODES[:1], *SEEDS[:1]]),
+    "ars": ({"algorithm": "ars", "engine": "vmap", "num_directions": 2}, SEEDS[:1]),
+    "HalfCheetah": (
+        {"env": "HalfCheetah-v5", "horizon": 20, "num_seeds": 2, "max_updates": 1},
+        EPISODES,
+    ),
+}
+
+
+def on_devices(count, folder, *line):
+    """Runs a program in a process that has so many devices; returns what it printed."""
+    flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={count}"
+    environment = os.environ | {"XLA_FLAGS": flags, "PYTHONPATH": PYTHONPATH}
+    done = subprocess.run(
+        [sys.executable, *line], cwd=folder, env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize("name", VARIANTS)
+def test_devices_change_nothing_but_rounding(tmp_path, name):
+    settings, divisions = VARIANTS[name]
+    given = [json.dumps(each) for each in (settings, *divisions)]
+    on_devices(8, tmp_path, str(ROOT / "tests" / "helpers" / "divided.py"), *given)
+
+
+@pytest.mark.parametrize(
+    ("seeds", "episodes", "here", "backend", "expected"),
+    [
+        (1, 16, 1, "cpu", ALONE),
+        (16, 16, 8, "gpu", Division(seeds=8)),
+        (9, 16, 8, "gpu", Division(seeds=5)),  # of two seeds each
+        (9, 4096, 8, "gpu", Division(episodes=8)),
+        (3, 16, 8, "gpu", Division(seeds=3)),
+        (1, 1024, 2, "gpu", ALONE),
+        (1, 2048, 2, "gpu", Division(episodes=2)),
+        (1, 65_536, 6, "gpu", Division(episodes=4)),
+        (1, 7, 2, "cpu", ALONE),
+        (1, 16, 8, "cpu", Division(episodes=8)),
+        (2, "auto", 8, "gpu", Division(seeds=2)),
+        (1, "auto", 8, "cpu", Division(episodes=8)),
+    ],
+)
+def test_what_is_divided(monkeypatch, seeds, episodes, here, backend, expected):
+    monkeypatch.setattr(jax, "local_device_count", lambda: here)
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    config = Config(num_seeds=seeds, num_episodes=episodes)
+    division = divide_run(config, seeds)
+    assert division == expected
+    each = division.of_each(config, seeds)
+    assert division.seeds * each.num_seeds >= seeds
+    assert division.episodes * each.episodes_per_update == config.episodes_per_update
+
+
+def rows(folder):
+    return list(csv.DictReader((folder / "metrics.csv").open()))
+
+
+@pytest.mark.cpu
+def test_a_run_goes_on_on_fewer_devices(tmp_path):
+    """Its checkpoints are those of any number."""
+    command = "--env toys:Drift --num-episodes 8 --eval-episodes 2 --hidden-sizes 4 --num-seeds 1"
+    command += " --env-steps None --eval-every 2 --checkpoint-every 2 --learning-rate 1e-4"
+    train = "-m", "mjx_reinforce.train"
+    said = on_devices(8, tmp_path, *train, *f"{command} --max-updates 4 --output out".split())
+    assert "which share the episodes of an update" in said
+    said = on_devices(
+        2, tmp_path, *train, *["--resume", "out", "--env", "toys:Drift", "--max-updates", "8"]
+    )
+    assert "2 devices" in said
+    assert "going on after 4 updates" in said
+    on_devices(1, tmp_path, *train, *f"{command} --max-updates 8 --output one".split())
+    one, other = rows(tmp_path / "one"), rows(tmp_path / "out")
+    assert len(one) == len(other) == 5
+    for ours, theirs in zip(one, other, strict=True):
+        for name in ("update", "env_steps"):
+            assert ours[name] == theirs[name]
+        for name in ("train_return", "eval_return", "gradient_norm"):
+            values = [float(row[name] or 0) for row in (ours, theirs)]
+            np.testing.assert_allclose(*values, rtol=1e-3)
+
+
+@pytest.mark.cpu
+def test_programs_of_several_devices_are_kept(tmp_path):
+    """The second start reads them, and trains to the bit what the first did."""
+    command = "-m mjx_reinforce.train --env CartPole-v1 --num-episodes 8 --eval-episodes 2"
+    command += " --num-seeds 1 --env-steps None --max-updates 2 --output"
+    for name in ("first", "second"):
+        on_devices(2, tmp_path, *command.split(), name)
+    for ours, theirs in zip(rows(tmp_path / "first"), rows(tmp_path / "second"), strict=True):
+        del ours["wall_seconds"], theirs["wall_seconds"]
+        assert ours == theirs
+
+
+def test_flags_of_xla_but_the_number_of_devices_keep_a_run_from_going_on(tmp_path):
+    several = "--xla_a=1 --xla_force_host_platform_device_count=8"
+    recorded = {"xla_flags": several}
+    resume.check_same_program(tmp_path, recorded, {"xla_flags": "--xla_a=1"})
+    with pytest.raises(ValueError, match="xla_flags"):
+        resume.check_same_program(tmp_path, recorded, {"xla_flags": "--xla_a=2"})
