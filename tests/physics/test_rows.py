@@ -80,7 +80,7 @@ def test_states_reach_limits_and_contacts_of_every_dimension():
     assert int(mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT) in kinds
 
 
-def test_a_disabled_constraint_has_no_row(made):
+def test_a_disabled_constraint_has_no_row():
     disabled = mjx.put_model(MODEL, impl="jax")
     flag = mjx.DisableBit.CONSTRAINT
     disabled = disabled.replace(opt=disabled.opt.replace(disableflags=flag))
