@@ -107,7 +107,9 @@ def test_a_chart_becomes_a_file_of_each_kind():
     rows = {"final": {"configuration": ["a"], "place": [0], "value": [3.0]}}
     rows["final"] |= {name: [3.0] for name in ("low", "high", "tenth", "ninetieth")}
     spec = spec_of(charts.final(["a"], None), ["a"], ["a"])
-    table = [dict(zip(rows["final"], x, strict=True)) for x in zip(*rows["final"].values())]
+    table = [
+        dict(zip(rows["final"], x, strict=True)) for x in zip(*rows["final"].values(), strict=True)
+    ]
     files = vega.render_chart(spec, {"final": table, "one": [{"row": 0}]}, "Final returns")
     assert files["png"].startswith(b"\x89PNG")
     assert files["pdf"].startswith(b"%PDF")
