@@ -109,7 +109,7 @@ class InMujoco:
         mj_step(self.model, self.data, self.env.frame_skip)
         if self.env.contact_forces:
             mj_rnePostConstraint(self.model, self.data)
-        given = before, self._fields(), self._episode, jnp.asarray(action)
+        given = before, self._fields(), self._episode, np.asarray(action)
         observation, reward, ended = self._advance(*given)
         return np.asarray(observation), float(reward), bool(ended)
 

@@ -139,11 +139,12 @@ def film(settings: WatchSettings) -> None:
         live(env, scene(env), roles[-1].player, source.horizon, settings)
         return
     model = scene(env)
-    Renderer(model, settings.width, settings.height)  # raises before anything is compiled
+    size = settings.width, settings.height
+    renderer = Renderer(model, *size)  # raises before anything is compiled
     from mjx_reinforce.export.takes import side_by_side
 
     takes = [_take(settings, source, env, model, role) for role in roles]
-    shown = side_by_side(takes, settings.width, settings.height, seconds=settings.seconds)
+    shown = side_by_side(takes, *size, seconds=settings.seconds, renderer=renderer)
     samples = [*map(shown.draw, shown.samples)]
     frames = map(shown.draw, track(range(shown.length), "drawing", transient=True))
     write_film(output, frames, shown.rate, samples)

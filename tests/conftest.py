@@ -15,6 +15,8 @@ from pathlib import Path
 os.environ.setdefault(
     "XLA_FLAGS",
     "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true"
+    # The workers share the cores: a program compiled in parts takes longer in all.
+    + " --xla_cpu_parallel_codegen_split_count=1"
     # On a GPU a program compiled again may else round otherwise.
     + " --xla_gpu_deterministic_ops=true"
     # JAX 0.10's older emitters of fusions compile twice as fast; its users have the newer ones.

@@ -43,7 +43,7 @@ class Renderer:
         # Without a GPU smooth edges take half the time of a picture, and show no better in it.
         model.vis.quality.offsamples = 0
         # Without a GPU a fine shadow takes half the time of a picture, and shows no better in it.
-        model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, 2 * max(width, height))
+        model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, max(width, height))
         cameras = [model.camera(i).name for i in range(model.ncam)]
         self._camera = "track" if "track" in cameras else -1
         self._model, self._data = model, mujoco.MjData(model)

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.checks import check_type
@@ -69,10 +68,10 @@ class Player(NamedTuple):
                 f"[N, {mean.size}], got one of shape {list(observation.shape)}"
             )
         if rng is None:
-            action = _mode(self.policy, self.actor, jnp.asarray(observation))
+            action = _mode(self.policy, self.actor, observation)
         else:
             key = jax.random.key(int(rng.integers(2**32)))
-            action = _sample(self.policy, self.actor, jnp.asarray(observation), key)
+            action = _sample(self.policy, self.actor, observation, key)
         return np.array(action) if action.ndim else int(action)
 
 

@@ -62,6 +62,7 @@ def side_by_side(
     seconds: float,
     columns: int | None = None,
     max_rate: float = MAX_RATE,
+    renderer: Renderer | None = None,
 ) -> Film:
     """Returns a film of several takes that begin together; one that ends earlier stands still.
 
@@ -72,6 +73,7 @@ def side_by_side(
       seconds: length at most (simulated s); it ends with the longest take.
       columns: takes in a row; by default all.
       max_rate: frames a second at most.
+      renderer: of the last take's model, where it is open already.
 
     Raises:
       ValueError: there is no take, or no OpenGL.
@@ -82,7 +84,8 @@ def side_by_side(
     dt = max(take.dt for take in takes)
     interval = dt * max(1, math.ceil(1 / (dt * max_rate) - 1e-9))
     lasting = max(min(len(take.qpos) * take.dt, seconds) for take in takes)
-    renderers = [Renderer(take.model, width, height) for take in takes]
+    renderers = [Renderer(take.model, width, height) for take in takes[:-1]]
+    renderers.append(renderer or Renderer(takes[-1].model, width, height))
     blank = np.full((height, width, 3), _PAPER, np.uint8)
 
     def draw(frame: int) -> np.ndarray:

@@ -69,8 +69,7 @@ def simulate(
 ) -> Iterator[Moment | None]:
     """Plays an episode until it ends by its own rule; yields None at its start, then each step."""
     rng = np.random.default_rng(episode) if noise else None
-    start, _ = jax.random.split(jax.random.fold_in(jax.random.key(0), episode))
-    observation, ended = simulation.reset(start), False
+    observation, ended = simulation.reset(_start_key(episode)), False
     body = pushed_body(simulation.env.mj_model)
     yield None
     while not ended:
@@ -81,6 +80,12 @@ def simulate(
         broken = not (np.isfinite(observation).all() and np.isfinite(reward))
         ended = ended or broken
         yield Moment(np.nan if broken else reward, ended, force)
+
+
+@jax.jit
+def _start_key(episode: int) -> jax.Array:
+    """Returns the key of an episode's start; one program compiles sooner than its parts."""
+    return jax.random.split(jax.random.fold_in(jax.random.key(0), episode))[0]
 
 
 def push_at(seconds: float, push: float) -> float:

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jax import lax
@@ -19,7 +20,6 @@ from mjx_reinforce import fused
 
 #: Of the examples at least so many must reach the comparison.
 FLOOR = 0.8
-EXAMPLES = 50
 BATCH, SIZE = 5, 3
 
 
@@ -188,7 +188,8 @@ PROGRAMS = st.builds(
 )
 
 
-def test_random_programs_compute_what_jax_computes():
+@pytest.mark.parametrize("examples", [12, 50])
+def test_random_programs_compute_what_jax_computes(examples):
     rng = np.random.default_rng(0)
     x = jnp.asarray(rng.integers(-64, 65, BATCH) / 8, jnp.float32)
     v = jnp.asarray(rng.integers(-64, 65, (BATCH, SIZE)) / 8, jnp.float32)
@@ -196,7 +197,7 @@ def test_random_programs_compute_what_jax_computes():
     tried, compared = [], []
 
     @settings(
-        max_examples=EXAMPLES,
+        max_examples=examples,
         deadline=None,
         derandomize=True,
         database=None,

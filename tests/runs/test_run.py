@@ -9,7 +9,7 @@ import mjx_reinforce
 from mjx_reinforce.export.policy_files import read_policy
 
 CONFIG = dataclasses.replace(
-    mjx_reinforce.of_task("InvertedPendulum-v5"),
+    mjx_reinforce.of_task("ContinuousCartPole-v0"),
     num_seeds=2,
     env_steps=None,
     max_updates=6,
@@ -32,7 +32,7 @@ def test_what_it_returns(results, tmp_path, monkeypatch):
     assert results.config.horizon == 20
     assert results.directory is None
     assert results.summary["status"] == "finished"
-    assert repr(results).startswith("RunResults(InvertedPendulum-v5, 2 seeds, return ")
+    assert repr(results).startswith("RunResults(ContinuousCartPole-v0, 2 seeds, return ")
 
 
 def test_files_are_written_only_where_asked_and_say_the_same(results, tmp_path, monkeypatch):
@@ -71,7 +71,7 @@ def test_quiet_is_quiet_and_the_rest_shows_progress(capsys):
     assert capsys.readouterr().out == ""
     mjx_reinforce.run(CONFIG)
     said = capsys.readouterr().out
-    assert said.startswith("Training 2 seeds of InvertedPendulum-v5")
+    assert said.startswith("Training 2 seeds of ContinuousCartPole-v0")
     assert "update     6" in said
 
 

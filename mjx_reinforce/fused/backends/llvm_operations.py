@@ -138,10 +138,10 @@ def _absolute(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list
 
 
 def _sign(text: Text, op: Op, dtype: np.dtype, _: list[np.dtype], args: list[str]) -> str:
-    """-1, 0 or 1; zeros and NaN stay as they are."""
+    """-1, 0 or 1; zeros and NaN stay as they are, and no unsigned number is negative."""
     kind, zero = text.type(dtype), text.constant(dtype.type(0))
     result = args[0] if dtype.kind == "f" else zero
-    for order, value in (("gt", 1), ("lt", -1)):
+    for order, value in (("gt", 1), ("lt", -1))[: 1 if dtype.kind == "u" else 2]:
         mask = _compare(text, Op(order), dtype, [dtype], [args[0], zero])
         one = text.constant(dtype.type(value))
         result = text.let(f"select {text.type(bool)} {mask}, {kind} {one}, {kind} {result}")

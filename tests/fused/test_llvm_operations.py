@@ -1,0 +1,256 @@
+"""The instructions of each operation: NumPy's results, also of NaN, infinities and zeros."""
+
+import ctypes
+
+import numpy as np
+import pytest
+from jax import lax
+
+from mjx_reinforce.fused.backends.llvm_operations import OPERATIONS
+from mjx_reinforce.fused.backends.llvm_text import Text
+from mjx_reinforce.fused.errors import UnsupportedPrimitive
+from mjx_reinforce.fused.ops import Op
+
+llvm = pytest.importorskip("llvmlite.binding", reason="machine code is written by llvmlite")
+
+LANES = 16
+INFINITY = np.inf
+X = np.float32(
+    [0, -0.0, 1, -1, 1e-40, -1e-40, INFINITY, -INFINITY, np.nan, 2.5, -2.5, 0.5, 3e38, 7, -1.5, 1.5]
+)
+Y = np.float32(
+    [-0.0, 0, np.nan, 3, 1e-40, 2, -INFINITY, INFINITY, 1, -2, 0.75, 0.5, -3e38, 0.1, -0.0, 1.5]
+)
+I = np.int32([0, 1, -1, 2**31 - 1, -(2**31), 5, -5, 7, -7, 8, 100, -100, 31, 32, 3, -3])  # noqa: E741
+J = np.int32([1, 1, -1, 1, 1, 3, 3, -2, -2, 40, 31, 32, 0, 33, 31, 2])
+U, V = I.view(np.uint32), J.view(np.uint32)
+B = I % 2 == 0
+
+
+def compiled(op, dtype, kinds):
+    text = Text(LANES)
+
+    def place(number):
+        return f"%in{number}"
+
+    loaded = []
+    for number, kind in enumerate(kinds):
+        stored = np.dtype(np.int8) if kind == np.bool_ else kind
+        value = text.let(f"load {text.type(stored)}, ptr {place(number)}, align 1")
+        if kind == np.bool_:
+            value = text.let(f"trunc {text.type(stored)} {value} to {text.type(kind)}")
+        loaded.append(value)
+    result, stored = OPERATIONS[op.name](text, op, dtype, kinds, loaded), dtype
+    if dtype == np.bool_:
+        stored = np.dtype(np.int8)
+        result = text.let(f"zext {text.type(dtype)} {result} to {text.type(stored)}")
+    text.line(f"store {text.type(stored)} {result}, ptr %out, align 1")
+    text.line("ret void")
+    pointers = ", ".join(f"ptr {place(number)}" for number in range(len(kinds)))
+    return llvm.parse_assembly(text.function(f"void @f({pointers}, ptr %out)"))
+
+
+def run(name, *operands, dtype=None, **params):
+    """What the instructions make of the operands."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    machine = llvm.Target.from_default_triple().create_target_machine(opt=1, jit=True)
+    kinds = [x.dtype for x in operands]
+    dtype = np.dtype(dtype or kinds[-1])
+    module = compiled(Op(name, tuple(sorted(params.items()))), dtype, kinds)
+    module.verify()
+    engine = llvm.create_mcjit_compiler(module, machine)
+    engine.finalize_object()
+    out = np.zeros(LANES, dtype)
+    function = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * (1 + len(operands)))
+    given = [np.ascontiguousarray(x) for x in operands]
+    function(engine.get_function_address("f"))(*(x.ctypes.data for x in (*given, out)))
+    return out
+
+
+def assert_bits(got, want):
+    """Equal numbers, equal signs of zeros, and NaN where NaN is."""
+    np.testing.assert_array_equal(got, want)
+    if got.dtype.kind == "f":
+        number = ~np.isnan(want)
+        np.testing.assert_array_equal(np.signbit(got)[number], np.signbit(want)[number])
+
+
+def shifted(x, y, how):
+    """By more bits than there are, nothing is left but copies of the sign."""
+    by, bits = y.view(np.uint32).astype(np.int64), x.view(np.uint32).astype(np.int64)
+    inside = by < 32
+    by = np.minimum(by, 31)
+    if how == "right":
+        return (x.astype(np.int64) >> by).astype(np.int32)
+    moved = bits << by if how == "left" else bits >> by
+    return np.where(inside, moved & 0xFFFFFFFF, 0).astype(np.uint32).view(x.dtype)
+
+
+def nearest_away(x):
+    return np.copysign(np.floor(np.abs(x) + np.float32(0.5)), x)
+
+
+FLOATS = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "rem": np.fmod,
+    "neg": np.negative,
+    "abs": np.abs,
+    "sign": lambda x: np.where(x == 0, x, np.sign(x)),  # XLA's keeps the sign of a zero
+    "floor": np.floor,
+    "ceil": np.ceil,
+    "sqrt": np.sqrt,
+    "rsqrt": lambda x: np.float32(1) / np.sqrt(x),
+}
+INTEGERS = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+    "max": np.maximum,
+    "min": np.minimum,
+    "neg": np.negative,
+    "abs": np.abs,
+    "not": np.invert,
+    "sign": np.sign,
+    "population_count": lambda x: [bin(n).count("1") for n in x.view(np.uint32).tolist()],
+    "clz": lambda x: [32 - n.bit_length() for n in x.view(np.uint32).tolist()],
+}
+COMPARISONS = {
+    "eq": np.equal,
+    "ne": np.not_equal,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+}
+
+
+@pytest.mark.parametrize("name", FLOATS)
+def test_floats(name):
+    operands = [X, Y][: FLOATS[name].nin if isinstance(FLOATS[name], np.ufunc) else 1]
+    with np.errstate(all="ignore"):
+        want = FLOATS[name](*operands)
+    assert_bits(run(name, *operands), want)
+
+
+@pytest.mark.parametrize("name", ["max", "min"])
+def test_extremes_are_nan_where_either_is(name):
+    want = {"max": np.maximum, "min": np.minimum}[name](X, Y)
+    np.testing.assert_array_equal(run(name, X, Y), want)
+    np.testing.assert_array_equal(run(name, Y, X), want)
+
+
+@pytest.mark.parametrize("kind", [np.int32, np.uint32])
+@pytest.mark.parametrize("name", INTEGERS)
+def test_integers(name, kind):
+    """Also the least, which has no negative of its own; unsigned ones are never negative."""
+    if (name, kind) == ("abs", np.uint32):
+        pytest.skip("JAX has none")
+    function = INTEGERS[name]
+    operands = [I.view(kind), J.view(kind)]
+    operands = operands[: function.nin if isinstance(function, np.ufunc) else 1]
+    with np.errstate(all="ignore"):
+        want = np.asarray(function(*operands), kind)
+    assert_bits(run(name, *operands), want)
+
+
+@pytest.mark.parametrize("operands", [(X, Y), (I, J), (U, V), (X, X)], ids=["f", "i", "u", "same"])
+@pytest.mark.parametrize("name", COMPARISONS)
+def test_comparisons(name, operands):
+    """With NaN all are false, except that it is unequal."""
+    want = COMPARISONS[name](*operands)
+    assert_bits(run(name, *operands, dtype=bool), want)
+    assert want.any() or operands[0] is operands[1]
+
+
+@pytest.mark.parametrize("name", ["div", "rem"])
+def test_integers_are_divided_towards_zero(name):
+    """By zero, and where the quotient is no int32, XLA's results are in another test."""
+    divides = (J != 0) & ~((I == -(2**31)) & (J == -1))
+    quotient = np.trunc(I.astype(np.float64) / np.where(J == 0, 1, J)).astype(np.int64)
+    want = quotient if name == "div" else I - quotient * J
+    np.testing.assert_array_equal(run(name, I, J)[divides], want[divides])
+
+
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [
+        ("shift_left", "left"),
+        ("shift_right_logical", "logical"),
+        ("shift_right_arithmetic", "right"),
+    ],
+)
+def test_shifts(name, how):
+    assert_bits(run(name, I, J), shifted(I, J, how))
+
+
+def test_rounding_has_two_ways():
+    away, even = lax.RoundingMethod.AWAY_FROM_ZERO, lax.RoundingMethod.TO_NEAREST_EVEN
+    assert_bits(run("round", X, rounding_method=even), np.rint(X))
+    assert_bits(run("round", X, rounding_method=away), nearest_away(X))
+    assert np.any(np.rint(X) != nearest_away(X))
+
+
+def test_finite():
+    assert_bits(run("is_finite", X, dtype=bool), np.isfinite(X))
+    assert run("is_finite", I, dtype=bool).all()
+
+
+def test_a_case_is_selected():
+    assert_bits(run("select_n", B, X, Y), np.where(B, Y, X))
+    which = np.abs(J) % 3
+    assert_bits(run("select_n", which, I, J, I + J), np.choose(which, [I, J, I + J]))
+
+
+def test_bools():
+    both = I % 3 == 0
+    for name, function in {"and": B & both, "or": B | both, "xor": B ^ both}.items():
+        assert_bits(run(name, B, both), function)
+    assert_bits(run("not", B), ~B)
+    assert_bits(run("max", B, both), B | both)
+    assert_bits(run("min", B, both), B & both)
+
+
+@pytest.mark.parametrize("after", [np.int32, np.uint32, np.int8])
+def test_a_float_out_of_range_becomes_the_nearest_integer(after):
+    limits = np.iinfo(after)
+    exact = np.nan_to_num(np.trunc(X.astype(np.float64)), nan=0.0)
+    want = np.clip(exact, limits.min, limits.max).astype(after)
+    assert_bits(run("convert_element_type", X, dtype=after, new_dtype=np.dtype(after)), want)
+
+
+@pytest.mark.parametrize(
+    ("x", "after"),
+    [
+        (I, np.float32),
+        (U, np.float32),
+        (B, np.float32),
+        (B, np.int32),
+        (I, np.bool_),
+        (X, np.bool_),
+        (I, np.int8),
+        (X, np.float64),
+        (U, np.float64),
+    ],
+)
+def test_conversions(x, after):
+    assert_bits(
+        run("convert_element_type", x, dtype=after, new_dtype=np.dtype(after)), x.astype(after)
+    )
+
+
+def test_bits_stay():
+    assert_bits(run("bitcast_convert_type", X, dtype=np.int32), X.view(np.int32))
+    got = run("bitcast_convert_type", X.view(np.int32), dtype=np.float32)
+    np.testing.assert_array_equal(got.view(np.int32), X.view(np.int32))
+
+
+def test_what_has_no_instruction_is_refused():
+    with pytest.raises(UnsupportedPrimitive, match="no instruction for 'zeta'"):
+        OPERATIONS["zeta"](Text(LANES), Op("zeta"), np.dtype("f4"), [], [])
