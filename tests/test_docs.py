@@ -15,6 +15,7 @@ from saved_runs import make_run
 
 import mjx_reinforce
 from mjx_reinforce import envs
+from mjx_reinforce.console.commands import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -89,16 +90,15 @@ def test_notebook_runs(name, tmp_path):
 
 def test_flags_of_pages_exist(capfd):
     """What the pages say on command lines is what the commands know."""
-    for name in ("train", "sweep", "report", "watch", "export.__main__"):
-        all_of_them = ["all"] * (name in ("train", "sweep"))
-        command = importlib.import_module(f"mjx_reinforce.{name}")
-        run_command("--help", *all_of_them, command=command)
+    for name, (module, _) in COMMANDS.items():
+        words = ["all"] * (name in ("train", "sweep"))
+        run_command("--help", *words, command=importlib.import_module(module))
     known = set(re.findall(r"--[a-z][a-z-]+", capfd.readouterr().out))
     said = {}
     for path in sorted(DOCS.glob("*.md")):
         for code in blocks(path.read_text("utf-8"), "sh"):
             for line in code.replace("\\\n", " ").splitlines():
-                if re.search(r"mjx-reinforce (train|sweep|report|watch|export)", line):
+                if re.search(rf"mjx-reinforce ({'|'.join(COMMANDS)})", line):
                     said |= dict.fromkeys(re.findall(r"(?<= )--[a-z][a-z-]+", line), path.name)
     assert len(said) > 15
     assert {flag: page for flag, page in said.items() if flag not in known} == {}
