@@ -110,3 +110,10 @@ def test_links_of_pages_are_files():
         for link in re.findall(r"\]\(([^)#\s]+)", path.read_text("utf-8")):
             if "://" not in link:
                 assert (path.parent / link).exists(), f"{path.name}: {link}"
+
+
+def test_pictures_and_films_are_small():
+    """A clone and a page load quickly."""
+    most = {".png": 100_000, ".gif": 300_000}
+    sizes = {path: path.stat().st_size for path in DOCS.rglob("*") if path.suffix in most}
+    assert {path.name: size for path, size in sizes.items() if size > most[path.suffix]} == {}
