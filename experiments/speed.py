@@ -80,6 +80,14 @@ def seconds_of(*arguments: str) -> float:
     return time.perf_counter() - begin
 
 
+def commit() -> str:
+    """Returns the commit of the package, and whether its files have changed since."""
+    git = ("git", "-C", str(DOCS.parent))
+    head = subprocess.run([*git, "rev-parse", "--short", "HEAD"], stdout=subprocess.PIPE, text=True)
+    changed = subprocess.run([*git, "diff", "--quiet", "HEAD", "--", "mjx_reinforce", "envs"])
+    return head.stdout.strip() + "-dirty" * (changed.returncode != 0)
+
+
 def measure(settings: Settings) -> dict[str, object]:
     """Returns a row of docs/speed.jsonl."""
     with tempfile.TemporaryDirectory() as folder:
@@ -91,12 +99,11 @@ def measure(settings: Settings) -> dict[str, object]:
         os.environ["XDG_CACHE_HOME"] = f"{folder}/another"
         first = seconds_of(*train, "--eval-episodes", "2", "--output", f"{folder}/run")
     device, cores = jax.devices()[0].device_kind, len(os.sched_getaffinity(0))
-    commit = subprocess.run(["git", "describe", "--always", "--dirty"], stdout=-1, text=True)
     return {
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "machine": f"{device}, {platform.machine()}, {cores} cores",
         "load": round(os.getloadavg()[0], 1),
-        "commit": commit.stdout.strip(),
+        "commit": commit(),
         "jax": jax.__version__,
         "engine": settings.engine,
         "env": settings.env,
@@ -115,9 +122,13 @@ def draw(rows: list[dict], path: Path) -> None:
     lines = sorted({(row["env"], row["engine"], row["machine"]) for row in rows})
     for key in lines:
         ours = [row for row in rows if (row["env"], row["engine"], row["machine"]) == key]
-        when = [datetime.datetime.fromisoformat(row["time"]) for row in ours]
         for ax, name in zip(axes, ("env_steps_per_second", "first_result_seconds"), strict=True):
-            ax.plot(when, [row[name] for row in ours], "o-", label=", ".join(key))
+            ax.plot(
+                [row["commit"] for row in ours],
+                [row[name] for row in ours],
+                "o-",
+                label=", ".join(key),
+            )
     for ax, label in zip(axes, ("env steps a second", "first result (s)"), strict=True):
         ax.set_ylabel(label)
         ax.tick_params(axis="x", rotation=30)
