@@ -42,7 +42,13 @@ _TABLE: dict[str, tuple[str | Callable[..., Any], dict[str, Any]]] = {
 
 
 def names() -> list[str]:
-    """Returns the ids that ``make`` knows, in order."""
+    """Returns the ids that ``make`` knows, in order.
+
+    Examples:
+      >>> from mjx_reinforce import envs
+      >>> "Hopper-v5" in envs.names()
+      True
+    """
     return sorted(_TABLE)
 
 
@@ -56,6 +62,11 @@ def make(id: str, /, **kwargs: object) -> Any:
     Raises:
       ValueError: the id is unknown, with the known ones; it cannot be imported or built; or it
         gives no environment.
+
+    Examples:
+      >>> from mjx_reinforce import envs
+      >>> envs.make("CartPole-v1", max_episode_steps=50).max_episode_steps
+      50
     """
     check_id(id)
     entry, settings = (id, {}) if ":" in id else _TABLE[id]
@@ -138,6 +149,13 @@ def register(id: str, entry: Callable[..., Any], /, **kwargs: object) -> None:
     Raises:
       ValueError: the id is taken or has other characters than letters, digits, "_", "." and "-",
         or the entry is no class or function.
+
+    Examples:
+      >>> from mjx_reinforce import envs
+      >>> from mjx_reinforce.envs.tasks.cart_pole import CartPole
+      >>> envs.register("LongCartPole-v0", CartPole, max_episode_steps=5000)
+      >>> envs.make("LongCartPole-v0").max_episode_steps
+      5000
     """
     if not re.fullmatch(r"[\w.-]+", id):
         raise ValueError(f"an environment's id has letters, digits, _, . and - only, got {id!r}")

@@ -9,9 +9,8 @@ from mjx_reinforce.export.takes import Film, Take, side_by_side
 from mjx_reinforce.playing.cast import untrained
 from mjx_reinforce.watch import scene
 
-#: The tasks side by side, and the size of their file and of any other at most (bytes).
-_TASKS = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5")
-_LARGEST_OF_TASKS, LARGEST = 2_000_000, 300_000
+#: The tasks side by side, and the size of a file at most (bytes).
+_TASKS, LARGEST = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5"), 300_000
 
 
 def write(folder: Path, arm: Path | None) -> None:
@@ -20,8 +19,7 @@ def write(folder: Path, arm: Path | None) -> None:
     configure_jax()
     folder.mkdir(parents=True, exist_ok=True)
     tasks = [_take(load(name), name.removesuffix("-v5")) for name in _TASKS]
-    film = side_by_side(tasks, 208, 208, seconds=6.0, max_rate=20)
-    save(folder / "tasks.gif", film, _LARGEST_OF_TASKS)
+    save(folder / "tasks.gif", side_by_side(tasks, 176, 176, seconds=3.0, max_rate=12))
     hopper = load("Hopper-v5")
     both = [_take(untrained(hopper), "before training"), _take(hopper, "after training")]
     save(folder / "before-and-after.gif", side_by_side(both, 240, 240, seconds=4.0, max_rate=12))
@@ -34,10 +32,10 @@ def write(folder: Path, arm: Path | None) -> None:
     save(folder / "pushed.gif", side_by_side(pushed, 320, 240, seconds=9.0, max_rate=12))
 
 
-def save(path: Path, film: Film, most_bytes: int = LARGEST) -> None:
-    """Writes a film of so many bytes at most, and says how large it is."""
+def save(path: Path, film: Film) -> None:
+    """Writes a film of ``LARGEST`` bytes at most, and says how large it is."""
     frames = [film.draw(frame) for frame in range(film.length)]
-    write_small_gif(path, frames, film.rate, most_bytes)
+    write_small_gif(path, frames, film.rate, LARGEST)
     print(f"{path}: {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB", flush=True)
 
 

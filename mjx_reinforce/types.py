@@ -22,8 +22,14 @@ MjSpec: TypeAlias = Any
 class Box(NamedTuple):
     """The actions a continuous environment accepts, entry by entry.
 
-    low: [A] the least value of each entry, -inf where unbounded
-    high: [A] the greatest value of each entry, inf where unbounded
+    Attributes:
+      low: [A] the least value of each entry, -inf where unbounded
+      high: [A] the greatest value of each entry, inf where unbounded
+
+    Examples:
+      >>> import mjx_reinforce as mr
+      >>> mr.envs.make("ContinuousCartPole-v0").action_space
+      Box(low=array([-1.]), high=array([1.]))
     """
 
     low: np.ndarray
@@ -31,7 +37,15 @@ class Box(NamedTuple):
 
 
 class Discrete(NamedTuple):
-    """The actions a discrete environment accepts: one integer [], 0 to ``num_actions`` - 1."""
+    """The actions a discrete environment accepts: one integer [], 0 to ``num_actions`` - 1.
+
+    Examples:
+      >>> import jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> family = mr.categorical(mr.Discrete(2))
+      >>> family.mode(jnp.asarray([0.0, 1.0])).item()
+      1
+    """
 
     num_actions: int
 
@@ -43,6 +57,12 @@ class Environment(Protocol):
     ``reset`` and ``step`` are pure functions on one environment. The state they
     return has at least ``obs`` [O], ``reward`` [] and ``done`` [], which is not 0 where the episode
     ends. An episode has at least one step: ``done`` and ``reward`` of ``reset`` are not read.
+
+    Examples:
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> env.observation_size, env.action_size, env.max_episode_steps
+      (4, 2, 500)
     """
 
     def reset(self, rng: jax.Array) -> Any:
@@ -63,14 +83,26 @@ class Environment(Protocol):
 class Trajectory:
     """N complete episodes, time first.
 
-    observation: [T, N, O] what the policy saw; zero where the episode is over
-    action: [T, N, A], or [T, N] if discrete: what the policy drew; zero where the episode is over
-    reward: [T, N] what the action earned; zero where the episode is over
-    mask: [T, N] True while the episode runs, its last step included
-    nonfinite: [N] True where the simulation left the finite numbers
-    simulated: [] int32, env steps that were simulated for these episodes, those in which an
-      episode was over already included
-    played: [N] whether an episode was played, None where all were; one that was not has no step
+    Attributes:
+      observation: [T, N, O] what the policy saw; zero where the episode is over
+      action: [T, N, A], or [T, N] if discrete: what the policy drew; zero where the episode is over
+      reward: [T, N] what the action earned; zero where the episode is over
+      mask: [T, N] True while the episode runs, its last step included
+      nonfinite: [N] True where the simulation left the finite numbers
+      simulated: [] int32, env steps that were simulated for these episodes, those in which an
+        episode was over already included
+      played: [N] whether an episode was played, None where all were; one that was not has no step
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> played.reward.sum(0).tolist()  # the return of each episode
+      [3.0, 3.0]
     """
 
     observation: jax.Array

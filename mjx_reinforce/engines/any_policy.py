@@ -61,6 +61,19 @@ def rollout(
 
     Raises:
       ValueError: an argument makes no sense, or the engine cannot play this.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> family = mr.categorical(env.action_space)
+      >>> policy = mr.mlp_policy(env.observation_size, family)
+      >>> episodes = mr.rollout(
+      ...     env, policy.apply, policy.init(jax.random.key(0)), family, jax.random.key(1),
+      ...     num_episodes=8, horizon=20,
+      ... )
+      >>> episodes.reward.shape
+      (20, 8)
     """
     if hasattr(env, "num_envs"):
         raise ValueError("rollout takes one environment, and this is many: pass its env, vec.env")

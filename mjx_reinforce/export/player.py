@@ -26,10 +26,18 @@ from mjx_reinforce.policies.policy import Policy
 class Player(NamedTuple):
     """The trained policy of one seed of a run.
 
-    env: the id of the environment that it was trained on
-    seed: the number of the seed
-    policy: the network and its distribution
-    actor: the seed's parameters and observation statistics
+    Attributes:
+      env: the id of the environment that it was trained on
+      seed: the number of the seed
+      policy: the network and its distribution
+      actor: the seed's parameters and observation statistics
+
+    Examples:
+      >>> import numpy as np
+      >>> import mjx_reinforce as mr
+      >>> player = mr.load("HalfCheetah-v5")  # it comes with the package
+      >>> player.env, player.act(np.zeros(17)).shape, player.act(np.zeros((5, 17))).shape
+      ('HalfCheetah-v5', (6,), (5, 6))
     """
 
     env: str
@@ -92,6 +100,13 @@ def load(
 
     Raises:
       ValueError: there is no such run, task or seed, the run has not ended, or a file is damaged.
+
+    Examples:
+      >>> import numpy as np
+      >>> import mjx_reinforce as mr
+      >>> player = mr.load("HalfCheetah-v5")  # it comes with the package
+      >>> player.env, player.act(np.zeros(17)).shape, player.act(np.zeros((5, 17))).shape
+      ('HalfCheetah-v5', (6,), (5, 6))
     """
     return load_saved(run, seed, which, policy)[0]
 

@@ -59,6 +59,24 @@ def save_policy(directory: Path, actor: Actor, settings: dict[str, Any]) -> None
       settings: ``policy`` (a name), ``hidden_sizes``, ``initial_std``, ``observation_size``,
         ``action_low`` and ``action_high`` or, if discrete, ``num_actions``; optionally
         ``shared_trunk``, ``initializer``, ``rescale``: what ``build_policy`` reads.
+
+    Examples:
+      >>> import pathlib, tempfile
+      >>> import jax, numpy as np
+      >>> import mjx_reinforce as mr
+      >>> settings = {
+      ...     "policy": "categorical", "hidden_sizes": (8,), "initial_std": 0.5,
+      ...     "observation_size": 4, "num_actions": 2,
+      ... }
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> policy = mr.mlp_policy(4, mr.categorical(env.action_space), (8,))
+      >>> keys = jax.random.split(jax.random.key(0), 3)  # three seeds
+      >>> actors = jax.vmap(mr.reinforce(env, policy=policy).init)(keys).actor
+      >>> folder = pathlib.Path(tempfile.mkdtemp()) / "policy"
+      >>> mr.save_policy(folder, actors, settings)
+      >>> policy, actor = mr.load_policy(folder, seed=2)
+      >>> mr.act(policy, actor, np.zeros(4)).shape
+      (2,)
     """
     directory.mkdir(parents=True, exist_ok=True)
     arrays = {name: np.asarray(value) for name, value in arrays_of(actor).items()}
@@ -80,6 +98,24 @@ def load_policy(directory: str | Path, seed: int | None = None) -> tuple[Policy,
 
     Raises:
       ValueError: the files cannot be read or are damaged, or there is no such seed.
+
+    Examples:
+      >>> import pathlib, tempfile
+      >>> import jax, numpy as np
+      >>> import mjx_reinforce as mr
+      >>> settings = {
+      ...     "policy": "categorical", "hidden_sizes": (8,), "initial_std": 0.5,
+      ...     "observation_size": 4, "num_actions": 2,
+      ... }
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> policy = mr.mlp_policy(4, mr.categorical(env.action_space), (8,))
+      >>> keys = jax.random.split(jax.random.key(0), 3)  # three seeds
+      >>> actors = jax.vmap(mr.reinforce(env, policy=policy).init)(keys).actor
+      >>> folder = pathlib.Path(tempfile.mkdtemp()) / "policy"
+      >>> mr.save_policy(folder, actors, settings)
+      >>> policy, actor = mr.load_policy(folder, seed=2)
+      >>> mr.act(policy, actor, np.zeros(4)).shape
+      (2,)
     """
     saved = read_policy(directory, seed)
     return saved.policy, saved.actor

@@ -20,6 +20,11 @@ def pretrained() -> dict[str, dict[str, Any]]:
       starts that nothing else used; ``interval``, which covers the mean with 95 %; ``command``,
       ``git_commit``, ``machine``, ``seconds`` (of training) and ``compile_seconds``; ``env_steps``
       and ``seed`` of the policy; ``seeds``, of how many it is the best; ``horizon`` (env steps).
+
+    Examples:
+      >>> import mjx_reinforce as mr
+      >>> round(mr.pretrained()["HalfCheetah-v5"]["return"]) > 9000
+      True
     """
     return {path.name: provenance_of(path.name) for path in sorted(FOLDER.glob("*-v*"))}
 

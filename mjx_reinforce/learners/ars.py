@@ -98,6 +98,15 @@ def ars(
 
     Raises:
       ValueError: an argument makes no sense.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("ContinuousCartPole-v0")
+      >>> learner = mr.ars(env, num_directions=2, horizon=20)
+      >>> state, metrics = mr.train_step(learner, learner.init(jax.random.key(0)))
+      >>> metrics["episodes"].item()  # two a direction
+      4
     """
     check_environment(env)
     horizon = check_horizon(env, horizon)

@@ -32,11 +32,26 @@ from mjx_reinforce.types import Trajectory
 class Estimator(NamedTuple):
     """A pair of pure functions, as in optax, and what they require.
 
-    init: (key, observation_size) -> state; consumes the key
-    update: (state, trajectory) -> (weight [T, N], next state, metrics); the weight
-      is zero outside the mask, and the trajectory's observations are normalised; what an episode
-      earned that broke (``trajectory.nonfinite``) is no return, see ``replace_broken``
-    min_episodes: the least N that ``update`` accepts
+    Attributes:
+      init: (key, observation_size) -> state; consumes the key
+      update: (state, trajectory) -> (weight [T, N], next state, metrics); the weight
+        is zero outside the mask, and the trajectory's observations are normalised; what an episode
+        earned that broke (``trajectory.nonfinite``) is no return, see ``replace_broken``
+      min_episodes: the least N that ``update`` accepts
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> def update(state, trajectory):
+      ...     return jnp.where(trajectory.mask, 1.0, 0.0), state, {}
+      >>> estimator = mr.Estimator(init=lambda key, observation_size: None, update=update)
+      >>> estimator.update(None, played)[0].shape
+      (3, 2)
     """
 
     init: Callable[[jax.Array, int], Any]
@@ -48,7 +63,21 @@ class Estimator(NamedTuple):
 
 
 def total_return(discount: float | jax.Array = 0.99) -> Estimator:
-    """Weights every action of an episode by the return of the whole, G[0] (Williams 1992)."""
+    """Weights every action of an episode by the return of the whole, G[0] (Williams 1992).
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.total_return(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()
+      [3.0, 3.0, 3.0]
+    """
     _check_discount(discount)
 
     def weigh(trajectory):
@@ -59,7 +88,21 @@ def total_return(discount: float | jax.Array = 0.99) -> Estimator:
 
 
 def reward_to_go(discount: float | jax.Array = 0.99) -> Estimator:
-    """Weights an action by what came after it, G[t] (Sutton et al. 1999, theorem 1)."""
+    """Weights an action by what came after it, G[t] (Sutton et al. 1999, theorem 1).
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.reward_to_go(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()
+      [3.0, 2.0, 1.0]
+    """
     _check_discount(discount)
     return _stateless(lambda trajectory: _returns(trajectory, discount))
 
@@ -78,6 +121,19 @@ def leave_one_out(discount: float | jax.Array = 0.99, *, ended: str = "zero") ->
 
     Raises:
       ValueError: ``ended`` is unknown or the discount is not in [0, 1].
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.leave_one_out(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()  # both episodes earned the same
+      [0.0, 0.0, 0.0]
     """
     _check_discount(discount)
     if ended not in ("zero", "skip"):
@@ -108,6 +164,19 @@ def mean_log_prob(discount: float | jax.Array = 0.99) -> Estimator:
     product. Its gradient is unbiased, except for E[sum_t G[t] / L], which counts a
     reward the more often the later it comes. It is also noisy, because the weight of an action
     contains the rewards from before that action.
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.mean_log_prob(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()  # (3 + 2 + 1) / 3
+      [2.0, 2.0, 2.0]
     """
     _check_discount(discount)
 
@@ -130,6 +199,19 @@ def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
     spread, so that a long episode counts no more than a short one. Where each step earns the
     same, the weight depends on the remaining time alone: it is positive for early actions and
     negative for late ones.
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.normalized_returns(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].round(3).tolist()
+      [1.0, 0.0, -1.0]
     """
     _check_discount(discount)
 
@@ -160,6 +242,19 @@ def standardize(
 
     Raises:
       ValueError: what is given is no estimator, or the floor is negative.
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.standardize(mr.reward_to_go(1.0))
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight.std().round(2).item() < 1
+      True
     """
     check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
     check_number("floor", floor, finite=False)
@@ -183,6 +278,19 @@ def discount_weights(estimator: Estimator, discount: float | jax.Array = 0.99) -
     the start, nor of any other objective (Nota and Thomas 2020,
     arXiv:1906.07073); with it, late steps hardly count. Most programs leave it
     out, and so does everything here unless wrapped in this.
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.discount_weights(mr.total_return(1.0), 0.5)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()
+      [3.0, 1.5, 0.75]
     """
     check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
     _check_discount(discount)
@@ -210,6 +318,19 @@ def shift_rewards(estimator: Estimator, shift: float | jax.Array) -> Estimator:
 
     Raises:
       ValueError: what is given is no estimator, or the shift is no finite number.
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.shift_rewards(mr.reward_to_go(1.0), 1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()
+      [0.0, 0.0, 0.0]
     """
     check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
     number = known_number(shift)

@@ -26,16 +26,27 @@ from mjx_reinforce.types import Environment, PyTree, Trajectory
 class TrainState:
     """All that the next update needs; it holds no environment state.
 
-    key: [] the seed's own random key, split by every update
-    num_updates: [2] how many updates were made, as ``counts`` has it
-    env_steps: [2] how many env steps were played in them, as ``counts`` has it
-    progress: [] the share of the budget that is used, for what changes with it, such as the
-      learning rate; the caller of the learner sets it
-    actor: the policy's parameters and the observation statistics
-    opt_state: the optimiser's state
-    estimator_state: the estimator's, such as a critic
-    start_key: [] what every episode is reset with, where all start alike; else None
-    pace: how many episodes the next update plays, where that follows the noise; else None
+    Attributes:
+      key: [] the seed's own random key, split by every update
+      num_updates: [2] how many updates were made, as ``counts`` has it
+      env_steps: [2] how many env steps were played in them, as ``counts`` has it
+      progress: [] the share of the budget that is used, for what changes with it, such as the
+        learning rate; the caller of the learner sets it
+      actor: the policy's parameters and the observation statistics
+      opt_state: the optimiser's state
+      estimator_state: the estimator's, such as a critic
+      start_key: [] what every episode is reset with, where all start alike; else None
+      pace: how many episodes the next update plays, where that follows the noise; else None
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, num_episodes=4, horizon=20)
+      >>> state = learner.init(jax.random.key(0))
+      >>> state, metrics = mr.train_step(learner, state)
+      >>> metrics["episodes"].item(), metrics["episode_return"].shape
+      (4, ())
     """
 
     key: jax.Array
@@ -90,16 +101,27 @@ class Host:
 class Learner(NamedTuple):
     """How a policy learns on one environment; any part may be replaced with ``_replace``.
 
-    init: (key) -> TrainState; consumes the key
-    play: (TrainState, key, active) -> what is played for one update, a ``Trajectory`` of N fresh
-      episodes or a pytree that holds one; nothing where ``active`` [] is False; consumes the key.
-      A ``Host`` where guests do not make the others wait
-    learn: (TrainState, what was played, key) -> (TrainState, metrics), with the actor and all else
-      that changes by learning; consumes the key
-    policy: the policy that is trained
-    engine: how its episodes are played
-    room: the most episodes that an update can play, where that follows the noise
-    narrower: the same with less room, the least first; a step takes the first that has enough
+    Attributes:
+      init: (key) -> TrainState; consumes the key
+      play: (TrainState, key, active) -> what is played for one update, a ``Trajectory`` of N fresh
+        episodes or a pytree that holds one; nothing where ``active`` [] is False; consumes the key.
+        A ``Host`` where guests do not make the others wait
+      learn: (TrainState, what was played, key) -> (TrainState, metrics), with the actor and all
+        else that changes by learning; consumes the key
+      policy: the policy that is trained
+      engine: how its episodes are played
+      room: the most episodes that an update can play, where that follows the noise
+      narrower: the same with less room, the least first; a step takes the first that has enough
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, num_episodes=4, horizon=20)
+      >>> state = learner.init(jax.random.key(0))
+      >>> state, metrics = mr.train_step(learner, state)
+      >>> metrics["episodes"].item(), metrics["episode_return"].shape
+      (4, ())
     """
 
     init: Callable[[jax.Array], TrainState]
@@ -187,6 +209,16 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
       ``gradient_norm``, ``gradient_snr`` (of ``full_batch``, ``natural_gradient`` and ``ars``
       alone), ``clipped_gradients`` (see ``updates``),
       ``explained_variance`` (of an estimator with a baseline), and the estimator's own.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, num_episodes=4, horizon=20)
+      >>> state = learner.init(jax.random.key(0))
+      >>> state, metrics = mr.train_step(learner, state)
+      >>> metrics["episodes"].item(), metrics["episode_return"].shape
+      (4, ())
     """
     check_kind("state", state, TrainState, "learner.init(jax.random.key(0))")
     return learner.step(state)

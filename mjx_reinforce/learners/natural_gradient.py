@@ -66,6 +66,19 @@ def natural_gradient(
     Raises:
       ValueError: the policy's distribution does not know its KL divergence, ``max_kl`` or
         ``damping`` is not positive, or ``iterations`` is less than one.
+
+    Examples:
+      >>> import jax, optax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> policy = mr.mlp_policy(env.observation_size, mr.categorical(env.action_space), ())
+      >>> update = mr.natural_gradient(policy, max_kl=0.01)
+      >>> learner = mr.reinforce(
+      ...     env, policy=policy, update=update, optimizer=optax.sgd(1.0), num_episodes=4
+      ... )
+      >>> state, metrics = mr.train_step(learner, learner.init(jax.random.key(0)))
+      >>> metrics["kl"].shape
+      ()
     """
     check_kind("policy", policy, Policy, "mjx_reinforce.mlp_policy(...)")
     check_number("max_kl", max_kl, positive=True)

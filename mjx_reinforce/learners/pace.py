@@ -27,9 +27,18 @@ _ROOM_SHARE = 4
 class AutoEpisodes(NamedTuple):
     """The number of episodes of an update follows the gradient's noise.
 
-    least: how many an update plays at least, 2 or more
-    most: and at most
-    ratio: how many it plays for each episode of the noise scale B: at 1, noise equals signal
+    Attributes:
+      least: how many an update plays at least, 2 or more
+      most: and at most
+      ratio: how many it plays for each episode of the noise scale B: at 1, noise equals signal
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, num_episodes=mr.AutoEpisodes(least=8, most=64), horizon=20)
+      >>> learner.room
+      64
     """
 
     least: int = 16

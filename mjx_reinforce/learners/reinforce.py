@@ -143,6 +143,16 @@ def reinforce(
 
     Raises:
       ValueError: an argument makes no sense for this environment.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, num_episodes=4, horizon=20)
+      >>> state = learner.init(jax.random.key(0))
+      >>> state, metrics = mr.train_step(learner, state)
+      >>> metrics["episodes"].item(), metrics["episode_return"].shape
+      (4, ())
     """
     check_environment(env)
     size = observation_size(env)

@@ -69,6 +69,15 @@ def full_batch() -> Update:
     episode in 32, at least from one and at most from 64: from few it is right on average alone.
     Where only some episodes were played, it is estimated from all of these, and the metrics have
     ``noise``, a ``pace.Noise``, besides.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, update=mr.full_batch(), num_episodes=4, horizon=20)
+      >>> state, metrics = mr.train_step(learner, learner.init(jax.random.key(0)))
+      >>> metrics["gradient_norm"].shape
+      ()
     """
     return whole_rollout(lambda problem, key, params, gradient: gradient)
 
@@ -146,6 +155,16 @@ def minibatches(num_updates: int, batch_size: int) -> Update:
 
     Raises:
       ValueError: a number is less than one.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> update = mr.minibatches(num_updates=2, batch_size=16)
+      >>> learner = mr.reinforce(env, update=update, num_episodes=4, horizon=20)
+      >>> state, metrics = mr.train_step(learner, learner.init(jax.random.key(0)))
+      >>> metrics["gradient_norm"].shape
+      ()
     """
     for name, value in (("num_updates", num_updates), ("batch_size", batch_size)):
         check_count(name, value)
@@ -174,6 +193,15 @@ def each_step() -> Update:
     Step t follows its own share of the full gradient, the terms of all episodes at t, at the
     parameters that steps 0 to t - 1 have moved (Sutton and Barto 2018, section 13.3, has
     discount^t besides: see ``estimators.discount_weights``).
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, update=mr.each_step(), num_episodes=4, horizon=20)
+      >>> state, metrics = mr.train_step(learner, learner.init(jax.random.key(0)))
+      >>> metrics["gradient_norm"].shape
+      ()
     """
 
     def update(problem, key, params, opt_state):
@@ -279,6 +307,14 @@ def make_optimizer(
 
     Raises:
       ValueError: the name is unknown.
+
+    Examples:
+      >>> import jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> optimizer = mr.make_optimizer("sgd", 0.5, max_grad_norm=None)
+      >>> step, _ = optimizer.update(jnp.ones(2), optimizer.init(jnp.zeros(2)), jnp.zeros(2))
+      >>> step.tolist()
+      [-0.5, -0.5]
     """
     check_name("optimizer", name, dict.fromkeys(OPTIMIZERS))
     rate: Any = learning_rate

@@ -68,6 +68,19 @@ def value_baseline(
     Raises:
       ValueError: ``horizon``, ``num_fits`` or ``batch_size`` is less than one or the discount is
         not in [0, 1].
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.value_baseline(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight.shape
+      (3, 2)
     """
     for name, count in (("horizon", horizon), ("num_fits", num_fits), ("batch_size", batch_size)):
         check_count(name, count)
@@ -146,6 +159,19 @@ def full_batch_value_baseline(
 
     Raises:
       ValueError: ``num_fits`` is less than one or the discount is not in [0, 1].
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.full_batch_value_baseline(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight.shape
+      (3, 2)
     """
     check_count("num_fits", num_fits)
     to_go, network, fitter = _defaults(discount, network, optimizer)

@@ -14,8 +14,18 @@ from mjx_reinforce.policies.policy import Policy
 class Actor:
     """All that playing needs.
 
-    params: the policy's parameters
-    normalizer: the statistics that scale its observations
+    Attributes:
+      params: the policy's parameters
+      normalizer: the statistics that scale its observations
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env)
+      >>> actor = learner.init(jax.random.key(0)).actor
+      >>> mr.act(learner.policy, actor, jax.numpy.zeros((5, 4))).shape
+      (5, 2)
     """
 
     params: Any
@@ -40,6 +50,15 @@ def act(policy: Policy, actor: Actor, observation: jax.Array) -> jax.Array:
 
     Raises:
       ValueError: an argument is of another type, or the observation of another size.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env)
+      >>> actor = learner.init(jax.random.key(0)).actor
+      >>> mr.act(learner.policy, actor, jax.numpy.zeros((5, 4))).shape
+      (5, 2)
     """
     check_kind("policy", policy, Policy, "learner.policy")
     check_kind("actor", actor, Actor, "state.actor")

@@ -16,12 +16,22 @@ from mjx_reinforce.registry import check_name
 class Policy(NamedTuple):
     """A parametrised distribution over actions, given the observation.
 
-    init: (key) -> params; consumes the key
-    apply: (params, observation [..., O]) -> outputs [..., K] of ``distribution``: the
-      ``num_outputs`` entries that a network computes, then one for each of
-      ``distribution.constants``, which are parameters; ``normal`` has a log standard deviation for
-      each entry of the action. ``mlp_policy`` is an example
-    distribution: the family of distributions that the outputs are the parameters of
+    Attributes:
+      init: (key) -> params; consumes the key
+      apply: (params, observation [..., O]) -> outputs [..., K] of ``distribution``: the
+        ``num_outputs`` entries that a network computes, then one for each of
+        ``distribution.constants``, which are parameters; ``normal`` has a log standard deviation
+        for each entry of the action. ``mlp_policy`` is an example
+      distribution: the family of distributions that the outputs are the parameters of
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> policy = mr.mlp_policy(env.observation_size, mr.categorical(env.action_space), (8,))
+      >>> params = policy.init(jax.random.key(0))
+      >>> policy.apply(params, jax.numpy.zeros((5, 4))).shape  # a logit for each action
+      (5, 2)
     """
 
     init: Callable[[jax.Array], Any]
@@ -57,6 +67,15 @@ def mlp_policy(
     Raises:
       ValueError: a layer has no units, the initialiser is unknown, or a second network
         is asked for and no standard deviation depends on the observation.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> policy = mr.mlp_policy(env.observation_size, mr.categorical(env.action_space), (8,))
+      >>> params = policy.init(jax.random.key(0))
+      >>> policy.apply(params, jax.numpy.zeros((5, 4))).shape  # a logit for each action
+      (5, 2)
     """
     check_count("observation_size", observation_size)
     check_kind("distribution", distribution, Distribution, "mjx_reinforce.normal(env.action_space)")

@@ -35,18 +35,29 @@ from mjx_reinforce.training.initial import last_actors
 class RunResults(NamedTuple):
     """What a run of S seeds learned and measured, in E evaluations and U updates.
 
-    config: its settings, its horizon and its budget among them
-    directory: of its files, None where none were asked for
-    eval_return: [E, S] mean return of the policy's mode; NaN where it was not finite
-    env_steps: [E, S] trained until then
-    training: [U, S] each: ``episode_return``, the mean of an update's episodes, and the
-      ``env_steps`` and ``episodes`` after it
-    test_returns: [S] of the last policies, on starts that nothing else is played on
-    best_test_returns: [S] the same of the policies with the best evaluations
-    policy: the network and its distribution
-    actor: [S, ...] the last policies
-    best: [S, ...] the policies with the best evaluations
-    summary: the contents of summary.json
+    Attributes:
+      config: its settings, its horizon and its budget among them
+      directory: of its files, None where none were asked for
+      eval_return: [E, S] mean return of the policy's mode; NaN where it was not finite
+      env_steps: [E, S] trained until then
+      training: [U, S] each: ``episode_return``, the mean of an update's episodes, and the
+        ``env_steps`` and ``episodes`` after it
+      test_returns: [S] of the last policies, on starts that nothing else is played on
+      best_test_returns: [S] the same of the policies with the best evaluations
+      policy: the network and its distribution
+      actor: [S, ...] the last policies
+      best: [S, ...] the policies with the best evaluations
+      summary: the contents of summary.json
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = dataclasses.replace(
+      ...     mr.of_task("CartPole-v1", env_steps=200), num_seeds=2, eval_episodes=2
+      ... )
+      >>> results = mr.run(config, quiet=True)
+      >>> results.test_returns.shape, results.summary["status"]
+      ((2,), 'finished')
     """
 
     config: Config
@@ -106,6 +117,16 @@ def run(
     Raises:
       ValueError: a setting makes no sense, or the directory is not empty.
       OSError: the last files of the run cannot be written.
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = dataclasses.replace(
+      ...     mr.of_task("CartPole-v1", env_steps=200), num_seeds=2, eval_episodes=2
+      ... )
+      >>> results = mr.run(config, quiet=True)
+      >>> results.test_returns.shape, results.summary["status"]
+      ((2,), 'finished')
     """
     check_kind("config", config, Config, 'mjx_reinforce.of_task("Hopper-v5")')
     if not (isinstance(observers, Sequence) and all(map(callable, observers))):

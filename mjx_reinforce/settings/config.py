@@ -36,7 +36,15 @@ class Config(
     PolicySettings,
     RunSettings,
 ):
-    """Train policies, many seeds at once, and report over the seeds."""
+    """Train policies, many seeds at once, and report over the seeds.
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = mr.of_task("CartPole-v1", env_steps=20_000)
+      >>> dataclasses.replace(config, num_seeds=8).num_seeds, config.env_steps
+      (8, 20000)
+    """
 
     def __repr__(self) -> str:
         return f"Config({changed_fields(self)})"

@@ -37,6 +37,13 @@ def of_task(
       num_seeds: that train together. More than a default run has change nothing: what a seed
         learns is then the same, and takes longer.
       seconds: that time; None: about a minute, or less where nothing more is to be had.
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = mr.of_task("CartPole-v1", env_steps=20_000)
+      >>> dataclasses.replace(config, num_seeds=8).num_seeds, config.env_steps
+      (8, 20000)
     """
     few = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **tuned.OF_TASKS.get(env, {}))
     if env_steps is None and seconds is None and (env in tuned.SOLVED or env not in tuned.OF_TASKS):

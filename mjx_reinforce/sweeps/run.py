@@ -19,12 +19,23 @@ from mjx_reinforce.sweeps.perform import perform
 class SweepResults(NamedTuple):
     """What a sweep measured, of R runs in E evaluations.
 
-    directory: of its files, None where none were asked for
-    configurations: the values of what was swept, in each
-    configuration: [R] the number of each run's
-    seed: [R]
-    eval_return: [E, R] mean return of the policy's mode; NaN where it was not finite
-    env_steps: [E, R] trained until then
+    Attributes:
+      directory: of its files, None where none were asked for
+      configurations: the values of what was swept, in each
+      configuration: [R] the number of each run's
+      seed: [R]
+      eval_return: [E, R] mean return of the policy's mode; NaN where it was not finite
+      env_steps: [E, R] trained until then
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = dataclasses.replace(
+      ...     mr.of_task("CartPole-v1", env_steps=200), num_seeds=2, eval_episodes=2
+      ... )
+      >>> swept = mr.sweep(config, over={"discount": [0.98, 0.99]}, quiet=True)
+      >>> swept.configurations, swept.configuration.tolist()
+      ([{'discount': 0.98}, {'discount': 0.99}], [0, 0, 1, 1])
     """
 
     directory: Path | None
@@ -62,6 +73,16 @@ def sweep(
     Raises:
       ValueError: a setting makes no sense, or the directory is not empty.
       OSError: a file cannot be written.
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = dataclasses.replace(
+      ...     mr.of_task("CartPole-v1", env_steps=200), num_seeds=2, eval_episodes=2
+      ... )
+      >>> swept = mr.sweep(config, over={"discount": [0.98, 0.99]}, quiet=True)
+      >>> swept.configurations, swept.configuration.tolist()
+      ([{'discount': 0.98}, {'discount': 0.99}], [0, 0, 1, 1])
     """
     check_kind("base", base, Config, 'mjx_reinforce.of_task("Hopper-v5")')
     with contextlib.ExitStack() as held:

@@ -22,13 +22,25 @@ from mjx_reinforce.training.state import RunState, budget_of
 class Evaluation(NamedTuple):
     """What an evaluation of the policies of S seeds measured.
 
-    updates: [S] int64, how many updates had made the policies
-    env_steps: [S] int64, how many env steps these had played
-    seconds: wall time since the end of compilation (s)
-    measured: [S] each, what ``mjx_reinforce.evaluate`` returns, such as ``eval_return``
-    actor: [S, ...] the policies that were evaluated, on the host
-    train_states: [S, ...] the newest states of training, on the device; at most one block of
-      updates further than ``actor``. The next block uses their memory again: copy what is to stay.
+    Attributes:
+      updates: [S] int64, how many updates had made the policies
+      env_steps: [S] int64, how many env steps these had played
+      seconds: wall time since the end of compilation (s)
+      measured: [S] each, what ``mjx_reinforce.evaluate`` returns, such as ``eval_return``
+      actor: [S, ...] the policies that were evaluated, on the host
+      train_states: [S, ...] the newest states of training, on the device; at most one block of
+        updates further than ``actor``. The next block uses their memory again: copy what stays.
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = dataclasses.replace(
+      ...     mr.of_task("CartPole-v1", env_steps=200), num_seeds=2, eval_episodes=2
+      ... )
+      >>> seen = []
+      >>> results = mr.run(config, observers=[seen.append], quiet=True)
+      >>> seen[-1].measured["eval_return"].shape
+      (2,)
     """
 
     updates: np.ndarray

@@ -48,6 +48,16 @@ def evaluate(
       horizon: T, the time limit in steps.
       active: [] where False nothing is played, and what is returned says nothing.
       sampled: whether the second N are played.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, num_episodes=4, horizon=20)
+      >>> actor = learner.init(jax.random.key(0)).actor
+      >>> found = mr.evaluate(env, learner, actor, jax.random.key(1), num_episodes=4, horizon=20)
+      >>> 1 <= found["eval_return"].item() <= 20
+      True
     """
     guests = guests_of(key, num_episodes=num_episodes, active=active, sampled=sampled)
     trajectory = learner.engine.rollout(

@@ -29,14 +29,24 @@ class VectorEnv:
     ``reset`` and ``step`` are pure functions of arrays: call them under ``jax.jit``, ``jax.vmap``
     and in ``lax.scan``, and donate the state. They are not differentiated.
 
-    env: the environment of which there are N
-    num_envs: N
-    autoreset: when the next episode begins: "next_step", "same_step" or "disabled"
-    max_episode_steps: the time limit in steps, which truncates an episode; None for none
-    observation_size: O
-    action_size: A
-    action_space: a ``Box`` or ``Discrete`` of one environment
-    engine: how the step is mapped: ``name``, and ``why``
+    Attributes:
+      env: the environment of which there are N
+      num_envs: N
+      autoreset: when the next episode begins: "next_step", "same_step" or "disabled"
+      max_episode_steps: the time limit in steps, which truncates an episode; None for none
+      observation_size: O
+      action_size: A
+      action_space: a ``Box`` or ``Discrete`` of one environment
+      engine: how the step is mapped: ``name``, and ``why``
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> vec = mr.make_vec("CartPole-v1", num_envs=8)
+      >>> state = vec.reset(jax.random.key(0))
+      >>> state = vec.step(state, vec.sample_actions(jax.random.key(1)))
+      >>> state.obs.shape, state.reward.tolist()[:2]
+      ((8, 4), [1.0, 1.0])
     """
 
     def __init__(
@@ -222,6 +232,15 @@ def make_vec(
 
     Raises:
       ValueError: an argument makes no sense, the environment is none, or it does not fit in memory.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> vec = mr.make_vec("CartPole-v1", num_envs=8)
+      >>> state = vec.reset(jax.random.key(0))
+      >>> state = vec.step(state, vec.sample_actions(jax.random.key(1)))
+      >>> state.obs.shape, state.reward.tolist()[:2]
+      ((8, 4), [1.0, 1.0])
     """
     check_count("num_envs", num_envs)
     mode = autoreset.name.lower() if isinstance(autoreset, enum.Enum) else autoreset

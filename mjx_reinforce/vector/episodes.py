@@ -23,16 +23,26 @@ AUTORESETS = ("next_step", "same_step", "disabled")
 class VectorState:
     """N environments.
 
-    simulation: the environments' own states, N first
-    reward: [N] what the last action earned; 0 where it broke, and after a reset
-    terminated: [N] bool, whether the task ended the episode by it
-    truncated: [N] bool, whether the time limit did
-    nonfinite: [N] bool, whether it left the finite numbers, which terminates the episode
-    final_obs: [N, O] what it led to, before any reset
-    metrics: [N] each, the terms of its reward and what else the task tells, by name
-    episode_return: [N] the rewards of the episode so far; all of them where it has just ended
-    episode_length: [N] int32, its steps so far; all of them where it has just ended
-    keys: [N, 2] uint32, what the next resets draw from
+    Attributes:
+      simulation: the environments' own states, N first
+      reward: [N] what the last action earned; 0 where it broke, and after a reset
+      terminated: [N] bool, whether the task ended the episode by it
+      truncated: [N] bool, whether the time limit did
+      nonfinite: [N] bool, whether it left the finite numbers, which terminates the episode
+      final_obs: [N, O] what it led to, before any reset
+      metrics: [N] each, the terms of its reward and what else the task tells, by name
+      episode_return: [N] the rewards of the episode so far; all of them where it has just ended
+      episode_length: [N] int32, its steps so far; all of them where it has just ended
+      keys: [N, 2] uint32, what the next resets draw from
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> vec = mr.make_vec("CartPole-v1", num_envs=8)
+      >>> state = vec.reset(jax.random.key(0))
+      >>> state = vec.step(state, vec.sample_actions(jax.random.key(1)))
+      >>> state.obs.shape, state.reward.tolist()[:2]
+      ((8, 4), [1.0, 1.0])
     """
 
     simulation: Any

@@ -21,19 +21,34 @@ from mjx_reinforce.vector.episodes import VectorState
 class Segment:
     """T steps of N environments, time first.
 
-    observation: [T, N, O] what the policy saw
-    action: [T, N, A], or [T, N] if discrete: what it drew
-    log_prob: [T, N] the logarithm of the action's probability density
-    reward: [T, N] what that earned
-    terminated: [T, N] bool, whether the task ended the episode by it
-    truncated: [T, N] bool, whether the time limit did
-    nonfinite: [T, N] bool, whether it left the finite numbers, which terminates the episode
-    next_observation: [T, N, O] what it led to, before any reset: its value belongs to a truncated
-      episode
-    played: [T, N] bool, False where ``next_step`` spent the step on a reset: leave it out of losses
-    metrics: [T, N] each, the terms of the reward and what else the task tells
-    episode_return: [T, N] the rewards of the episode so far; of all of it where it ended
-    episode_length: [T, N] int32, its steps so far
+    Attributes:
+      observation: [T, N, O] what the policy saw
+      action: [T, N, A], or [T, N] if discrete: what it drew
+      log_prob: [T, N] the logarithm of the action's probability density
+      reward: [T, N] what that earned
+      terminated: [T, N] bool, whether the task ended the episode by it
+      truncated: [T, N] bool, whether the time limit did
+      nonfinite: [T, N] bool, whether it left the finite numbers, which terminates the episode
+      next_observation: [T, N, O] what it led to, before any reset: its value belongs to a truncated
+        episode
+      played: [T, N] bool, False where ``next_step`` spent the step on a reset: no loss has it
+      metrics: [T, N] each, the terms of the reward and what else the task tells
+      episode_return: [T, N] the rewards of the episode so far; of all of it where it ended
+      episode_length: [T, N] int32, its steps so far
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> vec = mr.make_vec("CartPole-v1", num_envs=8)
+      >>> state = vec.reset(jax.random.key(0))
+      >>> family = mr.categorical(vec.action_space)
+      >>> policy = mr.mlp_policy(vec.observation_size, family)
+      >>> params = policy.init(jax.random.key(1))
+      >>> state, segment = mr.unroll(
+      ...     vec, policy.apply, params, family, state, jax.random.key(2), num_steps=5
+      ... )
+      >>> segment.reward.shape, segment.observation.shape
+      ((5, 8), (5, 8, 4))
     """
 
     observation: jax.Array
@@ -83,6 +98,20 @@ def unroll(
 
     Raises:
       ValueError: an argument makes no sense.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> vec = mr.make_vec("CartPole-v1", num_envs=8)
+      >>> state = vec.reset(jax.random.key(0))
+      >>> family = mr.categorical(vec.action_space)
+      >>> policy = mr.mlp_policy(vec.observation_size, family)
+      >>> params = policy.init(jax.random.key(1))
+      >>> state, segment = mr.unroll(
+      ...     vec, policy.apply, params, family, state, jax.random.key(2), num_steps=5
+      ... )
+      >>> segment.reward.shape, segment.observation.shape
+      ((5, 8), (5, 8, 4))
     """
     check_kind("vec", vec, VectorEnv, "mjx_reinforce.make_vec(id, num_envs)")
     vec.check_state(state)

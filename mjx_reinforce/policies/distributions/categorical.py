@@ -26,6 +26,13 @@ def categorical(
 
     Raises:
       ValueError: the space is continuous.
+
+    Examples:
+      >>> import jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> family = mr.categorical(mr.Discrete(2))
+      >>> family.mode(jnp.asarray([0.0, 1.0])).item()
+      1
     """
     del initial_std, rescale
     check_space("categorical", space)

@@ -25,6 +25,13 @@ def deterministic(
 
     Raises:
       ValueError: the space is discrete.
+
+    Examples:
+      >>> import jax.numpy as jnp, numpy as np
+      >>> import mjx_reinforce as mr
+      >>> family = mr.deterministic(mr.Box(-2 * np.ones(1), 2 * np.ones(1)))
+      >>> family.mode(jnp.ones(1)).tolist()  # 1 is the end of the range
+      [2.0]
     """
     del initial_std
     base = gaussian_outputs("deterministic", space, "parameter", 1.0, rescale)

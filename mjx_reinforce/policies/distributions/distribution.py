@@ -22,20 +22,31 @@ import jax
 class Distribution(NamedTuple):
     """A family of distributions over actions.
 
-    num_outputs: entries of ``outputs`` that the network computes
-    constants: [K - num_outputs] initial values of the entries that are the same in every state
-    noise: (key, shape) -> [*shape, E] the noise that ``sample`` transforms; consumes the key
-    sample: (outputs [..., K], noise [..., E]) -> action [..., A]; discrete: int32 [...]
-    mode: (outputs [..., K]) -> action like ``sample``, the deterministic policy
-    log_prob: (outputs [..., K], action [..., A]) -> [...], summed over entries
-    entropy: (outputs [..., K]) -> [...], in nats
-    num_scales: how many of ``num_outputs``, counted from the last, determine the width
-      of the distribution; a second network may compute them
-    std: (outputs [..., K]) -> [..., A] the standard deviation in the action's unit, before what
-      the family does to keep actions in their range; None where there is none
-    kl: (outputs, other outputs) -> [...] the divergence KL(first || second) in nats, if it is known
-    fisher: (constants [K - num_outputs]) -> [K] the diagonal of the Fisher matrix in ``outputs``,
-      of a family in which it is diagonal and depends on these alone; else None
+    Attributes:
+      num_outputs: entries of ``outputs`` that the network computes
+      constants: [K - num_outputs] initial values of the entries that are the same in every state
+      noise: (key, shape) -> [*shape, E] the noise that ``sample`` transforms; consumes the key
+      sample: (outputs [..., K], noise [..., E]) -> action [..., A]; discrete: int32 [...]
+      mode: (outputs [..., K]) -> action like ``sample``, the deterministic policy
+      log_prob: (outputs [..., K], action [..., A]) -> [...], summed over entries
+      entropy: (outputs [..., K]) -> [...], in nats
+      num_scales: how many of ``num_outputs``, counted from the last, determine the width
+        of the distribution; a second network may compute them
+      std: (outputs [..., K]) -> [..., A] the standard deviation in the action's unit, before what
+        the family does to keep actions in their range; None where there is none
+      kl: (outputs, other outputs) -> [...] the divergence KL(first || second) in nats, if known
+      fisher: (constants [K - num_outputs]) -> [K] the diagonal of the Fisher matrix in ``outputs``,
+        of a family in which it is diagonal and depends on these alone; else None
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> family = mr.categorical(mr.Discrete(3))
+      >>> noise = family.noise(jax.random.key(0), (5,))
+      >>> family.sample(jnp.zeros((5, 3)), noise).shape
+      (5,)
+      >>> round(family.entropy(jnp.zeros(3)).item(), 3)  # log 3
+      1.099
     """
 
     num_outputs: int

@@ -41,6 +41,14 @@ def normal(
     Raises:
       ValueError: the space is discrete, ``std`` is unknown, or ``initial_std`` is
         not positive or, for "sigmoid", not below 1.
+
+    Examples:
+      >>> import jax.numpy as jnp, numpy as np
+      >>> import mjx_reinforce as mr
+      >>> family = mr.normal(mr.Box(-np.ones(2), np.ones(2)))
+      >>> outputs = jnp.append(jnp.zeros(2), jnp.asarray(family.constants))
+      >>> family.mode(outputs).tolist(), family.log_prob(outputs, jnp.zeros(2)).shape
+      ([0.0, 0.0], ())
     """
     base = gaussian_outputs("normal", space, std, initial_std, rescale)
 

@@ -34,6 +34,14 @@ def truncated_normal(
 
     Raises:
       ValueError: as in ``normal``, or an entry is unbounded.
+
+    Examples:
+      >>> import jax.numpy as jnp, numpy as np
+      >>> import mjx_reinforce as mr
+      >>> family = mr.truncated_normal(mr.Box(-np.ones(2), np.ones(2)))
+      >>> outputs = jnp.append(jnp.zeros(2), jnp.asarray(family.constants))
+      >>> family.mode(outputs).tolist(), family.log_prob(outputs, jnp.zeros(2)).shape
+      ([0.0, 0.0], ())
     """
     base = gaussian_outputs("truncated-normal", space, std, initial_std, rescale)
     box = finite_box("truncated-normal", space)

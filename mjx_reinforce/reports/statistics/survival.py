@@ -64,6 +64,12 @@ def kaplan_meier(steps: ArrayLike, solved: ArrayLike, confidence: float = 0.95) 
       solved: [S] which of the two.
       confidence: the level of the pointwise interval, from Greenwood's variance of the logarithm
         of minus the logarithm; NaN where all seeds or none are left.
+
+    Examples:
+      >>> import mjx_reinforce as mr
+      >>> curve = mr.kaplan_meier([100, 200, 300], [True, True, False])
+      >>> curve.probability.round(2).tolist()
+      [0.67, 0.33, 0.33]
     """
     steps, solved = np.asarray(steps, float), np.asarray(solved, bool)
     survival = stats.ecdf(stats.CensoredData(uncensored=steps[solved], right=steps[~solved])).sf
@@ -165,6 +171,12 @@ def log_rank(
       solved: [S] of the same.
       other_steps: [S'] of the other.
       other_solved: [S'] of the same.
+
+    Examples:
+      >>> import mjx_reinforce as mr
+      >>> test = mr.log_rank([100, 110, 120], [True] * 3, [900, 910, 920], [True] * 3)
+      >>> test.p_value < 0.05
+      True
     """
     groups = []
     for some, done in ((steps, solved), (other_steps, other_solved)):

@@ -1,0 +1,42 @@
+# %% [markdown]
+# # A minute on each task
+#
+# The default settings of a task follow the time that you have and the machine that you are on. Here each task gets
+# the same number of seconds of training, with two seeds. Compiling comes on top: a few seconds for Reacher, half a
+# minute for Walker2d. The environment variable `SECONDS` changes the time.
+
+# %%
+import os
+import time
+
+import matplotlib.pyplot as plt
+
+import mjx_reinforce as mr
+
+SECONDS = float(os.environ.get("SECONDS", "60"))
+TASKS = ("InvertedPendulum-v5", "Reacher-v5", "Swimmer-v5", "Hopper-v5", "HalfCheetah-v5")
+
+# %%
+trained = {}
+for task in TASKS:
+    begin = time.perf_counter()
+    config = mr.of_task(task, num_seeds=2, seconds=SECONDS)
+    trained[task] = mr.run(config, quiet=True)
+    print(
+        f"{task}: {trained[task].test_returns.mean():.0f} after {config.env_steps:,} env steps a seed,"
+        f" {time.perf_counter() - begin:.0f} s with compiling"
+    )
+
+# %%
+fig, axes = plt.subplots(1, len(TASKS), figsize=(12, 2.8), layout="constrained")
+for ax, (task, results) in zip(axes, trained.items(), strict=True):
+    ax.plot(results.env_steps / 1e3, results.eval_return)
+    if (threshold := mr.envs.make(task).reward_threshold) is not None:
+        ax.axhline(threshold, color="gray", linestyle=":")
+    ax.set(title=task, xlabel="thousand env steps")
+axes[0].set_ylabel("return of two seeds")
+fig.savefig("tasks.png", dpi=80)
+
+# %% [markdown]
+# The dotted line is the return that counts as solved. `trained["Hopper-v5"].player()` is a policy that acts on
+# observations. [What it reaches](../results.md) has the figures of all tasks, on a quiet machine and on a GPU.

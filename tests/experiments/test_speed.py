@@ -1,0 +1,18 @@
+"""The speed over time: docs/speed.md explains each row of docs/speed.jsonl, and it is drawn."""
+
+import json
+import re
+
+import speed
+
+
+def test_rows_are_explained_and_drawn(tmp_path):
+    text = (speed.DOCS / "speed.jsonl").read_text("utf-8")
+    (tmp_path / "speed.jsonl").write_text(text, "utf-8")
+    speed.main(speed.Settings(measure=False), tmp_path)
+    assert (tmp_path / "speed.png").stat().st_size > 1000
+    explained = set(re.findall(r"^\| `(\w+)`", (speed.DOCS / "speed.md").read_text("utf-8"), re.M))
+    for line in text.splitlines():
+        assert {
+            name for name in json.loads(line) if name.endswith(("second", "seconds"))
+        } == explained

@@ -1,0 +1,119 @@
+"""The pages of docs/ and the examples of the public names run, and each public name has a page."""
+
+import doctest
+import importlib
+import inspect
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from command_lines import run_command
+from saved_runs import make_run
+
+import mjx_reinforce
+from mjx_reinforce import envs
+from mjx_reinforce.console.commands import COMMANDS
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCS = ROOT / "docs"
+PUBLIC = {name: getattr(mjx_reinforce, name) for name in mjx_reinforce.__all__}
+del PUBLIC["__version__"]
+TASKS = {f"envs.{name}": getattr(envs, name) for name in ("names", "make", "register")}
+#: Comment before a block that no test runs, with the reason.
+NOT_RUN = "<!-- not run: "
+
+
+def page(name):
+    return (DOCS / name).read_text("utf-8")
+
+
+def blocks(text, language):
+    """Returns the code of a page, without the blocks that a comment excuses."""
+    found = re.findall(
+        rf"({NOT_RUN}[^\n]*-->\n+)?^```{language}\n(.*?)^```", text, flags=re.S | re.M
+    )
+    return [code for excuse, code in found if not excuse]
+
+
+@pytest.mark.parametrize("name", [*PUBLIC, *TASKS])
+def test_example_runs(name, register):
+    """Every public name has an example in its docstring, and it gives what it says."""
+    it = (PUBLIC | TASKS)[name]
+    (example,) = doctest.DocTestFinder(recurse=False).find(it, name, globs={})
+    assert example.examples, f"{name} has no example"
+    failed, _ = doctest.DocTestRunner(optionflags=doctest.REPORT_NDIFF).run(example)
+    assert not failed
+
+
+def test_every_public_name_has_a_page():
+    """Once among the pages of the API, and on the page that has them all."""
+    pages = "\n".join(path.read_text("utf-8") for path in (DOCS / "api").glob("*.md"))
+    shown = re.findall(r"^::: mjx_reinforce\.(.+)$", pages, re.M)
+    assert sorted(shown) == sorted([*PUBLIC, *TASKS])
+    named = set(re.findall(r"`(?:envs\.)?(\w+)[`(]", page("all.md")))
+    assert {*PUBLIC, *(name.removeprefix("envs.") for name in TASKS)} <= named
+
+
+def test_every_public_function_has_types():
+    """Each argument is annotated, and so is what is returned."""
+    for name, it in (PUBLIC | TASKS).items():
+        if inspect.isfunction(it):
+            signature = inspect.signature(it)
+            typed = [each.annotation for each in signature.parameters.values()]
+            assert inspect.Signature.empty not in [*typed, signature.return_annotation], name
+
+
+@pytest.mark.parametrize(
+    "name",
+    [path.name for path in sorted(DOCS.glob("*.md")) if blocks(path.read_text("utf-8"), "python")],
+)
+def test_python_of_page_runs(name, tmp_path):
+    """Every Python block of a page, in order, in one program, beside a trained run."""
+    make_run(tmp_path / "pendulum", "InvertedPendulum-v5")
+    code = "\n".join(blocks(page(name), "python"))
+    command = [sys.executable, "-W", "ignore", "-c", code]
+    subprocess.run(command, check=True, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)})
+
+
+@pytest.mark.parametrize("name", [path.stem for path in sorted(DOCS.glob("notebooks/*.py"))])
+def test_notebook_runs(name, tmp_path):
+    """As a program, from its first cell to its last; it draws its picture."""
+    path = DOCS / "notebooks" / f"{name}.py"
+    settings = {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg", "SECONDS": "2"}
+    subprocess.run([sys.executable, path], check=True, cwd=tmp_path, env=os.environ | settings)
+    assert (tmp_path / f"{name}.png").exists()
+    assert (DOCS / "notebooks" / f"{name}.png").stat().st_size < 100_000
+
+
+def test_flags_of_pages_exist(capfd):
+    """What the pages say on command lines is what the commands know."""
+    for name, (module, _) in COMMANDS.items():
+        words = ["all"] * (name in ("train", "sweep"))
+        run_command("--help", *words, command=importlib.import_module(module))
+    known = set(re.findall(r"--[a-z][a-z-]+", capfd.readouterr().out))
+    said = {}
+    for path in sorted(DOCS.glob("*.md")):
+        for code in blocks(path.read_text("utf-8"), "sh"):
+            for line in code.replace("\\\n", " ").splitlines():
+                if re.search(rf"mjx-reinforce ({'|'.join(COMMANDS)})", line):
+                    said |= dict.fromkeys(re.findall(r"(?<= )--[a-z][a-z-]+", line), path.name)
+    assert len(said) > 15
+    assert {flag: page for flag, page in said.items() if flag not in known} == {}
+
+
+def test_links_of_pages_are_files():
+    """As GitHub shows the pages: each relative link is a file of the repository."""
+    for path in [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")]:
+        for link in re.findall(r"\]\(([^)#\s]+)", path.read_text("utf-8")):
+            if "://" not in link:
+                assert (path.parent / link).exists(), f"{path.name}: {link}"
+
+
+def test_pictures_and_films_are_small():
+    """A clone and a page load quickly."""
+    most = {".png": 100_000, ".gif": 300_000}
+    sizes = {path: path.stat().st_size for path in DOCS.rglob("*") if path.suffix in most}
+    assert {path.name: size for path, size in sizes.items() if size > most[path.suffix]} == {}
