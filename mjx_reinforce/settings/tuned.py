@@ -77,6 +77,8 @@ OF_TASKS: dict[str, dict[str, Any]] = {
         "standardize_floor": 1.5,
         "env_steps": 1_000_000,
         "decay_steps": 2_000_000,
+        "train_horizon": 100,
+        "eval_every": 50,
         "eval_episodes": 4,
     },
     "Hopper-v5": {
@@ -107,6 +109,8 @@ OF_TASKS: dict[str, dict[str, Any]] = {
         "initial_std": 0.2,
         "env_steps": 500_000,
         "decay_steps": 2_000_000,
+        "train_horizon": 250,
+        "eval_every": 50,
         "eval_episodes": 4,
         "test_episodes": 16,
     },
@@ -166,7 +170,11 @@ OF_BUDGETS: dict[str, tuple[tuple[int, dict[str, Any]], ...]] = {
         ),
     ),
     "HalfCheetah-v5": (
-        (100_000_000, {"num_episodes": 1024, "learning_rate": 0.02, "max_kl": 0.04}),
+        (
+            100_000_000,
+            {"num_episodes": 1024, "learning_rate": 0.02, "max_kl": 0.04}
+            | {"train_horizon": None, "eval_every": 5},
+        ),
     ),
     "Hopper-v5": (
         (3_000_000, _NATURAL | {"initial_std": 0.6, "normalize_steps": None}),
@@ -177,7 +185,11 @@ OF_BUDGETS: dict[str, tuple[tuple[int, dict[str, Any]], ...]] = {
         (100_000_000, _MANY_NATURAL | {"initial_std": 0.5, "standardize_floor": 1.0}),
     ),
     "Ant-v5": (
-        (100_000_000, _MANY_EPISODES | {"learning_rate": 0.02, "max_kl": 0.03, "initial_std": 0.4}),
+        (
+            100_000_000,
+            _MANY_NATURAL
+            | {"num_episodes": 2048, "discount": 0.99, "initial_std": 0.4, "eval_every": 40},
+        ),
     ),
     "Humanoid-v5": ((100_000_000, _FEW_UPDATES | {"initial_std": 0.3}),),
     "HumanoidStandup-v5": ((100_000_000, _FEW_UPDATES),),

@@ -19,7 +19,7 @@ def env_steps_in(
 ) -> int:
     """Returns the env steps that a mean seed will have played in all after a time.
 
-    A copy of the state is trained for a small part of that time. The speed of the second half of
+    A copy of the state is trained, and evaluated, for a small part of that time. The speed of the second half of
     that part counts: the first updates also have what a device does once, and the shortest
     episodes.
 
@@ -34,7 +34,7 @@ def env_steps_in(
     began, past = time.perf_counter(), [(0.0, _played(state))]
     going = True
     while going and past[-1][0] < _PART * seconds:
-        copy, metrics, _ = programs.advance(copy, False, budget)
+        copy, metrics, _ = programs.advance(copy, True, budget)
         past.append((time.perf_counter() - began, _played(copy)))
         going = bool(metrics["active"].any())
     end, played = past[-1]

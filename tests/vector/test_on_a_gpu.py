@@ -8,6 +8,7 @@ import pytest
 from toys import Drifting
 
 from mjx_reinforce import Box, envs, make_vec
+from mjx_reinforce.engines import mapping
 from mjx_reinforce.engines.native import available
 from mjx_reinforce.engines.native.gpu import lockstep, ptx
 
@@ -67,11 +68,13 @@ def test_mapped_over_it_remains_one_launch(monkeypatch):
     assert text.count("pure_callback[") == 1
 
 
-def test_machine_code_for_a_gpu_is_not_chosen_by_itself(monkeypatch):
+def test_machine_code_for_a_gpu_is_chosen_where_a_step_is_large(monkeypatch):
     gpu_on_cpu.emulate(monkeypatch)
     engine = make_vec(TOY, 4).engine
     assert engine.name == "fused"
-    assert "engine='native' asks for them" in engine.why
+    assert "XLA's kernels are faster on a GPU" in engine.why
+    monkeypatch.setattr(mapping, "_SMALL", 10)
+    assert make_vec(TOY, 4).engine.name == "native"
 
 
 def test_llvm_makes_ptx_of_it(monkeypatch):
