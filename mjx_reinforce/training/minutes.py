@@ -19,9 +19,9 @@ def env_steps_in(
 ) -> int:
     """Returns the env steps that a mean seed will have played in all after a time.
 
-    A copy of the state is trained, and evaluated, for a small part of that time. The speed of the second half of
-    that part counts: the first updates also have what a device does once, and the shortest
-    episodes.
+    A copy of the state is trained, and evaluated, for a small part of that time. The speed of the
+    second half of that part counts: the first updates also have what a device does once, and the
+    shortest episodes.
 
     Args:
       seconds: the time.
