@@ -89,7 +89,7 @@ def as_page(name, cells):
     if REPOSITORY:
         colab = f"https://colab.research.google.com/github/{REPOSITORY}/blob/gh-pages/notebooks"
         links = f"[Open in Colab]({colab}/{name}.ipynb){{ .md-button }} " + links
-    return "\n\n".join([parts[0], links, *parts[1:]])
+    return "\n\n".join([parts[0], links, f"![What this notebook draws]({name}.png)", *parts[1:]])
 
 
 def as_notebook(cells):
