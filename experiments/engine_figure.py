@@ -23,6 +23,7 @@ from mjx_reinforce import act, envs
 from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.native import program, step
 from mjx_reinforce.fused import scalarized
+from pictures import save_picture
 
 DOCS = Path(__file__).parents[1] / "docs"
 #: engine and precision -> colour (Okabe and Ito's, for all eyes) and marker
@@ -95,7 +96,7 @@ def main(count: bool = False) -> None:
         axes.margins(x=0.6, y=0.12)
         axes.grid(alpha=0.3)
         axes.legend(fontsize="small")
-    figure.savefig(DOCS / "engine.png")
+    save_picture(figure, DOCS / "engine.png")
 
 
 @functools.cache

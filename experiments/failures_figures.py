@@ -8,6 +8,7 @@ import numpy as np
 
 from failures_answers import Arm, Quarter
 from failures_measures import Kept
+from pictures import save_picture
 
 #: Colours that differ for colour-blind readers too (Okabe and Ito 2008).
 _FAILING, _OTHERS = "#d55e00", "#0072b2"
@@ -40,7 +41,7 @@ def draw_all(
         "mended": _arms(arms, words),
     }.items():
         # Without the version of matplotlib in it, the same numbers give the same file.
-        figure.savefig(docs / f"failures-{name}.png", metadata={"Software": None})
+        save_picture(figure, docs / f"failures-{name}.png")
 
 
 def _figure(rows: int, columns: int, width: float, height: float, **shared: Any) -> tuple[Any, Any]:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.settings.presets import PRESETS
+from pictures import save_picture
 from reproduce_cases import Case
 from reproduce_mistakes import STALE
 from reproduce_statistics import spread, windowed
@@ -24,7 +25,7 @@ def draw(
     figure = Figure(figsize=size, dpi=90, layout="constrained")
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
         _draw_panel(axes, *panel, reference)
-    figure.savefig(path)
+    save_picture(figure, path)
 
 
 def _draw_panel(

@@ -7,13 +7,17 @@ import numpy as np
 
 import results_seconds as kept
 from mjx_reinforce.reports.statistics.aggregates import interval
+from pictures import save_picture
 from results_figures import panels
 from results_tables import estimate, number, play_table, seconds
 from seeds_markdown import listed, table
 
 #: Commit -> what its settings were that have changed since.
 _SINCE = {
-    "e6f8e08c5022": "since then Swimmer has shorter steps, and Pusher the natural gradient",
+    "e6f8e08c5022": (
+        "since then Swimmer has shorter steps, Pusher the natural gradient, and on two threads\n"
+        "HalfCheetah and Ant cut their episodes of training"
+    ),
 }
 _PEERS = ("Stable-Baselines3 PPO", "Stable-Baselines3 SAC")
 #: Blue and vermilion for the machines, black and grey for others.
@@ -198,7 +202,7 @@ def _draw(groups: Sequence[kept.Group], results: Path, docs: Path) -> None:
     axes[0].set_ylabel("return without noise")
     figure.legend(*_legend(), loc="outside lower center", ncols=6, frameon=False)
     (docs / "results").mkdir(parents=True, exist_ok=True)
-    figure.savefig(docs / "results" / "seconds.png", metadata={"Software": None})
+    save_picture(figure, docs / "results" / "seconds.png")
 
 
 def _legend() -> tuple[list, list[str]]:

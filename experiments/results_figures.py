@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.reports.experiment import setting_in_words
+from pictures import save_picture
 from results_files import Result
 from results_runs import FACTOR
 from results_tables import moved_measure
@@ -31,7 +32,7 @@ def draw(results: Sequence[Result], folder: Path) -> None:
     }.items():
         if figure is not None:
             # Without the version of matplotlib in it, the same numbers give the same file.
-            figure.savefig(folder / f"{name}.png", metadata={"Software": None})
+            save_picture(figure, folder / f"{name}.png")
 
 
 def panels(count: int) -> tuple[Any, list[Any]]:

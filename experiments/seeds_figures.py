@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from pictures import save_picture
 from seeds_answers import CONTRASTS, DEFAULTS, MEASURES, Effect, best_rates, select
 from seeds_few import AnyPair, FewSeeds
 from seeds_runs import Task
@@ -51,7 +52,7 @@ def draw_all(
         "wrong_winner": _wrong_winner(few, pairs),
     }.items():
         # Without the version of matplotlib in it, the same numbers give the same file.
-        figure.savefig(folder / f"{name}.png", metadata={"Software": None})
+        save_picture(figure, folder / f"{name}.png")
 
 
 def _figure(rows: int, columns: int, width: float, height: float, **shared: Any) -> tuple[Any, Any]:

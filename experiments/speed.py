@@ -20,6 +20,7 @@ import tyro
 
 from mjx_reinforce import envs, mlp_policy, normal, rollout
 from mjx_reinforce.console.jax_setup import configure_jax
+from pictures import save_picture
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 
@@ -135,7 +136,7 @@ def draw(rows: list[dict], path: Path) -> None:
     axes[0].set_yscale("log")
     axes[1].set_ylim(bottom=0)
     fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", fontsize="small")
-    fig.savefig(path, dpi=90)
+    save_picture(fig, path, dpi=90)
 
 
 def main(settings: Settings, docs: Path = DOCS) -> None:

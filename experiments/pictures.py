@@ -1,0 +1,20 @@
+"""How the pictures of docs/ are saved: small, and the same bytes each time."""
+
+from pathlib import Path
+
+from matplotlib.figure import Figure
+from PIL import Image
+
+
+def save_picture(figure: Figure, path: Path, **options: float) -> None:
+    """Saves a figure as a PNG of at most 256 colors.
+
+    Args:
+      figure: what is saved.
+      path: the file, which is replaced.
+      options: for ``Figure.savefig``, such as ``dpi``.
+    """
+    figure.savefig(path, metadata={"Software": None}, **options)
+    with Image.open(path) as picture:
+        small = picture.convert("RGB").quantize(256)
+    small.save(path, optimize=True)
