@@ -4,12 +4,14 @@
     python experiments/trainers.py stable-baselines3 --num-envs 64
     python experiments/trainers.py clean-rl --program ppo_continuous_action.py
     python experiments/trainers.py brax
+    python experiments/trainers.py rejax
     python experiments/trainers.py table
 
 trains each seed on Gymnasium's environments and then on ours, so that a busy machine slows both,
-and adds a row for each to docs/trainers.csv; brax, which knows no Gymnasium, trains on our task
-under its own wrappers in its place. ``table`` prints the table of docs/vector.md. CleanRL's program
-is the user's to download (``trainers_cleanrl.py``).
+and adds a row for each to docs/trainers.csv; brax and rejax, which train on environments in JAX,
+train on our task under their own wrappers in its place. ``table`` prints the table of
+docs/vector.md. CleanRL's program is the user's to download (``trainers_cleanrl.py``); rejax is
+``pip install rejax gymnax==0.0.9``.
 """
 
 import csv
@@ -87,6 +89,18 @@ class Brax(_Run):
 
 
 @dataclasses.dataclass(frozen=True)
+class Rejax(_Run):
+    """rejax's PPO with its settings for the task, under its own wrapper of brax's and on ours."""
+
+    task: str = "HalfCheetah-v5"
+    """A key of ``trainers_rejax.SETTINGS``."""
+    num_envs: int = 32
+    """Environments that play at once, on either side."""
+    rollout: int = 1024
+    """Env steps between updates, of all environments together."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Table:
     """Print the table of docs/vector.md."""
 
@@ -98,6 +112,7 @@ _Command = (
     Annotated[Sb3, tyro.conf.subcommand("stable-baselines3")]
     | Annotated[CleanRl, tyro.conf.subcommand("clean-rl")]
     | Annotated[Brax, tyro.conf.subcommand("brax")]
+    | Annotated[Rejax, tyro.conf.subcommand("rejax")]
     | Annotated[Table, tyro.conf.subcommand("table")]
 )
 
@@ -114,6 +129,10 @@ def main(command: _Command) -> None:
         import trainers_brax
 
         compare("brax", ("brax",), trainers_brax.train, command, ("brax", OURS))
+    elif isinstance(command, Rejax):
+        import trainers_rejax
+
+        compare("rejax", ("rejax", "brax"), trainers_rejax.train, command, ("rejax", OURS))
     else:
         import trainers_cleanrl
 
@@ -126,7 +145,7 @@ def compare(
     program: str,
     libraries: tuple[str, ...],
     train: Callable[..., Any],
-    told: Sb3 | CleanRl | Brax,
+    told: Sb3 | CleanRl | Brax | Rejax,
     sides: tuple[str, str] = ("gymnasium", OURS),
 ) -> None:
     """Trains each seed on both sides, and adds their rows."""

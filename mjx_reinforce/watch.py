@@ -171,7 +171,8 @@ def _take(
             print(compare(settings, by_name))
     body = pushed_body(env.mj_model) if settings.push else 0
     pushes = episode.pushes
-    return Take(role.label, model, env.dt, episode.qpos, episode.rewards, pushes, body)
+    dt = _within(env, "dt").dt
+    return Take(role.label, model, dt, episode.qpos, episode.rewards, pushes, body)
 
 
 def _stands_still(take: "Take") -> bool:
@@ -259,6 +260,7 @@ def scene(env: "MujocoEnv") -> Any:
     Raises:
       ValueError: it has none.
     """
+    env = _within(env, "mj_model")
     settings = getattr(env, "settings", None)
     xml_file = getattr(env, "scene", None) or getattr(settings, "xml_file", None)
     if xml_file is not None and not hasattr(xml_file, "nbody"):  # no compiled model
@@ -270,8 +272,15 @@ def scene(env: "MujocoEnv") -> Any:
         return env.mj_model
     raise ValueError(
         f"{type(env).__name__} has no mj_model, so there is nothing to draw; in a wrapper, set "
-        "self.mj_model and self.dt to those of what it wraps; or play with mjx_reinforce.load"
+        "self.env to what it wraps; or play with mjx_reinforce.load"
     )
+
+
+def _within(env: Any, name: str) -> Any:
+    """Returns the outermost of wrappers that has an attribute, or what they wrap as ``env``."""
+    while not hasattr(env, name) and hasattr(env, "env"):
+        env = env.env
+    return env
 
 
 if __name__ == "__main__":

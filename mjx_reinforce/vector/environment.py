@@ -14,13 +14,15 @@ from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.engines.mapping import MapEngine, map_function
 from mjx_reinforce.engines.native.available import GENERATOR
 from mjx_reinforce.policies.arguments import check_count, check_key
-from mjx_reinforce.registry import check_name
+from mjx_reinforce.registry import check_name, nearest
 from mjx_reinforce.settings.memory import gigabytes, host_memory
 from mjx_reinforce.types import Box, Discrete, Environment, action_space, null_action
 from mjx_reinforce.vector.episodes import AUTORESETS, VectorState, advance_function, blank
 
 #: Copies of the states that a step has in memory: 4.6 of HalfCheetah, a million of them.
 _COPIES = 5
+#: Those of ``make_vec`` that are no settings of the task.
+_ARGUMENTS = ("num_envs", "autoreset", "max_episode_steps", "engine")
 
 
 class VectorEnv:
@@ -246,13 +248,14 @@ def make_vec(
     mode = autoreset.name.lower() if isinstance(autoreset, enum.Enum) else autoreset
     check_name("autoreset", str(mode), dict.fromkeys(AUTORESETS))
     check_type("max_episode_steps", max_episode_steps, int | None)
-    made: Environment
-    if isinstance(env, str):
-        made = envs.make(env, **settings)
-    elif settings:
-        raise ValueError(f"{sorted(settings)} are for an id; this environment is made already")
-    else:
-        made = env
+    try:
+        made = _made(env, settings)
+    except ValueError as error:
+        meant = [own for own in (nearest(name, _ARGUMENTS) for name in settings) if own]
+        if not meant:
+            raise
+        hint = f"make_vec itself takes {meant[0]!r}"
+        raise ValueError(f"{str(error).rstrip('.')}; {hint}") from error
     check_parts(made)
     check_environment(made)
     if max_episode_steps is None:
@@ -260,3 +263,12 @@ def make_vec(
     else:
         check_count("max_episode_steps", max_episode_steps)
     return VectorEnv(made, num_envs, str(mode), max_episode_steps, engine)
+
+
+def _made(env: str | Environment, settings: dict[str, object]) -> Environment:
+    """Returns the environment, built where it is an id."""
+    if isinstance(env, str):
+        return envs.make(env, **settings)
+    if settings:
+        raise ValueError(f"{sorted(settings)} are for an id; this environment is made already")
+    return env

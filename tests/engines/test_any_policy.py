@@ -48,6 +48,27 @@ class Nnx(nnx.Module):
         return self.last(nnx.gelu(self.first(x)))
 
 
+@jax.tree_util.register_pytree_node_class
+class Network:
+    """A network that is its own parameters, as a module of equinox is."""
+
+    def __init__(self, weights, activation):
+        self.weights, self.activation = weights, activation
+
+    def __call__(self, x):
+        *inner, last = self.weights
+        for weights in inner:
+            x = self.activation(x @ weights)
+        return x @ last
+
+    def tree_flatten(self):
+        return (self.weights,), self.activation
+
+    @classmethod
+    def tree_unflatten(cls, activation, children):
+        return cls(*children, activation)
+
+
 def policies(size, outputs):
     init, act = plain(8, outputs)
     module = Linen(outputs)
@@ -56,10 +77,11 @@ def policies(size, outputs):
         "plain": (act, init(size)),
         "linen": (module.apply, module.init(KEY, jnp.zeros(size))),
         "nnx": (lambda state, x: nnx.merge(graph, state)(x), state),
+        "callable": (lambda network, x: network(x), Network(init(size), jnp.tanh)),
     }
 
 
-@pytest.mark.parametrize("kind", ["plain", "linen", "nnx"])
+@pytest.mark.parametrize("kind", ["plain", "linen", "nnx", "callable"])
 @pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "CartPole-v1"])
 def test_every_engine_plays_every_policy(env_id, kind):
     env = envs.make(env_id)
@@ -83,6 +105,25 @@ def test_every_engine_plays_every_policy(env_id, kind):
         np.testing.assert_array_equal(played["auto"].mask, played[other].mask)
         np.testing.assert_allclose(played["auto"].reward, played[other].reward, atol=1e-3)
         np.testing.assert_allclose(played["auto"].observation, played[other].observation, atol=1e-3)
+
+
+def test_an_equinox_module_plays_as_the_document_writes_it():
+    """docs/vector.md; a module filtered by ``partition`` has None where its functions were."""
+    eqx = pytest.importorskip("equinox")
+    env = envs.make("InvertedPendulum-v5")
+    model = eqx.nn.MLP(4, 2, width_size=8, depth=2, activation=jnp.tanh, key=KEY)
+    params, static = eqx.partition(model, eqx.is_array)
+    play = functools.partial(
+        rollout, env, lambda params, x: eqx.combine(params, static)(x),
+        distribution=normal(env.action_space), num_episodes=5, horizon=30,
+    )  # fmt: skip
+    played = {
+        engine: jax.jit(functools.partial(play, engine=engine))(params, key=KEY)
+        for engine in ("auto", "native", "vmap")
+    }
+    np.testing.assert_array_equal(played["auto"].observation, played["native"].observation)
+    np.testing.assert_array_equal(played["auto"].mask, played["vmap"].mask)
+    np.testing.assert_allclose(played["auto"].observation, played["vmap"].observation, atol=1e-3)
 
 
 def test_a_large_policy_plays_on_machine_code_of_the_env_step(monkeypatch):

@@ -1,9 +1,13 @@
 """Others' programs on our environments: what is changed in them, and that they train."""
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import peers_rows
 import trainers
+from mjx_reinforce.vector import for_brax
 
 ROW = dict.fromkeys(trainers.COLUMNS, "") | {"program": "P", "task": "T-v1", "num_envs": 8}
 PROGRAM = """
@@ -58,3 +62,27 @@ def test_stable_baselines3_is_trained_on_both_sides(tmp_path, capsys):
     assert all(row["env_steps"] == 512 and row["mean_return"] > 3 for row in rows)
     trainers.main(trainers.Table(rows=path))
     assert "| Stable-Baselines3 | InvertedPendulum-v5 | 8 | 512 | 2 | " in capsys.readouterr().out
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_rejax_maps_one_environment_in_one_call():
+    pytest.importorskip("rejax")
+    import trainers_rejax
+
+    task = "InvertedPendulum-v5"
+    one, many = trainers_rejax.OneOfMany(task), for_brax.make(task, 3)
+    keys = jax.random.split(jax.random.PRNGKey(0), 3)
+    first = jax.vmap(lambda key: jax.random.fold_in(key, 0))(keys)
+    (obs, state), other = jax.vmap(one.reset)(keys), many.reset(first)
+    np.testing.assert_array_equal(obs, other.obs)
+    mapped = jax.jit(jax.vmap(one.step))
+    assert str(jax.make_jaxpr(mapped)(keys, state, jnp.zeros((3, 1)))).count("ffi_call[") == 1
+    ended = 0
+    for _ in range(20):
+        action = jnp.array([[1.0], [-1.0], [0.1]])
+        obs, state, reward, done, _ = mapped(keys, state, action)
+        other = many.step(other, action)
+        for found, expected in ((obs, other.obs), (reward, other.reward), (done, other.done)):
+            np.testing.assert_array_equal(found, expected)
+        ended += int(done.sum())
+    assert ended > 1

@@ -287,6 +287,59 @@ def test_what_takes_long_says_so_without_a_terminal(capfd, monkeypatch):
     assert "still compiling and playing, 0 s" in capfd.readouterr().err
 
 
+WRAPPERS = """
+from brax.envs.base import Wrapper
+from mjx_reinforce import envs
+
+
+class Plain:
+    "A wrapper with what training needs, and no more."
+
+    def __init__(self):
+        self.env = env = envs.make("CartPole-v1")
+        self.observation_size, self.action_size = env.observation_size, env.action_size
+        self.action_space, self.max_episode_steps = env.action_space, env.max_episode_steps
+        self.reset = env.reset
+
+    def step(self, state, action):
+        return self.env.step(state, action)
+
+
+class Twice(Plain):
+    "Plays each action twice."
+
+    def __init__(self):
+        super().__init__()
+        self.dt = 2 * self.env.dt
+
+    def step(self, state, action):
+        return self.env.step(self.env.step(state, action), action)
+
+
+class OfBrax(Wrapper):
+    def __init__(self):
+        super().__init__(envs.make("CartPole-v1"))
+"""
+
+
+def test_wrapped_environments_are_filmed(tmp_path):
+    """By a wrapper of brax's, which hands on all attributes, and by one's own, which has few."""
+    (tmp_path / "wraps.py").write_text(WRAPPERS)
+    run = make_run(tmp_path)
+    change_arrays(run / "policy" / "actor.npz", checksum=None)
+    frames = {}
+    for name in ("CartPole-v1", "wraps:Plain", "wraps:OfBrax", "wraps:Twice"):
+        for file in ("config.json", "policy/policy.json"):
+            change(run / file, env=name)
+        command = [sys.executable, "-m", "mjx_reinforce.watch", ".", "--env", name, "--overwrite"]
+        options = ["--width", "96", "--height", "64"]
+        subprocess.run([*command, *options], check=True, capture_output=True, cwd=run)
+        with Image.open(run / "seed-1.gif") as film:
+            frames[name] = film.n_frames, film.info["duration"]
+    assert frames["CartPole-v1"] == frames["wraps:Plain"] == frames["wraps:OfBrax"]
+    assert frames["wraps:Twice"][1] == 1000 * 2 * envs.make("CartPole-v1").dt
+
+
 def test_an_environment_without_a_model_is_refused(register, tmp_path, monkeypatch, capsys):
     """Survive has what training needs, and no more."""
     make_run(tmp_path, "InvertedPendulum-v5", observation_size=1)
@@ -297,5 +350,5 @@ def test_an_environment_without_a_model_is_refused(register, tmp_path, monkeypat
         watch_run(monkeypatch, tmp_path)
     error = capsys.readouterr().err
     assert "Survive has no mj_model, so there is nothing to draw" in error
-    assert "in a wrapper, set self.mj_model and self.dt to those of what it wraps" in error
+    assert "in a wrapper, set self.env to what it wraps" in error
     assert error.count("\n") == 1
