@@ -62,7 +62,7 @@ class RunFiles:
             self._saved = True
         updates = driver.updates()
         self._sinks = open_sinks(config, log.directory, None if found is None else updates)
-        again = "" if updates else ": no checkpoint serves, so it begins again, to the same numbers"
+        again = "" if updates else ": there is no checkpoint yet, so it begins again"
         self._say(f"going on after {updates} updates{again}")
 
     def updated(self, driver: Driver, met: Arrays) -> None:

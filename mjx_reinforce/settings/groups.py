@@ -141,7 +141,7 @@ class RunSettings:
     """Time limit of an episode in env steps. If not given, the environment's own limit."""
     train_horizon: int | None = setting(None, *COUNT)
     """Cut the episodes of training after this many env steps; evaluations play whole ones. Updates
-    take less time, and follow the gradient of the return until the cut."""
+    take less time, and never see what comes after the cut. Some tasks have a cut by default."""
     one_start: bool = False
     """Begin all training episodes of a seed in one state; each seed has its own. Evaluations
     keep their own starts."""

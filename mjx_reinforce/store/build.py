@@ -54,7 +54,7 @@ def build(
     forever = config.normalize_steps is None
     shared = {
         "policy": build_policy(policy_settings(env, config)) if policy is None else policy,
-        "horizon": _training_horizon(config, horizon),
+        "horizon": config.training_horizon(horizon),
         "normalize_steps": math.inf if forever else config.normalize_steps,
         "normalize_min_std": config.normalize_min_std,
         "engine": config.engine,
@@ -64,17 +64,6 @@ def build(
     if config.algorithm == "ars":
         return _build_ars(env, config, shared), horizon
     return _build_reinforce(env, config, {**shared, "devices": devices}), horizon
-
-
-def _training_horizon(config: Config, horizon: int) -> int:
-    """Returns the env steps of an episode of training at most, or raises ValueError."""
-    asked = config.train_horizon
-    if asked is not None and asked >= horizon:
-        raise ValueError(
-            f"--train-horizon {asked:,} would do nothing: an episode has at most {horizon:,} env "
-            "steps; lower it or leave it out"
-        )
-    return config.training_horizon(horizon)
 
 
 def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:

@@ -179,7 +179,9 @@ def test_training_is_cut_and_evaluations_are_whole():
     assert np.all(looked.measured["eval_length"] > 6)
 
 
-def test_a_cut_that_does_nothing_is_refused():
-    for settings in ({"train_horizon": 500}, {"horizon": 100, "train_horizon": 100}):
-        with pytest.raises(ValueError, match=r"--train-horizon \d+ would do nothing.*lower it"):
-            ready.made(envs.make(CONFIG.env), dataclasses.replace(CONFIG, **settings))
+def test_a_cut_after_the_time_limit_is_none():
+    """So a task that cuts its episodes by default takes any ``--horizon``."""
+    config = dataclasses.replace(CONFIG, horizon=20, train_horizon=100)
+    prepared = ready.made(envs.make(CONFIG.env), config)
+    assert prepared.horizon == 20
+    assert prepared.programs.rides
