@@ -65,23 +65,24 @@ def states(model, init_qpos):
     """Simulations about a pose: as it is, fast, turned, lifted, and with a NaN."""
     rng, sizes = np.random.default_rng(5), mujoco.MjData(model)  # pyright: ignore
 
-    def state(scale=1.0, **changes):
+    def state(scale=1.0, height=1.1, **changes):
         made = {name: rng.normal(size=getattr(sizes, name).shape) for name in FIELDS}
         made |= {name: 20 * rng.normal(size=model.nv) for name in FORCES}
         made["cfrc_ext"] *= scale
         made["qpos"] = init_qpos + 0.1 * rng.normal(size=model.nq)
         made["qvel"] = 4 * rng.normal(size=model.nv)
+        made["site_xpos"][..., 2] = height
         made["xipos"] = np.float32(made["xipos"])
         for place, value in changes.items():
             if int(place[4:]) < model.nv:
                 made[place[:4]][int(place[4:])] = value
         return made
 
-    heights = [-0.21, -0.2, 0.0, 0.15, 0.2, 0.25, 0.7, 0.75, 0.8, 1.0, 1.4, 2.0, 2.1]
+    heights = [-0.21, -0.2, 0.0, 0.15, 0.2, 0.25, 0.7, 0.75, 0.8, 0.95, 1.0, 1.4, 2.0, 2.1]
     return [
         state(),
         state(3000.0),
-        *(state(**{f"qpos{place}": x}) for place in (1, 2) for x in heights),
+        *(state(height=x, **{f"qpos{place}": x}) for place in (1, 2) for x in heights),
         *(state(qpos1=1.25, qpos2=0.11, **{f"qvel{place}": 150.0}) for place in range(2)),
         state(qpos1=np.nan),
         state(qvel1=np.nan),
