@@ -83,7 +83,7 @@ def states(model, init_qpos):
         state(),
         state(3000.0),
         *(state(height=x, **{f"qpos{place}": x}) for place in (1, 2) for x in heights),
-        *(state(qpos1=1.25, qpos2=0.11, **{f"qvel{place}": 150.0}) for place in range(2)),
+        *(state(qpos1=1.25, qpos2=0.11, qvel1=speed) for speed in (150.0, -150.0)),
         state(qpos1=np.nan),
         state(qvel1=np.nan),
     ]
