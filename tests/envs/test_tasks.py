@@ -78,7 +78,7 @@ def states(model, init_qpos):
                 made[place[:4]][int(place[4:])] = value
         return made
 
-    heights = [-0.21, -0.2, 0.0, 0.15, 0.2, 0.25, 0.7, 0.75, 0.8, 0.95, 1.0, 1.4, 2.0, 2.1]
+    heights = [-1.05, -0.21, -0.2, 0.0, 0.15, 0.2, 0.25, 0.7, 0.75, 0.8, 0.95, 1.0, 1.4, 2.0, 2.1]
     return [
         state(),
         state(3000.0),
