@@ -1,0 +1,75 @@
+"""A function of one example in machine code: ``jax.vmap``'s results of batches of any size."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mjx_reinforce.engines.native import mapping
+from mjx_reinforce.engines.native.cpu import seam
+from mjx_reinforce.engines.native.cpu.denormals import Flush, flush
+from mjx_reinforce.engines.native.cpu.machine import this_machine
+from mjx_reinforce.engines.native.cpu.mapping import POSITIONS
+from mjx_reinforce.engines.native.mapping import machine_map
+
+pytest.importorskip("llvmlite", reason="machine code is written by llvmlite")
+pytestmark = pytest.mark.cpu
+
+
+def function(x, nothing, more):
+    """Leaves of every kind; two results, one of them empty, one a bool, one an integer."""
+    flag, count = more
+    y = jnp.where(flag, x, -2 * x) + count
+    return {"y": y, "none": nothing * 2, "big": y.sum() > 1, "n": count * 2 + 1, "x": x[1]}
+
+
+def batch(size):
+    rng = np.random.default_rng(size)
+    flags, counts = rng.integers(0, 2, size) > 0, rng.integers(-5, 5, size).astype(np.int32)
+    x = rng.normal(size=(size, 3)).astype(np.float32)
+    return jnp.asarray(x), jnp.zeros((size, 0)), (jnp.asarray(flags), jnp.asarray(counts))
+
+
+@pytest.fixture(scope="module")
+def mapped():
+    return jax.jit(machine_map(function, *jax.tree.map(lambda x: x[0], batch(1))))
+
+
+@pytest.mark.parametrize("size", [1, 16, 37])
+def test_results_are_those_of_vmap(mapped, size):
+    """The last lanes have no example where the size is no multiple of theirs."""
+    got, want = mapped(*batch(size)), jax.vmap(function)(*batch(size))
+    assert jax.tree.structure(got) == jax.tree.structure(want)
+    for x, exact in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+        assert (x.shape, x.dtype) == (exact.shape, exact.dtype)
+        np.testing.assert_allclose(x, exact, rtol=1e-6)
+    assert size % this_machine().lanes or size == 16
+
+
+def test_numbers_of_8_bits_are_refused():
+    with pytest.raises(TypeError, match="it has numbers of int8, not of 32 or 64 bits"):
+        machine_map(lambda x: x, jnp.int8(1))
+    with pytest.raises(TypeError, match="numbers of uint8"):
+        machine_map(lambda x: x.astype(jnp.uint8), jnp.int32(1))
+
+
+def test_numbers_below_the_smallest_normal_are_zero(monkeypatch):
+    """Also in threads of Python's: XLA has its own flush too."""
+    if not flush(this_machine().triple).begin:
+        pytest.skip("unknown on this machine")
+
+    def run(code, shapes, rows):
+        return seam._play(code, shapes, POSITIONS, jnp.int32(0), *rows)
+
+    monkeypatch.setattr(mapping, "_run", run)
+    small = machine_map(lambda x, y: x * y, jnp.float32(0), jnp.float32(0))
+    x = np.float32([1e-20, 1e-19, 1.0, 1e-38]).repeat(9)
+    y = np.float32([1e-20, 1e-18, 1e-39, 0.5]).repeat(9)
+    np.testing.assert_array_equal(small(x, y), np.where(x * y < 2.0**-126, 0, x * y))
+    assert (x * y > 0).all()
+
+
+def test_flushing_is_known_by_the_architecture():
+    assert flush("arm64-apple-darwin") == flush("aarch64-unknown-linux-gnu") != Flush()
+    assert flush("x86_64-pc-linux-gnu").begin != flush("aarch64-linux").begin
+    assert flush("riscv64-linux") == Flush()
