@@ -15,7 +15,7 @@ from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.contract import check_environment
-from mjx_reinforce.engines.episode import episode_keys
+from mjx_reinforce.engines.episode import check_shapes, episode_keys
 from mjx_reinforce.fused import any_lane
 from mjx_reinforce.learners import counts, pace
 from mjx_reinforce.learners.contract import check_estimator, check_optimizer, check_update
@@ -310,6 +310,7 @@ class _Reinforce:
         """Plays the episodes of an update, with guests before them if there are any."""
         play = functools.partial(self._play_part, engine)
         visitors = None if guests is None else (guests.keys, guests.deterministic(), guests.active)
+        check_shapes((), (self.num_episodes,), active=active)
         chosen = jnp.broadcast_to(self._chosen(state, active), self.num_episodes)
         keys = episode_keys(key, self.num_episodes)
         given = state.actor, state.start_key, visitors, keys, chosen

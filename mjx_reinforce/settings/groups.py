@@ -121,9 +121,9 @@ class RunSettings:
     minutes: float | None = setting(
         None, Range.POSITIVE, Mark.BUDGET, Mark.NOT_COMPILED, once="it is for one run"
     )
-    """Training time of all seeds together, in place of --env-steps, which the first updates
-    measure and config.json keeps, so --like RUN repeats the run to the last bit. If episodes
-    grow, the run ends early."""
+    """Training time of all seeds together, in place of --env-steps. The first updates measure the
+    env steps, which config.json keeps: --like RUN repeats the run to the bit. If episodes grow, the
+    run ends early."""
     max_updates: int | None = setting(None, *TOTAL, Mark.BUDGET, Mark.NOT_COMPILED)
     """Stop every seed after this many updates; with --num-episodes 1, as many episodes."""
     stop_when_solved: bool = setting(
@@ -131,30 +131,28 @@ class RunSettings:
     )
     """Stop once every seed's last evaluation reached the environment's reward threshold."""
     num_episodes: int | Literal["auto"] = _for_reinforce(16, *COUNT)
-    """Complete episodes that each seed plays for one update. auto: the number at which the noise of
-    the gradient equals its signal, measured during training. With ars, use --num-directions."""
+    """Episodes that each seed plays for an update. auto: the number at which the noise of the
+    gradient equals its signal. With ars, use --num-directions."""
     min_episodes: int = _for_reinforce(16, *SEVERAL, Reader.AUTO_EPISODES)
-    """Minimum number of episodes of an update, with --num-episodes auto."""
+    """Fewest episodes of an update, with --num-episodes auto."""
     max_episodes: int = _for_reinforce(2048, *SEVERAL, Reader.AUTO_EPISODES)
-    """Maximum number of episodes of an update, with --num-episodes auto."""
+    """Most episodes of an update, with --num-episodes auto."""
     horizon: int | None = setting(None, *COUNT)
     """Time limit of an episode in env steps. If not given, the environment's own limit."""
     train_horizon: int | None = setting(None, *COUNT)
-    """Cut the episodes of training after this many env steps; evaluations play whole ones. Updates
-    take less time, and never see what comes after the cut. Some tasks have a cut by default."""
+    """Cut training episodes, not evaluations, after this many env steps."""
     one_start: bool = False
-    """Begin all training episodes of a seed in one state; each seed has its own. Evaluations
-    keep their own starts."""
+    """Begin all training episodes of a seed in one state of its own. Evaluations keep theirs."""
     engine: Literal["auto", "vmap", "fused", "native"] = setting(
         "auto", once="it changes no result but by rounding"
     )
-    """How episodes are played: vmap (the step mapped by jax.vmap), fused (written out as scalar
+    """How episodes are played: vmap (jax.vmap of the step), fused (written out as scalar
     operations), native (machine code for this CPU or NVIDIA GPU), or auto, the fastest here."""
     like: Path | None = setting(None, Mark.PLACE, once="every configuration begins with it")
-    """Take all settings from the run in this directory, except those on the command line."""
+    """Take all settings from this run, except those on the command line."""
     init_from: str | None = setting(None, Mark.NOT_COMPILED, once="it is for one run")
-    """Start with the last policies of the run in this directory, which has the same policy
-    settings. Seed i starts with the policy of seed i modulo that run's seeds."""
+    """Start with the last policies of this run, which has the same policy settings. Seed i takes
+    the policy of seed i modulo that run's seeds."""
     output: Path | None = setting(None, Mark.PLACE, once="it has one directory")
     """Directory of the run. If not given, runs/<env>-<time>."""
     overwrite: bool = setting(False, Reader.DIRECTORY, Mark.PLACE, once="it has one directory")
