@@ -631,7 +631,12 @@ WRONG = {
     ),
     "num_seeds": st.integers(max_value=0) | st.floats() | _TEXT,
     "normalize_steps": st.integers(max_value=-1) | st.integers(min_value=2**31) | _TEXT,
-    "discount": st.floats(max_value=-1e-9) | st.floats(min_value=1.001) | st.just(math.nan) | _TEXT,
+    **dict.fromkeys(
+        ("discount", "final_discount"),
+        st.floats(max_value=-1e-9) | st.floats(min_value=1.001) | st.just(math.nan) | _TEXT,
+    ),
+    # Seconds are the host's, in float64; the env steps of a time are at most 2^53.
+    "minutes": st.floats(max_value=0) | st.sampled_from([math.nan, math.inf]) | _TEXT,
     "reward_shift": st.sampled_from([math.nan, math.inf, -math.inf, 1e30, -1e13]) | _TEXT,
     "momentum": st.floats(max_value=-1e-9) | st.floats(min_value=1 - 2**-25) | st.just(math.nan),
     "env": _TEXT.filter(lambda text: ":" not in text) | st.none(),
