@@ -13,12 +13,13 @@ from mjx_reinforce.engines.native import available
 from mjx_reinforce.engines.native.mapping import machine_map
 from mjx_reinforce.engines.native.outlook import check_seconds
 from mjx_reinforce.engines.native.program import refusal
+from mjx_reinforce.fused import jaxprs, size
 from mjx_reinforce.types import Environment, PyTree, observation_size
 
-#: Scalar operations of a step. On an H100, XLA's kernels of InvertedPendulum, which has a third of
-#: them, played 1.6 times as many env steps a second as ours; for HalfCheetah, which has more than
-#: this, XLA compiled for minutes.
-_SMALL = 10_000
+#: Scalar operations of a step, before any fold away: between those of the tasks without contacts
+#: and those of the others. On an H100, XLA's kernels of InvertedPendulum played 1.6 times as many
+#: env steps a second as ours, and those of HalfCheetah were still compiling after a minute.
+_SMALL = 100_000
 MappedFunction = Callable[..., Any]
 
 
@@ -56,17 +57,16 @@ def map_function(
     """
     began = time.perf_counter()
 
-    mapped = fused.vmap(function, branch_cost=branch_cost())
-    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((1, *x.shape), x.dtype), examples)
-
     def in_scalars() -> MappedFunction | str:
+        mapped = fused.vmap(function, branch_cost=branch_cost())
+        batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((1, *x.shape), x.dtype), examples)
         return against_writing(mapped, observation_size(env), *batch) or mapped
 
     def in_machine_code() -> MappedFunction | str:
-        if name == "auto" and available.platform() == "gpu" and not isinstance(in_scalars(), str):
-            count = sum(mapped.write(*batch).operations.values())
-            if count < _SMALL:
-                return f"XLA's kernels are faster on a GPU for a step of {count:,} operations"
+        if name == "auto" and available.platform() == "gpu":
+            traced, _ = jaxprs.trace(function, *examples)
+            if size.num_scalars(traced) < _SMALL:
+                return "on a GPU XLA's kernels are faster for so small a step"
         return machine_code(env, function, *examples)
 
     made = pick(name, env, in_machine_code, in_scalars, jax.vmap(function))

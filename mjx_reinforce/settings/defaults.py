@@ -17,6 +17,8 @@ from mjx_reinforce.settings.own_code import CODE
 
 #: Where a budget is large, it has about so many evaluations.
 _EVALUATIONS = 50
+#: Of a long run, the time between two evaluations (s), with as many seeds as a default run has.
+_BETWEEN = 20.0
 #: A default run trains for about so long (s) with as many seeds as a default run has, and never
 #: less than the task's settings in ``tuned`` say.
 _DEFAULT_SECONDS = 60.0
@@ -79,8 +81,9 @@ def _in_time(seconds: float, rows: Sequence[tuple[int, Config]]) -> tuple[int, C
 def _with_budget(config: Config, env_steps: int) -> Config:
     """Returns settings with a budget, to which what is made for a smaller one is stretched.
 
-    Schedules that would end before it are as long as it, and where episodes are long there are no
-    more than ``_EVALUATIONS``.
+    Schedules that would end before it are as long as it. Where episodes are long there are no more
+    evaluations than ``_EVALUATIONS``, except in a run so long that an interrupt, which waits for
+    the updates between two, would wait for more than ``_BETWEEN``.
     """
     config = dataclasses.replace(config, env_steps=env_steps)
     if isinstance(config.decay_steps, int) and config.decay_steps < env_steps:
@@ -89,7 +92,8 @@ def _with_budget(config: Config, env_steps: int) -> Config:
         return config
     horizon = config.training_horizon(measured.TASKS[config.env].horizon)
     played = config.episodes_per_update * horizon
-    every = env_steps // played // _EVALUATIONS
+    usual = dataclasses.replace(config, num_seeds=Config.num_seeds)
+    every = min(env_steps // _EVALUATIONS, expected_env_steps(_BETWEEN, usual)) // played
     return dataclasses.replace(config, eval_every=max(config.eval_every, every))
 
 

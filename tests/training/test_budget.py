@@ -104,7 +104,12 @@ def test_a_budget_chooses_the_settings():
     assert many.env_steps == 10**12
     assert few.decay_steps == 1_500_000  # it does not end before the run
     assert some.decay_steps == many.decay_steps == "budget"
-    assert many.eval_every == 10**12 // (1024 * 1000 * 50)
+    # An interrupt of so long a run does not wait for a fiftieth of it.
+    between = defaults.expected_env_steps(20.0, many)
+    assert many.eval_every == max(few.eval_every, between // (1024 * 1000))
+    assert many.eval_every < 10**12 // (1024 * 1000 * 50)
+    medium = of_task("HalfCheetah-v5", 5 * 10**7)
+    assert medium.eval_every == 5 * 10**7 // 50 // (16 * 100)
     for config in (few, some, many):
         words = ["--env", "Hopper-v5", "--env-steps", str(config.env_steps)]
         assert parse(words) == config
