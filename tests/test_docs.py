@@ -113,6 +113,17 @@ def test_links_of_pages_are_files():
                 assert (path.parent / link).exists(), f"{path.name}: {link}"
 
 
+def test_pages_name_experiments_that_exist():
+    pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")]
+    for path in [*pages, *(ROOT / "experiments").rglob("*.py"), ROOT / "experiments/README.md"]:
+        text = path.read_text("utf-8")
+        for name in re.findall(r"python -m (experiments\.[\w.]*\w)", text):
+            place = ROOT / name.replace(".", "/")
+            assert place.with_suffix(".py").exists() or (place / "__main__.py").exists(), name
+        for name in re.findall(r"(?<![\w/])experiments/[\w./-]*\w", text):
+            assert (ROOT / name).exists(), f"{path.name}: {name}"
+
+
 def test_pictures_and_films_are_small():
     """A clone and a page load quickly."""
     most = {".png": 100_000, ".gif": 300_000}

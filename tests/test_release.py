@@ -65,7 +65,7 @@ def test_the_version_is_that_of_the_installed_package():
 
 def test_constraints_are_the_versions_of_the_figures():
     pinned = dict(re.findall(r"^([\w-]+)==(\S+)$", text("constraints.txt"), re.M))
-    results = sorted((ROOT / "experiments" / "results").glob("*.json"))
+    results = sorted((ROOT / "experiments" / "studies" / "results" / "data").glob("*.json"))
     assert len(results) > 10
     for path in results:
         known = json.loads(path.read_text(encoding="utf-8"))["packages"]

@@ -3,7 +3,7 @@
 #
 # The simulator is not tied to REINFORCE. `make_vec` gives many environments, `unroll` plays a segment of them in one
 # call of machine code, and the rest is yours. This is PPO (Schulman et al. 2017) with its whole training in one
-# compiled program. `experiments/ppo.py` in the repository is the larger one, with normalized observations and rewards.
+# compiled program. `experiments/examples/ppo.py` in the repository is the larger one, with normalized observations and rewards.
 
 # %%
 import time

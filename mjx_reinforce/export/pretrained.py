@@ -1,6 +1,6 @@
 """Trained policies that come with the package: a folder of NumPy files and JSON for each task.
 
-``python experiments/results.py pretrained DIR`` writes them.
+``python -m experiments.studies.results pretrained DIR`` writes them.
 """
 
 from pathlib import Path

@@ -156,7 +156,7 @@ _FEW_UPDATES: dict[str, Any] = _MANY_NATURAL | {"max_kl": 0.1, "discount": 0.99,
 
 #: Environment id -> from so many env steps of a seed on, what else differs. The last rows, of 1,024
 #: episodes, were found on one H100; those before, and Swimmer's, on two cores with 2 to 8 seeds,
-#: at 4 to 20 million env steps (experiments/tuning, round 12).
+#: at 4 to 20 million env steps (experiments/studies/tuning, round 12).
 OF_BUDGETS: dict[str, tuple[tuple[int, dict[str, Any]], ...]] = {
     "Reacher-v5": ((100_000_000, _MANY_EPISODES | {"learning_rate": 0.01, "max_kl": 0.02}),),
     "Pusher-v5": (

@@ -310,7 +310,7 @@ def test_a_script_sees_modules_of_the_current_folder():
     """Python leaves that folder out for scripts, as -P does for modules."""
     done = subprocess.run(
         [sys.executable, "-P", "-m", "mjx_reinforce.envs", "my_arm:Arm"],
-        cwd=ROOT / "experiments",
+        cwd=ROOT / "experiments" / "examples",
         env=os.environ | {"PYTHONPATH": str(ROOT)},
         capture_output=True,
         text=True,

@@ -13,7 +13,7 @@ from places import ROOT
 
 from mjx_reinforce import envs, new
 
-EXPERIMENTS = ROOT / "experiments"
+EXAMPLES = ROOT / "experiments" / "examples"
 SENSED = """<mujoco><option timestep="0.002"/><worldbody>
   <body name='say "it"'><freejoint/><geom size="0.1"/><site name="end-effector"/>
     <body><joint axis="0 1 0"/><geom size="0.1"/></body></body></worldbody>
@@ -24,7 +24,7 @@ def test_the_arm_learns_to_reach(tmp_path):
     command = [sys.executable, "-m", "mjx_reinforce.train", "--env", "my_arm:Arm"]
     options = ["--num-episodes", "64", "--env-steps", "300_000", "--num-seeds", "2"]
     output = ["--output", str(tmp_path / "arm")]
-    subprocess.run([*command, *options, *output], check=True, capture_output=True, cwd=EXPERIMENTS)
+    subprocess.run([*command, *options, *output], check=True, capture_output=True, cwd=EXAMPLES)
     with (tmp_path / "arm" / "metrics.csv").open() as file:
         rows = [*csv.DictReader(file)]
     returns = [float(row["eval_return"]) for row in rows if row["seed"] == "0"]
@@ -32,7 +32,7 @@ def test_the_arm_learns_to_reach(tmp_path):
 
 
 def test_the_arm_is_paid_for_the_distance_of_the_ball(monkeypatch):
-    monkeypatch.syspath_prepend(EXPERIMENTS)
+    monkeypatch.syspath_prepend(EXAMPLES)
     env = envs.make("my_arm:Arm")
     qpos, qvel = env.initial(jax.random.key(0))
     assert (qpos.shape, qvel.shape, env.action_size) == ((6,), (6,), 3)
@@ -44,7 +44,7 @@ def test_the_arm_is_paid_for_the_distance_of_the_ball(monkeypatch):
 
 
 def test_a_model_becomes_a_class_that_plays(tmp_path, monkeypatch, capsys):
-    shutil.copy(EXPERIMENTS / "my_arm.xml", tmp_path / "my_robot-2.xml")
+    shutil.copy(EXAMPLES / "my_arm.xml", tmp_path / "my_robot-2.xml")
     monkeypatch.chdir(tmp_path)
     new.main(["my_robot-2.xml"])
     said = capsys.readouterr().out
@@ -90,7 +90,7 @@ def test_names_of_a_model_cannot_break_the_class(tmp_path, monkeypatch):
     ],
 )
 def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
-    arm = (EXPERIMENTS / "my_arm.xml").read_text()
+    arm = (EXAMPLES / "my_arm.xml").read_text()
     texts = {"arm": arm, "still": "<mujoco/>", "broken": "<mujoco"}
     texts["pgs"] = arm.replace("<option", '<option solver="PGS"')
     for name, text in texts.items():

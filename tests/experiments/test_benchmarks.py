@@ -2,9 +2,9 @@
 
 import pytest
 
-import benchmark_rows as rows
-import benchmark_tables as tables
-from benchmark_peers import c_mujoco, warp_room
+from experiments.kit.rows import threads
+from experiments.speed.benchmark import rows, tables
+from experiments.speed.benchmark.peers import c_mujoco, warp_room
 
 ROW = {
     "date": "2026-11-24T12:00:00",
@@ -57,7 +57,7 @@ def test_peers_say_their_precision_and_settings():
     candidate = c_mujoco("InvertedPendulum-v5", batch=2, steps=1)
     candidate.run()
     assert (candidate.env_steps, candidate.row["precision"]) == (2, "float64")
-    assert f"{rows.threads()} threads; NEWTON, 100 iterations" in candidate.row["settings"]
+    assert f"{threads()} threads; NEWTON, 100 iterations" in candidate.row["settings"]
 
 
 def test_mujoco_warp_has_room_by_the_model():

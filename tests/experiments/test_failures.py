@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-import failures
-import failures_answers as answers
-import failures_measures as measures
-import failures_page
-from failures_runs import Measured, Setting, train
+from experiments.studies.failures import __main__ as failures
+from experiments.studies.failures import answers, measures, page
+from experiments.studies.failures.runs import Measured, Setting, train
 
 UPDATES = {
     # seed 0 solves and stays, 1 never solves, 2 falls in an update without a gradient, 3 with one
@@ -100,4 +98,4 @@ def test_bounded_scale_and_budget_hold_in_a_training():
 def test_the_page_is_what_the_script_writes():
     kept = measures.load(failures.DATA)
     written = (failures.DOCS / "failures.md").read_text("utf-8")
-    assert failures_page.page(kept, answers.arms(kept)) == written
+    assert page.page(kept, answers.arms(kept)) == written

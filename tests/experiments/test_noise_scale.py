@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from toys import Drift
 
-import noise_scale as module
+from experiments.studies import noise_scale as module
+from experiments.studies.noise_scale import Settings, episode_gradients, noise_scale, rows
 from mjx_reinforce import leave_one_out, mlp_policy, normal, rollout
 from mjx_reinforce.learners.gradients import accumulate_gradient
 from mjx_reinforce.learners.reinforce import _surrogate
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.settings.defaults import of_task
-from noise_scale import Settings, episode_gradients, noise_scale, rows
 
 
 def test_by_hand():

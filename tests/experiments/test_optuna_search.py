@@ -9,6 +9,8 @@ import pytest
 
 from mjx_reinforce.settings.config import Config
 
+MODULE = "experiments.examples.optuna_search"
+
 
 class Trial:
     """Suggests the lower ends; is hopeless from its second moment on, if it is the second."""
@@ -52,9 +54,9 @@ def module(monkeypatch):
         trial=types.SimpleNamespace(TrialState=types.SimpleNamespace(PRUNED="pruned")),
     )
     monkeypatch.setitem(sys.modules, "optuna", fake)
-    monkeypatch.delitem(sys.modules, "optuna_search", raising=False)
-    yield importlib.import_module("optuna_search")
-    sys.modules.pop("optuna_search", None)
+    monkeypatch.delitem(sys.modules, MODULE, raising=False)
+    yield importlib.import_module(MODULE)
+    sys.modules.pop(MODULE, None)
 
 
 def test_a_hopeless_trial_is_ended_and_told_as_such(module, monkeypatch):
@@ -81,6 +83,6 @@ def test_a_hopeless_trial_is_ended_and_told_as_such(module, monkeypatch):
 
 def test_without_optuna_the_remedy_is_said(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
-    monkeypatch.delitem(sys.modules, "optuna_search", raising=False)
+    monkeypatch.delitem(sys.modules, MODULE, raising=False)
     with pytest.raises(SystemExit, match="pip install optuna"):
-        importlib.import_module("optuna_search")
+        importlib.import_module(MODULE)

@@ -13,7 +13,7 @@ from places import ROOT
 from mjx_reinforce import envs, registry
 from mjx_reinforce.envs import models
 
-SCRIPT = ROOT / "experiments" / "own_model.py"
+SCRIPT = ROOT / "experiments" / "examples" / "own_model.py"
 ONE_JOINT = """
 <mujoco>
   <option {option}/>

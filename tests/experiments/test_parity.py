@@ -1,8 +1,9 @@
 """Every environment against the installed Gymnasium, in float64, and the models field by field.
 
 MuJoCo's constraint solver stops at a tolerance of 1e-8; here it goes on to the optimum, by Newton's
-method for all tasks, so that what is left are differences of the models. ``experiments/parity.py``
-compares them as they are, with more states and in single precision too.
+method for all tasks, so that what is left are differences of the models.
+``experiments.checks.parity`` compares them as they are, with more states and in single precision
+too.
 """
 
 import gymnasium
@@ -11,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import parity
-import parity_tables
+from experiments.checks.parity import __main__ as parity
+from experiments.checks.parity import tables
+from experiments.checks.parity.native import Native
+from experiments.checks.parity.sides import Ours, make_peer
+from experiments.checks.parity.states import draw_states
 from mjx_reinforce import envs
 from mjx_reinforce.engines.native import available
-from parity_native import Native
-from parity_sides import Ours, make_peer
-from parity_states import draw_states
 
 NUM_STATES = 64
 IDS = [id for id in envs.names() if not id.endswith("-v0")]  # CartPole-v0 is v1, cut short
@@ -159,9 +160,9 @@ def test_rows_in_a_file_become_the_table(tmp_path):
     row |= {"qpos": 4.16e-9, "qvel": 0.14, "observation": 55.3, "return_p_value": 0.294}
     parity.append(path, [row | {"qpos": 1.0}], made)
     parity.append(path, [row, row | {"dtype": "float32"}], made)
-    rows = parity_tables.read(path)
+    rows = tables.read(path)
     assert all(made["jax"] == jax.__version__ for made in rows)
-    last = parity_tables.errors(rows, "native").splitlines()[-1]
+    last = tables.errors(rows, "native").splitlines()[-1]
     moved = "4e-9 / 1e-1"
     assert last == f"| Hopper-v5 | 5 | {moved} | 55 | 0 | {moved} | 0 | 0, 0 | 0.29, 0.29 |"
-    assert "Hopper" not in parity_tables.errors(rows, "vmap")
+    assert "Hopper" not in tables.errors(rows, "vmap")

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from places import ROOT
 
-import peers
-import peers_rows as rows
-import peers_settings as settings
+from experiments.kit import rows as kit
+from experiments.speed.peers import __main__ as peers
+from experiments.speed.peers import rows, settings
+from experiments.speed.peers.clock import Budgets, Clock
 from mjx_reinforce import envs
 from mjx_reinforce.types import Box
-from peers_clock import Budgets, Clock
 
 PUBLISHED = ROOT / "docs" / "published.csv"
 FOUND = rows.result(60, 61.25, 5000, np.array([1.0, 2.0, 6.0]))
@@ -54,8 +54,9 @@ def test_budgets_are_in_order():
 
 def test_rows_come_back(tmp_path):
     path = tmp_path / "docs" / "rows.csv"
-    rows.append(path, ROW)
-    rows.append(path, ROW | {"seed": 4, "settings": rows.words({"a": 1, "b": "x, y"})})
+    kit.append(path, [ROW], rows.COLUMNS)
+    other = ROW | {"seed": 4, "settings": kit.words({"a": 1, "b": "x, y"})}
+    kit.append(path, [other], rows.COLUMNS)
     back = rows.read(path)
     assert [row["seed"] for row in back] == [3, 4]
     assert back[0]["mean_return"] == 3.0
@@ -65,8 +66,9 @@ def test_rows_come_back(tmp_path):
 
 
 def test_a_row_has_every_column(tmp_path):
+    other = {k: ROW[k] for k in ROW if k != "task"} | {"more": 1}
     with pytest.raises(ValueError, match=r"columns that do not fit: \['more', 'task'\]"):
-        rows.append(tmp_path / "rows.csv", {k: ROW[k] for k in ROW if k != "task"} | {"more": 1})
+        kit.append(tmp_path / "rows.csv", [other], rows.COLUMNS)
 
 
 def test_every_task_has_settings_and_their_source():
@@ -88,7 +90,7 @@ def test_every_task_has_settings_and_their_source():
 
 
 def test_actions_are_rescaled_to_the_bounds():
-    from peers_brax import Rescaled
+    from experiments.speed.peers.brax import Rescaled
 
     env = envs.make("ContinuousCartPole-v0")
     env.action_space = Box(np.array([-0.5]), np.array([0.1]))
@@ -103,7 +105,7 @@ def test_actions_are_rescaled_to_the_bounds():
 
 
 def test_a_return_ends_with_its_episode():
-    import peers_brax
+    from experiments.speed.peers import brax as peers_brax
 
     env = envs.make("ContinuousCartPole-v0")
     keys = jax.random.split(jax.random.key(0), 3)
@@ -115,7 +117,7 @@ def test_a_return_ends_with_its_episode():
 
 
 def test_brax_trains_on_our_environments():
-    import peers_brax
+    from experiments.speed.peers import brax as peers_brax
 
     env = peers_brax.Rescaled(envs.make("ContinuousCartPole-v0"))
     few = {"num_envs": 64, "batch_size": 64, "num_minibatches": 8}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from saved_runs import change, change_arrays, make_run
 
-import results_pretrained
+from experiments.studies.results import pretrained
 from mjx_reinforce import load_policy
 from mjx_reinforce.files import read_json
 from mjx_reinforce.runs import command_line
@@ -45,7 +45,7 @@ def test_the_best_of_several_runs_is_packed(tmp_path):
     for name, returns in (("a", [90.0, 1.0, 2.0]), ("b/c", [1.0, 9.0, 2.0]), ("d", [1.0, 2.0, 3])):
         change(finished(runs / name) / "summary.json", final_returns=returns)
     change(finished(runs / "unfinished") / "summary.json", status="interrupted")
-    said = results_pretrained.pack(runs, tmp_path / "out", 64)
+    said = pretrained.pack(runs, tmp_path / "out", 64)
     assert len(said) == 1
     facts = read_json(tmp_path / "out" / "CartPole-v1" / "provenance.json")
     _, packed = load_policy(tmp_path / "out" / "CartPole-v1", 0)
@@ -69,7 +69,7 @@ def test_the_best_of_several_runs_is_packed(tmp_path):
 def test_the_command_gives_the_settings_again():
     config = of_task("CartPole-v1", 7000, 5)
     written = json.loads(json.dumps(vars(config))) | {"standardize": False, "hidden_sizes": [8, 4]}
-    line = shlex.split(results_pretrained.command(written))
+    line = shlex.split(pretrained.command(written))
     assert line[:3] == ["python", "-m", "mjx_reinforce.train"]
     again = command_line.parse(line[3:])
     assert vars(again) | {"standardize": True} == vars(config) | {"hidden_sizes": (8, 4)}
@@ -78,4 +78,4 @@ def test_the_command_gives_the_settings_again():
 
 def test_no_run_is_refused(tmp_path):
     with pytest.raises(ValueError, match="has no run of a task of this package that has ended"):
-        results_pretrained.pack(tmp_path, tmp_path / "out", 8)
+        pretrained.pack(tmp_path, tmp_path / "out", 8)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from toys import Toy, ToyState
 
-import reproduce
+from experiments.studies.reproduce import __main__ as reproduce
+from experiments.studies.reproduce.cases import CASES, load_reference
+from experiments.studies.reproduce.mistakes import clamped_log_prob, stale_starts
+from experiments.studies.reproduce.statistics import compare, rank_test, reached, windowed
 from mjx_reinforce import Box, reinforce
 from mjx_reinforce.learners.estimators import reward_to_go
 from mjx_reinforce.policies.distributions.truncated_normal import truncated_normal
 from mjx_reinforce.settings.config import check
 from mjx_reinforce.settings.presets import PRESETS
-from reproduce_cases import CASES, load_reference
-from reproduce_mistakes import clamped_log_prob, stale_starts
-from reproduce_statistics import compare, rank_test, reached, windowed
 
 RECORD = {"every_updates": 50, "window_updates": 50, "seeds": {"1": [1.0, 2.0, 3.0], "2": [5.0]}}
 

@@ -9,17 +9,10 @@ import tarfile
 import numpy as np
 import pytest
 
-import results_files
-import results_page
-import results_runs
-import tuning
-from mjx_reinforce.export.run_files import read_run
-from mjx_reinforce.files import read_json
-from mjx_reinforce.reports.statistics import Estimate, iqm
-from mjx_reinforce.runs import command_line
-from mjx_reinforce.settings.config import Config, check
-from mjx_reinforce.sweeps.designs.design import check_design
-from results_measures import (
+from experiments.studies.results import files
+from experiments.studies.results import page as results_page
+from experiments.studies.results import runs as results_runs
+from experiments.studies.results.measures import (
     compare,
     curves,
     least_share_solved,
@@ -28,7 +21,14 @@ from results_measures import (
     steps_quantile,
     verdict,
 )
-from results_tasks import TASKS, settings_of, sweep_settings_of
+from experiments.studies.results.tasks import TASKS, settings_of, sweep_settings_of
+from experiments.studies.tuning import __main__ as tuning
+from mjx_reinforce.export.run_files import read_run
+from mjx_reinforce.files import read_json
+from mjx_reinforce.reports.statistics import Estimate, iqm
+from mjx_reinforce.runs import command_line
+from mjx_reinforce.settings.config import Config, check
+from mjx_reinforce.sweeps.designs.design import check_design
 
 PENDULUM, REACHER = TASKS["InvertedPendulum-v5"], TASKS["Reacher-v5"]
 
@@ -216,17 +216,17 @@ def kept(tmp_path):
     write_sweep(runs / "sensitivity" / PENDULUM.name, PENDULUM)
     rows = [
         {"policy": policy, "seed": 3, "simulation": name, "episode": i, "return": value + i % 2}
-        for policy in results_files.POLICIES
+        for policy in files.POLICIES
         for name, value in (("ours", 998), ("gymnasium 1.4.0", 998 if policy == "best" else 900))
         for i in range(20)
     ]
-    results_files.write_played(runs / "play" / f"{PENDULUM.name}.csv", rows)
-    results_files.gather(TASKS.values(), runs, tmp_path / "kept")
+    files.write_played(runs / "play" / f"{PENDULUM.name}.csv", rows)
+    files.gather(TASKS.values(), runs, tmp_path / "kept")
     return tmp_path / "kept"
 
 
 def test_the_page_says_what_was_measured_and_what_is_missing(kept, tmp_path):
-    parts = results_files.load(TASKS.values(), kept)
+    parts = files.load(TASKS.values(), kept)
     docs = tmp_path / "docs"
     (docs / "films").mkdir(parents=True)
     (docs / "films" / f"{PENDULUM.name}-best.gif").touch()
@@ -247,7 +247,7 @@ def test_the_page_says_what_was_measured_and_what_is_missing(kept, tmp_path):
     assert f"Not played yet: {REACHER.name}." in page
     assert "Of 2 policies, 1 have" in page
     assert f"[film](films/{PENDULUM.name}-best.gif)" in page
-    assert f"-{results_files.POLICIES[1]}.gif" not in page
+    assert f"-{files.POLICIES[1]}.gif" not in page
     assert f"since their episodes stayed short: {PENDULUM.name} 16 of " in page
     rate = settings_of(PENDULUM, 1, 1).learning_rate / 3
     assert f"| 16 | 1,000 | solved 100.0 % | learning rate {rate:.6g}: 0.0 % | none |" in page
@@ -264,13 +264,13 @@ def test_what_is_packed_elsewhere_gives_the_same_page(kept, tmp_path):
         for name in ("policy.json", "actor.npz"):
             (runs / task.name / "policy" / name).write_text(task.name)
     path = tmp_path / "packed.tar.gz"
-    assert results_files.pack(tasks, runs, path) == [PENDULUM.name, REACHER.name]
+    assert files.pack(tasks, runs, path) == [PENDULUM.name, REACHER.name]
     with tarfile.open(path) as archive:
         archive.extractall(here, filter="data")
     assert not list(here.rglob("metrics.csv"))
     assert results_runs.ended(here / REACHER.name)
     assert read_run(here / REACHER.name).env == REACHER.env
-    results_files.gather(TASKS.values(), here, tmp_path / "again")
+    files.gather(TASKS.values(), here, tmp_path / "again")
     for path in (tmp_path / "again").iterdir():
         assert path.read_bytes() == (kept / path.name).read_bytes()
     assert len(list((tmp_path / "again").iterdir())) == 6
@@ -281,7 +281,7 @@ def test_results_from_before_seeds_had_starts_of_their_own_say_so(kept, tmp_path
     facts = json.loads(path.read_text())
     del facts["settings"]["test_episodes"]
     path.write_text(json.dumps(facts))
-    results = results_files.load((PENDULUM, REACHER), kept)
+    results = files.load((PENDULUM, REACHER), kept)
     said = "the choice of the starts out: "
     assert f"{said}{REACHER.name}.\n" in results_page.page(results, tmp_path)
 
@@ -289,7 +289,7 @@ def test_results_from_before_seeds_had_starts_of_their_own_say_so(kept, tmp_path
 def test_the_page_without_sweeps_and_games(kept, tmp_path):
     for kind in ("sensitivity", "play"):
         (kept / f"{PENDULUM.name}-{kind}.csv").unlink()
-    page = results_page.page(results_files.load(TASKS.values(), kept), tmp_path)
+    page = results_page.page(files.load(TASKS.values(), kept), tmp_path)
     assert "## In Gymnasium" not in page
     assert "## How much each setting matters" not in page
     assert "not played" in page
@@ -297,12 +297,12 @@ def test_the_page_without_sweeps_and_games(kept, tmp_path):
 
 def test_a_page_of_nothing_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no result yet"):
-        results_page.write(results_files.load(TASKS.values(), tmp_path), tmp_path)
+        results_page.write(files.load(TASKS.values(), tmp_path), tmp_path)
 
 
 def test_unfinished_runs_are_not_gathered(tmp_path):
     run = tmp_path / "runs" / PENDULUM.name
     write_run(run, PENDULUM, [1.0, 2.0], 950.0)
     (run / "summary.json").write_text('{"status": "interrupted"}')
-    results_files.gather([PENDULUM], tmp_path / "runs", tmp_path / "kept")
-    assert results_files.load([PENDULUM], tmp_path / "kept") == [PENDULUM]
+    files.gather([PENDULUM], tmp_path / "runs", tmp_path / "kept")
+    assert files.load([PENDULUM], tmp_path / "kept") == [PENDULUM]

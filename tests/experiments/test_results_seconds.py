@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-import results_clock
-import results_readme
-import results_seconds
+from experiments.studies.results import clock, seconds
+from experiments.studies.results import readme as results_readme
 from mjx_reinforce.files import write_json
 
 GPU = {"device": "NVIDIA X", "git_commit": "0123456789abcdef", "cpu": None, "cores": None}
@@ -34,12 +33,12 @@ def folder(tmp_path):
     _run(tmp_path / "runs" / "young", CPU, [0.0], [[0]])
     (tmp_path / "runs" / "no run").mkdir()
     (tmp_path / "kept").mkdir()
-    results_seconds.gather(tmp_path / "runs", tmp_path / "kept")
+    seconds.gather(tmp_path / "runs", tmp_path / "kept")
     return tmp_path
 
 
 def test_returns_are_those_after_a_minute_and_at_the_end(folder):
-    gpu, cpu = results_seconds.load(folder / "kept")
+    gpu, cpu = seconds.load(folder / "kept")
     assert (gpu.device, cpu.device) == ("NVIDIA X", "zen, 2 of 8 threads")
     np.testing.assert_array_equal(gpu.minute, [4, 8])
     np.testing.assert_array_equal(gpu.final, [11, 21])
@@ -49,7 +48,7 @@ def test_returns_are_those_after_a_minute_and_at_the_end(folder):
 
 
 def test_curves_are_means_at_the_last_evaluation(folder):
-    curves = results_seconds.curves(folder / "kept")
+    curves = seconds.curves(folder / "kept")
     gpu = curves["Hopper-v5", "NVIDIA X"]
     assert gpu["seconds"][0] == pytest.approx(30)
     assert gpu["seconds"][-1] == pytest.approx(90)
@@ -58,13 +57,13 @@ def test_curves_are_means_at_the_last_evaluation(folder):
 
 
 def test_what_is_kept_of_a_task_and_machine_is_replaced(folder):
-    before = results_seconds.load(folder / "kept")
-    results_seconds.gather(folder / "runs", folder / "kept")
-    after = results_seconds.load(folder / "kept")
+    before = seconds.load(folder / "kept")
+    seconds.gather(folder / "runs", folder / "kept")
+    after = seconds.load(folder / "kept")
     assert [x.rows for x in after] == [x.rows for x in before]
     _run(folder / "more" / "gpu", GPU, [0.0, 50.0], [[0], [2]], test=[3.0])
-    results_seconds.gather(folder / "more", folder / "kept")
-    gpu, cpu = results_seconds.load(folder / "kept")
+    seconds.gather(folder / "more", folder / "kept")
+    gpu, cpu = seconds.load(folder / "kept")
     np.testing.assert_array_equal(gpu.final, [3])
     assert cpu.rows == before[1].rows
 
@@ -83,7 +82,7 @@ def test_the_page_sets_others_beside_ours(folder):
         'Hopper-v5,Stable-Baselines3 PPO,"z, 2 of 8 threads",600,5\n'
         'Hopper-v5,Stable-Baselines3 SAC,"other, 4 of 8 threads",60,9\n'
     )
-    page = "\n\n".join(results_clock.sections(folder / "kept", docs))
+    page = "\n\n".join(clock.sections(folder / "kept", docs))
     assert "| Hopper-v5 | 2 | 6.00, 4.00 | 16.0 (" in page
     assert "| 12.0 (B, 3 million) | none |" in page
     assert (
@@ -91,7 +90,7 @@ def test_the_page_sets_others_beside_ours(folder):
         in page
     )
     assert (docs / "results" / "seconds.png").exists()
-    assert results_clock.sections(folder / "nothing", docs) == []
+    assert clock.sections(folder / "nothing", docs) == []
 
 
 def test_the_table_of_the_readme(folder):
@@ -102,7 +101,7 @@ def test_the_table_of_the_readme(folder):
     )
     readme = folder / "README.md"
     readme.write_text("Before.\n<!-- results -->\nold\n<!-- end -->\nAfter.\n")
-    results_readme.write(results_seconds.load(folder / "kept"), docs, readme)
+    results_readme.write(seconds.load(folder / "kept"), docs, readme)
     text = readme.read_text()
     assert text.startswith("Before.\n<!-- results -->\n| task |")
     assert "| Hopper-v5 | 6.0 | 6.0 | 16.0 in 90.0 s | 3,000 |\n" in text

@@ -4,15 +4,21 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import seeds_few
-import seeds_findings
-import seeds_page
-import seeds_runs
-import seeds_words
+from experiments.studies.seeds import few as seeds_few
+from experiments.studies.seeds import findings, words
+from experiments.studies.seeds import page as seeds_page
+from experiments.studies.seeds import runs as seeds_runs
+from experiments.studies.seeds.answers import (
+    CONTRASTS,
+    HALVES,
+    at_best,
+    best_rates,
+    effects,
+    paired_iqm_difference,
+)
+from experiments.studies.seeds.few import any_pair, few_seeds
+from experiments.studies.seeds.runs import Task, load, measure, save
 from mjx_reinforce.reports.statistics import iqm
-from seeds_answers import CONTRASTS, HALVES, at_best, best_rates, effects, paired_iqm_difference
-from seeds_few import any_pair, few_seeds
-from seeds_runs import Task, load, measure, save
 
 #: With a rate more than in the study, so that two are below its best and two are not.
 FACTORS = seeds_runs.FACTORS | {"learning_rate": [3e-3, 1e-2, 3e-2, 1e-1]}
@@ -147,7 +153,7 @@ def test_rates_without_a_failure_have_an_interval(tasks):
 
 def test_the_page_says_what_the_numbers_are(tasks, tmp_path, monkeypatch):
     monkeypatch.setattr(seeds_few, "_DRAWS", 20)
-    seeds_page.write(seeds_findings.find(tasks, COUNTS), tmp_path)
+    seeds_page.write(findings.find(tasks, COUNTS), tmp_path)
     page = (tmp_path / "seeds.md").read_text("utf-8")
     assert "a learned baseline is better than no baseline on Up-v0; a learned baseline is" in page
     assert "| gamma^t against no gamma^t | no difference found | no difference found |" in page
@@ -261,14 +267,12 @@ def test_what_is_better_by_another_measure_says_by_which(monkeypatch):
     steps = np.random.default_rng(1).uniform(300, 700, task.steps_to_solve.shape)
     steps[FACTORS["estimator"].index("value-baseline")] -= 300
     task = task._replace(steps_to_solve=steps)
-    answers = seeds_words.short_answers(seeds_findings.find([task], COUNTS))
+    answers = words.short_answers(findings.find([task], COUNTS))
     (row,) = [line for line in answers.splitlines() if line.startswith(f"| {LEARNED.name} |")]
     assert "a learned baseline: much better (9" in row
     assert row.endswith("% in env steps to solve) |")
     failed = np.full_like(task.final_return, 60.0)
     failed[FACTORS["estimator"].index("value-baseline"), ..., :80:2] = 0.0  # of one half alone
-    found = seeds_findings.find([task._replace(final_return=failed)], COUNTS)
-    (row,) = [
-        line for line in seeds_words.short_answers(found).splitlines() if LEARNED.name in line
-    ]
+    found = findings.find([task._replace(final_return=failed)], COUNTS)
+    (row,) = [line for line in words.short_answers(found).splitlines() if LEARNED.name in line]
     assert row.endswith("better in env steps to solve, worse in solved at the end |")

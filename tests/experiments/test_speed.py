@@ -3,15 +3,17 @@
 import json
 import re
 
-import speed
+from experiments.speed import over_time
 
 
 def test_rows_are_explained_and_drawn(tmp_path):
-    text = (speed.DOCS / "speed.jsonl").read_text("utf-8")
+    text = (over_time.DOCS / "speed.jsonl").read_text("utf-8")
     (tmp_path / "speed.jsonl").write_text(text, "utf-8")
-    speed.main(speed.Settings(measure=False), tmp_path)
+    over_time.main(over_time.Settings(measure=False), tmp_path)
     assert (tmp_path / "speed.png").stat().st_size > 1000
-    explained = set(re.findall(r"^\| `(\w+)`", (speed.DOCS / "speed.md").read_text("utf-8"), re.M))
+    explained = set(
+        re.findall(r"^\| `(\w+)`", (over_time.DOCS / "speed.md").read_text("utf-8"), re.M)
+    )
     for line in text.splitlines():
         assert {
             name for name in json.loads(line) if name.endswith(("second", "seconds"))

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import peers_rows
-import trainers
+from experiments.kit import rows as kit
+from experiments.speed.trainers import __main__ as trainers
 from mjx_reinforce.vector import for_brax
 
 ROW = dict.fromkeys(trainers.COLUMNS, "") | {"program": "P", "task": "T-v1", "num_envs": 8}
@@ -22,14 +22,14 @@ if __name__ == "__main__":
 
 def test_one_statement_is_changed():
     pytest.importorskip("torch")
-    import trainers_cleanrl
+    from experiments.speed.trainers import cleanrl_ppo
 
-    changed = trainers_cleanrl.changed(PROGRAM).splitlines()
+    changed = cleanrl_ppo.changed(PROGRAM).splitlines()
     before = PROGRAM.splitlines()
-    assert changed == [*before[:3], "    " + trainers_cleanrl.LINE, before[-1]]
+    assert changed == [*before[:3], "    " + cleanrl_ppo.LINE, before[-1]]
     for text in ("x = 1\n", PROGRAM + "    envs = 1\n"):
         with pytest.raises(ValueError, match=r"in [02] places; expected one"):
-            trainers_cleanrl.changed(text)
+            cleanrl_ppo.changed(text)
 
 
 def test_the_table_tells_means_with_intervals_and_median_seconds(tmp_path):
@@ -39,7 +39,7 @@ def test_the_table_tells_means_with_intervals_and_median_seconds(tmp_path):
             told = {"env_steps": 2048, "mean_return": value, "start_seconds": 1}
             times = {"seconds": seed + 1.2, "cpu_seconds": seed * 9}
             row = ROW | told | times | {"environment": side, "seed": seed}
-            peers_rows.append(path, row, trainers.COLUMNS)
+            kit.append(path, [row], trainers.COLUMNS)
     line = trainers.table(trainers.read(path)).splitlines()[2]
     *case, steps, seeds, theirs, ours, seconds, _ = line.strip("| ").split(" | ")
     assert [*case, steps, seeds] == ["P", "T-v1", "8", "2,048", "3"]
@@ -67,10 +67,10 @@ def test_stable_baselines3_is_trained_on_both_sides(tmp_path, capsys):
 @pytest.mark.filterwarnings("ignore")
 def test_rejax_maps_one_environment_in_one_call():
     pytest.importorskip("rejax")
-    import trainers_rejax
+    from experiments.speed.trainers import rejax_ppo
 
     task = "InvertedPendulum-v5"
-    one, many = trainers_rejax.OneOfMany(task), for_brax.make(task, 3)
+    one, many = rejax_ppo.OneOfMany(task), for_brax.make(task, 3)
     keys = jax.random.split(jax.random.PRNGKey(0), 3)
     first = jax.vmap(lambda key: jax.random.fold_in(key, 0))(keys)
     (obs, state), other = jax.vmap(one.reset)(keys), many.reset(first)

@@ -5,10 +5,10 @@ import json
 import jax
 import numpy as np
 
+from experiments.kit.trainings import results
 from mjx_reinforce.export.policy_files import build_policy, save_policy
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.policies.normalize import Normalizer
-from trainings import results
 
 SPACES = {
     "InvertedPendulum-v5": {

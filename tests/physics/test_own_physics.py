@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 import pytest
 
-import own_models
-from feature_models import MODELS
+from experiments.checks import own_models
+from experiments.checks.feature_models import MODELS
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
 

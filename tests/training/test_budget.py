@@ -8,12 +8,12 @@ import re
 import numpy as np
 import pytest
 
+from experiments.kit.trainings import results
 from mjx_reinforce.export.policy_files import load_policy
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.settings import defaults, tuned
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.settings.defaults import of_task
-from trainings import results
 
 SMALL = ["--env", "Drift-v0", "--num-seeds", "3", "--eval-episodes", "2", "--num-episodes", "4"]
 SMALL += ["--hidden-sizes", "4"]

@@ -8,7 +8,7 @@ from brax.envs.wrappers.training import wrap
 from brax.training.agents.ppo import train as ppo
 from toys import Drifting
 
-import peers_brax
+from experiments.speed.peers import brax as peers_brax
 from mjx_reinforce import Box, Discrete, envs
 from mjx_reinforce.vector import for_brax
 

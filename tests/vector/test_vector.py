@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from toys import Drifting
 
+from experiments.checks.vector_parity import GymnasiumSide, compare
 from mjx_reinforce import Box, envs, fused, make_vec
 from mjx_reinforce.engines.native.counter import key_of
 from mjx_reinforce.engines.native.mapping import machine_map
 from mjx_reinforce.vector.episodes import AUTORESETS
-from vector_parity import GymnasiumSide, compare
 
 SPACE = Box(np.array([-3.0]), np.array([1.0]))
 ENGINES = ("native", "fused", "vmap")

@@ -1,0 +1,261 @@
+"""Makes the rows of docs/benchmarks.csv: everything that README.md and the documents say of speed.
+
+    python -m experiments.speed.benchmark.all gpu --minutes 8 --commit $(git rev-parse HEAD)
+    python -m experiments.speed.benchmark.all cpu --minutes 4 --commit $(git rev-parse HEAD)
+
+Each task has a process of its own. All compile at once, on all cores. When all have (or six
+tenths of the minutes are over, and what has not compiled is left out), one after the other times
+its engines and peers, interleaved, while nothing else runs, and appends its rows: a call that is
+cut off keeps what was timed. On a CPU a process has two threads from its start, and all are timed
+on the same two cores (``taskset``). `tables.py` and `figure.py` make the tables
+and the figure.
+"""
+
+import concurrent.futures
+import dataclasses
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import IO, Literal, NamedTuple
+
+import tyro
+
+from experiments.kit.rows import now
+from experiments.speed.benchmark.rows import RAW, Candidate
+
+
+class Sizes(NamedTuple):
+    """How much of a task is timed on a GPU; episodes fill an H100 or an H200 once or more often.
+
+    batch, steps: of native's episodes
+    mjx: the episodes of plain MJX, each number that is tried
+    mjx_steps: their env steps
+    warp: the worlds of MuJoCo Warp, each number that is tried
+    train: native's training updates too
+    """
+
+    batch: int
+    steps: int
+    mjx: tuple[int, ...] = ()
+    mjx_steps: int = 0
+    warp: tuple[int, ...] = (8_192, 32_768)
+    train: bool = False
+
+
+#: What stands first is timed first, and so kept where a call is cut off.
+GPU = {
+    "InvertedPendulum-v5": Sizes(262_144, 200, (16_384, 65_536), 50, (32_768, 131_072), True),
+    "Hopper-v5": Sizes(33_792, 200, (8_192, 32_768), 10, train=True),
+    "HalfCheetah-v5": Sizes(33_792, 200, (8_192, 32_768), 10, train=True),
+    "Walker2d-v5": Sizes(33_792, 200, (32_768,), 5),
+    "Ant-v5": Sizes(33_792, 100, (32_768,), 2, train=True),
+    "Pusher-v5": Sizes(67_584, 100, (32_768,), 10),
+    "Reacher-v5": Sizes(540_672, 50, (16_384, 65_536), 50, (32_768, 131_072)),
+    "Swimmer-v5": Sizes(135_168, 200, (8_192,), 20, (32_768, 131_072)),
+    "InvertedDoublePendulum-v5": Sizes(135_168, 200, (4_096,), 20, (32_768, 131_072)),
+    "CartPole-v1": Sizes(262_144, 200, warp=()),
+    "Humanoid-v5": Sizes(33_792, 50),
+    "HumanoidStandup-v5": Sizes(33_792, 50),
+}
+#: Episodes and env steps of native's on two cores.
+CPU = {
+    "InvertedPendulum-v5": (8_192, 100),
+    "Hopper-v5": (2_048, 20),
+    "HalfCheetah-v5": (2_048, 20),
+    "Walker2d-v5": (2_048, 20),
+    "Ant-v5": (512, 20),
+    "Humanoid-v5": (512, 20),
+    "HumanoidStandup-v5": (512, 20),
+    "Pusher-v5": (2_048, 20),
+    "Reacher-v5": (2_048, 50),
+    "Swimmer-v5": (2_048, 50),
+    "InvertedDoublePendulum-v5": (2_048, 50),
+}
+#: The task that also shows the engines beside native on a CPU.
+SHOWN_ON_CPU = "InvertedPendulum-v5"
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Measure all that the documents say of speed, on a GPU or on two cores of a CPU."""
+
+    part: tyro.conf.Positional[Literal["gpu", "train", "cpu"]]
+    """gpu: rollouts; train: training on a GPU; cpu: rollouts on two cores."""
+    minutes: float = 5.0
+    """What this may take; what is not done by then is left out."""
+    csv: Path = RAW
+    """Where to append the rows."""
+    commit: str = ""
+    """Of the code that is measured."""
+    repeats: int = 4
+    """Timed runs of each row, after one that warms up."""
+    tasks: tuple[str, ...] = ()
+    """All of the part if not given."""
+    shrink: int = 1
+    """Divide episodes and worlds by this, to try the script; such rows are worth nothing."""
+    worker: str = ""
+    """The call that this process times its only task for."""
+
+
+def main() -> None:
+    """Starts a process for each task, or is one."""
+    settings = tyro.cli(Settings, description=__doc__)
+    if settings.worker:
+        work(settings)
+    else:
+        conduct(settings)
+
+
+def conduct(settings: Settings) -> None:
+    """Lets all tasks compile at once, then time one by one."""
+    began = time.monotonic()
+    date = now()
+    every = {"cpu": list(CPU), "gpu": list(GPU)}
+    every["train"] = [task for task, sizes in GPU.items() if sizes.train]
+    tasks = list(settings.tasks or every[settings.part])
+    started = {task: start(task, i, date, settings) for i, task in enumerate(tasks)}
+    with concurrent.futures.ThreadPoolExecutor(len(tasks)) as pool:
+        ready = {task: pool.submit(until, p.stdout, "compiled") for task, p in started.items()}
+        concurrent.futures.wait(ready.values(), timeout=0.6 * 60 * settings.minutes)
+        for task, process in started.items():
+            if not ready[task].done() or not ready[task].result():
+                print(f"{task}: left out, not compiled in time or failed", flush=True)
+                process.kill()
+        print(f"compiled after {time.monotonic() - began:.0f} s", flush=True)
+        for process in started.values():
+            left = settings.minutes * 60 - (time.monotonic() - began)
+            if process.poll() is None and left > 0:
+                if settings.part == "cpu":
+                    quiet = named(two_cores())
+                    move = ["taskset", "-acp", quiet, str(process.pid)]
+                    subprocess.run(move, check=True, stdout=subprocess.DEVNULL)
+                print(*go(process, left), sep="\n", flush=True)
+            process.kill()
+    print(f"{settings.part}: {time.monotonic() - began:.0f} s", flush=True)
+
+
+def start(task: str, index: int, date: str, settings: Settings) -> subprocess.Popen[str]:
+    """Starts a task's process; on a CPU, held to two of the machine's threads."""
+    command = [sys.executable, "-m", "experiments.speed.benchmark.all", settings.part]
+    command += ["--tasks", task, "--worker", date]
+    for name in ("minutes", "csv", "commit", "repeats", "shrink"):
+        command.append(f"--{name}={getattr(settings, name)}")
+    environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    if settings.part == "cpu":
+        environment["JAX_PLATFORMS"] = "cpu"
+        usable = sorted(os.sched_getaffinity(0))
+        first = 2 * (index % (len(usable) // 2))
+        command = ["taskset", "-c", named(usable[first : first + 2]), *command]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment, text=True)
+
+
+def two_cores() -> list[int]:
+    """Returns a hardware thread of each of two cores, or two threads where it has one core."""
+    usable = sorted(os.sched_getaffinity(0))
+    place = "/sys/devices/system/cpu/cpu{}/topology/thread_siblings_list"
+    cores = {}
+    for thread in usable:
+        siblings = Path(place.format(thread))
+        cores.setdefault(siblings.read_text() if siblings.exists() else thread, thread)
+    return list(cores.values())[:2] if len(cores) > 1 else usable[:2]
+
+
+def named(threads: list[int]) -> str:
+    """Returns threads as ``taskset`` takes them."""
+    return ",".join(str(thread) for thread in threads)
+
+
+def until(stream: IO[str] | None, word: str) -> bool:
+    """Reads lines up to a word; returns whether it came."""
+    return stream is not None and any(line.strip() == word for line in stream)
+
+
+def go(process: subprocess.Popen[str], seconds: float) -> list[str]:
+    """Lets a process time, for so long at most; returns what it printed."""
+    try:
+        return process.communicate("go\n", timeout=seconds)[0].splitlines()
+    except subprocess.TimeoutExpired:
+        return ["no time left"]
+
+
+def work(settings: Settings) -> None:
+    """Compiles one task's engines, waits for its turn, times and appends."""
+    import jax
+
+    from experiments.speed.benchmark.rows import append, facts, measure, speed
+
+    jax.config.update("jax_default_matmul_precision", "highest")
+    (task,) = settings.tasks
+    prepare = {"gpu": on_gpu, "train": trainings, "cpu": on_cpu}[settings.part]
+    candidates = prepare(task, settings.shrink)
+    worlds = GPU[task].warp if settings.part == "gpu" else ()
+    if worlds:
+        added(task, 128)  # compiles
+    print("compiled", flush=True)
+    if sys.stdin.readline().strip() != "go":
+        return
+    for number in worlds:
+        candidates += added(task, number // settings.shrink)
+    said = facts(settings.worker, settings.commit)
+    rows = [row | said for row in measure(candidates, settings.repeats)]
+    append(settings.csv, rows)
+    for row in rows:
+        words = (row[key] for key in ("task", "what", "engine", "precision", "batch"))
+        print(*words, f"{speed(row):.3g} env steps/s", sep=", ", flush=True)
+
+
+def added(task: str, worlds: int) -> list[Candidate]:
+    """MuJoCo Warp with so many worlds; where it fails, its reason is printed instead."""
+    from experiments.speed.benchmark.peers import mujoco_warp
+
+    try:
+        candidate = mujoco_warp(task, worlds)
+        candidate.run()
+    except Exception as error:  # whatever it raises, the other rows stand
+        print(f"{task}: MuJoCo Warp, {worlds} worlds: {error!r}", file=sys.stderr, flush=True)
+        return []
+    return [candidate]
+
+
+def on_gpu(task: str, shrink: int) -> list[Candidate]:
+    """Native, plain MJX and C MuJoCo."""
+    from experiments.speed.benchmark.ours import rollouts
+    from experiments.speed.benchmark.peers import c_mujoco
+
+    sizes = GPU[task]
+    few, *native = rollouts(task, "native", [128, sizes.batch // shrink], sizes.steps)
+    few.run()  # NVIDIA's driver translates a kernel, the same for any number, when it first runs
+    if not sizes.warp:
+        return native
+    batches = [batch // shrink for batch in sizes.mjx]
+    plain = rollouts(task, "plain MJX", batches, sizes.mjx_steps) if batches else []
+    return [*native, *plain, c_mujoco(task)]
+
+
+def trainings(task: str, shrink: int) -> list[Candidate]:
+    """Training updates of a 64-64 policy."""
+    from experiments.speed.benchmark.ours import training
+
+    return [training(task, "native", GPU[task].batch // shrink, 100)]
+
+
+def on_cpu(task: str, shrink: int) -> list[Candidate]:
+    """Native in both precisions beside C MuJoCo and Gymnasium, on the threads of this process."""
+    from experiments.speed.benchmark.ours import rollouts
+    from experiments.speed.benchmark.peers import peers
+
+    batch, steps = CPU[task]
+    batches = [batch // shrink]
+    candidates = rollouts(task, "native", batches, steps)
+    candidates += rollouts(task, "native", batches, steps, "float64")
+    if task == SHOWN_ON_CPU:
+        candidates += rollouts(task, "fused", batches, steps)
+        candidates += rollouts(task, "plain MJX", [128, 512], steps)
+    return candidates + peers(task)
+
+
+if __name__ == "__main__":
+    main()

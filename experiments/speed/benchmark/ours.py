@@ -1,0 +1,140 @@
+"""Our engines, as `python -m experiments.speed.benchmark` times them."""
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from experiments.speed.benchmark.rows import Candidate
+from mjx_reinforce import Actor, act, envs, load_policy, mlp_policy, reinforce
+from mjx_reinforce.engines.choice import ActingPolicy, choose
+from mjx_reinforce.learners.reinforce import default_distribution
+from mjx_reinforce.policies import normalize
+from mjx_reinforce.types import action_space, observation_size
+
+#: Name in the table -> engine, and the solver of the environment's physics.
+ENGINES = {
+    "plain MJX": ("vmap", "mjx"),
+    "plain MJX, 1 iteration": ("vmap", "fast"),
+    "vmap": ("vmap", "exact"),
+    "fused": ("fused", "exact"),
+    "native": ("native", "exact"),
+}
+
+
+@struct.dataclass
+class LoopState:
+    """A state of a looping environment, and where it starts again."""
+
+    inner: Any
+    start: Any
+    obs: jax.Array
+    reward: jax.Array
+    done: jax.Array
+
+
+class Loop:
+    """An environment whose episodes never end: they start again where they started."""
+
+    def __init__(self, env: Any, steps: int):
+        self.env, self.max_episode_steps = env, steps
+        self.action_size, self.action_space = env.action_size, action_space(env)
+
+    def reset(self, rng):
+        """Starts an episode, and remembers the start."""
+        state = self.env.reset(rng)
+        return LoopState(state, state, state.obs, state.reward, state.done)
+
+    def step(self, state, action):
+        """Steps, or goes back to the start where the episode is over."""
+        after = self.env.step(state.inner, action)
+        over = after.done > 0
+        inner = jax.tree.map(lambda s, x: jnp.where(over, s, x), state.start, after)
+        return LoopState(inner, state.start, inner.obs, after.reward, jnp.zeros_like(after.done))
+
+
+def rollouts(
+    env_id: str,
+    name: str,
+    batches: list[int],
+    steps: int,
+    precision: str = "float32",
+    *,
+    policy: Path | None = None,
+) -> list[Candidate]:
+    """Whole rollouts with a policy, its noise and all that an update needs, for every batch."""
+    candidates = []
+    with jax.enable_x64(precision == "float64"):
+        engine_name, solver = ENGINES[name]
+        env = Loop(make(env_id, solver), steps)
+        network, actor = the_policy(env, policy)
+        play_act = functools.partial(act, network)
+        began = time.perf_counter()
+        player = ActingPolicy(play_act, actor, network.distribution)
+        engine = choose(engine_name, env, player, steps)
+        choosing = time.perf_counter() - began  # machine code is made here
+        for batch in batches:
+
+            def play(actor, key, batch=batch):
+                sizes = {"num_episodes": batch, "horizon": steps}
+                return engine.rollout(env, play_act, actor, network.distribution, key, **sizes)
+
+            what = "rollout, untrained 16-32 policy" if policy is None else f"rollout, {policy}"
+            row = {"what": what, "engine": name, "task": env_id, "precision": precision}
+            row |= {"batch": batch, "steps": steps}
+            candidates.append(compiled(row, play, actor, batch * steps, choosing))
+    return candidates
+
+
+def training(
+    env_id: str, name: str, batch: int, steps: int, sizes: tuple[int, ...] = (64, 64)
+) -> Candidate:
+    """Whole updates in float32: rollout, estimator, gradient and optimiser."""
+    engine_name, solver = ENGINES[name]
+    env = Loop(make(env_id, solver), steps)
+    policy = mlp_policy(observation_size(env), default_distribution(action_space(env)), sizes)
+    began = time.perf_counter()
+    learner = reinforce(env, policy=policy, num_episodes=batch, engine=engine_name)
+    choosing = time.perf_counter() - began
+    state = learner.init(jax.random.key(0))
+
+    def update(state, key):
+        return learner.step(dataclasses.replace(state, key=key))
+
+    what = f"training, untrained {sizes[0]}-{sizes[1]} policy"
+    row = {"what": what, "engine": name, "task": env_id, "precision": "float32"}
+    row |= {"batch": batch, "steps": steps}
+    return compiled(row, update, state, batch * steps, choosing)
+
+
+def make(env_id: str, solver: str) -> Any:
+    """Builds an environment; one without a MuJoCo model has no solver."""
+    env = envs.make(env_id)
+    return envs.make(env_id, solver=solver) if hasattr(env, "mj_model") else env
+
+
+def the_policy(env: Any, directory: Path | None) -> tuple[Any, Actor]:
+    """A trained policy's first seed, or a fresh 16-32 network."""
+    if directory is not None:
+        return load_policy(directory, seed=0)
+    size = observation_size(env)
+    policy = mlp_policy(size, default_distribution(action_space(env)), (16, 32))
+    return policy, Actor(params=policy.init(jax.random.key(0)), normalizer=normalize.init(size))
+
+
+def compiled(
+    row: dict[str, Any], fn: Callable[..., Any], argument: Any, env_steps: int, before: float
+) -> Candidate:
+    """Compiles ``fn(argument, key)``, and notes how long that and what came before took (s)."""
+    started = time.perf_counter()
+    program = jax.jit(fn).lower(argument, jax.random.key(0)).compile()
+    row["compile_seconds"] = before + time.perf_counter() - started
+    row["device"] = jax.devices()[0].device_kind
+    keys = iter(jax.random.split(jax.random.key(1), 1000))
+    return Candidate(row, lambda: jax.block_until_ready(program(argument, next(keys))), env_steps)

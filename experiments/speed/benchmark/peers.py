@@ -1,0 +1,199 @@
+"""What a user would otherwise pick, as far as it is installed here, to be timed."""
+
+import functools
+import importlib.util
+import math
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments.kit.rows import threads
+from experiments.speed.benchmark.rows import Candidate
+from mjx_reinforce import envs
+
+#: Worlds that MuJoCo Warp simulates at once.
+WARP_WORLDS = (8192, 32768)
+#: Env steps that MuJoCo Warp's worlds have gone through before they are timed.
+WARP_BEFORE = 50
+#: What MuJoCo Warp may have too little room for: `OverflowType`, without the limits of iterations.
+WARP_ROOM = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZON")
+
+
+def peers(env_id: str) -> list[Candidate]:
+    """C MuJoCo on all threads; where it can run, MuJoCo Warp and Gymnasium's vector env."""
+    candidates = []
+    if hasattr(envs.make(env_id), "mj_model"):
+        candidates.append(c_mujoco(env_id))
+        if importlib.util.find_spec("warp") and jax.default_backend() == "gpu":
+            candidates += [mujoco_warp(env_id, batch) for batch in WARP_WORLDS]
+    if _in_gymnasium(env_id):
+        candidates.append(gymnasium_vector(env_id))
+    return candidates
+
+
+def c_mujoco(env_id: str, batch: int = 512, steps: int = 20) -> Candidate:
+    """``mujoco.rollout`` under random actions, on all threads, in double precision.
+
+    No policy; the states of all physics steps are recorded, which ``mujoco.rollout`` always does.
+    """
+    from mujoco import MjData, mj_getState, mj_stateSize, mjtState, rollout  # type: ignore
+
+    env = envs.make(env_id)
+    model = env.mj_model
+    full = mjtState.mjSTATE_FULLPHYSICS
+    start = np.empty(mj_stateSize(model, full))
+    mj_getState(model, MjData(model), start, full)
+    data = [MjData(model) for _ in range(threads())]
+    control = np.repeat(_actions(env, batch, steps), env.frame_skip, axis=1)
+    pool = rollout.Rollout(nthread=threads())
+
+    def run():
+        pool.rollout(model, data, np.tile(start, (batch, 1)), control)
+
+    row = {"what": "rollout, no policy", "engine": "C MuJoCo", "task": env_id}
+    row |= {"precision": "float64", "batch": batch, "steps": steps, "device": "cpu"}
+    row["settings"] = f"{threads()} threads; {options(model)}"
+    return Candidate(row, run, batch * steps)
+
+
+def mujoco_warp(env_id: str, batch: int, steps: int = 20) -> Candidate:
+    """MuJoCo Warp under constant random actions: no policy, no noise, nothing recorded.
+
+    Each run begins where the worlds have gone through ``WARP_BEFORE`` steps, so that what falls has
+    come to contacts. One CUDA graph plays an env step. There is room for what `warp_room` finds,
+    doubled until those steps need no more.
+
+    Raises (when run):
+      RuntimeError: a world came to need more.
+    """
+    import warp  # pyright: ignore
+    from mujoco import MjData, mj_forward  # type: ignore
+    from mujoco.mjx.third_party import mujoco_warp  # pyright: ignore
+    from mujoco.mjx.third_party.mujoco_warp._src.types import OverflowType  # pyright: ignore
+
+    warp.config.quiet = True
+    env = envs.make(env_id)
+    model = env.mj_model
+    data = MjData(model)
+    mj_forward(model, data)
+    started = time.perf_counter()
+    on_gpu = mujoco_warp.put_model(model)
+    on_gpu.opt.warn_overflow = 0  # said once, below
+    actions = _actions(env, batch, 1)[:, 0].astype(np.float32)
+    too_small = sum(OverflowType[name] for name in WARP_ROOM)
+
+    def begin(room):
+        worlds = mujoco_warp.put_data(model, data, nworld=batch, **room)
+        worlds.ctrl.assign(actions)
+
+        def play():
+            for _ in range(env.frame_skip):
+                mujoco_warp.step(on_gpu, worlds)
+
+        play()  # compiles
+        with warp.ScopedCapture() as capture:
+            play()
+        return worlds, capture.graph  # the graph has the addresses of the worlds alone
+
+    def go(worlds, graph, count):
+        for _ in range(count):
+            warp.capture_launch(graph)
+        warp.synchronize()
+        return OverflowType(int(np.bitwise_or.reduce(worlds.overflow.numpy())) & too_small)
+
+    room = warp_room(env_id)
+    kept = begin(room)
+    while go(*kept, WARP_BEFORE):
+        room = {name: 2 * size for name, size in room.items()}
+        kept = begin(room)
+    state = [getattr(kept[0], name) for name in ("qpos", "qvel", "qacc_warmstart")]
+    start = [warp.clone(array) for array in state]
+
+    def run():
+        for array, old in zip(state, start, strict=True):
+            warp.copy(array, old)
+        if lacking := go(*kept, steps):
+            raise RuntimeError(f"{env_id}: MuJoCo Warp had too little room: {lacking!r} in {room}")
+
+    row: dict[str, Any] = {"what": "rollout, no policy", "engine": "MuJoCo Warp", "task": env_id}
+    row |= {"precision": "float32", "batch": batch, "steps": steps}
+    row["device"] = warp.get_device().name
+    sizes = ", ".join(f"{name} {size}" for name, size in room.items())
+    own = f"graph_conditional {on_gpu.opt.graph_conditional}, tolerance at least 1e-6"
+    row["settings"] = f"{sizes}; {options(model)}; {own}; warp {warp.__version__}"
+    row["compile_seconds"] = time.perf_counter() - started
+    return Candidate(row, run, batch * steps)
+
+
+@functools.cache
+def warp_room(env_id: str, worlds: int = 64, steps: int = 130) -> dict[str, int]:
+    """Returns how many contacts (nconmax) and rows (njmax) a world of MuJoCo Warp needs.
+
+    Half as many again as C MuJoCo has at most, in as many worlds under constant random actions, and
+    the next multiple of eight.
+    """
+    from mujoco import MjData, mj_resetData, mj_step  # type: ignore
+
+    env = envs.make(env_id)
+    model = env.mj_model
+    data = MjData(model)
+    contacts = rows = 0
+    for action in _actions(env, worlds, 1)[:, 0]:
+        mj_resetData(model, data)
+        data.ctrl[:] = action
+        for _ in range(steps * env.frame_skip):
+            mj_step(model, data)
+            contacts, rows = max(contacts, data.ncon), max(rows, data.nefc)
+    return {"nconmax": _above(1.5 * contacts), "njmax": _above(1.5 * rows)}
+
+
+def _above(x: float) -> int:
+    return max(8, 8 * math.ceil(x / 8))
+
+
+def options(model) -> str:
+    """Returns a model's solver settings in words."""
+    from mujoco import mjtCone, mjtIntegrator, mjtJacobian, mjtSolver  # type: ignore
+
+    opt = model.opt
+    kinds = (mjtSolver(opt.solver), mjtIntegrator(opt.integrator), mjtCone(opt.cone))
+    names = [kind.name.partition("_")[2] for kind in (*kinds, mjtJacobian(opt.jacobian))]
+    solver, integrator, cone, jacobian = names
+    return (
+        f"{solver}, {opt.iterations} iterations of {opt.ls_iterations} line-search steps, "
+        f"tolerance {opt.tolerance:g}, {integrator}, {cone} cones, {jacobian} Jacobian"
+    )
+
+
+def gymnasium_vector(env_id: str, batch: int = 8, steps: int = 50) -> Candidate:
+    """Gymnasium's synchronous vector environment under random actions; no policy."""
+    import gymnasium
+
+    env = gymnasium.make_vec(env_id, num_envs=batch, vectorization_mode="sync")
+    env.reset(seed=0)
+    actions = [env.action_space.sample() for _ in range(steps)]
+
+    def run():
+        for action in actions:
+            env.step(action)
+
+    row = {"what": "rollout, no policy", "engine": "Gymnasium", "task": env_id}
+    row |= {"precision": "float64", "batch": batch, "steps": steps, "device": "cpu"}
+    row["settings"] = f"gymnasium {gymnasium.__version__}, vectorization_mode sync"
+    return Candidate(row, run, batch * steps)
+
+
+def _actions(env, batch: int, steps: int) -> np.ndarray:
+    """Draws actions [batch, steps, A] evenly between the bounds."""
+    low, high = env.action_space
+    return np.random.default_rng(0).uniform(low, high, (batch, steps, env.mj_model.nu))
+
+
+def _in_gymnasium(env_id: str) -> bool:
+    if not importlib.util.find_spec("gymnasium"):
+        return False
+    import gymnasium
+
+    return env_id in gymnasium.registry

@@ -1,0 +1,240 @@
+"""Writes the tables of speed of README.md and docs/benchmarks.md from docs/benchmarks.csv.
+
+``python -m experiments.speed.benchmark.tables`` replaces what stands between ``<!-- NAME -->`` and
+``<!-- end -->``, where NAME is one of `TABLES`. A number is the median of a row's repetitions, the
+greatest where several batches were tried; a ratio is of rows of one call.
+"""
+
+import functools
+import textwrap
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from experiments.kit.markdown import filled, listed, table
+from experiments.kit.places import DOCS, ROOT
+from experiments.speed.benchmark.rows import RAW, read, speed
+
+PAGES = (ROOT / "README.md", DOCS / "benchmarks.md")
+#: The tasks of README.md's table.
+FEW = ("InvertedPendulum-v5", "Reacher-v5", "HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5")
+OTHERS = (
+    *("InvertedDoublePendulum-v5", "Swimmer-v5", "Pusher-v5", "Humanoid-v5"),
+    *("HumanoidStandup-v5", "CartPole-v1"),
+)
+
+
+class Raw(NamedTuple):
+    """The rows of each kind of call (`all.py`), of its last date for each task.
+
+    gpu: rollouts on a GPU, and C MuJoCo on its machine
+    train: training on a GPU
+    cpu: rollouts on two cores
+    """
+
+    gpu: list[dict[str, Any]]
+    train: list[dict[str, Any]]
+    cpu: list[dict[str, Any]]
+
+
+def last_calls(rows: list[dict[str, Any]]) -> Raw:
+    """Sorts rows by the kind of their call, and keeps each task's last call of a kind."""
+    kinds: dict[str, str] = {}
+    for row in rows:
+        if row["what"].startswith("training"):
+            kinds[row["date"]] = "train"
+        elif row["device"] != "cpu":
+            kinds[row["date"]] = "gpu"
+    found: dict[str, list[dict[str, Any]]] = {"gpu": [], "train": [], "cpu": []}
+    last: dict[tuple[str, str], str] = {}
+    for row in rows:
+        key = row["task"], kinds.get(row["date"], "cpu")
+        last[key] = max(last.get(key, ""), row["date"])
+    for row in rows:
+        kind = kinds.get(row["date"], "cpu")
+        if row["date"] == last[row["task"], kind]:
+            found[kind].append(row)
+    return Raw(**found)
+
+
+def best(
+    rows: list[dict[str, Any]], task: str, engine: str, precision: str = ""
+) -> dict[str, Any] | None:
+    """Returns the fastest row of a task and an engine, of one precision if given."""
+    fit = [row for row in rows if row["task"] == task and row["engine"] == engine]
+    fit = [row for row in fit if precision in ("", row["precision"])]
+    return max(fit, key=speed, default=None)
+
+
+def rate(row: dict[str, Any] | None) -> str:
+    """Returns a row's speed with three digits: "1.35e8"; nothing where there is no row."""
+    if row is None:
+        return ""
+    mantissa, exponent = f"{speed(row):.2e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def ratio(one: dict[str, Any] | None, other: dict[str, Any] | None) -> str:
+    """Returns how many times as fast one row is as another."""
+    return "" if one is None or other is None else times(speed(one) / speed(other))
+
+
+def times(x: float) -> str:
+    """Returns a ratio with two digits, more where it is above a hundred."""
+    return f"{x:.1f}" if x < 10 else f"{x:,.0f}"
+
+
+def at(row: dict[str, Any] | None) -> str:
+    """Returns a row's episodes or worlds and their steps: "33,792 x 200"."""
+    return "" if row is None else f"{row['batch']:,} x {row['steps']}"
+
+
+def tasks_of(rows: list[dict[str, Any]]) -> list[str]:
+    """Returns the tasks that rows have, in the order of the tables."""
+    have = {row["task"] for row in rows}
+    return [task for task in FEW + OTHERS if task in have]
+
+
+def origin(rows: list[dict[str, Any]]) -> str:
+    """Returns where and when rows were measured, in a line."""
+
+    def every(key: str) -> str:
+        return listed(dict.fromkeys(row[key] for row in rows))
+
+    devices = every("device") if any(row["device"] != "cpu" for row in rows) else "CPU alone"
+    commits = listed(dict.fromkeys(row["commit"][:8] or "not noted" for row in rows))
+    line = f"{devices}; {every('machine')}; JAX {every('jax')}; calls of {every('date')}"
+    return f"{line}; commit {commits}."
+
+
+def span(name: str, pairs: list[tuple[str, Any, Any]]) -> str:
+    """Returns "1.5 (Ant) to 30 (Hopper) times ..." over tasks that have both rows."""
+    found = [(speed(a) / speed(b), task) for task, a, b in pairs if a and b]
+    if not found:
+        return f"{name}: not measured"
+    (low, slow), (high, fast) = min(found), max(found)
+    words = [f"{times(x)} ({task.partition('-v')[0]})" for x, task in ((low, slow), (high, fast))]
+    return f"{words[0]} to {words[1]} times {name}"
+
+
+def readme(raw: Raw) -> str:
+    """The table of README.md."""
+    rows = []
+    for task in FEW:
+        cpu = (best(raw.cpu, task, "native", "float32"), best(raw.cpu, task, "C MuJoCo"))
+        gpu = (best(raw.gpu, task, engine) for engine in ("native", "MuJoCo Warp"))
+        rows.append((task, *map(rate, (*gpu, *cpu))))
+    card = listed(dict.fromkeys(r["device"] for r in raw.gpu if r["device"] != "cpu"))
+    header = ("task", f"one {card}", "MuJoCo Warp on it", "two CPU cores", "C MuJoCo on them")
+    return table(header, rows)
+
+
+def words(raw: Raw) -> str:
+    """How many times as fast as others, in a sentence."""
+    warp, equal, single = [], [], []
+    for task in FEW:
+        gpu, other = best(raw.gpu, task, "native"), best(raw.gpu, task, "MuJoCo Warp")
+        cpu, double = (best(raw.cpu, task, "native", x) for x in ("float32", "float64"))
+        c_mujoco = best(raw.cpu, task, "C MuJoCo")
+        warp.append((task, gpu, other))
+        single.append((task, cpu, c_mujoco))
+        equal.append((task, double, c_mujoco))
+    return textwrap.fill(
+        "On two cores `native` plays the tasks of README.md at "
+        f"{span('the speed of C MuJoCo', equal)} in equal precision, and at "
+        f"{span('its speed', single)} in float32, which is what it trains in; on the GPU at "
+        f"{span('the speed of MuJoCo Warp', warp)}.",
+        110,
+    )
+
+
+def gpu(raw: Raw) -> str:
+    """All tasks on a GPU."""
+    rows = []
+    for task in tasks_of(raw.gpu):
+        native, warp = best(raw.gpu, task, "native"), best(raw.gpu, task, "MuJoCo Warp")
+        plain, c_mujoco = best(raw.gpu, task, "plain MJX"), best(raw.gpu, task, "C MuJoCo")
+        cells = (rate(native), at(native), rate(warp), at(warp), ratio(native, warp))
+        training = best(raw.train, task, "native")
+        rows.append((task, *cells, rate(plain), at(plain), rate(c_mujoco), rate(training)))
+    header = (
+        "task",
+        "native",
+        "episodes x steps",
+        "MuJoCo Warp",
+        "worlds x steps",
+        "native / Warp",
+        "plain MJX",
+        "its episodes x steps",
+        "C MuJoCo, all threads, float64",
+        "training, native, 64-64",
+    )
+    return f"{origin(raw.gpu + raw.train)}\n\n{table(header, rows)}"
+
+
+def warp(raw: Raw) -> str:
+    """What MuJoCo Warp had room for, and its settings."""
+    rows = []
+    for task in tasks_of(raw.gpu):
+        if row := best(raw.gpu, task, "MuJoCo Warp"):
+            sizes, _, rest = row["settings"].partition("; ")
+            rows.append((task, sizes, rest))
+    return table(("task", "room for each world", "settings"), rows)
+
+
+def cpu(raw: Raw) -> str:
+    """All tasks on two cores of a CPU."""
+    rows = []
+    for task in tasks_of(raw.cpu):
+        single, double = (best(raw.cpu, task, "native", x) for x in ("float32", "float64"))
+        c_mujoco, gymnasium = (best(raw.cpu, task, x) for x in ("C MuJoCo", "Gymnasium"))
+        cells = (at(single), rate(single), rate(double), rate(c_mujoco))
+        ratios = (ratio(double, c_mujoco), ratio(single, c_mujoco))
+        rows.append((task, *cells, *ratios, rate(gymnasium)))
+    header = (
+        "task",
+        "episodes x steps",
+        "native, float32",
+        "native, float64",
+        "C MuJoCo, float64",
+        "float64 / C",
+        "float32 / C",
+        "Gymnasium",
+    )
+    return f"{origin(raw.cpu)}\n\n{table(header, rows)}"
+
+
+def engines(raw: Raw) -> str:
+    """All engines on two cores, where they were measured."""
+    rows = []
+    for row in raw.cpu:
+        if plain := best(raw.cpu, row["task"], "plain MJX"):
+            cells = (row["task"], row["engine"], row["precision"], at(row), rate(row))
+            rows.append((*cells, ratio(row, plain)))
+    header = ("task", "engine", "precision", "episodes x steps", "env steps/s", "/ plain MJX")
+    return table(header, rows)
+
+
+TABLES: dict[str, Callable[[Raw], str]] = {
+    "speed": readme,
+    "speed in words": words,
+    "speed on a GPU": gpu,
+    "MuJoCo Warp's settings": warp,
+    "speed on two cores": cpu,
+    "engines on two cores": engines,
+}
+
+
+def page(text: str, raw: Raw) -> str:
+    """Returns a page with its tables made again."""
+    return filled(text, {name: functools.partial(make, raw) for name, make in TABLES.items()})
+
+
+def main() -> None:
+    """Writes."""
+    raw = last_calls(read(RAW))
+    for path in PAGES:
+        path.write_text(page(path.read_text(encoding="utf-8"), raw), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

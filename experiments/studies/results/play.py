@@ -1,0 +1,126 @@
+"""The best and the median policy of every task in Gymnasium and in our simulation, and films."""
+
+import functools
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.studies.results.files import POLICIES, write_played
+from experiments.studies.results.films import save
+from experiments.studies.results.runs import ended
+from experiments.studies.results.tasks import ROOT, Task
+from mjx_reinforce import Player, envs, load
+from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce.export.films import import_mujoco
+from mjx_reinforce.export.run_files import Run, read_run
+from mjx_reinforce.export.takes import Take, side_by_side
+from mjx_reinforce.watch import scene
+
+#: Films: their length (simulated s), frames a second, and size (pixels).
+_SECONDS, _RATE, _SIZE = 6.0, 12, (320, 240)
+
+
+def play(tasks: Iterable[Task], directory: Path, films: Path, num_episodes: int) -> None:
+    """Plays the policies of those tasks whose runs have ended, and films them in Gymnasium.
+
+    Args:
+      tasks: of the results.
+      directory: of the stages; the returns go to DIR/play/TASK.csv.
+      films: the folder of films, TASK-best.gif and TASK-median.gif.
+      num_episodes: of each policy in each simulation.
+    """
+    import_mujoco()
+    configure_jax()
+    films.mkdir(parents=True, exist_ok=True)
+    for task in tasks:
+        path = directory / "play" / f"{task.name}.csv"
+        if path.exists() or not ended(directory / task.name):
+            print(f"{task.name} is {'played' if path.exists() else 'not trained'}", flush=True)
+            continue
+        print(f"== {task.name}", flush=True)
+        run = read_run(directory / task.name)
+        ours = own_simulation(run, load(run.directory), num_episodes)
+        rows: list[dict[str, Any]] = []
+        for policy in POLICIES:
+            rows += _play(run, policy, num_episodes, ours, films / f"{task.name}-{policy}.gif")
+        write_played(path, rows)
+
+
+def own_simulation(run: Run, player: Player, num_episodes: int) -> Any:
+    """Returns a function from an actor to the returns [N] of episodes without noise.
+
+    Args:
+      run: gives the task and its time limit.
+      player: whose policy the actors are of.
+      num_episodes: N.
+
+    Returns:
+      (actor, root of all randomness of the starts) -> returns [N].
+    """
+    import jax
+
+    from mjx_reinforce.engines import choice
+    from mjx_reinforce.engines.rollouts import episode_returns
+    from mjx_reinforce.policies.actor import act
+
+    env, policy = envs.make(run.env), player.policy
+    whose = choice.ActingPolicy(functools.partial(act, policy), player.actor, policy.distribution)
+    engine = choice.choose("auto", env, whose, run.horizon)
+
+    @jax.jit
+    def returns(actor, root):
+        return episode_returns(
+            engine.rollout(
+                env,
+                whose.act,
+                actor,
+                policy.distribution,
+                # Training and its evaluations split the keys of their roots; this is not split.
+                jax.random.key(root),
+                num_episodes=num_episodes,
+                horizon=run.horizon,
+                deterministic=True,
+            )
+        )
+
+    return returns
+
+
+def _play(run: Run, policy: Any, num_episodes: int, ours: Any, film: Path) -> list[dict[str, Any]]:
+    """Plays one policy, films it, and returns a row for each episode."""
+    from mjx_reinforce.export.player import load_seed
+    from mjx_reinforce.playing.mjx_playing import gymnasium_simulator
+
+    player, _ = load_seed(run, policy)
+    version, simulate = gymnasium_simulator(player, run.horizon)
+    episodes = [simulate(number, False) for number in range(num_episodes)]
+    returns = {
+        "ours": np.asarray(ours(player.actor, ROOT + 1), float).tolist(),
+        f"gymnasium {version}": [episode.total for episode in episodes],
+    }
+    for name, values in returns.items():
+        print(f"{policy}, seed {player.seed}: mean return {np.mean(values):.1f} in {name}")
+    _film(film, run.env, f"{run.env}, {policy} seed", episodes)
+    return [
+        {
+            "policy": policy,
+            "seed": player.seed,
+            "simulation": name,
+            "episode": number,
+            "return": f"{value:.9g}",
+        }
+        for name, values in returns.items()
+        for number, value in enumerate(values)
+    ]
+
+
+def _film(path: Path, env_id: str, label: str, episodes: Sequence[Any]) -> None:
+    """Writes a film of episodes one after the other, until it is long enough."""
+    env = envs.make(env_id)
+    qpos = np.concatenate([episode.qpos for episode in episodes])
+    # The return is a sum over the film: each episode but the first begins by taking back the last.
+    rewards = [np.append(episode.rewards, -episode.rewards.sum()) for episode in episodes]
+    take = Take(label, scene(env), env.dt, qpos, np.concatenate(rewards)[:-1])
+    save(path, side_by_side([take], *_SIZE, seconds=_SECONDS, max_rate=_RATE))

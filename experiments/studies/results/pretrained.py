@@ -1,0 +1,157 @@
+"""The trained policies that come with the package: the best of each task, from runs."""
+
+import dataclasses
+import json
+import shlex
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from scipy import stats
+
+from experiments.studies.results.play import own_simulation
+from experiments.studies.results.runs import ended
+from mjx_reinforce import envs
+from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce.export.player import Player, load_seed
+from mjx_reinforce.export.policy_files import SavedPolicy, save_policy
+from mjx_reinforce.export.pretrained import PROVENANCE_FILE
+from mjx_reinforce.export.run_files import Run, read_run
+from mjx_reinforce.files import read_json, write_json
+from mjx_reinforce.settings.config import flag
+from mjx_reinforce.settings.defaults import of_task
+
+#: Roots of the starts on which policies are compared, and of those on which the best is measured.
+_CHOICE, _MEASURE = 718281828, 314159265
+#: What a run's command need not say.
+_NOT_SAID = {"output", "minutes", "overwrite", "env", "engine", "tensorboard", "wandb", "jsonl"}
+
+
+class Candidate(NamedTuple):
+    """The best seed of a run, by the run's own evaluation."""
+
+    run: Run
+    which: str
+    player: Player
+    saved: SavedPolicy
+
+
+def pack(directory: Path, folder: Path, num_episodes: int) -> list[str]:
+    """Writes the best policy of every task that has a run.
+
+    Args:
+      directory: of run directories that ``mjx_reinforce.train`` left, at any depth.
+      folder: of the policies, one folder for each task; those of other tasks stay.
+      num_episodes: by which the best is chosen, and as many others that measure it.
+
+    Returns:
+      A line for each task: its return.
+
+    Raises:
+      ValueError: there is no run that has ended.
+    """
+    configure_jax()
+    runs = [read_run(path) for path in _runs(directory)]
+    if not runs:
+        raise ValueError(f"{directory} has no run of a task of this package that has ended")
+    said = []
+    for task in sorted({run.env for run in runs}):
+        found = [x for run in runs if run.env == task for x in _candidates(run)]
+        play = _simulations(found, num_episodes)
+        means = [float(np.mean(play(x, _CHOICE))) for x in found]
+        best = found[int(np.argmax(means))]
+        returns = play(best, _MEASURE)
+        provenance = _provenance(best, returns)
+        actor = jax.tree.map(lambda x: np.asarray(x)[None], best.player.actor)
+        save_policy(folder / task, actor, best.saved.settings)
+        write_json(folder / task / PROVENANCE_FILE, provenance)
+        low, high = provenance["interval"]
+        said.append(f"{task}: {provenance['return']:.1f} ({low:.1f} to {high:.1f})")
+        print(said[-1], flush=True)
+    return said
+
+
+def _simulations(
+    found: Sequence[Candidate], num_episodes: int
+) -> Callable[[Candidate, int], np.ndarray]:
+    """Returns a function from a candidate and a root of the starts to its returns [N].
+
+    Candidates with equal policies share a program; their networks may differ.
+    """
+    programs: dict[Any, Any] = {}
+
+    def play(candidate: Candidate, root: int) -> np.ndarray:
+        saved = candidate.saved.settings
+        key = json.dumps([saved, candidate.run.horizon], sort_keys=True)
+        if key not in programs:
+            programs[key] = own_simulation(candidate.run, candidate.player, num_episodes)
+        return np.asarray(programs[key](candidate.player.actor, root), float)
+
+    return play
+
+
+def _runs(directory: Path) -> Iterator[Path]:
+    for path in sorted(directory.rglob("config.json")):
+        run = path.parent
+        if (
+            envs.is_ours(read_json(path).get("env", ""))
+            and ended(run)
+            and (run / "policy").exists()
+        ):
+            yield run
+
+
+def _candidates(run: Run) -> Iterator[Candidate]:
+    for which in ("last", "best"):
+        if which == "last" or (run.directory / "policy" / "best").is_dir():
+            yield Candidate(run, which, *load_seed(run, "best", which))
+
+
+def _provenance(best: Candidate, returns: np.ndarray) -> dict[str, Any]:
+    """Returns where a policy comes from and what it earned, see ``pretrained.pretrained``."""
+    written, summary = (read_json(best.run.directory / f"{x}.json") for x in ("config", "summary"))
+    mean, spread = float(np.mean(returns)), float(stats.sem(returns))
+    half = spread * float(stats.t.ppf(0.975, len(returns) - 1))
+    device = written["device"]
+    if device == "cpu":  # a run of an older version does not name it
+        device = written.get("cpu", "unknown CPU").split(",")[0]
+    return {
+        "task": best.run.env,
+        "return": round(mean, 2),
+        "interval": [round(mean - half, 2), round(mean + half, 2)],
+        "episodes": len(returns),
+        "command": command(written),
+        "git_commit": written["git_commit"],
+        "machine": f"{device}, {written['cpu_count']} CPU cores",
+        "packages": {k: v for k, v in written["packages"].items() if k in ("jax", "mujoco-mjx")},
+        "seconds": round(summary["run_seconds"], 1),
+        "compile_seconds": round(summary["compile_seconds"], 1),
+        "seeds": summary["num_seeds"],
+        "seed": best.player.seed,
+        "policy": best.which,
+        "env_steps": int(summary["env_steps"][best.player.seed]),
+        "horizon": best.run.horizon,
+    }
+
+
+def command(written: dict[str, Any]) -> str:
+    """Returns the command line that trains a run again: what is not the task's default.
+
+    Args:
+      written: of the run's config.json.
+    """
+    env = written["env"]
+    default = dataclasses.asdict(of_task(env, written["env_steps"], written["num_seeds"]))
+    words = ["python", "-m", "mjx_reinforce.train", "--env", env]
+    for name in default:
+        value, always = written.get(name, default[name]), name in ("env_steps", "num_seeds", "seed")
+        plain = list(default[name]) if isinstance(default[name], tuple) else default[name]
+        if name in _NOT_SAID or (value == plain and not always):
+            continue
+        if isinstance(value, bool):
+            words.append(flag(name if value else f"no_{name}"))
+        else:
+            words += [flag(name), *map(str, value if isinstance(value, list) else [value])]
+    return shlex.join(words)
