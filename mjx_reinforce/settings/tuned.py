@@ -77,8 +77,8 @@ OF_TASKS: dict[str, dict[str, Any]] = {
         "standardize_floor": 1.5,
         "env_steps": 1_000_000,
         "decay_steps": 2_000_000,
-        "train_horizon": 100,
-        "eval_every": 50,
+        "train_horizon": 250,
+        "eval_every": 20,
         "eval_episodes": 4,
     },
     "Hopper-v5": {
@@ -172,8 +172,7 @@ OF_BUDGETS: dict[str, tuple[tuple[int, dict[str, Any]], ...]] = {
     "HalfCheetah-v5": (
         (
             100_000_000,
-            {"num_episodes": 1024, "learning_rate": 0.02, "max_kl": 0.04}
-            | {"train_horizon": None, "eval_every": 5},
+            {"num_episodes": 1024, "learning_rate": 0.02, "max_kl": 0.04},
         ),
     ),
     "Hopper-v5": (
