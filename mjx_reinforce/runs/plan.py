@@ -115,7 +115,7 @@ def make_plan(ready: "Ready", config: Config, num_processes: int = 1) -> Plan:
     where = _where(machine, num_processes, division)
     text = (
         f"Training {what} on {where}, with the engine {ready.engine}: "
-        f"{ready.why}. {time}. It needs about {memory} of memory."
+        f"{ready.why}. {time}. It needs about {memory} of memory.{_idle(machine, division)}"
     )
     return Plan(text, compiling, seconds, bounded)
 
@@ -152,6 +152,19 @@ def _where(machine: Hardware, num_processes: int, division: "Division") -> str:
     elif here > 1 and not machine.shared:
         name += f", the first of the {here} here (more would not make so few episodes faster),"
     return name if num_processes == 1 else f"{num_processes} processes, each on {name}"
+
+
+def _idle(machine: Hardware, division: "Division") -> str:
+    """Returns a sentence where devices stand idle and ``_where`` does not say so, else nothing."""
+    import jax
+
+    here = jax.local_device_count()
+    if division.count == here or (division.count == 1 and not machine.shared):
+        return ""
+    return (
+        f" Of {here} devices here, {here - division.count} stand idle: the seeds, or the episodes "
+        "of an update, are too few or do not divide evenly among more."
+    )
 
 
 def training_seconds(config: Config, task: Task, speed: Speed) -> tuple[float, bool]:

@@ -22,6 +22,7 @@ from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.settings.measured import Speed, Task
 from mjx_reinforce.settings.presets import PRESETS
 from mjx_reinforce.store import ready
+from mjx_reinforce.training.division import divide_run
 
 
 @pytest.fixture
@@ -323,6 +324,17 @@ def test_a_plan_says_what_is_known(monkeypatch, engine):
     else:
         assert compiling is None
         assert "is not known" in text
+
+
+@pytest.mark.parametrize(
+    ("seeds", "episodes", "here", "idle"),
+    [(1, 7, 4, 3), (1, 6, 4, 1), (5, 16, 4, None), (9, 7, 4, 1), (1, 8, 4, None), (1, 8, 1, None)],
+)
+def test_a_plan_says_how_many_devices_stand_idle(monkeypatch, seeds, episodes, here, idle):
+    monkeypatch.setattr(jax, "local_device_count", lambda: here)
+    config = Config(num_seeds=seeds, num_episodes=episodes)
+    said = plan._idle(plan.this_hardware(), divide_run(config, seeds))
+    assert said == "" if idle is None else f"Of {here} devices here, {idle} stand idle" in said
 
 
 def test_a_run_begins_with_its_plan(run, capsys):

@@ -99,6 +99,20 @@ def test_runs_are_in_as_few_chunks_as_there_is_room(limit, expected):
     assert plan.divide(group(), limit, 2, exact=True) == plan.GroupPlan(expected, (2,))
 
 
+@pytest.mark.parametrize(
+    ("side", "devices", "said"),
+    [
+        (8, 8, ""),
+        (9, 8, ""),
+        (3, 8, " Of 8 devices here, 5 stand idle: no more runs are under way at once."),
+        (3, 1, " Of 8 devices here, 7 stand idle: --exact computes on one."),
+    ],
+)
+def test_a_plan_says_how_many_devices_stand_idle(monkeypatch, side, devices, said):
+    monkeypatch.setattr(plan.jax, "local_device_count", lambda: 8)
+    assert plan._idle(side, devices) == said
+
+
 def test_slots_are_no_wider_than_the_chunk(monkeypatch):
     monkeypatch.setattr(plan, "_CPU_EPISODES", (128, 32))
     assert plan.divide(group(), 15, 1, exact=False).widths == (8, 2)

@@ -4,6 +4,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
+
 from mjx_reinforce.reports.experiment import counted
 from mjx_reinforce.runs.plan import duration, run_seconds, task_of, this_hardware
 from mjx_reinforce.settings.memory import gigabytes, needed, num_cores
@@ -132,7 +134,22 @@ def describe_plan(
         f"{counted(len(groups), 'compiled program')}, {counted(chunks, 'chunk')} of up to {side:,} "
         f"runs. {_time(envs, horizons, learners, groups, num_devices, part_trained)}. "
         f"It needs about {gigabytes(memory)} of memory beside the programs."
+        f"{_idle(side, num_devices)}"
     )
+
+
+def _idle(side: int, num_devices: int) -> str:
+    """Returns a sentence where devices of this process stand idle, else nothing.
+
+    Args:
+      side: how many runs are under way at once at most.
+      num_devices: among which they are divided.
+    """
+    here, busy = jax.local_device_count(), min(side, num_devices)
+    if busy == here:
+        return ""
+    why = "no more runs are under way at once" if busy < num_devices else "--exact computes on one"
+    return f" Of {here} devices here, {here - busy} stand idle: {why}."
 
 
 def _time(
