@@ -16,6 +16,8 @@ from mkdocs.structure.files import File
 ROOT = Path(__file__).resolve().parents[1]
 REPOSITORY = os.environ.get("GITHUB_REPOSITORY")
 PAGES = {"CHANGELOG.md": "changelog.md", "CONTRIBUTING.md": "contributing.md"}
+#: Pages that the search shows before others with the same words.
+FOUND_FIRST = ("own_task.md",)
 PAGES_OF_README = {"README.md": "index.md"} | PAGES
 
 
@@ -49,6 +51,8 @@ def on_files(files, config):
 
 def on_page_markdown(markdown, page, **_):
     """Turns links to files outside of docs/ into links to their copies on the site."""
+    if page.file.src_uri in FOUND_FIRST:
+        page.meta["search"] = {"boost": 4}
     up = "../" * page.file.src_uri.count("/")
     markdown = re.sub(r"\]\(((?:\.\./)?notebooks/\w+)\.py\)", r"](\1.md)", markdown)
 

@@ -16,6 +16,8 @@ from saved_runs import make_run
 import mjx_reinforce
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import COMMANDS
+from mjx_reinforce.reports.page.citation import bibtex
+from mjx_reinforce.training.records.rows import COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
@@ -111,6 +113,32 @@ def test_links_of_pages_are_files():
         for link in re.findall(r"\]\(([^)#\s]+)", path.read_text("utf-8")):
             if "://" not in link:
                 assert (path.parent / link).exists(), f"{path.name}: {link}"
+
+
+def table(name, heading):
+    """Returns the rows of the first table below a heading, without its own first line."""
+    text = page(name).partition(f"\n## {heading}\n")[2]
+    lines = re.search(r"(?:^\|.*\n)+", text, re.M)
+    assert lines, heading
+    return [[x.strip() for x in line.strip("|\n").split("|")] for line in lines[0].splitlines()[2:]]
+
+
+def test_the_columns_of_metrics_are_explained_in_their_order():
+    explained = [row[0].strip("`") for row in table("first_run.md", "Columns of metrics.csv")]
+    assert explained == list(COLUMNS)
+
+
+def test_thresholds_are_those_of_the_tasks():
+    said = {row[0].strip("`"): row[1:] for row in table("settings.md", "Thresholds of the tasks")}
+    assert list(said) == envs.names()
+    for name, (threshold, horizon) in said.items():
+        env = envs.make(name)
+        known = "none" if env.reward_threshold is None else f"{env.reward_threshold:,g}"
+        assert (threshold, horizon) == (known, f"{env.max_episode_steps:,}")
+
+
+def test_the_site_says_how_to_cite():
+    assert bibtex("VERSION").strip() in page("index.md")
 
 
 def test_pages_name_experiments_that_exist():

@@ -130,4 +130,4 @@ print(f"median distance at the end: {100 * np.median(distance[-1]):.1f} cm")
 # 2. Let the mass vary: `randomize` may also return `{"body_mass": self.model.body_mass * factor}`.
 # 3. A film: `mjx-reinforce watch RUN --env my_module:Arm`, of a run that `run(config, output="RUN")` wrote.
 #
-# [Your own task](../own_task.md) says what models may have, and what is refused.
+# [Your own environment](../own_task.md) says what models may have, and what is refused.

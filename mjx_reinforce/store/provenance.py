@@ -46,9 +46,13 @@ def version(package: str) -> str | None:
 
 
 def _git_commit() -> str | None:
-    """Returns the commit this package runs from, or None outside a checkout."""
+    """Returns the last commit that changed this package, or None outside a checkout.
+
+    A commit of documents or tests changes no result, and a run goes on after it.
+    """
     here = Path(__file__).parent
-    command = ["git", "-C", str(here), "rev-parse", "HEAD"]
+    folders = [str(here.parent), str((here.parent / "envs").resolve())]
+    command = ["git", "-C", str(here), "log", "-1", "--format=%H", "--", *folders]
     with contextlib.suppress(OSError, subprocess.CalledProcessError):
         tracked = subprocess.run(
             ["git", "-C", str(here), "ls-files", "--error-unmatch", Path(__file__).name],

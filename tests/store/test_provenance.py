@@ -28,9 +28,31 @@ def test_a_package_that_is_not_installed_has_no_version():
 
 
 @pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no checkout")
-def test_the_commit_is_that_of_the_checkout():
-    here = subprocess.run(["git", "-C", ROOT, "rev-parse", "HEAD"], capture_output=True, text=True)
-    assert provenance()["git_commit"] == here.stdout.strip()
+def test_the_commit_is_one_of_the_checkout():
+    known = ["git", "-C", ROOT, "cat-file", "-t", provenance()["git_commit"]]
+    assert subprocess.run(known, capture_output=True, text=True).stdout == "commit\n"
+
+
+def test_the_commit_is_the_last_that_changed_the_package(tmp_path, monkeypatch):
+    package, tasks = tmp_path / "mjx_reinforce", tmp_path / "envs"
+    (package / "store").mkdir(parents=True)
+    tasks.mkdir()
+    (package / "envs").symlink_to("../envs")
+    copy = shutil.copy(module.__file__, package / "store" / "provenance.py")
+    monkeypatch.setattr(module, "__file__", str(copy))
+    git = ["git", "-C", tmp_path, "-c", "user.name=A", "-c", "user.email=a@example.org"]
+    subprocess.run([*git, "init", "-q"], check=True)
+
+    def commit_after_writing(path):
+        path.write_text("new")
+        subprocess.run([*git, "add", "-A"], check=True)
+        subprocess.run([*git, "commit", "-q", "-m", path.name], check=True)
+        return module._git_commit()
+
+    first = commit_after_writing(package / "train.py")
+    assert commit_after_writing(tmp_path / "README.md") == first
+    second = commit_after_writing(tasks / "ant.py")
+    assert second not in (None, first)
 
 
 def test_a_file_that_git_does_not_track_is_of_no_commit(tmp_path, monkeypatch):
