@@ -14,9 +14,10 @@ from mjx_reinforce.reports.statistics.aggregates import interval
 
 #: Commit -> what its settings were that have changed since.
 _SINCE = {
-    "e6f8e08c5022": (
-        "since then Swimmer has shorter steps, Pusher the natural gradient, and on two threads\n"
-        "HalfCheetah and Ant cut their episodes of training"
+    "e6f8e08c5022": "since then Swimmer has shorter steps",
+    "08b5cddba03e": (
+        "HalfCheetah had its cut of 250 env steps, which is the default since then, from\n"
+        "`--train-horizon 250 --eval-every 20` (on two threads 240)"
     ),
 }
 _PEERS = ("Stable-Baselines3 PPO", "Stable-Baselines3 SAC")
