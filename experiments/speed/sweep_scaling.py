@@ -144,10 +144,15 @@ def main() -> None:
     parser.add_argument("--devices", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--num-seeds", default="1024")
     parser.add_argument("--rounds", type=int, help="train in this process, so often in turn")
+    parser.add_argument("--slots", type=int, nargs="+", help="episodes in one, with --rounds")
     settings, others = parser.parse_known_args()  # any other flag is the sweep's
     arguments = ["--num-seeds", settings.num_seeds, *others]
     with tempfile.TemporaryDirectory(prefix="scaling-") as folder:
         if settings.rounds:
+            if settings.slots:
+                from mjx_reinforce.sweeps.designs import plan
+
+                plan._CPU_EPISODES = plan._GPU_EPISODES = tuple(settings.slots)
             compare(settings.devices, settings.rounds, arguments, Path(folder))
             return
         times = {n: measure(n, arguments, Path(folder)) for n in settings.devices}

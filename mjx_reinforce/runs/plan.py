@@ -161,9 +161,10 @@ def _idle(machine: Hardware, division: "Division") -> str:
     here = jax.local_device_count()
     if division.count == here or (division.count == 1 and not machine.shared):
         return ""
+    idle = here - division.count
     return (
-        f" Of {here} devices here, {here - division.count} stand idle: the seeds, or the episodes "
-        "of an update, are too few or do not divide evenly among more."
+        f" Of {here} devices here, {idle} stand{'s' * (idle == 1)} idle: the seeds, or the "
+        "episodes of an update, are too few or do not divide evenly among more."
     )
 
 

@@ -334,7 +334,8 @@ def test_a_plan_says_how_many_devices_stand_idle(monkeypatch, seeds, episodes, h
     monkeypatch.setattr(jax, "local_device_count", lambda: here)
     config = Config(num_seeds=seeds, num_episodes=episodes)
     said = plan._idle(plan.this_hardware(), divide_run(config, seeds))
-    assert said == "" if idle is None else f"Of {here} devices here, {idle} stand idle" in said
+    verb = "stands" if idle == 1 else "stand"
+    assert said == "" if idle is None else f"Of {here} devices here, {idle} {verb} idle" in said
 
 
 def test_a_run_begins_with_its_plan(run, capsys):

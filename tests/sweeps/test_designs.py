@@ -105,6 +105,7 @@ def test_runs_are_in_as_few_chunks_as_there_is_room(limit, expected):
         (8, 8, ""),
         (9, 8, ""),
         (3, 8, " Of 8 devices here, 5 stand idle: no more runs are under way at once."),
+        (7, 8, " Of 8 devices here, 1 stands idle: no more runs are under way at once."),
         (3, 1, " Of 8 devices here, 7 stand idle: --exact computes on one."),
     ],
 )

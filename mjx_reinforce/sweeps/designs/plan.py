@@ -149,7 +149,7 @@ def _idle(side: int, num_devices: int) -> str:
     if busy == here:
         return ""
     why = "no more runs are under way at once" if busy < num_devices else "--exact computes on one"
-    return f" Of {here} devices here, {here - busy} stand idle: {why}."
+    return f" Of {here} devices here, {here - busy} stand{'s' * (here - busy == 1)} idle: {why}."
 
 
 def _time(
