@@ -85,7 +85,8 @@ def test_python_of_page_runs(name, tmp_path):
 def test_notebook_runs(name, tmp_path):
     """As a program, from its first cell to its last; it draws its picture."""
     path = DOCS / "notebooks" / f"{name}.py"
-    settings = {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg", "SECONDS": "2"}
+    settings = {"PYTHONPATH": str(ROOT), "MPLBACKEND": "agg"}
+    settings |= {"SECONDS": "2", "ENV_STEPS": "500000"}
     subprocess.run([sys.executable, path], check=True, cwd=tmp_path, env=os.environ | settings)
     assert (tmp_path / f"{name}.png").exists()
     assert (DOCS / "notebooks" / f"{name}.png").stat().st_size < 100_000
