@@ -4,7 +4,6 @@ They run on the CPU unless JAX_PLATFORMS names something else.
 """
 
 import atexit
-import gc
 import os
 import shutil
 import tempfile
@@ -40,8 +39,6 @@ from mjx_reinforce.fused.passes.verify import verify
 SLOW = Path(__file__).with_name("slow.txt")
 _STALE = pytest.StashKey[list[str]]()
 
-# Traced programs are many objects that stay: to look for garbage among them so often is slow.
-gc.set_threshold(100_000, 50, 1000)
 scalarized.inspect = verify
 jax.config.update("jax_default_matmul_precision", "highest")
 

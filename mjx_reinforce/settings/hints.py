@@ -102,10 +102,12 @@ class Known(NamedTuple):
 
     switch: whether it takes no value
     positional: whether its value stands without it
+    once: why a sweep cannot go over it; None if it can
     """
 
     switch: bool
     positional: bool
+    once: str | None = None
 
 
 def known(form: type) -> dict[str, Known]:
@@ -121,7 +123,7 @@ def _known(form: type) -> Iterator[tuple[str, Known]]:
             yield from _known(kind)
         else:
             positional = tyro.conf.Positional in get_args(kind)
-            yield flag(field.name), Known(kind is bool, positional)
+            yield flag(field.name), Known(kind is bool, positional, field.metadata.get("once"))
 
 
 def required(form: type) -> list[str]:
@@ -200,7 +202,12 @@ def _about_value(words: Sequence[str], flag: str, flags: Mapping[str, Known], pr
         return f"{word!r} is a preset, and a preset comes before all flags (see --help)"
     why = f": {flag} takes one value" if flag in flags and not flags[flag].switch else ""
     if why and trains:
-        why += f"; {command('sweep')} --over {flag[2:]} compares several"
+        once = flags[flag].once
+        why += (
+            f", also in a sweep: {once}"
+            if once
+            else f"; {command('sweep')} --over {flag[2:]} compares several"
+        )
     return f"no flag takes {' '.join(map(repr, words))}{why} (see --help)"
 
 

@@ -27,7 +27,7 @@ class Form:
 
     run: Annotated[str, tyro.conf.Positional]
     learning_rate: float = 0.1
-    num_seeds: int = 4
+    num_seeds: int = dataclasses.field(default=4, metadata={"once": "all have as many"})
     overwrite: bool = False
 
 
@@ -41,7 +41,7 @@ def test_the_flags_of_a_form():
     assert known(Form) == {
         "--run": Known(switch=False, positional=True),
         "--learning-rate": Known(switch=False, positional=False),
-        "--num-seeds": Known(switch=False, positional=False),
+        "--num-seeds": Known(switch=False, positional=False, once="all have as many"),
         "--overwrite": Known(switch=True, positional=False),
     }
     assert required(Form) == ["RUN"]
@@ -66,6 +66,7 @@ def test_flags_that_a_form_has_not():
         (["--zzzzzz"], "unknown flag '--zzzzzz'. (See prog --help.)"),
         (["--overwrite", "yes"], "--no-overwrite switches it off"),
         (["--learning-rate", "1", "2"], "--learning-rate takes one value; "),
+        (["--num-seeds", "4", "8"], "--num-seeds takes one value, also in a sweep: all have as"),
     ],
 )
 def test_what_was_meant(words, said):

@@ -17,7 +17,7 @@ _SINCE = {
     "e6f8e08c5022": "since then Swimmer has shorter steps",
     "08b5cddba03e": (
         "HalfCheetah had its cut of 250 env steps, which is the default since then, from\n"
-        "`--train-horizon 250 --eval-every 20` (on two threads 240)"
+        "`--train-horizon 250 --eval-every 20` (on two threads `--eval-every 240`)"
     ),
 }
 _PEERS = ("Stable-Baselines3 PPO", "Stable-Baselines3 SAC")
@@ -72,8 +72,9 @@ def _words(groups: Sequence[kept.Group]) -> str:
         "On a GPU that is `python -m mjx_reinforce.train --env TASK --num-seeds 16 --seed ROOT\n"
         "--env-steps N` with the seeds and env steps of the table.\n"
         "Time is that of training with its evaluations, of all seeds together; compiling is\n"
-        "apart. After a minute: the last evaluation until then. At the end: episodes from starts\n"
-        "that were used nowhere else; where a run was stopped, its last evaluation. There is no\n"
+        "apart. After a minute: the last evaluation until then. At the end, and of a run that\n"
+        "ended within the minute: episodes from starts that were used nowhere else; where a run\n"
+        "was stopped, its last evaluation. There is no\n"
         "critic, no importance weight, no replayed step: an update is one gradient of the\n"
         "episodes just played. No search used these seeds\n"
         f"(roots {roots}).\n"
@@ -114,7 +115,8 @@ def _published(docs: Path, task: str, algorithm: str) -> str:
 
 def _cpu_words() -> str:
     return (
-        "The default command with `--num-seeds 1`, a run for each root. Beside it, where it ran\n"
+        "The default command with `--num-seeds 1`, a run for each root; evaluations on the\n"
+        "way have the same starts in all of them. Beside it, where it ran\n"
         "on two threads of the same processor, Stable-Baselines3 on Gymnasium's tasks, after a\n"
         "minute and after ten: one seed (the minute: two runs), with the settings of its zoo\n"
         "([peers.csv](peers.csv))."

@@ -36,7 +36,8 @@ class Group(NamedTuple):
     """The runs of one task on one machine.
 
     task, device: which; the device in words
-    minute: each seed's return [S] at its last evaluation within ``MINUTE``
+    minute: each seed's return [S] at its last evaluation within ``MINUTE``; of a run that ended
+      within it, on fresh starts
     final: each seed's return [S] at the end, on fresh starts; of a run that was stopped, at its
       last evaluation
     seconds: training time of all seeds together, evaluations included; the median of several runs
@@ -168,6 +169,8 @@ def load(folder: Path) -> list[Group]:
             np.array([float(row[name]) for row in mine])
             for name in ("minute", "final", "seconds", "env_steps")
         )
+        over = (seconds <= MINUTE) & np.array([row["status"] == "finished" for row in mine])
+        minute = np.where(over, final, minute)
         stopped = any(row["status"] != "finished" for row in mine)
         of_time = float(np.median(seconds))
         groups.append(Group(task, device, minute, final, of_time, steps.mean(), stopped, mine))
