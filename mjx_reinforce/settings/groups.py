@@ -140,8 +140,7 @@ class RunSettings:
     horizon: int | None = setting(None, *COUNT)
     """Time limit of an episode in env steps. If not given, the environment's own limit."""
     train_horizon: int | None = setting(None, *COUNT)
-    """Cut training episodes, not evaluations, after this many env steps. Where all env steps earn
-    the same and all episodes reach the cut, nothing is learned."""
+    """Cut training episodes, not evaluations, after this many env steps."""
     one_start: bool = False
     """Begin all training episodes of a seed in one state of its own. Evaluations keep theirs."""
     engine: Literal["auto", "vmap", "fused", "native"] = setting(

@@ -97,7 +97,7 @@ def test_a_table_of_a_small_task(register, monkeypatch, tmp_path):
     assert len({row["noise_scale"] for row in found if np.isfinite(row["noise_scale"])}) > 6
     path = tmp_path / "rows.csv"
     for row in found:
-        module._append(path, row)
+        module.kit.append(path, [row], list(row))
     assert len(path.read_text().splitlines()) == 1 + len(found)
     assert not jnp.isnan(jnp.array([row["explained_variance"] for row in found])).any()
     with pytest.raises(ValueError, match="at least 4, got 3"):

@@ -109,7 +109,7 @@ def test_a_budget_chooses_the_settings():
     assert many.eval_every == max(few.eval_every, between // (1024 * 1000))
     assert many.eval_every < 10**12 // (1024 * 1000 * 50)
     medium = of_task("HalfCheetah-v5", 5 * 10**7)
-    assert medium.eval_every == 5 * 10**7 // 50 // (16 * 100)
+    assert medium.eval_every == 5 * 10**7 // 50 // (16 * 250)
     for config in (few, some, many):
         words = ["--env", "Hopper-v5", "--env-steps", str(config.env_steps)]
         assert parse(words) == config
