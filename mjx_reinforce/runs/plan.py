@@ -156,16 +156,19 @@ def _where(machine: Hardware, num_processes: int, division: "Division") -> str:
 
 def _idle(machine: Hardware, division: "Division") -> str:
     """Returns a sentence where devices stand idle and ``_where`` does not say so, else nothing."""
+    if division.count == 1 and not machine.shared:
+        return ""
+    why = "the seeds, or the episodes of an update, are too few or do not divide evenly among more"
+    return idle(division.count, why)
+
+
+def idle(busy: int, why: str) -> str:
+    """Returns a sentence on the devices of this process that stand idle; nothing if none does."""
     import jax
 
     here = jax.local_device_count()
-    if division.count == here or (division.count == 1 and not machine.shared):
-        return ""
-    idle = here - division.count
-    return (
-        f" Of {here} devices here, {idle} stand{'s' * (idle == 1)} idle: the seeds, or the "
-        "episodes of an update, are too few or do not divide evenly among more."
-    )
+    rest = here - busy
+    return f" Of {here} devices here, {rest} stand{'s' * (rest == 1)} idle: {why}." if rest else ""
 
 
 def training_seconds(config: Config, task: Task, speed: Speed) -> tuple[float, bool]:

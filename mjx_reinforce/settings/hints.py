@@ -202,12 +202,8 @@ def _about_value(words: Sequence[str], flag: str, flags: Mapping[str, Known], pr
         return f"{word!r} is a preset, and a preset comes before all flags (see --help)"
     why = f": {flag} takes one value" if flag in flags and not flags[flag].switch else ""
     if why and trains:
-        once = flags[flag].once
-        why += (
-            f", also in a sweep: {once}"
-            if once
-            else f"; {command('sweep')} --over {flag[2:]} compares several"
-        )
+        swept = f"; {command('sweep')} --over {flag[2:]} compares several"
+        why += f", also in a sweep: {once}" if (once := flags[flag].once) else swept
     return f"no flag takes {' '.join(map(repr, words))}{why} (see --help)"
 
 

@@ -3,6 +3,7 @@
 import dataclasses
 
 import numpy as np
+import jax
 import pytest
 
 from mjx_reinforce.settings.config import Config
@@ -110,7 +111,7 @@ def test_runs_are_in_as_few_chunks_as_there_is_room(limit, expected):
     ],
 )
 def test_a_plan_says_how_many_devices_stand_idle(monkeypatch, side, devices, said):
-    monkeypatch.setattr(plan.jax, "local_device_count", lambda: 8)
+    monkeypatch.setattr(jax, "local_device_count", lambda: 8)
     assert plan._idle(side, devices) == said
 
 

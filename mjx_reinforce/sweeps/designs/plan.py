@@ -4,10 +4,8 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
-
 from mjx_reinforce.reports.experiment import counted
-from mjx_reinforce.runs.plan import duration, run_seconds, task_of, this_hardware
+from mjx_reinforce.runs.plan import duration, idle, run_seconds, task_of, this_hardware
 from mjx_reinforce.settings.memory import gigabytes, needed, num_cores
 from mjx_reinforce.store.build import policy_settings
 from mjx_reinforce.sweeps.designs.groups import Group
@@ -145,11 +143,8 @@ def _idle(side: int, num_devices: int) -> str:
       side: how many runs are under way at once at most.
       num_devices: among which they are divided.
     """
-    here, busy = jax.local_device_count(), min(side, num_devices)
-    if busy == here:
-        return ""
-    why = "no more runs are under way at once" if busy < num_devices else "--exact computes on one"
-    return f" Of {here} devices here, {here - busy} stand{'s' * (here - busy == 1)} idle: {why}."
+    few = "no more runs are under way at once"
+    return idle(min(side, num_devices), few if side < num_devices else "--exact computes on one")
 
 
 def _time(
