@@ -2,8 +2,8 @@
 
 import dataclasses
 
-import numpy as np
 import jax
+import numpy as np
 import pytest
 
 from mjx_reinforce.settings.config import Config
