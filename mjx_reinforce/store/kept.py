@@ -17,7 +17,7 @@ import numpy as np
 from jax import export
 
 from mjx_reinforce import envs
-from mjx_reinforce.engines.native import objects
+from mjx_reinforce.engines.native import look, objects
 from mjx_reinforce.engines.native.available import made_for, platform
 from mjx_reinforce.engines.native.cpu import seam
 from mjx_reinforce.engines.native.gpu.seam import PTX
@@ -42,11 +42,12 @@ def key_of(config: Config, share: slice = slice(None)) -> str | None:
     """Returns a name for all that the programs of a run depend on, for all seeds or a share.
 
     None where nothing is kept: on what is neither a CPU nor a GPU, of code or a model of the
-    user's, and where JAX is to look for NaNs, which it cannot in a program that is not traced.
+    user's, and where JAX is to look for NaNs or kernels are to be described, neither of which is
+    possible in a program that is not traced.
     """
     looks = any(jax.config.values[name] for name in ("jax_debug_nans", "jax_debug_infs"))
     own = not envs.is_ours(config.env) or any(is_own(getattr(config, name)) for name in CODE)
-    if looks or objects.folder() is None or own:
+    if looks or look.level() or objects.folder() is None or own:
         return None
     if "xml_file" in split_words(config.env_set):  # the file may change
         return None

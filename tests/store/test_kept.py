@@ -18,7 +18,7 @@ from toys import Survive
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.engines.native import objects
+from mjx_reinforce.engines.native import look, objects
 from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.gpu import seam as gpu
 from mjx_reinforce.settings.config import Config
@@ -185,6 +185,12 @@ def test_programs_need_no_code_of_others(monkeypatch):
 def test_nothing_is_kept_of_an_environment_of_the_users(register):
     for name in ("Survive-v0", "toys:Survive"):
         assert kept.key_of(Config(env=name)) is None
+
+
+def test_nothing_is_kept_where_kernels_are_described(monkeypatch):
+    assert kept.key_of(CONFIG) is not None
+    monkeypatch.setenv(look.VARIABLE, "1")
+    assert kept.key_of(CONFIG) is None
 
 
 @pytest.mark.parametrize("looks", ["jax_debug_nans", "jax_debug_infs"])

@@ -7,9 +7,14 @@ All engines play the same looping task: an episode that ends starts again from i
 so that every simulated step is a real one. A rollout has a policy, its noise, and all that is
 recorded for an update. Runs are interleaved and the median is shown; compare rows of one run with
 each other, not with another machine's. `all.py` makes the rows of docs/benchmarks.csv.
+
+With MJX_REINFORCE_DEBUG=1 the native engine describes its kernels, see docs/engine.md. The last
+column is the time of one env step of one episode, which is what an update of few episodes waits
+for. The column is empty where the batch is too large for all episodes to be played at once.
 """
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +27,11 @@ from experiments.kit.rows import now
 from experiments.speed.benchmark.ours import ENGINES, rollouts, training
 from experiments.speed.benchmark.peers import peers
 from experiments.speed.benchmark.rows import append, facts, measure, speed
+from mjx_reinforce.engines.native import available
+from mjx_reinforce.engines.native.cpu.machine import this_machine
 
+#: Threads of a multiprocessor that the longest programs leave room for.
+THREADS = 256
 SHOWN = ("task", "what", "engine", "precision", "batch", "steps", "compile_seconds")
 
 
@@ -93,11 +102,25 @@ def engines(env_id: str, settings: Settings):
 
 def show(rows: list[dict[str, Any]]) -> None:
     """Prints the table."""
-    table = Table(*(key.replace("_", " ") for key in SHOWN), "env steps/s")
+    columns = (*(key.replace("_", " ") for key in SHOWN), "env steps/s", "ns a step of an episode")
+    table = Table(*columns)
     for row in rows:
         cells = (row.get(key) for key in SHOWN)
-        table.add_row(*(_format(cell) for cell in cells), f"{speed(row):,.0f}")
+        table.add_row(*(_format(x) for x in cells), f"{speed(row):,.0f}", latency(row))
     Console(width=160).print(table)
+
+
+def latency(row: dict[str, Any]) -> str:
+    """Returns the time of one env step of one episode (ns), if all of a rollout play at once."""
+    together = row["engine"] == "native" and row["what"].startswith("rollout")
+    return f"{1e9 * row['batch'] / speed(row):,.0f}" if together and fits(row["batch"]) else ""
+
+
+def fits(batch: int) -> bool:
+    """Returns whether the native engine surely plays so many episodes at once, of any task."""
+    if available.platform() == "cpu":
+        return batch <= this_machine().lanes * (os.cpu_count() or 1)
+    return batch <= THREADS * jax.devices()[0].core_count
 
 
 def _format(value: Any) -> str:

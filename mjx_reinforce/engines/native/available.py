@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 
+from mjx_reinforce.engines.native import look
 from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.gpu import seam as gpu
 
@@ -69,7 +70,12 @@ def _short(made_for: machine.Machine) -> str:
 
 
 def unavailable() -> str | None:
-    """Returns why JAX cannot run machine code of ours here, None if it can."""
+    """Returns why JAX cannot run machine code of ours here, None if it can.
+
+    Raises:
+      ValueError: the variable MJX_REINFORCE_DEBUG has a value that means nothing.
+    """
+    look.level()
     if platform() not in ("cpu", "gpu"):
         return f"it runs on CPUs and NVIDIA GPUs, this is JAX on a {platform()}"
     if sys.platform == "win32":

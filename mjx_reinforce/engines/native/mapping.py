@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engines.native import available, objects
+from mjx_reinforce.engines.native import available, look, objects
 from mjx_reinforce.engines.native.cpu import handler, machine, seam
 from mjx_reinforce.engines.native.cpu.denormals import flush
 from mjx_reinforce.engines.native.cpu.mapping import POSITIONS, mapping_text
 from mjx_reinforce.engines.native.gpu import ptx
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
+from mjx_reinforce.engines.native.gpu.lockstep import operations
 from mjx_reinforce.engines.native.gpu.mapping import mapping_text as gpu_mapping_text
 from mjx_reinforce.engines.native.program import GPU_LOOPS, LOOPS, WRITERS
 from mjx_reinforce.engines.native.step import BRANCH_COST, stored
@@ -58,7 +59,8 @@ def machine_map(
     for leaf in (*kept, *map(jax.eval_shape, [stored] * len(results), results)):
         if np.dtype(leaf.dtype).itemsize not in (4, 8):
             raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
-    code = _code(flat, kept, check)
+    name = getattr(function, "__qualname__", type(function).__name__)
+    code = _code(flat, kept, check, f"map of {name}")
 
     def mapped(*args: PyTree) -> Any:
         values = jax.tree.leaves(args)
@@ -90,7 +92,7 @@ def _run(
 
 
 def _code(
-    function: Callable[..., Any], examples: list[Any], check: SizeCheck | None
+    function: Callable[..., Any], examples: list[Any], check: SizeCheck | None, name: str
 ) -> machine.Code | ptx.Kernel:
     """Returns the machine code that maps a function of leaves."""
     traced, _ = jaxprs.trace(function, *examples)
@@ -102,20 +104,21 @@ def _code(
             check(traced)
         return scalarized.build(function, examples, [True] * len(examples), BRANCH_COST, limits)
 
+    def write_gpu() -> str:  # where memory or disk has no code
+        step = written(GPU_LOOPS)
+        return look.title(name, operations(step.schedule)) + gpu_mapping_text(step)
+
     if not on_cpu:
-        return ptx.load_kernel(
-            source,
-            lambda: gpu_mapping_text(written(GPU_LOOPS)),  # where memory or disk has no code
-            gpu_seam.compute_capability(),
-            objects.folder(),
-        )
+        capability = gpu_seam.compute_capability()
+        return ptx.load_kernel(source, write_gpu, capability, objects.folder())
     target = machine.this_machine()
 
     def write() -> str:
         step = written(LOOPS)
+        title = look.title(name, operations(step.schedule))
         num_args = 1 + sum(bool(np.prod(x.shape)) for x in step.in_avals)
         sizes = [np.dtype(x.dtype).itemsize for x in step.out_avals if np.prod(x.shape)]
         entry = handler.handler_text(num_args, sizes, target.lanes, POSITIONS, zeroed=False)
-        return entry + mapping_text(step, target.lanes, flush(target.triple))
+        return title + entry + mapping_text(step, target.lanes, flush(target.triple))
 
     return machine.load_module(source, write, handler.NAMES, target, objects.folder())

@@ -9,12 +9,13 @@ import numpy as np
 
 from mjx_reinforce import fused
 from mjx_reinforce.engines import episode
-from mjx_reinforce.engines.native import available, objects, outlook, step
+from mjx_reinforce.engines.native import available, look, objects, outlook, step
 from mjx_reinforce.engines.native.cpu import handler, kernel, machine, queue
 from mjx_reinforce.engines.native.cpu.denormals import flush
 from mjx_reinforce.engines.native.gpu import kernel as gpu_kernel
 from mjx_reinforce.engines.native.gpu import ptx, scratch
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
+from mjx_reinforce.engines.native.gpu.lockstep import operations
 from mjx_reinforce.engines.native.step import StepResult
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.fused.graph import Limits
@@ -68,9 +69,12 @@ def build_program(
 
     def write() -> str:  # not called where memory or disk has the code
         outlook.check_seconds(env, traced, shapes.record[0].size)
+        limits, varying = LOOPS if on_cpu else GPU_LOOPS, [True] * len(jax.tree.leaves(examples))
+        written = scalarized.build(function, examples, varying, step.BRANCH_COST, limits)
+        title = look.title(look.name_of(env), operations(written.schedule))
         if target is None:
-            return _write_gpu(function, examples)
-        return _write_cpu(function, examples, target)
+            return title + gpu_kernel.kernel_text(written, len(jax.tree.leaves(actor)))
+        return title + _write_cpu(written, examples, target)
 
     if target is None:
         code = ptx.load_kernel(source, write, gpu_seam.compute_capability(), folder)
@@ -93,22 +97,12 @@ def while_running(function: Callable[..., StepResult]) -> Any:
     return lambda *args: function(*args, jnp.int32(1))
 
 
-def _write_gpu(function: Callable[..., StepResult], examples: tuple[Any, ...]) -> str:
-    """Writes a step, and the kernel around it, as LLVM IR."""
-    actor = examples[0]
-    varying = [True] * len(jax.tree.leaves(examples))
-    written = scalarized.build(function, examples, varying, step.BRANCH_COST, GPU_LOOPS)
-    return gpu_kernel.kernel_text(written, len(jax.tree.leaves(actor)))
-
-
 def _write_cpu(
-    function: Callable[..., StepResult], examples: tuple[Any, ...], target: machine.Machine
+    written: scalarized.Scalarized, examples: tuple[Any, ...], target: machine.Machine
 ) -> str:
     """Writes a step, and all around it, as LLVM IR."""
     actor, carried, *_ = examples
     num_actor = len(jax.tree.leaves(actor))
-    varying = [True] * len(jax.tree.leaves(examples))
-    written = scalarized.build(function, examples, varying, step.BRANCH_COST, LOOPS)
     buffers = [x for x in jax.tree.leaves((actor, carried.state)) if np.prod(x.shape)]
     records = [np.dtype(x.dtype).itemsize for x in written.out_avals[: queue.NUM_RECORDS]]
     num_args, lanes = queue.NUM_CONTROLS + len(buffers), target.lanes

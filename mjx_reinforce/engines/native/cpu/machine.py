@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mjx_reinforce.engines.native import objects
+from mjx_reinforce.engines.native import look, objects
 from mjx_reinforce.registry import check_name
 
 #: Asks for code that older CPUs run too; one of ``LEVELS``.
@@ -129,8 +129,8 @@ def load_module(
     key = _key(source, names, machine)
     with _LOCK:
         if key not in _LOADED:
-            found = objects.read_object(folder, key) if folder else None
-            data = found or _compile(write(), machine)
+            found = objects.read_object(folder, key) if folder and not look.level() else None
+            data = found or _build(key, write, machine, folder)
             _LOADED[key] = Code(key, _link(key, names, data), compiled=not found)
             if folder and not found:
                 objects.write_object(folder, key, data)
@@ -164,13 +164,25 @@ def _key(source: str, names: tuple[str, ...], machine: Machine) -> str:
     ).hexdigest()
 
 
-def _compile(text: str, machine: Machine) -> bytes:
-    """Returns object code."""
+def _build(key: str, write: Callable[[], str], machine: Machine, folder: Path | None) -> bytes:
+    """Returns object code of what ``write`` returns."""
+    target = _target(machine)
+
+    def texts(text: str, _: bytes) -> dict[str, str]:
+        return {"ll": text, "s": target.emit_assembly(_parse(text, target, machine))}
+
+    def compile(text: str) -> bytes:
+        return target.emit_object(_parse(text, target, machine))
+
+    return look.build(key, folder, write, compile, look.code_facts, texts)
+
+
+def _parse(text: str, target: Any, machine: Machine) -> Any:
+    """Returns LLVM's module of a text."""
     import llvmlite.binding as llvm
 
-    target = _target(machine)
     header = f'target datalayout = "{target.target_data}"\ntarget triple = "{machine.triple}"\n'
-    return target.emit_object(llvm.parse_assembly(header + text))
+    return llvm.parse_assembly(header + text)
 
 
 def _target(machine: Machine) -> Any:

@@ -1,5 +1,6 @@
 """From LLVM IR to PTX, the assembly language that NVIDIA's driver takes."""
 
+import functools
 import hashlib
 import re
 import threading
@@ -7,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from mjx_reinforce.engines.native import objects
+from mjx_reinforce.engines.native import look, objects
 
 #: LLVM's name of NVIDIA's GPUs.
 TRIPLE = "nvptx64-nvidia-cuda"
@@ -55,12 +56,29 @@ def load_kernel(
     key = _key(source, capability)
     with _LOCK:
         if key not in _LOADED:
-            found = objects.read_object(folder, key) if folder else None
-            text = found.decode() if found else _compile(write(), capability)
+            found = objects.read_object(folder, key) if folder and not look.level() else None
+            text = found.decode() if found else _build(key, write, capability, folder)
             _LOADED[key] = Kernel(key, text, *_facts(text), compiled=not found)
             if folder and not found:
                 objects.write_object(folder, key, text.encode())
         return _LOADED[key]
+
+
+def _build(key: str, write: Callable[[], str], capability: str, folder: Path | None) -> str:
+    """Returns PTX of what ``write`` returns."""
+
+    def facts(made: str) -> dict[str, str]:
+        threads, blocks, words = _facts(made)
+        return look.driver_facts(made) | {
+            "threads of a multiprocessor": f"{blocks * threads:,}",
+            "long arrays of a thread": f"{4 * words:,} bytes",
+        }
+
+    def texts(text: str, made: str) -> dict[str, str]:
+        return {"ll": text, "ptx": made}
+
+    compile = functools.partial(_compile, capability=capability)
+    return look.build(key, folder, write, compile, facts, texts)
 
 
 def _facts(text: str) -> tuple[int, int, int]:
