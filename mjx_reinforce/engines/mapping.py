@@ -9,7 +9,7 @@ import jax
 
 from mjx_reinforce import fused
 from mjx_reinforce.engines.choice import against_writing, branch_cost, pick
-from mjx_reinforce.engines.native import available
+from mjx_reinforce.engines.native import available, look
 from mjx_reinforce.engines.native.mapping import machine_map
 from mjx_reinforce.engines.native.outlook import check_seconds
 from mjx_reinforce.engines.native.program import refusal
@@ -85,6 +85,7 @@ def machine_code(
         return against
     check = functools.partial(check_seconds, env, entries=observation_size(env))
     try:
-        return machine_map(function, *examples, check=check)
+        name = f"{getattr(function, '__name__', 'a function')} of {look.name_of(env)}"
+        return machine_map(function, *examples, check=check, name=name)
     except Exception as error:  # whatever it is, another engine may play this
         return refusal(error)

@@ -8,10 +8,10 @@ import pytest
 from players import actor_and_act
 from toys import Drifting
 
+from mjx_reinforce.engines.mapping import machine_code
 from mjx_reinforce.engines.native import available, look, objects, program
 from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.gpu import ptx
-from mjx_reinforce.engines.native.mapping import machine_map
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
@@ -198,8 +198,8 @@ def test_what_is_played_and_mapped_is_named(monkeypatch, capfd):
     def doubled(x):
         return x + x
 
-    machine_map(doubled, jnp.float32(0))
-    assert "doubled, 1 scalar operations\n" in capfd.readouterr().err
+    assert not isinstance(machine_code(Wrapper(), doubled, jnp.float32(0)), str)
+    assert ": doubled of Wrapper of Drifting, 1 scalar operations\n" in capfd.readouterr().err
 
 
 def _act_and_actor(env):

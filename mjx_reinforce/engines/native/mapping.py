@@ -29,6 +29,7 @@ def machine_map(
     function: Callable[..., Any],
     *examples: PyTree,
     check: SizeCheck | None = None,
+    name: str = "a function",
 ) -> Callable[..., Any]:
     """Returns a function of a batch, compiled unless memory or disk has it.
 
@@ -40,6 +41,7 @@ def machine_map(
       function: of one example; pytrees of numbers of 32 or 64 bits and bools, in and out.
       *examples: its arguments, or their shapes.
       check: raises TooLarge where writing it out and compiling it takes too long.
+      name: what ``look`` calls it.
 
     Raises:
       TooLarge: writing it out would take minutes.
@@ -59,8 +61,7 @@ def machine_map(
     for leaf in (*kept, *map(jax.eval_shape, [stored] * len(results), results)):
         if np.dtype(leaf.dtype).itemsize not in (4, 8):
             raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
-    name = getattr(function, "__qualname__", type(function).__name__)
-    code = _code(flat, kept, check, f"map of {name}")
+    code = _code(flat, kept, check, name)
 
     def mapped(*args: PyTree) -> Any:
         values = jax.tree.leaves(args)
