@@ -125,11 +125,16 @@ OF_TASKS: dict[str, dict[str, Any]] = {
         "test_episodes": 16,
     },
     "HumanoidStandup-v5": {
-        "learning_rate": 1e-3,
-        "max_kl": 0.01,
+        "update": "natural-gradient",
+        "num_episodes": 128,
+        "train_horizon": 100,
+        "max_kl": 0.1,
         "initial_std": 0.3,
-        "env_steps": 64_000,
+        "ended_episodes": "skip",
+        "normalize_steps": None,
+        "env_steps": 200_000,
         "decay_steps": 1_000_000,
+        "eval_every": 10,
         "eval_episodes": 2,
     },
 }
@@ -191,7 +196,10 @@ OF_BUDGETS: dict[str, tuple[tuple[int, dict[str, Any]], ...]] = {
         ),
     ),
     "Humanoid-v5": ((100_000_000, _FEW_UPDATES | {"initial_std": 0.3}),),
-    "HumanoidStandup-v5": ((100_000_000, _FEW_UPDATES),),
+    "HumanoidStandup-v5": (
+        (2_000_000, {"num_episodes": 256}),
+        (100_000_000, {"num_episodes": 512, "eval_every": 20}),
+    ),
 }
 #: Nothing more is to be had of these in a minute than in what is said above,
 SOLVED = ("InvertedPendulum-v5", "InvertedPendulum-v4")
