@@ -1,417 +1,230 @@
-"""The gradient of a small network over all samples as one kernel on a GPU.
+"""The kernel of ``policy_gradient``, in Pallas for Triton.
 
-XLA computes it in some 14 passes over arrays [samples, units]. This kernel reads each sample once:
-forward pass, log-probability, entropy and backward pass stay in registers and shared memory. A
-program of its grid goes over many tiles of samples, and adds up the gradient of all parameters in
-registers. Its sums are added in a fixed order, so that the same samples give the same bits.
+XLA computes the gradient in some 14 passes over arrays [samples, units]. This kernel reads each
+sample once: forward pass, loss and backward pass of a tile of samples stay on a multiprocessor. A
+program of the kernel's grid goes over many tiles, skips those without a sample inside the mask, and
+adds up the gradient of all parameters.
 
-Matrices are multiplied on tensor cores, each number as the sum of two in bfloat16. Of the four
-products the one of the two small parts is left out. The error of a product is below 2^-15 of it;
-XLA's default for float32 on these GPUs, TF32, has 2^-10.
+Precision: matrices are multiplied on tensor cores, each number as the sum of two in bfloat16. Of
+the four products the one of the two small parts is left out, and sums are in float32 (Henry, Tang
+and Heinecke 2019, arXiv:1904.06376). The error of a product is below 2^-14 of it; TF32's is 2^-10.
+
+Determinism: all sums are in a fixed order, so that the same samples give the same bits.
+
+Triton needs sizes that are powers of two, and 16 for a factor. Widths W of layers are padded to
+these: W[0] of the observation, whose entry after the last is 1, then of each hidden layer.
 """
 
 import functools
-from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.core
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
 from mjx_reinforce import fused
-from mjx_reinforce.policies.policy import Policy
 
-#: (outputs [..., K], action [..., A], weight [...], mask [...]) -> (the loss summed, sums of
-#: metrics).
-Loss = Callable[..., tuple[jax.Array, dict[str, jax.Array]]]
-
-#: Samples of a tile, and warps that work on it.
-TILE, WARPS = 128, 4
-#: Programs that one multiprocessor is given at most, and tiles that a program is given at least.
-PROGRAMS, LEAST_TILES = 4, 8
-#: What is larger does not fit in registers.
-_MOST_UNITS, _MOST_OBSERVATIONS, _MOST_OUTPUTS, _MOST_LAYERS = 64, 63, 8, 3
-#: Tensor cores multiply matrices of so many rows and columns at least.
-_LEAST = 16
-#: XLA's name of what compiles and launches the kernel.
-TRITON = "__gpu$xla.gpu.triton"
-MULTIPLY = "bf16x3"
-SKIP = True
+#: Samples of a tile, and warps that work on it. So an H100 went over 2.0e9 samples a second, of a
+#: 64-64 network; with 128 samples over 1.0e9, 1.6e9 with 8 warps; with 32 samples over 1.3e9.
+TILE, WARPS = 64, 4
+#: Programs of a launch at most, four for each multiprocessor of an H100; tiles of each at least.
+PROGRAMS, TILES = 528, 8
+#: Rows and columns of a factor at least.
+LEAST = 16
 
 
-class _Head(NamedTuple):
-    """What is computed for a sample from the network's outputs on, written out in scalars.
+class Given(NamedTuple):
+    """Samples, and parameters padded with zeros.
 
-    written: (outputs, action, weight, mask, *operands) -> (loss, metrics, derivative of the loss
-      in the outputs).
-    operands: what the loss closes over and jit or vmap trace.
+    observation, action, weight, mask: [B, O], [B, A], [B] and [B]
+    kernels: [W[k], W[k + 1]] of each hidden layer; the first one's bias is its row O
+    biases: [W[k + 1]] of each hidden layer after the first
+    last: [K, W[-1]], the last layer's kernel transposed
+    numbers: the last layer's bias, the policy's constants and the cost of entropy
     """
 
-    written: fused.Scalarized
-    operands: list[jax.Array]
+    observation: Any
+    action: Any
+    weight: Any
+    mask: Any
+    kernels: list[Any]
+    biases: list[Any]
+    last: Any
+    numbers: Any
 
 
-def unsupported(policy: Policy, observation_size: int) -> str | None:
-    """Returns why the kernel does not compute the gradient of a policy here, or None."""
-    if jax.default_backend() != "gpu" or jax.devices()[0].platform != "gpu":
-        return "it is for NVIDIA's GPUs"
-    return unfit(policy, observation_size)
+class Sums(NamedTuple):
+    """Sums over samples.
+
+    kernels: [W[k], W[k + 1]], the gradient for each hidden layer; row O is the first one's bias
+    biases: [W[0], W[k + 1]] for each hidden layer after the first; row O is the bias
+    last: [16, W[-1]], the gradient of the last layer's kernel transposed
+    numbers: what ``head`` computes
+    """
+
+    kernels: list[Any]
+    biases: list[Any]
+    last: Any
+    numbers: Any
 
 
-def unfit(policy: Policy, observation_size: int) -> str | None:
-    """Returns why the kernel cannot compute the gradient of a policy, or None."""
-    network = getattr(policy.apply, "network", None)
-    if network is None:
-        return "it is for policies of one network with tanh units"
-    sizes = network.hidden_sizes
-    if not 1 <= len(sizes) <= _MOST_LAYERS or max(sizes) > _MOST_UNITS:
-        return "the network is too large, or linear"
-    if observation_size > _MOST_OBSERVATIONS or network.num_outputs > _MOST_OUTPUTS:
-        return "there are too many observations or outputs"
-    if jax.config.values["jax_enable_x64"]:
-        return "it computes in float32"
-    return None
-
-
-def gradient(
-    policy: Policy, loss: Loss, params: Any, samples: tuple[jax.Array, ...], **options: Any
-) -> tuple[jax.Array, Any, Any]:
-    """Sums a loss, its gradient and its metrics over samples; ``unfit`` says for which policies.
+def launch(head: fused.Scalarized, given: Given, *, interpret: bool = False) -> Sums:
+    """Returns sums over all samples; vmapped, it remains one launch.
 
     Args:
-      policy: of one network.
-      loss: of samples from the network's outputs on.
-      params: the policy's.
-      samples: observation [T, N, O], action [T, N, ...], weight [T, N] and mask [T, N].
-      options: ``interpret`` computes without a GPU.
-
-    Returns:
-      The loss [], its gradient like ``params``, and the metrics.
+      head: (outputs of the policy, action, weight, mask, cost of entropy) -> any numbers, after
+        which come the derivatives of the loss in the outputs.
+      given: as in ``Given``.
+      interpret: whether to compute without a GPU, for tests.
     """
-    observation, action, weight, mask = samples
-    count = mask.size
-    flat = (
-        observation.reshape(count, -1),
-        action.reshape(count, -1),
-        weight.reshape(count),
-        mask.reshape(count),
-    )
-    outputs = jax.ShapeDtypeStruct(
-        (policy.distribution.num_outputs + len(policy.distribution.constants),), jnp.float32
-    )
-    head, metrics = _head(loss, outputs, jax.ShapeDtypeStruct(action.shape[2:], action.dtype))
-    layers = [(layer["kernel"], layer["bias"]) for layer in params["network"]["params"].values()]
-    given = *flat, params["constants"], layers, head.operands
     leaves, tree = jax.tree.flatten(given)
+    first = given.kernels[0].shape[0]
+    results = Sums(
+        kernels=[x.shape for x in given.kernels],
+        biases=[(first, *x.shape) for x in given.biases],
+        last=(LEAST, given.last.shape[1]),
+        numbers=(padded(sum(map(len, head.outputs))),),
+    )
+    shapes, result_tree = jax.tree.flatten(results, is_leaf=lambda x: type(x) is tuple)
 
     @jax.custom_batching.custom_vmap
-    def compute(*leaves):  # [S, ...]
-        return _launch(head.written, *tree.unflatten(leaves), **options)
+    def run(*leaves):  # [S, ...] each
+        seeds, tiles = len(leaves[0]), leaves[0].shape[1] // TILE
+        programs = max(1, min(PROGRAMS // seeds, tiles // TILES))
 
-    @compute.def_vmap
+        def body(*refs):
+            k = len(leaves)
+            _kernel(head, programs, tree.unflatten(refs[:k]), result_tree.unflatten(refs[k:]))
+
+        each = pl.pallas_call(
+            body,
+            grid=(seeds, programs),
+            in_specs=[_block(1, x.shape[1:]) for x in leaves],
+            out_specs=[_block(2, shape) for shape in shapes],
+            out_shape=[jax.ShapeDtypeStruct((seeds, programs, *x), jnp.float32) for x in shapes],
+            compiler_params=triton.CompilerParams(num_warps=WARPS, num_stages=1),
+            interpret=interpret,
+        )(*leaves)
+        return [jnp.sum(x, axis=1) for x in each]
+
+    @run.def_vmap
     def _(size, mapped, *leaves):
-        along = [
+        each = [
             x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
             for x, is_mapped in zip(leaves, mapped, strict=True)
         ]
-        results = compute(*(x.reshape(-1, *x.shape[2:]) for x in along))
-        sums, grads, layers = jax.tree.map(lambda x: x.reshape(size, -1, *x.shape[1:]), results)
-        return (sums, grads, layers), jax.tree.map(lambda x: True, (sums, grads, layers))
+        sums = run(*(x.reshape(-1, *x.shape[2:]) for x in each))
+        return [x.reshape(size, -1, *x.shape[1:]) for x in sums], [True] * len(sums)
 
-    results = compute(*(x[None] for x in leaves))
-    (value, *sums), constants, layers = jax.tree.map(lambda x: x[0], results)
-    network = {
-        name: {"kernel": kernel, "bias": bias}
-        for name, (kernel, bias) in zip(params["network"]["params"], layers, strict=True)
-    }
-    grads = {"network": {"params": network}, "constants": constants}
-    return value, grads, metrics.unflatten(sums)
+    return result_tree.unflatten(x[0] for x in run(*(x[None] for x in leaves)))
 
 
-def _head(loss: Loss, outputs: Any, action: Any) -> tuple[_Head, Any]:
-    """Returns what is computed from the network's outputs on, and the structure of the metrics."""
-
-    def differentiated(outputs, action, weight, mask):
-        (value, metrics), slope = jax.value_and_grad(loss, has_aux=True)(
-            outputs, action, weight, mask
-        )
-        return value, metrics, slope
-
-    shape = jax.ShapeDtypeStruct
-    examples = outputs, action, shape((), jnp.float32), shape((), bool)
-    closed, shapes = jax.make_jaxpr(differentiated, return_shape=True)(*examples)
-    traced = [k for k, x in enumerate(closed.consts) if isinstance(x, jax.core.Tracer)]
-    operands = [closed.consts[k] for k in traced]
-
-    def of_operands(outputs, action, weight, mask, *operands):
-        consts = list(closed.consts)
-        for k, operand in zip(traced, operands, strict=True):
-            consts[k] = operand
-        return jax.core.eval_jaxpr(closed.jaxpr, consts, outputs, action, weight, mask)
-
-    written = fused.scalarize(
-        of_operands, *examples, *(shape(x.shape, x.dtype) for x in operands), branch_cost=2**31
-    )
-    return _Head(written, operands), jax.tree.structure(shapes[1])
+def padded(size: int) -> int:
+    """Returns the size that an axis is padded to."""
+    return max(LEAST, 1 << (size - 1).bit_length())
 
 
-def _launch(
-    written: fused.Scalarized,
-    observation: jax.Array,
-    action: jax.Array,
-    weight: jax.Array,
-    mask: jax.Array,
-    constants: jax.Array,
-    layers: list[tuple[jax.Array, jax.Array]],
-    operands: list[jax.Array],
-    *,
-    interpret: bool = False,
-    tile: int | None = None,
-    warps: int | None = None,
-    programs: int | None = None,
-    multiply: str | None = None,
-    skip: bool | None = None,
-) -> Any:
-    """Returns sums [S, ...] of the loss and the metrics, and of the gradients."""
-    tile = TILE if tile is None else tile
-    multiply = MULTIPLY if multiply is None else multiply
-    skip = SKIP if skip is None else skip
-    seeds, count, observation_size = observation.shape
-    if programs is None:
-        processors = 132 if interpret else jax.devices()[0].core_count
-        room = max(1, PROGRAMS * processors // seeds)
-        programs = max(1, min(room, count // (LEAST_TILES * tile)))
-    kernels = [kernel for kernel, _ in layers]
-    widths = [_wide(observation_size + 1), *(_wide(x.shape[-1]) for x in kernels[:-1])]
-    hidden = [_pad(x, widths[k], widths[k + 1]) for k, x in enumerate(kernels[:-1])]
-    # The bias of the first layer is the weight of an entry that is 1.
-    first, *biases = [bias for _, bias in layers[:-1]]
-    hidden[0] = hidden[0].at[:, observation_size, : first.shape[-1]].set(first)
-    biases = [jnp.pad(x, ((0, 0), (0, widths[k + 2] - x.shape[-1]))) for k, x in enumerate(biases)]
-    last = jnp.swapaxes(_pad(kernels[-1], widths[-1], kernels[-1].shape[-1]), 1, 2)
-    numbers = jnp.concatenate(
-        [layers[-1][1], constants, *(x.reshape(seeds, -1) for x in operands)], axis=1
-    ).astype(jnp.float32)
-    num_outputs, num_constants = kernels[-1].shape[-1], constants.shape[-1]
-    given = observation, action, weight, mask, *hidden, *biases, last, numbers
-    metrics = len(written.outputs) - 1
-    results = [
-        *((w, widths[k + 1]) for k, w in enumerate(widths[:-1])),
-        *((widths[0], w) for w in widths[2:]),
-        (_LEAST, widths[-1]),
-        (_wide(metrics + num_outputs + num_constants),),
-    ]
-    body = functools.partial(
-        _kernel,
-        written=written,
-        widths=widths,
-        num_outputs=num_outputs,
-        num_constants=num_constants,
-        operands=[x.shape[1:] for x in operands],
-        tile=tile,
-        programs=programs,
-        multiply=multiply,
-        skip=skip,
-    )
-    partial_sums = pl.pallas_call(
-        body,
-        grid=(seeds, programs),
-        in_specs=[_of_seed(x.shape) for x in given],
-        out_specs=[_of_program(shape) for shape in results],
-        out_shape=[
-            jax.ShapeDtypeStruct((seeds, programs, *shape), jnp.float32) for shape in results
-        ],
-        interpret=interpret,
-        compiler_params=triton.CompilerParams(
-            num_warps=WARPS if warps is None else warps, num_stages=1
-        ),
-    )(*given)
-    *sums, numbers = [jnp.sum(x, axis=1) for x in partial_sums]
-    depth = len(widths) - 1
-    slopes = [x[:, observation_size] for x in (sums[0], *sums[depth : 2 * depth - 1])]
-    own = [
-        (total[:, : x.shape[1], : x.shape[2]], slope[:, : x.shape[2]])
-        for x, total, slope in zip(kernels, sums, slopes, strict=False)
-    ]
-    own.append(
-        (
-            jnp.swapaxes(sums[-1][:, :num_outputs, : kernels[-1].shape[1]], 1, 2),
-            numbers[:, metrics : metrics + num_outputs],
-        )
-    )
-    slopes = numbers[:, metrics + num_outputs : metrics + num_outputs + num_constants]
-    return [numbers[:, k] for k in range(metrics)], slopes, own
+def _block(axes: int, shape: tuple[int, ...]) -> pl.BlockSpec:
+    """Returns a program's part of an array whose first axes are those of the grid."""
+    return pl.BlockSpec((None,) * axes + shape, lambda *at: at[:axes] + (0,) * len(shape))
 
 
-def _of_seed(shape: tuple[int, ...]) -> pl.BlockSpec:
-    return pl.BlockSpec((None, *shape[1:]), lambda s, p: (s,) + (0,) * (len(shape) - 1))
+class _Split(NamedTuple):
+    """A matrix as the sum of two in bfloat16."""
+
+    large: jax.Array
+    small: jax.Array
 
 
-def _of_program(shape: tuple[int, ...]) -> pl.BlockSpec:
-    return pl.BlockSpec((None, None, *shape), lambda s, p: (s, p) + (0,) * len(shape))
+def _split(x: jax.Array) -> _Split:
+    large = x.astype(jnp.bfloat16)
+    return _Split(large, (x - large.astype(jnp.float32)).astype(jnp.bfloat16))
 
 
-def _wide(size: int) -> int:
-    """Returns a power of two of at least that size, which Triton asks of arrays."""
-    return max(_LEAST, 1 << (size - 1).bit_length())
-
-
-def _pad(x: jax.Array, rows: int, columns: int) -> jax.Array:
-    return jnp.pad(x, ((0, 0), (0, rows - x.shape[1]), (0, columns - x.shape[2])))
-
-
-class _Factor:
-    """A matrix that is a factor of products: itself, and its two parts in bfloat16."""
-
-    def __init__(self, x: jax.Array, multiply: str):
-        self.x, self.multiply = x, multiply
-        if multiply == "bf16x3":
-            self.large = x.astype(jnp.bfloat16)
-            self.small = (x - self.large.astype(jnp.float32)).astype(jnp.bfloat16)
-
-
-_PRECISIONS = {
-    "ieee": lax.Precision.HIGHEST,
-    "tf32": lax.DotAlgorithmPreset.TF32_TF32_F32,
-    "tf32x3": lax.DotAlgorithmPreset.TF32_TF32_F32_X3,
-}
-
-
-def _product(a: _Factor, b: _Factor, contract: tuple[int, int]) -> jax.Array:
-    """Returns a product in float32 of matrices, summed over these axes of the two."""
-    dims = (((contract[0],), (contract[1],)), ((), ()))
+def _product(a: _Split, b: _Split, over: tuple[int, int]) -> jax.Array:
+    """Returns a product of matrices in float32, summed over these axes of the two."""
     dot = functools.partial(
-        lax.dot_general, dimension_numbers=dims, preferred_element_type=jnp.float32
+        lax.dot_general,
+        dimension_numbers=(((over[0],), (over[1],)), ((), ())),
+        precision=lax.Precision.HIGHEST,
+        preferred_element_type=jnp.float32,
     )
-    if a.multiply != "bf16x3":
-        return dot(a.x, b.x, precision=_PRECISIONS[a.multiply])
     return dot(a.large, b.small) + dot(a.small, b.large) + dot(a.large, b.large)
 
 
-def _kernel(
-    observation,
-    action,
-    weight,
-    mask,
-    *refs,
-    written: fused.Scalarized,
-    widths: Sequence[int],
-    num_outputs: int,
-    num_constants: int,
-    operands: Sequence[tuple[int, ...]],
-    tile: int,
-    programs: int,
-    multiply: str,
-    skip: bool,
-):
+def _kernel(head: fused.Scalarized, programs: int, given: Given, results: Sums) -> None:
     """Sums over every ``programs``-th tile of samples."""
+    count, size = given.observation.shape
+    kernels = [_split(x[...]) for x in given.kernels]
+    biases = [None, *(x[...] for x in given.biases)]
+    last = [given.last[k, :] for k in range(given.last.shape[0])]
+    numbers = [given.numbers[k] for k in range(given.numbers.shape[0])]
+    column = lax.broadcasted_iota(jnp.int32, (TILE, given.kernels[0].shape[0]), 1)
+    output = lax.broadcasted_iota(jnp.int32, (TILE, LEAST), 1)
     program = pl.program_id(1)
-    depth = len(widths) - 1
-    hidden, refs = refs[:depth], refs[depth:]
-    biases, refs = refs[: depth - 1], refs[depth - 1 :]
-    last, numbers, *results = refs
-    count, observation_size = observation.shape
-    factor = functools.partial(_Factor, multiply=multiply)
-    weights = [factor(ref[...]) for ref in hidden]
-    biases = [ref[...] for ref in biases]
-    last = [last[k, :] for k in range(num_outputs)]
-    scalar = [numbers[k] for k in range(numbers.shape[0])]
-    column = lax.broadcasted_iota(jnp.int32, (tile, widths[0]), 1)
-    small = lax.broadcasted_iota(jnp.int32, (tile, _LEAST), 1)
 
     def add(k, sums):
-        row = (program + k * programs) * tile + lax.iota(jnp.int32, tile)
-        inside = row < count
-        alive = triton.load(mask.at[row], mask=inside, other=False)
-        if not skip:
-            return add_alive(row, inside, alive, sums)
+        row = (program + k * programs) * TILE + lax.iota(jnp.int32, TILE)
+        alive = triton.load(given.mask.at[row], mask=row < count, other=False)
         return lax.cond(
             jnp.max(alive.astype(jnp.int32)) > 0,
-            lambda: add_alive(row, inside, alive, sums),
+            lambda: jax.tree.map(jnp.add, sums, of_tile(row, alive)),
             lambda: sums,
         )
 
-    def add_alive(row, inside, alive, sums):
+    def of_tile(row, alive):
+        load = functools.partial(triton.load, mask=row < count, other=0)
         seen = triton.load(
-            observation.at[row[:, None], jnp.minimum(column, observation_size - 1)],
-            mask=inside[:, None] & (column < observation_size),
+            given.observation.at[row[:, None], jnp.minimum(column, size - 1)],
+            mask=(row < count)[:, None] & (column < size),
             other=0.0,
         )
-        units = [factor(jnp.where(column == observation_size, 1.0, seen))]
-        values = []
-        for k in range(depth):
-            z = _product(units[k], weights[k], (1, 0))
-            values.append(jnp.tanh(z if k == 0 else z + biases[k - 1][None, :]))
-            units.append(factor(values[k]))
+        units, values = [_split(jnp.where(column == size, 1.0, seen))], []
+        for kernel, bias in zip(kernels, biases, strict=True):
+            z = _product(units[-1], kernel, (1, 0))
+            values.append(jnp.tanh(z if bias is None else z + bias[None, :]))
+            units.append(_split(values[-1]))
+
+        shared = [jnp.full(TILE, x) for x in numbers]
         outputs = [
-            jnp.sum(values[-1] * row_of[None, :], axis=1) + scalar[k]
-            for k, row_of in enumerate(last)
+            jnp.sum(values[-1] * x[None, :], axis=1) + bias
+            for x, bias in zip(last, shared, strict=False)
         ]
-        read = _reader(
-            outputs,
-            scalar[num_outputs:],
-            num_constants,
-            lambda k: triton.load(action.at[row, k], mask=inside, other=0),
-            triton.load(weight.at[row], mask=inside, other=0.0),
-            alive,
-            operands,
+        arguments = (
+            [*outputs, *shared[len(last) : -1]],
+            [load(given.action.at[row, k]) for k in range(given.action.shape[1])],
+            [load(given.weight.at[row])],
+            [alive],
+            shared[-1:],
         )
-        found = written.compile("xla", read=read, batch_shape=(tile,))
-        *own, slopes = found
-        lanes = jnp.zeros((tile,), jnp.float32)
-        slopes = [lanes + x for x in slopes]
-        own = [*(lanes + x for (x,) in own), *slopes]
-        by_output = jnp.zeros((tile, _LEAST), jnp.float32)
-        back = jnp.zeros((tile, widths[-1]), jnp.float32)
-        for k in range(num_outputs):
-            by_output = jnp.where(small == k, slopes[k][:, None], by_output)
-            back += slopes[k][:, None] * last[k][None, :]
-        grads, bias_grads = [], []
-        for k in reversed(range(depth)):
-            back = factor(back * (1.0 - values[k] * values[k]))
-            grads.append(_product(units[k], back, (0, 0)))
+        found = head.compile("xla", read=lambda at: arguments[at[0]][at[1]], batch_shape=(TILE,))
+        found = [jnp.zeros(TILE) + x for leaf in found for x in leaf]
+
+        slopes, back = jnp.zeros((TILE, LEAST)), jnp.zeros(values[-1].shape)
+        for k, slope in enumerate(found[-len(arguments[0]) :][: len(last)]):
+            slopes = jnp.where(output == k, slope[:, None], slopes)
+            back += slope[:, None] * last[k][None, :]
+        of_kernels, of_biases = [], []
+        for k in reversed(range(len(kernels))):
+            back = _split(back * (1.0 - values[k] * values[k]))
+            of_kernels.append(_product(units[k], back, (0, 0)))
             if k > 0:
-                bias_grads.append(_product(units[0], back, (0, 0)))
-                back = _product(back, weights[k], (1, 1))
-        found = *grads[::-1], *bias_grads[::-1], _product(factor(by_output), units[-1], (0, 0))
-        return [total + x for total, x in zip(sums, [*found, *own], strict=True)]
+                of_biases.append(_product(units[0], back, (0, 0)))
+                back = _product(back, kernels[k], (1, 1))
+        of_last = _product(_split(slopes), units[-1], (0, 0))
+        return Sums(of_kernels[::-1], of_biases[::-1], of_last, found)
 
-    own = len(written.outputs) - 1 + num_outputs + num_constants
-    zeros = [
-        *(jnp.zeros(result.shape, jnp.float32) for result in results[:-1]),
-        *(jnp.zeros((tile,), jnp.float32) for _ in range(own)),
-    ]
-    tiles = pl.cdiv(count, tile)
-    mine = (tiles - program + programs - 1) // programs
-    sums = lax.fori_loop(0, mine, add, zeros)
-    for result, total in zip(results[:-1], sums, strict=False):
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape), results)
+    lanes = [jnp.zeros(TILE) for leaf in head.outputs for _ in leaf]
+    own = (pl.cdiv(count, TILE) - program + programs - 1) // programs
+    sums = lax.fori_loop(0, own, add, zeros._replace(numbers=lanes))
+    numbers, at = zeros.numbers, lax.iota(jnp.int32, zeros.numbers.size)
+    for k, lane in enumerate(sums.numbers):
+        numbers = jnp.where(at == k, jnp.sum(lane), numbers)
+
+    def write(result, total):
         result[...] = total
-    place = lax.iota(jnp.int32, results[-1].shape[0])
-    totals = jnp.zeros(place.shape, jnp.float32)
-    for k, total in enumerate(sums[len(results) - 1 :]):
-        totals = jnp.where(place == k, jnp.sum(total), totals)
-    results[-1][...] = totals
 
-
-def _reader(outputs, scalars, num_constants, load_action, weight, mask, operands):
-    """Returns a function from (number of the argument, position in it) to what it is."""
-    outputs = [*outputs, *scalars[:num_constants]]
-    starts = num_constants + np.cumsum([0, *(int(np.prod(x, dtype=int)) for x in operands)])
-    actions = functools.cache(load_action)
-
-    def read(place):
-        number, position = place
-        if number == 0:
-            x = outputs[position]
-            return jnp.zeros(mask.shape, jnp.float32) + x
-        if number == 1:
-            return actions(position)
-        if number < 4:
-            return (weight, mask)[number - 2]
-        return jnp.zeros(mask.shape, jnp.float32) + scalars[starts[number - 4] + position]
-
-    return read
+    jax.tree.map(write, results, sums._replace(numbers=numbers))

@@ -17,7 +17,7 @@ from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.engines.episode import check_shapes, episode_keys
 from mjx_reinforce.fused import any_lane
-from mjx_reinforce.learners import counts, gradient_kernel, pace
+from mjx_reinforce.learners import counts, pace
 from mjx_reinforce.learners.contract import check_estimator, check_optimizer, check_update
 from mjx_reinforce.learners.diagnostics import (
     nan_unless,
@@ -37,6 +37,7 @@ from mjx_reinforce.learners.learner import (
     keep_finite,
 )
 from mjx_reinforce.learners.pace import AutoEpisodes
+from mjx_reinforce.learners.policy_gradient import in_one_kernel
 from mjx_reinforce.learners.schedules import Clock
 from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_optimizer
 from mjx_reinforce.policies import normalize
@@ -384,7 +385,7 @@ class _Reinforce:
             divisor=self._divisor(trajectory),
             clock=Clock(state.progress, counts.as_float(state.env_steps)),
             played=trajectory.played,
-            gradient=self._gradient(),
+            in_one_kernel=self._in_one_kernel,
         )
         params, opt_state, update_metrics = self.update(problem, key, actor.params, state.opt_state)
         if self.auto is not None and state.pace is not None:
@@ -411,14 +412,14 @@ class _Reinforce:
         diagnostics = nan_unless(sound, metrics | update_metrics | change)
         return state, episode_metrics(trajectory) | diagnostics | {"skipped_update": skipped}
 
-    def _gradient(self) -> Callable[..., Any] | None:
-        """Returns what computes the gradient of all samples at once, if anything does."""
-        if self.devices is not None or gradient_kernel.unsupported(
-            self.policy, self.observation_size
-        ):
+    def _in_one_kernel(self, params: Any, samples: tuple[jax.Array, ...]) -> Any:
+        """Returns the gradient as ``policy_gradient.in_one_kernel`` does, or None."""
+        if self.devices is not None:  # samples are on several
             return None
-        loss = _loss(self.policy.distribution, self.entropy_cost)
-        return functools.partial(gradient_kernel.gradient, self.policy, loss)
+        loss = functools.partial(_loss, self.policy.distribution)
+        return in_one_kernel(
+            self.policy, loss, self.entropy_cost, params, samples, seeds=self.num_seeds
+        )
 
     def _divisor(self, trajectory: Trajectory) -> int | jax.Array:
         """Returns what the sum over all steps is divided by."""
@@ -460,22 +461,25 @@ class _OneStart:
 
 def _surrogate(policy: Policy, entropy_cost: float | jax.Array) -> Callable[..., Any]:
     """Returns (params, samples) -> (minus the sum in the formula, the sum of the entropy)."""
-    loss = _loss(policy.distribution, entropy_cost)
 
     def surrogate(params, chunk):
-        observation, *rest = chunk
-        return loss(policy.apply(params, observation), *rest)
+        observation, action, weight, mask = chunk
+        outputs = policy.apply(params, observation)
+        return _loss(policy.distribution, outputs, action, weight, mask, entropy_cost)
 
     return surrogate
 
 
-def _loss(distribution: Distribution, entropy_cost: float | jax.Array) -> Callable[..., Any]:
-    """Returns (outputs, action, weight, mask) -> what ``_surrogate`` does."""
-
-    def loss(outputs, action, weight, mask):
-        entropy = distribution.entropy(outputs)
-        terms = distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
-        loss = -jnp.sum(jnp.where(mask, terms, 0.0))
-        return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
-
-    return loss
+def _loss(
+    distribution: Distribution,
+    outputs: jax.Array,
+    action: jax.Array,
+    weight: jax.Array,
+    mask: jax.Array,
+    entropy_cost: float | jax.Array,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Returns what ``_surrogate`` does, from the policy's outputs on."""
+    entropy = distribution.entropy(outputs)
+    terms = distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
+    loss = -jnp.sum(jnp.where(mask, terms, 0.0))
+    return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}

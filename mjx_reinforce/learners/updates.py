@@ -6,7 +6,6 @@ episodes. No update corrects for that (there are no importance weights), and nei
 published programs that these updates follow.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -37,8 +36,8 @@ class Problem(NamedTuple):
     divisor: [] by which the sum over all samples is divided
     clock: how far the run was before the rollout
     played: [N] which episodes were played, None where all were
-    gradient: (params, samples) -> (loss, gradient, sums of metrics) of all samples at once, where
-      something is faster than ``accumulate_gradient``
+    in_one_kernel: (params, samples) -> what ``accumulate_gradient`` returns, or None where that is
+      to compute it
     """
 
     surrogate: Callable[[Any, tuple[jax.Array, ...]], tuple[jax.Array, dict[str, jax.Array]]]
@@ -47,7 +46,7 @@ class Problem(NamedTuple):
     divisor: int | jax.Array
     clock: Clock
     played: jax.Array | None = None
-    gradient: Callable[[Any, tuple[jax.Array, ...]], tuple[jax.Array, Any, Any]] | None = None
+    in_one_kernel: Callable[[Any, tuple[jax.Array, ...]], Any] = lambda params, samples: None
 
 
 #: Where the number of episodes follows the noise, it is measured between so many groups of them, at
@@ -92,8 +91,9 @@ def whole_rollout(turn: Turn) -> Update:
     def update(problem, key, params, opt_state):
         mask = problem.samples[-1]
         if problem.played is None:
-            gradient = problem.gradient or functools.partial(accumulate_gradient, problem.surrogate)
-            _, grads, sums = gradient(params, problem.samples)
+            _, grads, sums = problem.in_one_kernel(params, problem.samples) or accumulate_gradient(
+                problem.surrogate, params, problem.samples
+            )
             metrics = {}
             if mask.shape[1] > 1:
                 metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)

@@ -1,4 +1,4 @@
-"""The kernel of a small network's gradient, interpreted, against ``jax.value_and_grad``."""
+"""The kernel of a small policy's gradient, interpreted, against ``jax.value_and_grad``."""
 
 import functools
 
@@ -6,15 +6,34 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AbstractDevice, AbstractMesh, AxisType, use_abstract_mesh
 
 from mjx_reinforce import envs, mlp_policy, reinforce, train_step
-from mjx_reinforce.learners import gradient_kernel
+from mjx_reinforce.learners import gradient_kernel, policy_gradient
 from mjx_reinforce.learners.reinforce import _loss, _surrogate
 from mjx_reinforce.registry import DISTRIBUTIONS, load_choice
 from mjx_reinforce.types import Box, Discrete
 
+FAMILIES = [x for x in DISTRIBUTIONS if x != "deterministic"]
 SAMPLES = 9 * 11
-OPTIONS = {"interpret": True, "tile": 32, "programs": 2, "multiply": "ieee"}
+
+
+@pytest.fixture
+def interpreted(monkeypatch):
+    """Tiles are of 32 samples, a program has one or two, and products are in float32."""
+    launch = functools.partial(gradient_kernel.launch, interpret=True)
+    monkeypatch.setattr(gradient_kernel, "launch", launch)
+    for name, number in {"TILE": 32, "TILES": 1, "PROGRAMS": 2}.items():
+        monkeypatch.setattr(gradient_kernel, name, number)
+    whole = lambda x: gradient_kernel._Split(x, jnp.zeros_like(x))  # noqa: E731
+    monkeypatch.setattr(gradient_kernel, "_split", whole)
+
+
+@pytest.fixture
+def on_a_gpu(monkeypatch):
+    """JAX finds a GPU of the kind that it was measured on, and any samples are enough."""
+    monkeypatch.setattr(policy_gradient, "_capability", lambda: policy_gradient.MEASURED)
+    monkeypatch.setattr(policy_gradient, "LEAST_SAMPLES", 1)
 
 
 def problem(family, hidden=(16, 32), seed=0):
@@ -36,8 +55,8 @@ def problem(family, hidden=(16, 32), seed=0):
 
 
 def by_kernel(policy, cost, params, samples):
-    loss = _loss(policy.distribution, cost)
-    return gradient_kernel.gradient(policy, loss, params, samples, **OPTIONS)
+    loss = functools.partial(_loss, policy.distribution)
+    return policy_gradient.kernel_gradient(loss, params, samples, jnp.asarray(cost))
 
 
 def by_xla(policy, cost, params, samples):
@@ -54,19 +73,35 @@ def assert_equal(found, expected):
         assert np.linalg.norm(x - y) <= 1e-5 * (np.linalg.norm(y) if y.ndim else SAMPLES)
 
 
-@pytest.mark.parametrize("family", [x for x in DISTRIBUTIONS if x != "deterministic"])
+@pytest.mark.usefixtures("interpreted")
+@pytest.mark.parametrize("family", FAMILIES)
 def test_every_distribution(family):
     policy, params, samples = problem(family)
     found = jax.jit(functools.partial(by_kernel, policy))(0.3, params, samples)
     assert_equal(found, jax.jit(functools.partial(by_xla, policy))(0.3, params, samples))
 
 
+@pytest.mark.parametrize("over", [(1, 0), (0, 0), (1, 1)])
+def test_products(over):
+    a, b = np.random.default_rng(0).normal(size=(2, 40, 40)).astype(np.float32)
+    found = gradient_kernel._product(*map(gradient_kernel._split, (a, b)), over)
+    assert found.dtype == jnp.float32
+    a, b = (
+        x.astype(float) if over[k] == 1 - k else x.T.astype(float) for k, x in enumerate((a, b))
+    )
+    error = np.abs(found - a @ b) / (np.abs(a) @ np.abs(b))
+    assert error.max() < 2.0**-14
+    assert error.max() > 2.0**-24, "in float32 it takes ten times as long"
+
+
+@pytest.mark.usefixtures("interpreted")
 @pytest.mark.parametrize("hidden", [(24,), (64, 64), (16, 8, 20)])
 def test_layers(hidden):
     policy, params, samples = problem("normal", hidden)
     assert_equal(by_kernel(policy, 0.0, params, samples), by_xla(policy, 0.0, params, samples))
 
 
+@pytest.mark.usefixtures("interpreted")
 def test_seeds_of_their_own():
     """Parameters, samples and the cost of entropy differ; one more axis shares the samples."""
     made = [problem("normal", seed=k) for k in range(4)]
@@ -84,6 +119,7 @@ def test_seeds_of_their_own():
     assert_equal(found, expected)
 
 
+@pytest.mark.usefixtures("interpreted")
 def test_what_is_not_finite_shows():
     policy, params, (observation, action, weight, mask) = problem("normal")
     weight = weight.at[3, 4].set(jnp.nan)
@@ -98,15 +134,33 @@ def test_what_is_not_finite_shows():
     assert_equal(by_kernel(policy, 0.0, params, samples), by_xla(policy, 0.0, params, samples))
 
 
+@pytest.mark.parametrize("family", FAMILIES)
+def test_triton_has_what_it_needs(family, monkeypatch):
+    """JAX's part of the compiler takes the kernel, and that of the largest network."""
+    # JAX 0.12 asks the device, and finds none here.
+    gpu = AbstractDevice(device_kind="NVIDIA H100 80GB HBM3", num_cores=None, platform="cuda")
+    mesh = AbstractMesh((1,), ("x",), axis_types=(AxisType.Auto,), abstract_device=gpu)
+    launch = gradient_kernel.launch
+
+    def launch_there(*given):
+        with use_abstract_mesh(mesh):
+            return launch(*given)
+
+    monkeypatch.setattr(gradient_kernel, "launch", launch_there)
+    for made in (problem(family), problem(family, (64, 64, 64))):
+        given = jax.tree.map(lambda x: jax.ShapeDtypeStruct((4, *x.shape), x.dtype), made[1:])
+        program = jax.jit(jax.vmap(functools.partial(by_kernel, made[0], 0.1)))
+        lowered = program.trace(*given).lower(lowering_platforms=("cuda",))
+        assert policy_gradient.TRITON in lowered.as_text()
+
+
+@pytest.mark.usefixtures("interpreted", "on_a_gpu")
 @pytest.mark.parametrize("loss_per", ["episode", "step"])
 def test_a_learner_takes_it(loss_per, monkeypatch):
     env = envs.make("CartPole-v1")
-    kernel = functools.partial(gradient_kernel.gradient, **OPTIONS)
     found = []
-    for on in (False, True):
-        if on:
-            monkeypatch.setattr(gradient_kernel, "unsupported", gradient_kernel.unfit)
-            monkeypatch.setattr(gradient_kernel, "gradient", kernel)
+    for least in (10**6, 1):
+        monkeypatch.setattr(policy_gradient, "LEAST_SAMPLES", least)
         learner = reinforce(env, num_episodes=4, horizon=20, loss_per=loss_per, entropy_cost=0.1)
         state, metrics = train_step(learner, learner.init(jax.random.key(0)))
         found.append((state.actor.params, metrics["gradient_norm"]))
@@ -117,14 +171,31 @@ def test_a_learner_takes_it(loss_per, monkeypatch):
     ), "the kernel rounds otherwise; it was not taken"
 
 
+@pytest.mark.usefixtures("interpreted", "on_a_gpu")
+def test_xla_takes_what_cannot_be_written_out(monkeypatch):
+    policy, params, samples = problem("normal")
+
+    def loss(outputs, action, weight, mask, cost):
+        value, metrics = _loss(policy.distribution, outputs, action, weight, mask, cost)
+        return value + jnp.linalg.svd(outputs[..., None], compute_uv=False)[0] * 0.0, metrics
+
+    fine = functools.partial(_loss, policy.distribution)
+    in_one_kernel = policy_gradient.in_one_kernel
+    assert in_one_kernel(policy, fine, 0.1, params, samples) is not None
+    assert in_one_kernel(policy, loss, 0.1, params, samples) is None
+    monkeypatch.setattr(policy_gradient, "_capability", lambda: "8.0")
+    assert in_one_kernel(policy, fine, 0.1, params, samples) is None
+    monkeypatch.undo()
+    assert in_one_kernel(policy, fine, 0.1, params, samples) is None, "there is no GPU here"
+
+
 def test_for_which_policies():
     policy, *_ = problem("normal")
-    assert gradient_kernel.unfit(policy, 5) is None
-    assert gradient_kernel.unsupported(policy, 5) is not None, "there is no GPU here"
+    assert policy_gradient.fits(policy, 5)
     other = policy._replace(apply=lambda *given: policy.apply(*given))
-    assert gradient_kernel.unfit(other, 5) is not None
-    assert gradient_kernel.unfit(problem("normal", (128,))[0], 5) is not None
-    assert gradient_kernel.unfit(problem("normal", ())[0], 5) is not None
-    assert gradient_kernel.unfit(policy, 200) is not None
+    assert not policy_gradient.fits(other, 5)
+    assert not policy_gradient.fits(problem("normal", (128,))[0], 5)
+    assert not policy_gradient.fits(problem("normal", ())[0], 5)
+    assert not policy_gradient.fits(policy, 200)
     with jax.enable_x64(True):
-        assert gradient_kernel.unfit(policy, 5) is not None
+        assert not policy_gradient.fits(policy, 5)
