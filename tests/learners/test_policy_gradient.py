@@ -9,6 +9,7 @@ import pytest
 from jax.sharding import AbstractDevice, AbstractMesh, AxisType, use_abstract_mesh
 
 from mjx_reinforce import envs, mlp_policy, reinforce, train_step
+from mjx_reinforce.devices import RUNS, Devices
 from mjx_reinforce.learners import gradient_kernel, policy_gradient
 from mjx_reinforce.learners.reinforce import _loss, _surrogate
 from mjx_reinforce.registry import DISTRIBUTIONS, load_choice
@@ -117,6 +118,22 @@ def test_seeds_of_their_own():
         for f in (by_kernel, by_xla)
     )
     assert_equal(found, expected)
+
+
+@pytest.mark.usefixtures("interpreted", "on_a_gpu")
+def test_seeds_of_a_device():
+    """Within ``shard_map``, where JAX says for indices how they are divided."""
+    policy, *given = problem("categorical")
+    given = jax.tree.map(lambda x: x[None], given)
+
+    def gradient(params, samples):
+        loss = functools.partial(_loss, policy.distribution)
+        found = policy_gradient.in_one_kernel(policy, loss, 0.1, params, samples)
+        assert found is not None
+        return found
+
+    found = Devices(1).jit(jax.vmap(gradient), (RUNS, RUNS), RUNS)(*given)
+    assert_equal(found, jax.vmap(functools.partial(by_xla, policy, 0.1))(*given))
 
 
 @pytest.mark.usefixtures("interpreted")
