@@ -26,6 +26,7 @@ from mjx_reinforce.learners.diagnostics import (
     within_kl,
 )
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
+from mjx_reinforce.learners.gpu.gradient import in_one_kernel
 from mjx_reinforce.learners.learner import (
     Guests,
     Host,
@@ -37,7 +38,6 @@ from mjx_reinforce.learners.learner import (
     keep_finite,
 )
 from mjx_reinforce.learners.pace import AutoEpisodes
-from mjx_reinforce.learners.policy_gradient import in_one_kernel
 from mjx_reinforce.learners.schedules import Clock
 from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_optimizer
 from mjx_reinforce.policies import normalize
@@ -413,7 +413,7 @@ class _Reinforce:
         return state, episode_metrics(trajectory) | diagnostics | {"skipped_update": skipped}
 
     def _in_one_kernel(self, params: Any, samples: tuple[jax.Array, ...]) -> Any:
-        """Returns the gradient as ``policy_gradient.in_one_kernel`` does, or None."""
+        """Returns the gradient as ``gpu.gradient.in_one_kernel`` does, or None."""
         if self.devices is not None:  # samples are on several
             return None
         loss = functools.partial(_loss, self.policy.distribution)

@@ -100,7 +100,7 @@ def mlp_policy(
         fixed = jnp.broadcast_to(params["constants"], (*batch, len(constants)))
         return jnp.concatenate([*outputs, fixed], axis=-1)
 
-    if len(networks) == 1:  # learners.policy_gradient knows its derivative
+    if len(networks) == 1:  # learners.gpu.gradient knows its derivative
         apply.network = networks["network"]  # pyright: ignore[reportFunctionMemberAccess]
     return Policy(init, apply, distribution)
 

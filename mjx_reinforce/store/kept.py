@@ -22,7 +22,7 @@ from mjx_reinforce.engines.native.available import made_for, platform
 from mjx_reinforce.engines.native.cpu import seam
 from mjx_reinforce.engines.native.gpu.seam import PTX
 from mjx_reinforce.envs.settings import split_words
-from mjx_reinforce.learners.policy_gradient import TRITON
+from mjx_reinforce.learners.gpu.gradient import TRITON
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import Config, marked

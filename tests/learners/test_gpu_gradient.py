@@ -10,7 +10,7 @@ from jax.sharding import AbstractDevice, AbstractMesh, AxisType, use_abstract_me
 
 from mjx_reinforce import envs, mlp_policy, reinforce, train_step
 from mjx_reinforce.devices import RUNS, Devices
-from mjx_reinforce.learners import gradient_kernel, policy_gradient
+from mjx_reinforce.learners.gpu import gradient, kernel
 from mjx_reinforce.learners.reinforce import _loss, _surrogate
 from mjx_reinforce.registry import DISTRIBUTIONS, load_choice
 from mjx_reinforce.types import Box, Discrete
@@ -22,19 +22,19 @@ SAMPLES = 9 * 11
 @pytest.fixture
 def interpreted(monkeypatch):
     """Tiles are of 32 samples, a program has one or two, and products are in float32."""
-    launch = functools.partial(gradient_kernel.launch, interpret=True)
-    monkeypatch.setattr(gradient_kernel, "launch", launch)
+    launch = functools.partial(kernel.launch, interpret=True)
+    monkeypatch.setattr(kernel, "launch", launch)
     for name, number in {"TILE": 32, "TILES": 1, "PROGRAMS": 2}.items():
-        monkeypatch.setattr(gradient_kernel, name, number)
-    whole = lambda x: gradient_kernel._Split(x, jnp.zeros_like(x))  # noqa: E731
-    monkeypatch.setattr(gradient_kernel, "_split", whole)
+        monkeypatch.setattr(kernel, name, number)
+    whole = lambda x: kernel._Split(x, jnp.zeros_like(x))  # noqa: E731
+    monkeypatch.setattr(kernel, "_split", whole)
 
 
 @pytest.fixture
 def on_a_gpu(monkeypatch):
     """JAX finds a GPU of the kind that it was measured on, and any samples are enough."""
-    monkeypatch.setattr(policy_gradient, "_capability", lambda: policy_gradient.MEASURED)
-    monkeypatch.setattr(policy_gradient, "LEAST_SAMPLES", 1)
+    monkeypatch.setattr(gradient, "_capability", lambda: gradient.MEASURED)
+    monkeypatch.setattr(gradient, "LEAST_SAMPLES", 1)
 
 
 def problem(family, hidden=(16, 32), seed=0):
@@ -57,7 +57,7 @@ def problem(family, hidden=(16, 32), seed=0):
 
 def by_kernel(policy, cost, params, samples):
     loss = functools.partial(_loss, policy.distribution)
-    return policy_gradient.kernel_gradient(loss, params, samples, jnp.asarray(cost))
+    return gradient.kernel_gradient(loss, params, samples, jnp.asarray(cost))
 
 
 def by_xla(policy, cost, params, samples):
@@ -85,7 +85,7 @@ def test_every_distribution(family):
 @pytest.mark.parametrize("over", [(1, 0), (0, 0), (1, 1)])
 def test_products(over):
     a, b = np.random.default_rng(0).normal(size=(2, 40, 40)).astype(np.float32)
-    found = gradient_kernel._product(*map(gradient_kernel._split, (a, b)), over)
+    found = kernel._product(*map(kernel._split, (a, b)), over)
     assert found.dtype == jnp.float32
     a, b = (
         x.astype(float) if over[k] == 1 - k else x.T.astype(float) for k, x in enumerate((a, b))
@@ -126,13 +126,13 @@ def test_seeds_of_a_device():
     policy, *given = problem("categorical")
     given = jax.tree.map(lambda x: x[None], given)
 
-    def gradient(params, samples):
+    def each(params, samples):
         loss = functools.partial(_loss, policy.distribution)
-        found = policy_gradient.in_one_kernel(policy, loss, 0.1, params, samples)
+        found = gradient.in_one_kernel(policy, loss, 0.1, params, samples)
         assert found is not None
         return found
 
-    found = Devices(1).jit(jax.vmap(gradient), (RUNS, RUNS), RUNS)(*given)
+    found = Devices(1).jit(jax.vmap(each), (RUNS, RUNS), RUNS)(*given)
     assert_equal(found, jax.vmap(functools.partial(by_xla, policy, 0.1))(*given))
 
 
@@ -157,18 +157,18 @@ def test_triton_has_what_it_needs(family, monkeypatch):
     # JAX 0.12 asks the device, and finds none here.
     gpu = AbstractDevice(device_kind="NVIDIA H100 80GB HBM3", num_cores=None, platform="cuda")
     mesh = AbstractMesh((1,), ("x",), axis_types=(AxisType.Auto,), abstract_device=gpu)
-    launch = gradient_kernel.launch
+    launch = kernel.launch
 
     def launch_there(*given):
         with use_abstract_mesh(mesh):
             return launch(*given)
 
-    monkeypatch.setattr(gradient_kernel, "launch", launch_there)
+    monkeypatch.setattr(kernel, "launch", launch_there)
     for made in (problem(family), problem(family, (64, 64, 64))):
         given = jax.tree.map(lambda x: jax.ShapeDtypeStruct((4, *x.shape), x.dtype), made[1:])
         program = jax.jit(jax.vmap(functools.partial(by_kernel, made[0], 0.1)))
         lowered = program.trace(*given).lower(lowering_platforms=("cuda",))
-        assert policy_gradient.TRITON in lowered.as_text()
+        assert gradient.TRITON in lowered.as_text()
 
 
 @pytest.mark.usefixtures("interpreted", "on_a_gpu")
@@ -177,7 +177,7 @@ def test_a_learner_takes_it(loss_per, monkeypatch):
     env = envs.make("CartPole-v1")
     found = []
     for least in (10**6, 1):
-        monkeypatch.setattr(policy_gradient, "LEAST_SAMPLES", least)
+        monkeypatch.setattr(gradient, "LEAST_SAMPLES", least)
         learner = reinforce(env, num_episodes=4, horizon=20, loss_per=loss_per, entropy_cost=0.1)
         state, metrics = train_step(learner, learner.init(jax.random.key(0)))
         found.append((state.actor.params, metrics["gradient_norm"]))
@@ -197,10 +197,10 @@ def test_xla_takes_what_cannot_be_written_out(monkeypatch):
         return value + jnp.linalg.svd(outputs[..., None], compute_uv=False)[0] * 0.0, metrics
 
     fine = functools.partial(_loss, policy.distribution)
-    in_one_kernel = policy_gradient.in_one_kernel
+    in_one_kernel = gradient.in_one_kernel
     assert in_one_kernel(policy, fine, 0.1, params, samples) is not None
     assert in_one_kernel(policy, loss, 0.1, params, samples) is None
-    monkeypatch.setattr(policy_gradient, "_capability", lambda: "8.0")
+    monkeypatch.setattr(gradient, "_capability", lambda: "8.0")
     assert in_one_kernel(policy, fine, 0.1, params, samples) is None
     monkeypatch.undo()
     assert in_one_kernel(policy, fine, 0.1, params, samples) is None, "there is no GPU here"
@@ -208,11 +208,11 @@ def test_xla_takes_what_cannot_be_written_out(monkeypatch):
 
 def test_for_which_policies():
     policy, *_ = problem("normal")
-    assert policy_gradient.fits(policy, 5)
+    assert gradient.fits(policy, 5)
     other = policy._replace(apply=lambda *given: policy.apply(*given))
-    assert not policy_gradient.fits(other, 5)
-    assert not policy_gradient.fits(problem("normal", (128,))[0], 5)
-    assert not policy_gradient.fits(problem("normal", ())[0], 5)
-    assert not policy_gradient.fits(policy, 200)
+    assert not gradient.fits(other, 5)
+    assert not gradient.fits(problem("normal", (128,))[0], 5)
+    assert not gradient.fits(problem("normal", ())[0], 5)
+    assert not gradient.fits(policy, 200)
     with jax.enable_x64(True):
-        assert not policy_gradient.fits(policy, 5)
+        assert not gradient.fits(policy, 5)

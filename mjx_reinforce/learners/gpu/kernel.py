@@ -1,4 +1,4 @@
-"""The kernel of ``policy_gradient``, in Pallas for Triton.
+"""The kernel of ``gradient``, in Pallas for Triton.
 
 XLA computes the gradient in some 14 passes over arrays [samples, units]. This kernel reads each
 sample once: forward pass, loss and backward pass of a tile of samples stay on a multiprocessor. A
