@@ -26,6 +26,7 @@ from mjx_reinforce.learners.diagnostics import (
     within_kl,
 )
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
+from mjx_reinforce.learners.gpu.gradient import in_one_kernel
 from mjx_reinforce.learners.learner import (
     Guests,
     Host,
@@ -384,6 +385,7 @@ class _Reinforce:
             divisor=self._divisor(trajectory),
             clock=Clock(state.progress, counts.as_float(state.env_steps)),
             played=trajectory.played,
+            in_one_kernel=self._in_one_kernel,
         )
         params, opt_state, update_metrics = self.update(problem, key, actor.params, state.opt_state)
         if self.auto is not None and state.pace is not None:
@@ -409,6 +411,15 @@ class _Reinforce:
         sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
         diagnostics = nan_unless(sound, metrics | update_metrics | change)
         return state, episode_metrics(trajectory) | diagnostics | {"skipped_update": skipped}
+
+    def _in_one_kernel(self, params: Any, samples: tuple[jax.Array, ...]) -> Any:
+        """Returns the gradient as ``gpu.gradient.in_one_kernel`` does, or None."""
+        if self.devices is not None:  # samples are on several
+            return None
+        loss = functools.partial(_loss, self.policy.distribution)
+        return in_one_kernel(
+            self.policy, loss, self.entropy_cost, params, samples, seeds=self.num_seeds
+        )
 
     def _divisor(self, trajectory: Trajectory) -> int | jax.Array:
         """Returns what the sum over all steps is divided by."""
@@ -454,9 +465,21 @@ def _surrogate(policy: Policy, entropy_cost: float | jax.Array) -> Callable[...,
     def surrogate(params, chunk):
         observation, action, weight, mask = chunk
         outputs = policy.apply(params, observation)
-        entropy = policy.distribution.entropy(outputs)
-        terms = policy.distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
-        loss = -jnp.sum(jnp.where(mask, terms, 0.0))
-        return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
+        return _loss(policy.distribution, outputs, action, weight, mask, entropy_cost)
 
     return surrogate
+
+
+def _loss(
+    distribution: Distribution,
+    outputs: jax.Array,
+    action: jax.Array,
+    weight: jax.Array,
+    mask: jax.Array,
+    entropy_cost: float | jax.Array,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Returns what ``_surrogate`` does, from the policy's outputs on."""
+    entropy = distribution.entropy(outputs)
+    terms = distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
+    loss = -jnp.sum(jnp.where(mask, terms, 0.0))
+    return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}

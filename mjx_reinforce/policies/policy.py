@@ -100,6 +100,8 @@ def mlp_policy(
         fixed = jnp.broadcast_to(params["constants"], (*batch, len(constants)))
         return jnp.concatenate([*outputs, fixed], axis=-1)
 
+    if len(networks) == 1:  # learners.gpu.gradient knows its derivative
+        apply.network = networks["network"]  # pyright: ignore[reportFunctionMemberAccess]
     return Policy(init, apply, distribution)
 
 

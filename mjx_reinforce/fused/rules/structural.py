@@ -119,6 +119,7 @@ RULES = {
     "pvary": _identity,
     "random_wrap": _identity,
     "random_unwrap": _identity,
+    "reshard": _identity,
     "sharding_constraint": _identity,
     "stop_gradient": _identity,
 }

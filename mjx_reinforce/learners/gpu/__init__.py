@@ -1,0 +1,1 @@
+"""The gradient of a small policy on an NVIDIA GPU: one kernel."""
