@@ -89,11 +89,6 @@ TASKS: dict[str, Task] = {
         Task("Swimmer-v5", "Swimmer-v5", 64, 2_000_000, (35.6, 2.6), 500_000),
         Task(
             *("HalfCheetah-v5", "HalfCheetah-v5", 64, 2_000_000, (1138.8, 104.7), 500_000),
-            note=(
-                "since then the default cuts its episodes of training after 250 env steps. 16\n"
-                "  seeds (root 8101) had 4,827 (4,405 to 5,204) after as many env steps, the\n"
-                "  worst 2,932."
-            ),
         ),
         Task("Hopper-v5", "Hopper-v5", 64, 1_500_000, (416.0, 104.7), 500_000),
         Task(
