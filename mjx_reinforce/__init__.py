@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # what type checkers and editors read in place of __getattr__
     from mjx_reinforce.engines.any_policy import rollout
     from mjx_reinforce.export.player import Player, load
     from mjx_reinforce.export.policy_files import load_policy, save_policy
-    from mjx_reinforce.export.pretrained import pretrained
+    from mjx_reinforce.export.run_files import pretrained
     from mjx_reinforce.learners.ars import ars
     from mjx_reinforce.learners.estimators import (
         Estimator,
@@ -120,7 +120,7 @@ _HOME = {
     "Trajectory": "types",
     "Player": "export.player",
     "load": "export.player",
-    "pretrained": "export.pretrained",
+    "pretrained": "export.run_files",
     "load_policy": "export.policy_files",
     "save_policy": "export.policy_files",
 }

@@ -17,8 +17,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.heartbeat import heartbeat
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.console.lines import say_error
-from mjx_reinforce.console.streams import accept_everything, silence_alarms
+from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
 from mjx_reinforce.export.films import (
     Renderer,
     import_gymnasium,
@@ -28,8 +27,15 @@ from mjx_reinforce.export.films import (
 )
 from mjx_reinforce.export.run_files import SeedChoice, Which
 from mjx_reinforce.files import check_folder
-from mjx_reinforce.playing.cast import PolicySource, Role, cast, main_seed, read_source
-from mjx_reinforce.playing.newest import RUNS, choose_run
+from mjx_reinforce.playing.cast import (
+    RUNS,
+    PolicySource,
+    Role,
+    cast,
+    choose_run,
+    main_seed,
+    read_source,
+)
 from mjx_reinforce.settings.flags import read_command_line
 from mjx_reinforce.settings.own_code import check_named
 
@@ -134,7 +140,7 @@ def film(settings: WatchSettings) -> None:
     env = envs.make_set(source.env, source.run.env_set if source.run else ())
     check_observations(env, roles[-1].player, source)
     if settings.live:
-        from mjx_reinforce.playing.live import live
+        from mjx_reinforce.playing.mujoco_playing import live
 
         live(env, scene(env), roles[-1].player, source.horizon, settings)
         return

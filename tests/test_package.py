@@ -118,7 +118,7 @@ def test_pages_films_and_logs_wait():
     """What draws and logs is imported when something is drawn or logged."""
     late = ("altair", "vl_convert", "jinja2", "tensorboardX", "matplotlib", "PIL", "mediapy")
     loaded = run(
-        "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.sweeps.main\n"
+        "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.sweeps.command_line\n"
         "import mjx_reinforce.runs.run, mjx_reinforce.runs.observers, mjx_reinforce.store.ready\n"
         f"print([m for m in {late} if m in sys.modules])"
     )

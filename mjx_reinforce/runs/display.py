@@ -21,7 +21,7 @@ from mjx_reinforce.console.heartbeat import heartbeat
 from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.runs.plan import duration
 from mjx_reinforce.settings.own_code import env_flag
-from mjx_reinforce.training.records import nonfinite, progress
+from mjx_reinforce.training import nonfinite, progress
 
 
 class _Bar(Progress):

@@ -16,7 +16,7 @@ import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from mjx_reinforce.checks import whole_number
-from mjx_reinforce.console.lines import columns_of, say_error, wrapped
+from mjx_reinforce.console.streams import columns_of, say_error, wrapped
 from mjx_reinforce.settings.hints import about_unknown, known, required, unknown_flags
 
 Form = TypeVar("Form")

@@ -15,19 +15,18 @@ from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.plan import duration, is_wrong
 from mjx_reinforce.settings.config import MAX_COUNT
 from mjx_reinforce.sweeps import carry, chunks
+from mjx_reinforce.sweeps.ahead import Stopwatch, one_ahead
 from mjx_reinforce.sweeps.chunks import Runs, Saver
 from mjx_reinforce.sweeps.designs import rungs
 from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.designs.groups import Group, learner_builder
-from mjx_reinforce.sweeps.designs.plan import GroupPlan, divide, group_seconds
-from mjx_reinforce.sweeps.designs.prepare import Prepared
+from mjx_reinforce.sweeps.designs.plan import GroupPlan, Prepared, divide, group_seconds
 from mjx_reinforce.sweeps.designs.rungs import Rung
 from mjx_reinforce.sweeps.history import History
+from mjx_reinforce.sweeps.programs import SlotPrograms, compile_programs
 from mjx_reinforce.sweeps.results import SweepFiles
-from mjx_reinforce.sweeps.slots.ahead import Stopwatch, one_ahead
-from mjx_reinforce.sweeps.slots.programs import SlotPrograms, compile_programs
 from mjx_reinforce.training.driver import drive
-from mjx_reinforce.training.records.progress import Progress
+from mjx_reinforce.training.progress import Progress
 
 #: More than this share of a sweep is all of it, up to rounding.
 _ALL = 1 - 1e-6

@@ -1,7 +1,7 @@
 """The programs that move runs on side by side: the seeds of a run, or what a sweep has in a slot.
 
 ``programs_of`` writes them once for both. ``compile_run`` compiles those of a run; a sweep compiles
-them for slots, see ``sweeps.slots.programs``.
+them for slots, see ``sweeps.programs``.
 """
 
 import functools

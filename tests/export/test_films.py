@@ -17,10 +17,10 @@ from mjx_reinforce import envs, load, pretrained, watch
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export import films, takes
-from mjx_reinforce.export.pretrained import FOLDER
+from mjx_reinforce.export.run_files import FOLDER
 from mjx_reinforce.export.scenery import dress
-from mjx_reinforce.playing import live, mujoco_playing
 from mjx_reinforce.playing import mjx_playing as playing
+from mjx_reinforce.playing import mujoco_playing
 
 ASSETS = sorted(path.name for path in (FOLDER.parents[2] / "envs" / "assets").glob("*.xml"))
 
@@ -290,10 +290,10 @@ def test_live_plays_on_until_the_window_closes(monkeypatch, capsys):
             seen.append(self.data.qpos.copy())
 
     monkeypatch.setattr(viewer, "launch_passive", Window)
-    monkeypatch.setattr(live.time, "sleep", lambda seconds: None)
+    monkeypatch.setattr(mujoco_playing.time, "sleep", lambda seconds: None)
     env, player = envs.make("Reacher-v5"), load("Reacher-v5")
     settings = watch.WatchSettings("Reacher-v5", live=True, episode=3)
-    live.live(env, env.mj_model, player, 50, settings)
+    mujoco_playing.live(env, env.mj_model, player, 50, settings)
     assert seen[-1] == "closed"
     for number, first in ((3, 0), (4, 51)):
         episode = mujoco_playing.mujoco_simulator(env, player, 50)(number, False)
@@ -301,4 +301,4 @@ def test_live_plays_on_until_the_window_closes(monkeypatch, capsys):
         assert f"episode {number}: return {episode.total:.1f}\n" in capsys.readouterr().out or first
     monkeypatch.setattr(viewer, "launch_passive", lambda *_, **__: 1 / 0)
     with pytest.raises(ValueError, match="viewer does not open"):
-        live.live(env, env.mj_model, player, 50, settings)
+        mujoco_playing.live(env, env.mj_model, player, 50, settings)

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from mjx_reinforce import files
-from mjx_reinforce.runs.sinks.json_lines import JsonLines
+from mjx_reinforce.runs.sinks import JsonLines
 
 NAMES = ("update", "seed", "eval_return", "entropy")
 FIRST = {"update": ["0", "0"], "seed": ["0", "1"], "eval_return": ["1.5", "nan"]}

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from mjx_reinforce import files
 from mjx_reinforce import train as train_module
 from mjx_reinforce.reports.statistics import iqm, iqm_interval
-from mjx_reinforce.runs.log import RunLog
-from mjx_reinforce.runs.sinks import over_seeds, sink, tensorboard
-from mjx_reinforce.runs.sinks.sink import Queue
+from mjx_reinforce.runs import over_seeds, sinks, tensorboard
+from mjx_reinforce.runs.directory import RunLog
+from mjx_reinforce.runs.sinks import Queue
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.records import rows
+from mjx_reinforce.training import rows
 
 
 def evaluation(update, num_seeds=20, first=False):
@@ -131,7 +131,7 @@ def test_cells_come_back_to_the_last_bit(dtype, data):
 
 
 def test_json_lines_are_the_rows_of_the_table(directory):
-    [lines] = sink.open_sinks(Config(jsonl=True), directory, None)
+    [lines] = sinks.open_sinks(Config(jsonl=True), directory, None)
     for update in (0, 5, 10):
         new = rows.lines(evaluation(update, first=not update))
         files.append(directory / "metrics.csv", new)
@@ -142,7 +142,7 @@ def test_json_lines_are_the_rows_of_the_table(directory):
     assert isinstance(as_json(directory / "metrics.jsonl")[0]["update"], int)
     written = (directory / "metrics.jsonl").read_bytes()
     (directory / "metrics.jsonl").write_bytes(written[:100] + b"\n{half a ro")
-    sink.open_sinks(Config(jsonl=True), directory, 10)
+    sinks.open_sinks(Config(jsonl=True), directory, 10)
     assert (directory / "metrics.jsonl").read_bytes() == written
 
 
@@ -160,7 +160,7 @@ def test_what_a_kill_left_of_writing_a_file_is_removed(directory, name):
 
 
 def test_tensorboard_has_the_numbers_and_the_histograms(directory):
-    [charted] = sink.open_sinks(Config(tensorboard=True), directory, None)
+    [charted] = sinks.open_sinks(Config(tensorboard=True), directory, None)
     for update in (0, 5):
         charted.write(evaluation(update))
     charted.close()
@@ -176,7 +176,7 @@ def test_tensorboard_has_the_numbers_and_the_histograms(directory):
 
 @pytest.mark.parametrize("level", [0.0, 1000.0, -3e38])
 def test_a_histogram_of_equal_values_is_one_bin(directory, level):
-    [charted] = sink.open_sinks(Config(tensorboard=True), directory, None)
+    [charted] = sinks.open_sinks(Config(tensorboard=True), directory, None)
     charted.write(evaluation(0) | {"eval_return": 20 * [str(level)]})
     histogram = charts(directory / "tensorboard")[0]["eval_return/seeds"]
     assert [count for count in histogram.bucket if count] == [20]
@@ -185,10 +185,10 @@ def test_a_histogram_of_equal_values_is_one_bin(directory, level):
 def resumed_charts(directory):
     """Events of a run that was killed after 10 updates and went on from 5, then of 3 seeds."""
     config = Config(tensorboard=True)
-    [killed] = sink.open_sinks(config, directory, None)
+    [killed] = sinks.open_sinks(config, directory, None)
     for update in (0, 5, 10):
         killed.write(evaluation(update))
-    [resumed] = sink.open_sinks(config, directory, 5)
+    [resumed] = sinks.open_sinks(config, directory, 5)
     resumed.write(evaluation(10, num_seeds=3))
     resumed.write(evaluation(15, num_seeds=3))
     return directory / "tensorboard"
@@ -213,7 +213,7 @@ def test_tensorboard_itself_reads_it_so(directory):
 
 def test_a_run_that_starts_again_drops_everything(directory):
     for _ in range(2):
-        [charted] = sink.open_sinks(Config(tensorboard=True), directory, None)
+        [charted] = sinks.open_sinks(Config(tensorboard=True), directory, None)
         charted.write(evaluation(0))
     assert list(charts(directory / "tensorboard")) == [0]
     assert sum(event.HasField("summary") for event in events(directory / "tensorboard")) == 2
@@ -222,8 +222,8 @@ def test_a_run_that_starts_again_drops_everything(directory):
 @pytest.mark.parametrize("name", ["jsonl", "tensorboard"])
 def test_a_full_disk_delays_rows_and_loses_none(directory, monkeypatch, name):
     config = Config(**{name: True})
-    [slow] = sink.open_sinks(config, directory, None)
-    module = f"mjx_reinforce.runs.sinks.{'json_lines' if name == 'jsonl' else name}"
+    [slow] = sinks.open_sinks(config, directory, None)
+    module = f"mjx_reinforce.runs.{'sinks' if name == 'jsonl' else name}"
 
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -297,7 +297,7 @@ def wandb_rows(directory):
 
 WANDB_PROGRAM = """
 import json, pathlib, sys
-from mjx_reinforce.runs.sinks.weights_and_biases import WeightsAndBiases
+from mjx_reinforce.runs.weights_and_biases import WeightsAndBiases
 sink = WeightsAndBiases(pathlib.Path("."))
 for rows in json.load(sys.stdin):
     sink.write(rows)
@@ -329,7 +329,7 @@ def test_wandb_that_has_no_key_says_what_to_do(directory, monkeypatch):
     monkeypatch.setattr(wandb, "init", init)
     monkeypatch.setenv("WANDB_MODE", "online")
     with pytest.raises(OSError, match="key configured; run wandb login, or unset WANDB_MODE"):
-        sink.open_sinks(Config(wandb=True), directory, None)
+        sinks.open_sinks(Config(wandb=True), directory, None)
 
 
 def test_only_a_disk_is_asked_for_room(run, monkeypatch, capsys):

@@ -13,10 +13,10 @@ from rich.console import Console
 from mjx_reinforce.reports.statistics import summarize
 from mjx_reinforce.runs import display
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training import nonfinite
 from mjx_reinforce.training.evaluation import evaluate
-from mjx_reinforce.training.records import nonfinite
-from mjx_reinforce.training.records.progress import Progress
-from mjx_reinforce.training.records.record import RunRecord
+from mjx_reinforce.training.progress import Progress
+from mjx_reinforce.training.record import RunRecord
 from mjx_reinforce.types import Trajectory
 
 

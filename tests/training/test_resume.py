@@ -27,15 +27,14 @@ from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.learner import TrainState
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.runs.directory import locked, make_directory
-from mjx_reinforce.runs.log import RunLog
+from mjx_reinforce.runs.directory import RunLog, locked, make_directory
 from mjx_reinforce.runs.observers import RunFiles
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.best import first_best, keep_best
 from mjx_reinforce.training.driver import Driver
 from mjx_reinforce.training.programs import Looked
-from mjx_reinforce.training.records.record import RunRecord
+from mjx_reinforce.training.record import RunRecord
 
 SIZE = ["--num-seeds", "3", "--eval-episodes", "2", "--hidden-sizes", "4"]
 ANY = ["--env", "Drift-v0", "--env-steps", "None", *SIZE]
@@ -191,7 +190,7 @@ def test_a_run_that_cannot_end_is_resumed(run, trained, tmp_path, monkeypatch, c
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("mjx_reinforce.runs.log.write_bytes", full)
+    monkeypatch.setattr("mjx_reinforce.runs.directory.write_bytes", full)
     arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "full"]
     assert run(*COMMON, *arguments) == 1
     assert "then go on with --resume full" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing but itself."""
+"""The report as one HTML page that needs nothing but itself; how to cite the program."""
 
 import datetime
 import json
@@ -14,7 +14,6 @@ from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_i
 from mjx_reinforce.reports.film import PageFilm
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.page import charts, learning, palette, vega, words
-from mjx_reinforce.reports.page.citation import bibtex
 from mjx_reinforce.reports.page.columns import Table, short
 from mjx_reinforce.reports.page.distributions import slider_stops
 from mjx_reinforce.reports.page.figures import SHOWN, Figure
@@ -233,3 +232,21 @@ def _in_words(value: object) -> str:
     if isinstance(value, list):
         return ", ".join(map(_in_words, value))
     return say(value)
+
+
+#: CITATION.cff of the repository says the same.
+TITLE = "mjx_reinforce: REINFORCE on MuJoCo, a thousand seeds in one program"
+AUTHORS = "The mjx_reinforce authors"
+YEAR = 2026
+
+
+def bibtex(version: str) -> str:
+    """Returns an entry for a bibliography, of BibTeX's type misc, which every style knows."""
+    return (
+        (
+            f"@misc{{mjx_reinforce, author = {{{{{AUTHORS}}}}}, title = {{{{{TITLE}}}}}, "
+            f"year = {{{YEAR}}}, note = {{Version {version}}}}}"
+        )
+        .replace("mjx_reinforce:", r"mjx\_reinforce:")
+        .replace("{{The mjx_", r"{{The mjx\_")
+    )

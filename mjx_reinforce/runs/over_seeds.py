@@ -3,7 +3,7 @@
 import numpy as np
 
 from mjx_reinforce.reports.statistics import iqm, iqm_interval
-from mjx_reinforce.training.records.rows import Cells
+from mjx_reinforce.training.rows import Cells
 
 #: Seeds that are shown one by one, the first ones: each is a curve for every column.
 MAX_SINGLE_SEEDS = 16

@@ -16,10 +16,9 @@ from mjx_reinforce.files import Arrays
 from mjx_reinforce.learners import counts
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.settings.memory import num_cores
+from mjx_reinforce.sweeps.ahead import Stopwatch, started
 from mjx_reinforce.sweeps.history import Measured
-from mjx_reinforce.sweeps.slots.ahead import Stopwatch, started
-from mjx_reinforce.sweeps.slots.layout import StateRows
-from mjx_reinforce.sweeps.slots.packing import pack_slots
+from mjx_reinforce.sweeps.layout import StateRows, pack_slots
 from mjx_reinforce.training.block import BuildLearner
 from mjx_reinforce.training.programs import Programs, compiling, programs_of
 from mjx_reinforce.training.state import Budget, RunState, Seed, budget_of
@@ -96,7 +95,7 @@ class SlotPrograms(NamedTuple):
         Args:
           states: [R, B] of all runs; changed.
           training: [R] which of them still train; at least one does.
-          lengths: [R] about how long their episodes are, see ``packing.pack_slots``.
+          lengths: [R] about how long their episodes are, see ``layout.pack_slots``.
           blocks: how many, where one of the narrowest slots holds these runs. Else they are packed
             again after one.
 

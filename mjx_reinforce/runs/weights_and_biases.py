@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from mjx_reinforce.files import read_json, write_json
-from mjx_reinforce.runs.sinks import over_seeds
-from mjx_reinforce.training.records.rows import Cells
+from mjx_reinforce.runs import over_seeds
+from mjx_reinforce.training.rows import Cells
 
 #: Which run it is, and up to which update it has rows.
 NAME = "wandb/mjx_reinforce.json"

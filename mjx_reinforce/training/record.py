@@ -12,9 +12,9 @@ import numpy as np
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.reports.statistics import summarize
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training import nonfinite, rows
 from mjx_reinforce.training.budget import used
-from mjx_reinforce.training.records import nonfinite, rows
-from mjx_reinforce.training.records.progress import BLOCKS, Progress, measure_progress
+from mjx_reinforce.training.progress import BLOCKS, Progress, measure_progress
 
 
 class GrowingTable:

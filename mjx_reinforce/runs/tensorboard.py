@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.files import append
-from mjx_reinforce.runs.sinks import over_seeds
-from mjx_reinforce.training.records.rows import Cells
+from mjx_reinforce.runs import over_seeds
+from mjx_reinforce.training.rows import Cells
 
 NAME = "tensorboard"
 PATTERN = "events.out.tfevents.*"
