@@ -134,7 +134,7 @@ def film(settings: WatchSettings) -> None:
         import_gymnasium()
     import_mujoco()
     configure_jax()
-    from mjx_reinforce.playing.simulations import check_observations
+    from mjx_reinforce.playing.mujoco_playing import check_observations
 
     roles = cast(settings, source)
     env = envs.make_set(source.env, source.run.env_set if source.run else ())
@@ -164,8 +164,7 @@ def _take(
 ) -> Any:
     """Returns the episode of one policy, and says what it earned."""
     from mjx_reinforce.export.takes import Take
-    from mjx_reinforce.playing.mujoco_playing import pushed_body
-    from mjx_reinforce.playing.simulations import simulators
+    from mjx_reinforce.playing.mujoco_playing import pushed_body, simulators
 
     by_name = simulators(settings.backend, env, role.player, source, settings.push)
     name, play = list(by_name.items())[-1]

@@ -55,8 +55,7 @@ def export(settings: ExportSettings) -> list[Path]:
     """
     if not is_pretrained(settings.run):
         read_run(settings.run)
-    from mjx_reinforce.export.arithmetic import arithmetic, numpy_source
-    from mjx_reinforce.export.onnx_model import import_onnx, onnx_model
+    from mjx_reinforce.export.arithmetic import arithmetic, import_onnx, numpy_source, onnx_model
     from mjx_reinforce.export.player import load_saved
     from mjx_reinforce.files import write_arrays, write_bytes
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from mjx_reinforce.files import append, finite, write_bytes
+from mjx_reinforce.runs import charts
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.rows import Cells, parse_cell
 
@@ -75,30 +76,24 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Que
     Raises:
       OSError: one of them cannot be written.
     """
-    from mjx_reinforce.runs import tensorboard, weights_and_biases
-
     sinks = []
     if config.jsonl:
         sinks.append(Queue("metrics.jsonl", JsonLines(directory)))
     if config.tensorboard:
-        sinks.append(Queue("tensorboard/", tensorboard.TensorBoard(directory, updates)))
+        sinks.append(Queue("tensorboard/", charts.TensorBoard(directory, updates)))
     if config.wandb:
-        sinks.append(Queue("to W&B", weights_and_biases.WeightsAndBiases(directory)))
+        sinks.append(Queue("to W&B", charts.WeightsAndBiases(directory)))
     return sinks
 
 
 def files(directory: Path) -> list[Path]:
     """Returns the files that sinks replace at once."""
-    from mjx_reinforce.runs import weights_and_biases
-
-    return [directory / NAME, directory / weights_and_biases.NAME]
+    return [directory / NAME, directory / charts.WANDB_RUN]
 
 
 def remove_outputs(directory: Path) -> None:
     """Removes what the sinks of an older run left; W&B keeps its runs apart itself."""
-    from mjx_reinforce.runs import tensorboard
-
-    events = (directory / tensorboard.NAME).glob(tensorboard.PATTERN)
+    events = (directory / charts.TENSORBOARD).glob(charts.EVENTS)
     for path in (*files(directory), *events):
         path.unlink(missing_ok=True)
 

@@ -12,8 +12,8 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.best import first_best
 from mjx_reinforce.training.budget import env_steps_in
 from mjx_reinforce.training.driver import Driver
-from mjx_reinforce.training.nonfinite import HOPELESS
 from mjx_reinforce.training.programs import compile_run
+from mjx_reinforce.training.progress import HOPELESS
 from mjx_reinforce.training.record import RunRecord
 from mjx_reinforce.training.state import begin_with, last_actors
 

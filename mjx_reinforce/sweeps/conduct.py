@@ -14,7 +14,7 @@ from mjx_reinforce.learners import counts
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.plan import duration, is_wrong
 from mjx_reinforce.settings.config import MAX_COUNT
-from mjx_reinforce.sweeps import carry, chunks
+from mjx_reinforce.sweeps import chunks, results
 from mjx_reinforce.sweeps.ahead import Stopwatch, one_ahead
 from mjx_reinforce.sweeps.chunks import Runs, Saver
 from mjx_reinforce.sweeps.designs import rungs
@@ -246,8 +246,8 @@ class Conductor:
             return chunks.initial_states(programs, stage.group, runs)
         before = next(old for old in self._before if old.number == stage.number)
         shapes = programs.layout.shapes
-        states = carry.last_states(self._files, before.chunks, shapes, self._display.say)
-        states = carry.select_runs(states, before.chunks, runs)
+        states = results.last_states(self._files, before.chunks, shapes, self._display.say)
+        states = results.select_runs(states, before.chunks, runs)
         history.now["updates"] = counts.to_int(states.train_states.num_updates)
         history.now["env_steps"] = counts.to_int(states.train_states.env_steps)
         return programs.layout.rows(states)

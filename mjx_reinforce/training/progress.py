@@ -1,10 +1,14 @@
-"""How far a run is, how well it does, how fast it goes, and how long it still takes."""
+"""How far a run is, how well it does, how fast it goes, and how long it still takes.
+
+Updates may meet numbers that are not finite: which ones, and when a seed is past hope.
+"""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.files import Arrays
 from mjx_reinforce.reports.statistics import iqm
 
 #: The time left is estimated from so many of the latest blocks: episodes change their length.
@@ -68,3 +72,84 @@ def _slope(values: np.ndarray, seconds: np.ndarray) -> float:
     """Returns how much the values grew a second, NaN where no time passed."""
     passed = seconds[-1] - seconds[0]
     return float((values[-1] - values[0]) / passed) if passed > 0 else math.nan
+
+
+#: Why a run that is ``hopeless`` is stopped.
+HOPELESS = (
+    "every seed that still trained was broken throughout the last updates, its episodes "
+    "or its new policy not finite; lower --learning-rate (ars: --step-size) or mend the task"
+)
+#: The fields of such an update, in the order of summary.json.
+EVENT_COLUMNS = {"seed": np.int64, "update": np.int64, "episodes": np.int64, "skipped": np.bool_}
+#: A run is not given up before each of its seeds was broken so many updates in a row: blocks may
+#: be shorter, and a seed may recover from one such update, since the next draws other numbers.
+_FEWEST = 5
+#: A message names so many seeds.
+_NAMED = 5
+
+
+def nonfinite_updates(metrics: Arrays, updates: np.ndarray) -> Arrays:
+    """Returns the M updates of a block that met numbers which are not finite.
+
+    Args:
+      metrics: [K, S] each, as for ``Record.add_updates``.
+      updates: [K, S] how many each seed had made after each of them.
+
+    Returns:
+      [M] each: ``seed``, ``update`` (how many the seed had made before it), ``episodes`` (how many
+      of it left the finite numbers) and ``skipped`` (whether the policy stayed as it was).
+    """
+    episodes, skipped = metrics["nonfinite_episodes"], metrics["skipped_update"]
+    k, s = np.nonzero((episodes + skipped) * metrics["active"])
+    found = (s, updates[k, s] - 1, episodes[k, s], skipped[k, s])
+    return {
+        name: x.astype(kind) for (name, kind), x in zip(EVENT_COLUMNS.items(), found, strict=True)
+    }
+
+
+def as_events(updates: Arrays) -> list[dict[str, Any]]:
+    """Returns the updates of ``nonfinite_updates`` one by one, as summary.json has them."""
+    columns = (updates[name].tolist() for name in EVENT_COLUMNS)
+    return [dict(zip(EVENT_COLUMNS, event, strict=True)) for event in zip(*columns, strict=True)]
+
+
+def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
+    """Returns how many of its latest updates each seed was broken in, without one between.
+
+    An update is broken if all its episodes left the finite numbers, or if it was skipped.
+
+    Args:
+      before: [S] the same before this block.
+      metrics: [K, S] each, as for ``Record.add_updates``.
+    """
+    broken = metrics["nonfinite_episodes"] >= metrics["episodes"]
+    broken |= metrics["skipped_update"] > 0
+    count = before
+    for active_now, broken_now in zip(metrics["active"], broken, strict=True):
+        count = np.where(active_now, np.where(broken_now, count + 1, 0), count)
+    return count
+
+
+def hopeless(in_a_row: np.ndarray, used: np.ndarray, block: int) -> bool:
+    """Returns whether every seed that still trains was broken throughout a block of updates.
+
+    Args:
+      in_a_row: [S] from ``broken_in_a_row``.
+      used: [S] the fraction of its budget that each seed has used.
+      block: updates in a block; fewer than five count as five.
+    """
+    training = used < 1.0
+    return bool(training.any() and np.all(in_a_row[training] >= max(block, _FEWEST)))
+
+
+def describe_nonfinite(updates: Arrays, num_seeds: int) -> str:
+    """Returns one line about at least one update of ``nonfinite_updates``."""
+    first, last = updates["update"].min(), updates["update"].max()
+    seeds = np.unique(updates["seed"]).tolist()
+    named = ", ".join(map(str, seeds[:_NAMED])) + (", ..." if len(seeds) > _NAMED else "")
+    when = f"update {first}" if first == last else f"updates {first} to {last}"
+    return (
+        f"{when}: {len(seeds):,} of {num_seeds:,} seeds met numbers that are not finite "
+        f"({named}): {updates['episodes'].sum():,} episodes, "
+        f"{updates['skipped'].sum():,} updates skipped"
+    )

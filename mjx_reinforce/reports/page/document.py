@@ -13,7 +13,7 @@ from markupsafe import Markup
 from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
 from mjx_reinforce.reports.film import PageFilm
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.page import charts, learning, palette, vega, words
+from mjx_reinforce.reports.page import charts, learning, vega, words
 from mjx_reinforce.reports.page.columns import Table, short
 from mjx_reinforce.reports.page.distributions import slider_stops
 from mjx_reinforce.reports.page.figures import SHOWN, Figure
@@ -121,14 +121,14 @@ def fill(
         files=[(name, _size_in_words(text)) for name, text in content["files"].items()],
         version=version,
         seconds=f"{seconds:.1f} s",
-        light=palette.LIGHT,
-        dark=palette.DARK,
-        colour=palette.colour,
-        dash=palette.dash,
+        light=vega.LIGHT,
+        dark=vega.DARK,
+        colour=vega.colour,
+        dash=vega.dash,
         css=Markup(_read_template("page.css")),
         script=Markup(_read_template("page.js")),
         vega_bundle=Markup(vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")),
-        content=Markup(_json({**content, "row": charts.ROW, "light": palette.LIGHT})),
+        content=Markup(_json({**content, "row": charts.ROW, "light": vega.LIGHT})),
     )
 
 

@@ -4,11 +4,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mjx_reinforce.reports.experiment import counted
+from mjx_reinforce.reports.experiment import COMPARED, Result, counted
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.page import learning, tables, words
 from mjx_reinforce.reports.page.words import interval_in_words, number, percent, steps
-from mjx_reinforce.reports.results import COMPARED, Result
 
 #: A table: its ``header``, and ``rows`` of a ``label`` and ``cells``, pairs of a value and what
 #: stands below it. Where the header has a column more, the first is the rank of the row.

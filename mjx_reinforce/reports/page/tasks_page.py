@@ -6,14 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from mjx_reinforce.reports.experiment import counted
+from mjx_reinforce.reports.experiment import COMPARED, counted
 from mjx_reinforce.reports.page import charts, document, learning, vega
 from mjx_reinforce.reports.page.columns import Table, join_tables, short
 from mjx_reinforce.reports.page.figures import SHOWN, Figure, task_figures
 from mjx_reinforce.reports.page.listings import Listing, listings
 from mjx_reinforce.reports.page.tables import task_tables
 from mjx_reinforce.reports.page.words import LEVEL, interval_in_words, number, p_value, percent
-from mjx_reinforce.reports.results import COMPARED
 from mjx_reinforce.reports.tasks import Faster, Tasks, in_order
 
 _SCORE = "A score of 0 is that of untrained policies; table 1 says what 1 is in each task."

@@ -6,9 +6,15 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import counted, ordered, say, setting_in_words
+from mjx_reinforce.reports.experiment import (
+    COMPARED,
+    Result,
+    counted,
+    ordered,
+    say,
+    setting_in_words,
+)
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.results import COMPARED, Result
 from mjx_reinforce.reports.statistics import Estimate
 from mjx_reinforce.reports.statistics.comparisons import Comparison
 
