@@ -100,6 +100,21 @@ def test_the_wheel_has_every_package():
     assert set(listed["packages"]) == {f"mjx_reinforce.{name}".strip(".") for name in packages}
 
 
+def test_the_wheel_has_every_file_that_is_no_module():
+    """Tables, templates and policies, which modules read beside them."""
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]
+    packed = {
+        path
+        for package, patterns in listed["package-data"].items()
+        for pattern in patterns
+        for path in PACKAGE.joinpath(*package.split(".")[1:]).glob(pattern)
+    }
+    ours = {path for path in PACKAGE.rglob("*") if path.is_file()} | {
+        *(PACKAGE / "envs/assets").iterdir()
+    }
+    assert {path for path in ours if path.suffix not in (".py", ".pyc")} == packed
+
+
 def run(code):
     return subprocess.run(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True

@@ -1,5 +1,6 @@
 """A trained policy's deterministic action as plain arithmetic, as Python and as ONNX."""
 
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -113,31 +114,6 @@ def _ending(head: str, settings: dict[str, Any]) -> tuple[np.ndarray, np.ndarray
     return means.middle, means.half, {}
 
 
-_PLAYER = '''"""A trained policy's deterministic action, written by mjx_reinforce.export.
-
-It needs NumPy, and {name}.npz beside this file:
-
-    import {name}
-    action = {name}.act(observation)  # {shapes}
-"""
-
-from pathlib import Path
-
-import numpy as np
-
-#: What it was trained on, and the number of the seed.
-ENVIRONMENT, SEED = {env}, {seed}
-with np.load(Path(__file__).with_suffix(".npz")) as archive:
-    P = dict(archive)
-
-
-def act(observation):
-    """Returns the action for an observation."""
-    x = np.asarray(observation, np.float32)
-    {body}
-'''
-
-
 def numpy_source(plain: Arithmetic, name: str, env: str, seed: int) -> str:
     """Returns the text of a module with a function ``act``.
 
@@ -152,7 +128,8 @@ def numpy_source(plain: Arithmetic, name: str, env: str, seed: int) -> str:
     if plain.head == "argmax":
         shapes = f"[{size}] -> an integer, or [N, {size}] -> [N]"
     body = "\n    ".join(_statements(plain))
-    return _PLAYER.format(name=name, shapes=shapes, env=ascii(env), seed=seed, body=body)
+    template = Path(__file__).with_name("numpy_policy.txt").read_text("utf-8")
+    return template.format(name=name, shapes=shapes, env=ascii(env), seed=seed, body=body)
 
 
 def _statements(plain: Arithmetic) -> list[str]:
