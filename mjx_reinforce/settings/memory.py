@@ -18,7 +18,7 @@ from mjx_reinforce.settings.measured import TASKS, Task
 
 _FLOAT = 4  # bytes
 #: Copies of the episodes that a gradient needs: as played, scaled, and by time.
-_COPIES = 3
+_EPISODE_COPIES = 3
 #: The values of the hidden units, and what the gradient adds to them.
 _ACTIVATIONS = 2
 #: Parameters, gradient, two moments, and all that again while a seed's update is proposed.
@@ -30,7 +30,7 @@ _CHUNK = 128
 #: Bytes of an env step that an evaluation plays: the reward, the mask, and copies.
 _EVALUATED = 10
 #: Numbers that a seed's update reports.
-_METRICS = 20
+_REPORTED = 20
 
 
 #: CPU cores that make a run faster; it was not tried with more.
@@ -80,14 +80,16 @@ def parts(config: Config, task: Task) -> list[MemoryPart]:
             _FLOAT * fitted * (config.value_fits + values + _ACTIVATIONS * sum(critic)),
             "--value-batch-size, --value-fits or --num-seeds",
         ),
-        MemoryPart(_FLOAT * _COPIES * steps * values, f"--num-seeds, {fewer} or --train-horizon"),
+        MemoryPart(
+            _FLOAT * _EPISODE_COPIES * steps * values, f"--num-seeds, {fewer} or --train-horizon"
+        ),
         MemoryPart(_FLOAT * network, f"--hidden-sizes, --num-seeds or {fewer}"),
         MemoryPart(
             _FLOAT * (_ACTIVATIONS * valued * sum(critic) + critics),
             "--value-hidden-sizes, --num-seeds or --train-horizon",
         ),
         MemoryPart(_EVALUATED * evaluated, "--eval-episodes, --num-seeds or --horizon"),
-        MemoryPart(_FLOAT * _METRICS * seeds * config.block_length, "--eval-every or --num-seeds"),
+        MemoryPart(_FLOAT * _REPORTED * seeds * config.block_length, "--eval-every or --num-seeds"),
     ]
 
 

@@ -140,7 +140,7 @@ def _on_leaves(programs: Programs) -> dict[str, Callable[..., Any]]:
 def _on_states(load: Callable[[str], Callable[..., Any]], like: RunState, rides: bool) -> Programs:
     """Returns the programs of which ``load`` returns those on leaves, when they are traced."""
 
-    def begin(*given: Any) -> tuple[RunState, jax.Array]:
+    def begin(*given: jax.Array) -> tuple[RunState, jax.Array]:
         leaves, keys = load("begin")(*given[:3])  # a run has no settings that are traced
         return restored(leaves, like), jax.random.wrap_key_data(keys)
 

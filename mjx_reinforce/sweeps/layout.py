@@ -10,7 +10,7 @@ What goes between the host and its devices is one array: a state has dozens of l
 costs as much to choose, to send and to fetch as all of them in one array.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -75,7 +75,7 @@ class StateRows:
         leaves = (read(*each) for each in zip(parts, self._types, strict=True))
         return with_keys(self._shaped(leaves), self._like)
 
-    def _shaped(self, leaves: Any) -> Any:
+    def _shaped(self, leaves: Iterable[np.ndarray] | Iterable[jax.Array]) -> Any:
         """Returns states of leaves [R, numbers], with the data of keys as leaves."""
         shaped = [
             leaf.reshape(len(leaf), *shape)

@@ -71,10 +71,10 @@ def save(folder: Path, checkpoint: Checkpoint, *, even: bool) -> None:
     """
     folder.mkdir(exist_ok=True)
     content = _encode(checkpoint)
-    number = max((_number(path) for path in _files(folder)), default=0) + 1
+    number = max((_number(path) for path in _archives(folder)), default=0) + 1
     name = f"{number:06d}-{'even-' if even else ''}{_digest(content)}.npz"
     write_bytes(folder / name, content)
-    files = _files(folder)
+    files = _archives(folder)
     kept = files[:_KEPT] + [path for path in files if "-even-" in path.name][:1]
     for path in files:
         if path not in kept:
@@ -94,7 +94,7 @@ def read_checkpoints(
     Raises:
       ValueError: a checkpoint is whole, but its state is not like that.
     """
-    for path in _files(folder):
+    for path in _archives(folder):
         content = _read(path)
         if content is None:
             say(f"checkpoint {path.name} is damaged; trying the one before")
@@ -104,7 +104,7 @@ def read_checkpoints(
 
 def settings_of(folder: Path) -> dict[str, Any]:
     """Returns the settings with which the newest whole checkpoint was written; {} if none has."""
-    for content in filter(None, map(_read, _files(folder))):
+    for content in filter(None, map(_read, _archives(folder))):
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             return json.loads(str(archive["rest"])).get("settings") or {}
     return {}
@@ -113,13 +113,13 @@ def settings_of(folder: Path) -> dict[str, Any]:
 def remove_checkpoints(folder: Path, after: int = 0) -> None:
     """Removes the checkpoints after a number, parts of unwritten ones, and a folder left empty."""
     parts = folder.glob(".*.npz.*")
-    for path in [*parts, *(path for path in _files(folder) if _number(path) > after)]:
+    for path in [*parts, *(path for path in _archives(folder) if _number(path) > after)]:
         path.unlink()
     with contextlib.suppress(OSError):
         folder.rmdir()
 
 
-def _files(folder: Path) -> list[Path]:
+def _archives(folder: Path) -> list[Path]:
     """Returns the checkpoints in a folder, the newest first."""
     paths = folder.iterdir() if folder.is_dir() else ()
     return sorted(filter(lambda path: _NAME.fullmatch(path.name), paths), key=_number, reverse=True)
@@ -198,7 +198,7 @@ def _unflatten(arrays: Arrays, like: PyTree) -> Any:
     return jax.tree.unflatten(structure, [_leaf(arrays[_name(path)], old) for path, old in leaves])
 
 
-def _name(path: Any) -> str:
+def _name(path: jax.tree_util.KeyPath) -> str:
     return "state/" + jax.tree_util.keystr(path, simple=True, separator="/")
 
 

@@ -209,7 +209,7 @@ def compile_run(
         states = place(states)
         return on_host(present(states), evaluating(states.train_states.actor, states.eval_keys))
 
-    def on_host(policies: Any, measured: dict[str, jax.Array]) -> Looked:
+    def on_host(policies: tuple[Actor, jax.Array], measured: dict[str, jax.Array]) -> Looked:
         seen = jax.tree.map(lambda x: x[:num_seeds], jax.device_get((*policies, measured)))
         return Looked(*seen)
 

@@ -85,7 +85,7 @@ def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
     return Config(**settings)
 
 
-def _choices(hint: Any) -> str:
+def _choices(hint: object) -> str:
     names = typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
     return f", not one of {', '.join(names)}" if names else ""
 
@@ -170,7 +170,7 @@ def check_same_program(
             )
 
 
-def _without_devices(flags: Any) -> str:
+def _without_devices(flags: object) -> str:
     """Returns XLA_FLAGS without the number of a CPU's devices, with which a run may go on."""
     kept = (x for x in str(flags or "").split() if not x.startswith(f"{_DEVICES}="))
     return " ".join(kept)

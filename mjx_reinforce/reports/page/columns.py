@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_reinforce.reports.experiment import say
 from mjx_reinforce.reports.findings import Findings, swept
@@ -28,7 +29,7 @@ def rows(table: Table, labels: Sequence[str]) -> list[dict[str, Any]]:
     return listed
 
 
-def short(values: Any, digits: int = 5) -> list[Any]:
+def short(values: ArrayLike, digits: int = 5) -> list[Any]:
     """Returns numbers with a few digits, None where they are not finite."""
     flat = np.asarray(values, float).ravel().tolist()
     return [_integer(float(f"{x:.{digits}g}")) if math.isfinite(x) else None for x in flat]

@@ -6,7 +6,7 @@ from mjx_reinforce.reports.experiment import counted, ordered, setting_in_words
 from mjx_reinforce.reports.findings import Findings, swept, values_of
 from mjx_reinforce.reports.page import charts, tables
 from mjx_reinforce.reports.page.distributions import edges, slider_stops
-from mjx_reinforce.reports.page.vega import renamed, specification
+from mjx_reinforce.reports.page.vega import Chart, renamed, specification
 from mjx_reinforce.reports.page.words import interval_in_words, number
 
 #: So many configurations are shown at first, the best.
@@ -73,7 +73,7 @@ def task_figures(findings: Findings, task: int, place: int) -> list[Figure]:
     return made
 
 
-def _figure(findings: Findings, chart: Any, **fields: Any) -> Figure:
+def _figure(findings: Findings, chart: Chart, **fields: Any) -> Figure:
     labels, last = findings.labels, len(slider_stops(findings)) - 1
     spec = specification(chart, labels, labels[:SHOWN], float(findings.grid[-1]), last)
     spec["description"] = fields["alt"]

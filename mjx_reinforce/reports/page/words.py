@@ -1,8 +1,7 @@
 """What the figures of a report say, in sentences."""
 
 import math
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -31,7 +30,7 @@ def number(value: float) -> str:
     return f"{value:,.1f}" if abs(value) >= 10 or value == 0 else f"{value:.3g}"
 
 
-def interval_in_words(estimate: Estimate, form: Any = number) -> str:
+def interval_in_words(estimate: Estimate, form: Callable[[float], str] = number) -> str:
     """Returns an interval, "997.0 to 999.0", or that there is none."""
     if math.isnan(estimate.low) or math.isnan(estimate.high):
         return "no interval"
