@@ -167,7 +167,7 @@ def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = 
         pages.append((page.name, f"{beside.name}/{page.name}"))
     drawn, data = tasks_page.tasks_figures(tasks), tasks_page.tasks_chart_tables(tasks)
     labels = tasks_page.labels(tasks)
-    files = {"scores.csv": columns.table_csv(tasks_page.scores(tasks), labels)}
+    files = {"scores.csv": columns.table_csv(columns.scores(tasks), labels)}
     texts = {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
     for name, content in {**files, **texts, **latex_tables(tasks_page.listed(tasks))}.items():
         write_bytes(beside / name, encoded(content))

@@ -4,6 +4,8 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from mjx_reinforce.reports.experiment import COMPARED, Result, counted
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.page import learning, tables, words
@@ -132,7 +134,7 @@ def _fate(findings: Findings, result: Result, s: int) -> dict[str, Any]:
     cells = [
         (str(int(result.configuration.seed[s])), ""),
         (number(final) if math.isfinite(final) else "not finite", ""),
-        (words.fate(findings, result, s), ""),
+        (_how_it_ended(findings, result, s), ""),
     ]
     return {"label": result.configuration.label, "cells": cells}
 
@@ -180,3 +182,24 @@ def tabular(header: Sequence[str], rows: Sequence[Mapping]) -> str:
 def escaped(text: str) -> str:
     """Returns a text that LaTeX prints as it is."""
     return "".join(_SPECIAL.get(each, each) for each in text)
+
+
+def _how_it_ended(findings: Findings, result: Result, s: int) -> str:
+    """Returns how a seed ended, and how it came to that."""
+    part, threshold = result.configuration, findings.experiment.threshold
+    returns, at = part.eval_return[:, s], part.env_steps[:, s]
+    if not np.isfinite(returns[-1]):
+        first = len(returns) - int(np.argmax(np.isfinite(returns[::-1])))
+        since = at[first % len(returns)] if np.isfinite(returns).any() else 0
+        return f"not finite since {steps(float(since))} env steps"
+    top = int(np.nanargmax(returns))
+    best = f"its best, {number(returns[top])}, was at {steps(float(at[top]))} env steps"
+    if threshold is None:
+        return "at its best at the end" if returns[-1] == returns[top] else best
+    if returns[-1] >= threshold:
+        return f"solved, first at {steps(float(result.solving.steps[s]))}" if result.solving else ""
+    if returns[top] < threshold:
+        return f"never solved; {best}"
+    lost = int(np.flatnonzero(returns >= threshold)[-1]) + 1
+    first_time = steps(float(at[np.argmax(returns >= threshold)]))
+    return f"solved at {first_time}, lost it at {steps(float(at[lost]))} env steps"

@@ -281,24 +281,3 @@ def _of_measure(findings: Findings) -> Iterator[str]:
             "from starts that are the same at every evaluation of a seed."
         )
     yield "One task: nothing here says how these settings do on another."
-
-
-def fate(findings: Findings, result: Result, s: int) -> str:
-    """Returns how a seed ended, and how it came to that."""
-    part, threshold = result.configuration, findings.experiment.threshold
-    returns, at = part.eval_return[:, s], part.env_steps[:, s]
-    if not np.isfinite(returns[-1]):
-        first = len(returns) - int(np.argmax(np.isfinite(returns[::-1])))
-        since = at[first % len(returns)] if np.isfinite(returns).any() else 0
-        return f"not finite since {steps(float(since))} env steps"
-    top = int(np.nanargmax(returns))
-    best = f"its best, {number(returns[top])}, was at {steps(float(at[top]))} env steps"
-    if threshold is None:
-        return "at its best at the end" if returns[-1] == returns[top] else best
-    if returns[-1] >= threshold:
-        return f"solved, first at {steps(float(result.solving.steps[s]))}" if result.solving else ""
-    if returns[top] < threshold:
-        return f"never solved; {best}"
-    lost = int(np.flatnonzero(returns >= threshold)[-1]) + 1
-    first_time = steps(float(at[np.argmax(returns >= threshold)]))
-    return f"solved at {first_time}, lost it at {steps(float(at[lost]))} env steps"
