@@ -17,10 +17,9 @@ from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.files import check_folder, write_bytes
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
-from mjx_reinforce.reports.film import PageFilm, film_of_median
 from mjx_reinforce.reports.findings import Findings, compute_findings
 from mjx_reinforce.reports.page import columns, document, learning, tables, tasks_page
-from mjx_reinforce.reports.page.document import Watch, encoded
+from mjx_reinforce.reports.page.document import PageFilm, Watch, encoded, film_of_median
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.listings import latex_tables, listings
 from mjx_reinforce.reports.page.vega import ONE, render_chart
