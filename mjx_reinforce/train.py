@@ -197,7 +197,7 @@ def train(
         display.say(plan.text)
         with display.compiling(plan.compiling), _collection_paused():
             from mjx_reinforce.reports.curves import load_libraries
-            from mjx_reinforce.runs.directory import RunLog
+            from mjx_reinforce.runs.log import RunLog
             from mjx_reinforce.runs.observers import RunFiles, Screen
             from mjx_reinforce.runs.training import compile_driver, draw, summary_of
 

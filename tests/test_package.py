@@ -129,6 +129,13 @@ def test_import_is_light():
     assert loaded.strip() == "[]"
 
 
+@pytest.mark.parametrize("command", ["train", "sweeps.designs.grid", "export.__main__", "new"])
+def test_what_reads_a_command_line_is_light(command):
+    """So that --help, and what is refused, take no second."""
+    loaded = run(f"import sys, mjx_reinforce.{command}\nprint('jax' in sys.modules)")
+    assert loaded.strip() == "False"
+
+
 def test_pages_films_and_logs_wait():
     """What draws and logs is imported when something is drawn or logged."""
     late = ("altair", "vl_convert", "jinja2", "tensorboardX", "matplotlib", "PIL", "mediapy")

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from mjx_reinforce.files import Arrays
-from mjx_reinforce.runs.directory import RunLog
 from mjx_reinforce.runs.display import Display
+from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.sinks import Queue, open_sinks
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.checkpoint import Attempts, Checkpoint, SaveDue

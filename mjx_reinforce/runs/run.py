@@ -18,8 +18,9 @@ from mjx_reinforce.export.run_files import Which
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.policies.policy import Policy
 from mjx_reinforce.reports.statistics import worst_if_not_finite
-from mjx_reinforce.runs.directory import RunLog, locked, make_directory, remove_empty
+from mjx_reinforce.runs.directory import locked, make_directory, remove_empty
 from mjx_reinforce.runs.display import Display
+from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.observers import Callbacks, RunFiles, Screen
 from mjx_reinforce.runs.plan import make_plan
 from mjx_reinforce.runs.sinks import check_installed

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Protocol
 
 from mjx_reinforce.files import append, finite, write_bytes
-from mjx_reinforce.runs import charts
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.rows import Cells, parse_cell
 
@@ -76,6 +75,8 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Que
     Raises:
       OSError: one of them cannot be written.
     """
+    from mjx_reinforce.runs import charts
+
     sinks = []
     if config.jsonl:
         sinks.append(Queue("metrics.jsonl", JsonLines(directory)))
@@ -88,11 +89,15 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Que
 
 def files(directory: Path) -> list[Path]:
     """Returns the files that sinks replace at once."""
+    from mjx_reinforce.runs import charts
+
     return [directory / NAME, directory / charts.WANDB_RUN]
 
 
 def remove_outputs(directory: Path) -> None:
     """Removes what the sinks of an older run left; W&B keeps its runs apart itself."""
+    from mjx_reinforce.runs import charts
+
     events = (directory / charts.TENSORBOARD).glob(charts.EVENTS)
     for path in (*files(directory), *events):
         path.unlink(missing_ok=True)

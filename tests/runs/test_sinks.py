@@ -16,7 +16,7 @@ from mjx_reinforce import files
 from mjx_reinforce import train as train_module
 from mjx_reinforce.reports.statistics import iqm, iqm_interval
 from mjx_reinforce.runs import charts, sinks
-from mjx_reinforce.runs.directory import RunLog
+from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.sinks import Queue
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import rows

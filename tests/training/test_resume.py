@@ -27,7 +27,8 @@ from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.learner import TrainState
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.runs.directory import RunLog, locked, make_directory
+from mjx_reinforce.runs.directory import locked, make_directory
+from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.observers import RunFiles
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import checkpoint
