@@ -191,7 +191,7 @@ def test_a_run_that_cannot_end_is_resumed(run, trained, tmp_path, monkeypatch, c
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("mjx_reinforce.runs.directory.write_bytes", full)
+    monkeypatch.setattr("mjx_reinforce.runs.log.write_bytes", full)
     arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "full"]
     assert run(*COMMON, *arguments) == 1
     assert "then go on with --resume full" in capsys.readouterr().err
