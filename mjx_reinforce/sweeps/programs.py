@@ -116,7 +116,7 @@ class SlotPrograms(NamedTuple):
 
         rows, measured = zip(*_side_by_side(move, lanes), strict=True)
         states[lanes[lanes >= 0]] = np.stack(rows)[lanes >= 0]
-        measured = [_joined(lanes, block) for block in zip(*measured, strict=True)]
+        measured = [_of_slots(lanes, block) for block in zip(*measured, strict=True)]
         return [block for block in measured if len(block.runs)]
 
     def evaluate(self, states: np.ndarray) -> Measured:
@@ -127,7 +127,7 @@ class SlotPrograms(NamedTuple):
             slot, which = self._put((states[runs], runs >= 0))
             return runs >= 0, jax.device_get(programs.evaluate(slot, which))
 
-        return _joined(lanes, _side_by_side(look, lanes))
+        return _of_slots(lanes, _side_by_side(look, lanes))
 
     def _pack(self, chosen: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, Slot]:
         """Returns the runs of each slot, and what moves them."""
@@ -153,7 +153,7 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_cores())
 
 
-def _joined(lanes: np.ndarray, slots: Sequence[Any]) -> Measured:
+def _of_slots(lanes: np.ndarray, slots: Sequence[Any]) -> Measured:
     """Returns what was measured in slots, each of which has (which lanes count [W], values [W])."""
     which, values = zip(*slots, strict=True)
     kept = np.concatenate(which)

@@ -72,22 +72,22 @@ def restored(leaves: Sequence[jax.Array | np.ndarray], like: PyTree) -> Any:
 
 def seed_keys(seed: Seed, num_seeds: int) -> jax.Array:
     """Returns the keys [S] that the seeds of a run begin with."""
-    return jax.random.split(_key(seed, domain=0), num_seeds)
+    return jax.random.split(_root_key(seed, domain=0), num_seeds)
 
 
 def eval_keys(eval_seed: Seed, numbers: jax.Array | np.ndarray) -> jax.Array:
     """Returns the keys of every evaluation but the last test, of the seeds [R] numbered so."""
-    return _for_each_seed(_key(eval_seed, domain=1), numbers)
+    return _for_each_seed(_root_key(eval_seed, domain=1), numbers)
 
 
 def last_test_keys(eval_seed: Seed, numbers: jax.Array | np.ndarray, config: Config) -> jax.Array:
     """Returns the keys [K, R] of the last test, which plays the episodes of K evaluations."""
     rounds = -(-(config.test_episodes or config.eval_episodes) // config.eval_episodes)
-    keys = jax.random.split(_key(eval_seed, domain=2), rounds)
+    keys = jax.random.split(_root_key(eval_seed, domain=2), rounds)
     return jax.vmap(_for_each_seed, in_axes=(0, None))(keys, numbers)
 
 
-def _key(seed: Seed, domain: int) -> jax.Array:
+def _root_key(seed: Seed, domain: int) -> jax.Array:
     """Returns the root of the keys of training (domain 0), evaluation (1), or the last test (2).
 
     The domains share no key, whatever seeds the user chooses.

@@ -112,7 +112,7 @@ def test_runs_are_in_as_few_chunks_as_there_is_room(limit, expected):
 )
 def test_a_plan_says_how_many_devices_stand_idle(monkeypatch, side, devices, said):
     monkeypatch.setattr(jax, "local_device_count", lambda: 8)
-    assert plan._idle(side, devices) == said
+    assert plan._idle_devices(side, devices) == said
 
 
 def test_slots_are_no_wider_than_the_chunk(monkeypatch):

@@ -141,11 +141,11 @@ def describe_plan(
         f"{counted(len(groups), 'compiled program')}, {counted(chunks, 'chunk')} of up to {side:,} "
         f"runs. {_time(envs, horizons, learners, groups, num_devices, part_trained)}. "
         f"It needs about {gigabytes(memory)} of memory beside the programs."
-        f"{_idle(side, num_devices)}"
+        f"{_idle_devices(side, num_devices)}"
     )
 
 
-def _idle(side: int, num_devices: int) -> str:
+def _idle_devices(side: int, num_devices: int) -> str:
     """Returns a sentence where devices of this process stand idle, else nothing.
 
     Args:
