@@ -7,8 +7,7 @@ import tyro
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.lines import for_stream
-from mjx_reinforce.console.streams import accept_everything
+from mjx_reinforce.console.streams import accept_everything, for_stream
 from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 
 

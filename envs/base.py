@@ -3,6 +3,7 @@
 import abc
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, cast
 
 import jax
@@ -202,7 +203,7 @@ class MujocoEnv(Env):
         check_shape("qvel", qvel, (self.mj_model.nv,))
         return self._start(qpos, qvel, episode or {})
 
-    def _step_of(self, model: mjx.Model, forward: Any) -> Any:
+    def _step_of(self, model: mjx.Model, forward: Callable[..., Any]) -> Any:
         """Returns a physics step of a model, of which ``forward`` is the forward pass."""
         if self.settings.solver == "exact":
             return functools.partial(physics.step, model, evaluate=forward)

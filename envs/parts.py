@@ -20,7 +20,7 @@ _PREFIXES = {
 #: Fields of mjData with a row for each joint; others that a joint has are those of its dofs.
 _OF_JOINTS = ("xanchor", "xaxis")
 #: Kind -> how many of it a model has.
-_COUNTS = {
+_SIZES = {
     "body": "nbody",
     "geom": "ngeom",
     "site": "nsite",
@@ -37,7 +37,7 @@ class Part:
 
     def __init__(self, data: Any, model: MjModel, kind: str, name: str):
         """Finds the part; raises ValueError for a name that the model has not."""
-        names = [getattr(model, kind)(i).name for i in range(getattr(model, _COUNTS[kind]))]
+        names = [getattr(model, kind)(i).name for i in range(getattr(model, _SIZES[kind]))]
         check_name(kind, name, dict.fromkeys(filter(None, names)))
         self._data, self._model, self._kind, self.id = data, model, kind, names.index(name)
 

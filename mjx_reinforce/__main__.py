@@ -30,8 +30,7 @@ def _command(arguments: list[str]) -> tuple[str, list[str]]:
     first = arguments[0] if arguments else "--help"
     if first in COMMANDS:
         return first, arguments[1:]
-    from mjx_reinforce.console.lines import for_stream, say_error
-    from mjx_reinforce.console.streams import accept_everything
+    from mjx_reinforce.console.streams import accept_everything, for_stream, say_error
     from mjx_reinforce.store.provenance import version
 
     accept_everything()

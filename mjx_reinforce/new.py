@@ -20,50 +20,6 @@ if TYPE_CHECKING:
 
 #: What is named in the class, by mjData's arrays whose rows it numbers.
 _POSITION_OF = {"site": "site_xpos", "body": "xpos"}
-_TEMPLATE = '''"""{title}: what the robot should do.
-
-Train it in this folder, and film what it learned:
-
-    mjx-reinforce train --env {module}:{title} --output {module}_run
-    mjx-reinforce watch {module}_run --env {module}:{title}
-"""
-
-from pathlib import Path
-
-import jax
-import jax.numpy as jnp
-
-from mjx_reinforce.envs.base import MujocoEnv
-
-{constants}class {title}(MujocoEnv):
-    """{about}"""
-
-    def __init__(self):
-        super().__init__(
-            xml_file=str(Path(__file__).resolve().with_name({xml})),
-            frame_skip={frame_skip},  # physics steps of {timestep:g} s an action
-            max_episode_steps={steps},
-            reward_threshold=None,  # the return at which the task is solved, if you know one
-        )
-
-    def initial(self, rng):
-        """Draws the start of an episode: qpos [{nq}] (m, rad) near the model's pose, at rest."""
-        qpos = jnp.asarray(self.mj_model.qpos0)
-        noise = 0.01 * jax.random.uniform(rng, qpos.shape, minval=-1, maxval=1)
-        return qpos + noise, jnp.zeros({nv})
-
-    def observe(self, data):
-        """Returns what the policy sees: {seen}."""
-        return jnp.concatenate([{observed}])
-
-    def outcome(self, before, data, action):
-        """Returns the reward, whether the episode ends, and the terms of the reward."""
-        # Yours to write. This one holds the model's pose with little force. Every field of mjData
-        # is in data, and where the step began in before: before.qpos, before.qvel.
-        pose = -jnp.sum(jnp.square(data.qpos - self.mj_model.qpos0))
-        control = -0.01 * jnp.sum(jnp.square(action))
-        return pose + control, False, {{"reward_pose": pose, "reward_control": control}}
-'''
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,7 +100,8 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
         seen.append("sensors")
         observed.append("data.sensordata")
     constants = "".join(_constants(model))
-    return _TEMPLATE.format(
+    template = Path(__file__).with_name("new_task.txt").read_text("utf-8")
+    return template.format(
         title=_title(module),
         module=module,
         xml=json.dumps(xml),

@@ -12,18 +12,16 @@ from typing import Any, NamedTuple
 import tyro
 
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.lines import say_error
-from mjx_reinforce.console.streams import accept_everything
+from mjx_reinforce.console.streams import accept_everything, say_error
 from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.files import check_folder, write_bytes
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
-from mjx_reinforce.reports.film import PageFilm, film_of_median
 from mjx_reinforce.reports.findings import Findings, compute_findings
-from mjx_reinforce.reports.page import columns, document, latex, learning, tables, tasks_page
-from mjx_reinforce.reports.page.document import Watch, encoded
+from mjx_reinforce.reports.page import columns, document, learning, tables, tasks_page
+from mjx_reinforce.reports.page.document import PageFilm, Watch, encoded, film_of_median
 from mjx_reinforce.reports.page.figures import Figure, figures
-from mjx_reinforce.reports.page.listings import listings
+from mjx_reinforce.reports.page.listings import latex_tables, listings
 from mjx_reinforce.reports.page.vega import ONE, render_chart
 from mjx_reinforce.reports.tasks import find_tasks, rename
 from mjx_reinforce.settings.defaults import check_task, of_task
@@ -168,9 +166,9 @@ def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = 
         pages.append((page.name, f"{beside.name}/{page.name}"))
     drawn, data = tasks_page.tasks_figures(tasks), tasks_page.tasks_chart_tables(tasks)
     labels = tasks_page.labels(tasks)
-    files = {"scores.csv": columns.table_csv(tasks_page.scores(tasks), labels)}
+    files = {"scores.csv": columns.table_csv(columns.scores(tasks), labels)}
     texts = {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
-    for name, content in {**files, **texts, **latex.tables(tasks_page.listed(tasks))}.items():
+    for name, content in {**files, **texts, **latex_tables(tasks_page.listed(tasks))}.items():
         write_bytes(beside / name, encoded(content))
     for figure in drawn:
         _write_figure(figure, data, labels, figure.title, beside)
@@ -198,7 +196,7 @@ def _write_page(findings: Findings, output: Path, started: float, *, film: bool 
         files["effects.csv"] = columns.effects_csv(findings)
     beside, labels = _beside(output), findings.labels
     beside.mkdir(exist_ok=True)
-    texts = {**files, **_tables(findings, data), **latex.tables(listings(findings))}
+    texts = {**files, **_tables(findings, data), **latex_tables(listings(findings))}
     for name, content in texts.items():
         write_bytes(beside / name, encoded(content))
     for figure in drawn:

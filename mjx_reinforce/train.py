@@ -28,7 +28,7 @@ from mjx_reinforce.runs.directory import (
     remove_empty,
 )
 from mjx_reinforce.runs.plan import Plan, make_plan
-from mjx_reinforce.runs.sinks.sink import check_installed
+from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.settings.own_code import code_flags
@@ -81,7 +81,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
                 default = start(arguments, "train")[0]
                 ready, found = _start(env, config, default, processes, share)
             if config.init_from is not None and found is None:
-                from mjx_reinforce.training.initial import last_actors
+                from mjx_reinforce.training.state import last_actors
 
                 last_actors(config, ready.policy)  # refused before anything is compiled
             plan = make_plan(ready, config, processes.count)

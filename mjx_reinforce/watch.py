@@ -17,8 +17,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.heartbeat import heartbeat
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.console.lines import say_error
-from mjx_reinforce.console.streams import accept_everything, silence_alarms
+from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
 from mjx_reinforce.export.films import (
     Renderer,
     import_gymnasium,
@@ -28,8 +27,15 @@ from mjx_reinforce.export.films import (
 )
 from mjx_reinforce.export.run_files import SeedChoice, Which
 from mjx_reinforce.files import check_folder
-from mjx_reinforce.playing.cast import PolicySource, Role, cast, main_seed, read_source
-from mjx_reinforce.playing.newest import RUNS, choose_run
+from mjx_reinforce.playing.cast import (
+    RUNS,
+    PolicySource,
+    Role,
+    cast,
+    choose_run,
+    main_seed,
+    read_source,
+)
 from mjx_reinforce.settings.flags import read_command_line
 from mjx_reinforce.settings.own_code import check_named
 
@@ -128,13 +134,13 @@ def film(settings: WatchSettings) -> None:
         import_gymnasium()
     import_mujoco()
     configure_jax()
-    from mjx_reinforce.playing.simulations import check_observations
+    from mjx_reinforce.playing.mujoco_playing import check_observations
 
     roles = cast(settings, source)
     env = envs.make_set(source.env, source.run.env_set if source.run else ())
     check_observations(env, roles[-1].player, source)
     if settings.live:
-        from mjx_reinforce.playing.live import live
+        from mjx_reinforce.playing.mujoco_playing import live
 
         live(env, scene(env), roles[-1].player, source.horizon, settings)
         return
@@ -158,8 +164,7 @@ def _take(
 ) -> Any:
     """Returns the episode of one policy, and says what it earned."""
     from mjx_reinforce.export.takes import Take
-    from mjx_reinforce.playing.mujoco_playing import pushed_body
-    from mjx_reinforce.playing.simulations import simulators
+    from mjx_reinforce.playing.mujoco_playing import pushed_body, simulators
 
     by_name = simulators(settings.backend, env, role.player, source, settings.push)
     name, play = list(by_name.items())[-1]

@@ -100,6 +100,21 @@ def test_the_wheel_has_every_package():
     assert set(listed["packages"]) == {f"mjx_reinforce.{name}".strip(".") for name in packages}
 
 
+def test_the_wheel_has_every_file_that_is_no_module():
+    """Tables, templates and policies, which modules read beside them."""
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]
+    packed = {
+        path
+        for package, patterns in listed["package-data"].items()
+        for pattern in patterns
+        for path in PACKAGE.joinpath(*package.split(".")[1:]).glob(pattern)
+    }
+    ours = {path for path in PACKAGE.rglob("*") if path.is_file()} | {
+        *(PACKAGE / "envs/assets").iterdir()
+    }
+    assert {path for path in ours if path.suffix not in (".py", ".pyc")} == packed
+
+
 def run(code):
     return subprocess.run(
         [sys.executable, "-c", code], check=True, capture_output=True, text=True
@@ -114,11 +129,18 @@ def test_import_is_light():
     assert loaded.strip() == "[]"
 
 
+@pytest.mark.parametrize("command", ["train", "sweeps.designs.grid", "export.__main__", "new"])
+def test_what_reads_a_command_line_is_light(command):
+    """So that --help, and what is refused, take no second."""
+    loaded = run(f"import sys, mjx_reinforce.{command}\nprint('jax' in sys.modules)")
+    assert loaded.strip() == "False"
+
+
 def test_pages_films_and_logs_wait():
     """What draws and logs is imported when something is drawn or logged."""
     late = ("altair", "vl_convert", "jinja2", "tensorboardX", "matplotlib", "PIL", "mediapy")
     loaded = run(
-        "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.sweeps.main\n"
+        "import sys, mjx_reinforce.train, mjx_reinforce.watch, mjx_reinforce.sweeps.command_line\n"
         "import mjx_reinforce.runs.run, mjx_reinforce.runs.observers, mjx_reinforce.store.ready\n"
         f"print([m for m in {late} if m in sys.modules])"
     )
@@ -139,17 +161,13 @@ def test_readme_python_runs(tmp_path):
 
 
 def test_type_checkers_see_the_public_names():
-    """What a checker imports is what is imported on first use, and all of it is public."""
-    tree = ast.parse((ROOT / "mjx_reinforce" / "__init__.py").read_text("utf-8"))
-    (checked,) = (node for node in tree.body if isinstance(node, ast.If))
-    seen = {
-        alias.name: node.module.removeprefix("mjx_reinforce.")
-        for node in checked.body
-        if isinstance(node, ast.ImportFrom) and node.module
-        for alias in node.names
-    }
-    assert seen == mjx_reinforce._HOME
-    assert sorted(mjx_reinforce.__all__) == sorted([*seen, "__version__"])
+    """They read the stub, which says where each is imported from, and that all of it is public."""
+    tree = ast.parse((ROOT / "mjx_reinforce" / "__init__.pyi").read_text("utf-8"))
+    (public,) = (node.value for node in tree.body if isinstance(node, ast.Assign))
+    assert ast.literal_eval(public) == mjx_reinforce.__all__
+    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    assert {node.module.removeprefix("mjx_reinforce.") for node in imports} <= set(FILES)
+    assert mjx_reinforce._HOME.keys() == {alias.name for node in imports for alias in node.names}
 
 
 def test_slow_tests_are_tests(stale_lines):

@@ -11,7 +11,7 @@ import pytest
 from places import ROOT
 
 import mjx_reinforce
-from mjx_reinforce.reports.page.citation import YEAR
+from mjx_reinforce.reports.page.document import YEAR
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
 #: Packages that conda-forge calls otherwise than PyPI.

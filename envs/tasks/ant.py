@@ -4,8 +4,8 @@ import dataclasses
 
 import jax.numpy as jnp
 
+from mjx_reinforce.envs.locomotion import Healthy
 from mjx_reinforce.envs.settings import Interval, check_range
-from mjx_reinforce.envs.walkers import Healthy
 
 
 class Ant(Healthy):

@@ -102,7 +102,9 @@ class Cart(Env):
         zero = jnp.zeros((), qpos.dtype)
         return _state(qpos, qvel, zero, zero)
 
-    def push(self, state: State, force: Any, reward_up: float, reward_lost: float) -> State:
+    def push(
+        self, state: State, force: jax.Array | float, reward_up: float, reward_lost: float
+    ) -> State:
         """Returns the state a timestep later.
 
         Args:
@@ -180,7 +182,7 @@ class ContinuousCartPole(Cart):
         return self.push(state, _FORCE * action[0], 1.0, 0.0)
 
 
-def _acceleration(motion: Motion, force: Any) -> jax.Array:
+def _acceleration(motion: Motion, force: jax.Array | float) -> jax.Array:
     """Returns the accelerations [2] (m/s^2, rad/s^2).
 
     Florian (2007), Correct equations for the dynamics of the cart-pole system, equations 23 and

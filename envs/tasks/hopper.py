@@ -4,8 +4,8 @@ import dataclasses
 
 import jax.numpy as jnp
 
+from mjx_reinforce.envs.locomotion import PlanarWalker, within
 from mjx_reinforce.envs.settings import Interval, check_range
-from mjx_reinforce.envs.walkers import PlanarWalker, within
 
 
 class Hopper(PlanarWalker):

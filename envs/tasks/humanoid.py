@@ -4,9 +4,8 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from mjx_reinforce.envs.person import Person
+from mjx_reinforce.envs.locomotion import Healthy, Person, within
 from mjx_reinforce.envs.settings import Interval, check_range
-from mjx_reinforce.envs.walkers import Healthy, within
 
 
 class Humanoid(Person, Healthy):

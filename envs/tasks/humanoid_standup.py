@@ -4,7 +4,7 @@ import dataclasses
 
 import jax.numpy as jnp
 
-from mjx_reinforce.envs.person import Person
+from mjx_reinforce.envs.locomotion import Person
 from mjx_reinforce.envs.settings import Interval, check_range
 
 

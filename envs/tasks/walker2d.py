@@ -2,8 +2,8 @@
 
 import dataclasses
 
+from mjx_reinforce.envs.locomotion import PlanarWalker
 from mjx_reinforce.envs.settings import Interval
-from mjx_reinforce.envs.walkers import PlanarWalker
 
 
 class Walker2d(PlanarWalker):

@@ -34,11 +34,11 @@ def train(width: int, output: Path) -> None:
     from mjx_reinforce.console.jax_setup import configure_jax
     from mjx_reinforce.devices import Devices
     from mjx_reinforce.settings.defaults import of_task
+    from mjx_reinforce.sweeps.ahead import Stopwatch
     from mjx_reinforce.sweeps.chunks import initial_states, split_runs
     from mjx_reinforce.sweeps.designs.grid import configure, grid
     from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
-    from mjx_reinforce.sweeps.slots.ahead import Stopwatch
-    from mjx_reinforce.sweeps.slots.programs import compile_programs
+    from mjx_reinforce.sweeps.programs import compile_programs
 
     configure_jax()
     base = dataclasses.replace(

@@ -49,9 +49,9 @@ def compare(devices: list[int], rounds: int, arguments: list[str], folder: Path)
     from mjx_reinforce.runs.display import Display
     from mjx_reinforce.sweeps.command_line import parse_design
     from mjx_reinforce.sweeps.conduct import Conductor, Stage
-    from mjx_reinforce.sweeps.designs.prepare import prepare_sweep
+    from mjx_reinforce.sweeps.designs.plan import prepare_sweep
+    from mjx_reinforce.sweeps.programs import SlotPrograms
     from mjx_reinforce.sweeps.results import SweepFiles
-    from mjx_reinforce.sweeps.slots.programs import SlotPrograms
 
     class TimedPrograms(SlotPrograms):
         def begin(self, *args: Any, **named: Any) -> Any:

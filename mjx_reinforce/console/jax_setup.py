@@ -9,7 +9,6 @@ import sys
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from mjx_reinforce.engines.native.ownership import distrust, distrust_contents, make_folder
 
@@ -95,7 +94,7 @@ def _unusable(folder: Path) -> str | None:
 
 
 def _forget_unreadable(
-    show: Callable[..., None], message: Any, *where: Any, **options: Any
+    show: Callable[..., None], message: object, *where: object, **options: object
 ) -> None:
     """Shows a warning; one about the cache in a line, and removes a program that cannot be read.
 

@@ -10,8 +10,7 @@ import tyro
 
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import accept_everything
-from mjx_reinforce.export.pretrained import is_pretrained
-from mjx_reinforce.export.run_files import SeedChoice, Which, read_run
+from mjx_reinforce.export.run_files import SeedChoice, Which, is_pretrained, read_run
 from mjx_reinforce.files import check_folder
 from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 
@@ -56,9 +55,7 @@ def export(settings: ExportSettings) -> list[Path]:
     """
     if not is_pretrained(settings.run):
         read_run(settings.run)
-    from mjx_reinforce.export.arithmetic import arithmetic
-    from mjx_reinforce.export.numpy_source import numpy_source
-    from mjx_reinforce.export.onnx_model import import_onnx, onnx_model
+    from mjx_reinforce.export.arithmetic import arithmetic, import_onnx, numpy_source, onnx_model
     from mjx_reinforce.export.player import load_saved
     from mjx_reinforce.files import write_arrays, write_bytes
 

@@ -17,8 +17,8 @@ from mjx_reinforce.files import write_bytes
 if TYPE_CHECKING:
     from mjx_reinforce.types import MjModel
 
-#: Colours of a .gif, beside the one that is transparent, and fewer of them for a small file.
-_COLORS, _FEWER_COLORS = 255, (128, 64, 32, 16, 8)
+#: Colours of a .gif, beside the one that is transparent.
+_COLORS = 255
 #: What MuJoCo's backends need that are not EGL.
 _NEEDS = {"glfw": "a screen", "osmesa": "the library OSMesa"}
 #: Pictures, spread over a film, whose colours it has.
@@ -124,7 +124,6 @@ def write_film(
     frames: Iterable[np.ndarray],
     rate: float,
     samples: Sequence[np.ndarray],
-    colors: int = _COLORS,
 ) -> None:
     """Writes a film at once.
 
@@ -133,10 +132,9 @@ def write_film(
       frames: pictures [height, width, 3] uint8.
       rate: frames a second.
       samples: a few of the pictures; a .gif has the colours that show these best.
-      colors: how many a .gif has, 255 at most; fewer make a smaller file.
     """
     if path.suffix.lower() == ".gif":
-        write_bytes(path, gif(frames, rate, samples, colors))
+        write_bytes(path, gif(frames, rate, samples))
     else:
         with tempfile.TemporaryDirectory(dir=path.parent) as folder:
             partial = Path(folder) / path.name
@@ -144,31 +142,8 @@ def write_film(
             os.replace(partial, path)
 
 
-def write_small_gif(path: Path, frames: Sequence[np.ndarray], rate: float, most_bytes: int) -> None:
-    """Writes a .gif of so many bytes at most, with as many colours as that allows.
-
-    Args:
-      path: .gif.
-      frames: pictures [height, width, 3] uint8.
-      rate: frames a second.
-      most_bytes: of the file.
-
-    Raises:
-      ValueError: the film is larger with the fewest colours.
-    """
-    film, samples = b"", frames[:: -(-len(frames) // SAMPLES)]
-    for colors in _FEWER_COLORS:
-        film = gif(frames, rate, samples, colors)
-        if len(film) <= most_bytes:
-            write_bytes(path, film)
-            return
-    raise ValueError(
-        f"{path} would have {len(film)} bytes, {most_bytes} are allowed: make it shorter or smaller"
-    )
-
-
 def gif(
-    frames: Iterable[np.ndarray], rate: float, samples: Sequence[np.ndarray], colors: int
+    frames: Iterable[np.ndarray], rate: float, samples: Sequence[np.ndarray], colors: int = _COLORS
 ) -> bytes:
     """Returns a .gif with one palette, that of the samples: one a picture takes 6 ms.
 

@@ -9,14 +9,16 @@ import numpy as np
 
 from mjx_reinforce.checks import check_type
 from mjx_reinforce.export.policy_files import SavedPolicy, read_policy
-from mjx_reinforce.export.pretrained import FOLDER, is_pretrained, provenance_of
 from mjx_reinforce.export.run_files import (
+    FOLDER,
     Run,
     SeedChoice,
     Which,
     choose_seed,
     final_returns,
+    is_pretrained,
     policy_folder,
+    provenance_of,
     read_run,
 )
 from mjx_reinforce.policies.actor import Actor, act

@@ -1,6 +1,7 @@
 """A floor, a sky and a light for a model that is only drawn; what moves in it is not changed."""
 
 import warnings
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -74,7 +75,7 @@ def _compile_scene(spec: "MjSpec") -> Any:
         return spec.compile()
 
 
-def _add_light(spec: "MjSpec", kinds: Any, length: float) -> None:
+def _add_light(spec: "MjSpec", kinds: ModuleType, length: float) -> None:
     """Adds a light that goes with the first body, so that its shadow does not end on the way."""
     body = spec.worldbody.first_body() or spec.worldbody
     light = body.add_light(pos=(0, 0, 2 * length), dir=(0, 0, -1))
@@ -85,7 +86,7 @@ def _add_light(spec: "MjSpec", kinds: Any, length: float) -> None:
     light.diffuse = _LIGHT
 
 
-def _add_tiles(spec: "MjSpec", kinds: Any, length: float) -> None:
+def _add_tiles(spec: "MjSpec", kinds: ModuleType, length: float) -> None:
     """Adds the material of a chequered floor to a model of a length (m)."""
     spec.add_texture(
         name="mjx_reinforce_tiles",

@@ -1,15 +1,18 @@
-"""A connection between two processes of one run: messages, and notice when the other ends.
+"""A connection between two processes of one run: how it is made, messages, and notice of an end.
 
 The system closes the connections of a process that dies, however it died, so the other end reads
 that at once. Where a whole host is gone, TCP's own signs of life stop within ``_SILENCE`` seconds.
 """
 
 import contextlib
+import errno
+import json
 import queue
 import socket
 import struct
 import threading
 from collections.abc import Callable
+from typing import Any
 
 #: Kinds of messages: data for a process that waits, a signal that asks to stop, a leave-taking, and
 #: word of a third process that died.
@@ -18,6 +21,8 @@ DATA, STOP, BYE, DIED = b"D", b"S", b"B", b"X"
 _HEAD = struct.Struct("!cQ")
 #: Seconds after which a host that does not answer is gone, and between two questions.
 _SILENCE, _INTERVAL = 15, 3
+#: Seconds to wait for a greeting.
+GREETING = 10.0
 
 
 class Link:
@@ -100,3 +105,39 @@ def _receive_bytes(connection: socket.socket, length: int) -> bytes:
         parts.append(part)
         length -= len(part)
     return b"".join(parts)
+
+
+def address(coordinator: str) -> tuple[str, int]:
+    """Returns host and port; raises ValueError if they are none."""
+    host, _, port = coordinator.rpartition(":")
+    if not host or not port.isascii() or not port.isdigit() or not 0 < int(port) < 2**16:
+        raise ValueError(f"--coordinator must be HOST:PORT, such as node1:4321, got {coordinator}")
+    return host.strip("[]"), int(port)
+
+
+def listener(coordinator: str) -> socket.socket:
+    """Returns what listens at the address, or at that port on all of this host's addresses."""
+    host, port = address(coordinator)
+    try:
+        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
+        try:
+            return socket.create_server((host, port), family=family)
+        except OSError as error:
+            if error.errno != errno.EADDRNOTAVAIL:  # the name may be that of a gateway
+                raise
+            return socket.create_server(("", port))
+    except OSError as error:
+        raise ValueError(
+            f"cannot listen at --coordinator {coordinator} ({error.strerror or error}); it must be "
+            "the host of process 0, and a port that is free there"
+        ) from error
+
+
+def greeting(connection: socket.socket) -> dict[str, Any] | None:
+    """Returns what a process says of itself; None if it is none of ours."""
+    connection.settimeout(GREETING)
+    with contextlib.suppress(OSError, ValueError):
+        said = json.loads(receive(connection)[1])
+        if isinstance(said, dict) and said.keys() == {"index", "count", "common", "name"}:
+            return said
+    return None

@@ -7,7 +7,6 @@ the others at once.
 
 import contextlib
 import dataclasses
-import errno
 import itertools
 import json
 import os
@@ -19,10 +18,21 @@ from typing import Any
 
 from mjx_reinforce.console.heartbeat import heartbeat, to_screen
 from mjx_reinforce.console.interrupt import Interrupt
-from mjx_reinforce.hosts.links import BYE, DATA, DIED, STOP, Link, receive, send
+from mjx_reinforce.hosts.links import (
+    BYE,
+    DATA,
+    DIED,
+    GREETING,
+    STOP,
+    Link,
+    address,
+    greeting,
+    listener,
+    send,
+)
 
-#: Seconds to wait for processes that have not come yet, between two tries, and for a greeting.
-_PATIENCE, _PAUSE, _GREETING = 300.0, 0.1, 10.0
+#: Seconds to wait for processes that have not come yet, and between two tries.
+_PATIENCE, _PAUSE = 300.0, 0.1
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -141,15 +151,7 @@ def check_processes(settings: ProcessSettings) -> None:
     if not 0 <= index < count:
         raise ValueError(f"--process-id must lie in [0, {count}), got {index}")
     if settings.coordinator is not None:
-        _address(settings.coordinator)
-
-
-def _address(coordinator: str) -> tuple[str, int]:
-    """Returns host and port; raises ValueError if they are none."""
-    host, _, port = coordinator.rpartition(":")
-    if not host or not port.isascii() or not port.isdigit() or not 0 < int(port) < 2**16:
-        raise ValueError(f"--coordinator must be HOST:PORT, such as node1:4321, got {coordinator}")
-    return host.strip("[]"), int(port)
+        address(settings.coordinator)
 
 
 @contextlib.contextmanager
@@ -217,18 +219,18 @@ def _gather(coordinator: str, hello: dict[str, Any], interrupt: Interrupt) -> Pr
     count = hello["count"]
     names = [hello["name"], *(f"process {i}" for i in range(1, count))]
     processes, until = Processes(0, names), time.monotonic() + _PATIENCE
-    with _listener(coordinator) as listener:
+    with listener(coordinator) as listening:
         while len(processes.links) < count - 1:
-            listener.settimeout(max(until - time.monotonic(), 0.01))
+            listening.settimeout(max(until - time.monotonic(), 0.01))
             try:
-                connection, _ = listener.accept()
+                connection, _ = listening.accept()
             except TimeoutError:
                 missing = sorted(set(range(1, count)) - processes.links.keys())
                 raise ValueError(
                     f"process {', '.join(map(str, missing))} of {count} did not come to "
                     f"{coordinator} within {_PATIENCE:.0f} s; start the same command on every host"
                 ) from None
-            came = _greeting(connection)
+            came = greeting(connection)
             if came is None:  # a stranger
                 connection.close()
                 continue
@@ -237,34 +239,6 @@ def _gather(coordinator: str, hello: dict[str, Any], interrupt: Interrupt) -> Pr
             processes.connect(came["index"], connection, interrupt)
     processes.tell(json.dumps(processes.names).encode())
     return processes
-
-
-def _listener(coordinator: str) -> socket.socket:
-    """Returns what listens at the address, or at that port on all of this host's addresses."""
-    host, port = _address(coordinator)
-    try:
-        family = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0][0]
-        try:
-            return socket.create_server((host, port), family=family)
-        except OSError as error:
-            if error.errno != errno.EADDRNOTAVAIL:  # the name may be that of a gateway
-                raise
-            return socket.create_server(("", port))
-    except OSError as error:
-        raise ValueError(
-            f"cannot listen at --coordinator {coordinator} ({error.strerror or error}); it must be "
-            "the host of process 0, and a port that is free there"
-        ) from error
-
-
-def _greeting(connection: socket.socket) -> dict[str, Any] | None:
-    """Returns what a process says of itself; None if it is none of ours."""
-    connection.settimeout(_GREETING)
-    with contextlib.suppress(OSError, ValueError):
-        said = json.loads(receive(connection)[1])
-        if isinstance(said, dict) and said.keys() == {"index", "count", "common", "name"}:
-            return said
-    return None
 
 
 def _check_greeting(came: dict[str, Any], ours: dict[str, Any], processes: Processes) -> None:
@@ -287,10 +261,10 @@ def _check_greeting(came: dict[str, Any], ours: dict[str, Any], processes: Proce
 
 def _follow(coordinator: str, hello: dict[str, Any], interrupt: Interrupt) -> Processes:
     """Finds process 0, as one of the others."""
-    address, until = _address(coordinator), time.monotonic() + _PATIENCE
+    place, until = address(coordinator), time.monotonic() + _PATIENCE
     while True:
         try:
-            connection = socket.create_connection(address, timeout=_GREETING)
+            connection = socket.create_connection(place, timeout=GREETING)
             send(connection, DATA, json.dumps(hello).encode())
             break
         except OSError as error:

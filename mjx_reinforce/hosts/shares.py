@@ -53,7 +53,7 @@ def lead(
         limits = np.stack([np.asarray(limit) for limit in budget])
         answers = ask("look and advance" if look else "advance", before, budget=limits)
         states, metrics, looked = (
-            [_part(x, group) for x in answers] for group in ("state", "metrics", "looked")
+            [_group_of(x, group) for x in answers] for group in ("state", "metrics", "looked")
         )
         evaluation = _looked(before, _together(looked)) if look else None
         return _state_of(_together(states), like), _together_in_time(metrics), evaluation
@@ -125,7 +125,7 @@ def _numbered_leaves(tree: PyTree) -> Arrays:
     return {str(i): np.asarray(leaf) for i, leaf in enumerate(leaves)}
 
 
-def _part(arrays: Arrays, group: str) -> Arrays:
+def _group_of(arrays: Arrays, group: str) -> Arrays:
     return {k.removeprefix(f"{group}/"): x for k, x in arrays.items() if k.startswith(f"{group}/")}
 
 

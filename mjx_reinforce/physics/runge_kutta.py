@@ -38,8 +38,9 @@ def runge_kutta_4(
         stage, rate, sums = carry
         position, weight, next_position = row
         stage = like(evaluate(stage), stage)
-        # The next stage's solver starts at this one's solution. C starts all four at the last time
-        # step's: the minimum is the same, after more steps (Humanoid, random actions: 1.9, not 1.7).
+        # The next stage's solver starts at this one's solution. C starts all four where the time
+        # step did: the minimum is the same, after more steps (Humanoid, random actions: 1.9, not
+        # 1.7).
         stage = stage.replace(qacc_warmstart=stage.qacc)
         rate = _displacement_rate(model, stage.qvel, rate, position)
         rates = rate, stage.qacc, stage.act_dot

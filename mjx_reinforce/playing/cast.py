@@ -1,11 +1,14 @@
-"""Who plays in a film: seeds of a run, a policy of the package, or one before training."""
+"""Who plays in a film: seeds of a run, a policy of the package, or one before training.
+
+Where a command names no run, it is about the newest.
+"""
 
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from mjx_reinforce.console.commands import command
 from mjx_reinforce.export.player import Player
-from mjx_reinforce.export.pretrained import is_pretrained, provenance_of
-from mjx_reinforce.export.run_files import Run, choose_seed, read_run
+from mjx_reinforce.export.run_files import Run, choose_seed, is_pretrained, provenance_of, read_run
 
 
 class PolicySource(NamedTuple):
@@ -102,3 +105,26 @@ def untrained(player: Player) -> Any:
     params = player.policy.init(jax.random.key(player.seed))
     actor = Actor(params=params, normalizer=normalize.init(player.observation_size))
     return player._replace(actor=actor)
+
+
+#: Where runs are put that name no other place, see ``files.choose_directory``.
+RUNS = Path("runs")
+
+
+def choose_run(directory: Path) -> Path:
+    """Returns a directory, or of a folder of runs the one whose policies were written last.
+
+    Raises:
+      ValueError: the directory is ``RUNS``, and has no run that has policies.
+    """
+    if (directory / "config.json").exists():
+        return directory
+    policies = [x for x in directory.glob("*/policy") if (x.parent / "config.json").exists()]
+    if policies:
+        return max(policies, key=lambda policy: policy.stat().st_mtime).parent
+    if directory == RUNS:
+        raise ValueError(
+            f"no run was named, and the folder {directory} has none: {command('train')} trains "
+            f"one; one elsewhere is named as in {command('watch')} DIRECTORY"
+        )
+    return directory

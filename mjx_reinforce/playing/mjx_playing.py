@@ -3,6 +3,7 @@
 import functools
 import warnings
 from collections.abc import Callable
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -110,7 +111,7 @@ def gymnasium_simulator(player: Player, horizon: int) -> tuple[str, Callable[[in
     return gymnasium.__version__, play
 
 
-def _make_env(gymnasium: Any, player: Player, horizon: int) -> Any:
+def _make_env(gymnasium: ModuleType, player: Player, horizon: int) -> Any:
     """Returns Gymnasium's environment; raises ValueError as ``gymnasium_simulator``."""
     if ":" in player.env:  # to Gymnasium, "module:id" is a module to import
         raise ValueError(f"{player.env} is not Gymnasium's; leave --backend gymnasium out")

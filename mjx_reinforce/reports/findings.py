@@ -7,9 +7,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.reports.curves import on_grid
-from mjx_reinforce.reports.experiment import Configuration, Experiment
+from mjx_reinforce.reports.experiment import (
+    COMPARED,
+    Configuration,
+    Experiment,
+    Result,
+    Solving,
+    shared_seeds,
+)
 from mjx_reinforce.reports.learning import Learning, compare_learning
-from mjx_reinforce.reports.results import COMPARED, Result, Solving, shared_seeds
 from mjx_reinforce.reports.statistics import Estimate, iqm, iqm_interval
 from mjx_reinforce.reports.statistics.aggregates import interval, wilson
 from mjx_reinforce.reports.statistics.comparisons import Comparison, compare_all

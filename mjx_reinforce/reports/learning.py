@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import ordered
-from mjx_reinforce.reports.results import COMPARED, Result, shared_seeds
+from mjx_reinforce.reports.experiment import COMPARED, Result, ordered, shared_seeds
 from mjx_reinforce.reports.statistics import Estimate
 from mjx_reinforce.reports.statistics.aggregates import interval
 from mjx_reinforce.reports.statistics.comparisons import (

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from mjx_reinforce.files import read_json
 from mjx_reinforce.reports.experiment import Configuration, Source
@@ -115,7 +116,7 @@ def read_columns(path: Path, kinds: dict[str, Any]) -> dict[str, np.ndarray]:
     return found
 
 
-def _reads_as(kind: Any, text: str) -> bool:
+def _reads_as(kind: DTypeLike, text: str) -> bool:
     try:
         np.array([text], dtype=kind)
     except ValueError:

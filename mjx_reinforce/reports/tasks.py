@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import Experiment, relabel
+from mjx_reinforce.reports.experiment import Experiment, Result, relabel
 from mjx_reinforce.reports.findings import Findings, compute_findings
-from mjx_reinforce.reports.results import Result
 from mjx_reinforce.reports.statistics import Estimate
 from mjx_reinforce.reports.statistics.aggregates import interval
 from mjx_reinforce.reports.statistics.comparisons import holm

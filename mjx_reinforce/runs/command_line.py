@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.lines import say_error
+from mjx_reinforce.console.streams import say_error
 from mjx_reinforce.hosts.processes import ProcessSettings, check_processes
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs.directory import remove_empty

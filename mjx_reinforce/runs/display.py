@@ -21,7 +21,7 @@ from mjx_reinforce.console.heartbeat import heartbeat
 from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.runs.plan import duration
 from mjx_reinforce.settings.own_code import env_flag
-from mjx_reinforce.training.records import nonfinite, progress
+from mjx_reinforce.training import progress
 
 
 class _Bar(Progress):
@@ -117,7 +117,7 @@ class Display:
     def show_nonfinite(self, updates: dict[str, np.ndarray], num_seeds: int) -> None:
         """Says in a line which updates of a block met numbers that are not finite, if any did."""
         if len(updates["seed"]):
-            self.say(nonfinite.describe_nonfinite(updates, num_seeds), "yellow")
+            self.say(progress.describe_nonfinite(updates, num_seeds), "yellow")
 
 
 def _returns_and_speed(now: progress.Progress) -> str:

@@ -11,11 +11,10 @@ from mjx_reinforce import files
 from mjx_reinforce.export.policy_files import save_policy
 from mjx_reinforce.files import write_arrays, write_bytes, write_json
 from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.runs.sinks import sink
+from mjx_reinforce.runs import sinks
 from mjx_reinforce.store.provenance import provenance
-from mjx_reinforce.training import checkpoint
+from mjx_reinforce.training import checkpoint, rows
 from mjx_reinforce.training.checkpoint import Checkpoint
-from mjx_reinforce.training.records import rows
 
 #: The files of a run, besides those in ``checkpoint/``.
 _POLICY = ("policy/actor.npz", "policy/policy.json")
@@ -43,7 +42,7 @@ class RunLog:
         for name in _RESULTS:
             (self.directory / name).unlink(missing_ok=True)
         checkpoint.remove_checkpoints(self.directory / "checkpoint")
-        sink.remove_outputs(self.directory)
+        sinks.remove_outputs(self.directory)
         write_json(self.directory / "config.json", {**settings, **provenance()})
         files.create_csv(self._metrics, rows.COLUMNS)
 
@@ -79,7 +78,7 @@ class RunLog:
 
     def _remove_parts(self) -> None:
         """Removes what a crash left of writing files."""
-        for path in (*(self.directory / name for name in _FILES), *sink.files(self.directory)):
+        for path in (*(self.directory / name for name in _FILES), *sinks.files(self.directory)):
             for part in path.parent.glob(f".{path.name}.*"):
                 part.unlink()
 

@@ -8,13 +8,12 @@ from typing import Any
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.log import RunLog
-from mjx_reinforce.runs.sinks.sink import Queue, open_sinks
+from mjx_reinforce.runs.sinks import Queue, open_sinks
 from mjx_reinforce.training import resume
-from mjx_reinforce.training.checkpoint import Checkpoint
+from mjx_reinforce.training.checkpoint import Attempts, Checkpoint, SaveDue
 from mjx_reinforce.training.driver import Driver, Evaluation
-from mjx_reinforce.training.records.rows import Cells
 from mjx_reinforce.training.resume import recordable
-from mjx_reinforce.training.saving import Attempts, SaveDue
+from mjx_reinforce.training.rows import Cells
 
 #: Once so much of the budget is used, the time that is left can be trusted: before, episodes may be
 #: much shorter than later, so that each takes longer for its steps.

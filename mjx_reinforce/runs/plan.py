@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from mjx_reinforce.settings import measured, operations
+from mjx_reinforce.settings import measured, memory
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.settings.measured import Speed, Task
@@ -133,8 +133,8 @@ def run_seconds(config: Config, task: Task, machine: Hardware, speed: Speed) -> 
     They learn from whole updates, in which short episodes wait for the longest.
     """
     seconds, bounded = training_seconds(config, task, speed)
-    own = operations.per_step(of_task(config.env, env_steps=1), task)
-    beyond = max(0.0, operations.per_step(config, task) - own)
+    own = memory.operations_per_step(of_task(config.env, env_steps=1), task)
+    beyond = max(0.0, memory.operations_per_step(config, task) - own)
     steps = config.num_seeds * _steps(config, task, task.useful)[0]
     rate = measured.CPU_OPERATIONS if machine.shared else measured.GPU_OPERATIONS
     return (seconds + steps * beyond / rate) / machine.faster, bounded

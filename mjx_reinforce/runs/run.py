@@ -23,13 +23,13 @@ from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.log import RunLog
 from mjx_reinforce.runs.observers import Callbacks, RunFiles, Screen
 from mjx_reinforce.runs.plan import make_plan
-from mjx_reinforce.runs.sinks.sink import check_installed
+from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.runs.training import compile_driver, draw, summary_of
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.store.ready import get_ready
 from mjx_reinforce.training.driver import Driver, Evaluation
-from mjx_reinforce.training.initial import last_actors
+from mjx_reinforce.training.state import last_actors
 
 
 class RunResults(NamedTuple):

@@ -10,12 +10,12 @@ from mjx_reinforce.learners import counts
 from mjx_reinforce.reports.curves import draw_learning_curve
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.best import first_best
+from mjx_reinforce.training.budget import env_steps_in
 from mjx_reinforce.training.driver import Driver
-from mjx_reinforce.training.initial import begin_with, last_actors
-from mjx_reinforce.training.minutes import env_steps_in
 from mjx_reinforce.training.programs import compile_run
-from mjx_reinforce.training.records.nonfinite import HOPELESS
-from mjx_reinforce.training.records.record import RunRecord
+from mjx_reinforce.training.progress import HOPELESS
+from mjx_reinforce.training.record import RunRecord
+from mjx_reinforce.training.state import begin_with, last_actors
 
 if TYPE_CHECKING:
     from mjx_reinforce.store.ready import Ready

@@ -16,7 +16,7 @@ import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from mjx_reinforce.checks import whole_number
-from mjx_reinforce.console.lines import columns_of, say_error, wrapped
+from mjx_reinforce.console.streams import columns_of, say_error, wrapped
 from mjx_reinforce.settings.hints import about_unknown, known, required, unknown_flags
 
 Form = TypeVar("Form")
@@ -192,7 +192,7 @@ def _few_fields(form: type, names: Sequence[str]) -> type:
     return dataclasses.make_dataclass(form.__name__, made, frozen=True, kw_only=True)
 
 
-def _as_form(form: type[Form], parsed: Any) -> Form:
+def _as_form(form: type[Form], parsed: object) -> Form:
     """Returns what was read as the dataclass that was asked for."""
     hints = get_type_hints(form)
     values = {

@@ -10,57 +10,15 @@ import tyro
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import COMMANDS, SCRIPT, command
 from mjx_reinforce.registry import nearest
-from mjx_reinforce.settings.config import flag, spoken
+from mjx_reinforce.settings.config import flag, read_tables, spoken
 from mjx_reinforce.settings.presets import PRESETS
 
+_OTHERS = read_tables("hints.toml")
 #: Flags of other libraries, and short forms -> ours.
-_OTHERS = {
-    "--env": "env-id env-name environment task task-id game model robot e",
-    "--num-seeds": "n seeds n-seeds nseeds num-seed number-of-seeds runs num-runs repeats trials",
-    "--seed": "random-seed rng-seed",
-    "--env-steps": "steps n-steps num-steps timesteps total-timesteps num-timesteps total-steps "
-    "env-step max-steps budget-steps frames n-timesteps train-steps",
-    "--minutes": "time time-limit minute mins max-time hours seconds duration wall-time",
-    "--max-updates": "updates num-updates n-updates iterations num-iterations n-iterations iters "
-    "epochs n-epochs num-epochs generations",
-    "--num-episodes": "episodes n-episodes batch-size batch num-envs n-envs episodes-per-update "
-    "rollouts num-rollouts parallel-envs",
-    "--learning-rate": "lr alpha step learning-rates policy-lr actor-lr l",
-    "--value-learning-rate": "value-lr critic-lr vf-lr baseline-lr",
-    "--discount": "gamma discount-factor discounting",
-    "--hidden-sizes": "hidden hidden-size hidden-layers layers hidden-units net-arch network "
-    "hidden-dims hidden-dim units num-layers architecture",
-    "--estimator": "baseline advantage advantages critic",
-    "--algorithm": "algo alg method agent",
-    "--optimizer": "optim optimiser",
-    "--policy": "distribution dist policy-class",
-    "--initial-std": "std sigma init-std action-std log-std exploration noise-level",
-    "--entropy-cost": "ent-coef entropy entropy-coef entropy-coefficient entropy-bonus",
-    "--max-grad-norm": "clip clip-grad grad-clip gradient-clip clip-norm",
-    "--max-kl": "kl target-kl kl-target trust-region",
-    "--horizon": "episode-length max-episode-steps time-steps episode-steps length",
-    "--output": "out o dir logdir log-dir save-dir output-dir save path folder run-dir name "
-    "exp-name directory",
-    "--overwrite": "force f replace",
-    "--resume": "continue restart checkpoint load",
-    "--init-from": "pretrained from warm-start finetune",
-    "--eval-every": "eval-freq eval-interval eval-frequency log-every log-interval",
-    "--eval-episodes": "n-eval-episodes num-eval-episodes",
-    "--checkpoint-every": "save-every save-freq checkpoint-freq",
-    "--wandb": "track use-wandb",
-    "--tensorboard": "tb tensorboard-log",
-    "--over": "grid values",
-    "--search": "tune tuner",
-    "--budget": "num-configurations samples",
-    "--to": "format export type",
-    "--backend": "simulator sim",
-    "--noise": "stochastic sample",
-    "--which": "checkpoint-type policy-type",
-}
 _MEANT: dict[str, list[str]] = {}
-for _flag, _words in _OTHERS.items():
+for _flag, _words in _OTHERS["flags"].items():
     for _word in _words.split():
-        _MEANT.setdefault(f"--{_word}", []).append(_flag)
+        _MEANT.setdefault(f"--{_word}", []).append(f"--{_flag}")
 
 _GPU = "a GPU is used where JAX finds one; JAX_PLATFORMS=cuda before the command insists on it"
 _CONFIG = f"the settings of a run are in its config.json; {SCRIPT} train --like RUN repeats them"
@@ -79,14 +37,7 @@ _NONE = {
 
 
 #: Words of other libraries for a command -> ours.
-_COMMANDS = {
-    **dict.fromkeys(("run", "learn", "fit", "start"), "train"),
-    **dict.fromkeys(("play", "film", "video", "render", "view", "enjoy", "eval", "show"), "watch"),
-    **dict.fromkeys(("tune", "search", "grid", "optimize", "ablate"), "sweep"),
-    **dict.fromkeys(("plot", "compare", "analyze", "stats", "html"), "report"),
-    **dict.fromkeys(("save", "onnx", "convert"), "export"),
-    **dict.fromkeys(("tasks", "list", "env", "environments"), "envs"),
-}
+_COMMANDS = {word: ours for ours, words in _OTHERS["commands"].items() for word in words.split()}
 #: Flags of one command alone.
 _ELSEWHERE = {"--over": "sweep", "--search": "sweep", "--budget": "sweep", "--to": "export"}
 

@@ -1,4 +1,4 @@
-"""How much memory a run needs, from its settings alone, and whether it is there.
+"""What a run needs, from its settings alone: memory, whether that is there, and arithmetic.
 
 The factors were read off XLA's own account of its programs (``memory_analysis``), for 100 seeds of
 toys with 4 and 300 observations and 1,000 seeds of InvertedPendulum.
@@ -18,7 +18,7 @@ from mjx_reinforce.settings.measured import TASKS, Task
 
 _FLOAT = 4  # bytes
 #: Copies of the episodes that a gradient needs: as played, scaled, and by time.
-_COPIES = 3
+_EPISODE_COPIES = 3
 #: The values of the hidden units, and what the gradient adds to them.
 _ACTIVATIONS = 2
 #: Parameters, gradient, two moments, and all that again while a seed's update is proposed.
@@ -30,7 +30,7 @@ _CHUNK = 128
 #: Bytes of an env step that an evaluation plays: the reward, the mask, and copies.
 _EVALUATED = 10
 #: Numbers that a seed's update reports.
-_METRICS = 20
+_REPORTED = 20
 
 
 #: CPU cores that make a run faster; it was not tried with more.
@@ -80,14 +80,16 @@ def parts(config: Config, task: Task) -> list[MemoryPart]:
             _FLOAT * fitted * (config.value_fits + values + _ACTIVATIONS * sum(critic)),
             "--value-batch-size, --value-fits or --num-seeds",
         ),
-        MemoryPart(_FLOAT * _COPIES * steps * values, f"--num-seeds, {fewer} or --train-horizon"),
+        MemoryPart(
+            _FLOAT * _EPISODE_COPIES * steps * values, f"--num-seeds, {fewer} or --train-horizon"
+        ),
         MemoryPart(_FLOAT * network, f"--hidden-sizes, --num-seeds or {fewer}"),
         MemoryPart(
             _FLOAT * (_ACTIVATIONS * valued * sum(critic) + critics),
             "--value-hidden-sizes, --num-seeds or --train-horizon",
         ),
         MemoryPart(_EVALUATED * evaluated, "--eval-episodes, --num-seeds or --horizon"),
-        MemoryPart(_FLOAT * _METRICS * seeds * config.block_length, "--eval-every or --num-seeds"),
+        MemoryPart(_FLOAT * _REPORTED * seeds * config.block_length, "--eval-every or --num-seeds"),
     ]
 
 
@@ -185,3 +187,37 @@ def _may_have_accelerator() -> bool:
     if os.environ.get("JAX_PLATFORMS") == "cpu":
         return False
     return importlib.util.find_spec("jax_plugins") is not None
+
+
+_FORWARDS, _BACKWARDS = 2, 4
+#: Steps that each of the natural gradient's iterations passes over at most, forwards and backwards.
+_FISHER_STEPS = 4096
+
+
+def operations_per_step(config: Config, task: Task) -> float:
+    """Returns the operations for each env step that a run plays and trains on.
+
+    The policy plays and measures how far it moved, and learns from each step once, or from what
+    minibatches draw; the natural gradient passes over some of them again and again. The value
+    network gives each step its value, and is fitted ``value_fits`` times, on all of them or on
+    minibatches.
+
+    Args:
+      config: the settings.
+      task: the sizes of the task; ``config`` may have another time limit.
+    """
+    policy = num_parameters(config, task)
+    if config.algorithm == "ars":
+        return _FORWARDS * policy
+    steps = config.fewest_episodes * config.training_horizon(task.horizon)
+    learned = 1.0
+    if config.update == "minibatches":
+        learned = config.minibatch_updates * config.minibatch_size / steps
+    elif config.update == "natural-gradient" and config.hidden_sizes:
+        learned += config.natural_iterations * min(1, _FISHER_STEPS / steps)
+    fitted = config.value_fits
+    if config.value_fit == "minibatches":
+        fitted *= config.value_batch_size / steps
+    once = _FORWARDS + _BACKWARDS
+    value = critic_parameters(config, task) * (_FORWARDS + once * fitted)
+    return (2 * _FORWARDS + once * learned) * policy + value

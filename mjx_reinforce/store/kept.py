@@ -2,11 +2,13 @@
 
 They lie beside XLA's compiled programs in JAX's cache, under a hash of all that they depend on:
 every source file of this package, the versions of others, the settings, the device. What a run
-begins with (its seeds) and when it ends are inputs of its programs.
+begins with (its seeds) and when it ends are inputs of its programs. What they take and return is
+described in JSON, without pickle: pytrees whose leaves are shapes or random keys.
 """
 
 import dataclasses
 import hashlib
+import importlib
 import json
 import os
 from collections.abc import Callable, Sequence
@@ -29,12 +31,11 @@ from mjx_reinforce.settings.config import Config, marked
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.own_code import CODE
 from mjx_reinforce.store.provenance import provenance, version
-from mjx_reinforce.store.trees import describe_tree, rebuild
 from mjx_reinforce.training.block import Block
 from mjx_reinforce.training.programs import Programs
 from mjx_reinforce.training.resume import recordable
 from mjx_reinforce.training.state import Budget, RunState, restored
-from mjx_reinforce.types import plain
+from mjx_reinforce.types import PyTree, is_key, plain
 
 _PROGRAMS = ("begin", "advance", "evaluate")
 
@@ -141,7 +142,7 @@ def _on_leaves(programs: Programs) -> dict[str, Callable[..., Any]]:
 def _on_states(load: Callable[[str], Callable[..., Any]], like: RunState, rides: bool) -> Programs:
     """Returns the programs of which ``load`` returns those on leaves, when they are traced."""
 
-    def begin(*given: Any) -> tuple[RunState, jax.Array]:
+    def begin(*given: jax.Array) -> tuple[RunState, jax.Array]:
         leaves, keys = load("begin")(*given[:3])  # a run has no settings that are traced
         return restored(leaves, like), jax.random.wrap_key_data(keys)
 
@@ -184,3 +185,70 @@ def _write_program(key: str, name: str, content: bytes) -> None:
     folder = objects.folder()
     if folder is not None:
         objects.write_object(folder, f"{key}-{name}", content)
+
+
+#: The packages whose classes a description may name.
+_PACKAGES = ("mjx_reinforce", "optax")
+
+
+def describe_tree(tree: PyTree) -> Any:
+    """Returns what JSON can hold of a pytree: its structure, and its leaves' shapes and dtypes.
+
+    Args:
+      tree: of dicts, tuples, lists, None, NamedTuples and dataclasses; every leaf has a shape.
+
+    Raises:
+      TypeError: it has something else.
+    """
+    if tree is None:
+        return None
+    if isinstance(tree, dict):
+        return {"dict": {name: describe_tree(x) for name, x in tree.items()}}
+    kind, fields = type(tree), _fields(tree)
+    if fields is not None:
+        if kind.__module__.partition(".")[0] not in _PACKAGES:
+            raise TypeError(f"{kind} is of another package than {', '.join(_PACKAGES)}")
+        if "." in kind.__qualname__:
+            raise TypeError(f"{kind} is not at the top of its module")
+        parts = {name: describe_tree(getattr(tree, name)) for name in fields}
+        return {"class": f"{kind.__module__}:{kind.__qualname__}", "fields": parts}
+    if isinstance(tree, tuple | list):
+        return {kind.__name__: [describe_tree(x) for x in tree]}
+    if not hasattr(tree, "shape"):
+        raise TypeError(f"a leaf of {kind}")
+    return {"leaf": "key" if is_key(tree) else np.dtype(tree.dtype).name, "shape": list(tree.shape)}
+
+
+def rebuild(described: Any) -> Any:
+    """Returns the pytree of ``describe_tree``; its leaves are ``jax.ShapeDtypeStruct``.
+
+    Raises:
+      ValueError, KeyError, TypeError, AttributeError or ImportError: it is no such description.
+    """
+    if described is None:
+        return None
+    if "leaf" in described:
+        kind = described["leaf"]
+        dtype = _key_dtype() if kind == "key" else np.dtype(kind)
+        return jax.ShapeDtypeStruct(tuple(described["shape"]), dtype)
+    if "class" in described:
+        module, _, name = described["class"].partition(":")
+        if module.partition(".")[0] not in _PACKAGES:
+            raise ValueError(f"{module} is of another package than {', '.join(_PACKAGES)}")
+        parts = {name: rebuild(x) for name, x in described["fields"].items()}
+        return getattr(importlib.import_module(module), name)(**parts)
+    if "dict" in described:
+        return {name: rebuild(x) for name, x in described["dict"].items()}
+    ((kind, parts),) = described.items()
+    return {"tuple": tuple, "list": list}[kind](map(rebuild, parts))
+
+
+def _fields(tree: PyTree) -> tuple[str, ...] | None:
+    """Returns the names of the fields of a dataclass or NamedTuple; None of anything else."""
+    if dataclasses.is_dataclass(tree):
+        return tuple(field.name for field in dataclasses.fields(tree))
+    return getattr(tree, "_fields", None)
+
+
+def _key_dtype() -> Any:
+    return jax.eval_shape(jax.random.key, 0).dtype

@@ -100,7 +100,7 @@ def made(
         division = _division(config, share)
     devices = division.devices() if division.episodes > 1 else None
     learner, horizon = build(env, config, devices=devices)
-    width = division.width(_size(config, share))
+    width = division.width(_num_seeds(config, share))
     threshold = getattr(env, "reward_threshold", None)
     return Ready(
         horizon=horizon,
@@ -114,8 +114,8 @@ def made(
 
 
 def _division(config: Config, share: slice) -> Division:
-    return divide_run(config, _size(config, share))
+    return divide_run(config, _num_seeds(config, share))
 
 
-def _size(config: Config, share: slice) -> int:
+def _num_seeds(config: Config, share: slice) -> int:
     return len(range(config.num_seeds)[share])

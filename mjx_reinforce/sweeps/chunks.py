@@ -10,11 +10,10 @@ import numpy as np
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps.designs.groups import Group
 from mjx_reinforce.sweeps.history import History, Measured
-from mjx_reinforce.sweeps.slots.layout import StateRows
-from mjx_reinforce.sweeps.slots.programs import SlotPrograms
+from mjx_reinforce.sweeps.layout import StateRows
+from mjx_reinforce.sweeps.programs import SlotPrograms
 from mjx_reinforce.training import checkpoint
-from mjx_reinforce.training.checkpoint import Checkpoint
-from mjx_reinforce.training.saving import Attempts, SaveDue
+from mjx_reinforce.training.checkpoint import Attempts, Checkpoint, SaveDue
 from mjx_reinforce.training.state import RunState
 
 #: The host need not look at a sweep more often than this. Between short blocks the devices would

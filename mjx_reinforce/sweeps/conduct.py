@@ -14,20 +14,19 @@ from mjx_reinforce.learners import counts
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.plan import duration, is_wrong
 from mjx_reinforce.settings.config import MAX_COUNT
-from mjx_reinforce.sweeps import carry, chunks
+from mjx_reinforce.sweeps import chunks, results
+from mjx_reinforce.sweeps.ahead import Stopwatch, one_ahead
 from mjx_reinforce.sweeps.chunks import Runs, Saver
 from mjx_reinforce.sweeps.designs import rungs
 from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.designs.groups import Group, learner_builder
-from mjx_reinforce.sweeps.designs.plan import GroupPlan, divide, group_seconds
-from mjx_reinforce.sweeps.designs.prepare import Prepared
+from mjx_reinforce.sweeps.designs.plan import GroupPlan, Prepared, divide, group_seconds
 from mjx_reinforce.sweeps.designs.rungs import Rung
 from mjx_reinforce.sweeps.history import History
+from mjx_reinforce.sweeps.programs import SlotPrograms, compile_programs
 from mjx_reinforce.sweeps.results import SweepFiles
-from mjx_reinforce.sweeps.slots.ahead import Stopwatch, one_ahead
-from mjx_reinforce.sweeps.slots.programs import SlotPrograms, compile_programs
 from mjx_reinforce.training.driver import drive
-from mjx_reinforce.training.records.progress import Progress
+from mjx_reinforce.training.progress import Progress
 
 #: More than this share of a sweep is all of it, up to rounding.
 _ALL = 1 - 1e-6
@@ -247,8 +246,8 @@ class Conductor:
             return chunks.initial_states(programs, stage.group, runs)
         before = next(old for old in self._before if old.number == stage.number)
         shapes = programs.layout.shapes
-        states = carry.last_states(self._files, before.chunks, shapes, self._display.say)
-        states = carry.select_runs(states, before.chunks, runs)
+        states = results.last_states(self._files, before.chunks, shapes, self._display.say)
+        states = results.select_runs(states, before.chunks, runs)
         history.now["updates"] = counts.to_int(states.train_states.num_updates)
         history.now["env_steps"] = counts.to_int(states.train_states.env_steps)
         return programs.layout.rows(states)

@@ -11,8 +11,8 @@ import numpy as np
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.budget import used
-from mjx_reinforce.training.records.progress import Progress, measure_progress
-from mjx_reinforce.training.records.record import GrowingTable
+from mjx_reinforce.training.progress import Progress, measure_progress
+from mjx_reinforce.training.record import GrowingTable
 
 #: What is kept of every evaluation, and the name of its latest.
 _CURVES = {"eval_return": "eval_return", "env_steps": "eval_env_steps"}

@@ -20,7 +20,7 @@ from mjx_reinforce.training.resume import check_same_program
 
 if TYPE_CHECKING:
     from mjx_reinforce.report import WrittenReport
-    from mjx_reinforce.sweeps.designs.prepare import Prepared
+    from mjx_reinforce.sweeps.designs.plan import Prepared
     from mjx_reinforce.sweeps.results import SweepFiles
 
 #: Not every terminal has the page's quotation marks.
@@ -92,7 +92,7 @@ def _perform(
     """Does what ``perform`` says, in a directory that is ours; ``known`` is its sweep.json."""
     from mjx_reinforce.runs.display import Display
     from mjx_reinforce.sweeps.conduct import Conductor
-    from mjx_reinforce.sweeps.designs.prepare import prepare_sweep
+    from mjx_reinforce.sweeps.designs.plan import prepare_sweep
     from mjx_reinforce.sweeps.results import SweepFiles
 
     with heartbeat((lambda text: None) if quiet else to_screen, None, "writing the simulation out"):

@@ -54,7 +54,7 @@ def keep_best(best: Best, looked: Looked) -> Best:
     )
     better = eval_return >= np.asarray(best.eval_return)
 
-    def choose(new: np.ndarray, old: Any) -> np.ndarray:
+    def choose(new: np.ndarray, old: np.ndarray) -> np.ndarray:
         return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
     return jax.tree.map(choose, present, best)

@@ -2,7 +2,8 @@
 
 Each archive is written whole, under a name that ends in the beginning of its SHA-256: a file that
 was cut off or changed is noticed, and the one before it is used. The newest two are kept, and the
-newest one that is even, for runs whose budget is raised.
+newest one that is even, for runs whose budget is raised. ``SaveDue`` says when one is due, and
+``Attempts`` what is done where a file cannot be written while a run goes on.
 """
 
 import contextlib
@@ -10,6 +11,7 @@ import hashlib
 import io
 import json
 import re
+import time
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -69,10 +71,10 @@ def save(folder: Path, checkpoint: Checkpoint, *, even: bool) -> None:
     """
     folder.mkdir(exist_ok=True)
     content = _encode(checkpoint)
-    number = max((_number(path) for path in _files(folder)), default=0) + 1
+    number = max((_number(path) for path in _archives(folder)), default=0) + 1
     name = f"{number:06d}-{'even-' if even else ''}{_digest(content)}.npz"
     write_bytes(folder / name, content)
-    files = _files(folder)
+    files = _archives(folder)
     kept = files[:_KEPT] + [path for path in files if "-even-" in path.name][:1]
     for path in files:
         if path not in kept:
@@ -92,7 +94,7 @@ def read_checkpoints(
     Raises:
       ValueError: a checkpoint is whole, but its state is not like that.
     """
-    for path in _files(folder):
+    for path in _archives(folder):
         content = _read(path)
         if content is None:
             say(f"checkpoint {path.name} is damaged; trying the one before")
@@ -102,7 +104,7 @@ def read_checkpoints(
 
 def settings_of(folder: Path) -> dict[str, Any]:
     """Returns the settings with which the newest whole checkpoint was written; {} if none has."""
-    for content in filter(None, map(_read, _files(folder))):
+    for content in filter(None, map(_read, _archives(folder))):
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
             return json.loads(str(archive["rest"])).get("settings") or {}
     return {}
@@ -111,13 +113,13 @@ def settings_of(folder: Path) -> dict[str, Any]:
 def remove_checkpoints(folder: Path, after: int = 0) -> None:
     """Removes the checkpoints after a number, parts of unwritten ones, and a folder left empty."""
     parts = folder.glob(".*.npz.*")
-    for path in [*parts, *(path for path in _files(folder) if _number(path) > after)]:
+    for path in [*parts, *(path for path in _archives(folder) if _number(path) > after)]:
         path.unlink()
     with contextlib.suppress(OSError):
         folder.rmdir()
 
 
-def _files(folder: Path) -> list[Path]:
+def _archives(folder: Path) -> list[Path]:
     """Returns the checkpoints in a folder, the newest first."""
     paths = folder.iterdir() if folder.is_dir() else ()
     return sorted(filter(lambda path: _NAME.fullmatch(path.name), paths), key=_number, reverse=True)
@@ -196,7 +198,7 @@ def _unflatten(arrays: Arrays, like: PyTree) -> Any:
     return jax.tree.unflatten(structure, [_leaf(arrays[_name(path)], old) for path, old in leaves])
 
 
-def _name(path: Any) -> str:
+def _name(path: jax.tree_util.KeyPath) -> str:
     return "state/" + jax.tree_util.keystr(path, simple=True, separator="/")
 
 
@@ -204,3 +206,59 @@ def _leaf(values: np.ndarray, old: jax.Array) -> jax.Array:
     """Returns values in memory of the device's own, which may be donated; a key where it was."""
     array = jax.numpy.array(values)
     return jax.random.wrap_key_data(array) if is_key(old) else array
+
+
+#: Between checkpoints, where the user has not said how many updates.
+_CHECKPOINT_SECONDS = 60.0
+
+
+class SaveDue:
+    """When a checkpoint is due: after enough updates, or about a minute after the last one."""
+
+    def __init__(self, checkpoint_every: int | None):
+        """Begins before the first update.
+
+        Args:
+          checkpoint_every: updates between checkpoints; None for about a minute.
+        """
+        self._every = checkpoint_every
+        self.saved(0)
+
+    def saved(self, updates: int) -> None:
+        """Notes that the newest checkpoint has so many updates, also one that was found."""
+        self._at, self._updates = time.perf_counter(), updates
+
+    def is_due(self, updates: int) -> bool:
+        """Returns whether to save after so many updates."""
+        if self._every is None:
+            return time.perf_counter() - self._at >= _CHECKPOINT_SECONDS
+        return updates - self._updates >= self._every
+
+
+class Attempts:
+    """Writes of a run that goes on: one that fails is a warning, and is tried again later."""
+
+    def __init__(self, say: Callable[[str], None]):
+        """Takes what shows a line to the user."""
+        self._say = say
+        self._failing: set[str] = set()
+
+    def attempt(self, what: str, write: Callable[[], None]) -> bool:
+        """Returns whether something could be written; the first failure in a row is shown.
+
+        Args:
+          what: is written, for the warning.
+          write: writes it, or raises OSError.
+        """
+        try:
+            write()
+            self._failing.discard(what)
+            return True
+        except OSError as error:
+            if what not in self._failing:
+                problem = error.strerror or error
+                self._say(
+                    f"warning: cannot write {what} ({problem}); training goes on and tries again"
+                )
+            self._failing.add(what)
+            return False

@@ -14,8 +14,8 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.best import Best, keep_best
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.programs import Looked, RunPrograms
-from mjx_reinforce.training.records.record import RunRecord
-from mjx_reinforce.training.records.rows import Cells
+from mjx_reinforce.training.record import RunRecord
+from mjx_reinforce.training.rows import Cells
 from mjx_reinforce.training.state import RunState, budget_of
 
 

@@ -1,7 +1,7 @@
 """The programs that move runs on side by side: the seeds of a run, or what a sweep has in a slot.
 
 ``programs_of`` writes them once for both. ``compile_run`` compiles those of a run; a sweep compiles
-them for slots, see ``sweeps.slots.programs``.
+them for slots, see ``sweeps.programs``.
 """
 
 import functools
@@ -209,7 +209,7 @@ def compile_run(
         states = place(states)
         return on_host(present(states), evaluating(states.train_states.actor, states.eval_keys))
 
-    def on_host(policies: Any, measured: dict[str, jax.Array]) -> Looked:
+    def on_host(policies: tuple[Actor, jax.Array], measured: dict[str, jax.Array]) -> Looked:
         seen = jax.tree.map(lambda x: x[:num_seeds], jax.device_get((*policies, measured)))
         return Looked(*seen)
 

@@ -85,7 +85,7 @@ def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
     return Config(**settings)
 
 
-def _choices(hint: Any) -> str:
+def _choices(hint: object) -> str:
     names = typing.get_args(hint) if typing.get_origin(hint) is Literal else ()
     return f", not one of {', '.join(names)}" if names else ""
 
@@ -170,7 +170,7 @@ def check_same_program(
             )
 
 
-def _without_devices(flags: Any) -> str:
+def _without_devices(flags: object) -> str:
     """Returns XLA_FLAGS without the number of a CPU's devices, with which a run may go on."""
     kept = (x for x in str(flags or "").split() if not x.startswith(f"{_DEVICES}="))
     return " ".join(kept)
@@ -194,7 +194,7 @@ def newest_checkpoint(like: "RunState", config: Config, say: Callable[[str], Non
     assert config.resume is not None
     _check_unchanged(config, checkpoint.settings_of(config.resume / "checkpoint"))
     states = like, shape_of_best(like.train_states)
-    length = _size(config.resume / "metrics.csv")
+    length = _length(config.resume / "metrics.csv")
     for found in checkpoint.read_checkpoints(config.resume / "checkpoint", states, say):
         if found.metrics_bytes > length:
             say(f"metrics.csv is shorter than at checkpoint {found.number}; trying the one before")
@@ -219,7 +219,7 @@ def _check_unchanged(config: Config, trained: Mapping[str, Any]) -> None:
             )
 
 
-def _size(path: Path) -> int:
+def _length(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 

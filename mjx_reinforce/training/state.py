@@ -1,7 +1,8 @@
-"""The states of runs side by side, and what they begin with: their keys and their budget."""
+"""The states of runs side by side, and what they begin with: keys, a budget, policies."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +12,8 @@ from flax import struct
 
 from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.learner import TrainState
-from mjx_reinforce.settings.config import MAX_COUNT, Config
+from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.settings.config import MAX_COUNT, Config, flag
 from mjx_reinforce.types import PyTree, with_keys
 
 #: A root of randomness; traced inside of programs.
@@ -70,22 +72,22 @@ def restored(leaves: Sequence[jax.Array | np.ndarray], like: PyTree) -> Any:
 
 def seed_keys(seed: Seed, num_seeds: int) -> jax.Array:
     """Returns the keys [S] that the seeds of a run begin with."""
-    return jax.random.split(_key(seed, domain=0), num_seeds)
+    return jax.random.split(_root_key(seed, domain=0), num_seeds)
 
 
 def eval_keys(eval_seed: Seed, numbers: jax.Array | np.ndarray) -> jax.Array:
     """Returns the keys of every evaluation but the last test, of the seeds [R] numbered so."""
-    return _for_each_seed(_key(eval_seed, domain=1), numbers)
+    return _for_each_seed(_root_key(eval_seed, domain=1), numbers)
 
 
 def last_test_keys(eval_seed: Seed, numbers: jax.Array | np.ndarray, config: Config) -> jax.Array:
     """Returns the keys [K, R] of the last test, which plays the episodes of K evaluations."""
     rounds = -(-(config.test_episodes or config.eval_episodes) // config.eval_episodes)
-    keys = jax.random.split(_key(eval_seed, domain=2), rounds)
+    keys = jax.random.split(_root_key(eval_seed, domain=2), rounds)
     return jax.vmap(_for_each_seed, in_axes=(0, None))(keys, numbers)
 
 
-def _key(seed: Seed, domain: int) -> jax.Array:
+def _root_key(seed: Seed, domain: int) -> jax.Array:
     """Returns the root of the keys of training (domain 0), evaluation (1), or the last test (2).
 
     The domains share no key, whatever seeds the user chooses.
@@ -99,3 +101,50 @@ def _for_each_seed(key: jax.Array, numbers: jax.Array | np.ndarray) -> jax.Array
     Start states shared by all seeds would be a chance that no interval over seeds knows of.
     """
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.asarray(numbers))
+
+
+#: Settings of a policy that only say how its first parameters were drawn.
+_DRAWN = ("initial_std", "initializer", "env")
+
+
+def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
+    """Returns the actors [S, ...] with which the seeds of a run begin.
+
+    Args:
+      config: its settings, with ``init_from``.
+      policy: what ``build.policy_settings`` returns.
+
+    Raises:
+      ValueError: there is no such run, it has no policies, or they are of another form.
+    """
+    from mjx_reinforce.export.policy_files import read_policy
+    from mjx_reinforce.export.run_files import read_run
+
+    assert config.init_from is not None
+    directory = Path(config.init_from)
+    run = read_run(directory)
+    saved = read_policy(directory / "policy", own=config.policy)
+    settings = {field.name for field in dataclasses.fields(Config)}
+    for name in sorted(policy, key=lambda name: name in settings):  # what no flag sets goes first
+        value, old = policy[name], saved.settings.get(name, policy[name])
+        if name not in settings and old != value:
+            raise ValueError(
+                f"the policies in {directory} are for {run.env}, with {name} {old}, and "
+                f"{config.env} has {value}; leave --init-from out, or give a run of {config.env}"
+            )
+        if name not in _DRAWN and old != value:
+            raise ValueError(
+                f"the policies in {directory} have {name} {old}, and this run {value}; give "
+                f"{flag(name)} that value, or leave --init-from out"
+            )
+    seeds = np.arange(config.num_seeds) % saved.num_seeds
+    return jax.tree.map(lambda x: x[seeds], saved.actor)
+
+
+def begin_with(state: RunState, actors: Actor) -> RunState:
+    """Returns the state of a run before its first update, with actors [S, ...] of another."""
+    old = state.train_states.actor
+    actor = jax.tree.map(lambda new, like: jnp.asarray(new, like.dtype), actors, old)
+    return dataclasses.replace(
+        state, train_states=dataclasses.replace(state.train_states, actor=actor)
+    )

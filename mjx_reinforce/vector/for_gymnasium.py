@@ -25,7 +25,7 @@ _MODES = {
 #: A seed of all environments, or one for each.
 Seeds: TypeAlias = int | Sequence[int | None] | None
 #: How arrays are handed out, by name; "torch" and "jax" stay on the device.
-_ARRAYS = ("numpy", "jax", "torch")
+_KINDS_OF_ARRAYS = ("numpy", "jax", "torch")
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
@@ -46,7 +46,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
           ValueError: an argument has no such value, or there is nothing to render.
         """
-        check_name("arrays", arrays, dict.fromkeys(_ARRAYS))
+        check_name("arrays", arrays, dict.fromkeys(_KINDS_OF_ARRAYS))
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
         if render_mode and not hasattr(vec.env, "mj_model"):

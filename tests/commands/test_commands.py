@@ -12,9 +12,9 @@ from places import ROOT
 from mjx_reinforce import __main__ as script
 from mjx_reinforce import envs, registry
 from mjx_reinforce.checks import whole_number
-from mjx_reinforce.console import commands, lines
+from mjx_reinforce.console import commands, streams
 from mjx_reinforce.envs.__main__ import main as envs_main
-from mjx_reinforce.playing.newest import choose_run
+from mjx_reinforce.playing.cast import choose_run
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.settings.groups import MAIN
@@ -114,10 +114,10 @@ def test_help_wraps_at_words(call, monkeypatch, columns):
 def test_text_wraps_at_words():
     text = f"{'word ' * 30}\n  name    {'what ' * 30}\nmjx_reinforce.{'x' * 70} --flag"
     for columns in (20, 60, 200):
-        shown = lines.wrapped(text, columns)
+        shown = streams.wrapped(text, columns)
         assert shown.split() == text.split()
         assert all(len(line) <= columns or "x" * 70 in line for line in shown.splitlines())
-    first, second = lines.wrapped(f"  name    {'what ' * 8}", 40).splitlines()
+    first, second = streams.wrapped(f"  name    {'what ' * 8}", 40).splitlines()
     assert (first[:10], second[:10]) == ("  name    ", " " * 10)
 
 

@@ -12,7 +12,7 @@ from mjx_reinforce import load, report, watch
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export import __main__ as export
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.sweeps import main as sweep_command
+from mjx_reinforce.sweeps import command_line as sweep_command
 from mjx_reinforce.sweeps.designs.design import Design, as_record
 from mjx_reinforce.training.resume import recordable
 

@@ -24,8 +24,8 @@ from mjx_reinforce.policies import normalize
 from mjx_reinforce.reports.statistics import smooth
 from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, check_step_count
 from mjx_reinforce.store.build import build
-from mjx_reinforce.training.records.nonfinite import as_events
-from mjx_reinforce.training.records.record import RunRecord
+from mjx_reinforce.training.progress import as_events
+from mjx_reinforce.training.record import RunRecord
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
 

@@ -8,8 +8,9 @@ import tarfile
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from experiments.studies.results import files
+from experiments.studies.results import files, films
 from experiments.studies.results import page as results_page
 from experiments.studies.results import runs as results_runs
 from experiments.studies.results.measures import (
@@ -306,3 +307,18 @@ def test_unfinished_runs_are_not_gathered(tmp_path):
     (run / "summary.json").write_text('{"status": "interrupted"}')
     files.gather([PENDULUM], tmp_path / "runs", tmp_path / "kept")
     assert files.load([PENDULUM], tmp_path / "kept") == [PENDULUM]
+
+
+def test_a_film_of_the_pages_has_as_many_colours_as_its_size_allows(tmp_path):
+    still = np.random.default_rng(0).integers(0, 256, (40, 60, 3), np.uint8)
+    frames = [np.roll(still, 8 * i, axis=1) for i in range(6)]
+    sizes = []
+    for most in (10**6, 40_000, 20_000):
+        films.write_small_gif(tmp_path / "film.gif", frames, 10.0, most)
+        sizes.append((tmp_path / "film.gif").stat().st_size)
+        assert sizes[-1] <= most
+        with Image.open(tmp_path / "film.gif") as film:
+            assert film.n_frames == 6
+    assert sizes[0] > sizes[-1]
+    with pytest.raises(ValueError, match="make it shorter or smaller"):
+        films.write_small_gif(tmp_path / "film.gif", frames, 10.0, 100)

@@ -6,8 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from mjx_reinforce.export import onnx_model
-from mjx_reinforce.export.arithmetic import Arithmetic
+from mjx_reinforce.export.arithmetic import Arithmetic, import_onnx, onnx_model
 
 onnx = pytest.importorskip("onnx")
 
@@ -47,7 +46,7 @@ def test_the_model_computes_the_arithmetic(head, scaled, num_layers):
     from onnx.reference import ReferenceEvaluator
 
     plain = arithmetic(head, scaled=scaled, num_layers=num_layers)
-    model = onnx.load_model_from_string(onnx_model.onnx_model(plain, "Task-v0", 7))
+    model = onnx.load_model_from_string(onnx_model(plain, "Task-v0", 7))
     (action,) = ReferenceEvaluator(model).run(None, {"observation": OBSERVATION})
     assert action.dtype == (np.int64 if head == "argmax" else np.float32)
     np.testing.assert_allclose(action, expected(plain, OBSERVATION), rtol=1e-5, atol=1e-6)
@@ -63,4 +62,4 @@ def test_the_model_computes_the_arithmetic(head, scaled, num_layers):
 def test_without_the_package_the_remedy_is_said(monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(ValueError, match=r"--to onnx needs the package onnx .*pip install onnx"):
-        onnx_model.import_onnx()
+        import_onnx()

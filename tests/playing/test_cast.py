@@ -9,7 +9,7 @@ import pytest
 from saved_runs import make_run
 
 from mjx_reinforce.export import player as players
-from mjx_reinforce.export.pretrained import provenance_of
+from mjx_reinforce.export.run_files import provenance_of
 from mjx_reinforce.playing import cast
 
 

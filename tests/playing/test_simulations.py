@@ -7,7 +7,7 @@ import pytest
 from toys import Survive
 
 from mjx_reinforce.envs.base import MujocoEnv
-from mjx_reinforce.playing import simulations
+from mjx_reinforce.playing import mujoco_playing
 from mjx_reinforce.playing.cast import PolicySource
 
 RUN = types.SimpleNamespace(directory=Path("run"), env_set=())
@@ -18,14 +18,14 @@ PLAYER = types.SimpleNamespace(observation_size=1)
 @pytest.fixture
 def chosen(monkeypatch):
     """Names of what plays, with what they were given."""
-    monkeypatch.setattr(simulations, "mujoco_simulator", lambda *given: ("C", *given[2:]))
-    monkeypatch.setattr(simulations, "simulator", lambda *given: ("MJX", *given[2:]))
-    monkeypatch.setattr(simulations, "gymnasium_simulator", lambda *given: ("1.4", "theirs"))
+    monkeypatch.setattr(mujoco_playing, "mujoco_simulator", lambda *given: ("C", *given[2:]))
+    monkeypatch.setattr(mujoco_playing, "simulator", lambda *given: ("MJX", *given[2:]))
+    monkeypatch.setattr(mujoco_playing, "gymnasium_simulator", lambda *given: ("1.4", "theirs"))
 
     def of(backend, *, run=None, mujoco=False, push=0.0):
         env = MujocoEnv.__new__(Plain) if mujoco else Survive()
         source = PolicySource("Task-v0", 60, run)
-        return simulations.simulators(backend, env, PLAYER, source, push)  # pyright: ignore
+        return mujoco_playing.simulators(backend, env, PLAYER, source, push)  # pyright: ignore
 
     return of
 
@@ -68,7 +68,7 @@ def test_gymnasium_plays_no_task_with_other_settings(chosen):
 
 
 def test_observations_of_another_size_are_refused():
-    check, env = simulations.check_observations, Survive()
+    check, env = mujoco_playing.check_observations, Survive()
     other = types.SimpleNamespace(observation_size=3)
     check(env, PLAYER, PolicySource("Task-v0", 60, RUN))  # pyright: ignore
     check(env, other, PolicySource("Task-v0", 60, None))  # pyright: ignore

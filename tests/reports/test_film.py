@@ -6,7 +6,7 @@ import types
 
 import pytest
 
-from mjx_reinforce.reports import film
+from mjx_reinforce.reports.page import document
 
 
 @pytest.fixture
@@ -23,8 +23,8 @@ def made(monkeypatch, tmp_path):
             (tmp_path / "film.gif").write_bytes(b"GIF89a")
             return types.SimpleNamespace(returncode=returncode, stdout=stdout, stderr=stderr)
 
-        monkeypatch.setattr(film.subprocess, "run", run)
-        found = film.film_of_median(tmp_path / "run", tmp_path / "film.gif")
+        monkeypatch.setattr(document.subprocess, "run", run)
+        found = document.film_of_median(tmp_path / "run", tmp_path / "film.gif")
         return found, [str(x) for x in commands[0]]
 
     return make
@@ -52,4 +52,4 @@ def test_the_page_holds_the_film_and_its_first_line(made, tmp_path):
     ],
 )
 def test_where_there_is_none_the_page_says_why(made, end, said):
-    assert made(**end)[0] == film.PageFilm(said)
+    assert made(**end)[0] == document.PageFilm(said)

@@ -17,8 +17,8 @@ from saved_runs import make_run
 
 from mjx_reinforce import report
 from mjx_reinforce.reports import findings, sources, tasks
-from mjx_reinforce.reports.page import latex, learning, listings, tasks_page
-from mjx_reinforce.reports.page.citation import AUTHORS, TITLE, bibtex
+from mjx_reinforce.reports.page import learning, listings, tasks_page
+from mjx_reinforce.reports.page.document import AUTHORS, TITLE, bibtex
 
 RATES = {"learning_rate": [1e-3, 3e-3, 1e-2]}
 
@@ -167,7 +167,9 @@ HOSTILE = "50 % of_a & b #1 $x$ {y} ~z ^w \\input{/etc/passwd} <c>"
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="there is no LaTeX here")
 def test_latex_prints_names_as_they_are(tmp_path):
-    table = latex.tabular(["", "name", "value"], [{"label": HOSTILE, "cells": [("1", "0 to 2")]}])
+    table = listings.tabular(
+        ["", "name", "value"], [{"label": HOSTILE, "cells": [("1", "0 to 2")]}]
+    )
     parts = [r"\documentclass{article}\usepackage{booktabs}\begin{document}", table]
     (tmp_path / "page.tex").write_text("\n".join([*parts, r"\end{document}"]), encoding="utf-8")
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "page.tex"]
@@ -176,7 +178,7 @@ def test_latex_prints_names_as_they_are(tmp_path):
 
 
 def test_latex_has_no_commands_of_names():
-    text = latex.escaped(HOSTILE)
+    text = listings.escaped(HOSTILE)
     assert r"\input" not in text
     assert r"\textbackslash{}input\{/etc/passwd\}" in text
 

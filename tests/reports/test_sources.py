@@ -10,7 +10,7 @@ from measured_runs import ONE, make_measured_run
 
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import ordered, settings_in_words
-from mjx_reinforce.training.records.rows import COLUMNS
+from mjx_reinforce.training.rows import COLUMNS
 
 
 def test_a_run(tmp_path):

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from mjx_reinforce.reports.sweep_source import read_sweep_source
+from mjx_reinforce.reports.sources import read_sweep_source
 
 CONTENT = {
     "status": "interrupted",

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from mjx_reinforce.reports.page import charts, vega
-from mjx_reinforce.reports.page.palette import colour, dash
+from mjx_reinforce.reports.page.vega import colour, dash
 
 LABELS = ["a", "b", "c"]
 

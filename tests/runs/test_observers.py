@@ -8,7 +8,7 @@ import pytest
 
 from mjx_reinforce.runs.observers import Callbacks, RunFiles, Screen
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.records.progress import Progress
+from mjx_reinforce.training.progress import Progress
 
 
 class Log:

@@ -16,7 +16,7 @@ from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
 from mjx_reinforce.console.heartbeat import heartbeat
 from mjx_reinforce.runs import command_line, plan
-from mjx_reinforce.settings import measured, memory, operations
+from mjx_reinforce.settings import measured, memory
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.settings.measured import Speed, Task
@@ -201,7 +201,7 @@ def test_the_time_of_a_run_by_hand():
 def test_the_operations_of_networks_by_hand():
     """A policy of 1,282 parameters, a value network of 97: 5 to 16, 16 to 1, with biases."""
     task, plain = Task(4, 1, 50, 1.0, 0.0), Config(estimator="reward-to-go")
-    assert operations.per_step(plain, task) == 10 * 1282
+    assert memory.operations_per_step(plain, task) == 10 * 1282
     value = dataclasses.replace(
         plain,
         estimator="value-baseline",
@@ -209,18 +209,18 @@ def test_the_operations_of_networks_by_hand():
         value_fit="full-batch",
         value_fits=3,
     )
-    assert operations.per_step(value, task) == 10 * 1282 + (2 + 6 * 3) * 97
+    assert memory.operations_per_step(value, task) == 10 * 1282 + (2 + 6 * 3) * 97
     # 3 minibatches of 400 are 1.5 times the 16 * 50 steps of a rollout.
     fitted = dataclasses.replace(value, value_fit="minibatches", value_batch_size=400)
-    assert operations.per_step(fitted, task) == 10 * 1282 + (2 + 6 * 1.5) * 97
+    assert memory.operations_per_step(fitted, task) == 10 * 1282 + (2 + 6 * 1.5) * 97
     # 50 minibatches of 128 are 8 times the 16 * 50 steps of a rollout.
     drawn = dataclasses.replace(plain, update="minibatches")
-    assert operations.per_step(drawn, task) == (4 + 6 * 8) * 1282
+    assert memory.operations_per_step(drawn, task) == (4 + 6 * 8) * 1282
     natural = dataclasses.replace(plain, update="natural-gradient", natural_iterations=3)
-    assert operations.per_step(natural, task) == (4 + 6 * (1 + 3)) * 1282
+    assert memory.operations_per_step(natural, task) == (4 + 6 * (1 + 3)) * 1282
     few = dataclasses.replace(natural, num_episodes=2 * 4096 // 50, hidden_sizes=(32, 32))
-    assert operations.per_step(few, task) == pytest.approx((4 + 6 * 2.5) * 1282, rel=0.01)
-    assert operations.per_step(dataclasses.replace(value, algorithm="ars"), task) == 2 * 1282
+    assert memory.operations_per_step(few, task) == pytest.approx((4 + 6 * 2.5) * 1282, rel=0.01)
+    assert memory.operations_per_step(dataclasses.replace(value, algorithm="ars"), task) == 2 * 1282
 
 
 #: Env steps of all seeds, and the processor's time that training and evaluating them took (s), on

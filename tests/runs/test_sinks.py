@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from mjx_reinforce import files
 from mjx_reinforce import train as train_module
 from mjx_reinforce.reports.statistics import iqm, iqm_interval
+from mjx_reinforce.runs import charts, sinks
 from mjx_reinforce.runs.log import RunLog
-from mjx_reinforce.runs.sinks import over_seeds, sink, tensorboard
-from mjx_reinforce.runs.sinks.sink import Queue
+from mjx_reinforce.runs.sinks import Queue
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.records import rows
+from mjx_reinforce.training import rows
 
 
 def evaluation(update, num_seeds=20, first=False):
@@ -66,7 +66,7 @@ def events(folder):
     from tensorboardX.proto.event_pb2 import Event
     from tensorboardX.record_writer import masked_crc32c
 
-    for path in sorted(folder.glob(tensorboard.PATTERN)):
+    for path in sorted(folder.glob(charts.EVENTS)):
         content = path.read_bytes()
         while content:
             length, of_length = struct.unpack("<QI", content[:12])
@@ -77,7 +77,7 @@ def events(folder):
             content = content[16 + length :]
 
 
-def charts(folder):
+def events_of(folder):
     """What TensorBoard shows: {step: {name: value}}, without what a later start drops."""
     shown = {}
     for event in events(folder):
@@ -93,8 +93,8 @@ def charts(folder):
 
 
 def test_statistics_are_over_all_seeds_and_a_few_seeds_are_single():
-    shown = over_seeds.scalars(evaluation(10))
-    values = over_seeds.measured(evaluation(10))["eval_return"]
+    shown = charts.scalars(evaluation(10))
+    values = charts.measured(evaluation(10))["eval_return"]
     low, high = iqm_interval(values)
     assert shown["eval_return/iqm"] == float(iqm(values))
     assert (shown["eval_return/iqm_low"], shown["eval_return/iqm_high"]) == (low, high)
@@ -110,7 +110,7 @@ def test_statistics_are_over_all_seeds_and_a_few_seeds_are_single():
 
 
 def test_before_the_first_update_its_columns_are_not_shown():
-    shown = over_seeds.scalars(evaluation(0, first=True))
+    shown = charts.scalars(evaluation(0, first=True))
     assert {name.partition("/")[0] for name in shown} == {
         *("progress", "eval_return", "eval_return_stochastic", "eval_length")
     }
@@ -131,7 +131,7 @@ def test_cells_come_back_to_the_last_bit(dtype, data):
 
 
 def test_json_lines_are_the_rows_of_the_table(directory):
-    [lines] = sink.open_sinks(Config(jsonl=True), directory, None)
+    [lines] = sinks.open_sinks(Config(jsonl=True), directory, None)
     for update in (0, 5, 10):
         new = rows.lines(evaluation(update, first=not update))
         files.append(directory / "metrics.csv", new)
@@ -142,7 +142,7 @@ def test_json_lines_are_the_rows_of_the_table(directory):
     assert isinstance(as_json(directory / "metrics.jsonl")[0]["update"], int)
     written = (directory / "metrics.jsonl").read_bytes()
     (directory / "metrics.jsonl").write_bytes(written[:100] + b"\n{half a ro")
-    sink.open_sinks(Config(jsonl=True), directory, 10)
+    sinks.open_sinks(Config(jsonl=True), directory, 10)
     assert (directory / "metrics.jsonl").read_bytes() == written
 
 
@@ -160,13 +160,13 @@ def test_what_a_kill_left_of_writing_a_file_is_removed(directory, name):
 
 
 def test_tensorboard_has_the_numbers_and_the_histograms(directory):
-    [charted] = sink.open_sinks(Config(tensorboard=True), directory, None)
+    [charted] = sinks.open_sinks(Config(tensorboard=True), directory, None)
     for update in (0, 5):
         charted.write(evaluation(update))
     charted.close()
-    shown = charts(directory / "tensorboard")
+    shown = events_of(directory / "tensorboard")
     assert list(shown) == [0, 5]
-    expected = over_seeds.scalars(evaluation(5))
+    expected = charts.scalars(evaluation(5))
     for name, value in expected.items():
         np.testing.assert_allclose(shown[5][name], value, rtol=1e-6, err_msg=name)
     histogram = shown[5]["eval_return/seeds"]
@@ -176,26 +176,26 @@ def test_tensorboard_has_the_numbers_and_the_histograms(directory):
 
 @pytest.mark.parametrize("level", [0.0, 1000.0, -3e38])
 def test_a_histogram_of_equal_values_is_one_bin(directory, level):
-    [charted] = sink.open_sinks(Config(tensorboard=True), directory, None)
+    [charted] = sinks.open_sinks(Config(tensorboard=True), directory, None)
     charted.write(evaluation(0) | {"eval_return": 20 * [str(level)]})
-    histogram = charts(directory / "tensorboard")[0]["eval_return/seeds"]
+    histogram = events_of(directory / "tensorboard")[0]["eval_return/seeds"]
     assert [count for count in histogram.bucket if count] == [20]
 
 
 def resumed_charts(directory):
     """Events of a run that was killed after 10 updates and went on from 5, then of 3 seeds."""
     config = Config(tensorboard=True)
-    [killed] = sink.open_sinks(config, directory, None)
+    [killed] = sinks.open_sinks(config, directory, None)
     for update in (0, 5, 10):
         killed.write(evaluation(update))
-    [resumed] = sink.open_sinks(config, directory, 5)
+    [resumed] = sinks.open_sinks(config, directory, 5)
     resumed.write(evaluation(10, num_seeds=3))
     resumed.write(evaluation(15, num_seeds=3))
     return directory / "tensorboard"
 
 
 def test_tensorboard_of_a_resumed_run_shows_no_step_twice(directory):
-    shown = charts(resumed_charts(directory))
+    shown = events_of(resumed_charts(directory))
     assert list(shown) == [0, 5, 10, 15]
     assert "eval_return/seed_15" in shown[5]
     assert "eval_return/seed_15" not in shown[10]
@@ -213,17 +213,17 @@ def test_tensorboard_itself_reads_it_so(directory):
 
 def test_a_run_that_starts_again_drops_everything(directory):
     for _ in range(2):
-        [charted] = sink.open_sinks(Config(tensorboard=True), directory, None)
+        [charted] = sinks.open_sinks(Config(tensorboard=True), directory, None)
         charted.write(evaluation(0))
-    assert list(charts(directory / "tensorboard")) == [0]
+    assert list(events_of(directory / "tensorboard")) == [0]
     assert sum(event.HasField("summary") for event in events(directory / "tensorboard")) == 2
 
 
 @pytest.mark.parametrize("name", ["jsonl", "tensorboard"])
 def test_a_full_disk_delays_rows_and_loses_none(directory, monkeypatch, name):
     config = Config(**{name: True})
-    [slow] = sink.open_sinks(config, directory, None)
-    module = f"mjx_reinforce.runs.sinks.{'json_lines' if name == 'jsonl' else name}"
+    [slow] = sinks.open_sinks(config, directory, None)
+    module = f"mjx_reinforce.runs.{'sinks' if name == 'jsonl' else 'charts'}"
 
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -239,7 +239,7 @@ def test_a_full_disk_delays_rows_and_loses_none(directory, monkeypatch, name):
         updates = [row["update"] for row in as_json(directory / "metrics.jsonl")]
         assert updates[::20] == [0, 5, 10, 15]
     else:
-        assert list(charts(directory / "tensorboard")) == [0, 5, 10, 15]
+        assert list(events_of(directory / "tensorboard")) == [0, 5, 10, 15]
 
 
 def test_rows_that_wait_are_written_at_the_end():
@@ -297,7 +297,7 @@ def wandb_rows(directory):
 
 WANDB_PROGRAM = """
 import json, pathlib, sys
-from mjx_reinforce.runs.sinks.weights_and_biases import WeightsAndBiases
+from mjx_reinforce.runs.charts import WeightsAndBiases
 sink = WeightsAndBiases(pathlib.Path("."))
 for rows in json.load(sys.stdin):
     sink.write(rows)
@@ -315,7 +315,7 @@ def test_wandb_is_offline_and_goes_on(directory, monkeypatch):
         subprocess.run(command, input=given, check=True, cwd=directory, text=True)
     found, ids = wandb_rows(directory)
     assert [row["_step"] for row in found] == [0, 5, 10]
-    assert found[1]["eval_return/iqm"] == over_seeds.scalars(evaluation(5))["eval_return/iqm"]
+    assert found[1]["eval_return/iqm"] == charts.scalars(evaluation(5))["eval_return/iqm"]
     assert len(ids) == 1
     assert {path.name for path in directory.iterdir()} == {"metrics.csv", "config.json", "wandb"}
 
@@ -329,7 +329,7 @@ def test_wandb_that_has_no_key_says_what_to_do(directory, monkeypatch):
     monkeypatch.setattr(wandb, "init", init)
     monkeypatch.setenv("WANDB_MODE", "online")
     with pytest.raises(OSError, match="key configured; run wandb login, or unset WANDB_MODE"):
-        sink.open_sinks(Config(wandb=True), directory, None)
+        sinks.open_sinks(Config(wandb=True), directory, None)
 
 
 def test_only_a_disk_is_asked_for_room(run, monkeypatch, capsys):
@@ -366,7 +366,7 @@ def test_a_run_with_all_sinks_and_its_resumption(run, tmp_path):
     out = tmp_path / "out"
     table = as_csv(out / "metrics.csv")
     assert as_json(out / "metrics.jsonl") == table
-    shown = charts(out / "tensorboard")
+    shown = events_of(out / "tensorboard")
     assert list(shown) == sorted({int(row["update"]) for row in table})
     last = [row for row in table if row["update"] == 15]
     for name in ("eval_return", "kl", "policy_std", "gradient_snr", "explained_variance"):

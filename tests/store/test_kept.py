@@ -23,7 +23,7 @@ from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.gpu import seam as gpu
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import of_task
-from mjx_reinforce.store import kept, ready, trees
+from mjx_reinforce.store import kept, ready
 from mjx_reinforce.training.programs import compile_run
 from mjx_reinforce.training.state import budget_of
 
@@ -283,7 +283,7 @@ def test_a_program_that_calls_python_is_not_kept(folder):
 def test_a_tree_of_states_is_described_and_rebuilt(env):
     config = of_task(env)
     like = ready.made(envs.make(env), config).programs.like
-    again = trees.rebuild(trees.describe_tree(like))
+    again = kept.rebuild(kept.describe_tree(like))
     assert jax.tree.structure(again) == jax.tree.structure(like)
     for new, old in zip(jax.tree.leaves(again), jax.tree.leaves(like), strict=True):
         assert (new.shape, new.dtype) == (old.shape, old.dtype)
@@ -291,15 +291,15 @@ def test_a_tree_of_states_is_described_and_rebuilt(env):
 
 def test_a_tree_of_other_classes_is_neither_described_nor_rebuilt():
     with pytest.raises(TypeError, match="another package"):
-        trees.describe_tree({"a": Survive().reset(jax.random.key(0))})
+        kept.describe_tree({"a": Survive().reset(jax.random.key(0))})
     with pytest.raises(TypeError, match="a leaf of"):
-        trees.describe_tree([3])
-    assert trees.rebuild(trees.describe_tree((optax.EmptyState(), None))) == (
+        kept.describe_tree([3])
+    assert kept.rebuild(kept.describe_tree((optax.EmptyState(), None))) == (
         optax.EmptyState(),
         None,
     )
     with pytest.raises(ValueError, match="another package"):
-        trees.rebuild({"class": "subprocess:Popen", "fields": {"args": {"dict": {}}}})
+        kept.rebuild({"class": "subprocess:Popen", "fields": {"args": {"dict": {}}}})
 
 
 _SECOND = """

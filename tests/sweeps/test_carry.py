@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_reinforce.sweeps import carry
+from mjx_reinforce.sweeps import results
 from mjx_reinforce.sweeps.chunks import Runs
 from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.checkpoint import Checkpoint
@@ -30,16 +30,16 @@ def shape_of(number):
 
 
 def test_states_lie_side_by_side_and_runs_find_theirs(files):
-    states = carry.last_states(files, [FIRST, SECOND], shape_of, pytest.fail)
+    states = results.last_states(files, [FIRST, SECOND], shape_of, pytest.fail)
     assert states["run"].tolist() == [40, 50, 41, 51, 52]
     on = Runs("1-0", np.array([0, 0]), np.array([5, 4]), np.array([2, 1]))
-    assert carry.select_runs(states, [FIRST, SECOND], on)["run"].tolist() == [52, 41]
+    assert results.select_runs(states, [FIRST, SECOND], on)["run"].tolist() == [52, 41]
 
 
 def test_a_run_that_was_in_no_chunk_has_no_state(files):
-    states = carry.last_states(files, [FIRST], shape_of, pytest.fail)
+    states = results.last_states(files, [FIRST], shape_of, pytest.fail)
     with pytest.raises(KeyError):
-        carry.select_runs(states, [FIRST], SECOND)
+        results.select_runs(states, [FIRST], SECOND)
 
 
 def test_damaged_states_are_named(files):
@@ -47,6 +47,6 @@ def test_damaged_states_are_named(files):
     [path] = files.checkpoints("0-1").iterdir()
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(ValueError, match=r"0-1 are damaged; start another sweep"):
-        carry.last_states(files, [FIRST, SECOND], shape_of, said.append)
+        results.last_states(files, [FIRST, SECOND], shape_of, said.append)
     assert len(said) == 1
     assert path.name in said[0]

@@ -8,7 +8,7 @@ import pytest
 
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps import chunks
-from mjx_reinforce.sweeps.designs import grid, plan, rungs, search
+from mjx_reinforce.sweeps.designs import design, grid, plan, rungs
 from mjx_reinforce.sweeps.designs.groups import Group, make_groups
 
 CONFIG = Config(env_steps=1000, max_updates=7, num_seeds=3, num_episodes=16)
@@ -63,9 +63,9 @@ def test_words_that_are_no_values_are_refused(given, said):
 
 def test_draws_are_different_and_the_same_for_a_seed():
     over = {"learning_rate": [1e-4, 1e-1], "estimator": ["total-return", "reward-to-go"]}
-    drawn = search.draw_configurations(over, 50, seed=3)
+    drawn = design.draw_configurations(over, 50, seed=3)
     assert len({tuple(entry.values()) for entry in drawn}) == 50
-    assert drawn == search.draw_configurations(over, 50, seed=3)
+    assert drawn == design.draw_configurations(over, 50, seed=3)
     assert all(1e-4 <= entry["learning_rate"] <= 1e-1 for entry in drawn)
 
 
@@ -79,7 +79,7 @@ def test_draws_are_different_and_the_same_for_a_seed():
 )
 def test_a_range_without_a_scale_is_refused(over, said):
     with pytest.raises(ValueError, match=said):
-        search.draw_configurations(over, 2, seed=0)
+        design.draw_configurations(over, 2, seed=0)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_a_range_without_a_scale_is_refused(over, said):
     [([1, 2], True), ([1, 2, 3], False), ([True, False], False), (["a", "b"], False)],
 )
 def test_two_numbers_are_a_range(values, answer):
-    assert search.is_range(values) == answer
+    assert design.is_range(values) == answer
 
 
 # The plan and its chunks.
@@ -112,7 +112,7 @@ def test_runs_are_in_as_few_chunks_as_there_is_room(limit, expected):
 )
 def test_a_plan_says_how_many_devices_stand_idle(monkeypatch, side, devices, said):
     monkeypatch.setattr(jax, "local_device_count", lambda: 8)
-    assert plan._idle(side, devices) == said
+    assert plan._idle_devices(side, devices) == said
 
 
 def test_slots_are_no_wider_than_the_chunk(monkeypatch):

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.sweeps.slots.ahead import Stopwatch, started
-from mjx_reinforce.sweeps.slots.layout import StateRows
-from mjx_reinforce.sweeps.slots.packing import pack_slots
+from mjx_reinforce.sweeps.ahead import Stopwatch, started
+from mjx_reinforce.sweeps.layout import StateRows, pack_slots
 
 
 @pytest.mark.parametrize("num_devices", [1, 2, 8])

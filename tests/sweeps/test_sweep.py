@@ -25,16 +25,15 @@ from mjx_reinforce.runs import plan as runs_plan
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.store.build import build
-from mjx_reinforce.sweeps import chunks, conduct, perform
-from mjx_reinforce.sweeps import main as sweep_command
-from mjx_reinforce.sweeps.designs import plan, rungs, search
+from mjx_reinforce.sweeps import chunks, conduct, perform, programs
+from mjx_reinforce.sweeps import command_line as sweep_command
+from mjx_reinforce.sweeps.designs import design, plan, rungs
 from mjx_reinforce.sweeps.designs.design import Design, check_design, read_design
 from mjx_reinforce.sweeps.designs.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
+from mjx_reinforce.sweeps.layout import pack_slots
 from mjx_reinforce.sweeps.results import join_parts
 from mjx_reinforce.sweeps.run import read_results
-from mjx_reinforce.sweeps.slots import programs
-from mjx_reinforce.sweeps.slots.packing import pack_slots
 from mjx_reinforce.training import programs as training_programs
 from mjx_reinforce.training.programs import programs_of
 from mjx_reinforce.training.state import eval_keys
@@ -670,9 +669,9 @@ def test_ranges_are_drawn_as_their_settings_are():
         "estimator": ["leave-one-out", "total-return"],
         "entropy_cost": [0.0, 0.25, 1.0],
     }
-    drawn = search.draw_configurations(over, 400, seed=0)
-    assert drawn == search.draw_configurations(over, 400, seed=0)
-    assert drawn != search.draw_configurations(over, 400, seed=1)
+    drawn = design.draw_configurations(over, 400, seed=0)
+    assert drawn == design.draw_configurations(over, 400, seed=0)
+    assert drawn != design.draw_configurations(over, 400, seed=1)
     columns = {name: [values[name] for values in drawn] for name in over}
     # Half of the draws lie on each side of the middle of the scale: 200, standard deviation 10.
     assert abs(np.sum(np.array(columns["learning_rate"]) < 10**-2.5) - 200) < 50
@@ -681,7 +680,7 @@ def test_ranges_are_drawn_as_their_settings_are():
     assert set(columns["estimator"]) == set(over["estimator"])
     assert set(columns["entropy_cost"]) == {0.0, 0.25, 1.0}
     with pytest.raises(ValueError, match="only 2 different"):
-        search.draw_configurations({"estimator": over["estimator"]}, 3, seed=0)
+        design.draw_configurations({"estimator": over["estimator"]}, 3, seed=0)
 
 
 @pytest.mark.parametrize("report", [True, False])

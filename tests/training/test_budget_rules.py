@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training import budget, saving
+from mjx_reinforce.training import budget, checkpoint
 
 
 def test_the_budget_that_is_nearer_to_its_end_counts():
@@ -19,7 +19,7 @@ def test_the_budget_that_is_nearer_to_its_end_counts():
 
 
 def test_a_checkpoint_is_due_after_so_many_updates():
-    due = saving.SaveDue(5)
+    due = checkpoint.SaveDue(5)
     assert [due.is_due(n) for n in (0, 4, 5, 6)] == [False, False, True, True]
     due.saved(6)
     assert [due.is_due(n) for n in (6, 10, 11)] == [False, False, True]
@@ -27,8 +27,8 @@ def test_a_checkpoint_is_due_after_so_many_updates():
 
 def test_a_checkpoint_is_due_after_a_minute(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(saving.time, "perf_counter", lambda: now[0])
-    due = saving.SaveDue(None)
+    monkeypatch.setattr(checkpoint.time, "perf_counter", lambda: now[0])
+    due = checkpoint.SaveDue(None)
     now[0] += 59.0
     assert not due.is_due(10**9)
     now[0] += 1.0
@@ -43,7 +43,7 @@ def test_a_checkpoint_is_due_after_a_minute(monkeypatch):
 )
 def test_the_first_failure_in_a_row_is_a_warning(error, said):
     heard, fails = [], [True, True, False, True]
-    attempts = saving.Attempts(heard.append)
+    attempts = checkpoint.Attempts(heard.append)
 
     def write():
         if fails.pop(0):

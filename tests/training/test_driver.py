@@ -10,7 +10,7 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.best import Best
 from mjx_reinforce.training.driver import Driver, drive
 from mjx_reinforce.training.programs import Looked, RunPrograms
-from mjx_reinforce.training.records.record import RunRecord
+from mjx_reinforce.training.record import RunRecord
 
 BLOCK = 2
 CONFIG = Config(num_seeds=2, env_steps=None, max_updates=3 * BLOCK, eval_every=BLOCK)

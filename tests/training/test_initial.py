@@ -10,7 +10,7 @@ from saved_runs import SPACES, make_run
 
 from mjx_reinforce.export.policy_files import read_policy
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.initial import begin_with, last_actors
+from mjx_reinforce.training.state import begin_with, last_actors
 
 POLICY = {"hidden_sizes": [8, 8], "initial_std": 0.5} | SPACES["InvertedPendulum-v5"]
 

@@ -9,7 +9,7 @@ import pytest
 
 from mjx_reinforce.learners import counts
 from mjx_reinforce.settings.config import MAX_COUNT
-from mjx_reinforce.training.minutes import env_steps_in
+from mjx_reinforce.training.budget import env_steps_in
 
 
 def state_of(env_steps):

@@ -13,10 +13,10 @@ from rich.console import Console
 from mjx_reinforce.reports.statistics import summarize
 from mjx_reinforce.runs import display
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training import progress
 from mjx_reinforce.training.evaluation import evaluate
-from mjx_reinforce.training.records import nonfinite
-from mjx_reinforce.training.records.progress import Progress
-from mjx_reinforce.training.records.record import RunRecord
+from mjx_reinforce.training.progress import Progress
+from mjx_reinforce.training.record import RunRecord
 from mjx_reinforce.types import Trajectory
 
 
@@ -122,18 +122,18 @@ def test_a_seed_is_broken_while_nothing_of_it_is_finite():
         "skipped_update": np.array([[0, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0]]),
         "episodes": np.full((3, 4), 4),
     }
-    count = nonfinite.broken_in_a_row(np.array([2, 0, 5, 1]), metrics)
+    count = progress.broken_in_a_row(np.array([2, 0, 5, 1]), metrics)
     assert count.tolist() == [5, 3, 2, 2]
 
 
 def test_a_run_is_hopeless_if_all_that_train_are():
     count = np.array([5, 9, 0])
-    assert nonfinite.hopeless(count, np.array([0.1, 0.5, 1.0]), block=5)
-    assert nonfinite.hopeless(count, np.array([0.1, 0.5, 1.0]), block=1)
-    assert not nonfinite.hopeless(count, np.array([0.1, 0.5, 0.9]), block=5)
-    assert not nonfinite.hopeless(count, np.array([0.1, 0.5, 1.0]), block=6)
-    assert not nonfinite.hopeless(count - 1, np.array([0.1, 0.5, 1.0]), block=1)
-    assert not nonfinite.hopeless(count, np.ones(3), block=5)
+    assert progress.hopeless(count, np.array([0.1, 0.5, 1.0]), block=5)
+    assert progress.hopeless(count, np.array([0.1, 0.5, 1.0]), block=1)
+    assert not progress.hopeless(count, np.array([0.1, 0.5, 0.9]), block=5)
+    assert not progress.hopeless(count, np.array([0.1, 0.5, 1.0]), block=6)
+    assert not progress.hopeless(count - 1, np.array([0.1, 0.5, 1.0]), block=1)
+    assert not progress.hopeless(count, np.ones(3), block=5)
 
 
 def test_a_block_of_broken_updates_is_one_line():
@@ -141,7 +141,7 @@ def test_a_block_of_broken_updates_is_one_line():
     metrics["nonfinite_episodes"] = np.full((4, 9), 2)
     metrics["skipped_update"] = np.zeros((4, 9), int)
     made = 6 + np.cumsum(metrics["active"], axis=0)
-    assert nonfinite.describe_nonfinite(nonfinite.nonfinite_updates(metrics, made), 1000) == (
+    assert progress.describe_nonfinite(progress.nonfinite_updates(metrics, made), 1000) == (
         "updates 6 to 9: 9 of 1,000 seeds met numbers that are not finite (0, 1, 2, 3, 4, ...): "
         "66 episodes, 0 updates skipped"  # the last seed made one update of four
     )

@@ -35,7 +35,7 @@ from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.best import first_best, keep_best
 from mjx_reinforce.training.driver import Driver
 from mjx_reinforce.training.programs import Looked
-from mjx_reinforce.training.records.record import RunRecord
+from mjx_reinforce.training.record import RunRecord
 
 SIZE = ["--num-seeds", "3", "--eval-episodes", "2", "--hidden-sizes", "4"]
 ANY = ["--env", "Drift-v0", "--env-steps", "None", *SIZE]

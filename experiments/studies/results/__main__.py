@@ -143,7 +143,7 @@ def _readme(arguments: argparse.Namespace) -> int:
 
 def _pretrained(arguments: argparse.Namespace) -> int:
     from experiments.studies.results import pretrained as results_pretrained
-    from mjx_reinforce.export.pretrained import FOLDER
+    from mjx_reinforce.export.run_files import FOLDER
 
     folder = arguments.folder or FOLDER
     results_pretrained.pack(arguments.directory, folder, arguments.episodes)

@@ -1,16 +1,22 @@
 """Films of the package's own policies, for README.md and docs: several beside each other."""
 
+from collections.abc import Sequence
 from pathlib import Path
+
+import numpy as np
 
 from mjx_reinforce import Player, envs, load
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.export.films import import_mujoco, write_small_gif
+from mjx_reinforce.export.films import SAMPLES, gif, import_mujoco
 from mjx_reinforce.export.takes import Film, Take, side_by_side
+from mjx_reinforce.files import write_bytes
 from mjx_reinforce.playing.cast import untrained
 from mjx_reinforce.watch import scene
 
 #: The tasks side by side, and the size of a file at most (bytes).
 _TASKS, LARGEST = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5"), 300_000
+#: How many colours a film has, if it may not have more.
+_FEWER_COLORS = (128, 64, 32, 16, 8)
 
 
 def write(folder: Path, arm: Path | None) -> None:
@@ -37,6 +43,29 @@ def save(path: Path, film: Film) -> None:
     frames = [film.draw(frame) for frame in range(film.length)]
     write_small_gif(path, frames, film.rate, LARGEST)
     print(f"{path}: {len(frames)} frames, {path.stat().st_size / 1000:.0f} kB", flush=True)
+
+
+def write_small_gif(path: Path, frames: Sequence[np.ndarray], rate: float, most_bytes: int) -> None:
+    """Writes a .gif of so many bytes at most, with as many colours as that allows.
+
+    Args:
+      path: .gif.
+      frames: pictures [height, width, 3] uint8.
+      rate: frames a second.
+      most_bytes: of the file.
+
+    Raises:
+      ValueError: the film is larger with the fewest colours.
+    """
+    film, samples = b"", frames[:: -(-len(frames) // SAMPLES)]
+    for colors in _FEWER_COLORS:
+        film = gif(frames, rate, samples, colors)
+        if len(film) <= most_bytes:
+            write_bytes(path, film)
+            return
+    raise ValueError(
+        f"{path} would have {len(film)} bytes, {most_bytes} are allowed: make it shorter or smaller"
+    )
 
 
 def _take(player: Player, label: str, push: float = 0.0, episode: int = 0) -> Take:

@@ -146,25 +146,14 @@ def solved(labels: Sequence[str], end: float) -> Chart:
 
     Data: ``solved`` (configuration, env_steps, share, low, high).
     """
-    chart = shown_rows("solved")
     x = alt.X("env_steps:Q", title=_STEPS_TITLE, axis=_THOUSANDS, scale=alt.Scale(nice=False))
-    scale = alt.Scale(domain=[0, 1])
-    axis = alt.Axis(format=".0%")
-    y = alt.Y("share:Q", title="seeds that have solved the task", scale=scale, axis=axis)
     tips = [
-        "configuration:N",
         alt.Tooltip("env_steps:Q", title="env steps", format=",.0f"),
         alt.Tooltip("share:Q", title="have solved", format=".1%"),
-        alt.Tooltip("low:Q", title="95 % from", format=".1%"),
-        alt.Tooltip("high:Q", title="to", format=".1%"),
     ]
-    band = chart.mark_area(opacity=0.18, interpolate="step-after").encode(
-        x=x, y=alt.Y("low:Q", title=y["title"]), y2="high:Q", color=series(labels)
-    )
-    line = chart.mark_line(strokeWidth=2.2, interpolate="step-after").encode(
-        x=x, y=y, color=series(labels), strokeDash=dashes(labels), tooltip=tips
-    )
-    return alt.layer(band, line, moment_line(end), height=_HEIGHT)
+    title = "seeds that have solved the task"
+    layers = _shares("solved", labels, x, title, tips, interpolate="step-after")
+    return alt.layer(*layers, moment_line(end), height=_HEIGHT)
 
 
 def profile(labels: Sequence[str], threshold: float | None) -> Chart:
@@ -172,28 +161,31 @@ def profile(labels: Sequence[str], threshold: float | None) -> Chart:
 
     Data: ``profile`` (configuration, threshold, share, low, high).
     """
-    chart = shown_rows("profile")
     x = alt.X("threshold:Q", title="return at the end", scale=alt.Scale(nice=False))
-    y = alt.Y(
-        "share:Q",
-        title="seeds above it",
-        scale=alt.Scale(domain=[0, 1]),
-        axis=alt.Axis(format=".0%"),
-    )
     tips = [
-        "configuration:N",
         alt.Tooltip("threshold:Q", title="return", format=",.1f"),
         alt.Tooltip("share:Q", title="seeds above", format=".1%"),
-        alt.Tooltip("low:Q", title="95 % from", format=".1%"),
-        alt.Tooltip("high:Q", title="to", format=".1%"),
     ]
-    band = chart.mark_area(opacity=0.18).encode(
-        x=x, y=alt.Y("low:Q", title=y["title"]), y2="high:Q", color=series(labels)
+    layers = _shares("profile", labels, x, "seeds above it", tips)
+    return alt.layer(*layers, *threshold_line(threshold, "x"), height=_HEIGHT)
+
+
+def _shares(
+    data: str, labels: Sequence[str], x: alt.X, title: str, tips: list[alt.Tooltip], **line: Any
+) -> tuple[alt.Chart, alt.Chart]:
+    """Returns the band and the line of a share of the seeds; ``line`` says how they are drawn."""
+    chart, axis, scale = shown_rows(data), alt.Axis(format=".0%"), alt.Scale(domain=[0, 1])
+    y = alt.Y("share:Q", title=title, scale=scale, axis=axis)
+    bounds = [alt.Tooltip("low:Q", title="95 % from", format=".1%")]
+    bounds.append(alt.Tooltip("high:Q", title="to", format=".1%"))
+    band = chart.mark_area(opacity=0.18, **line).encode(
+        x=x, y=alt.Y("low:Q", title=title), y2="high:Q", color=series(labels)
     )
-    line = chart.mark_line(strokeWidth=2.2).encode(
-        x=x, y=y, color=series(labels), strokeDash=dashes(labels), tooltip=tips
+    tooltip = ["configuration:N", *tips, *bounds]
+    drawn = chart.mark_line(strokeWidth=2.2, **line).encode(
+        x=x, y=y, color=series(labels), strokeDash=dashes(labels), tooltip=tooltip
     )
-    return alt.layer(band, line, *threshold_line(threshold, "x"), height=_HEIGHT)
+    return band, drawn
 
 
 def sensitivity(

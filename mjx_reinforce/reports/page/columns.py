@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from mjx_reinforce.reports.experiment import say
 from mjx_reinforce.reports.findings import Findings, swept
 from mjx_reinforce.reports.statistics import Estimate
+from mjx_reinforce.reports.tasks import Tasks
 
 #: Columns by name, all of one length. ``configuration`` holds places among the results.
 Table = dict[str, list[Any]]
@@ -28,7 +30,7 @@ def rows(table: Table, labels: Sequence[str]) -> list[dict[str, Any]]:
     return listed
 
 
-def short(values: Any, digits: int = 5) -> list[Any]:
+def short(values: ArrayLike, digits: int = 5) -> list[Any]:
     """Returns numbers with a few digits, None where they are not finite."""
     flat = np.asarray(values, float).ravel().tolist()
     return [_integer(float(f"{x:.{digits}g}")) if math.isfinite(x) else None for x in flat]
@@ -145,3 +147,22 @@ def _no_formula(cell: object) -> Any:
         return cell if math.isfinite(float(cell)) else f"'{cell}"
     except ValueError:
         return f"'{cell}"
+
+
+def scores(tasks: Tasks) -> Table:
+    """Returns a row for each configuration, task and seed, in full digits."""
+    parts: list[Table] = []
+    for place, each in enumerate(tasks.overall):
+        for findings, final, area in zip(tasks.findings, each.scores, each.areas, strict=True):
+            result = next(r for r in findings.results if r.configuration.label == each.label)
+            parts.append(
+                {
+                    "configuration": [place] * len(final),
+                    "task": [findings.experiment.env] * len(final),
+                    "seed": result.configuration.seed.tolist(),
+                    "final_return": result.final.tolist(),
+                    "score": final.tolist(),
+                    "score_while_training": area.tolist(),
+                }
+            )
+    return join_tables(parts)

@@ -6,9 +6,9 @@ the first seed did, when some may not have solved the task that do.
 
 import numpy as np
 
+from mjx_reinforce.reports.experiment import Result
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.page.columns import Table, short
-from mjx_reinforce.reports.results import Result
 
 #: Bars of a histogram, and moments, at most.
 _BARS = 36

@@ -1,20 +1,22 @@
-"""The report as one HTML page that needs nothing but itself."""
+"""The report as one HTML page that needs nothing but itself; how to cite the program."""
 
+import base64
 import datetime
 import json
 import math
+import subprocess
+import sys
 from collections.abc import Mapping
 from importlib import resources
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
 from markupsafe import Markup
 
 from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
-from mjx_reinforce.reports.film import PageFilm
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.page import charts, learning, palette, vega, words
-from mjx_reinforce.reports.page.citation import bibtex
+from mjx_reinforce.reports.page import charts, learning, vega, words
 from mjx_reinforce.reports.page.columns import Table, short
 from mjx_reinforce.reports.page.distributions import slider_stops
 from mjx_reinforce.reports.page.figures import SHOWN, Figure
@@ -42,6 +44,17 @@ _METHODS = (
     "Curves are read off, by linear interpolation, at the same env steps for all seeds, up to the "
     "end of the shortest.",
 )
+#: So long is waited for a film (s); a humanoid takes a minute to compile on few cores.
+_TIMEOUT = 600
+#: Length (s) and size (pixels) of the film: the page holds it, so that it has to be small.
+_FORM = ("--seconds", "8", "--width", "360", "--height", "270")
+
+
+class PageFilm(NamedTuple):
+    """A film for the page: what is seen in it, and the GIF as a data URL; or why there is none."""
+
+    said: str
+    url: str = ""
 
 
 class Watch(NamedTuple):
@@ -122,14 +135,14 @@ def fill(
         files=[(name, _size_in_words(text)) for name, text in content["files"].items()],
         version=version,
         seconds=f"{seconds:.1f} s",
-        light=palette.LIGHT,
-        dark=palette.DARK,
-        colour=palette.colour,
-        dash=palette.dash,
+        light=vega.LIGHT,
+        dark=vega.DARK,
+        colour=vega.colour,
+        dash=vega.dash,
         css=Markup(_read_template("page.css")),
         script=Markup(_read_template("page.js")),
         vega_bundle=Markup(vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")),
-        content=Markup(_json({**content, "row": charts.ROW, "light": palette.LIGHT})),
+        content=Markup(_json({**content, "row": charts.ROW, "light": vega.LIGHT})),
     )
 
 
@@ -233,3 +246,43 @@ def _in_words(value: object) -> str:
     if isinstance(value, list):
         return ", ".join(map(_in_words, value))
     return say(value)
+
+
+#: CITATION.cff of the repository says the same.
+TITLE = "mjx_reinforce: REINFORCE on MuJoCo, a thousand seeds in one program"
+AUTHORS = "The mjx_reinforce authors"
+YEAR = 2026
+
+
+def bibtex(version: str) -> str:
+    """Returns an entry for a bibliography, of BibTeX's type misc, which every style knows."""
+    return (
+        (
+            f"@misc{{mjx_reinforce, author = {{{{{AUTHORS}}}}}, title = {{{{{TITLE}}}}}, "
+            f"year = {{{YEAR}}}, note = {{Version {version}}}}}"
+        )
+        .replace("mjx_reinforce:", r"mjx\_reinforce:")
+        .replace("{{The mjx_", r"{{The mjx\_")
+    )
+
+
+def film_of_median(run: Path, output: Path) -> PageFilm:
+    """Films the seed of a run whose last return is the median, and returns the film.
+
+    Args:
+      run: the directory of a run with saved policies.
+      output: the .gif file, which is replaced.
+    """
+    command = [sys.executable, "-m", "mjx_reinforce.watch", str(run), "--seed", "median"]
+    command += [*_FORM, "--output", str(output), "--overwrite"]
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, errors="replace", timeout=_TIMEOUT
+        )
+    except subprocess.TimeoutExpired:
+        return PageFilm(f"There is no film: it was not ready after {_TIMEOUT} s.")
+    if done.returncode:
+        lines = done.stderr.strip().splitlines() or [f"watch exited with {done.returncode}"]
+        return PageFilm(f"There is no film: {lines[-1].removeprefix('error: ')}.")
+    encoded = base64.b64encode(output.read_bytes()).decode()
+    return PageFilm(done.stdout.splitlines()[0], f"data:image/gif;base64,{encoded}")

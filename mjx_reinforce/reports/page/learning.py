@@ -4,12 +4,11 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from mjx_reinforce.reports.experiment import counted, say, setting_in_words
+from mjx_reinforce.reports.experiment import COMPARED, Result, counted, say, setting_in_words
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.learning import Level, fastest
 from mjx_reinforce.reports.page import words
 from mjx_reinforce.reports.page.words import LEVEL, interval_in_words, number, p_value, steps
-from mjx_reinforce.reports.results import COMPARED, Result
 
 #: The measures of a setting's effect, as the page calls them.
 MEASURES = {

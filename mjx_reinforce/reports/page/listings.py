@@ -1,13 +1,15 @@
 """The report's tables, as the page shows them and as LaTeX files hold them."""
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from mjx_reinforce.reports.experiment import counted
+import numpy as np
+
+from mjx_reinforce.reports.experiment import COMPARED, Result, counted
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.page import learning, tables, words
 from mjx_reinforce.reports.page.words import interval_in_words, number, percent, steps
-from mjx_reinforce.reports.results import COMPARED, Result
 
 #: A table: its ``header``, and ``rows`` of a ``label`` and ``cells``, pairs of a value and what
 #: stands below it. Where the header has a column more, the first is the rank of the row.
@@ -132,6 +134,72 @@ def _fate(findings: Findings, result: Result, s: int) -> dict[str, Any]:
     cells = [
         (str(int(result.configuration.seed[s])), ""),
         (number(final) if math.isfinite(final) else "not finite", ""),
-        (words.fate(findings, result, s), ""),
+        (_how_it_ended(findings, result, s), ""),
     ]
     return {"label": result.configuration.label, "cells": cells}
+
+
+#: What LaTeX would take for a command, and what it prints for it.
+_SPECIAL = {
+    **{each: f"\\{each}" for each in "&%$#_{}"},
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    "\u00a0": "~",
+    "\u2013": "--",
+    "“": "``",
+    "”": "''",
+}
+
+
+def latex_tables(listed: Mapping[str, Listing]) -> dict[str, str]:
+    """Returns the files by name: a ``tabular`` for each table of the page."""
+    return {f"table-{name}.tex": tabular(**listing) for name, listing in listed.items()}
+
+
+def tabular(header: Sequence[str], rows: Sequence[Mapping]) -> str:
+    """Returns a table as a ``tabular`` of booktabs; intervals stand in brackets after their value.
+
+    Args:
+      header: the names of the columns.
+      rows: a ``label`` and ``cells`` each, see ``listings.Listing``.
+    """
+    ranked = len(header) > 1 + len(rows[0]["cells"])
+    lines = []
+    for place, row in enumerate(rows, start=1):
+        cells = [f"{value} ({below})" if below else value for value, below in row["cells"]]
+        lines.append([*([str(place)] if ranked else []), row["label"], *cells])
+    kinds = "r" * ranked + "l" + "r" * (len(header) - ranked - 1)
+    body = [" & ".join(map(escaped, line)) + r" \\" for line in lines]
+    names = " & ".join(map(escaped, header)) + r" \\"
+    parts = [rf"\begin{{tabular}}{{{kinds}}}", r"\toprule", names, r"\midrule", *body]
+    return "\n".join([*parts, r"\bottomrule", r"\end{tabular}", ""])
+
+
+def escaped(text: str) -> str:
+    """Returns a text that LaTeX prints as it is."""
+    return "".join(_SPECIAL.get(each, each) for each in text)
+
+
+def _how_it_ended(findings: Findings, result: Result, s: int) -> str:
+    """Returns how a seed ended, and how it came to that."""
+    part, threshold = result.configuration, findings.experiment.threshold
+    returns, at = part.eval_return[:, s], part.env_steps[:, s]
+    if not np.isfinite(returns[-1]):
+        first = len(returns) - int(np.argmax(np.isfinite(returns[::-1])))
+        since = at[first % len(returns)] if np.isfinite(returns).any() else 0
+        return f"not finite since {steps(float(since))} env steps"
+    top = int(np.nanargmax(returns))
+    best = f"its best, {number(returns[top])}, was at {steps(float(at[top]))} env steps"
+    if threshold is None:
+        return "at its best at the end" if returns[-1] == returns[top] else best
+    if returns[-1] >= threshold:
+        return f"solved, first at {steps(float(result.solving.steps[s]))}" if result.solving else ""
+    if returns[top] < threshold:
+        return f"never solved; {best}"
+    lost = int(np.flatnonzero(returns >= threshold)[-1]) + 1
+    first_time = steps(float(at[np.argmax(returns >= threshold)]))
+    return f"solved at {first_time}, lost it at {steps(float(at[lost]))} env steps"

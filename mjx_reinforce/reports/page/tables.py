@@ -5,11 +5,10 @@ from typing import Literal
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import ordered, say
+from mjx_reinforce.reports.experiment import Result, ordered, say
 from mjx_reinforce.reports.findings import Findings, swept, values_of
 from mjx_reinforce.reports.page.columns import Table, join_tables, short
 from mjx_reinforce.reports.page.distributions import distributions
-from mjx_reinforce.reports.results import Result
 from mjx_reinforce.reports.statistics.profiles import performance_profile
 from mjx_reinforce.reports.statistics.survival import kaplan_meier
 

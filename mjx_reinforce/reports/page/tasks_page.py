@@ -6,14 +6,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from mjx_reinforce.reports.experiment import counted
+from mjx_reinforce.reports.experiment import COMPARED, counted
 from mjx_reinforce.reports.page import charts, document, learning, vega
-from mjx_reinforce.reports.page.columns import Table, join_tables, short
+from mjx_reinforce.reports.page.columns import Table, short
 from mjx_reinforce.reports.page.figures import SHOWN, Figure, task_figures
 from mjx_reinforce.reports.page.listings import Listing, listings
 from mjx_reinforce.reports.page.tables import task_tables
 from mjx_reinforce.reports.page.words import LEVEL, interval_in_words, number, p_value, percent
-from mjx_reinforce.reports.results import COMPARED
 from mjx_reinforce.reports.tasks import Faster, Tasks, in_order
 
 _SCORE = "A score of 0 is that of untrained policies; table 1 says what 1 is in each task."
@@ -85,25 +84,6 @@ def tasks_chart_tables(tasks: Tasks) -> dict[str, Table]:
         drawn = task_tables(in_order(tasks, findings))
         found |= {f"{name}-{n}": table for name, table in drawn.items()}
     return found
-
-
-def scores(tasks: Tasks) -> Table:
-    """Returns a row for each configuration, task and seed, in full digits."""
-    parts: list[Table] = []
-    for place, each in enumerate(tasks.overall):
-        for findings, final, area in zip(tasks.findings, each.scores, each.areas, strict=True):
-            result = next(r for r in findings.results if r.configuration.label == each.label)
-            parts.append(
-                {
-                    "configuration": [place] * len(final),
-                    "task": [findings.experiment.env] * len(final),
-                    "seed": result.configuration.seed.tolist(),
-                    "final_return": result.final.tolist(),
-                    "score": final.tolist(),
-                    "score_while_training": area.tolist(),
-                }
-            )
-    return join_tables(parts)
 
 
 def listed(tasks: Tasks) -> dict[str, Listing]:

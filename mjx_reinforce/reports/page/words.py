@@ -1,14 +1,19 @@
 """What the figures of a report say, in sentences."""
 
 import math
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import counted, ordered, say, setting_in_words
+from mjx_reinforce.reports.experiment import (
+    COMPARED,
+    Result,
+    counted,
+    ordered,
+    say,
+    setting_in_words,
+)
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.results import COMPARED, Result
 from mjx_reinforce.reports.statistics import Estimate
 from mjx_reinforce.reports.statistics.comparisons import Comparison
 
@@ -25,7 +30,7 @@ def number(value: float) -> str:
     return f"{value:,.1f}" if abs(value) >= 10 or value == 0 else f"{value:.3g}"
 
 
-def interval_in_words(estimate: Estimate, form: Any = number) -> str:
+def interval_in_words(estimate: Estimate, form: Callable[[float], str] = number) -> str:
     """Returns an interval, "997.0 to 999.0", or that there is none."""
     if math.isnan(estimate.low) or math.isnan(estimate.high):
         return "no interval"
@@ -276,24 +281,3 @@ def _of_measure(findings: Findings) -> Iterator[str]:
             "from starts that are the same at every evaluation of a seed."
         )
     yield "One task: nothing here says how these settings do on another."
-
-
-def fate(findings: Findings, result: Result, s: int) -> str:
-    """Returns how a seed ended, and how it came to that."""
-    part, threshold = result.configuration, findings.experiment.threshold
-    returns, at = part.eval_return[:, s], part.env_steps[:, s]
-    if not np.isfinite(returns[-1]):
-        first = len(returns) - int(np.argmax(np.isfinite(returns[::-1])))
-        since = at[first % len(returns)] if np.isfinite(returns).any() else 0
-        return f"not finite since {steps(float(since))} env steps"
-    top = int(np.nanargmax(returns))
-    best = f"its best, {number(returns[top])}, was at {steps(float(at[top]))} env steps"
-    if threshold is None:
-        return "at its best at the end" if returns[-1] == returns[top] else best
-    if returns[-1] >= threshold:
-        return f"solved, first at {steps(float(result.solving.steps[s]))}" if result.solving else ""
-    if returns[top] < threshold:
-        return f"never solved; {best}"
-    lost = int(np.flatnonzero(returns >= threshold)[-1]) + 1
-    first_time = steps(float(at[np.argmax(returns >= threshold)]))
-    return f"solved at {first_time}, lost it at {steps(float(at[lost]))} env steps"

@@ -176,7 +176,7 @@ def paired_rates(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> Differ
     spread = num_seeds**2 * np.sqrt(of_x.value * (1 - of_x.value) * of_y.value * (1 - of_y.value))
     correlation = np.divide(shrunk, spread, out=np.zeros_like(value), where=spread > 0)
 
-    def half(one: Any, other: Any) -> Any:
+    def half(one: np.ndarray, other: np.ndarray) -> Any:
         return np.sqrt(one**2 - 2 * correlation * one * other + other**2)
 
     low = value - half(of_x.value - of_x.low, of_y.high - of_y.value)

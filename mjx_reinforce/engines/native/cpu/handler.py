@@ -11,6 +11,8 @@ from pathlib import Path
 from string import Template
 from typing import NamedTuple
 
+from mjx_reinforce.fused.backends.llvm_text import Text
+
 _TEXT = Path(__file__).with_name("handler.ll")
 #: The functions to be called from outside.
 NAMES = ("handler", "open", "share", "close")
@@ -116,3 +118,24 @@ def handler_text(
         "zeroed": int(zeroed),
     }
     return Template(_TEXT.read_text("utf-8")).substitute(values)
+
+
+class JobText:
+    """Writes a function that has ``ptr %job`` among its arguments."""
+
+    def __init__(self, text: Text):
+        self.text = text
+
+    def field(self, name: str) -> str:
+        """Returns the pointer to a field of the job."""
+        number = FIELDS.index(name)
+        return self.text.let(f"getelementptr inbounds %Job, ptr %job, i32 0, i32 {number}")
+
+    def job(self, name: str, kind: str) -> str:
+        """Returns the value of a field of the job."""
+        return self.text.let(f"load {kind}, ptr {self.field(name)}")
+
+    def element(self, pointers: str, number: int) -> str:
+        """Returns one of several pointers, such as those to the job's data."""
+        place = self.text.let(f"getelementptr inbounds ptr, ptr {pointers}, i64 {number}")
+        return self.text.let(f"load ptr, ptr {place}")

@@ -37,21 +37,22 @@ def player_text(step: scalarized.Scalarized, num_actor: int, lanes: int, flush: 
     return flush.declarations + queue_text(places, lanes) + work
 
 
-class _Work:
+class _Work(handler.JobText):
     """Writes ``@work``; pointers are to the lane vectors of its memory."""
 
     def __init__(self, text: Text, places: VectorLayout):
-        self.text, self.places = text, places
+        super().__init__(text)
+        self.places = places
         self.room, self.memory = self._allocate()
         self.inputs = [self._pointer(field) for field in places.inputs]
         self.seed, self.episode = self._pointer(places.seed), self._pointer(places.episode)
         self.step, self.broken = self._pointer(places.step), self._pointer(places.broken)
         self.alive = self._pointer(places.alive)
-        self.horizon = self._job("horizon", "i64")
-        self.episodes = self._job("episodes", "i64")
+        self.horizon = self.job("horizon", "i64")
+        self.episodes = self.job("episodes", "i64")
         first = NUM_CONTROLS + len(places.actor_fields) + len(places.state_fields)
-        data = self._job("data", "ptr")
-        self.records = [self._element(data, first + k) for k in range(NUM_RECORDS)]
+        data = self.job("data", "ptr")
+        self.records = [self.element(data, first + k) for k in range(NUM_RECORDS)]
 
     def write(self, step: scalarized.Scalarized, flush: Flush) -> str:
         """Returns the function that plays with a step."""
@@ -141,17 +142,6 @@ class _Work:
 
     def _pointer(self, field: Field) -> str:
         return self.text.let(f"getelementptr inbounds i8, ptr {self.memory}, i64 {field.offset}")
-
-    def _field(self, name: str) -> str:
-        number = handler.FIELDS.index(name)
-        return self.text.let(f"getelementptr inbounds %Job, ptr %job, i32 0, i32 {number}")
-
-    def _job(self, name: str, kind: str) -> str:
-        return self.text.let(f"load {kind}, ptr {self._field(name)}")
-
-    def _element(self, pointers: str, number: int) -> str:
-        place = self.text.let(f"getelementptr inbounds ptr, ptr {pointers}, i64 {number}")
-        return self.text.let(f"load ptr, ptr {place}")
 
     def _is_set(self, flag: str) -> str:
         zero = self.text.constant(np.int32(0))

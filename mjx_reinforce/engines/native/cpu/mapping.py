@@ -33,21 +33,22 @@ def mapping_text(written: scalarized.Scalarized, lanes: int, flush: Flush) -> st
     return flush.declarations + _Work(Text(lanes), written).write(flush)
 
 
-class _Work:
+class _Work(handler.JobText):
     """Writes ``@work``."""
 
     def __init__(self, text: Text, written: scalarized.Scalarized):
-        self.text, self.written = text, written
+        super().__init__(text)
+        self.written = written
 
     def write(self, flush: Flush) -> str:
         """Returns the function."""
         text, lanes = self.text, self.text.lanes
         text.line(flush.begin)
-        total, data = self._job("total", "i64"), self._job("data", "ptr")
-        next_at = self._field("next")
+        total, data = self.job("total", "i64"), self.job("data", "ptr")
+        next_at = self.field("next")
         given = [x for x in self.written.in_avals if _size(x)]
         made = [x for x in self.written.out_avals if _size(x)]
-        buffers = [self._buffer(data, k) for k in range(1 + len(given) + len(made))]
+        buffers = [self.element(data, k) for k in range(1 + len(given) + len(made))]
         arguments, results = buffers[1 : 1 + len(given)], buffers[1 + len(given) :]
         columns = [text.reserve(x.dtype, _size(x)) if _size(x) else "null" for x in self.inputs]
         head, body, end = text.label(), text.label(), text.label()
@@ -97,17 +98,6 @@ class _Work:
         text, kind = self.text, self.text.type(_LONG)
         first = text.let(f"mul {kind} {item}, {text.constant(np.int64(size))}")
         return [text.let(f"add {kind} {first}, {text.constant(np.int64(k))}") for k in range(size)]
-
-    def _field(self, name: str) -> str:
-        number = handler.FIELDS.index(name)
-        return self.text.let(f"getelementptr inbounds %Job, ptr %job, i32 0, i32 {number}")
-
-    def _job(self, name: str, kind: str) -> str:
-        return self.text.let(f"load {kind}, ptr {self._field(name)}")
-
-    def _buffer(self, data: str, number: int) -> str:
-        place = self.text.let(f"getelementptr inbounds ptr, ptr {data}, i64 {number}")
-        return self.text.let(f"load ptr, ptr {place}")
 
 
 def _size(leaf: jaxprs.Shape) -> int:

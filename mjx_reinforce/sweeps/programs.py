@@ -16,10 +16,9 @@ from mjx_reinforce.files import Arrays
 from mjx_reinforce.learners import counts
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.settings.memory import num_cores
+from mjx_reinforce.sweeps.ahead import Stopwatch, started
 from mjx_reinforce.sweeps.history import Measured
-from mjx_reinforce.sweeps.slots.ahead import Stopwatch, started
-from mjx_reinforce.sweeps.slots.layout import StateRows
-from mjx_reinforce.sweeps.slots.packing import pack_slots
+from mjx_reinforce.sweeps.layout import StateRows, pack_slots
 from mjx_reinforce.training.block import BuildLearner
 from mjx_reinforce.training.programs import Programs, compiling, programs_of
 from mjx_reinforce.training.state import Budget, RunState, Seed, budget_of
@@ -96,7 +95,7 @@ class SlotPrograms(NamedTuple):
         Args:
           states: [R, B] of all runs; changed.
           training: [R] which of them still train; at least one does.
-          lengths: [R] about how long their episodes are, see ``packing.pack_slots``.
+          lengths: [R] about how long their episodes are, see ``layout.pack_slots``.
           blocks: how many, where one of the narrowest slots holds these runs. Else they are packed
             again after one.
 
@@ -117,7 +116,7 @@ class SlotPrograms(NamedTuple):
 
         rows, measured = zip(*_side_by_side(move, lanes), strict=True)
         states[lanes[lanes >= 0]] = np.stack(rows)[lanes >= 0]
-        measured = [_joined(lanes, block) for block in zip(*measured, strict=True)]
+        measured = [_of_slots(lanes, block) for block in zip(*measured, strict=True)]
         return [block for block in measured if len(block.runs)]
 
     def evaluate(self, states: np.ndarray) -> Measured:
@@ -128,7 +127,7 @@ class SlotPrograms(NamedTuple):
             slot, which = self._put((states[runs], runs >= 0))
             return runs >= 0, jax.device_get(programs.evaluate(slot, which))
 
-        return _joined(lanes, _side_by_side(look, lanes))
+        return _of_slots(lanes, _side_by_side(look, lanes))
 
     def _pack(self, chosen: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, Slot]:
         """Returns the runs of each slot, and what moves them."""
@@ -154,7 +153,7 @@ def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(num_cores())
 
 
-def _joined(lanes: np.ndarray, slots: Sequence[Any]) -> Measured:
+def _of_slots(lanes: np.ndarray, slots: Sequence[Any]) -> Measured:
     """Returns what was measured in slots, each of which has (which lanes count [W], values [W])."""
     which, values = zip(*slots, strict=True)
     kept = np.concatenate(which)

@@ -1,9 +1,16 @@
-"""States of runs as rows of bytes: what goes between the host and its devices, as one array.
+"""Which runs are moved side by side, and their states as rows of bytes.
 
-A state has dozens of leaves, and each costs as much to choose, to send and to fetch as all of them
-in one array.
+A compiled program moves a fixed number of runs at once, a slot, and takes about as long as the
+longest episode in it, whether the others still train or not. So before a block of updates the
+runs that still train are sorted by the length of their episodes and packed into slots again. Runs
+whose budget is used lie aside. The packing follows from what a checkpoint holds, so that a resumed
+run packs as it would have.
+
+What goes between the host and its devices is one array: a state has dozens of leaves, and each
+costs as much to choose, to send and to fetch as all of them in one array.
 """
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
@@ -68,7 +75,7 @@ class StateRows:
         leaves = (read(*each) for each in zip(parts, self._types, strict=True))
         return with_keys(self._shaped(leaves), self._like)
 
-    def _shaped(self, leaves: Any) -> Any:
+    def _shaped(self, leaves: Iterable[np.ndarray] | Iterable[jax.Array]) -> Any:
         """Returns states of leaves [R, numbers], with the data of keys as leaves."""
         shaped = [
             leaf.reshape(len(leaf), *shape)
@@ -80,3 +87,28 @@ class StateRows:
 def _flat(leaf: PyTree) -> Any:
     """Returns a leaf as [R, numbers]."""
     return leaf.reshape(len(leaf), int(np.prod(leaf.shape[1:])))
+
+
+def pack_slots(
+    chosen: np.ndarray, lengths: np.ndarray, widths: Sequence[int], num_devices: int
+) -> np.ndarray:
+    """Returns the runs of each slot.
+
+    Args:
+      chosen: [R] which runs are packed, at least one.
+      lengths: [R] about how long their episodes are; runs of equal lengths share a slot.
+      widths: that slots may have, multiples of the number of devices, the most first. The first of
+        which these runs fill more than a quarter of a slot is taken, or else the last: on an H200
+        the wider slot takes as long as two of an eighth of its width.
+      num_devices: among which a slot is divided; each gets as many runs as the others, or one less.
+
+    Returns:
+      [slots, width], the number of the run in each lane, -1 where there is none.
+    """
+    runs = np.flatnonzero(chosen)
+    runs = runs[np.argsort(lengths[runs], kind="stable")]
+    width = next((width for width in widths if len(runs) > width // 4), widths[-1])
+    lanes = np.full((-(-len(runs) // width), width), -1)
+    lanes.flat[: len(runs)] = runs
+    dealt = lanes.reshape(len(lanes), width // num_devices, num_devices)
+    return dealt.swapaxes(1, 2).reshape(lanes.shape)

@@ -12,9 +12,9 @@ import numpy as np
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.reports.statistics import summarize
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training import progress, rows
 from mjx_reinforce.training.budget import used
-from mjx_reinforce.training.records import nonfinite, rows
-from mjx_reinforce.training.records.progress import BLOCKS, Progress, measure_progress
+from mjx_reinforce.training.progress import BLOCKS, Progress, measure_progress
 
 
 class GrowingTable:
@@ -81,7 +81,7 @@ class RunRecord:
                 {k: np.zeros((0, config.num_seeds), x) for k, x in kinds.items()}
             ),
             "nonfinite": GrowingTable(
-                {k: np.zeros(0, x) for k, x in nonfinite.EVENT_COLUMNS.items()}
+                {k: np.zeros(0, x) for k, x in progress.EVENT_COLUMNS.items()}
             ),
         }
         self._last: Arrays = {}
@@ -134,7 +134,7 @@ class RunRecord:
 
         Returns:
           The updates in it that met numbers which are not finite, see
-          ``nonfinite.nonfinite_updates``.
+          ``progress.nonfinite_updates``.
         """
         active, played = metrics["active"], metrics["episodes"]
         finite = metrics["nonfinite_episodes"] == 0
@@ -152,8 +152,8 @@ class RunRecord:
         self.env_steps, self.updates = env_steps[-1], updates[-1]
         self.episodes = episodes[-1]
         self._simulated += _sum(metrics["simulated_steps"])
-        self._broken_in_a_row = nonfinite.broken_in_a_row(self._broken_in_a_row, metrics)
-        met = nonfinite.nonfinite_updates(metrics, updates)
+        self._broken_in_a_row = progress.broken_in_a_row(self._broken_in_a_row, metrics)
+        met = progress.nonfinite_updates(metrics, updates)
         self._tables["nonfinite"].append(met)
         self._remember(metrics | {"episode_return": returns})
         return met
@@ -218,7 +218,7 @@ class RunRecord:
     def hopeless(self) -> bool:
         """Returns whether all seeds that still train were broken throughout a block of updates."""
         share = used(self._config, self.env_steps, self.updates)
-        return nonfinite.hopeless(self._broken_in_a_row, share, self._config.eval_every)
+        return progress.hopeless(self._broken_in_a_row, share, self._config.eval_every)
 
     def progress(self) -> Progress:
         """Returns how far the run is, as of its last evaluation."""
@@ -259,7 +259,7 @@ class RunRecord:
             "run_seconds": run_seconds,
             "env_steps_per_second": float(env_steps / run_seconds),
             "useful_step_fraction": float((env_steps + self._evaluated) / max(self._simulated, 1)),
-            "nonfinite": nonfinite.as_events(self._tables["nonfinite"].columns()),
+            "nonfinite": progress.as_events(self._tables["nonfinite"].columns()),
         }
 
 

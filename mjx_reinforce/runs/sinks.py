@@ -1,11 +1,14 @@
-"""What a sink is, and which ones a run has."""
+"""What a sink is, which ones a run has, and that of JSON lines."""
 
+import csv
 import importlib.util
+import json
 from pathlib import Path
 from typing import Protocol
 
+from mjx_reinforce.files import append, finite, write_bytes
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.records.rows import Cells
+from mjx_reinforce.training.rows import Cells, parse_cell
 
 #: Settings that need a package, and the package.
 _NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
@@ -72,29 +75,61 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Que
     Raises:
       OSError: one of them cannot be written.
     """
-    from mjx_reinforce.runs.sinks import json_lines, tensorboard, weights_and_biases
+    from mjx_reinforce.runs import charts
 
     sinks = []
     if config.jsonl:
-        sinks.append(Queue("metrics.jsonl", json_lines.JsonLines(directory)))
+        sinks.append(Queue("metrics.jsonl", JsonLines(directory)))
     if config.tensorboard:
-        sinks.append(Queue("tensorboard/", tensorboard.TensorBoard(directory, updates)))
+        sinks.append(Queue("tensorboard/", charts.TensorBoard(directory, updates)))
     if config.wandb:
-        sinks.append(Queue("to W&B", weights_and_biases.WeightsAndBiases(directory)))
+        sinks.append(Queue("to W&B", charts.WeightsAndBiases(directory)))
     return sinks
 
 
 def files(directory: Path) -> list[Path]:
     """Returns the files that sinks replace at once."""
-    from mjx_reinforce.runs.sinks import json_lines, weights_and_biases
+    from mjx_reinforce.runs import charts
 
-    return [directory / json_lines.NAME, directory / weights_and_biases.NAME]
+    return [directory / NAME, directory / charts.WANDB_RUN]
 
 
 def remove_outputs(directory: Path) -> None:
     """Removes what the sinks of an older run left; W&B keeps its runs apart itself."""
-    from mjx_reinforce.runs.sinks import tensorboard
+    from mjx_reinforce.runs import charts
 
-    events = (directory / tensorboard.NAME).glob(tensorboard.PATTERN)
+    events = (directory / charts.TENSORBOARD).glob(charts.EVENTS)
     for path in (*files(directory), *events):
         path.unlink(missing_ok=True)
+
+
+NAME = "metrics.jsonl"
+
+
+class JsonLines:
+    """Writes every row as a JSON object on a line.
+
+    A number that is not finite, or was not measured, is null.
+    """
+
+    def __init__(self, directory: Path):
+        """Writes the rows that metrics.csv has already, in place of what was there."""
+        self._path = directory / NAME
+        with (directory / "metrics.csv").open(encoding="utf-8", newline="") as file:
+            written = [*csv.reader(file)]
+        names = written[0]
+        columns = zip(*written[1:], strict=True) if written[1:] else ([] for _ in names)
+        write_bytes(self._path, _as_json_lines(dict(zip(names, columns, strict=True))))
+
+    def write(self, rows: Cells) -> None:
+        """Adds rows, or raises OSError and adds none."""
+        append(self._path, _as_json_lines(rows))
+
+    def close(self) -> None:
+        """Does nothing: every line is written."""
+
+
+def _as_json_lines(rows: Cells) -> bytes:
+    numbers = zip(*(map(parse_cell, cells) for cells in rows.values()), strict=True)
+    objects = (finite(dict(zip(rows, row, strict=True))) for row in numbers)
+    return "".join(json.dumps(each, allow_nan=False) + "\n" for each in objects).encode()

@@ -1,0 +1,119 @@
+"""The public names and their homes: what type checkers read, and ``__init__.py`` too."""
+
+from mjx_reinforce.engines.any_policy import rollout
+from mjx_reinforce.export.player import Player, load
+from mjx_reinforce.export.policy_files import load_policy, save_policy
+from mjx_reinforce.export.run_files import pretrained
+from mjx_reinforce.learners.ars import ars
+from mjx_reinforce.learners.estimators import (
+    Estimator,
+    discount_weights,
+    leave_one_out,
+    mean_log_prob,
+    normalized_returns,
+    reward_to_go,
+    shift_rewards,
+    standardize,
+    total_return,
+)
+from mjx_reinforce.learners.learner import Learner, TrainState, train_step
+from mjx_reinforce.learners.natural_gradient import natural_gradient
+from mjx_reinforce.learners.pace import AutoEpisodes
+from mjx_reinforce.learners.reinforce import reinforce
+from mjx_reinforce.learners.updates import each_step, full_batch, make_optimizer, minibatches
+from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
+from mjx_reinforce.policies.actor import Actor, act
+from mjx_reinforce.policies.distributions.categorical import categorical
+from mjx_reinforce.policies.distributions.clipped_normal import clipped_normal
+from mjx_reinforce.policies.distributions.deterministic import deterministic
+from mjx_reinforce.policies.distributions.distribution import Distribution
+from mjx_reinforce.policies.distributions.normal import normal
+from mjx_reinforce.policies.distributions.tanh_normal import tanh_normal
+from mjx_reinforce.policies.distributions.truncated_normal import truncated_normal
+from mjx_reinforce.policies.policy import Policy, mlp_policy
+from mjx_reinforce.reports.statistics import iqm, iqm_interval, mean_interval
+from mjx_reinforce.reports.statistics.comparisons import (
+    compare_all,
+    paired_difference,
+    probability_of_improvement,
+)
+from mjx_reinforce.reports.statistics.survival import kaplan_meier, log_rank
+from mjx_reinforce.runs.run import RunResults, run
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.sweeps.run import SweepResults, sweep
+from mjx_reinforce.training.driver import Evaluation
+from mjx_reinforce.training.evaluation import evaluate
+from mjx_reinforce.types import Box, Discrete, Environment, Trajectory
+from mjx_reinforce.vector.environment import VectorEnv, make_vec
+from mjx_reinforce.vector.episodes import VectorState
+from mjx_reinforce.vector.segments import Segment, unroll
+
+__version__: str
+__all__ = [
+    "Actor",
+    "AutoEpisodes",
+    "Box",
+    "Config",
+    "Discrete",
+    "Distribution",
+    "Environment",
+    "Estimator",
+    "Evaluation",
+    "Learner",
+    "Player",
+    "Policy",
+    "RunResults",
+    "Segment",
+    "SweepResults",
+    "TrainState",
+    "Trajectory",
+    "VectorEnv",
+    "VectorState",
+    "__version__",
+    "act",
+    "ars",
+    "categorical",
+    "clipped_normal",
+    "compare_all",
+    "deterministic",
+    "discount_weights",
+    "each_step",
+    "evaluate",
+    "full_batch",
+    "full_batch_value_baseline",
+    "iqm",
+    "iqm_interval",
+    "kaplan_meier",
+    "leave_one_out",
+    "load",
+    "load_policy",
+    "log_rank",
+    "make_optimizer",
+    "make_vec",
+    "mean_interval",
+    "mean_log_prob",
+    "minibatches",
+    "mlp_policy",
+    "natural_gradient",
+    "normal",
+    "normalized_returns",
+    "of_task",
+    "paired_difference",
+    "pretrained",
+    "probability_of_improvement",
+    "reinforce",
+    "reward_to_go",
+    "rollout",
+    "run",
+    "save_policy",
+    "shift_rewards",
+    "standardize",
+    "sweep",
+    "tanh_normal",
+    "total_return",
+    "train_step",
+    "truncated_normal",
+    "unroll",
+    "value_baseline",
+]

@@ -1,0 +1,44 @@
+"""From a design to groups, chunks and a plan, without a program."""
+
+import pytest
+
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.sweeps.designs.design import Design
+from mjx_reinforce.sweeps.designs.plan import prepare_sweep
+
+BASE = Config(
+    env="ContinuousCartPole-v0", num_seeds=3, env_steps=None, max_updates=2, engine="vmap"
+)
+OVER = {"num_episodes": [2, 4], "learning_rate": [1e-3, 1e-2, 1e-1]}
+
+
+def prepared(limits=None, num_processes=1, **changes):
+    return prepare_sweep(Design(base=BASE, over=OVER, **changes), limits, num_processes)
+
+
+def test_a_group_is_what_shares_its_programs():
+    sweep = prepared()
+    assert [group.members.tolist() for group in sweep.groups] == [[0, 1, 2], [3, 4, 5]]
+    assert [group.config.num_episodes for group in sweep.groups] == [2, 4]
+    assert sweep.groups[1].settings["learning_rate"].tolist() == [1e-3, 1e-2, 1e-1]
+    assert len(sweep.configurations) == 6
+    assert sweep.horizons == [50, 50]
+    assert sweep.engine == "vmap"
+    assert "18 runs" in sweep.plan
+
+
+def test_a_chunk_has_as_many_runs_as_asked_or_as_it_had():
+    assert prepared(chunk_runs=4).limits == [4, 4]
+    assert prepared([2, 9], chunk_runs=4).limits == [2, 9]
+
+
+def test_exact_sweeps_have_one_device_and_trace_every_number():
+    sweep = prepared(exact=True)
+    assert sweep.devices.count == 1
+    assert len(sweep.groups[0].settings) > 5
+
+
+def test_a_task_that_refuses_its_settings():
+    wrong = Config(env="ContinuousCartPole-v0", env_set=("no_such=1",), env_steps=10)
+    with pytest.raises(ValueError, match="no_such"):
+        prepare_sweep(Design(base=wrong, over=OVER), None, 1)
