@@ -37,12 +37,12 @@ attributes #0 = { "nvvm.maxntid"="128" "nvvm.minctasm"="2" }
 def nothing_in_memory(monkeypatch):
     monkeypatch.setattr(machine, "_LOADED", {})
     monkeypatch.setattr(ptx, "_LOADED", {})
-    monkeypatch.delenv(look.VARIABLE, raising=False)
+    monkeypatch.delenv(look.DEBUG, raising=False)
 
 
 @pytest.mark.parametrize("value", ["yes", "3", "-1", "1.0", " 1"])
 def test_another_value_is_named_with_the_remedy(value, monkeypatch):
-    monkeypatch.setenv(look.VARIABLE, value)
+    monkeypatch.setenv(look.DEBUG, value)
     with pytest.raises(ValueError, match=f"MJX_REINFORCE_DEBUG is '{value}'; set it to 1 .* unset"):
         available.unavailable()
 
@@ -50,7 +50,7 @@ def test_another_value_is_named_with_the_remedy(value, monkeypatch):
 @pytest.mark.parametrize("value", [None, "", "0"])
 def test_nothing_is_said_unless_asked(value, monkeypatch, tmp_path, capfd):
     if value is not None:
-        monkeypatch.setenv(look.VARIABLE, value)
+        monkeypatch.setenv(look.DEBUG, value)
     key = items.load(tmp_path).key
     assert capfd.readouterr() == ("", "")
     assert [path.name for path in tmp_path.iterdir()] == [f"{key}.o"]
@@ -62,7 +62,7 @@ def test_nothing_is_said_unless_asked(value, monkeypatch, tmp_path, capfd):
 def test_code_on_disk_is_built_again_and_described(monkeypatch, tmp_path, capfd):
     key = items.load(tmp_path).key
     machine._LOADED.clear()
-    monkeypatch.setenv(look.VARIABLE, "1")
+    monkeypatch.setenv(look.DEBUG, "1")
     assert items.load(tmp_path).compiled
     items.load(tmp_path)  # from memory, without a word
     said = capfd.readouterr().err
@@ -75,7 +75,7 @@ def test_code_on_disk_is_built_again_and_described(monkeypatch, tmp_path, capfd)
 
 
 def test_the_texts_are_left_beside_the_objects(monkeypatch, tmp_path, capfd):
-    monkeypatch.setenv(look.VARIABLE, "2")
+    monkeypatch.setenv(look.DEBUG, "2")
     folder = tmp_path / "native"
     key = items.load(folder).key
     assert (folder / f"{key}.ll").read_text() == items.text()
@@ -88,7 +88,7 @@ def test_the_texts_are_left_beside_the_objects(monkeypatch, tmp_path, capfd):
 @pytest.mark.parametrize("folder", ["none", "a file"])
 def test_a_folder_that_takes_no_texts_breaks_nothing(folder, monkeypatch, tmp_path, capfd):
     (tmp_path / "file").touch()
-    monkeypatch.setenv(look.VARIABLE, "2")
+    monkeypatch.setenv(look.DEBUG, "2")
     code = items.load(None if folder == "none" else tmp_path / "file" / "native")
     assert "handler" in code.addresses
     said = capfd.readouterr().err
@@ -101,7 +101,7 @@ def test_the_stack_is_that_of_the_assembly(monkeypatch, tmp_path, capfd):
     target = machine.this_machine()
     if not target.triple.startswith("x86_64"):
         pytest.skip("of x86-64 alone")
-    monkeypatch.setenv(look.VARIABLE, "2")
+    monkeypatch.setenv(look.DEBUG, "2")
     text = """declare void @use(ptr)
     define void @f() {
       %room = alloca [5000 x i8], align 64
@@ -134,7 +134,7 @@ def test_the_log_of_the_assembler():
 
 
 def test_a_kernel_for_a_gpu(monkeypatch, tmp_path, capfd):
-    monkeypatch.setenv(look.VARIABLE, "2")
+    monkeypatch.setenv(look.DEBUG, "2")
     items.load(tmp_path)
     (elf,) = (objects.read_object(tmp_path, path.stem) or b"" for path in tmp_path.glob("*.o"))
     monkeypatch.setattr(look, "_assemble", lambda text: (LOG, elf))
@@ -168,7 +168,7 @@ def test_a_driver_that_refuses_breaks_nothing(monkeypatch, capfd):
     def lost(_):
         raise OSError("libcuda.so.1: cannot open")
 
-    monkeypatch.setenv(look.VARIABLE, "1")
+    monkeypatch.setenv(look.DEBUG, "1")
     for number, (load, words) in enumerate(
         (
             (lost, "OSError: libcuda.so.1: cannot open"),
@@ -188,7 +188,7 @@ def test_what_is_played_and_mapped_is_named(monkeypatch, capfd):
         env = Drifting()
 
     monkeypatch.setattr(objects, "folder", lambda: None)
-    monkeypatch.setenv(look.VARIABLE, "1")
+    monkeypatch.setenv(look.DEBUG, "1")
     for env, name in ((Drifting(), "Drifting"), (Wrapper(), "Wrapper of Drifting")):
         machine._LOADED.clear()
         program.build_program(env, *_act_and_actor(env), 20)

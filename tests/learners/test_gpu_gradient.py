@@ -208,11 +208,11 @@ def test_xla_takes_what_cannot_be_written_out(monkeypatch):
 
 def test_for_which_policies():
     policy, *_ = problem("normal")
-    assert gradient.fits(policy, 5)
+    assert gradient.is_supported(policy, 5)
     other = policy._replace(apply=lambda *given: policy.apply(*given))
-    assert not gradient.fits(other, 5)
-    assert not gradient.fits(problem("normal", (128,))[0], 5)
-    assert not gradient.fits(problem("normal", ())[0], 5)
-    assert not gradient.fits(policy, 200)
+    assert not gradient.is_supported(other, 5)
+    assert not gradient.is_supported(problem("normal", (128,))[0], 5)
+    assert not gradient.is_supported(problem("normal", ())[0], 5)
+    assert not gradient.is_supported(policy, 200)
     with jax.enable_x64(True):
-        assert not gradient.fits(policy, 5)
+        assert not gradient.is_supported(policy, 5)

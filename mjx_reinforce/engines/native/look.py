@@ -16,9 +16,9 @@ from typing import Any, TypeVar
 
 from mjx_reinforce.engines.native.ownership import make_folder
 
-Made = TypeVar("Made", str, bytes)
+Compiled = TypeVar("Compiled", str, bytes)
 #: Asks for descriptions; see ``level``.
-VARIABLE = "MJX_REINFORCE_DEBUG"
+DEBUG = "MJX_REINFORCE_DEBUG"
 #: What NVIDIA's assembler says of a function, of which a kernel may have several.
 _LOG = {
     "registers of a thread": (r"Used (\d+) registers", max, ""),
@@ -40,10 +40,10 @@ def level() -> int:
     Raises:
       ValueError: the variable has another value.
     """
-    value = os.environ.get(VARIABLE) or "0"
+    value = os.environ.get(DEBUG) or "0"
     if value not in ("0", "1", "2"):
         raise ValueError(
-            f"{VARIABLE} is {value!r}; set it to 1 for a description of each kernel, to 2 for its "
+            f"{DEBUG} is {value!r}; set it to 1 for a description of each kernel, to 2 for its "
             "text too, or unset it"
         )
     return int(value)
@@ -64,10 +64,10 @@ def build(
     key: str,
     folder: Path | None,
     write: Callable[[], str],
-    compile: Callable[[str], Made],
-    facts: Callable[[Made], Mapping[str, str]],
-    texts: Callable[[str, Made], Mapping[str, str]],
-) -> Made:
+    compile: Callable[[str], Compiled],
+    facts: Callable[[Compiled], Mapping[str, str]],
+    texts: Callable[[str, Compiled], Mapping[str, str]],
+) -> Compiled:
     """Returns what ``compile`` makes of what ``write`` returns, and describes it if asked to.
 
     Args:

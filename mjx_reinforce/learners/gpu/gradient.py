@@ -55,7 +55,7 @@ def in_one_kernel(
     """
     if seeds * samples[-1].size < LEAST_SAMPLES or _capability() != MEASURED:
         return None
-    if not fits(policy, samples[0].shape[-1]):
+    if not is_supported(policy, samples[0].shape[-1]):
         return None
     program = jax.jit(functools.partial(kernel_gradient, loss))
     given = params, samples, jnp.asarray(entropy_cost, jnp.float32)
@@ -67,7 +67,7 @@ def in_one_kernel(
     return program(*given)
 
 
-def fits(policy: Policy, observation_size: int) -> bool:
+def is_supported(policy: Policy, observation_size: int) -> bool:
     """Returns whether the kernel is for a policy."""
     network = getattr(policy.apply, "network", None)
     return (
