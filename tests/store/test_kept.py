@@ -189,7 +189,7 @@ def test_nothing_is_kept_of_an_environment_of_the_users(register):
 
 def test_nothing_is_kept_where_kernels_are_described(monkeypatch):
     assert kept.key_of(CONFIG) is not None
-    monkeypatch.setenv(look.VARIABLE, "1")
+    monkeypatch.setenv(look.DEBUG, "1")
     assert kept.key_of(CONFIG) is None
 
 
