@@ -20,7 +20,8 @@ import numpy as np
 import tyro
 
 from experiments.checks.feature_models import MODELS
-from mjx_reinforce import normal, rollout
+from mjx_reinforce import normal
+from mjx_reinforce.engines import rollouts
 from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.envs.base import MujocoEnv
 
@@ -34,7 +35,7 @@ FIELDS = (
     *("ten_length", "actuator_length", "actuator_force", "qfrc_bias", "qfrc_passive"),
     *("qfrc_actuator", "qfrc_constraint"),
 )
-ENGINES = {"vmap": rollout, "native": native.rollout}
+ENGINES = {"vmap": rollouts.rollout, "native": native.rollout}
 
 
 class Shown(MujocoEnv):
