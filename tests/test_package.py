@@ -165,7 +165,10 @@ def test_type_checkers_see_the_public_names():
     tree = ast.parse((ROOT / "mjx_reinforce" / "__init__.pyi").read_text("utf-8"))
     (public,) = (node.value for node in tree.body if isinstance(node, ast.Assign))
     assert ast.literal_eval(public) == mjx_reinforce.__all__
-    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    nodes = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    modules = {alias.asname for node in nodes if not node.module for alias in node.names}
+    assert modules == set(mjx_reinforce._MODULES)
+    imports = [node for node in nodes if node.module]
     assert {node.module.removeprefix("mjx_reinforce.") for node in imports} <= set(FILES)
     assert mjx_reinforce._HOME.keys() == {alias.name for node in imports for alias in node.names}
 

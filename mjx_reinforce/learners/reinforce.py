@@ -133,9 +133,9 @@ def reinforce(
       normalize_min_std: the least that an observation is divided by, in its own unit. (What hardly
         changes in the first steps would be magnified for the rest of training.)
       one_start: reset every episode of a seed with the same key, drawn once at ``init``.
-      num_seeds: how many will learn at once, vmapped. It decides nothing but speed: of many,
-        updates whose episodes are all short pass over their first steps alone, the same up to
-        rounding.
+      num_seeds: how many will learn at once, vmapped. It decides nothing but speed
+        and rounding: of many, updates whose episodes are all short pass over their first steps
+        alone, and on some GPUs a kernel computes the gradient (``gpu.gradient``).
       engine: how episodes are played: "auto", "vmap", "fused" or "native", see
         ``engines.choice``.
       devices: among which the episodes of an update are divided; they stay where they are played,

@@ -101,7 +101,8 @@ def mlp_policy(
         return jnp.concatenate([*outputs, fixed], axis=-1)
 
     if len(networks) == 1:  # learners.gpu.gradient knows its derivative
-        apply.network = networks["network"]  # pyright: ignore[reportFunctionMemberAccess]
+        # With the function that the mark is for: ``functools.wraps`` copies marks.
+        apply.network = apply, networks["network"]  # pyright: ignore[reportFunctionMemberAccess]
     return Policy(init, apply, distribution)
 
 

@@ -22,6 +22,6 @@ for _row in _ROWS:
     if "at_least" in _row:
         OF_BUDGETS.setdefault(_row["task"], []).append((_row["at_least"], _without_facts(_row)))
 #: Nothing more is to be had of these in a minute than in what is said above,
-SOLVED = tuple(task for task, row in _SMALLEST.items() if "solved" in row)
+SOLVED = tuple(task for task, row in _SMALLEST.items() if row.get("solved"))
 #: or than in so many env steps of a seed.
 ENOUGH = {task: row["enough"] for task, row in _SMALLEST.items() if "enough" in row}

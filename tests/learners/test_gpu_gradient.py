@@ -211,6 +211,8 @@ def test_for_which_policies():
     assert gradient.is_supported(policy, 5)
     other = policy._replace(apply=lambda *given: policy.apply(*given))
     assert not gradient.is_supported(other, 5)
+    wrapped = functools.wraps(policy.apply)(lambda params, x: policy.apply(params, 10 * x))
+    assert not gradient.is_supported(policy._replace(apply=wrapped), 5)
     assert not gradient.is_supported(problem("normal", (128,))[0], 5)
     assert not gradient.is_supported(problem("normal", ())[0], 5)
     assert not gradient.is_supported(policy, 200)

@@ -44,6 +44,12 @@ def test_a_sweep_that_goes_on_has_no_other_settings(resumed, flags):
         resumed(*flags)
 
 
+def test_a_run_that_goes_on_is_no_sweep(tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(ValueError, match="is a run: python -m mjx_reinforce.train --resume"):
+        command_line.parse_design(["--resume", str(tmp_path)])
+
+
 def test_a_sweep_that_goes_on_takes_no_preset(resumed):
     with pytest.raises(
         ValueError, match="has the sweep's own settings: leave the preset continuous-cartpole"

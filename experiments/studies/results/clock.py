@@ -17,7 +17,8 @@ _SINCE = {
     "e6f8e08c5022": "since then Swimmer has shorter steps",
     "08b5cddba03e": (
         "HalfCheetah had its cut of 250 env steps, which is the default since then, from\n"
-        "`--train-horizon 250 --eval-every 20` (on two threads `--eval-every 240`)"
+        "`--train-horizon 250 --eval-every 20` (on two threads `--eval-every 240`; on a GPU the\n"
+        "default is 120 by now)"
     ),
 }
 _PEERS = ("Stable-Baselines3 PPO", "Stable-Baselines3 SAC")
@@ -67,7 +68,7 @@ def _words(groups: Sequence[kept.Group]) -> str:
     )
     changed = "".join(f"; {words}" for commit, words in _SINCE.items() if commit in commits)
     return (
-        "The settings are those that a budget of that size selected (`settings/tuned.py`), at\n"
+        "The settings are those that a budget of that size selected (`settings/tuned.toml`), at\n"
         f"commit {commits}{changed}.\n"
         "On a GPU that is `python -m mjx_reinforce.train --env TASK --num-seeds 16 --seed ROOT\n"
         "--env-steps N` with the seeds and env steps of the table.\n"
@@ -145,7 +146,7 @@ def _noise_words() -> str:
     return (
         "The noise scale of the gradient, in episodes ([statistics.md](statistics.md)): with so\n"
         "many an update has as much noise as signal. By quarters of the updates of the runs\n"
-        "above, the median over evaluations and seeds."
+        "above, the median over evaluations and seeds. Not seen: the noise hid the signal."
     )
 
 

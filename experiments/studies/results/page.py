@@ -254,6 +254,7 @@ def _moved(results: Sequence[Result]) -> list[str]:
             f"starts out: {listed(shared)}."
         )
     words += f" Not swept yet: {listed(missing)}." if missing else ""
+    words += " HalfCheetah and Ant were swept before their episodes of training were cut."
     return [
         "## How much each setting matters",
         words,

@@ -103,6 +103,11 @@ def read_design(directory: Path) -> Design:
       ValueError: there is none, or its sweep.json is damaged or of another version.
     """
     path = directory / "sweep.json"
+    if not path.exists() and (directory / "config.json").exists():
+        raise ValueError(
+            f"{directory} is a run: python -m mjx_reinforce.train --resume {directory} goes on "
+            "with it"
+        )
     record = read_json(path)
     try:
         over = {
