@@ -49,66 +49,26 @@ from mjx_reinforce.vector.environment import VectorEnv, make_vec
 from mjx_reinforce.vector.episodes import VectorState
 from mjx_reinforce.vector.segments import Segment, unroll
 
-from . import (
-    console as console,
-)
-from . import (
-    engines as engines,
-)
-from . import (
-    envs as envs,
-)
-from . import (
-    export as export,
-)
-from . import (
-    files as files,
-)
-from . import (
-    fused as fused,
-)
-from . import (
-    hosts as hosts,
-)
-from . import (
-    learners as learners,
-)
-from . import (
-    physics as physics,
-)
-from . import (
-    playing as playing,
-)
-from . import (
-    policies as policies,
-)
-from . import (
-    registry as registry,
-)
-from . import (
-    reports as reports,
-)
-from . import (
-    runs as runs,
-)
-from . import (
-    settings as settings,
-)
-from . import (
-    store as store,
-)
-from . import (
-    sweeps as sweeps,
-)
-from . import (
-    training as training,
-)
-from . import (
-    types as types,
-)
-from . import (
-    vector as vector,
-)
+from . import console as console
+from . import engines as engines
+from . import envs as envs
+from . import export as export
+from . import files as files
+from . import fused as fused
+from . import hosts as hosts
+from . import learners as learners
+from . import physics as physics
+from . import playing as playing
+from . import policies as policies
+from . import registry as registry
+from . import reports as reports
+from . import runs as runs
+from . import settings as settings
+from . import store as store
+from . import sweeps as sweeps
+from . import training as training
+from . import types as types
+from . import vector as vector
 
 __version__: str
 __all__ = [
