@@ -12,6 +12,7 @@ from experiments.studies.results.tasks import Task, settings_of, sweep_settings_
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.files import read_json
 from mjx_reinforce.settings.config import Config, flag
+from mjx_reinforce.settings.relevance import is_read
 from mjx_reinforce.sweeps.designs.design import Design, read_design
 from mjx_reinforce.sweeps.perform import perform
 
@@ -118,18 +119,14 @@ def swept(directory: Path) -> bool:
 
 
 def moves(base: Config) -> Mapping[str, list[Any]]:
-    """Returns the values of every setting that a base has: less, its own, and more.
+    """Returns the values of every setting that a base has and reads: less, its own, and more.
 
     A discount and a momentum move by their distance from 1.
     """
     found: dict[str, list[Any]] = {}
     for name, counts in _MOVED.items():
         value = getattr(base, name)
-        if (
-            value is None
-            or isinstance(value, str)
-            or (name == "standardize_floor" and not base.standardize)
-        ):
+        if value is None or isinstance(value, str) or not is_read(name, base):
             continue
         values = [_moved(name, value, factor, counts) for factor in (1 / FACTOR, 1, FACTOR)]
         found[name] = list(dict.fromkeys(values))

@@ -1,6 +1,5 @@
 """From LLVM IR to PTX, the assembly language that NVIDIA's driver takes."""
 
-import functools
 import hashlib
 import re
 import threading
@@ -77,7 +76,9 @@ def _build(key: str, write: Callable[[], str], capability: str, folder: Path | N
     def texts(text: str, made: str) -> dict[str, str]:
         return {"ll": text, "ptx": made}
 
-    compile = functools.partial(_compile, capability=capability)
+    def compile(text: str) -> str:
+        return _compile(text, capability)
+
     return look.build(key, folder, write, compile, facts, texts)
 
 
