@@ -189,7 +189,7 @@ def test_a_learner_takes_it(loss_per, monkeypatch):
 
 
 @pytest.mark.usefixtures("interpreted", "on_a_gpu")
-def test_xla_takes_what_cannot_be_written_out(monkeypatch):
+def test_xla_takes_what_cannot_be_written_out(monkeypatch, capsys):
     policy, params, samples = problem("normal")
 
     def loss(outputs, action, weight, mask, cost):
@@ -198,8 +198,12 @@ def test_xla_takes_what_cannot_be_written_out(monkeypatch):
 
     fine = functools.partial(_loss, policy.distribution)
     in_one_kernel = gradient.in_one_kernel
+    monkeypatch.setenv("MJX_REINFORCE_DEBUG", "1")
     assert in_one_kernel(policy, fine, 0.1, params, samples) is not None
     assert in_one_kernel(policy, loss, 0.1, params, samples) is None
+    taken, refused = capsys.readouterr().err.splitlines()
+    assert taken == "gradient in one kernel"
+    assert refused.startswith("gradient by XLA: UnsupportedPrimitive: ")
     monkeypatch.setattr(gradient, "_capability", lambda: "8.0")
     assert in_one_kernel(policy, fine, 0.1, params, samples) is None
     monkeypatch.undo()

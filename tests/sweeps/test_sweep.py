@@ -532,7 +532,7 @@ def test_values_are_read_as_their_settings_are():
             "--over discount 0 1 --search random --budget 2000000000",
             "lower --num-seeds or --budget",
         ),
-        ("--resume nowhere", "cannot read nowhere/sweep.json"),
+        ("--resume nowhere", "there is no nowhere/sweep.json"),
     ],
 )
 def test_bad_sweeps_are_refused(run, capsys, tmp_path, monkeypatch, arguments, message):

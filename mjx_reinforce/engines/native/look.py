@@ -49,6 +49,12 @@ def level() -> int:
     return int(value)
 
 
+def say(text: str) -> None:
+    """Prints a line on stderr where descriptions are asked for."""
+    if level():
+        print(" ".join(text.split()), file=sys.stderr, flush=True)
+
+
 def title(what: str, operations: int) -> str:
     """Returns a comment in LLVM IR: what the kernel plays or maps, and its scalar operations."""
     return f"; {what}, {operations:,} scalar operations\n"

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce import fused
+from mjx_reinforce.engines.native import look
 from mjx_reinforce.policies.policy import Policy
 
 #: XLA's name of what compiles and launches the kernel.
@@ -63,8 +64,10 @@ def in_one_kernel(
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), given)
     try:
         program.trace(*shapes).lower(lowering_platforms=("cuda",))
-    except Exception:  # whatever it is, XLA computes it too
+    except Exception as error:  # whatever it is, XLA computes it too
+        look.say(f"gradient by XLA: {type(error).__name__}: {error}")
         return None
+    look.say("gradient in one kernel")
     return program(*given)
 
 

@@ -25,6 +25,7 @@ from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
 from mjx_reinforce import fused
+from mjx_reinforce.engines.native.gpu.seam import in_one_launch
 
 #: Samples of a tile, and warps that work on it. So an H100 went over 2.0e9 samples a second, of a
 #: 64-64 network; with 128 samples over 1.0e9, 1.6e9 with 8 warps; with 32 samples over 1.3e9.
@@ -89,7 +90,6 @@ def launch(head: fused.Scalarized, given: Given, *, interpret: bool = False) -> 
     )
     shapes, result_tree = jax.tree.flatten(results, is_leaf=lambda x: type(x) is tuple)
 
-    @jax.custom_batching.custom_vmap
     def run(*leaves):  # [S, ...] each
         seeds, tiles = len(leaves[0]), leaves[0].shape[1] // TILE
         programs = max(1, min(PROGRAMS // seeds, tiles // TILES))
@@ -109,16 +109,8 @@ def launch(head: fused.Scalarized, given: Given, *, interpret: bool = False) -> 
         )(*leaves)
         return [jnp.sum(x, axis=1) for x in each]
 
-    @run.def_vmap
-    def _(size, mapped, *leaves):
-        each = [
-            x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
-            for x, is_mapped in zip(leaves, mapped, strict=True)
-        ]
-        sums = run(*(x.reshape(-1, *x.shape[2:]) for x in each))
-        return [x.reshape(size, -1, *x.shape[1:]) for x in sums], [True] * len(sums)
-
-    return result_tree.unflatten(x[0] for x in run(*(x[None] for x in leaves)))
+    stacked = in_one_launch(run)(*(x[None] for x in leaves))
+    return result_tree.unflatten(x[0] for x in stacked)
 
 
 def padded(size: int) -> int:

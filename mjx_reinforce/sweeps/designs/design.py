@@ -103,12 +103,20 @@ def read_design(directory: Path) -> Design:
       ValueError: there is none, or its sweep.json is damaged or of another version.
     """
     path = directory / "sweep.json"
-    if not path.exists() and (directory / "config.json").exists():
+    try:
+        record = read_json(path)
+    except ValueError as error:
+        if not isinstance(error.__cause__, FileNotFoundError):
+            raise
+        if (directory / "config.json").is_file():
+            raise ValueError(
+                f"{directory} is a run: python -m mjx_reinforce.train --resume {directory} goes on "
+                "with it"
+            ) from error
         raise ValueError(
-            f"{directory} is a run: python -m mjx_reinforce.train --resume {directory} goes on "
-            "with it"
-        )
-    record = read_json(path)
+            f"cannot resume {directory}: there is no {path}, so no sweep was begun there; start "
+            "one with --output"
+        ) from error
     try:
         over = {
             name: [tuple(x) if isinstance(x, list) else x for x in values]

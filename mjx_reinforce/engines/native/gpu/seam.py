@@ -7,7 +7,7 @@ each process before it is relied on.
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -104,21 +104,28 @@ def launch(
     Returns:
       What the kernel does, without the seeds' axis.
     """
+    play = in_one_launch(lambda *stacked: _launch(kernel, record, horizon, *stacked))
+    return [x[0] for x in play(*(x[None] for x in args))]
 
-    @jax.custom_batching.custom_vmap
-    def play(*args):  # [S, ...]
-        return _launch(kernel, record, horizon, *args)
 
-    @play.def_vmap
+def in_one_launch(run: Callable[..., Sequence[jax.Array]]) -> Callable[..., Sequence[jax.Array]]:
+    """Returns ``run``, which is called once also where it is vmapped.
+
+    Args:
+      run: arrays [B, ...] -> a list of arrays [B, ...]; vmapped, it is given all examples along B.
+    """
+    together = jax.custom_batching.custom_vmap(run)
+
+    @together.def_vmap
     def _(size, mapped, *args):
         along = [
             x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
             for x, is_mapped in zip(args, mapped, strict=True)
         ]
-        results = play(*(x.reshape(-1, *x.shape[2:]) for x in along))
+        results = together(*(x.reshape(-1, *x.shape[2:]) for x in along))
         return [x.reshape(size, -1, *x.shape[1:]) for x in results], [True] * len(results)
 
-    return [x[0] for x in play(*(x[None] for x in args))]
+    return together
 
 
 def _launch(
@@ -149,8 +156,7 @@ def launch_map(
       args: its arguments [N, ...].
     """
 
-    @jax.custom_batching.custom_vmap
-    def play(*args):  # [N, ...]
+    def play(*args):
         examples = len(args[0])
         grid = _grid(examples, kernel.threads, kernel.blocks)
         given = [jnp.array([examples, math.prod(grid)], jnp.int32), *args]
@@ -159,16 +165,7 @@ def launch_map(
         scratch = [jax.ShapeDtypeStruct((words,), jnp.int32)] if words else []
         return _call(kernel.text, ENTRY, grid, given, made, scratch)[: len(made)]
 
-    @play.def_vmap
-    def _(size, mapped, *args):
-        along = [
-            x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
-            for x, is_mapped in zip(args, mapped, strict=True)
-        ]
-        made = play(*(x.reshape(-1, *x.shape[2:]) for x in along))
-        return [x.reshape(size, -1, *x.shape[1:]) for x in made], [True] * len(made)
-
-    return play(*args)
+    return in_one_launch(play)(*args)
 
 
 def _call(
