@@ -1,11 +1,12 @@
 """C MuJoCo's step in MJX, with constraint solvers that do less work for the same answer.
 
-The stages are MJX's own, in MJX's order, with four exceptions:
+The stages are MJX's own, in MJX's order, with five exceptions:
 
 - ``constraints`` solves for the constraint forces in closed form, or not at all where no constraint
   is active, or with a line search that ends when it is exact.
 - ``contacts`` finds the contacts of capsules as C MuJoCo 4.0 does; MJX 3.17 departs from it.
 - ``runge_kutta`` turns free and ball joints as C MuJoCo 4.0 does; MJX 3.17 departs from it.
+- ``inertia`` solves from the leaves of the kinematic tree to its root, where it is written out.
 - ``forward`` computes the sensors of accelerations without constraints too, where MJX skips them.
 
 Gymnasium runs C MuJoCo, so its answer is the one we want. For a model without such contacts and
@@ -18,7 +19,7 @@ from collections.abc import Callable
 import jax
 from mujoco import mjx
 
-from mjx_reinforce.physics import constraints, contacts
+from mjx_reinforce.physics import constraints, contacts, inertia
 from mjx_reinforce.physics.mjx_internals import jax_fields
 from mjx_reinforce.physics.runge_kutta import like, runge_kutta_4
 
@@ -51,7 +52,7 @@ def step(
         return runge_kutta_4(model, data, evaluate)
     data = evaluate(data)
     if integrator == mjx.IntegratorType.EULER:
-        return mjx.euler(model, data)
+        return inertia.euler(model, data)
     if integrator == mjx.IntegratorType.IMPLICITFAST:
         return mjx.implicit(model, data)
     raise NotImplementedError(f"MJX has no integrator {integrator}")
@@ -64,7 +65,7 @@ def forward(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.fwd_velocity(model, data)
     data = mjx.sensor_vel(model, data)
     data = mjx.fwd_actuation(model, data)
-    data = mjx.fwd_acceleration(model, data)
+    data = inertia.fwd_acceleration(model, data)
     if jax_fields(data).efc_J.size == 0:
         return mjx.sensor_acc(model, data.replace(qacc=data.qacc_smooth))
     return mjx.sensor_acc(model, constraints.solve(model, data))

@@ -198,7 +198,7 @@ def test_a_division_that_llvm_spells_otherwise_is_not_left():
 
 
 @pytest.mark.parametrize(
-    ("name", "threads", "blocks"), [("InvertedPendulum-v5", 32, 16), ("Hopper-v5", 128, 2)]
+    ("name", "threads", "blocks"), [("InvertedPendulum-v5", 32, 16), ("Hopper-v5", 256, 1)]
 )
 @pytest.mark.parametrize("capability", ["7.5", "9.0"])
 def test_ptx(name, threads, blocks, capability, tmp_path, monkeypatch):
@@ -304,6 +304,7 @@ def test_few_episodes_are_spread_over_all_multiprocessors(monkeypatch):
     assert seam._grid(1, 512, 2) == (1, 32)
     assert seam._grid(1_600, 512, 2) == (50, 32)
     assert seam._grid(6_400, 512, 2) == (100, 64)
+    assert seam._grid(15_000, 512, 2) == (94, 160)
     assert seam._grid(51_200, 512, 2) == (100, 512)
     assert seam._grid(10**7, 512, 2) == (200, 512)
     assert seam._grid(10**7, 32, 16) == (1_600, 32)

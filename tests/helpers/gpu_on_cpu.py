@@ -108,7 +108,7 @@ def emulate(monkeypatch, threads=1, block=None):
         code = compiled(text, block)
         words = int((re.findall(r"@scratch = constant i32 (\d+)", text) or [0])[0])
         address = str(code.addresses[ENTRY])
-        return ptx.Kernel(code.key, address, 128, 2, words, compiled=True)
+        return ptx.Kernel(code.key, address, 256, 1, words, compiled=True)
 
     def call(text, entry, grid, given, written, scratch=()):
         assert entry == ENTRY

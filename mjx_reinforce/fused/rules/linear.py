@@ -74,8 +74,13 @@ def _factor(graph: Graph, matrix: np.ndarray, size: int, dtype: DTypeLike) -> np
         lower[j, j] = graph.call("sqrt", _minus_dot(graph, matrix[j, j], row, row))
         for i in range(j + 1, size):
             rest = _minus_dot(graph, matrix[i, j], list(lower[i, :j]), row)
-            lower[i, j] = graph.call("div", rest, lower[j, j])
+            lower[i, j] = _divided(graph, rest, lower[j, j])
     return lower
+
+
+def _divided(graph: Graph, value: Any, pivot: Any) -> Any:
+    """Returns value / pivot: a pivot divides many values, and is inverted once for all of them."""
+    return graph.call("mul", value, graph.call("div", value.dtype.type(1), pivot))
 
 
 def _triangular_solve(
@@ -106,7 +111,7 @@ def _substitute(graph: Graph, matrix: np.ndarray, rhs: Any, lower: bool, unit: b
     for i in range(size) if lower else range(size - 1, -1, -1):
         known = slice(0, i) if lower else slice(i + 1, size)
         rest = _minus_dot(graph, solution[i], list(matrix[i, known]), solution[known])
-        solution[i] = rest if unit else graph.call("div", rest, matrix[i, i])
+        solution[i] = rest if unit else _divided(graph, rest, matrix[i, i])
     return solution
 
 

@@ -28,7 +28,7 @@ RESULTS = ("observation", "action", "reward", "length", "broken", "simulated", "
 _NUM_OTHERS = 3
 #: A block's threads, and how many blocks a multiprocessor holds at once, for programs that fit into
 #: its instruction caches and for longer ones. A thread has 128 registers, in a longer program 255.
-_SHORT_BLOCKS, _LONG_BLOCKS = (32, 16), (128, 2)
+_SHORT_BLOCKS, _LONG_BLOCKS = (32, 16), (256, 1)
 #: XLA's buffers begin at multiples of more bytes. A thread loads as many at once.
 _BUFFER_ALIGN = 16
 #: Denormals are zero, as in machine code for CPUs.

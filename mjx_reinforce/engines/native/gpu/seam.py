@@ -23,7 +23,7 @@ PTX = "__gpu$xla.gpu.ptx"
 #: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
 _OLDEST = (22,)
 #: Threads of a block at least: a warp.
-_LEAST_THREADS = 32
+_WARP = 32
 #: A kernel that adds 1 to the number that is its second argument and its result.
 _PROBE = """
 .version 7.0
@@ -204,10 +204,9 @@ def _call(
 def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
     """Returns how many blocks of how many threads, at most so many, play so many episodes.
 
-    Few episodes are spread over all multiprocessors, each of which has so many blocks at most.
+    They are spread over all multiprocessors, each of which has so many blocks at most.
     """
     processors = jax.devices()[0].core_count
-    threads = _LEAST_THREADS
-    while threads < most and threads * processors < items:
-        threads *= 2
+    warps = -(-items // (_WARP * processors))
+    threads = min(_WARP * warps, most)
     return min(-(-items // threads), blocks * processors), threads
