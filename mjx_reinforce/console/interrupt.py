@@ -39,7 +39,8 @@ class Interrupt:
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._handlers.items():
-            signal.signal(number, handler)
+            # Where a signal has ended the command, another must not change its exit status.
+            signal.signal(number, handler if self.number is None else signal.SIG_IGN)
         signal.set_wakeup_fd(self._descriptor)
         self._told.close()  # which ends the thread
 
