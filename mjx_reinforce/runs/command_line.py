@@ -16,11 +16,11 @@ from mjx_reinforce.runs.directory import remove_empty
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import flag_value, for_arguments, named_code
 from mjx_reinforce.settings.flags import asks_brief_help, read_command_line
-from mjx_reinforce.settings.groups import GROUPS, MAIN
+from mjx_reinforce.settings.groups import GROUPS, MAIN, UNUSUAL
 from mjx_reinforce.settings.hints import about_word
 from mjx_reinforce.settings.own_code import check_named
 from mjx_reinforce.settings.presets import PRESETS
-from mjx_reinforce.settings.relevance import changed, check_read
+from mjx_reinforce.settings.relevance import changed, check_read, is_read
 from mjx_reinforce.training import resume
 
 #: What a run leaves in its directory.
@@ -135,11 +135,18 @@ def _read_config(
     """Returns the settings that flags ask for, with others as given; --help exits."""
     groups = {**GROUPS, "hosts": ProcessSettings}
     said = _DESCRIPTION if asks_brief_help(arguments) else f"{_DESCRIPTION}\n\n{_names()}"
-    parsed = read_groups(groups, arguments, default, prog, said, MAIN)
+    parsed = read_groups(groups, arguments, default, prog, said, _main_settings(default))
     processes = parsed.pop("hosts")
     config = join_groups(parsed)
     check_read(config, changed(config, default))
     return config, processes
+
+
+def _main_settings(default: Config) -> list[str]:
+    """Returns what --help alone shows of the settings with these defaults."""
+    own = changed(default, Config())
+    unusual = [name for cause, shown in UNUSUAL.items() if cause in own for name in shown]
+    return [*(name for name in MAIN if is_read(name, default)), *unusual]
 
 
 def read_groups(

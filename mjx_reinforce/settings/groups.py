@@ -380,8 +380,14 @@ GROUPS = {
     "checkpoints": CheckpointSettings,
     "logs": LogSettings,
 }
-#: The settings that --help alone shows: those that most runs change.
+#: The settings that --help alone shows, where they are read: those that most runs change.
 MAIN = (
     *("env", "env_steps", "minutes", "num_seeds", "output", "resume"),
     *("estimator", "num_episodes", "learning_rate", "hidden_sizes"),
 )
+#: What it shows too where the default of one setting is not the usual one.
+UNUSUAL = {
+    "algorithm": ("num_directions", "step_size", "noise_std"),
+    "train_horizon": ("train_horizon",),
+    "update": ("update", "max_kl"),
+}

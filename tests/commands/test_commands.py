@@ -101,6 +101,25 @@ def test_help_has_ten_settings_and_help_all_the_rest(call, name):
     assert f"--help all shows all {len(every)} settings" in brief
 
 
+@pytest.mark.parametrize(
+    ("words", "more", "fewer"),
+    [
+        ("--env HumanoidStandup-v5", "update max-kl train-horizon", "learning-rate"),
+        ("--env HalfCheetah-v5", "train-horizon", "update"),
+        (
+            "continuous-cartpole-ars",
+            "num-directions step-size noise-std",
+            "estimator learning-rate",
+        ),
+    ],
+)
+def test_help_shows_what_makes_the_task(call, words, more, fewer):
+    """A setting that another has taken the place of is not shown."""
+    shown = re.findall(r"(?m)^[|│ ] --([a-z][a-z-]+)", call("train", *words.split(), "--help")[1])
+    assert set(more.split()) <= set(shown)
+    assert not set(fewer.split()) & set(shown)
+
+
 @pytest.mark.parametrize("columns", [60, 200])
 def test_help_wraps_at_words(call, monkeypatch, columns):
     monkeypatch.setenv("COLUMNS", str(columns))
