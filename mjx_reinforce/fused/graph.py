@@ -117,6 +117,17 @@ class Graph:
             self.scope.has_loop |= scope.has_loop
 
     @contextlib.contextmanager
+    def again(self, scope: Scope) -> Iterator[None]:
+        """Opens the scope of a branch once more; it is still the innermost's child."""
+        before = scope.cost
+        self._scopes.append(scope)
+        try:
+            yield
+        finally:
+            self._scopes.pop()
+            self.scope.cost += scope.cost - before
+
+    @contextlib.contextmanager
     def assuming(self, predicate: Scalar) -> Iterator[None]:
         """Assumes in a block that a predicate is true for at least one element of the batch."""
         before = set(self.certain)

@@ -5,15 +5,23 @@ Of ``cond``, cheap branches are both evaluated, and expensive ones skipped if un
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from mjx_reinforce.fused import arrays, jaxprs
 from mjx_reinforce.fused.graph import Graph
-from mjx_reinforce.fused.nodes import Gate, Node, Scalar, is_constant, same
+from mjx_reinforce.fused.nodes import Gate, Node, Scalar, Scope, is_constant, same
 
 #: A branch that evaluates itself in the graph's innermost scope.
 Branch = Callable[[], list[Scalar]]
+
+
+class _Body(NamedTuple):
+    """A branch that was evaluated: where its nodes are, and its results."""
+
+    scope: Scope
+    results: list[Scalar]
 
 
 def cond_rule(
@@ -57,13 +65,24 @@ def by_engine_rule(
 
 def _choose_among(graph: Graph, branches: list[Branch], choice: Node) -> list[Scalar]:
     """Returns the results of the branch that each lane takes."""
-    order = range(len(branches))
-    if len(branches) == 2 and _try_branch(graph, branches[0], 0)[0]:
-        order = (1, 0)  # the cheap branch first: its results are what a skipped one falls back on
+    needed = [_takes(graph, choice, k, len(branches)) for k in range(len(branches))]
+    order, tried = list(range(len(branches))), {}
+    if len(branches) == 2:
+        tried[0] = _expensive(graph, branches[0], 0, needed[0])
+        if tried[0] is not None:
+            order = [
+                1,
+                0,
+            ]  # the cheap branch first: its results are what a skipped one falls back on
     results: list[Scalar] | None = None
     for k in order:
-        needed = _takes(graph, choice, k, len(branches))
-        results = _merge(graph, branches[k], k, needed, results)
+        body = tried[k] if k in tried else _expensive(graph, branches[k], k, needed[k])
+        if body is not None:
+            results = _gate(graph, body, needed[k], results)
+            continue
+        others, results = results, branches[k]()
+        if others is not None:
+            results = _select_all(graph, needed[k], results, others)
     return results or []
 
 
@@ -79,42 +98,35 @@ def _takes(graph: Graph, choice: Node, k: int, count: int) -> Scalar:
     return graph.call("eq", choice, number(k))
 
 
-def _merge(
-    graph: Graph, branch: Branch, k: int, needed: Scalar, fallback: list[Scalar] | None
-) -> list[Scalar]:
-    """Adds the results of branch k to those of the branches before it."""
-    expensive, dtypes = _try_branch(graph, branch, k)
-    if expensive and isinstance(needed, Node) and needed not in graph.certain:
-        return _gate(graph, branch, needed, fallback or [dtype.type(0) for dtype in dtypes])
-    results = branch()
-    return results if fallback is None else _select_all(graph, needed, results, fallback)
+def _expensive(graph: Graph, branch: Branch, k: int, needed: Scalar) -> _Body | None:
+    """Evaluates branch k where it may be skipped; returns None if it need not be.
+
+    What a cheap branch makes is dropped. A branch that was expensive once remains so where less is
+    assumed.
+    """
+    if not isinstance(needed, Node) or needed in graph.certain:
+        return None
+    with graph.branch() as scope, graph.assuming(needed):
+        results = branch()
+    place = (graph.path, "expensive", k)
+    if place not in graph.learned:
+        if not scope.has_loop and scope.cost <= graph.branch_cost:
+            return None
+        graph.learned[place] = True
+    return _Body(scope, results)
 
 
-def _gate(graph: Graph, branch: Branch, needed: Node, cold: list[Scalar]) -> list[Scalar]:
-    """Makes the branch one that is skipped where no lane needs it."""
-    with graph.branch() as body, graph.assuming(needed):
-        hot = _select_all(graph, needed, branch(), cold)
-    gate = Gate(graph.scope, graph.number(), needed, body, hot, cold)
+def _gate(graph: Graph, body: _Body, needed: Node, fallback: list[Scalar] | None) -> list[Scalar]:
+    """Makes an expensive branch one that is skipped where no lane needs it."""
+    cold = fallback or [result.dtype.type(0) for result in body.results]
+    with graph.again(body.scope), graph.assuming(needed):
+        hot = _select_all(graph, needed, body.results, cold)
+    gate = Gate(graph.scope, graph.number(), needed, body.scope, hot, cold)
     for position, (on, off) in enumerate(zip(hot, cold, strict=True)):
         varying = any(isinstance(value, Node) and value.varying for value in (on, off))
         leaf = None if same(on, off) else graph.leaf(on.dtype, varying, gate, position)
         gate.outs.append(leaf)
     return [off if out is None else out for out, off in zip(gate.outs, cold, strict=True)]
-
-
-def _try_branch(graph: Graph, branch: Branch, k: int) -> tuple[bool, list[np.dtype]]:
-    """Returns whether branch k is expensive, and the dtypes of its results.
-
-    What it makes is dropped. A branch that was expensive once remains so where less is assumed.
-    """
-    place = (graph.path, "expensive", k)
-    if place not in graph.learned:
-        with graph.branch() as scope:
-            dtypes = [result.dtype for result in branch()]
-        if not scope.has_loop and scope.cost <= graph.branch_cost:
-            return False, dtypes
-        graph.learned[place] = dtypes
-    return True, graph.learned[place]
 
 
 def _select_all(graph: Graph, needed: Scalar, on: list[Scalar], off: list[Scalar]) -> list[Scalar]:
