@@ -14,7 +14,7 @@ from mjx_reinforce.fused import by_engine
 from mjx_reinforce.physics.mjx_internals import advance, solve_m
 
 
-def solve(model: mjx.Model, data: mjx.Data, force: jax.Array) -> jax.Array:
+def inverse_times(model: mjx.Model, data: mjx.Data, force: jax.Array) -> jax.Array:
     """Returns inv(M) force, [nv].
 
     Args:

@@ -62,7 +62,7 @@ def solve_limits(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array
     sign = [fields.efc_J[i, dof] for i, dof in enumerate(dofs)]
     unit = jnp.eye(model.nv, dtype=data.qacc_smooth.dtype)
     # response[i] is inv(M) applied to row i, up to its sign.
-    response = [inertia.solve(model, data, unit[dof]) for dof in dofs]
+    response = [inertia.inverse_times(model, data, unit[dof]) for dof in dofs]
     force: list[Any] = [None] * dofs.size
     for rows in _coupled_rows(model, joints):
         matrix = [

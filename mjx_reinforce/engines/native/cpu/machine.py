@@ -31,7 +31,7 @@ LEVELS = {
 #: LLVM holds vectors of 512 bits back where they lower the clock; the lanes are worth more.
 _WIDE = "-prefer-256-bit"
 #: Characters of a text that LLVM compiles with less effort.
-_LONG = 2_000_000
+_LONG_TEXT = 2_000_000
 _LOADED: dict[str, "Code"] = {}
 _LOCK = threading.Lock()
 #: Makes the names of libraries different.
@@ -186,7 +186,7 @@ def _effort(text: str) -> int:
     A long program compiles in two thirds of the time with less effort, and runs as fast (Ant,
     Humanoid); a short one may run slower (Hopper: 4 %).
     """
-    return 1 if len(text) > _LONG else 2
+    return 1 if len(text) > _LONG_TEXT else 2
 
 
 def _parse(text: str, target: Any, machine: Machine) -> Any:

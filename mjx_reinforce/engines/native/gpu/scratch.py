@@ -10,8 +10,10 @@ from numpy.typing import DTypeLike
 
 from mjx_reinforce.fused.backends.llvm_text import Text
 
-#: Bytes of a word, and threads of a warp. Those of a warp have their words side by side.
-_WORD, _WARP = 4, 32
+#: Threads of a warp. They have their words side by side.
+WARP = 32
+#: Bytes of a word.
+_WORD = 4
 #: On a GPU loops over so many contacts are written out. The arrays of longer loops are long.
 WRITTEN_OUT = 25
 _NUMBER = "call i32 @llvm.nvvm.read.ptx.sreg.{}()"
@@ -41,7 +43,7 @@ class ScratchText(Text):
         if count <= WRITTEN_OUT or np.dtype(dtype).itemsize > _WORD:
             return self.reserve(dtype, count)
         name = self.name()
-        first = self.words * _WORD * _WARP
+        first = self.words * _WORD * WARP
         self._reserved.append(f"  {name} = getelementptr inbounds i8, ptr %own, i64 {first}")
         self.words += count
         self._apart.add(name)
@@ -51,7 +53,7 @@ class ScratchText(Text):
         """Returns the pointer to an entry of an array."""
         if pointer not in self._apart:
             return super().at(pointer, dtype, index)
-        step = _WORD * _WARP
+        step = _WORD * WARP
         offset = index * step if isinstance(index, int) else self.let(f"mul i64 {index}, {step}")
         return self.let(f"getelementptr inbounds i8, ptr {pointer}, i64 {offset}")
 
@@ -68,7 +70,7 @@ class ScratchText(Text):
                 f"%threads = {_NUMBER.format('ntid.x')}",
                 "%before = mul i32 %block, %threads",
                 "%number = add i32 %before, %thread",
-                f"%lane = and i32 %number, {_WARP - 1}",
+                f"%lane = and i32 %number, {WARP - 1}",
                 "%others = sub i32 %number, %lane",
                 "%others.wide = zext i32 %others to i64",
                 "%lane.wide = zext i32 %lane to i64",

@@ -17,13 +17,12 @@ from jax import lax
 
 from mjx_reinforce.engines.native.gpu import ptx
 from mjx_reinforce.engines.native.gpu.kernel import ENTRY
+from mjx_reinforce.engines.native.gpu.scratch import WARP
 
 #: XLA's name of what launches a kernel.
 PTX = "__gpu$xla.gpu.ptx"
 #: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
 _OLDEST = (22,)
-#: Threads of a block at least: a warp.
-_WARP = 32
 #: A kernel that adds 1 to the number that is its second argument and its result.
 _PROBE = """
 .version 7.0
@@ -207,6 +206,6 @@ def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
     They are spread over all multiprocessors, each of which has so many blocks at most.
     """
     processors = jax.devices()[0].core_count
-    warps = -(-items // (_WARP * processors))
-    threads = min(_WARP * warps, most)
+    warps = -(-items // (WARP * processors))
+    threads = min(WARP * warps, most)
     return min(-(-items // threads), blocks * processors), threads
