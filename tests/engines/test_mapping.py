@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.engines.native import mapping
-from mjx_reinforce.engines.native.cpu import seam
+from mjx_reinforce.engines.native.cpu import machine, seam
 from mjx_reinforce.engines.native.cpu.denormals import Flush, flush
 from mjx_reinforce.engines.native.cpu.machine import this_machine
 from mjx_reinforce.engines.native.cpu.mapping import POSITIONS
@@ -44,6 +44,24 @@ def test_results_are_those_of_vmap(mapped, size):
         assert (x.shape, x.dtype) == (exact.shape, exact.dtype)
         np.testing.assert_allclose(x, exact, rtol=1e-6)
     assert size % this_machine().lanes or size == 16
+
+
+def test_a_long_text_takes_less_effort_and_gives_the_same_bits(mapped, monkeypatch):
+    efforts = []
+    target = machine._target
+
+    def noted(which, effort=2):
+        efforts.append(effort)
+        return target(which, effort)
+
+    monkeypatch.setattr(machine, "_target", noted)
+    monkeypatch.setattr(machine, "_LONG_TEXT", 0)
+    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(mapping.objects, "folder", lambda: None)
+    other = jax.jit(machine_map(function, *jax.tree.map(lambda x: x[0], batch(1))))
+    assert 1 in efforts
+    for x, y in zip(*map(jax.tree.leaves, (mapped(*batch(37)), other(*batch(37)))), strict=True):
+        np.testing.assert_array_equal(x, y)
 
 
 def test_numbers_of_8_bits_are_refused():
