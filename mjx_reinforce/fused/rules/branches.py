@@ -69,11 +69,8 @@ def _choose_among(graph: Graph, branches: list[Branch], choice: Node) -> list[Sc
     order, tried = list(range(len(branches))), {}
     if len(branches) == 2:
         tried[0] = _expensive(graph, branches[0], 0, needed[0])
-        if tried[0] is not None:
-            order = [
-                1,
-                0,
-            ]  # the cheap branch first: its results are what a skipped one falls back on
+        # The cheap branch comes first: its results are what a skipped one falls back on.
+        order = [0, 1] if tried[0] is None else [1, 0]
     results: list[Scalar] | None = None
     for k in order:
         body = tried[k] if k in tried else _expensive(graph, branches[k], k, needed[k])
