@@ -43,12 +43,14 @@ def euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     if model.opt.disableflags & mjx.DisableBit.EULERDAMP:
         return mjx.euler(model, data)
 
-    def from_leaves() -> mjx.Data:
-        damped = mjx.full_m(model, data) + jnp.diag(model.opt.timestep * model.dof_damping)
-        qacc = _from_leaves(damped, data.qfrc_smooth + data.qfrc_constraint)
-        return advance(model, data, data.act_dot, qacc)
+    damped = mjx.full_m(model, data) + jnp.diag(model.opt.timestep * model.dof_damping)
+    force = data.qfrc_smooth + data.qfrc_constraint
 
-    return by_engine(from_leaves, lambda: mjx.euler(model, data))
+    def whole() -> jax.Array:  # as MJX, where its matrices are dense
+        return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(damped), force)
+
+    qacc = by_engine(lambda: _from_leaves(damped, force), whole)
+    return advance(model, data, data.act_dot, qacc)
 
 
 def _from_leaves(inertia: jax.Array, force: jax.Array) -> jax.Array:
