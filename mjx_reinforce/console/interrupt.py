@@ -19,7 +19,8 @@ class Interrupt:
     It listens inside a ``with`` block, in a thread of its own: Python runs signal handlers in the
     main thread only, which may be inside a compiler for minutes. The process ends with
     ``os._exit``, which waits for no other thread, with the status that shells give: 128 plus the
-    signal's number.
+    signal's number. Once a signal has asked, later ones are ignored behind the block, where the
+    process only ends.
     """
 
     def __init__(self):
@@ -39,7 +40,7 @@ class Interrupt:
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._handlers.items():
-            # Where a signal has ended the command, another must not change its exit status.
+            # Python's handlers would change the exit status.
             signal.signal(number, handler if self.number is None else signal.SIG_IGN)
         signal.set_wakeup_fd(self._descriptor)
         self._told.close()  # which ends the thread

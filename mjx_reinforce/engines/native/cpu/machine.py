@@ -181,7 +181,7 @@ def _build(key: str, write: Callable[[], str], machine: Machine, folder: Path | 
 
 
 def _effort(text: str) -> int:
-    """Returns LLVM's level of effort for a text, which has some 60 characters an operation.
+    """Returns LLVM's level of effort for a text.
 
     A long program compiles in two thirds of the time with less effort, and runs as fast (Ant,
     Humanoid); a short one may run slower (Hopper: 4 %).
