@@ -20,7 +20,8 @@ What to know before using it:
 - Differentiation works where JAX's does: not in reverse through a ``while``. Rules of
   ``jax.custom_jvp`` and ``jax.custom_vjp`` are not kept; the function itself is differentiated.
 - ``lax.platform_dependent`` takes its default: what is written out does not depend on where it
-  runs. ``by_engine`` gives a program for what is written out beside the one for XLA.
+  runs. ``by_engine`` gives a program for what is written out beside the one for XLA, and of what
+  is ``skippable`` no lane's own result is selected.
 - A primitive without a rule raises ``UnsupportedPrimitive``, which names the line it came from.
   Typed PRNG keys and ``lax.platform_dependent`` without a default raise it too.
 
@@ -42,6 +43,7 @@ from mjx_reinforce.fused.errors import TooLarge, UnsupportedPrimitive, refusal
 from mjx_reinforce.fused.jaxprs import prune
 from mjx_reinforce.fused.lanes import any_lane
 from mjx_reinforce.fused.scalarized import Scalarized, scalarize
+from mjx_reinforce.fused.skippable import skippable
 from mjx_reinforce.fused.vmap import vmap
 
 __all__ = [
@@ -53,5 +55,6 @@ __all__ = [
     "prune",
     "refusal",
     "scalarize",
+    "skippable",
     "vmap",
 ]

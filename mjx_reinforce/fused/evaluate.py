@@ -32,6 +32,7 @@ _CONTROL = {
     "while": loops.while_rule,
     "scan": loops.scan_rule,
     "cond": branches.cond_rule,
+    "skippable": branches.skippable_rule,
     "by_engine": branches.by_engine_rule,
 }
 

@@ -15,6 +15,8 @@ from mjx_reinforce.fused.errors import TooLarge
 MAX_SCALARS = 4_000_000
 #: A loop's body is written again and again until what never changes in it is known.
 _LOOP = 2
+#: The program that is written out of a primitive of ours, among its parameters.
+_CARRIES = {"by_engine": "one", "skippable": "computation"}
 _ELEMENTWISE = {*ops.FACTS, "integer_pow", "square", "add_any", "clamp"}
 
 
@@ -45,8 +47,8 @@ def _equation_size(eqn: Any, default: Mapping[Any, int | None]) -> int:
         index = eqn.invars[0]
         known = None if jaxprs.is_literal(index) else default.get(index)
         return sum(sizes) if known is None else sizes[known]
-    if name == "by_engine":
-        return num_scalars(jaxprs.program(params["one"]))
+    if name in _CARRIES:
+        return num_scalars(jaxprs.program(params[_CARRIES[name]]))
     if name == "while":
         bodies = (params[part] for part in ("cond_jaxpr", "body_jaxpr"))
         return _LOOP * sum(num_scalars(jaxprs.program(body)) for body in bodies)

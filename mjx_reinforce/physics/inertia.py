@@ -46,11 +46,16 @@ def euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     damped = mjx.full_m(model, data) + jnp.diag(model.opt.timestep * model.dof_damping)
     force = data.qfrc_smooth + data.qfrc_constraint
 
-    def whole() -> jax.Array:  # as MJX, where its matrices are dense
-        return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(damped), force)
+    return advance(model, data, data.act_dot, solve(damped, force))
 
-    qacc = by_engine(lambda: _from_leaves(damped, force), whole)
-    return advance(model, data, data.act_dot, qacc)
+
+def solve(matrix: jax.Array, force: jax.Array) -> jax.Array:
+    """Returns inv(matrix) force, [nv], for an inertia matrix to which a positive one was added."""
+
+    def whole() -> jax.Array:  # as MJX, where its matrices are dense
+        return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix, lower=True), force)
+
+    return by_engine(lambda: _from_leaves(matrix, force), whole)
 
 
 def _from_leaves(inertia: jax.Array, force: jax.Array) -> jax.Array:

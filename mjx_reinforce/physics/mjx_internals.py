@@ -55,6 +55,7 @@ __all__ = [
     "collider",
     "collision_with",
     "fenced",
+    "geom_groups",
     "geom_pairs",
     "jax_fields",
     "make_frame",
@@ -116,6 +117,13 @@ for _function, _module, _name in (
     ("_gradient_descent", collision_sdf, "_gradient_step"),
 ):
     check_lookup(_module, _function, _name)
+
+
+def geom_groups(model: mjx.Model) -> Iterator[tuple[int, int, int]]:
+    """Yields for each pair of geoms that may meet the dimension of their contacts, and the two."""
+    for key, pairs in collision_driver._geom_groups(model).items():
+        for first, second, _ in pairs:
+            yield int(key.condim), first, second
 
 
 _Colliders = dict[tuple[mjx.GeomType, mjx.GeomType], Callable[..., Any]]

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 from mujoco import mjx
 
 from mjx_reinforce.physics import contact_rows
+from mjx_reinforce.physics.inertia import solve
 from mjx_reinforce.physics.mjx_internals import jax_fields
 
 # mjMINVAL: what C takes for zero.
@@ -31,13 +32,13 @@ _MIN_TRACE = 1e-15
 class _Rows(NamedTuple):
     """The constraints.
 
-    jacobian: [rows, nv] J
+    jacobian: J
     reference: [rows] r
     constraint_mass: [rows] D
     equality: [rows] whether a row is active on both sides
     """
 
-    jacobian: jax.Array
+    jacobian: contact_rows.Jacobian
     reference: jax.Array
     constraint_mass: jax.Array
     equality: jax.Array
@@ -49,13 +50,11 @@ class _Point(NamedTuple):
     qacc: [nv]
     imbalance: [nv] M a minus the unconstrained forces
     residual: [rows] J a - r
-    active: [rows] whether a row pushes
     """
 
     qacc: jax.Array
     imbalance: jax.Array
     residual: jax.Array
-    active: jax.Array
 
 
 class _Search(NamedTuple):
@@ -71,21 +70,32 @@ class _Search(NamedTuple):
     settled: jax.Array
 
 
+class _Line(NamedTuple):
+    """The cost's derivative along a step, for the rows that push at one length of it.
+
+    at_zero: [] where the line is at length zero
+    rate: [] how fast it increases
+    """
+
+    at_zero: jax.Array
+    rate: jax.Array
+
+
 class _LineSearch(NamedTuple):
     """The state of a line search along one step, by lengths of the step.
 
     low: [] the largest length known to have a negative derivative
     high: [] the smallest length known to have a positive derivative
-    root: [] where the derivative would be zero if no row changed from the last length evaluated
-    active: [rows] whether a row pushes at the last length evaluated
+    root: [] where the last line is zero
+    line: of the last length evaluated
     evaluated: [] how many lengths were
-    settled: [] whether the last two lengths evaluated have the same active rows
+    settled: [] whether the last two lengths evaluated have the same line
     """
 
     low: jax.Array
     high: jax.Array
     root: jax.Array
-    active: jax.Array
+    line: _Line
     evaluated: jax.Array
     settled: jax.Array
 
@@ -117,11 +127,13 @@ def solve_newton(
     """
     fields = jax_fields(data)
     equality = jnp.arange(fields.efc_D.shape[0]) < fields.ne
-    rows = _Rows(fields.efc_J, fields.efc_aref, fields.efc_D, equality)
     num_others = fields.ne + fields.nf + fields.nl
-    division = contact_rows.blocks(num_others, fields.contact.dim, may_unroll)
+    coupled = contact_rows.couplings(model)
+    division = contact_rows.blocks(num_others, fields.contact.dim, coupled, may_unroll)
     # A NaN counts as touching, so that it gets to the acceleration.
     touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
+    jacobian = contact_rows.with_bases(division, fields.efc_J, touching)
+    rows = _Rows(jacobian, fields.efc_aref, fields.efc_D, equality)
     inertia = mjx.full_m(model, data)
 
     def along(direction: jax.Array) -> jax.Array:
@@ -136,18 +148,18 @@ def solve_newton(
         slope = jnp.dot(direction, before.imbalance)
         curvature = jnp.dot(direction, change_of_imbalance)
         length = _line_search(rows, before, change, slope, curvature, model.opt.ls_iterations)
-        after = _point(
-            rows,
+        after = _Point(
             before.qacc + length * direction,
             before.imbalance + length * change_of_imbalance,
             before.residual + length * change,
         )
-        settled = jnp.all(after.active == before.active) | (decrement < smallest)
+        same = jnp.all(_active(rows, after.residual) == _active(rows, before.residual))
+        settled = same | (decrement < smallest)
         return _Search(after, search.steps + 1, settled)
 
     def begin(qacc: jax.Array) -> _Point:
         imbalance = inertia @ qacc - data.qfrc_smooth
-        return _point(rows, qacc, imbalance, along(qacc) - rows.reference)
+        return _Point(qacc, imbalance, along(qacc) - rows.reference)
 
     start = begin(data.qacc_smooth)
     if not model.opt.disableflags & mjx.DisableBit.WARMSTART:
@@ -164,20 +176,22 @@ def solve_newton(
     return end.qacc, joint_force, force
 
 
-def _point(rows: _Rows, qacc: jax.Array, imbalance: jax.Array, residual: jax.Array) -> _Point:
-    """Returns an acceleration [nv] with which rows push; a NaN pushes, so that it is not lost."""
-    return _Point(qacc, imbalance, residual, rows.equality | ~(residual >= 0))
+def _active(rows: _Rows, residual: jax.Array) -> jax.Array:
+    """Returns which rows push at residuals [rows]; a NaN pushes, so that it is not lost."""
+    return rows.equality | ~(residual >= 0)
 
 
 def _cost(rows: _Rows, data: mjx.Data, point: _Point) -> jax.Array:
     """Returns what is minimised, []."""
-    penalty = jnp.sum(jnp.where(point.active, rows.constraint_mass * point.residual**2, 0))
+    active = _active(rows, point.residual)
+    penalty = jnp.sum(jnp.where(active, rows.constraint_mass * point.residual**2, 0))
     return (jnp.dot(point.imbalance, point.qacc - data.qacc_smooth) + penalty) / 2
 
 
 def _force(rows: _Rows, point: _Point) -> jax.Array:
     """Returns the rows' forces, [rows]."""
-    return jnp.where(point.active, -rows.constraint_mass * point.residual, 0)
+    active = _active(rows, point.residual)
+    return jnp.where(active, -rows.constraint_mass * point.residual, 0)
 
 
 def _newton_direction(
@@ -189,13 +203,12 @@ def _newton_direction(
     half the product of gradient and step, up to the sign; it keeps its digits near the minimum,
     where the difference of two costs would be rounding error.
     """
-    active_mass = jnp.where(point.active, rows.constraint_mass, 0)
+    active_mass = jnp.where(_active(rows, point.residual), rows.constraint_mass, 0)
     hessian, joint_force = contact_rows.weighted(
         division, inertia, rows.jacobian, active_mass, _force(rows, point)
     )
     gradient = point.imbalance - joint_force
-    factor = jax.scipy.linalg.cho_factor(hessian, lower=True)
-    direction = -jax.scipy.linalg.cho_solve(factor, gradient)
+    direction = -solve(hessian, gradient)
     return direction, -jnp.dot(gradient, direction) / 2
 
 
@@ -225,27 +238,32 @@ def _line_search(
     row_slope = rows.constraint_mass * change * point.residual
     row_curvature = rows.constraint_mass * change**2
 
+    def line(active: jax.Array) -> _Line:
+        return _Line(
+            slope + jnp.sum(jnp.where(active, row_slope, 0)),
+            curvature + jnp.sum(jnp.where(active, row_curvature, 0)),
+        )
+
     def evaluate(last: _LineSearch) -> _LineSearch:
         inside = (last.low < last.root) & (last.root < last.high)
         length = jnp.where(inside, last.root, (last.low + last.high) / 2)
-        active = rows.equality | (point.residual + length * change < 0)
-        at_zero = slope + jnp.sum(jnp.where(active, row_slope, 0))
-        rate = curvature + jnp.sum(jnp.where(active, row_curvature, 0))
-        root = jnp.where(rate > 0, -at_zero / rate, length)
+        found = line(rows.equality | (point.residual + length * change < 0))
+        root = jnp.where(found.rate > 0, -found.at_zero / found.rate, length)
+        moved = [(new < old) | (new > old) for new, old in zip(found, last.line, strict=True)]
         return _LineSearch(
             low=jnp.where(root > length, length, last.low),
             high=jnp.where(root > length, last.high, length),
             root=root,
-            active=active,
+            line=found,
             evaluated=last.evaluated + 1,
-            settled=jnp.all(active == last.active),
+            settled=~jnp.any(jnp.stack(moved)),  # a NaN does not move
         )
 
     start = _LineSearch(
         low=jnp.zeros_like(slope),
         high=jnp.full_like(slope, jnp.inf),
         root=jnp.ones_like(slope),  # a full Newton step
-        active=point.active,
+        line=line(_active(rows, point.residual)),
         evaluated=jnp.int32(0),
         settled=jnp.array(False),
     )

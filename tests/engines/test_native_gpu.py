@@ -212,6 +212,7 @@ def test_ptx(name, threads, blocks, capability, tmp_path, monkeypatch):
     assert made.text.count(".entry play(") == 1
     assert f".target sm_{capability.replace('.', '')}" in made.text
     assert "call" not in made.text
+    assert '.pragma "nounroll";' in made.text  # the assembler leaves our loops as they are
     meetings = re.findall(r"(bar.warp.sync 0xffffffff; )?bar(?:rier)?\.(?:sync|red)", made.text)
     assert meetings
     assert all(meetings)  # a warp comes together before each: an H200 waited forever without

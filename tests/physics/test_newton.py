@@ -8,7 +8,7 @@ import pytest
 from mujoco import mjx
 
 from mjx_reinforce import envs
-from mjx_reinforce.physics import newton
+from mjx_reinforce.physics import contact_rows, newton
 from mjx_reinforce.physics import step as physics
 from mjx_reinforce.physics.mjx_internals import jax_fields
 
@@ -93,14 +93,15 @@ def test_the_line_search_finds_the_root_among_kinks():
     for _ in range(20):
         residual, change = random.standard_normal((2, 12))
         mass = 10 ** random.uniform(-1, 3, 12)
-        rows = newton._Rows(jnp.zeros((12, 1)), jnp.zeros(12), jnp.asarray(mass), jnp.array(False))
+        none = contact_rows.Jacobian(jnp.zeros((12, 1)), [])
+        rows = newton._Rows(none, jnp.zeros(12), jnp.asarray(mass), jnp.array(False))
         active = residual < 0
         curvature = random.uniform(0.1, 1)
         row_slope, row_curvature = mass * change * residual, mass * change**2
         # Newton's own line has its root at a step of 1.
         slope = -(curvature + (row_slope + row_curvature)[active].sum())
         zero = jnp.zeros(())
-        start = newton._Point(zero, zero, jnp.asarray(residual), jnp.asarray(active))
+        start = newton._Point(zero, zero, jnp.asarray(residual))
         found = newton._line_search(
             rows, start, jnp.asarray(change), jnp.asarray(slope), jnp.asarray(curvature), 50
         )

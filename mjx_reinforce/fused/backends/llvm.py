@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -14,7 +15,8 @@ from mjx_reinforce.fused.backends.llvm_text import Text, literal
 from mjx_reinforce.fused.errors import UnsupportedPrimitive
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
 from mjx_reinforce.fused.ops import Op
-from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
+from mjx_reinforce.fused.passes.accumulators import accumulators, reads, unread
+from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop, Schedule
 
 
 class Input(NamedTuple):
@@ -60,6 +62,10 @@ class LLVM(Backend[Value]):
     """Writes LLVM IR into a ``Text``; a value is a lane vector."""
 
     OPERATIONS = OPERATIONS
+    #: So many carries, or more, change in place where they can.
+    MANY = 32
+    #: What the branch back to the start of a loop tells LLVM.
+    BACK = ""
 
     def __init__(self, text: Text, inputs: Callable[[int], Input]):
         """Says what is written into, and where the inputs are.
@@ -72,6 +78,15 @@ class LLVM(Backend[Value]):
         self._inputs = inputs
         # Where a loop before has kept a value: the array of that value, and the iteration.
         self._kept: dict[Scalar, tuple[str, int]] = {}
+        # Where a node is stored as soon as it is known: in a carry that changes in place.
+        self._stored: dict[Node, Memory] = {}
+        self._reads: Counter[Node] = Counter()
+
+    def compile(self, schedule: Schedule, outputs: list[list[Scalar]]) -> Any:
+        """Writes a whole program; returns the value of each element of each output."""
+        self._reads = reads(schedule)
+        self._reads.update(x for leaf in outputs for x in leaf if isinstance(x, Node))
+        return super().compile(schedule, outputs)
 
     def constant(self, number: Any) -> Value:
         """A constant in every lane."""
@@ -97,7 +112,10 @@ class LLVM(Backend[Value]):
         """Writes one operation."""
         op = cast(Op, node.op)  # leaves are not scheduled
         kinds = [np.dtype(arg.dtype) for arg in node.args]
-        return OPERATIONS[op.name](self._text, op, node.dtype, kinds, cast(list[str], operands))
+        made = OPERATIONS[op.name](self._text, op, node.dtype, kinds, cast(list[str], operands))
+        if node in self._stored:
+            self._text.store(made, self._stored[node].pointer, node.dtype)
+        return made
 
     def reserve(self, dtype: np.dtype, count: int) -> str:
         """Returns a pointer to room for an array that a loop reads or leaves."""
@@ -111,56 +129,74 @@ class LLVM(Backend[Value]):
         """Writes a branch that is taken if some lane needs it."""
         text = self._text
         needed = self.some(self.value(gate.predicate, values))
-        cold = [self.value(out.cold, values) for out in gate.outs]
+        outs = [out for out in gate.outs if out.hot not in self._stored]
+        cold = [self.value(out.cold, values) for out in outs]
         before, hot_block, after = text.block, text.label(), text.label()
         text.line(f"br i1 {needed}, label %{hot_block}, label %{after}")
         text.start(hot_block)
         inner = self.inside(gate.body, values)
-        hot = [self.value(out.hot, inner) for out in gate.outs]
+        hot = [self.value(out.hot, inner) for out in outs]
         hot_end = text.block
         text.line(f"br label %{after}")
         text.start(after)
-        return [
-            text.let(f"phi {text.type(out.leaf.dtype)} [{x}, %{before}], [{y}, %{hot_end}]")
-            for out, x, y in zip(gate.outs, cold, hot, strict=True)
-        ]
+        chosen: dict[Node, Value] = {
+            out.leaf: text.let(
+                f"phi {text.type(out.leaf.dtype)} [{x}, %{before}], [{y}, %{hot_end}]"
+            )
+            for out, x, y in zip(outs, cold, hot, strict=True)
+        }
+        return [chosen.get(out.leaf) or self._stored[cast(Node, out.hot)] for out in gate.outs]
 
     def loop(
         self, loop: LiveLoop, values: dict[Node, Value]
     ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
         """Writes a loop, which ends when no lane goes on or its length is reached."""
         text = self._text
-        inits = [self.value(carry.init, values) for carry in loop.carries]
+        known = self._in_place(loop, values)
+        at_least_once = bool(loop.length) and loop.active is None
+        idle = known.keys() | (unread(loop) if at_least_once else set())
+        carries = [carry for carry in loop.carries if carry.leaf not in idle]
+        inits = [self.value(carry.init, values) for carry in carries]
         readers = [self._reader(e.leaf, e.values, values) for e in loop.elements]
         kept = [self.reserve(_dtype(r.value), loop.length or 0) for r in loop.records]
-        before, head, body, after = text.block, text.label(), text.label(), text.label()
+        before, head, after = text.block, text.label(), text.label()
         text.line(f"br label %{head}")
         text.start(head)
-        holes = [text.hole() for _ in range(len(loop.carries) + 1)]
+        holes = [text.hole() for _ in range(len(carries) + 1)]
         count, *names = [hole.name for hole in holes]
-        text.line(f"br i1 {self.goes_on(loop, count, names)}, label %{body}, label %{after}")
-        text.start(body)
-        skipped = self.may_skip(loop, names)
-        known: dict[Node, Value] = dict(zip((c.leaf for c in loop.carries), names, strict=True))
+        known.update(zip((carry.leaf for carry in carries), names, strict=True))
+        active = None if loop.active is None else self.value(loop.carries[loop.active].leaf, known)
+        if not at_least_once:
+            body = text.label()
+            text.line(f"br i1 {self.goes_on(loop, count, active)}, label %{body}, label %{after}")
+            text.start(body)
+        skipped = self.may_skip(active)
         for element, reader in zip(loop.elements, readers, strict=True):
             known[element.leaf] = reader(count)
         inner = self.inside(loop.body, values, known)
         for record, array in zip(loop.records, kept, strict=True):
             dtype = _dtype(record.value)
             text.store(self.value(record.value, inner), self._text.at(array, dtype, count), dtype)
-        nexts = [self.value(carry.next, inner) for carry in loop.carries]
-        kinds = [text.type(carry.leaf.dtype) for carry in loop.carries]
+        nexts = [self.value(carry.next, inner) for carry in carries]
+        kinds = [text.type(carry.leaf.dtype) for carry in carries]
         if skipped:
             nexts = self._joined(*skipped, kinds, names, nexts)
         nexts = [text.let(f"add i64 {count}, 1"), *nexts]
-        kinds = ["i64", *kinds]
-        for hole, kind, init, following in zip(holes, kinds, ["0", *inits], nexts, strict=True):
+        again = self.goes_on(loop, nexts[0], active) if at_least_once else None
+        for hole, kind, init, following in zip(
+            holes, ["i64", *kinds], ["0", *inits], nexts, strict=True
+        ):
             text.fill(hole, f"phi {kind} [{init}, %{before}], [{following}, %{text.block}]")
-        text.line(f"br label %{head}")
+        ends_or_not = f"i1 {again}, label %{head}, label %{after}" if again else f"label %{head}"
+        text.line(f"br {ends_or_not}{self.BACK}")
         text.start(after)
         for record, array in zip(loop.records, kept, strict=True):
             self._kept.update({out: (array, t) for t, out in enumerate(record.outs)})
-        return names, [
+        ends = [
+            super(LLVM, self).value(carry.next, inner) if at_least_once else known[carry.leaf]
+            for carry in loop.carries
+        ]
+        return ends, [
             [
                 Memory(self._text.at(array, _dtype(r.value), t), _dtype(r.value))
                 for t in range(len(r.outs))
@@ -168,7 +204,28 @@ class LLVM(Backend[Value]):
             for r, array in zip(loop.records, kept, strict=True)
         ]
 
-    def may_skip(self, loop: LiveLoop, carries: list[str]) -> tuple[str, str] | None:
+    def _in_place(self, loop: LiveLoop, values: dict[Node, Value]) -> dict[Node, Value]:
+        """Writes the starts of the carries that change in place; returns where each leaf lies.
+
+        Few carries stay in registers. What only this loop reads of such a loop before stays where
+        it is.
+        """
+        changed = accumulators(loop)
+        if len(changed) < self.MANY:
+            return {}
+        free = set(self._stored.values())
+        places: dict[Node, Value] = {}
+        for node, carry in changed.items():
+            start = super().value(carry.init, values)
+            if start in free and self._reads[carry.init] == 1:
+                place = cast(Memory, start)
+            else:
+                place = Memory(self._text.reserve(node.dtype, 1), node.dtype)
+                self._text.store(self.value(carry.init, values), place.pointer, place.dtype)
+            places[carry.leaf] = self._stored[node] = place
+        return places
+
+    def may_skip(self, active: str | None) -> tuple[str, str] | None:
         """Writes at the start of a loop's body a branch around it, for what does not go on.
 
         Returns:
@@ -188,14 +245,14 @@ class LLVM(Backend[Value]):
             for kind, old, new in zip(kinds, olds, news, strict=True)
         ]
 
-    def goes_on(self, loop: LiveLoop, count: str, carries: list[str]) -> str:
+    def goes_on(self, loop: LiveLoop, count: str, active: str | None) -> str:
         """Returns an i1: whether another iteration runs."""
         text = self._text
         conditions = []
         if loop.length is not None:
             conditions.append(text.let(f"icmp slt i64 {count}, {loop.length}"))
-        if loop.active is not None:
-            conditions.append(self.some(carries[loop.active]))
+        if active is not None:
+            conditions.append(self.some(active))
         if len(conditions) == 2:
             return text.let(f"and i1 {conditions[0]}, {conditions[1]}")
         return conditions[0]

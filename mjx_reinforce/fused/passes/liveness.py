@@ -29,7 +29,7 @@ class Carry(NamedTuple):
     """One value that a loop changes.
 
     leaf: the node that stands for it in the body.
-    init: its value before the loop.
+    init: its value before the loop; zero where nothing reads that.
     next: its value at the end of the body.
     out: the node that stands for it after the loop.
     """
@@ -149,7 +149,10 @@ class _Needs:
         elif role == "y":
             self._places[loop]["y"].add(i)
             needs = [loop.ys[i]]
-        else:  # in the body or after the loop
+        elif role == "out" and loop.length and loop.active is None:  # of an iteration that runs
+            self._places[loop]["out"].add(i)
+            needs = [loop.nexts[i]]
+        else:
             self._places[loop]["carry"].add(i)
             needs = [loop.inits[i], loop.nexts[i]]
         if loop.active is not None:
@@ -178,9 +181,10 @@ class _Needs:
 
     def _loop(self, loop: Loop) -> LiveLoop:
         places = {role: sorted(found) for role, found in self._places[loop].items()}
-        carried = places.get("carry", [])
+        read = set(places.get("carry", ()))
+        carried = sorted(read.union(places.get("out", ())))
         carries = [
-            Carry(leaf, loop.inits[i], loop.nexts[i], out)
+            Carry(leaf, loop.inits[i] if i in read else leaf.dtype.type(0), loop.nexts[i], out)
             for i in carried
             if (leaf := loop.carries[i]) is not None and (out := loop.outs[i]) is not None
         ]

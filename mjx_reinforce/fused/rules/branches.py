@@ -1,7 +1,7 @@
 """The rules for choices.
 
 Of ``cond``, cheap branches are both evaluated, and expensive ones skipped if unneeded. Of
-``by_engine``, the program for one episode is taken.
+``skippable``, nothing is selected. Of ``by_engine``, the program for one episode is taken.
 """
 
 from collections.abc import Callable
@@ -53,6 +53,31 @@ def cond_rule(
         return lambda: layout.unpack(run(program, list(operands), used))
 
     return layout.pack(_choose_among(graph, [branch(program) for program in programs], choice))
+
+
+def skippable_rule(
+    graph: Graph,
+    run: Callable,
+    eqn: jaxprs.Equation,
+    used: list[bool],
+    needed: np.ndarray,
+    *operands: np.ndarray,
+) -> list[np.ndarray]:
+    """Skips a computation that no lane needs, if it is expensive; see ``skippable``."""
+    count = eqn.params["num_results"]
+    otherwise, consts = list(operands[:count]), list(operands[count:])
+    layout = arrays.Layout([out.aval for out in eqn.outvars])
+
+    def compute() -> list[Scalar]:
+        return layout.unpack(run(jaxprs.program(eqn.params["computation"]), consts, used))
+
+    (predicate,) = arrays.elements(needed)
+    if is_constant(predicate) and not predicate:
+        return otherwise
+    body = _expensive(graph, compute, 0, predicate)
+    if body is None:
+        return layout.pack(compute())
+    return layout.pack(_close(graph, body, predicate, body.results, layout.unpack(otherwise)))
 
 
 def by_engine_rule(
@@ -118,6 +143,13 @@ def _gate(graph: Graph, body: _Body, needed: Node, fallback: list[Scalar] | None
     cold = fallback or [result.dtype.type(0) for result in body.results]
     with graph.again(body.scope), graph.assuming(needed):
         hot = _select_all(graph, needed, body.results, cold)
+    return _close(graph, body, needed, hot, cold)
+
+
+def _close(
+    graph: Graph, body: _Body, needed: Node, hot: list[Scalar], cold: list[Scalar]
+) -> list[Scalar]:
+    """Gives a branch its place; returns its results."""
     gate = Gate(graph.scope, graph.number(), needed, body.scope, hot, cold)
     for position, (on, off) in enumerate(zip(hot, cold, strict=True)):
         varying = any(isinstance(value, Node) and value.varying for value in (on, off))

@@ -11,7 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.engines.native.gpu.lockstep import LONG, Lockstep, operations, some_of_block
+from mjx_reinforce.engines.native.gpu.lockstep import (
+    LONG,
+    LOOP_FACTS,
+    Lockstep,
+    operations,
+    some_of_block,
+)
 from mjx_reinforce.engines.native.gpu.scratch import ScratchText
 from mjx_reinforce.engines.native.plays import MODE, NOT_PLAYED
 from mjx_reinforce.fused import scalarized
@@ -42,7 +48,7 @@ def entry_text(text: ScratchText, parameters: Sequence[str], written: scalarized
     parameters = [*parameters, *(["ptr noalias %scratch"] if text.words else [])]
     blocks = _LONG_BLOCKS if operations(written.schedule) > LONG else _SHORT_BLOCKS
     kernel = text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
-    return kernel + _ATTRIBUTES.format(*blocks)
+    return kernel + _ATTRIBUTES.format(*blocks) + LOOP_FACTS
 
 
 class _Leaf(NamedTuple):

@@ -17,6 +17,12 @@ from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop, Schedule
 
 #: Gates and loops of more operations are entered by all threads of a block at once.
 LONG = 3_000
+#: The name of what LLVM is told of a loop: NVIDIA's assembler, which would write out the loop over
+#: all contacts of a Humanoid, leaves it a loop.
+LOOP = "!0"
+LOOP_FACTS = f"""{LOOP} = distinct !{{{LOOP}, !1}}
+!1 = !{{!"llvm.loop.unroll.disable"}}
+"""
 #: The threads of a warp come together before they meet the others of their block: where they came
 #: to a barrier one by one, an H200 waited forever.
 _TOGETHER = "bar.warp.sync 0xffffffff;"
@@ -41,6 +47,8 @@ def operations(body: Schedule) -> int:
 
 class Lockstep(LLVM):
     """Writes LLVM IR for one of the threads of a block, all of which run what it writes."""
+
+    BACK = f", !llvm.loop {LOOP}"
 
     def __init__(self, text: ScratchText, inputs: Callable[[int], Input]):
         """Arguments are those of ``LLVM``."""
@@ -68,19 +76,19 @@ class Lockstep(LLVM):
         with self._going_through(loop.body):
             return super().loop(loop, values)
 
-    def goes_on(self, loop: LiveLoop, count: str, carries: list[str]) -> str:
+    def goes_on(self, loop: LiveLoop, count: str, active: str | None) -> str:
         """Returns an i1: whether another iteration runs; all threads of a long loop meet here."""
-        if self._together and loop.active is None:
+        if self._together and active is None:
             self._text.line(f'call void asm sideeffect "{_MEET}", ""() convergent')
-        return super().goes_on(loop, count, carries)
+        return super().goes_on(loop, count, active)
 
-    def may_skip(self, loop: LiveLoop, carries: list[str]) -> tuple[str, str] | None:
+    def may_skip(self, active: str | None) -> tuple[str, str] | None:
         """Writes the branch of threads that only wait for others in a loop."""
-        if not self._together or loop.active is None:
+        if not self._together or active is None:
             return None
         text, before = self._text, self._text.block
         work, after = text.label(), text.label()
-        text.line(f"br i1 {carries[loop.active]}, label %{work}, label %{after}")
+        text.line(f"br i1 {active}, label %{work}, label %{after}")
         text.start(work)
         self._together = False  # until the loop's end
         return before, after
