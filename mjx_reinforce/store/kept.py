@@ -22,7 +22,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.engines.native import look, objects
 from mjx_reinforce.engines.native.available import made_for, platform
 from mjx_reinforce.engines.native.cpu import seam
-from mjx_reinforce.engines.native.gpu.seam import PTX
+from mjx_reinforce.engines.native.gpu import seam as gpu_seam
 from mjx_reinforce.envs.settings import split_words
 from mjx_reinforce.learners.gpu.gradient import TRITON
 from mjx_reinforce.policies.actor import Actor
@@ -110,11 +110,15 @@ def read_programs(key: str) -> tuple[dict[str, Any], Programs] | None:
     """Returns the facts and the programs of a run; None unless all of them are on disk."""
     read = {name: _read_program(key, name) for name in ("facts", *_PROGRAMS)}
     found = {name: content for name, content in read.items() if content is not None}
-    if len(found) < len(read) or not all(map(seam.restore, found.values())):
+    if len(found) < len(read) or not all(map(_restore, found.values())):
         return None
     whole = json.loads(found["facts"])
     like = rebuild(whole["like"])
     return whole["facts"], _on_states(lambda name: _program(found[name]), like, whole["rides"])
+
+
+def _restore(program: bytes) -> bool:
+    return seam.restore(program) and gpu_seam.restore(program)
 
 
 def _on_leaves(programs: Programs) -> dict[str, Callable[..., Any]]:
@@ -164,7 +168,8 @@ def _export(
     key: str, name: str, program: Callable[..., Any], given: tuple[Any, ...]
 ) -> Callable[..., Any]:
     """Returns a program as it is kept, or as it was where JAX cannot export it."""
-    unsafe = [export.DisabledSafetyCheck.custom_call(x) for x in (*seam.targets(), PTX, TRITON)]
+    names = (*seam.targets(), *gpu_seam.targets(), gpu_seam.PTX, TRITON)
+    unsafe = [export.DisabledSafetyCheck.custom_call(x) for x in names]
     try:
         exported = export.export(jax.jit(program), disabled_checks=unsafe)(*given)
         # That list names all code in memory, also of other tasks; ``seam.restore`` would load it.

@@ -134,52 +134,26 @@ def test_the_log_of_the_assembler():
 
 
 def test_a_kernel_for_a_gpu(monkeypatch, tmp_path, capfd):
+    """Its assembler's log is told where it is assembled: see test_gpu_launch."""
     monkeypatch.setenv(look.DEBUG, "2")
-    items.load(tmp_path)
-    (elf,) = (objects.read_object(tmp_path, path.stem) or b"" for path in tmp_path.glob("*.o"))
-    monkeypatch.setattr(look, "_assemble", lambda text: (LOG, elf))
-    capfd.readouterr()
     made = ptx.load_kernel("toy", lambda: KERNEL, "9.0", tmp_path)
     said = capfd.readouterr().err
     assert said.startswith(f"kernel {made.key}: Toy, 7 scalar operations\n")
     for line in (
-        "registers of a thread: 255",
         "threads of a multiprocessor: 256",
         "long arrays of a thread: 0 bytes",
-        f"machine code: {look._text_bytes(elf):,} bytes",
         f"text, ptx: {tmp_path / made.key}.ptx",
     ):
         assert f"  {line}\n" in said
-    assert re.search(r"  the driver's assembler: \d+\.\d\d s\n", said)
     assert (tmp_path / f"{made.key}.ptx").read_text() == made.text
     assert (tmp_path / f"{made.key}.ll").read_text() == KERNEL
 
 
-def test_a_driver_that_refuses_breaks_nothing(monkeypatch, capfd):
-    """One that is not there, one that lacks a function, one that says no."""
-
-    class Driver:
-        def __init__(self, **functions):
-            self.__dict__ |= functions
-
-    def no(*_):
-        return 100
-
-    def lost(_):
-        raise OSError("libcuda.so.1: cannot open")
-
+def test_figures_that_are_not_found_break_nothing(monkeypatch, capfd):
     monkeypatch.setenv(look.DEBUG, "1")
-    for number, (load, words) in enumerate(
-        (
-            (lost, "OSError: libcuda.so.1: cannot open"),
-            (lambda _: Driver(), "AttributeError: .*cuInit"),
-            (lambda _: Driver(cuInit=no), "RuntimeError: cuInit returned 100"),
-        )
-    ):
-        monkeypatch.setattr(look.ctypes, "CDLL", load)
-        made = ptx.load_kernel(f"toy {number}", lambda: KERNEL, "9.0", None)
-        assert ".entry play(" in made.text
-        assert re.search(f"^  no figures: {words}", capfd.readouterr().err, re.MULTILINE)
+    monkeypatch.setattr(look, "_text_bytes", lambda data: int("no object"))
+    assert "handler" in items.load(None).addresses
+    assert re.search("^  no figures: ValueError: .*no object", capfd.readouterr().err, re.MULTILINE)
 
 
 @pytest.mark.cpu

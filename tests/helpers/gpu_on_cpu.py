@@ -110,8 +110,7 @@ def emulate(monkeypatch, threads=1, block=None):
         address = str(code.addresses[ENTRY])
         return ptx.Kernel(code.key, address, 256, 1, words, compiled=True)
 
-    def call(text, entry, grid, given, written, scratch=()):
-        assert entry == ENTRY
+    def call(kernel, grid, given, written, scratch=()):
         results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
         size = 32 * -(-threads // 32)
 
@@ -121,7 +120,7 @@ def emulate(monkeypatch, threads=1, block=None):
             assert not any(x.any() for x in left)
 
             nans = [np.full(x.size // grid[1] * size, np.nan, np.float32) for x in scratch]
-            run_threads(int(text), threads, [*args, *left, *nans])
+            run_threads(int(kernel.text), threads, [*args, *left, *nans])
             return left
 
         return jax.pure_callback(run, results, *given, *written)
@@ -134,9 +133,10 @@ def emulate(monkeypatch, threads=1, block=None):
     monkeypatch.setattr(seam, "_call", call)
 
 
-def lowered(monkeypatch, function, *args):
+def lowered(monkeypatch, function, *args, assemblers=()):
     """Returns what XLA's compiler for NVIDIA GPUs gets, as text."""
     monkeypatch.setattr(available, "platform", lambda: "gpu")
+    monkeypatch.setattr(seam, "_assemblers", lambda: assemblers)
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
     monkeypatch.setattr(seam, "_grid", lambda items, most, blocks: (-(-items // 32), 32))
     traced = jax.jit(function).trace(*jax.tree.map(jnp.asarray, args))

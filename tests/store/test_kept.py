@@ -20,6 +20,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.engines.native import look, objects
 from mjx_reinforce.engines.native.cpu import machine
+from mjx_reinforce.engines.native.gpu import ptx
 from mjx_reinforce.engines.native.gpu import seam as gpu
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import of_task
@@ -116,12 +117,26 @@ def test_programs_depend_on_the_number_of_devices(monkeypatch):
     assert kept.key_of(CONFIG) != key
 
 
-def test_a_program_that_launches_a_gpus_kernel_is_kept():
+@pytest.mark.parametrize("way", ["handler", "ptx"])
+def test_a_program_that_launches_a_gpus_kernel_is_kept(way, monkeypatch):
+    kernel = ptx.Kernel("0" * 64, "", 1, 1, 0, compiled=True)
+    monkeypatch.setattr(ptx, "_LOADED", {kernel.key: kernel})
+    monkeypatch.setattr(gpu, "_handler", lambda kernel, _: gpu._target(kernel.key))
+    assemblers = (lambda x: x,) if way == "handler" else ()
+
     def add(x):
-        return gpu._call(gpu._PROBE, "probe", (1, 1), [jnp.ones(1, jnp.int32)], [x])
+        return gpu._call_by(assemblers, kernel, (1, 1), [jnp.ones(1, jnp.int32)], [x])
 
     kept._export("key", "evaluate", add, (jax.ShapeDtypeStruct((1,), np.int32),))
-    assert gpu.PTX.encode() in kept._read_program("key", "evaluate")
+    name = gpu._target(kernel.key) if way == "handler" else gpu.PTX
+    assert name.encode() in kept._read_program("key", "evaluate")
+
+
+def test_a_program_whose_kernel_is_gone_is_not_read(folder):
+    name = gpu._target("0" * 64).encode()
+    for each in ("facts", *kept._PROGRAMS):
+        kept._write_program("key", each, name if each == "advance" else b"{}")
+    assert kept.read_programs("key") is None
 
 
 def test_a_commit_that_changes_no_source_changes_nothing(monkeypatch):

@@ -4,8 +4,6 @@ With 1, each kernel that is built is described on stderr. With 2, its texts are 
 objects too. While the variable is set, a kernel is built even if the disk has it.
 """
 
-import contextlib
-import ctypes
 import os
 import re
 import sys
@@ -27,9 +25,6 @@ _LOG = {
     "spill loads": (r"(\d+) bytes spill loads", sum, " bytes"),
     "shared memory of a block": (r"(\d+) bytes smem", max, " bytes"),
 }
-#: Names of CUDA's ``CUjit_option`` and ``CUjitInputType``.
-_INFO_LOG, _INFO_SIZE, _ERROR_LOG, _ERROR_SIZE, _VERBOSE, _PTX = 3, 4, 5, 6, 12, 1
-_LOG_BYTES = 2**16
 #: x86-64: the stack pointer is aligned for vectors and then lowered, by so many bytes.
 _FRAME = re.compile(rb"\x48\x83\xe4.\x48\x81\xec(.{4})", re.DOTALL)
 
@@ -136,54 +131,9 @@ def _text_bytes(data: bytes) -> int:
     return sum(x.size() for x in llvm.ObjectFileRef.from_data(data).sections() if x.is_text())
 
 
-def driver_facts(ptx: str) -> dict[str, str]:
-    """Returns what NVIDIA's driver knows of a kernel in PTX, which it compiles once more for it."""
-    began = time.perf_counter()
-    log, cubin = _assemble(ptx)
-    seconds = {"the driver's assembler": f"{time.perf_counter() - began:.2f} s"}
-    return seconds | log_facts(log) | {"machine code": f"{_text_bytes(cubin):,} bytes"}
-
-
 def log_facts(log: str) -> dict[str, str]:
     """Returns what the log of NVIDIA's assembler says of a kernel."""
     found = {name: list(map(int, re.findall(x[0], log))) for name, x in _LOG.items()}
     if not found["registers of a thread"]:
         return {"the driver's log": " ".join(log.split())[:300] or "empty"}
     return {name: f"{x[1](found[name] or [0]):,}{x[2]}" for name, x in _LOG.items()}
-
-
-def _assemble(ptx: str) -> tuple[str, bytes]:
-    """Returns the log of the driver's assembler, and the machine code, on JAX's first GPU."""
-    import jax
-
-    cuda, data = ctypes.CDLL("libcuda.so.1"), ptx.encode() + b"\0"
-    log, errors = (ctypes.create_string_buffer(_LOG_BYTES) for _ in range(2))
-    options = {
-        _INFO_LOG: ctypes.addressof(log),
-        _INFO_SIZE: _LOG_BYTES,
-        _ERROR_LOG: ctypes.addressof(errors),
-        _ERROR_SIZE: _LOG_BYTES,
-        _VERBOSE: 1,
-    }
-    names = (ctypes.c_int * len(options))(*options)
-    values = (ctypes.c_void_p * len(options))(*options.values())
-    context, linker, code = (ctypes.c_void_p() for _ in range(3))
-    device, size = ctypes.c_int(), ctypes.c_size_t()
-
-    def call(name: str, *args: Any) -> None:
-        if status := getattr(cuda, name)(*args):
-            raise RuntimeError(f"{name} returned {status} {errors.value.decode()}")
-
-    with contextlib.ExitStack() as undo:
-        call("cuInit", 0)
-        call("cuDeviceGet", ctypes.byref(device), jax.local_devices()[0].local_hardware_id)
-        call("cuDevicePrimaryCtxRetain", ctypes.byref(context), device)
-        undo.callback(call, "cuDevicePrimaryCtxRelease_v2", device)
-        call("cuCtxPushCurrent_v2", context)
-        undo.callback(call, "cuCtxPopCurrent_v2", ctypes.byref(ctypes.c_void_p()))
-        call("cuLinkCreate_v2", len(options), names, values, ctypes.byref(linker))
-        undo.callback(call, "cuLinkDestroy", linker)
-        given = (data, ctypes.c_size_t(len(data)), b"play", 0, None, None)
-        call("cuLinkAddData_v2", linker, _PTX, *given)
-        call("cuLinkComplete", linker, ctypes.byref(code), ctypes.byref(size))
-        return log.value.decode(), ctypes.string_at(code, size.value)

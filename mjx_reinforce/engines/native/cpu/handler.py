@@ -6,14 +6,16 @@ k % ``episodes`` of seed k / ``episodes``. All results are zero when it starts, 
 each entry itself; arrays are aligned to 16 bytes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from string import Template
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from mjx_reinforce.fused.backends.llvm_text import Text
 
 _TEXT = Path(__file__).with_name("handler.ll")
+#: What every handler begins with.
+_ENTRY = Path(__file__).parents[1] / "entry.ll"
 #: The functions to be called from outside.
 NAMES = ("handler", "open", "share", "close")
 #: The fields of a job, %Job.
@@ -56,18 +58,24 @@ OFFSETS = {
     "XLA_FFI_CallFrame.extension_start": 8,
     "XLA_FFI_CallFrame.api": 16,
     "XLA_FFI_CallFrame.ctx": 24,
+    "XLA_FFI_CallFrame.args.size": 56,
     "XLA_FFI_CallFrame.args.args": 72,
+    "XLA_FFI_CallFrame.rets.size": 96,
     "XLA_FFI_CallFrame.rets.rets": 112,
+    "XLA_FFI_CallFrame.attrs.attrs": 160,
     "XLA_FFI_Buffer.data": 24,
     "XLA_FFI_Buffer.rank": 32,
     "XLA_FFI_Buffer.dims": 40,
+    "XLA_FFI_Scalar.value": 8,
     "XLA_FFI_Metadata_Extension.extension_base.type": 8,
     "XLA_FFI_Metadata_Extension.metadata": 24,
     "XLA_FFI_Metadata.api_version.major_version": 24,
     "XLA_FFI_Metadata.api_version.minor_version": 28,
     "XLA_FFI_Metadata.traits": 32,
     "XLA_FFI_Api.api_version.minor_version": 36,
+    "XLA_FFI_Api.XLA_FFI_Error_Create": 48,
     "XLA_FFI_Api.XLA_FFI_Error_Destroy": 64,
+    "XLA_FFI_Api.XLA_FFI_Stream_Get": 80,
     "XLA_FFI_Api.XLA_FFI_ThreadPool_Schedule": 136,
     "XLA_FFI_Api.XLA_FFI_ThreadPool_NumThreads": 144,
 }
@@ -98,8 +106,7 @@ def handler_text(
     num_results = len(result_bytes)
     data_bytes, sizes_bytes = 8 * (num_args + num_results), 8 * num_results
     job_bytes = 8 * len(FIELDS)
-    values = {name.replace(".", "_"): offset for name, offset in OFFSETS.items()}
-    values |= {field: f"i32 0, i32 {number}" for number, field in enumerate(FIELDS)}
+    values: dict[str, Any] = {field: f"i32 0, i32 {number}" for number, field in enumerate(FIELDS)}
     values |= {
         "job": ", ".join("ptr" if field in _POINTERS else "i64" for field in FIELDS),
         "num_args": num_args,
@@ -117,7 +124,14 @@ def handler_text(
         "steps_ret": positions.steps,
         "zeroed": int(zeroed),
     }
-    return Template(_TEXT.read_text("utf-8")).substitute(values)
+    return with_entry(_TEXT, values)
+
+
+def with_entry(file: Path, values: Mapping[str, Any]) -> str:
+    """Returns the IR of a handler, of a file that defines ``@execute``."""
+    offsets = {name.replace(".", "_"): offset for name, offset in OFFSETS.items()}
+    text = _ENTRY.read_text("utf-8") + file.read_text("utf-8")
+    return Template(text).substitute(offsets | dict(values))
 
 
 class JobText:

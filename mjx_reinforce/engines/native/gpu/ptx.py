@@ -63,12 +63,23 @@ def load_kernel(
         return _LOADED[key]
 
 
+def in_memory() -> list[str]:
+    """Returns the keys of all kernels in memory."""
+    return list(_LOADED)
+
+
+def kept(key: str, folder: Path) -> Kernel | None:
+    """Returns a kernel by its key; None if it is not on disk."""
+    found = objects.read_object(folder, key)
+    return Kernel(key, found.decode(), *_facts(found.decode()), compiled=False) if found else None
+
+
 def _build(key: str, write: Callable[[], str], capability: str, folder: Path | None) -> str:
     """Returns PTX of what ``write`` returns."""
 
     def facts(made: str) -> dict[str, str]:
         threads, blocks, words = _facts(made)
-        return look.driver_facts(made) | {
+        return {
             "threads of a multiprocessor": f"{blocks * threads:,}",
             "long arrays of a thread": f"{4 * words:,} bytes",
         }

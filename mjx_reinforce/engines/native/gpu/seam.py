@@ -1,12 +1,18 @@
 """How JAX launches kernels on an NVIDIA GPU.
 
-A kernel goes to XLA as PTX, in a call that XLA's GPU compiler knows itself: it is launched within
-compiled programs and loops without Python. That call is internal to XLA, so it is tried once in
-each process before it is relied on.
+A kernel is launched within compiled programs and loops without Python. A handler of JAX's foreign
+function interface launches machine code, which is assembled while XLA compiles. Where that fails,
+the kernel goes to XLA as PTX, in a call that XLA's GPU compiler knows itself, and the driver
+assembles it when the program first runs. Each way is tried once in each process before it is
+relied on.
 """
 
+import ctypes
 import functools
+import hashlib
 import math
+import re
+import threading
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -15,11 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.engines.native.gpu import ptx
+from mjx_reinforce.engines.native import objects
+from mjx_reinforce.engines.native.gpu import assembler, launcher, ptx
 from mjx_reinforce.engines.native.gpu.kernel import ENTRY
 from mjx_reinforce.engines.native.gpu.scratch import WARP
 
-#: XLA's name of what launches a kernel.
+#: XLA's name of what launches a kernel in PTX.
 PTX = "__gpu$xla.gpu.ptx"
 #: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
 _OLDEST = (22,)
@@ -28,7 +35,7 @@ _PROBE = """
 .version 7.0
 .target sm_70
 .address_size 64
-.visible .entry probe(.param .u64 given, .param .u64 unread, .param .u64 written) {
+.visible .entry play(.param .u64 given, .param .u64 unread, .param .u64 written) {
   .reg .b64 %p<3>;
   .reg .b32 %x<3>;
   ld.param.u64 %p1, [given];
@@ -40,6 +47,11 @@ _PROBE = """
   ret;
 }
 """
+#: What may assemble a kernel, what is preferred first.
+Assemblers = tuple[assembler.Assembler, ...]
+#: XLA's names of the handlers that it knows.
+_HANDLERS: set[str] = set()
+_LOCK = threading.Lock()
 
 
 def kernels_unavailable() -> str | None:
@@ -63,10 +75,27 @@ def kernels_unavailable() -> str | None:
 
 @functools.cache
 def _refused() -> str | None:
-    """Returns why XLA does not launch kernels, None if it does: in a loop, into its own results."""
+    """Returns why kernels are launched in neither way, None if they are."""
+    return None if _assemblers() else _fails(())
+
+
+@functools.cache
+def _assemblers() -> Assemblers:
+    """Returns what assembles kernels: one that works, and what to try next where it fails."""
+    capabilities = {getattr(x, "compute_capability", "") for x in jax.local_devices()}
+    if len(capabilities) > 1:  # machine code is for one of them
+        return ()
+    found = assembler.assemblers(compute_capability())
+    return next((found[k:] for k, x in enumerate(found) if _fails((x,)) is None), ())
+
+
+def _fails(assemblers: Assemblers) -> str | None:
+    """Returns why a kernel is not launched, None if it is: in a loop, into its own results."""
+    key = hashlib.sha256(f"probe {[x.name for x in assemblers]}".encode()).hexdigest()
+    probe = ptx.Kernel(key, _PROBE, threads=1, blocks=1, scratch=0, compiled=True)
 
     def add(_: Any, x: jax.Array) -> jax.Array:
-        return _call(_PROBE, "probe", (1, 1), [jnp.ones(1, jnp.int32)], [x])[0]
+        return _call_by(assemblers, probe, (1, 1), [jnp.ones(1, jnp.int32)], [x])[0]
 
     try:
         with jax.ensure_compile_time_eval():
@@ -76,6 +105,45 @@ def _refused() -> str | None:
             )
     except Exception as error:  # what XLA raises has no type of its own
         return f"XLA does not launch its kernels: {' '.join(str(error).split())[:200]}"
+
+
+def targets() -> list[str]:
+    """Returns XLA's names of the handlers of all kernels in memory."""
+    return [_target(key) for key in ptx.in_memory()]
+
+
+def restore(program: bytes) -> bool:
+    """Makes ready the kernels that a program launches, from disk; returns whether all are there.
+
+    Args:
+      program: as JAX exports it, or anything else that has the names of handlers in it.
+    """
+    folder = objects.folder()
+    for key in set(re.findall(rb"mjx_reinforce_gpu_([0-9a-f]{64})", program)):
+        kernel = ptx.kept(key.decode(), folder) if folder else None
+        if kernel is None or not _assemblers():
+            return False
+        _handler(kernel, _assemblers())
+    return True
+
+
+def _target(key: str) -> str:
+    """Returns XLA's name of the handler of a kernel; kept programs find it again by it."""
+    return f"mjx_reinforce_gpu_{key}"
+
+
+def _handler(kernel: ptx.Kernel, assemblers: Assemblers) -> str:
+    """Returns XLA's name of the handler that launches a kernel, which is assembled meanwhile."""
+    name = _target(kernel.key)
+    with _LOCK:
+        if name not in _HANDLERS:
+            made = launcher.launcher(kernel.key)
+            address = jax.ffi.pycapsule(ctypes.c_void_p(made.handler))
+            jax.ffi.register_ffi_target(name, address, platform="CUDA")
+            given = (made.slot, kernel, assemblers, objects.folder())
+            threading.Thread(target=launcher.fill, args=given, daemon=True).start()
+            _HANDLERS.add(name)
+    return name
 
 
 def compute_capability() -> str:
@@ -141,7 +209,7 @@ def _launch(
     grid = _grid(seeds * episodes, kernel.threads, kernel.blocks)
     words = kernel.scratch * math.prod(grid)
     scratch = [shape((words,), jnp.int32)] if words else []
-    return _call(kernel.text, ENTRY, grid, given, zeros, scratch)[: len(zeros) - 1]
+    return _call(kernel, grid, given, zeros, scratch)[: len(zeros) - 1]
 
 
 def launch_map(
@@ -162,14 +230,13 @@ def launch_map(
         made = [jnp.zeros((examples, *x.shape[1:]), x.dtype) for x in results]
         words = kernel.scratch * math.prod(grid)
         scratch = [jax.ShapeDtypeStruct((words,), jnp.int32)] if words else []
-        return _call(kernel.text, ENTRY, grid, given, made, scratch)[: len(made)]
+        return _call(kernel, grid, given, made, scratch)[: len(made)]
 
     return in_one_launch(play)(*args)
 
 
 def _call(
-    text: str,
-    entry: str,
+    kernel: ptx.Kernel,
     grid: tuple[int, int],
     given: Sequence[jax.Array],
     written: Sequence[jax.Array],
@@ -180,24 +247,37 @@ def _call(
     They also write into ``scratch``, a buffer that begins with any values. Returns ``written`` as
     they leave it, and then that buffer.
     """
+    return _call_by(_assemblers(), kernel, grid, given, written, scratch)
+
+
+def _call_by(
+    assemblers: Assemblers,
+    kernel: ptx.Kernel,
+    grid: tuple[int, int],
+    given: Sequence[jax.Array],
+    written: Sequence[jax.Array],
+    scratch: Sequence[jax.ShapeDtypeStruct] = (),
+) -> Sequence[jax.Array]:
+    """Launches a kernel that is assembled so, or is PTX for XLA where nothing does."""
     results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
     aliases = {len(given) + k: k for k in range(len(results))}
     blocks, threads = map(np.int32, grid)
     one = np.int32(1)
-    return jax.ffi.ffi_call(PTX, [*results, *scratch], input_output_aliases=aliases)(
-        *given,
-        *written,
-        name=entry,
-        kernel_type="ptx",
-        kernel_data=text,
-        grid_x=blocks,
-        grid_y=one,
-        grid_z=one,
-        block_x=threads,
-        block_y=one,
-        block_z=one,
-        shared_mem_bytes=np.int32(0),
-    )
+    if assemblers:
+        target, attributes = _handler(kernel, assemblers), {"blocks": blocks, "threads": threads}
+    else:
+        target = PTX
+        attributes = {
+            "grid_x": blocks,
+            "block_x": threads,
+            "name": ENTRY,
+            "kernel_type": "ptx",  # XLA takes nothing else here
+            "kernel_data": kernel.text,
+            "shared_mem_bytes": np.int32(0),
+            **{f"{part}_{axis}": one for part in ("grid", "block") for axis in "yz"},
+        }
+    call = jax.ffi.ffi_call(target, [*results, *scratch], input_output_aliases=aliases)
+    return call(*given, *written, **attributes)
 
 
 def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
