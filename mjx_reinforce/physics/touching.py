@@ -26,6 +26,8 @@ Solution = tuple[jax.Array, jax.Array, jax.Array]
 Solver = Callable[..., Solution]
 #: Loops over more contacts are not written out, whatever the engine.
 _UNROLLABLE = 6
+#: Of so many contacts it is asked at once whether one of them touches.
+_AT_ONCE = 8
 
 
 def solve_touching(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
@@ -125,10 +127,25 @@ def _pack(contacts: Any, touching: jax.Array, room: int) -> tuple[Any, jax.Array
 
         return lax.cond(touches, put, lambda: state), None
 
+    def look_at_some(state: tuple, some: tuple) -> tuple[tuple, None]:
+        """Looks at each of a few contacts, if one of them touches."""
+
+        def look_at_each() -> tuple:
+            leaves, tree = jax.tree.flatten(some)
+            after = state
+            for one in zip(*leaves, strict=True):
+                after, _ = look(after, tree.unflatten(one))
+            return after
+
+        return lax.cond(jnp.any(some[1]), look_at_each, lambda: state), None
+
     apart = jax.tree.map(lambda x: jnp.broadcast_to(x[0], (room, *x.shape[1:])), contacts)
     apart = apart.replace(dist=jnp.full(room, jnp.inf, contacts.dist.dtype))
     start = apart, jnp.int32(0)
-    return lax.scan(look, start, (contacts, touching))[0]
+    whole, rows = touching.size // _AT_ONCE * _AT_ONCE, (contacts, touching)
+    some = jax.tree.map(lambda x: x[:whole].reshape(-1, _AT_ONCE, *x.shape[1:]), rows)
+    rest = jax.tree.map(lambda x: x[whole:], rows)
+    return lax.scan(look, lax.scan(look_at_some, start, some)[0], rest)[0]
 
 
 def _unpack(values: jax.Array, touching: jax.Array) -> jax.Array:
