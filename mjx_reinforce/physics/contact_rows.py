@@ -102,8 +102,10 @@ def _moves(model: mjx.Model) -> np.ndarray:
 
 def _pyramid(dim: int) -> np.ndarray:
     """Returns the edges [rows, dim] of a contact's pyramid: n + t_i, n - t_i; for one row, n."""
+    if dim == 1:
+        return np.eye(1)
     tangents = np.kron(np.eye(dim - 1), [[1.0], [-1.0]])
-    return np.hstack([np.ones((max(1, 2 * (dim - 1)), 1)), tangents]) if dim > 1 else np.eye(1)
+    return np.hstack([np.ones((len(tangents), 1)), tangents])
 
 
 def with_bases(division: Blocks, rows: jax.Array, touching: jax.Array) -> Jacobian:

@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -81,6 +81,8 @@ class LLVM(Backend[Value]):
         # Where a node is stored as soon as it is known: in a carry that changes in place.
         self._stored: dict[Node, Memory] = {}
         self._reads: Counter[Node] = Counter()
+        # Such places that loops in the body that is being written have left.
+        self._left: set[Value] = set()
 
     def compile(self, schedule: Schedule, outputs: list[list[Scalar]]) -> Any:
         """Writes a whole program; returns the value of each element of each output."""
@@ -116,6 +118,15 @@ class LLVM(Backend[Value]):
         if node in self._stored:
             self._text.store(made, self._stored[node].pointer, node.dtype)
         return made
+
+    def inside(
+        self, body: Schedule, values: dict[Node, Value], known: Mapping[Node, Value] | None = None
+    ) -> dict[Node, Value]:
+        """Runs a body; it may run again, and must find what is outside as it was."""
+        before, self._left = self._left, set()
+        inner = super().inside(body, values, known)
+        self._left = before
+        return inner
 
     def reserve(self, dtype: np.dtype, count: int) -> str:
         """Returns a pointer to room for an array that a loop reads or leaves."""
@@ -207,22 +218,22 @@ class LLVM(Backend[Value]):
     def _in_place(self, loop: LiveLoop, values: dict[Node, Value]) -> dict[Node, Value]:
         """Writes the starts of the carries that change in place; returns where each leaf lies.
 
-        Few carries stay in registers. What only this loop reads of such a loop before stays where
-        it is.
+        Few carries stay in registers. What only this loop reads of such a loop before it in the
+        same body stays where it is.
         """
         changed = accumulators(loop)
         if len(changed) < self.MANY:
             return {}
-        free = set(self._stored.values())
         places: dict[Node, Value] = {}
         for node, carry in changed.items():
             start = super().value(carry.init, values)
-            if start in free and self._reads[carry.init] == 1:
+            if start in self._left and self._reads[carry.init] == 1:
                 place = cast(Memory, start)
             else:
                 place = Memory(self._text.reserve(node.dtype, 1), node.dtype)
                 self._text.store(self.value(carry.init, values), place.pointer, place.dtype)
             places[carry.leaf] = self._stored[node] = place
+        self._left.update(places.values())
         return places
 
     def may_skip(self, active: str | None) -> tuple[str, str] | None:
