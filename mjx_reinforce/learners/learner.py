@@ -200,10 +200,11 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
     Returns:
       The next state, and metrics, each []: ``episodes`` (N), ``episode_return`` (mean over the N
       episodes; with ``_min`` and ``_max``), ``episode_length``, ``env_steps``
-      (played in this update), ``simulated_steps`` (with those in which an
-      episode was over already), ``nonfinite_episodes`` (those that broke, which count above with
-      what they earned until then), and ``skipped_update`` (1 where the proposed state was not
-      finite, as where all episodes broke, and the old one was kept). Then the
+      (played in this update), ``simulated_steps`` (with those in which an episode was over
+      already; of the native engine they depend on which thread is first),
+      ``nonfinite_episodes`` (those that broke, which count above with what they earned until
+      then), and ``skipped_update`` (1 where the proposed state was not finite, as where all
+      episodes broke, and the old one was kept). Then the
       diagnostics, NaN where an episode was not finite or the update was skipped:
       ``entropy``, ``kl``, ``policy_std`` (see ``diagnostics.policy_metrics``),
       ``gradient_norm``, ``gradient_snr`` (of ``full_batch``, ``natural_gradient`` and ``ars``
