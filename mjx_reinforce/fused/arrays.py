@@ -1,5 +1,6 @@
 """Arrays of scalars: numeric where every element is a constant, of dtype object otherwise."""
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -70,14 +71,19 @@ class Layout:
 
     def __init__(self, avals: Sequence[Any]):
         self._avals = list(avals)
+        self._sizes = [math.prod(aval.shape) for aval in self._avals]
 
     def pack(self, scalars: Sequence[Any]) -> list[np.ndarray]:
         """Makes the arrays of these scalars."""
         values, packed = iter(scalars), []
-        for aval in self._avals:
-            size = int(np.prod(aval.shape, dtype=int))
+        for aval, size in zip(self._avals, self._sizes, strict=True):
             packed.append(pack([next(values) for _ in range(size)], aval.shape, aval.dtype))
         return packed
+
+    def repeat(self, facts: Sequence[Any]) -> list[Any]:
+        """Lists what is known of each array once for each of its scalars."""
+        each = zip(facts, self._sizes, strict=True)
+        return [fact for fact, size in each for _ in range(size)]
 
     def unpack(self, packed: Sequence[np.ndarray]) -> list[Any]:
         """Lists the scalars of these arrays."""

@@ -101,17 +101,17 @@ def _inner_constants(jaxpr: core.Jaxpr) -> list[Any]:
     """Returns the constants of the programs that a program calls."""
     found = []
     for eqn in jaxpr.eqns:
-        for inner in _subprograms(eqn.params.values()):
+        for inner in subprograms(eqn.params.values()):
             found += [*inner.consts, *_inner_constants(inner.jaxpr)]
     return found
 
 
-def _subprograms(params: Iterable[Any]) -> list[Program]:
+def subprograms(params: Iterable[Any]) -> list[Program]:
     """Returns the programs among the parameters of an equation."""
     found = []
     for value in params:
         if isinstance(value, (tuple, list)):
-            found += _subprograms(value)
+            found += subprograms(value)
         elif isinstance(value, (core.Jaxpr, core.ClosedJaxpr)):
             found.append(program(value))
     return found

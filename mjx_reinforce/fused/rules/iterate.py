@@ -2,12 +2,24 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from mjx_reinforce.fused.graph import Graph
 from mjx_reinforce.fused.nodes import Loop, Node, Scalar, same
 
 #: (carry, elements of xs) -> (carry after one iteration, ys)
 Iteration = Callable[[list[Scalar], list[Scalar]], tuple[list[Scalar], list[Scalar]]]
+
+
+class Assumption(NamedTuple):
+    """What is assumed of each carry.
+
+    fixed: whether it keeps its initial value
+    varying: whether each lane has its own
+    """
+
+    fixed: list[bool]
+    varying: list[bool]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,13 +41,15 @@ def iterate(
     length: int | None = None,
     active: int | None = None,
     xs: Sequence[list[Scalar]] = (),
+    foreseen: Assumption | None = None,
 ) -> Loop:
     """Builds a loop.
 
     Every carry is first assumed to keep its initial value. The body is evaluated on that
     assumption, carries that break it are dropped from it, and so on until it holds: then it holds
     in every iteration. The same is done for 'all lanes agree'. Where this loop was built before, as
-    part of an outer loop's body, that begins with what was found then.
+    part of an outer loop's body, that begins with what was found then, and else with what was
+    foreseen.
 
     Args:
       graph: where the loop is made.
@@ -44,13 +58,12 @@ def iterate(
       length: the number of iterations, or None for no limit.
       active: the position in the carry of the bool that ends the loop when no lane has it.
       xs: for each element, its value in each iteration.
+      foreseen: what is assumed first; what holds and is not assumed costs operations.
     """
     plan = _Plan(step, list(inits), length, active, list(xs))
     place = (graph.path, active)
-    fixed, varying = graph.learned.get(place) or (
-        [True] * len(plan.inits),
-        [False] * len(plan.inits),
-    )
+    most = Assumption([True] * len(plan.inits), [False] * len(plan.inits))
+    fixed, varying = graph.learned.get(place) or foreseen or most
     varying = [v or varies(init) for v, init in zip(varying, plan.inits, strict=True)]
     while True:
         loop = _trace_body(graph, plan, fixed, varying)
@@ -59,7 +72,7 @@ def iterate(
         fixed = [f and not m for f, m in zip(fixed, moved, strict=True)]
         varying = [v or s for v, s in zip(varying, spread, strict=True)]
         if not any(moved) and not any(s and not f for s, f in zip(spread, fixed, strict=True)):
-            graph.learned[place] = fixed, varying
+            graph.learned[place] = Assumption(fixed, varying)
             return _close(graph, loop, varying)
 
 

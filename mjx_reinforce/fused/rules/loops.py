@@ -1,14 +1,14 @@
 """Rules for ``while`` and ``scan``: loops that end when no lane needs another iteration."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays, jaxprs
+from mjx_reinforce.fused import arrays, carries, jaxprs
 from mjx_reinforce.fused.graph import Graph
 from mjx_reinforce.fused.nodes import Gate, Loop, Node, Scalar, is_constant, same
-from mjx_reinforce.fused.rules.iterate import Iteration, iterate, varies
+from mjx_reinforce.fused.rules.iterate import Assumption, Iteration, iterate, varies
 
 
 def while_rule(
@@ -35,7 +35,21 @@ def while_rule(
     active = goes_on(start)
     if is_constant(active) and not active:
         return carry.pack(start)
-    loop = iterate(graph, step, [active, *start], active=0)
+    foreseen = None
+    if carries.has_loops(body) or carries.has_loops(cond):
+        kept = carries.keeps(body, num_body, len(eqn.outvars))
+        outside, inside = _varying(cond_consts), _varying(body_consts)
+
+        def after(varying: list[bool]) -> list[bool]:
+            new = jaxprs.depends(body, [*inside, *varying[1:]])
+            new = [n or (varying[0] and not k) for n, k in zip(new, kept, strict=True)]
+            return [*jaxprs.depends(cond, [*outside, *new]), *new]
+
+        of_goes_on, *of_carry = carries.spread(
+            after, [varies(active), *_varying(operands[num_cond + num_body :])]
+        )
+        foreseen = Assumption([False, *carry.repeat(kept)], [of_goes_on, *carry.repeat(of_carry)])
+    loop = iterate(graph, step, [active, *start], active=0, foreseen=foreseen)
     return carry.pack(loop.results()[0][1:])
 
 
@@ -61,13 +75,28 @@ def scan_rule(
     if length <= max(_limit(graph, has_arrays), eqn.params["unroll"]):
         final, table = _unroll(step, carry.unpack(init), rows)
     else:
-        final, table = _as_loop(graph, step, carry.unpack(init), rows, length)
+        foreseen = None
+        if carries.has_loops(body):
+            kept = carries.keeps(body, parts.num_consts, parts.num_carry)
+            before, beside = _varying(consts), _varying(operands[split:])
+
+            def after(varying: list[bool]) -> list[bool]:
+                return jaxprs.depends(body, [*before, *varying, *beside])[: parts.num_carry]
+
+            varying = carries.spread(after, _varying(init))
+            foreseen = Assumption(carry.repeat(kept), carry.repeat(varying))
+        final, table = _as_loop(graph, step, carry.unpack(init), rows, length, foreseen)
     table = [table[k] for k in np.argsort(order)] if length else []
     stacked = [outs.pack(row) for row in table]
     ys = [np.stack(arrays.together(column)) for column in zip(*stacked, strict=True)]
     if not table:
         ys = [arrays.zeros(out.aval) for out in eqn.outvars[parts.num_carry :]]
     return [*carry.pack(final), *ys]
+
+
+def _varying(operands: Sequence[np.ndarray]) -> list[bool]:
+    """Returns which arrays have elements that differ from lane to lane."""
+    return [any(map(varies, operand.flat)) for operand in operands]
 
 
 def _limit(graph: Graph, has_arrays: bool) -> int:
@@ -87,14 +116,19 @@ def _unroll(step: Iteration, state: list[Scalar], rows: list[list[Scalar]]) -> t
 
 
 def _as_loop(
-    graph: Graph, step: Iteration, inits: list, rows: list[list[Scalar]], length: int
+    graph: Graph,
+    step: Iteration,
+    inits: list,
+    rows: list[list[Scalar]],
+    length: int,
+    foreseen: Assumption | None,
 ) -> tuple[list, list]:
     """Builds a scan's loop; returns the final carry and the ys of each iteration."""
     xs = [list(column) for column in zip(*rows, strict=True)]
-    loop = iterate(graph, step, inits, length=length, xs=xs)
+    loop = iterate(graph, step, inits, length=length, xs=xs, foreseen=foreseen)
     switch = None if xs or loop.ys else _switch(loop)
     if switch is not None:
-        loop = iterate(graph, step, inits, length=length, active=switch)
+        loop = iterate(graph, step, inits, length=length, active=switch, foreseen=foreseen)
     final, columns = loop.results()
     return final, [list(row) for row in zip(*columns, strict=True)] or [[]] * length
 
