@@ -5,6 +5,7 @@ The choice is a primitive of our own, ``by_engine``, which carries both programs
 two.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -74,11 +75,53 @@ def _many(*operands: PyTree, many: Any, **_: Any) -> list[Any]:
 def _batched(operands: Sequence[Any], axes: Sequence[int | None], **params: Any) -> tuple:
     """Maps both programs; a result that depends on nothing mapped stays as it is."""
     mapped = [axis is not None for axis in axes]
-    programs = [params["one"], params["many"]]
-    spread = np.any([jaxprs.depends(program, mapped) for program in programs], axis=0)
+    one, many = params["one"], params["many"]
+    spread = np.any([_unmapped(one, mapped), jaxprs.depends(many, mapped)], axis=0)
     out_axes = [0 if wide else None for wide in spread]
-    one, many = (jax.vmap(core.jaxpr_as_fun(x), tuple(axes), out_axes) for x in programs)
-    return by_engine(one, many, *operands, may_unroll=params["may_unroll"]), out_axes
+    results = _CHOICE.bind(
+        *operands,
+        one=_Mapped(one, tuple(axes), out_axes, list(map(jax.typeof, operands))),
+        many=jax.make_jaxpr(jax.vmap(core.jaxpr_as_fun(many), tuple(axes), out_axes))(*operands),
+        may_unroll=params["may_unroll"],
+    )
+    return results, out_axes
+
+
+class _Mapped:
+    """A program mapped over one axis more; traced when it is first read, which XLA never does.
+
+    It is read as a closed jaxpr is.
+    """
+
+    def __init__(self, program: Any, axes: tuple, out_axes: list, shapes: list[Any]):
+        self.program, self._axes, self._out_axes, self._shapes = program, axes, out_axes, shapes
+
+    @functools.cached_property
+    def _traced(self) -> Any:
+        """The closed jaxpr."""
+        program = self.program._traced if isinstance(self.program, _Mapped) else self.program
+        mapped = jax.vmap(core.jaxpr_as_fun(program), self._axes, self._out_axes)
+        return jax.make_jaxpr(mapped)(*self._shapes)
+
+    @property
+    def jaxpr(self) -> Any:
+        """Its equations."""
+        return self._traced.jaxpr
+
+    @property
+    def consts(self) -> list[Any]:
+        """The values of its constant variables."""
+        return self._traced.consts
+
+    def __repr__(self) -> str:
+        return repr(self._traced)
+
+
+def _unmapped(program: Any, given: Sequence[bool]) -> list[bool]:
+    """Returns ``jaxprs.depends``, which mapping does not change, without reading what is mapped."""
+    while isinstance(program, _Mapped):
+        program = program.program
+    return jaxprs.depends(program, given)
 
 
 def _derivative(primals: Sequence[Any], tangents: Sequence[Any], *, many: Any, **_: Any) -> Any:

@@ -184,22 +184,26 @@ class Graph:
 
     def apply(self, op: ops.Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar:
         """Applies an operation: a constant, an existing node, a simpler one or a new one."""
-        if not any(isinstance(arg, Node) for arg in args):
+        nodes = [arg for arg in args if isinstance(arg, Node)]
+        if not nodes:
             return folding.fold(op, args, dtype)
         self._applied += 1
         if self._applied > _MOST:
             raise TooLarge(f"written out it is more than {_MOST:,} scalar operations")
         simpler = simplify.simplify(self, op, args, dtype)
-        return self._share(op, args, dtype) if simpler is None else simpler
+        return self._share(op, args, nodes, dtype) if simpler is None else simpler
 
-    def _share(self, op: ops.Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Node:
-        keys = tuple(map(identity, args))
-        key = (op, tuple(sorted(keys)) if ops.FACTS[op.name].commutes else keys)
-        nodes = [arg for arg in args if isinstance(arg, Node)]
-        depth = max(self.scope.floor, *(node.scope.depth for node in nodes))
-        for scope in self._scopes[depth::-1]:
-            if key in scope.known:
-                return scope.known[key]
+    def _share(
+        self, op: ops.Op, args: tuple[Scalar, ...], nodes: list[Node], dtype: np.dtype
+    ) -> Node:
+        keys = [arg if isinstance(arg, Node) else identity(arg) for arg in args]
+        key = (op, frozenset(keys) if ops.FACTS[op.name].commutes else tuple(keys))
+        least = max([node.scope.depth for node in nodes])  # no node of these is further outside
+        depth = max(self.scope.floor, least)
+        for k in range(depth, least - 1, -1):
+            known = self._scopes[k].known.get(key)
+            if known is not None:
+                return known
         scope = self._scopes[depth]
         varying = any(node.varying for node in nodes)
         node = Node(dtype, varying, scope, self.number(), op=op, args=args)

@@ -112,7 +112,7 @@ def subprograms(params: Iterable[Any]) -> list[Program]:
     for value in params:
         if isinstance(value, (tuple, list)):
             found += subprograms(value)
-        elif isinstance(value, (core.Jaxpr, core.ClosedJaxpr)):
+        elif isinstance(value, core.Jaxpr) or hasattr(type(value), "jaxpr"):  # open, or closed
             found.append(program(value))
     return found
 

@@ -1,5 +1,7 @@
 """The choice by engine: XLA computes one program, and the other is what is written out."""
 
+import importlib
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,6 +56,28 @@ def test_one_is_written_out_where_the_function_maps_it_itself():
     x = jnp.ones((2, 3))
     np.testing.assert_array_equal(fused.vmap(jax.vmap(choice))(x), x + 1)
     np.testing.assert_array_equal(jax.vmap(jax.vmap(choice))(x), 2 * x)
+
+
+def test_xla_does_not_read_what_is_written_out(monkeypatch):
+    """To map it takes as long as to map what XLA compiles."""
+    read = property(lambda _: pytest.fail("the program was read"))
+    module = importlib.import_module("mjx_reinforce.fused.by_engine")  # hidden by the function
+    monkeypatch.setattr(module._Mapped, "_traced", read)
+    twice = jax.jit(jax.vmap(jax.vmap(choice)))
+    np.testing.assert_array_equal(twice(jnp.ones((2, 3))), 2 * jnp.ones((2, 3)))
+    with pytest.raises(pytest.fail.Exception, match="was read"):
+        fused.vmap(jax.vmap(choice))(jnp.ones((2, 3)))
+
+
+def test_a_mapped_program_is_part_of_the_fingerprint():
+    """Its constants too, and those of programs in it."""
+
+    def mapped(offset):
+        offset = np.full(3, offset, np.float32)
+        return jax.vmap(lambda x: fused.by_engine(lambda y: y + offset, lambda y: y, x))
+
+    prints = [jaxprs.fingerprint(jaxprs.trace(mapped(k), jnp.ones((2, 3)))[0]) for k in (1, 1, 2)]
+    assert prints[0] == prints[1] != prints[2]
 
 
 def test_derivatives_are_those_of_many():

@@ -1,5 +1,6 @@
 """LLVM IR as text: what every part of the LLVM backend writes into."""
 
+import functools
 import struct
 from collections.abc import Callable, Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager
@@ -33,10 +34,14 @@ def scalar_type(dtype: DTypeLike) -> str:
     Raises:
       TypeError: the dtype has none here.
     """
-    name = np.dtype(dtype).name
-    if name not in _SCALARS:
-        raise TypeError(f"machine code is not written for values of {name}")
-    return _SCALARS[name]
+    return _scalar_type(np.dtype(dtype))
+
+
+@functools.cache
+def _scalar_type(dtype: np.dtype) -> str:
+    if dtype.name not in _SCALARS:
+        raise TypeError(f"machine code is not written for values of {dtype.name}")
+    return _SCALARS[dtype.name]
 
 
 def literal(number: Any) -> str:

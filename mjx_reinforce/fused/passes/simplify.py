@@ -60,7 +60,7 @@ def power(graph: Builder, base: Scalar, exponent: int) -> Scalar:
 
 
 def _is(value: Scalar, number: float) -> bool:
-    return is_constant(value) and bool(value == number)
+    return isinstance(value, np.generic) and bool(value == number)
 
 
 def _args(value: Scalar, name: str) -> tuple[Scalar, ...] | None:
@@ -247,12 +247,12 @@ def _through_select(
     graph: Builder, op: Op, args: tuple[Scalar, ...], dtype: np.dtype
 ) -> Scalar | None:
     """Folds an operation whose operands are constants and selections among constants."""
-    nodes = [arg for arg in args if not is_constant(arg)]
+    nodes = [arg for arg in args if isinstance(arg, Node)]
     if op.name == "convert_element_type" and nodes[0].dtype == np.bool_ and dtype != np.bool_:
         return graph.select(nodes[0], dtype.type(1), dtype.type(0))
-    choices: list[tuple] = [_args(node, "select_n") or () for node in nodes]
-    for choice in choices:
-        if len(choice) != 3 or choice[0] is not choices[0][0]:
+    for node in nodes:
+        choice = _args(node, "select_n")
+        if choice is None or len(choice) != 3 or choice[0] is not nodes[0].args[0]:
             return None
         if not (is_constant(choice[1]) and is_constant(choice[2])):
             return None
@@ -260,7 +260,7 @@ def _through_select(
     for case in (1, 2):
         chosen = [arg if is_constant(arg) else arg.args[case] for arg in args]
         cases.append(folding.fold(op, chosen, dtype))
-    return graph.select(choices[0][0], cases[1], cases[0])
+    return graph.select(nodes[0].args[0], cases[1], cases[0])
 
 
 _RULES: dict[str, Callable[..., Scalar | None]] = {
