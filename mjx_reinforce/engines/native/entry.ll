@@ -55,3 +55,19 @@ buffer:
 done:
   ret void
 }
+
+; XLA's error, an internal one (13), of a text.
+define internal ptr @error(ptr %api, ptr %text) {
+  %creating = alloca [4 x i64]
+  store i64 28, ptr %creating
+  %creating.extension = getelementptr i64, ptr %creating, i64 1
+  store ptr null, ptr %creating.extension
+  %creating.text = getelementptr i64, ptr %creating, i64 2
+  store ptr %text, ptr %creating.text
+  %creating.code = getelementptr i64, ptr %creating, i64 3
+  store i32 13, ptr %creating.code
+  %create.at = getelementptr i8, ptr %api, i64 $XLA_FFI_Api_XLA_FFI_Error_Create
+  %create = load ptr, ptr %create.at
+  %error = call ptr %create(ptr %creating)
+  ret ptr %error
+}

@@ -5,16 +5,21 @@ instructions: such code runs 1.2 to 2 times as fast as that of LLVM's default fo
 lays each object out in one piece, which that model asks for.
 """
 
+import atexit
 import functools
 import hashlib
 import itertools
 import os
+import subprocess
+import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from mjx_reinforce.engines.native import look, objects
+from mjx_reinforce.engines.native.cpu import emit
 from mjx_reinforce.registry import check_name
 
 #: Asks for code that older CPUs run too; one of ``LEVELS``.
@@ -30,10 +35,14 @@ LEVELS = {
 }
 #: LLVM holds vectors of 512 bits back where they lower the clock; the lanes are worth more.
 _WIDE = "-prefer-256-bit"
-#: Characters of a text that LLVM compiles with less effort.
+#: Characters of a text that LLVM compiles with less effort, and in a process of its own.
 _LONG_TEXT = 2_000_000
 _LOADED: dict[str, "Code"] = {}
 _LOCK = threading.Lock()
+#: Those that compile now.
+_PROCESSES: list[subprocess.Popen[bytes]] = []
+#: Held while one starts.
+_STARTING = threading.Lock()
 #: Makes the names of libraries different.
 _NUMBERS = itertools.count()
 
@@ -57,13 +66,18 @@ class Code(NamedTuple):
     """Functions in memory. They stay until the process ends: other threads may still run them.
 
     key: a name for all that the code depends on
-    addresses: function -> where it is
+    made: function -> where it is, once they are in memory
     compiled: whether it was compiled now, and not read from disk
     """
 
     key: str
-    addresses: dict[str, int]
+    made: Future[dict[str, int]]
     compiled: bool
+
+    @property
+    def addresses(self) -> dict[str, int]:
+        """Returns where the functions are; waits until they are in memory."""
+        return self.made.result()
 
 
 def this_machine(level: str | None = None) -> Machine:
@@ -118,6 +132,8 @@ def load_module(
 ) -> Code:
     """Returns the functions of a module, compiled unless memory or disk has them.
 
+    A long text is compiled in a process of its own; its functions are in memory later.
+
     Args:
       source: all that the module's text depends on, or a hash of it.
       write: returns the text, LLVM IR without a target. It may call functions of the C library.
@@ -132,11 +148,51 @@ def load_module(
     with _LOCK:
         if key not in _LOADED:
             found = objects.read_object(folder, key) if folder and not look.level() else None
-            data = found or _build(key, write, machine, folder)
-            _LOADED[key] = Code(key, _link(key, names, data), compiled=not found)
-            if folder and not found:
-                objects.write_object(folder, key, data)
+            if found:
+                made = _done(_link(key, names, found))
+            else:
+                made = _make(key, write, names, machine, folder)
+            _LOADED[key] = Code(key, made, compiled=not found)
         return _LOADED[key]
+
+
+def _make(
+    key: str,
+    write: Callable[[], str],
+    names: tuple[str, ...],
+    machine: Machine,
+    folder: Path | None,
+) -> Future[dict[str, int]]:
+    """Returns where the functions of a module will be, of what ``write`` returns."""
+
+    def finish(data: bytes) -> dict[str, int]:
+        addresses = _link(key, names, data)
+        if folder:
+            objects.write_object(folder, key, data)
+        return addresses
+
+    if look.level():
+        return _done(finish(_build(key, write, machine, folder)))
+    text = write()
+    if len(text) <= _LONG_TEXT or not sys.executable:
+        return _done(finish(_compile(text, machine)))
+    emit.parse(text, _target(machine))  # what is no LLVM IR is known at once
+    made: Future[dict[str, int]] = Future()
+
+    def work() -> None:
+        try:
+            made.set_result(finish(_compile_elsewhere(text, machine)))
+        except BaseException as error:  # whatever it is, who waits gets it
+            made.set_exception(error)
+
+    threading.Thread(target=work, daemon=True).start()
+    return made
+
+
+def _done(addresses: dict[str, int]) -> Future[dict[str, int]]:
+    made: Future[dict[str, int]] = Future()
+    made.set_result(addresses)
+    return made
 
 
 def in_memory() -> list[str]:
@@ -151,7 +207,7 @@ def loaded(key: str, names: tuple[str, ...], folder: Path) -> Code | None:
             data = objects.read_object(folder, key)
             if data is None:
                 return None
-            _LOADED[key] = Code(key, _link(key, names, data), compiled=False)
+            _LOADED[key] = Code(key, _done(_link(key, names, data)), compiled=False)
         return _LOADED[key]
 
 
@@ -171,13 +227,43 @@ def _build(key: str, write: Callable[[], str], machine: Machine, folder: Path | 
 
     def texts(text: str, _: bytes) -> dict[str, str]:
         target = _target(machine, _effort(text))
-        return {"ll": text, "s": target.emit_assembly(_parse(text, target, machine))}
+        return {"ll": text, "s": target.emit_assembly(emit.parse(text, target))}
 
     def compile(text: str) -> bytes:
-        target = _target(machine, _effort(text))
-        return target.emit_object(_parse(text, target, machine))
+        return _compile(text, machine)
 
     return look.build(key, folder, write, compile, look.code_facts, texts)
+
+
+def _compile(text: str, machine: Machine) -> bytes:
+    """Returns object code of a text."""
+    target = _target(machine, _effort(text))
+    return target.emit_object(emit.parse(text, target))
+
+
+def _compile_elsewhere(text: str, machine: Machine) -> bytes:
+    """Returns object code of a text, compiled in a process of its own while others use LLVM."""
+    arguments = machine.triple, machine.cpu, machine.features, str(_effort(text))
+    command, pipe = [sys.executable, "-P", emit.__file__, *arguments], subprocess.PIPE
+    with _STARTING:
+        # In a session of its own: Ctrl-C asks a run to stop, which still needs its code for that.
+        process = subprocess.Popen(
+            command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, start_new_session=True
+        )
+        _PROCESSES.append(process)
+    data, _ = process.communicate(text.encode())
+    _PROCESSES.remove(process)
+    if process.returncode < 0:
+        raise RuntimeError(f"LLVM was stopped by signal {-process.returncode}")
+    return _compile(text, machine) if process.returncode else data
+
+
+@atexit.register
+def _end_processes() -> None:
+    """Ends LLVM's processes when this one ends; no other starts any more."""
+    _STARTING.acquire()
+    for process in _PROCESSES:
+        process.kill()
 
 
 def _effort(text: str) -> int:
@@ -189,23 +275,9 @@ def _effort(text: str) -> int:
     return 1 if len(text) > _LONG_TEXT else 2
 
 
-def _parse(text: str, target: Any, machine: Machine) -> Any:
-    """Returns LLVM's module of a text."""
-    import llvmlite.binding as llvm
-
-    header = f'target datalayout = "{target.target_data}"\ntarget triple = "{machine.triple}"\n'
-    return llvm.parse_assembly(header + text)
-
-
 def _target(machine: Machine, effort: int = 2) -> Any:
     """Returns LLVM's compiler for a machine."""
-    import llvmlite.binding as llvm
-
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    return llvm.Target.from_triple(machine.triple).create_target_machine(
-        machine.cpu, machine.features, opt=effort, reloc="pic", codemodel="small", jit=True
-    )
+    return emit.compiler(machine.triple, machine.cpu, machine.features, effort)
 
 
 def _link(key: str, names: tuple[str, ...], data: bytes) -> dict[str, int]:

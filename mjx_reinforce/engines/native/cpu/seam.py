@@ -10,7 +10,8 @@ import functools
 import os
 import re
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ from mjx_reinforce.engines.native import objects
 from mjx_reinforce.engines.native.cpu import handler, machine
 from mjx_reinforce.engines.native.cpu.machine import Code
 
+_WAITING = Path(__file__).with_name("waiting.ll")
 #: key of the code -> how JAX calls it
 _WAYS: dict[str, str] = {}
 
@@ -78,12 +80,29 @@ def _target(key: str) -> str:
 def _register(code: Code) -> bool:
     """Tells XLA where the handler is; returns whether it took it."""
     jax.devices()  # a handler refused before XLA has started would keep it from starting
-    address = ctypes.c_void_p(code.addresses["handler"])
+    address = ctypes.c_void_p(code.addresses["handler"] if code.made.done() else _waiting(code))
     try:
         jax.ffi.register_ffi_target(_target(code.key), jax.ffi.pycapsule(address), platform="cpu")
     except (AttributeError, RuntimeError):  # jax.ffi has changed; XLA speaks another version
         return False
     return True
+
+
+def _waiting(code: Code) -> int:
+    """Returns a handler that waits for that of code which is still compiled, and calls it.
+
+    XLA compiles the program around it meanwhile.
+    """
+    text = f"; waits for {code.key}\n{handler.with_entry(_WAITING, {})}"
+    names, target = ("handler", "slot", "failed"), machine.this_machine()
+    found = machine.load_module(text, lambda: text, names, target, None).addresses
+
+    def fill(made: Future[dict[str, int]]) -> None:
+        ready = found["failed"] if made.exception() else made.result()["handler"]
+        ctypes.c_void_p.from_address(found["slot"]).value = ready
+
+    code.made.add_done_callback(fill)
+    return found["handler"]
 
 
 def _play(

@@ -72,7 +72,9 @@ call:
 done:
   ret ptr null
 failed:
-  %error = call ptr @error(ptr %api, i32 %status)
+  %text = alloca [64 x i8]
+  %printed = call i32 (ptr, i64, ptr, ...) @snprintf(ptr %text, i64 64, ptr @words, i32 %status)
+  %error = call ptr @error(ptr %api, ptr %text)
   ret ptr %error
 }
 
@@ -84,22 +86,4 @@ define internal i32 @attribute(ptr %attributes, i64 %number) {
   %value.to = load ptr, ptr %value.at
   %value = load i32, ptr %value.to
   ret i32 %value
-}
-
-; XLA's error, an internal one (13), of what the driver returned.
-define internal ptr @error(ptr %api, i32 %status) {
-  %text = alloca [64 x i8]
-  %printed = call i32 (ptr, i64, ptr, ...) @snprintf(ptr %text, i64 64, ptr @words, i32 %status)
-  %creating = alloca [4 x i64]
-  store i64 28, ptr %creating
-  %creating.extension = getelementptr i64, ptr %creating, i64 1
-  store ptr null, ptr %creating.extension
-  %creating.text = getelementptr i64, ptr %creating, i64 2
-  store ptr %text, ptr %creating.text
-  %creating.code = getelementptr i64, ptr %creating, i64 3
-  store i32 13, ptr %creating.code
-  %create.at = getelementptr i8, ptr %api, i64 $XLA_FFI_Api_XLA_FFI_Error_Create
-  %create = load ptr, ptr %create.at
-  %error = call ptr %create(ptr %creating)
-  ret ptr %error
 }
