@@ -119,16 +119,32 @@ def test_a_process_that_is_killed_is_an_error(monkeypatch, tmp_path):
         _ = items.load().addresses
 
 
-@pytest.mark.parametrize("end", ["", "sys.exit(7)", "os.kill(os.getpid(), signal.SIGINT)"])
-def test_who_ends_does_not_wait(end, tmp_path):
+#: XLA goes on in a thread of its own, and JAX waits for it when Python ends.
+WAITING = """
+import jax
+import jax.numpy as jnp
+machine._LONG_TEXT = 10**9
+play = jax.jit(lambda x, active: items.play(code, active + jnp.int32(0 * (x @ x @ x)[0, 0])))
+play(jnp.ones((2000, 2000)), jnp.array([1, 0, 1]))
+"""
+
+
+@pytest.mark.parametrize(
+    ("end", "status"),
+    [("", 0), ("sys.exit(7)", 7), ("os.kill(os.getpid(), signal.SIGINT)", -2), (WAITING, 0)],
+    ids=["end", "exit", "interrupt", "waiting program"],
+)
+def test_who_ends_does_not_wait(end, status, tmp_path):
     """And leaves no process behind."""
     script = f"""
 import os, signal, sys
 import native_items as items
 from mjx_reinforce.engines.native.cpu import machine
+text = "; played by no other test\\n" + items.text()
+items.text = lambda lanes: text
 machine._LONG_TEXT = 0
 machine.sys.executable = {program(tmp_path, f"echo $$ > {tmp_path}/number; exec sleep 60")!r}
-items.load()
+code = items.load()
 while not os.path.exists({str(tmp_path / "number")!r}): pass
 {end}
 """
@@ -140,7 +156,7 @@ while not os.path.exists({str(tmp_path / "number")!r}): pass
         timeout=60,
         check=False,
     )
-    assert done.returncode == {"": 0, "sys.exit(7)": 7}.get(end, -2), done.stderr
+    assert done.returncode == status, done.stderr
     assert time.monotonic() - began < 50
     number = int((tmp_path / "number").read_text())
     deadline = time.monotonic() + 10

@@ -39,10 +39,11 @@ _WIDE = "-prefer-256-bit"
 _LONG_TEXT = 2_000_000
 _LOADED: dict[str, "Code"] = {}
 _LOCK = threading.Lock()
-#: Those that compile now.
+#: Those that compile now, and the threads that wait for them.
 _PROCESSES: list[subprocess.Popen[bytes]] = []
-#: Held while one starts.
-_STARTING = threading.Lock()
+_THREADS: list[threading.Thread] = []
+#: Held while a process starts; none does once this one ends.
+_STARTING, _ENDS = threading.Lock(), threading.Event()
 #: Makes the names of libraries different.
 _NUMBERS = itertools.count()
 
@@ -185,7 +186,9 @@ def _make(
         except BaseException as error:  # whatever it is, who waits gets it
             made.set_exception(error)
 
-    threading.Thread(target=work, daemon=True).start()
+    thread = threading.Thread(target=work, daemon=True)
+    _THREADS.append(thread)
+    thread.start()
     return made
 
 
@@ -246,6 +249,8 @@ def _compile_elsewhere(text: str, machine: Machine) -> bytes:
     arguments = machine.triple, machine.cpu, machine.features, str(_effort(text))
     command, pipe = [sys.executable, "-P", emit.__file__, *arguments], subprocess.PIPE
     with _STARTING:
+        if _ENDS.is_set():
+            raise RuntimeError("this process ends")
         # In a session of its own: Ctrl-C asks a run to stop, which still needs its code for that.
         process = subprocess.Popen(
             command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, start_new_session=True
@@ -259,11 +264,14 @@ def _compile_elsewhere(text: str, machine: Machine) -> bytes:
 
 
 @atexit.register
-def _end_processes() -> None:
+def end_processes() -> None:
     """Ends LLVM's processes when this one ends; no other starts any more."""
-    _STARTING.acquire()
-    for process in _PROCESSES:
-        process.kill()
+    with _STARTING:
+        _ENDS.set()
+        for process in _PROCESSES:
+            process.kill()
+    for thread in _THREADS:
+        thread.join()
 
 
 def _effort(text: str) -> int:

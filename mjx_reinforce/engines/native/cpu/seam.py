@@ -5,6 +5,7 @@ Where it does not take the handler, ``jax.pure_callback`` runs the same code: ab
 instead of 0.4 µs, and XLA's programs are not cached then.
 """
 
+import atexit
 import ctypes
 import functools
 import os
@@ -102,6 +103,7 @@ def _waiting(code: Code) -> int:
         ctypes.c_void_p.from_address(found["slot"]).value = ready
 
     code.made.add_done_callback(fill)
+    atexit.register(machine.end_processes)  # before JAX ends, which waits for running programs
     return found["handler"]
 
 
