@@ -143,6 +143,7 @@ from mjx_reinforce.engines.native.cpu import machine
 text = "; played by no other test\\n" + items.text()
 items.text = lambda lanes: text
 machine._LONG_TEXT = 0
+signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it is ignored
 machine.sys.executable = {program(tmp_path, f"echo $$ > {tmp_path}/number; exec sleep 60")!r}
 code = items.load()
 while not os.path.exists({str(tmp_path / "number")!r}): pass
