@@ -5,12 +5,10 @@ instructions: such code runs 1.2 to 2 times as fast as that of LLVM's default fo
 lays each object out in one piece, which that model asks for.
 """
 
-import atexit
 import functools
 import hashlib
 import itertools
 import os
-import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -39,11 +37,6 @@ _WIDE = "-prefer-256-bit"
 _LONG_TEXT = 2_000_000
 _LOADED: dict[str, "Code"] = {}
 _LOCK = threading.Lock()
-#: Those that compile now, and the threads that wait for them.
-_PROCESSES: list[subprocess.Popen[bytes]] = []
-_THREADS: list[threading.Thread] = []
-#: Held while a process starts; none does once this one ends.
-_STARTING, _ENDS = threading.Lock(), threading.Event()
 #: Makes the names of libraries different.
 _NUMBERS = itertools.count()
 
@@ -143,7 +136,8 @@ def load_module(
       folder: where compiled objects are kept; None keeps none.
 
     Raises:
-      RuntimeError: the text is no LLVM IR, or it calls a function that is nowhere.
+      RuntimeError: the text is no LLVM IR, or it calls a function that is nowhere; a long text's
+        ``addresses`` raise the latter.
     """
     key = _key(source, names, machine)
     with _LOCK:
@@ -178,18 +172,7 @@ def _make(
     if len(text) <= _LONG_TEXT or not sys.executable:
         return _done(finish(_compile(text, machine)))
     emit.parse(text, _target(machine))  # what is no LLVM IR is known at once
-    made: Future[dict[str, int]] = Future()
-
-    def work() -> None:
-        try:
-            made.set_result(finish(_compile_elsewhere(text, machine)))
-        except BaseException as error:  # whatever it is, who waits gets it
-            made.set_exception(error)
-
-    thread = threading.Thread(target=work, daemon=True)
-    _THREADS.append(thread)
-    thread.start()
-    return made
+    return emit.later(lambda: finish(_compile_elsewhere(text, machine)))
 
 
 def _done(addresses: dict[str, int]) -> Future[dict[str, int]]:
@@ -245,33 +228,9 @@ def _compile(text: str, machine: Machine) -> bytes:
 
 
 def _compile_elsewhere(text: str, machine: Machine) -> bytes:
-    """Returns object code of a text, compiled in a process of its own while others use LLVM."""
-    arguments = machine.triple, machine.cpu, machine.features, str(_effort(text))
-    command, pipe = [sys.executable, "-P", emit.__file__, *arguments], subprocess.PIPE
-    with _STARTING:
-        if _ENDS.is_set():
-            raise RuntimeError("this process ends")
-        # In a session of its own: Ctrl-C asks a run to stop, which still needs its code for that.
-        process = subprocess.Popen(
-            command, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, start_new_session=True
-        )
-        _PROCESSES.append(process)
-    data, _ = process.communicate(text.encode())
-    _PROCESSES.remove(process)
-    if process.returncode < 0:
-        raise RuntimeError(f"LLVM was stopped by signal {-process.returncode}")
-    return _compile(text, machine) if process.returncode else data
-
-
-@atexit.register
-def end_processes() -> None:
-    """Ends LLVM's processes when this one ends; no other starts any more."""
-    with _STARTING:
-        _ENDS.set()
-        for process in _PROCESSES:
-            process.kill()
-    for thread in _THREADS:
-        thread.join()
+    """Returns object code of a text; this process compiles where no other can."""
+    of_machine = machine.triple, machine.cpu, machine.features
+    return emit.elsewhere(text, *of_machine, _effort(text)) or _compile(text, machine)
 
 
 def _effort(text: str) -> int:

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from mjx_reinforce.engines.native import objects
-from mjx_reinforce.engines.native.cpu import handler, machine
+from mjx_reinforce.engines.native.cpu import emit, handler, machine
 from mjx_reinforce.engines.native.cpu.machine import Code
 
 _WAITING = Path(__file__).with_name("waiting.ll")
@@ -103,7 +103,7 @@ def _waiting(code: Code) -> int:
         ctypes.c_void_p.from_address(found["slot"]).value = ready
 
     code.made.add_done_callback(fill)
-    atexit.register(machine.end_processes)  # before JAX ends, which waits for running programs
+    atexit.register(emit.end_processes)  # before JAX ends, which waits for running programs
     return found["handler"]
 
 
