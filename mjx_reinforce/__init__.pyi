@@ -18,7 +18,7 @@ from mjx_reinforce.learners.estimators import (
 )
 from mjx_reinforce.learners.learner import Learner, TrainState, train_step
 from mjx_reinforce.learners.natural_gradient import natural_gradient
-from mjx_reinforce.learners.pace import AutoEpisodes
+from mjx_reinforce.learners.pace import AutoEpisodes, Cut
 from mjx_reinforce.learners.reinforce import reinforce
 from mjx_reinforce.learners.updates import each_step, full_batch, make_optimizer, minibatches
 from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
@@ -76,6 +76,7 @@ __all__ = [
     "AutoEpisodes",
     "Box",
     "Config",
+    "Cut",
     "Discrete",
     "Distribution",
     "Environment",

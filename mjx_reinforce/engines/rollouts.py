@@ -20,11 +20,13 @@ class _Progress(NamedTuple):
     state: the environment's state, episodes on the last axis of every leaf
     alive: [N] whether the episode is still running
     nonfinite: [N] whether it left the finite numbers
+    left: [N] how many steps it may still take; None where the horizon alone bounds them
     """
 
     state: Any
     alive: jax.Array
     nonfinite: jax.Array
+    left: jax.Array | None
 
 
 def rollout(
@@ -38,6 +40,7 @@ def rollout(
     horizon: int,
     deterministic: bool | jax.Array = False,
     active: bool | jax.Array = True,
+    limit: int | jax.Array | None = None,
     env_step: Callable[[Any, jax.Array], Any] | None = None,
 ) -> Trajectory:
     """Plays N episodes from fresh resets, each to its end or to the horizon.
@@ -55,6 +58,8 @@ def rollout(
       horizon: T, the time limit in steps; reaching it ends an episode.
       deterministic: [] or [N] whether an episode takes the mode.
       active: [] or [N] whether an episode is played: else it has no step, and zeros stand for it.
+      limit: [] or [N] steps after which an episode ends, if that is before the horizon; an episode
+        with a limit of 0 is not played.
       env_step: ``env.step`` of N episodes, the last axis of every leaf; by default ``jax.vmap``.
 
     Returns:
@@ -64,7 +69,9 @@ def rollout(
     Raises:
       ValueError: an argument makes no sense.
     """
-    episode.check_shapes((), (num_episodes,), deterministic=deterministic, active=active)
+    flags = {"deterministic": deterministic, "active": active}
+    flags |= {} if limit is None else {"limit": limit}
+    episode.check_shapes((), (num_episodes,), **flags)
     if env_step is None:
         env_step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
     # Inside, episodes are the last axis: each scalar of the state is a contiguous row.
@@ -73,7 +80,9 @@ def rollout(
     modes = None if deterministic is False else jnp.broadcast_to(deterministic, num_episodes)
     step = functools.partial(_step, env_step, act, distribution, actor, modes)
     none = jnp.zeros(num_episodes, bool)
-    progress = _Progress(state, none | active, none)
+    left = None if limit is None else jnp.broadcast_to(limit, num_episodes)
+    alive = none | active if left is None else active & (left > 0)
+    progress = _Progress(state, alive, none, left)
     records = _empty_records(step, progress, distribution, horizon)
     progress, (observation, action, reward, mask), simulated = play_chunks(
         lambda noise, progress: lax.scan(step, progress, noise),
@@ -107,11 +116,15 @@ def _step(
       The progress, and the records of the step: observation [O, N], action [N, A], reward [N] and
       whether the episode was running before it [N].
     """
-    state, alive, nonfinite = progress
+    state, alive, nonfinite, left = progress
     played = episode.step(env_step, act, distribution, actor, state, noise, alive, deterministic)
     state = episode.hold(alive, played.state, state)
     record = (played.observation, played.action, played.reward, alive)
-    return _Progress(state, played.alive, nonfinite | played.broken), record
+    goes_on = played.alive
+    if left is not None:
+        left = left - 1
+        goes_on &= left > 0
+    return _Progress(state, goes_on, nonfinite | played.broken, left), record
 
 
 def _empty_records(

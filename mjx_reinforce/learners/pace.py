@@ -1,4 +1,4 @@
-"""As many episodes an update as the gradient's noise asks for.
+"""How much an update plays: as many episodes as the gradient's noise asks for, whole or cut.
 
 Noise and signal of a gradient are alike at the simple noise scale B = tr Cov(g) / |E g|^2, with g
 of one episode (McCandlish et al. 2018, arXiv:1812.06162, equation 2.9). Far fewer episodes than B
@@ -51,6 +51,42 @@ class AutoEpisodes(NamedTuple):
         while rooms[0] >= _ROOM_SHARE * self.least:
             rooms.insert(0, -(-rooms[0] // _ROOM_SHARE))
         return rooms
+
+
+class Cut(NamedTuple):
+    """Episodes of training end after some steps, until a share of the budget is used.
+
+    On a GPU an update of cut episodes is done sooner. A policy that was trained on cut episodes
+    alone may fail later in an episode, where it never was.
+
+    Attributes:
+      steps: after which an episode ends
+      until: the share of the budget, in [0, 1], from which on episodes are whole
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, horizon=100, cut=mr.Cut(steps=20, until=0.5))
+      >>> state, metrics = learner.step(learner.init(jax.random.key(0)))
+      >>> int(metrics["episode_length"]) <= 20
+      True
+    """
+
+    steps: int
+    until: float
+
+    def limit(self, progress: jax.Array, horizon: int) -> jax.Array:
+        """Returns the most steps [] of an episode where this share [] of the budget is used."""
+        return jnp.where(progress < self.until, min(self.steps, horizon), horizon)
+
+
+def check_cut(cut: Cut) -> None:
+    """Raises ValueError for numbers that make no sense."""
+    check_count("cut.steps", cut.steps)
+    check_number("cut.until", cut.until)
+    if cut.until > 1:
+        raise ValueError(f"cut.until must be a share of the budget in [0, 1], got {cut.until}")
 
 
 class Noise(NamedTuple):

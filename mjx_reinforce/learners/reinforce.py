@@ -37,7 +37,7 @@ from mjx_reinforce.learners.learner import (
     episode_metrics,
     keep_finite,
 )
-from mjx_reinforce.learners.pace import AutoEpisodes
+from mjx_reinforce.learners.pace import AutoEpisodes, Cut
 from mjx_reinforce.learners.schedules import Clock
 from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_optimizer
 from mjx_reinforce.policies import normalize
@@ -59,8 +59,9 @@ from mjx_reinforce.types import (
 
 #: Where functions are that make estimators, and are no schedules of them.
 _ESTIMATORS = tuple(f"mjx_reinforce.learners.{name}" for name in ("estimators", "value_baseline"))
-#: Episodes are short if none is longer than the horizon divided by this. An update passes over all
-#: steps that there may be, so it takes its time from the horizon, not from the episodes.
+#: Episodes are short if none is longer than the horizon divided by this, or than their cut. An
+#: update passes over all steps that there may be, so it takes its time from the horizon, not from
+#: the episodes.
 _SHORT = 8
 #: Updates of so many steps, of all seeds, are compiled for short episodes too. Measured on two CPU
 #: cores: that saves 70 ns for each of these steps in such an update, and takes 4 s to compile.
@@ -87,6 +88,7 @@ def reinforce(
     update: Update | None = None,
     num_episodes: int | AutoEpisodes = 16,
     horizon: int | None = None,
+    cut: Cut | None = None,
     entropy_cost: float | jax.Array = 0.0,
     loss_per: str = "episode",
     max_kl: float | jax.Array | None = None,
@@ -120,6 +122,8 @@ def reinforce(
       num_episodes: N, episodes an update; or ``AutoEpisodes()``, as many as the gradient's noise
         asks for, between bounds. That needs the update ``full_batch``, which measures the noise.
       horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
+      cut: how many steps episodes have at most until a share of the budget is used, which is
+        ``TrainState.progress``; by default they are never cut.
       entropy_cost: weight of the policy's entropy H, in return per nat.
       loss_per: "episode" divides the sum by N; "step" by the number of steps played, so that the
         gradient does not grow with the episodes.
@@ -169,6 +173,8 @@ def reinforce(
         auto, num_episodes = num_episodes, num_episodes.most
     check_count("num_episodes", num_episodes)
     check_count("num_seeds", num_seeds)
+    if cut is not None:
+        pace.check_cut(cut)
     check_number("entropy_cost", entropy_cost)
     check_number("normalize_steps", normalize_steps, finite=False)
     check_number("normalize_min_std", normalize_min_std)
@@ -190,6 +196,7 @@ def reinforce(
         num_episodes=num_episodes,
         auto=auto,
         horizon=check_horizon(env, horizon),
+        cut=cut,
         entropy_cost=entropy_cost,
         loss_per=loss_per,
         max_kl=max_kl,
@@ -225,6 +232,7 @@ class _Reinforce:
     num_episodes: int
     auto: AutoEpisodes | None
     horizon: int
+    cut: Cut | None
     entropy_cost: float | jax.Array
     loss_per: str
     max_kl: float | jax.Array | None
@@ -314,23 +322,33 @@ class _Reinforce:
         check_shapes((), (self.num_episodes,), active=active)
         chosen = jnp.broadcast_to(self._chosen(state, active), self.num_episodes)
         keys = episode_keys(key, self.num_episodes)
-        given = state.actor, state.start_key, visitors, keys, chosen
+        limit = None if self.cut is None else self.cut.limit(state.progress, self.horizon)
+        given = state.actor, state.start_key, visitors, limit, keys, chosen
         if self.devices is None:
             return play(*given)
         specs = _EPISODES, None if guests is None else _EPISODES
         divided = self.devices.map(
-            functools.partial(_part, self.devices, play), (NONE, NONE, NONE, RUNS, RUNS), specs
+            functools.partial(_part, self.devices, play),
+            (NONE, NONE, NONE, NONE, RUNS, RUNS),
+            specs,
         )
         own, looked = divided(*given)
         # Those of the first device; the others played none.
         return own, None if guests is None else looked.episodes(slice(len(guests.keys)))
 
     def _play_part(
-        self, engine: Engine, actor: Actor, start_key: Any, visitors: Any, keys: Any, chosen: Any
+        self,
+        engine: Engine,
+        actor: Actor,
+        start_key: Any,
+        visitors: Any,
+        limit: jax.Array | None,
+        keys: Any,
+        chosen: Any,
     ) -> tuple[Trajectory, Trajectory | None]:
         """Plays episodes of these keys, as far as they are chosen, with guests before them.
 
-        ``visitors`` are the keys of the guests, whether each takes the mode, and whether they are
+        They have ``limit`` steps at most, and guests those of the horizon. ``visitors`` are the keys of the guests, whether each takes the mode, and whether they are
         played; None without any.
         """
         count, modes = 0, False
@@ -339,6 +357,9 @@ class _Reinforce:
             count = len(guest_keys)
             modes = jnp.concatenate([guest_modes, jnp.zeros(len(keys), bool)])
             chosen = jnp.concatenate([jnp.broadcast_to(guest_active, count), chosen])
+            if limit is not None:
+                own = jnp.broadcast_to(limit, len(keys))
+                limit = jnp.concatenate([jnp.full(count, self.horizon), own])
             keys = jnp.concatenate([guest_keys, keys])
         played = engine.rollout(
             self.env if start_key is None else _OneStart(self.env, start_key),
@@ -350,6 +371,7 @@ class _Reinforce:
             horizon=self.horizon,
             deterministic=modes,
             active=chosen,
+            limit=limit,
         )
         if visitors is None:
             return played, None
@@ -361,8 +383,8 @@ class _Reinforce:
         """Learns; where all episodes, of many seeds, were short, from their first steps alone."""
         if self.auto is not None:
             trajectory = dataclasses.replace(trajectory, played=trajectory.mask[0])
-        few = len(trajectory.mask) // _SHORT
-        if few < CHUNK_STEPS or self.num_seeds * trajectory.mask.size < _MANY:
+        few = len(trajectory.mask) // _SHORT if self.cut is None else self.cut.steps
+        if not CHUNK_STEPS <= few < self.horizon or self.num_seeds * trajectory.mask.size < _MANY:
             return self._learn_from(state, trajectory, key)
         return jax.lax.cond(
             any_lane(jnp.any(trajectory.mask[few])),
@@ -432,11 +454,11 @@ class _Reinforce:
 
 def _part(devices: Devices, play: Callable[..., Any], *given: Any) -> tuple[Any, Any]:
     """Returns what ``_play_part`` plays of one device's part, guests on the first device alone."""
-    actor, start_key, visitors, keys, chosen = given
+    actor, start_key, visitors, limit, keys, chosen = given
     if visitors is not None:
         *others, active = visitors
         visitors = *others, active & (devices.number() == 0)
-    played = play(actor, start_key, visitors, keys, chosen)
+    played = play(actor, start_key, visitors, limit, keys, chosen)
     simulated = devices.sum(played[0].simulated)
     return jax.tree.map(
         lambda x: dataclasses.replace(x, simulated=simulated),

@@ -69,11 +69,13 @@ class Config(
     def training_horizon(self, horizon: int) -> int:
         """Returns the time limit of a training episode of a task, in env steps.
 
+        Where only the first are cut it is that of the others.
+
         Args:
           horizon: the task's own time limit.
         """
         whole = self.horizon or horizon
-        return min(whole, self.train_horizon or whole)
+        return whole if self.whole_after < 1 else min(whole, self.train_horizon or whole)
 
     @property
     def block_length(self) -> int:

@@ -44,6 +44,7 @@ class Reader(enum.Enum):
     VALUE_MINIBATCHES = "--value-fit minibatches", lambda c: c.value_fit == "minibatches"
     LEAVE_ONE_OUT = "--estimator leave-one-out", lambda c: c.estimator == "leave-one-out"
     AUTO_EPISODES = "--num-episodes auto", lambda c: c.num_episodes == "auto"
+    CUT = "--train-horizon N", lambda c: c.train_horizon is not None
     STANDARDIZE = "--standardize", lambda c: c.standardize
     DIRECTORY = "--output DIR", lambda c: c.output is not None or c.resume is not None
     MINIBATCHES = "--update minibatches", lambda c: c.update == "minibatches"
@@ -141,6 +142,8 @@ class RunSettings:
     """Time limit of an episode in env steps. If not given, the environment's own limit."""
     train_horizon: int | None = setting(None, *COUNT)
     """Cut training episodes, not evaluations, after this many env steps."""
+    whole_after: float = _for_reinforce(1.0, Range.SHARE, Reader.CUT)
+    """Share of the budget from which on training episodes are not cut any more; 1: all are."""
     one_start: bool = False
     """Begin all training episodes of a seed in one state of its own. Evaluations keep theirs."""
     engine: Literal["auto", "vmap", "fused", "native"] = setting(

@@ -92,13 +92,17 @@ def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
 def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
     from mjx_reinforce.console.heartbeat import to_screen
     from mjx_reinforce.engines.native import outlook
-    from mjx_reinforce.learners.pace import AutoEpisodes
+    from mjx_reinforce.learners.pace import AutoEpisodes, Cut
     from mjx_reinforce.learners.reinforce import reinforce
 
     if config.engine in ("auto", "native") and (said := outlook.announcement(env)):
         to_screen(said)
+    cut = None
+    if config.train_horizon is not None and config.whole_after < 1:
+        cut = Cut(config.train_horizon, config.whole_after)
     return reinforce(
         env,
+        cut=cut,
         estimator=_build_estimator(config, shared["horizon"]),
         optimizer=_build_optimizer(config),
         update=_build_update(config, shared["policy"]),

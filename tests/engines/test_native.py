@@ -50,6 +50,20 @@ def test_the_pendulum(hidden_sizes):
     assert_same_episodes(got, want, rounding=2e-5)
 
 
+def test_a_limit_for_each_episode():
+    """Also one beyond the horizon, and one of no step; some take the mode."""
+    env = Drifting()
+    limit, modes = jnp.array([60, 3, 0, 200, 51]), jnp.arange(5) % 2 == 1
+    options = {"deterministic": modes, "horizon": 100, "limit": limit}
+    got, want = both(env, actor_and_act(env, (4,)), **options)
+    assert_same_episodes(got, want, rounding=2e-5)
+    lengths = got.mask.sum(axis=1)
+    assert (lengths <= np.array(limit)).all()
+    assert {3, 0, 51} & set(lengths.ravel().tolist()) >= {3, 0}
+    whole, _ = both(env, actor_and_act(env, (4,)), **options | {"limit": None})
+    np.testing.assert_array_equal(got.reward, np.where(got.mask, whole.reward, 0))
+
+
 @pytest.mark.parametrize("id", ["CartPole-v1", "Reacher-v5"])
 def test_tasks_without_contacts(id):
     env = envs.make(id)

@@ -15,7 +15,7 @@ from mjx_reinforce.engines.native.cpu.queue import queue_text
 llvm = pytest.importorskip("llvmlite.binding", reason="machine code is written by llvmlite")
 
 LANES, S, N = 2, 2, 3
-SKIP, SAMPLE, MODE = plays.NOT_PLAYED, plays.SAMPLES, plays.MODE
+SKIP, SAMPLE, MODE = plays.NOT_PLAYED, 7, -8  # at most so many steps
 ACTOR = [("f4", 3), ("f4", 0), ("f8", 2)]
 STATE = [("f4", 2), ("i8", 1)]
 OTHERS = [("u4", 4), ("i4", 1), ("i4", 1), ("i4", 1)]
@@ -108,6 +108,7 @@ def test_lanes_begin_with_the_next_episodes_that_are_played(game):
     for lane in range(LANES):
         game.call("begin", lane)
     assert [game.flags(lane) for lane in range(LANES)] == [[1, 0, 0, 0, 0], [1, 1, 0, 2, 0]]
+    assert game.column(PLACES.limit).tolist() == [[7, 8]]
     game.check_values(0, 0)
     game.check_values(1, 2)
 

@@ -57,16 +57,17 @@ def play(env, key=None, *, num_episodes=4, horizon=6, distribution=PLAIN, act=ac
     return jax.tree.map(np.asarray, roll(jnp.array([0.1, 2.0]), distribution, key))
 
 
-def by_hand(env, key, num_episodes, horizon, chunk, deterministic=False):
+def by_hand(env, key, num_episodes, horizon, chunk, deterministic=False, limit=None):
     """The episodes one by one; an episode's keys come from its own index and the chunk."""
     shape = horizon, num_episodes
     deterministic = np.broadcast_to(deterministic, num_episodes)
+    limit = np.broadcast_to(horizon if limit is None else limit, num_episodes)
     observation, action = np.zeros((2, *shape, 2), np.float32)
     reward, mask = np.zeros(shape, np.float32), np.zeros(shape, bool)
     for n in range(num_episodes):
         reset_key, noise_key = jax.random.split(jax.random.fold_in(key, n))
         state = env.reset(reset_key)
-        for t in range(horizon):
+        for t in range(limit[n]):
             if t % chunk == 0:
                 noise_key, draw_key = jax.random.split(noise_key)
                 noise = PLAIN.noise(draw_key, (chunk,))
@@ -98,6 +99,16 @@ def test_episodes_are_those_of_a_loop(deterministic):
     assert lengths.max() == 6  # some at the horizon
     assert_is(trajectory, expected)
     assert not trajectory.nonfinite.any()
+
+
+@pytest.mark.parametrize("limit", [2, (6, 1, 0, 3)])
+def test_episodes_have_no_more_steps_than_their_limit(limit):
+    env, key = Counter(length=8), jax.random.key(3)
+    trajectory = play(env, key, limit=jnp.array(limit))
+    assert_is(trajectory, by_hand(env, key, 4, 6, 6, limit=limit))
+    assert (trajectory.mask.sum(axis=0) <= np.array(limit)).all()
+    with pytest.raises(ValueError, match=r"limit must be \[\] or \[4\], got the shape \[3\]"):
+        play(env, key, limit=jnp.arange(3))
 
 
 def test_episodes_of_given_keys():

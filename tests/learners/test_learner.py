@@ -1,5 +1,6 @@
 """The learner: exact gradients, probes, one trace, keys used once, seeds kept apart."""
 
+import dataclasses
 import functools
 
 import jax
@@ -8,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from toys import Late, Signed, SignedTarget, Survive, Target, Toy
+from toys import Drifting, Late, Signed, SignedTarget, Survive, Target, Toy
 
-from mjx_reinforce import mlp_policy, normal, reinforce, rollout, train_step
+from mjx_reinforce import Cut, mlp_policy, normal, reinforce, rollout, train_step
+from mjx_reinforce.engines.native import available
 from mjx_reinforce.learners import counts, estimators, gradients, updates
 from mjx_reinforce.learners.estimators import discounted_returns
 from mjx_reinforce.learners.value_baseline import value_baseline
@@ -328,3 +330,38 @@ def test_short_episodes_are_learned_from_in_short(length, update, monkeypatch):
     assert branches == [True, False]
     assert np.abs(learned[0]["constants"]).max() > 0
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6), *learned)
+
+
+@pytest.mark.parametrize("engine", ["vmap", "native"])
+@pytest.mark.parametrize("short_apart", [False, True])
+def test_episodes_are_cut_until_a_share_of_the_budget_is_used(engine, short_apart, monkeypatch):
+    """An update learns what one does whose episodes all have that horizon."""
+    if engine == "native" and (reason := available.unavailable()):
+        pytest.skip(reason)
+    monkeypatch.setattr("mjx_reinforce.learners.reinforce._MANY", 0 if short_apart else 2**31)
+    settings = {"num_episodes": 8, "engine": engine}
+    cut = reinforce(Drifting(), horizon=100, cut=Cut(steps=50, until=0.5), **settings)
+    first = cut.init(jax.random.key(0))
+    played = {}
+    for progress, horizon in ((0.0, 50), (0.49, 50), (0.5, 100), (1.0, 100)):
+        state = dataclasses.replace(first, progress=jnp.asarray(progress))
+        got, metrics = jax.jit(cut.step)(state)
+        want, expected = jax.jit(reinforce(Drifting(), horizon=horizon, **settings).step)(state)
+        played[horizon] = int(metrics["env_steps"])
+        assert played[horizon] == int(expected["env_steps"])
+        for a, b in zip(jax.tree.leaves(got.actor), jax.tree.leaves(want.actor), strict=True):
+            np.testing.assert_allclose(a, b, rtol=2e-5, atol=1e-6)
+    assert played[50] < played[100]
+
+
+@pytest.mark.parametrize(
+    ("cut", "said"),
+    [
+        (Cut(0, 0.5), "cut.steps must be at least 1, got 0"),
+        (Cut(5, 1.5), r"cut.until must be a share of the budget in \[0, 1\], got 1.5"),
+        (Cut(5, -0.1), "cut.until must be 0 or more and finite, got -0.1"),
+    ],
+)
+def test_a_cut_that_makes_no_sense_is_refused(cut, said):
+    with pytest.raises(ValueError, match=said):
+        reinforce(Survive(), cut=cut)

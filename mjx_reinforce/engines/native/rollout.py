@@ -18,7 +18,7 @@ from mjx_reinforce.engines.native import available
 from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.cpu import seam as cpu
 from mjx_reinforce.engines.native.gpu import seam as gpu
-from mjx_reinforce.engines.native.plays import MODE, NOT_PLAYED, SAMPLES
+from mjx_reinforce.engines.native.plays import plays
 from mjx_reinforce.engines.native.program import NativeProgram, build_program, refusal
 from mjx_reinforce.engines.native.step import stored
 from mjx_reinforce.fused import TooLarge, UnsupportedPrimitive
@@ -39,6 +39,7 @@ def rollout(
     horizon: int,
     deterministic: bool | jax.Array = False,
     active: bool | jax.Array = True,
+    limit: int | jax.Array | None = None,
     threads: int = 0,
 ) -> Trajectory:
     """Plays N episodes from fresh resets; arguments and result are those of ``rollouts.rollout``.
@@ -51,7 +52,9 @@ def rollout(
     Raises:
       ValueError: machine code cannot play this; see ``unsupported``.
     """
-    episode.check_shapes((), (num_episodes,), deterministic=deterministic, active=active)
+    steps = horizon if limit is None else limit
+    flags = {"deterministic": deterministic, "active": active, "limit": steps}
+    episode.check_shapes((), (num_episodes,), **flags)
     episode.check_shapes((), threads=threads)
     against = against_key(key)
     if against:
@@ -62,9 +65,8 @@ def rollout(
         raise ValueError(f"the native engine cannot play this: {error}") from error
     begin = functools.partial(episode.begin, env)
     state, keys = jax.vmap(begin)(episode.episode_keys(key, num_episodes))
-    plays = jnp.where(active, jnp.where(deterministic, MODE, SAMPLES), NOT_PLAYED)
     given = (
-        jnp.broadcast_to(plays.astype(jnp.int32), num_episodes),
+        jnp.broadcast_to(plays(active, deterministic, jnp.minimum(steps, horizon)), num_episodes),
         jax.random.key_data(keys),
         *(x.reshape(-1) for x in jax.tree.leaves(actor) if x.size),
         *(stored(x).reshape(num_episodes, -1) for x in jax.tree.leaves(state) if x.size),

@@ -47,6 +47,7 @@ class _Work(handler.JobText):
         self.inputs = [self._pointer(field) for field in places.inputs]
         self.seed, self.episode = self._pointer(places.seed), self._pointer(places.episode)
         self.step, self.broken = self._pointer(places.step), self._pointer(places.broken)
+        self.limit = self._pointer(places.limit)
         self.alive = self._pointer(places.alive)
         self.horizon = self.job("horizon", "i64")
         self.episodes = self.job("episodes", "i64")
@@ -97,8 +98,7 @@ class _Work(handler.JobText):
         steps = text.let(f"add {kind} {text.load(self.step, _INT)}, {one}")
         text.store(steps, self.step, _INT)
         text.store(broken, self.broken, _INT)
-        limit = text.broadcast("i32", text.let(f"trunc i64 {self.horizon} to i32"))
-        late = text.let(f"icmp sge {kind} {steps}, {limit}")
+        late = text.let(f"icmp sge {kind} {steps}, {text.load(self.limit, _INT)}")
         bools, true = text.type(bool), text.constant(np.True_)
         stops = text.let(f"xor {bools} {self._is_set(goes_on)}, {true}")
         stops = text.let(f"or {bools} {stops}, {late}")

@@ -33,6 +33,7 @@ class VectorLayout:
     actor: how many of them are the actor's.
     state: how many of them are the state's.
     broken: 1 where an episode left the finite numbers.
+    limit: how many steps an episode has at most.
     seed: which seed a lane plays for.
     episode: which of its episodes.
     counted: the steps of the episodes that it has ended.
@@ -43,6 +44,7 @@ class VectorLayout:
     actor: int
     state: int
     broken: Field
+    limit: Field
     seed: Field
     episode: Field
     counted: Field
@@ -105,5 +107,5 @@ def layout(leaves: list[Any], actor: int, state: int, lanes: int) -> VectorLayou
         return Field(begin, np.dtype(dtype), count)
 
     inputs = [field(x.dtype, int(np.prod(x.shape, dtype=int))) for x in leaves]
-    others = [field(np.int32, 1), *(field(np.int64, 1) for _ in range(3))]
+    others = [field(x, 1) for x in (np.int32, np.int32, np.int64, np.int64, np.int64)]
     return VectorLayout(inputs, actor, state, *others, size=end)

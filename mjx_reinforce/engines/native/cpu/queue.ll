@@ -39,6 +39,8 @@ end:
   ret void
 }
 
+declare i32 @llvm.abs.i32(i32, i1)
+
 ; Gives a lane the next episode that is played, if there is one.
 define internal void @begin(ptr %job, ptr %memory, i64 %lane) {
 entry:
@@ -75,10 +77,13 @@ fill:
   %runs = icmp ne i32 %kind, $not_played
   %alive = zext i1 %runs to i32
   store i32 %alive, ptr %alive.at
-  %is.mode = icmp eq i32 %kind, $mode
+  %is.mode = icmp slt i32 %kind, 0
   %flag = zext i1 %is.mode to i32
   ${deterministic_at}
   store i32 %flag, ptr %mode.lane
+  %limit = call i32 @llvm.abs.i32(i32 %kind, i1 false)
+  ${limit_at}
+  store i32 %limit, ptr %limit.at
   ${step_at}
   store i32 0, ptr %step.at
   %episodes.at = getelementptr inbounds %Job, ptr %job, $episodes

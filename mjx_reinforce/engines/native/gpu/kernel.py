@@ -19,7 +19,7 @@ from mjx_reinforce.engines.native.gpu.lockstep import (
     some_of_block,
 )
 from mjx_reinforce.engines.native.gpu.scratch import ScratchText
-from mjx_reinforce.engines.native.plays import MODE, NOT_PLAYED
+from mjx_reinforce.engines.native.plays import NOT_PLAYED
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.fused.backends.llvm import Input
 
@@ -95,8 +95,8 @@ class _Kernel:
         ]
         self.own = [_Leaf(self.text.reserve(*leaf), *leaf) for leaf in own]
         self.state, (self.keys, self.at, self.mode) = self.own[: len(state)], self.own[len(state) :]
-        self.row, self.limit, self.waited, self.running = (
-            self.text.reserve(_INT, 1) for _ in range(4)
+        self.row, self.limit, self.asks, self.waited, self.running = (
+            self.text.reserve(_INT, 1) for _ in range(5)
         )
 
     def write(self) -> str:
@@ -107,8 +107,8 @@ class _Kernel:
         )
         items = text.let(f"mul i32 {self.seeds}, {self.episodes}")
         text.store("0", self.waited, _INT)
-        text.store(items, self.limit, _INT)
-        self._begin("0", "0", "0")  # a thread without an episode has the values of one
+        text.store("1", self.asks, _INT)
+        self._begin("0", "0", "0", "0")  # a thread without an episode has the values of one
         head, body, end = text.label(), text.label(), text.label()
         text.line(f"br label %{head}")
         text.start(head)
@@ -141,9 +141,8 @@ class _Kernel:
         head, look, fill, end = (text.label() for _ in range(4))
         text.line(f"br label %{head}")
         text.start(head)
-        # The limit is 0 once a thread has found no more: it does not ask again.
-        limit = text.load(self.limit, _INT)
-        asks = text.let(f"icmp ne i32 {limit}, 0")
+        # A thread that has found no more does not ask again.
+        asks = text.let(f"icmp ne i32 {text.load(self.asks, _INT)}, 0")
         asked = text.label()
         text.line(f"br i1 {asks}, label %{asked}, label %{end}")
         text.start(asked)
@@ -152,20 +151,22 @@ class _Kernel:
         none = text.label()
         text.line(f"br i1 {some}, label %{look}, label %{none}")
         text.start(none)
-        text.store("0", self.limit, _INT)
+        text.store("0", self.asks, _INT)
         text.line(f"br label %{end}")
         text.start(look)
         plays = text.load(text.at("%plays", _INT, self._wide(item)), _INT)
         is_played = text.let(f"icmp ne i32 {plays}, {NOT_PLAYED}")
         text.line(f"br i1 {is_played}, label %{fill}, label %{head}")
         text.start(fill)
-        is_mode = text.let(f"icmp eq i32 {plays}, {MODE}")
-        self._begin(item, text.let(f"zext i1 {is_mode} to i32"), "1")
+        is_mode = text.let(f"icmp slt i32 {plays}, 0")
+        negated = text.let(f"sub i32 0, {plays}")
+        limit = text.let(f"select i1 {is_mode}, i32 {negated}, i32 {plays}")
+        self._begin(item, text.let(f"zext i1 {is_mode} to i32"), limit, "1")
         text.line(f"br label %{end}")
         text.start(end)
 
-    def _begin(self, item: str, mode: str, running: str) -> None:
-        """Writes how a thread begins an episode."""
+    def _begin(self, item: str, mode: str, limit: str, running: str) -> None:
+        """Writes how a thread begins an episode of so many steps at most."""
         text = self.text
         place = self._wide(item)
         for leaf, given in zip((x for x in self.state if x.size), self.given["state"], strict=True):
@@ -175,6 +176,7 @@ class _Kernel:
             (mode, self.mode.pointer),
             ("0", self.at.pointer),
             (item, self.row),
+            (limit, self.limit),
             (running, self.running),
         ):
             text.store(value, where, _INT)
@@ -214,7 +216,7 @@ class _Kernel:
         text = self.text
         steps = text.let(f"add i32 {text.load(self.at.pointer, _INT)}, 1")
         text.store(steps, self.at.pointer, _INT)
-        late = text.let(f"icmp sge i32 {steps}, {self.horizon}")
+        late = text.let(f"icmp sge i32 {steps}, {text.load(self.limit, _INT)}")
         ends = text.let(f"icmp eq i32 {goes_on}, 0")
         with text.when(text.let(f"or i1 {late}, {ends}")):
             row = self._wide(text.load(self.row, _INT))
