@@ -348,8 +348,8 @@ class _Reinforce:
     ) -> tuple[Trajectory, Trajectory | None]:
         """Plays episodes of these keys, as far as they are chosen, with guests before them.
 
-        They have ``limit`` steps at most, and guests those of the horizon. ``visitors`` are the keys of the guests, whether each takes the mode, and whether they are
-        played; None without any.
+        They have ``limit`` [] steps at most, guests those of the horizon. ``visitors`` are the keys
+        of the guests, whether each takes the mode, and whether they are played; None without any.
         """
         count, modes = 0, False
         if visitors is not None:
