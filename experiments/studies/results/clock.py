@@ -15,6 +15,10 @@ from mjx_reinforce.reports.statistics.aggregates import interval
 #: Commit -> what its settings were that have changed since.
 _SINCE = {
     "e6f8e08c5022": "since then Swimmer has shorter steps",
+    "0a4b350acd32": (
+        "of Humanoid the numbers at the end are those of its last evaluation, for those of its\n"
+        "test were not kept"
+    ),
     "08b5cddba03e": (
         "HalfCheetah had its cut of 250 env steps, which is the default since then, from\n"
         "`--train-horizon 250 --eval-every 20` (on two threads `--eval-every 240`; on a GPU the\n"
@@ -39,7 +43,7 @@ def sections(results: Path, docs: Path) -> list[str]:
     gpu, cpu = ([x for x in groups if is_gpu(x.device) == wanted] for wanted in (True, False))
     parts = ["## Against the clock", _words(groups)]
     if gpu:
-        parts += [f"### On one {listed(dict.fromkeys(x.device for x in gpu))}", _gpu(gpu, docs)]
+        parts += [f"### On one {' or '.join(dict.fromkeys(x.device for x in gpu))}", _gpu(gpu, docs)]
     if cpu:
         parts += ["### On two threads of a processor", _cpu_words(), _cpu(cpu, docs)]
     _draw(groups, results, docs)
@@ -76,8 +80,9 @@ def _words(groups: Sequence[kept.Group]) -> str:
         "apart. After a minute: the last evaluation until then. At the end, and of a run that\n"
         "ended within the minute: episodes from starts that were used nowhere else; where a run\n"
         "was stopped, its last evaluation. There is no\n"
-        "critic, no importance weight, no replayed step: an update is one gradient of the\n"
-        "episodes just played. No search used these seeds\n"
+        "bootstrapped value, no importance weight, no replayed step: an update is one gradient\n"
+        "of the episodes just played. What is subtracted from a return is the mean of the other\n"
+        "episodes, for Ant and Humanoid a learned value. No search used these seeds\n"
         f"(roots {roots}).\n"
         "Published figures are the best of each algorithm in [published.csv](published.csv),\n"
         "whatever the version of the task, with the env steps of a seed."
@@ -91,6 +96,7 @@ def _gpu(groups: Sequence[kept.Group], docs: Path) -> str:
         rows.append(
             [
                 group.task,
+                group.device.removeprefix("NVIDIA ").split()[0],
                 str(len(group.final)),
                 f"{number(group.minute.mean())}, {number(group.minute.min())}",
                 estimate(final),
@@ -102,7 +108,7 @@ def _gpu(groups: Sequence[kept.Group], docs: Path) -> str:
                 _published(docs, group.task, "SAC"),
             ]
         )
-    header = ["task", "seeds", "after a minute: mean, worst", "at the end: mean (95 %)", "worst"]
+    header = ["task", "on", "seeds", "after a minute: mean, worst", "at the end: mean (95 %)", "worst"]
     header += ["best seed", "seconds, all seeds", "env steps a seed", "PPO, published"]
     return table([*header, "SAC, published"], rows)
 
