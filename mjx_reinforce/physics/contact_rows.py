@@ -126,7 +126,7 @@ def with_bases(division: Blocks, rows: jax.Array, touching: jax.Array) -> Jacobi
 
     def by_contact(rows: jax.Array, touching: jax.Array) -> list[jax.Array]:
         made, first = [], 0
-        for group, edges in zip(division.groups, _by_group(division, rows), strict=True):
+        for group, edges in zip(division.groups, by_group(division, rows), strict=True):
             pyramid = group.pyramid
             inverse = jnp.asarray(pyramid.T / np.sum(pyramid**2, 0)[:, None], rows.dtype)
 
@@ -171,8 +171,8 @@ def weighted(
         for group, basis, *each in zip(
             division.groups,
             jacobian.bases,
-            _by_group(division, mass),
-            _by_group(division, force),
+            by_group(division, mass),
+            by_group(division, force),
             strict=True,
         ):
             pyramid = jnp.asarray(group.pyramid, start.dtype)
@@ -247,7 +247,7 @@ def _plus_product(start: jax.Array, left: jax.Array, right: jax.Array) -> jax.Ar
     return jnp.einsum("...k,...k->...", terms, factors)
 
 
-def _by_group(division: Blocks, rows: jax.Array) -> list[jax.Array]:
+def by_group(division: Blocks, rows: jax.Array) -> list[jax.Array]:
     """Divides an array [rows, ...] into the groups' [contacts, rows of a contact, ...]."""
     divided, first = [], division.others
     for group in division.groups:

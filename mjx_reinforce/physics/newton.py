@@ -15,6 +15,7 @@ MJX's own solver does the same steps, but its line search evaluates three points
 done; here a round evaluates one point, and the search ends when no row changes any more.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -70,7 +71,7 @@ class _Search(NamedTuple):
     settled: jax.Array
 
 
-class _Line(NamedTuple):
+class Line(NamedTuple):
     """The cost's derivative along a step, for the rows that push at one length of it.
 
     at_zero: [] where the line is at length zero
@@ -95,7 +96,7 @@ class _LineSearch(NamedTuple):
     low: jax.Array
     high: jax.Array
     root: jax.Array
-    line: _Line
+    line: Line
     evaluated: jax.Array
     settled: jax.Array
 
@@ -139,7 +140,7 @@ def solve_newton(
     def along(direction: jax.Array) -> jax.Array:
         return contact_rows.along(division, rows.jacobian, direction, touching)
 
-    smallest = model.opt.tolerance * jnp.maximum(jnp.trace(inertia), _MIN_TRACE)
+    smallest = smallest_decrement(model, inertia)
 
     def improve(search: _Search) -> _Search:
         before = search.point
@@ -174,6 +175,11 @@ def solve_newton(
     force = _force(rows, end)
     joint_force = contact_rows.weighted(division, inertia, rows.jacobian, force, force)[1]
     return end.qacc, joint_force, force
+
+
+def smallest_decrement(model: mjx.Model, inertia: jax.Array) -> jax.Array:
+    """Returns by how much a step must lower the cost for another one to be made, []."""
+    return model.opt.tolerance * jnp.maximum(jnp.trace(inertia), _MIN_TRACE)
 
 
 def _active(rows: _Rows, residual: jax.Array) -> jax.Array:
@@ -220,12 +226,7 @@ def _line_search(
     curvature: jax.Array,
     max_rounds: int,
 ) -> jax.Array:
-    """Returns the length of the step at which the cost's derivative along it is zero, [].
-
-    The derivative increases, and is linear as long as no row changes. Each round evaluates the root
-    of the linear piece found last; where rounding puts that root outside of the interval known to
-    hold the derivative's, the round evaluates the interval's middle. At the minimum the direction
-    is zero, and the length is 1.
+    """Returns the length of the step that leads to the least cost, [].
 
     Args:
       rows: the constraints.
@@ -238,16 +239,36 @@ def _line_search(
     row_slope = rows.constraint_mass * change * point.residual
     row_curvature = rows.constraint_mass * change**2
 
-    def line(active: jax.Array) -> _Line:
-        return _Line(
+    def line(active: jax.Array) -> Line:
+        return Line(
             slope + jnp.sum(jnp.where(active, row_slope, 0)),
             curvature + jnp.sum(jnp.where(active, row_curvature, 0)),
         )
 
+    def at(length: jax.Array) -> Line:
+        return line(rows.equality | (point.residual + length * change < 0))
+
+    return root(line(_active(rows, point.residual)), at, max_rounds)
+
+
+def root(first: Line, at: Callable[[jax.Array], Line], max_rounds: int) -> jax.Array:
+    """Returns the length of a step at which the cost's derivative along it is zero, [].
+
+    The derivative increases, and is linear as long as no row changes. Each round evaluates the root
+    of the linear piece found last; where rounding puts that root outside of the interval known to
+    hold the derivative's, the round evaluates the interval's middle. At the minimum the direction
+    is zero, and the length is 1.
+
+    Args:
+      first: the line where the step starts.
+      at: length [] -> the line there.
+      max_rounds: lengths to evaluate at most.
+    """
+
     def evaluate(last: _LineSearch) -> _LineSearch:
         inside = (last.low < last.root) & (last.root < last.high)
         length = jnp.where(inside, last.root, (last.low + last.high) / 2)
-        found = line(rows.equality | (point.residual + length * change < 0))
+        found = at(length)
         root = jnp.where(found.rate > 0, -found.at_zero / found.rate, length)
         moved = [(new < old) | (new > old) for new, old in zip(found, last.line, strict=True)]
         return _LineSearch(
@@ -260,10 +281,10 @@ def _line_search(
         )
 
     start = _LineSearch(
-        low=jnp.zeros_like(slope),
-        high=jnp.full_like(slope, jnp.inf),
-        root=jnp.ones_like(slope),  # a full Newton step
-        line=line(_active(rows, point.residual)),
+        low=jnp.zeros_like(first.rate),
+        high=jnp.full_like(first.rate, jnp.inf),
+        root=jnp.ones_like(first.rate),  # a full Newton step
+        line=first,
         evaluated=jnp.int32(0),
         settled=jnp.array(False),
     )

@@ -5,6 +5,7 @@ code for one episode (``fused``) is a loop over the pairs: short, and quick wher
 """
 
 import types
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -15,9 +16,12 @@ from jax import lax
 from mujoco import mjx
 
 from mjx_reinforce.fused import by_engine
+from mjx_reinforce.physics.mjx_internals import geom_pairs
 
 #: A collision function of MJX: (model, data, key, geoms [P, 2]) -> dist, pos, frame of contacts.
 Collide = Callable[..., Any]
+#: How many bodies ``advice`` names.
+_LISTED = 3
 
 
 def one_by_one(collide: Collide) -> Collide:
@@ -66,3 +70,20 @@ def one_by_one(collide: Collide) -> Collide:
 
     together.ncon = collide.ncon  # pyright: ignore
     return together
+
+
+def advice(model: Any) -> str:
+    """Returns how to make contacts of a MuJoCo model fewer; empty where no geoms can meet."""
+    pairs = [pair[:2] for pair in geom_pairs(model)]
+    if not pairs:
+        return ""
+    bodies = Counter(int(body) for pair in pairs for body in {*model.geom_bodyid[list(pair)]})
+    named = [
+        f"{model.body(body).name or f'number {body}'!r} ({count})"
+        for body, count in bodies.most_common(_LISTED)
+    ]
+    return (
+        f"its geoms can meet in {len(pairs):,} pairs, most of them at the bodies "
+        f"{', '.join(named)}: let fewer collide, such as the feet alone, by "
+        'contype="0" conaffinity="0" of the other geoms'
+    )

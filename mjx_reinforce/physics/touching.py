@@ -18,6 +18,7 @@ from mujoco import mjx
 
 from mjx_reinforce.fused import by_engine
 from mjx_reinforce.physics.mjx_internals import jax_fields, with_contact
+from mjx_reinforce.physics.newton_in_loops import solve_in_loops
 from mjx_reinforce.physics.rows import make_constraint
 
 #: Acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
@@ -33,8 +34,9 @@ _AT_ONCE = 8
 def solve_touching(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
     """Solves with the contacts that touch, or with all where more touch than there is room for.
 
-    Where that leaves more than half of the rows, it is not worth the branches (Pusher on an H200:
-    0.8 of the speed, 0.7 with a trained policy), and all are solved with.
+    The latter is so rare that ``newton_in_loops`` does it, slowly, in little code. Where those that
+    there is room for have more than half of the rows, it is not worth the branches (Pusher on an
+    H200: 0.8 of the speed, 0.7 with a trained policy), and ``solver`` takes all.
 
     Args:
       solver: what solves; it takes fewer contacts than the model has.
@@ -88,7 +90,7 @@ def _with_few(
         return qacc, joint_force, jnp.concatenate(parts)
 
     def every() -> Solution:
-        return solver(model, make_constraint(model, data, False), False)
+        return solve_in_loops(model, make_constraint(model, data, False))
 
     def packed_kind(kind: np.ndarray) -> tuple[Any, jax.Array]:
         return _pack(jax.tree.map(lambda x: x[kind], contact), touching[kind], room)

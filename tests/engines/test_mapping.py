@@ -46,6 +46,20 @@ def test_results_are_those_of_vmap(mapped, size):
     assert size % this_machine().lanes or size == 16
 
 
+def test_a_loop_reads_what_one_before_it_has_kept():
+    """In its order, backwards and in parts."""
+
+    def sums(x):
+        kept = jax.lax.scan(lambda y, _: (0.9 * y, jnp.sin(y)), x, None, 7)[1]
+        add = lambda y, row: (0.5 * y + row, None)  # noqa: E731
+        parts = kept, kept[::-1], kept[:4], kept[3:], kept[4::-1], kept[:2:-1], kept[::2]
+        return [jax.lax.scan(add, x, part)[0] for part in parts]
+
+    x, *_ = batch(37)
+    got = jax.jit(machine_map(sums, x[0]))(x)
+    np.testing.assert_allclose(got, jax.vmap(sums)(x), rtol=1e-5, atol=1e-6)
+
+
 def test_a_long_text_takes_less_effort_and_gives_the_same_bits(mapped, monkeypatch):
     efforts = []
     effort = machine._effort

@@ -8,7 +8,7 @@ import pytest
 from mujoco import mjx
 
 from mjx_reinforce import envs
-from mjx_reinforce.physics import contact_rows, newton
+from mjx_reinforce.physics import contact_rows, newton, newton_in_loops
 from mjx_reinforce.physics import step as physics
 from mjx_reinforce.physics.mjx_internals import jax_fields
 
@@ -16,22 +16,22 @@ SCENE = """
 <mujoco>
   <option timestep="0.01" tolerance="0" cone="{cone}" solver="{solver}"/>
   <worldbody>
-    <geom type="plane" size="5 5 1"/>
+    <geom type="plane" size="5 5 1" {geom}/>
     <body name="a" pos="0 0 0.2"><freejoint/>
       <geom type="capsule" size="0.1 0.3"/>
       <body pos="0.2 0 0"><joint axis="0 1 0" range="-0.5 0.5" limited="true" {joint}/>
         <geom type="capsule" size="0.08 0.2" pos="0.2 0 0"/>
       </body>
     </body>
-    <body name="b" pos="0.6 0 0.3"><freejoint/><geom type="sphere" size="0.15"/></body>
+    <body name="b" pos="0.6 0 0.3"><freejoint/><geom type="sphere" size="0.15" {geom}/></body>
   </worldbody>
   <equality><connect body1="a" body2="b" anchor="0.3 0 0"/></equality>
 </mujoco>
 """
 
 
-def scene(cone="pyramidal", solver="Newton", joint=""):
-    xml = SCENE.format(cone=cone, solver=solver, joint=joint)
+def scene(cone="pyramidal", solver="Newton", joint="", geom=""):
+    xml = SCENE.format(cone=cone, solver=solver, joint=joint, geom=geom)
     model = mujoco.MjModel.from_xml_string(xml)  # pyright: ignore
     return mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
 
@@ -67,6 +67,22 @@ def test_finds_the_optimum_that_mjx_finds():
     for ours, theirs in zip(actual, expected, strict=True):
         scale = 1 + np.abs(theirs).max(axis=1, keepdims=True)
         assert np.max(np.abs(ours - theirs) / scale) < 1e-9
+
+
+def test_in_loops_it_finds_the_same():
+    """The solver for more contacts than there is room for, with contacts of two dimensions."""
+    with jax.enable_x64(True):
+        model, data = scene(geom='condim="1"')
+
+        def both(*state):
+            ready = rows_at(model, data, *state)
+            return newton_in_loops.solve_in_loops(model, ready), newton.solve_newton(model, ready)
+
+        actual, expected = jax.jit(jax.vmap(both))(*random_states(model, 64))
+    assert {1, 3} == {*jax_fields(data).contact.dim}
+    for ours, theirs in zip(actual, expected, strict=True):
+        scale = 1 + np.abs(theirs).max(axis=1, keepdims=True)
+        assert np.max(np.abs(ours - theirs) / scale) < 1e-11
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float32"])

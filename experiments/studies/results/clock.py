@@ -43,7 +43,8 @@ def sections(results: Path, docs: Path) -> list[str]:
     gpu, cpu = ([x for x in groups if is_gpu(x.device) == wanted] for wanted in (True, False))
     parts = ["## Against the clock", _words(groups)]
     if gpu:
-        parts += [f"### On one {' or '.join(dict.fromkeys(x.device for x in gpu))}", _gpu(gpu, docs)]
+        cards = " or ".join(dict.fromkeys(x.device for x in gpu))
+        parts += [f"### On one {cards}", _gpu(gpu, docs)]
     if cpu:
         parts += ["### On two threads of a processor", _cpu_words(), _cpu(cpu, docs)]
     _draw(groups, results, docs)
@@ -108,8 +109,8 @@ def _gpu(groups: Sequence[kept.Group], docs: Path) -> str:
                 _published(docs, group.task, "SAC"),
             ]
         )
-    header = ["task", "on", "seeds", "after a minute: mean, worst", "at the end: mean (95 %)", "worst"]
-    header += ["best seed", "seconds, all seeds", "env steps a seed", "PPO, published"]
+    header = ["task", "on", "seeds", "after a minute: mean, worst", "at the end: mean (95 %)"]
+    header += ["worst", "best seed", "seconds, all seeds", "env steps a seed", "PPO, published"]
     return table([*header, "SAC, published"], rows)
 
 

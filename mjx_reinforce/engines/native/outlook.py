@@ -45,7 +45,7 @@ def check_seconds(env: Environment, traced: jaxprs.Program, entries: int) -> Non
 
 
 def _fewer_contacts(model: "MjModel") -> str:
-    from mjx_reinforce.physics.collisions import advice  # imports MJX, which takes a second
+    from mjx_reinforce.physics.pairs import advice  # imports MJX, which takes a second
 
     return advice(model)
 

@@ -278,7 +278,9 @@ class LLVM(Backend[Value]):
             return lambda count: self._place(place, dtype, count)
         kept = self._kept_in_order(row)
         if kept is not None:
-            return lambda count: Memory(self._text.at(kept, dtype, count), dtype)
+            kept_in, first = kept
+            index = lambda count: text.let(f"sub i64 {first}, {count}") if first else count  # noqa: E731
+            return lambda count: Memory(text.at(kept_in, dtype, index(count)), dtype)
         if all(map(is_constant, row)):
             table = text.table(dtype, [literal(x) for x in row])
             return lambda count: text.spread(dtype, table, count)
@@ -287,11 +289,15 @@ class LLVM(Backend[Value]):
             text.store(self.value(x, values), self._text.at(array, dtype, t), dtype)
         return lambda count: Memory(self._text.at(array, dtype, count), dtype)
 
-    def _kept_in_order(self, row: list[Scalar]) -> str | None:
-        """Returns the array in which an earlier loop has kept these values, or None."""
-        array, _ = self._kept.get(row[0], (None, 0))
-        in_order = all(self._kept.get(x) == (array, t) for t, x in enumerate(row))
-        return array if in_order else None
+    def _kept_in_order(self, row: list[Scalar]) -> tuple[str, int] | None:
+        """Returns the array in which an earlier loop has kept these values, and where the first is.
+
+        They are there from the start on, or backwards to the start; None if they are not.
+        """
+        array, first = self._kept.get(row[0], (None, 0))
+        step = -1 if first else 1
+        in_order = all(self._kept.get(x) == (array, first + step * t) for t, x in enumerate(row))
+        return (array, first) if array and in_order else None
 
     def _place(self, place: Places, dtype: np.dtype, count: str) -> Value:
         pointer, _, align = self._inputs(place.leaf)
