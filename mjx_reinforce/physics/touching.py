@@ -34,9 +34,9 @@ _AT_ONCE = 8
 def solve_touching(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
     """Solves with the contacts that touch, or with all where more touch than there is room for.
 
-    The latter is so rare that ``newton_in_loops`` does it, slowly, in little code. Where those that
-    there is room for have more than half of the rows, it is not worth the branches (Pusher on an
-    H200: 0.8 of the speed, 0.7 with a trained policy), and ``solver`` takes all.
+    The latter is so rare that ``newton_in_loops`` does it, in little code. Where those that there
+    is room for have more than half of the rows, it is not worth the branches (Pusher on an H200:
+    0.8 of the speed, 0.7 with a trained policy), and ``solver`` takes all.
 
     Args:
       solver: what solves; it takes fewer contacts than the model has.

@@ -70,7 +70,7 @@ def test_finds_the_optimum_that_mjx_finds():
 
 
 def test_in_loops_it_finds_the_same():
-    """The solver for more contacts than there is room for, with contacts of two dimensions."""
+    """As for more contacts than there is room for; of two dimensions."""
     with jax.enable_x64(True):
         model, data = scene(geom='condim="1"')
 
