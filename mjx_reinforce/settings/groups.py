@@ -139,13 +139,13 @@ class RunSettings:
     max_episodes: int = _for_reinforce(2048, *SEVERAL, Reader.AUTO_EPISODES)
     """Most episodes of an update, with --num-episodes auto."""
     horizon: int | None = setting(None, *COUNT)
-    """Time limit of an episode in env steps. If not given, the environment's own limit."""
+    """Time limit of an episode in env steps. None: the environment's own limit."""
     train_horizon: int | None = setting(None, *COUNT)
     """Cut training episodes, not evaluations, after this many env steps."""
     whole_after: float = _for_reinforce(1.0, Range.SHARE, Reader.CUT)
-    """Share of the budget from which on training episodes are not cut any more; 1: all are."""
+    """Cut until this share of the budget is used."""
     one_start: bool = False
-    """Begin all training episodes of a seed in one state of its own. Evaluations keep theirs."""
+    """Begin all training episodes, not evaluations, of a seed in one state."""
     engine: Literal["auto", "vmap", "fused", "native"] = setting(
         "auto", once="it changes no result but by rounding"
     )

@@ -83,7 +83,7 @@ def test_the_page_sets_others_beside_ours(folder):
         'Hopper-v5,Stable-Baselines3 SAC,"other, 4 of 8 threads",60,9\n'
     )
     page = "\n\n".join(clock.sections(folder / "kept", docs))
-    assert "| Hopper-v5 | 2 | 6.00, 4.00 | 16.0 (" in page
+    assert "| Hopper-v5 | X | 2 | 6.00, 4.00 | 16.0 (" in page
     assert "| 12.0 (B, 3 million) | none |" in page
     assert (
         "| 6.00 (5.00, 7.00) | 7.75 (6.50, 9.00) after 90.0 s (stopped) | 3.00, 5.00 | not run |"
