@@ -179,6 +179,27 @@ def test_training_is_cut_and_evaluations_are_whole():
     assert np.all(looked.measured["eval_length"] > 6)
 
 
+def test_training_is_cut_for_a_share_of_the_budget():
+    """Guests, who play whole episodes, ride from the start."""
+    config = dataclasses.replace(
+        CONFIG, num_seeds=1, env_steps=800, train_horizon=8, whole_after=0.5, eval_every=1
+    )
+    prepared = ready.made(envs.make(config.env), config)
+    state, programs = compile_run(prepared.programs, config)
+    budget, played, at = budget_of(config), [], []
+    for _ in range(40):
+        at.append(int(counts.to_int(state.train_states.env_steps)[0]))
+        state, metrics, looked = programs.advance(state, True, budget)
+        if not metrics["active"].any():
+            break
+        played.append(float(metrics["episode_length"].max()))
+        assert np.all(looked.measured["eval_length"] > 8)
+    before = [length for steps, length in zip(at, played, strict=False) if steps < 400]
+    after = [length for steps, length in zip(at, played, strict=False) if steps >= 400]
+    assert max(before) == 8
+    assert min(after) > 8
+
+
 def test_a_cut_after_the_time_limit_is_none():
     """So a task that cuts its episodes by default takes any ``--horizon``."""
     config = dataclasses.replace(CONFIG, horizon=20, train_horizon=100)
