@@ -69,8 +69,8 @@ def rollout(
     Raises:
       ValueError: an argument makes no sense.
     """
-    flags = {"deterministic": deterministic, "active": active}
-    flags |= {} if limit is None else {"limit": limit}
+    steps = horizon if limit is None else limit
+    flags = {"deterministic": deterministic, "active": active, "limit": steps}
     episode.check_shapes((), (num_episodes,), **flags)
     if env_step is None:
         env_step = jax.vmap(env.step, in_axes=-1, out_axes=-1)

@@ -59,9 +59,8 @@ from mjx_reinforce.types import (
 
 #: Where functions are that make estimators, and are no schedules of them.
 _ESTIMATORS = tuple(f"mjx_reinforce.learners.{name}" for name in ("estimators", "value_baseline"))
-#: Episodes are short if none is longer than the horizon divided by this, or than their cut. An
-#: update passes over all steps that there may be, so it takes its time from the horizon, not from
-#: the episodes.
+#: Episodes are short if none is longer than the horizon divided by this, or than the cut. An update
+#: passes over all steps that there may be: it takes its time from the horizon, not the episodes.
 _SHORT = 8
 #: Updates of so many steps, of all seeds, are compiled for short episodes too. Measured on two CPU
 #: cores: that saves 70 ns for each of these steps in such an update, and takes 4 s to compile.
@@ -383,7 +382,7 @@ class _Reinforce:
         """Learns; where all episodes, of many seeds, were short, from their first steps alone."""
         if self.auto is not None:
             trajectory = dataclasses.replace(trajectory, played=trajectory.mask[0])
-        few = len(trajectory.mask) // _SHORT if self.cut is None else self.cut.steps
+        few = max(self.horizon // _SHORT, 0 if self.cut is None else self.cut.steps)
         if not CHUNK_STEPS <= few < self.horizon or self.num_seeds * trajectory.mask.size < _MANY:
             return self._learn_from(state, trajectory, key)
         return jax.lax.cond(
