@@ -17,6 +17,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Literal, NamedTuple
 
@@ -30,10 +31,10 @@ class Sizes(NamedTuple):
     """How much of a task is timed on a GPU; episodes fill an H100 or an H200 once or more often.
 
     batch, steps: of native's episodes
+    few: native is timed with so many episodes too, and MuJoCo Warp with so many worlds
     mjx: the episodes of plain MJX, each number that is tried
     mjx_steps: their env steps
     warp: the worlds of MuJoCo Warp, each number that is tried
-    train: native's training updates too
     """
 
     batch: int
@@ -41,23 +42,23 @@ class Sizes(NamedTuple):
     mjx: tuple[int, ...] = ()
     mjx_steps: int = 0
     warp: tuple[int, ...] = (8_192, 32_768)
-    train: bool = False
+    few: tuple[int, ...] = ()
 
 
 #: What stands first is timed first, and so kept where a call is cut off.
 GPU = {
-    "InvertedPendulum-v5": Sizes(262_144, 200, (16_384, 65_536), 50, (32_768, 131_072), True),
-    "Hopper-v5": Sizes(33_792, 200, (8_192, 32_768), 10, train=True),
-    "HalfCheetah-v5": Sizes(33_792, 200, (8_192, 32_768), 10, train=True),
-    "Walker2d-v5": Sizes(33_792, 200, (32_768,), 5),
-    "Ant-v5": Sizes(33_792, 100, (32_768,), 2, train=True),
+    "InvertedPendulum-v5": Sizes(262_144, 200, (16_384, 65_536), 50, (32_768, 131_072)),
+    "Hopper-v5": Sizes(33_792, 1_000, (8_192, 32_768), 10, few=(2_048,)),
+    "HalfCheetah-v5": Sizes(33_792, 1_000, (8_192, 32_768), 10, few=(2_048,)),
+    "Walker2d-v5": Sizes(33_792, 1_000, (32_768,), 5, few=(2_048,)),
+    "Ant-v5": Sizes(33_792, 1_000, (32_768,), 2, few=(2_048,)),
     "Pusher-v5": Sizes(67_584, 100, (32_768,), 10),
     "Reacher-v5": Sizes(540_672, 50, (16_384, 65_536), 50, (32_768, 131_072)),
     "Swimmer-v5": Sizes(135_168, 200, (8_192,), 20, (32_768, 131_072)),
     "InvertedDoublePendulum-v5": Sizes(135_168, 200, (4_096,), 20, (32_768, 131_072)),
     "CartPole-v1": Sizes(262_144, 200, warp=()),
-    "Humanoid-v5": Sizes(33_792, 50),
-    "HumanoidStandup-v5": Sizes(33_792, 50),
+    "Humanoid-v5": Sizes(33_792, 200, few=(2_048,)),
+    "HumanoidStandup-v5": Sizes(33_792, 200, few=(2_048,)),
 }
 #: Episodes and env steps of native's on two cores.
 CPU = {
@@ -112,8 +113,7 @@ def conduct(settings: Settings) -> None:
     """Lets all tasks compile at once, then time one by one."""
     began = time.monotonic()
     date = now()
-    every = {"cpu": list(CPU), "gpu": list(GPU)}
-    every["train"] = [task for task, sizes in GPU.items() if sizes.train]
+    every = {"cpu": list(CPU), "gpu": list(GPU), "train": list(GPU)}
     tasks = list(settings.tasks or every[settings.part])
     started = {task: start(task, i, date, settings) for i, task in enumerate(tasks)}
     with concurrent.futures.ThreadPoolExecutor(len(tasks)) as pool:
@@ -191,16 +191,11 @@ def work(settings: Settings) -> None:
     (task,) = settings.tasks
     prepare = {"gpu": on_gpu, "train": trainings, "cpu": on_cpu}[settings.part]
     candidates = prepare(task, settings.shrink)
-    worlds = GPU[task].warp if settings.part == "gpu" else ()
-    if worlds:
-        added(task, 128)  # compiles
     print("compiled", flush=True)
     if sys.stdin.readline().strip() != "go":
         return
-    for number in worlds:
-        candidates += added(task, number // settings.shrink)
     said = facts(settings.worker, settings.commit)
-    rows = [row | said for row in measure(candidates, settings.repeats)]
+    rows = [row | said for row in measure(candidates(), settings.repeats)]
     append(settings.csv, rows)
     for row in rows:
         words = (row[key] for key in ("task", "what", "engine", "precision", "batch"))
@@ -220,29 +215,37 @@ def added(task: str, worlds: int) -> list[Candidate]:
     return [candidate]
 
 
-def on_gpu(task: str, shrink: int) -> list[Candidate]:
-    """Native, plain MJX and C MuJoCo."""
-    from experiments.speed.benchmark.ours import rollouts
+def on_gpu(task: str, shrink: int) -> Callable[[], list[Candidate]]:
+    """Native, plain MJX, C MuJoCo and MuJoCo Warp; records wait, for all tasks share the GPU."""
+    from experiments.speed.benchmark.ours import rollout_of, rollouts
     from experiments.speed.benchmark.peers import c_mujoco
 
     sizes = GPU[task]
-    few, *native = rollouts(task, "native", [128, sizes.batch // shrink], sizes.steps)
-    few.run()  # NVIDIA's driver translates a kernel, the same for any number, when it first runs
-    if not sizes.warp:
-        return native
-    batches = [batch // shrink for batch in sizes.mjx]
-    plain = rollouts(task, "plain MJX", batches, sizes.mjx_steps) if batches else []
-    return [*native, *plain, c_mujoco(task)]
+    native = rollout_of(task, "native", sizes.steps)
+    native(128).run()  # the machine code is the same for any number of episodes
+    plain = [batch // shrink for batch in sizes.mjx]
+    others = rollouts(task, "plain MJX", plain, sizes.mjx_steps) if plain else []
+    if sizes.warp:
+        others.append(c_mujoco(task))
+        added(task, 128)  # compiles
+
+    def candidates() -> list[Candidate]:
+        ours = [native(batch // shrink) for batch in (*sizes.few, sizes.batch)]
+        worlds = (*sizes.few, *sizes.warp)
+        return sum((added(task, number // shrink) for number in worlds), ours + others)
+
+    return candidates
 
 
-def trainings(task: str, shrink: int) -> list[Candidate]:
+def trainings(task: str, shrink: int) -> Callable[[], list[Candidate]]:
     """Training updates of a 64-64 policy."""
     from experiments.speed.benchmark.ours import training
 
-    return [training(task, "native", GPU[task].batch // shrink, 100)]
+    update = training(task, "native", GPU[task].batch // shrink, 100)
+    return lambda: [update]
 
 
-def on_cpu(task: str, shrink: int) -> list[Candidate]:
+def on_cpu(task: str, shrink: int) -> Callable[[], list[Candidate]]:
     """Native in both precisions beside C MuJoCo and Gymnasium, on the threads of this process."""
     from experiments.speed.benchmark.ours import rollouts
     from experiments.speed.benchmark.peers import peers
@@ -254,7 +257,8 @@ def on_cpu(task: str, shrink: int) -> list[Candidate]:
     if task == SHOWN_ON_CPU:
         candidates += rollouts(task, "fused", batches, steps)
         candidates += rollouts(task, "plain MJX", [128, 512], steps)
-    return candidates + peers(task)
+    candidates += peers(task)
+    return lambda: candidates
 
 
 if __name__ == "__main__":

@@ -69,27 +69,34 @@ def rollouts(
     policy: Path | None = None,
 ) -> list[Candidate]:
     """Whole rollouts with a policy, its noise and all that an update needs, for every batch."""
-    candidates = []
     with jax.enable_x64(precision == "float64"):
-        engine_name, solver = ENGINES[name]
-        env = Loop(make(env_id, solver), steps)
-        network, actor = the_policy(env, policy)
-        play_act = functools.partial(act, network)
-        began = time.perf_counter()
-        player = ActingPolicy(play_act, actor, network.distribution)
-        engine = choose(engine_name, env, player, steps)
-        choosing = time.perf_counter() - began  # machine code is made here
-        for batch in batches:
+        return list(map(rollout_of(env_id, name, steps, precision, policy=policy), batches))
 
-            def play(actor, key, batch=batch):
-                sizes = {"num_episodes": batch, "horizon": steps}
-                return engine.rollout(env, play_act, actor, network.distribution, key, **sizes)
 
-            what = "rollout, untrained 16-32 policy" if policy is None else f"rollout, {policy}"
-            row = {"what": what, "engine": name, "task": env_id, "precision": precision}
-            row |= {"batch": batch, "steps": steps}
-            candidates.append(compiled(row, play, actor, batch * steps, choosing))
-    return candidates
+def rollout_of(
+    env_id: str, name: str, steps: int, precision: str = "float32", *, policy: Path | None = None
+) -> Callable[[int], Candidate]:
+    """Makes the machine code of a rollout; returns what compiles a program of so many episodes."""
+    engine_name, solver = ENGINES[name]
+    env = Loop(make(env_id, solver), steps)
+    network, actor = the_policy(env, policy)
+    play_act = functools.partial(act, network)
+    began = time.perf_counter()
+    player = ActingPolicy(play_act, actor, network.distribution)
+    engine = choose(engine_name, env, player, steps)
+    choosing = time.perf_counter() - began  # machine code is made here
+
+    def of(batch: int) -> Candidate:
+        def play(actor, key):
+            sizes = {"num_episodes": batch, "horizon": steps}
+            return engine.rollout(env, play_act, actor, network.distribution, key, **sizes)
+
+        what = "rollout, untrained 16-32 policy" if policy is None else f"rollout, {policy}"
+        row = {"what": what, "engine": name, "task": env_id, "precision": precision}
+        row |= {"batch": batch, "steps": steps}
+        return compiled(row, play, actor, batch * steps, choosing)
+
+    return of
 
 
 def training(

@@ -15,10 +15,6 @@ from mjx_reinforce.reports.statistics.aggregates import interval
 #: Commit -> what its settings were that have changed since.
 _SINCE = {
     "e6f8e08c5022": "since then Swimmer has shorter steps",
-    "0a4b350acd32": (
-        "of Humanoid the numbers at the end are those of its last evaluation, for those of its\n"
-        "test were not kept"
-    ),
     "08b5cddba03e": (
         "HalfCheetah had its cut of 250 env steps, which is the default since then, from\n"
         "`--train-horizon 250 --eval-every 20` (on two threads `--eval-every 240`; on a GPU the\n"
