@@ -14,7 +14,8 @@ from mjx_reinforce.playing.cast import untrained
 from mjx_reinforce.watch import scene
 
 #: The tasks side by side, and the size of a file at most (bytes).
-_TASKS, LARGEST = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5"), 300_000
+_TASKS = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5")
+LARGEST = 300_000
 #: How many colours a film has, if it may not have more.
 _FEWER_COLORS = (128, 64, 32, 16, 8)
 
@@ -25,7 +26,7 @@ def write(folder: Path, arm: Path | None) -> None:
     configure_jax()
     folder.mkdir(parents=True, exist_ok=True)
     tasks = [_take(load(name), name.removesuffix("-v5")) for name in _TASKS]
-    save(folder / "tasks.gif", side_by_side(tasks, 176, 176, seconds=3.0, max_rate=12))
+    save(folder / "tasks.gif", side_by_side(tasks, 160, 176, seconds=2.5, max_rate=12))
     hopper = load("Hopper-v5")
     both = [_take(untrained(hopper), "before training"), _take(hopper, "after training")]
     save(folder / "before-and-after.gif", side_by_side(both, 240, 240, seconds=4.0, max_rate=12))

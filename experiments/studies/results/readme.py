@@ -11,7 +11,7 @@ from experiments.studies.results.clock import is_gpu
 from experiments.studies.results.tables import seconds
 
 #: The tasks of the table.
-_TASKS = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Swimmer-v5", "Reacher-v5")
+_TASKS = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5", "Swimmer-v5")
 
 
 def write(groups: Sequence[kept.Group], docs: Path, readme: Path) -> None:
