@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
+from jax import lax
 
 from experiments.checks.feature_models import MODELS
 from mjx_reinforce import normal
@@ -100,12 +101,13 @@ def expected(model: Any) -> list[np.ndarray]:
 
 
 def simulated(engine: str, env: Shown) -> np.ndarray:
-    """Returns what the model shows after every env step, [T, O]."""
+    """Returns what the model shows after every env step, [T, O]; "alone" is ``env.step`` itself."""
+    if engine == "alone":
+        return np.asarray(alone(env))
     distribution = normal(env.action_space, rescale=False)
-    nq, size = env.mj_model.nq, env.action_size
 
     def act(constants: jax.Array, observation: jax.Array) -> jax.Array:
-        action = control(observation[..., 1 : 1 + nq], size, jnp)  # after time
+        action = acted(env, observation)
         fixed = jnp.broadcast_to(constants, (*action.shape[:-1], constants.size))
         return jnp.concatenate([action, fixed], axis=-1)
 
@@ -116,6 +118,22 @@ def simulated(engine: str, env: Shown) -> np.ndarray:
         return played.observation[1:, 0]
 
     return np.asarray(play(jnp.asarray(distribution.constants, jnp.result_type(float))))
+
+
+def alone(env: Shown) -> jax.Array:
+    """Simulates one episode by no engine, which compiles soonest."""
+
+    def step(state: Any, _: None) -> tuple[Any, jax.Array]:
+        state = env.step(state, acted(env, state.obs))
+        return state, state.obs
+
+    play = jax.jit(lambda key: lax.scan(step, env.reset(key), None, STEPS)[1])
+    return play(jax.random.key(0))
+
+
+def acted(env: Shown, shown: jax.Array) -> jax.Array:
+    """Returns the control [..., A] where this is shown [..., O]."""
+    return control(shown[..., 1 : 1 + env.mj_model.nq], env.action_size, jnp)  # after time
 
 
 def compare(name: str, engines: tuple[str, ...]) -> Iterator[tuple[str, float, str]]:

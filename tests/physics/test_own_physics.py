@@ -64,7 +64,7 @@ def test_every_state_of_mujoco_is_accounted_for():
 
 @pytest.mark.parametrize("name", MODELS)
 def test_own_models(name):
-    [(_, error, words)] = own_models.compare(name, ("vmap",))
+    [(_, error, words)] = own_models.compare(name, ("alone",))
     if name in REFUSED:
         assert np.isnan(error)
         assert REFUSED[name] in words
@@ -75,8 +75,9 @@ def test_own_models(name):
 
 
 @pytest.mark.parametrize("name", ["muscle", "filter, RK4"])
-def test_machine_code_carries_activations(name):
-    [(_, error, words)] = own_models.compare(name, ("native",))
+@pytest.mark.parametrize("engine", own_models.ENGINES)
+def test_engines_carry_activations(engine, name):
+    [(_, error, words)] = own_models.compare(name, (engine,))
     assert error < 1e-9, words
 
 
