@@ -57,8 +57,8 @@ GPU = {
     "Swimmer-v5": Sizes(135_168, 200, (8_192,), 20, (32_768, 131_072)),
     "InvertedDoublePendulum-v5": Sizes(135_168, 200, (4_096,), 20, (32_768, 131_072)),
     "CartPole-v1": Sizes(262_144, 200, warp=()),
-    "Humanoid-v5": Sizes(33_792, 200, few=(2_048,)),
-    "HumanoidStandup-v5": Sizes(33_792, 200, few=(2_048,)),
+    "Humanoid-v5": Sizes(33_792, 500, few=(2_048,)),
+    "HumanoidStandup-v5": Sizes(33_792, 500, few=(2_048,)),
 }
 #: Episodes and env steps of native's on two cores.
 CPU = {
