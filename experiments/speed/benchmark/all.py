@@ -51,14 +51,14 @@ GPU = {
     "Hopper-v5": Sizes(33_792, 1_000, (8_192, 32_768), 10, few=(2_048,)),
     "HalfCheetah-v5": Sizes(33_792, 1_000, (8_192, 32_768), 10, few=(2_048,)),
     "Walker2d-v5": Sizes(33_792, 1_000, (32_768,), 5, few=(2_048,)),
-    "Ant-v5": Sizes(33_792, 1_000, (32_768,), 2, few=(2_048,)),
+    "Ant-v5": Sizes(33_792, 500, (32_768,), 2, few=(2_048,)),
     "Pusher-v5": Sizes(67_584, 100, (32_768,), 10),
     "Reacher-v5": Sizes(540_672, 50, (16_384, 65_536), 50, (32_768, 131_072)),
     "Swimmer-v5": Sizes(135_168, 200, (8_192,), 20, (32_768, 131_072)),
     "InvertedDoublePendulum-v5": Sizes(135_168, 200, (4_096,), 20, (32_768, 131_072)),
     "CartPole-v1": Sizes(262_144, 200, warp=()),
-    "Humanoid-v5": Sizes(33_792, 500, few=(2_048,)),
-    "HumanoidStandup-v5": Sizes(33_792, 500, few=(2_048,)),
+    "Humanoid-v5": Sizes(33_792, 200, few=(2_048,)),
+    "HumanoidStandup-v5": Sizes(33_792, 200, few=(2_048,)),
 }
 #: Episodes and env steps of native's on two cores.
 CPU = {
