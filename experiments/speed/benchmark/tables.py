@@ -37,22 +37,30 @@ class Raw(NamedTuple):
 
 
 def last_calls(rows: list[dict[str, Any]]) -> Raw:
-    """Sorts rows by the kind of their call, and keeps each task's last call of a kind."""
-    kinds: dict[str, str] = {}
-    for row in rows:
-        if row["what"].startswith("training"):
-            kinds[row["date"]] = "train"
-        elif row["device"] != "cpu":
-            kinds[row["date"]] = "gpu"
+    """Sorts rows by the kind of their call, and keeps each task's last call of a kind.
+
+    A rollout with a trained policy counts only where a task has none with an untrained one.
+    """
+    rollouts = [row for row in rows if row["what"].startswith("rollout")]
+    on_gpu = {row["date"] for row in rollouts if row["device"] != "cpu"}
+    trained = {row["date"] for row in rollouts if row["what"].startswith("rollout, trained")}
     found: dict[str, list[dict[str, Any]]] = {"gpu": [], "train": [], "cpu": []}
-    last: dict[tuple[str, str], str] = {}
+    last: dict[tuple[str, str], tuple[bool, str]] = {}
+
+    def kind(row: dict[str, Any]) -> str:
+        if row["what"].startswith("training"):
+            return "train"
+        return "gpu" if row["date"] in on_gpu else "cpu"
+
+    def rank(row: dict[str, Any]) -> tuple[bool, str]:
+        return row["date"] not in trained, row["date"]
+
     for row in rows:
-        key = row["task"], kinds.get(row["date"], "cpu")
-        last[key] = max(last.get(key, ""), row["date"])
+        key = row["task"], kind(row)
+        last[key] = max(last.get(key, rank(row)), rank(row))
     for row in rows:
-        kind = kinds.get(row["date"], "cpu")
-        if row["date"] == last[row["task"], kind]:
-            found[kind].append(row)
+        if rank(row) == last[row["task"], kind(row)]:
+            found[kind(row)].append(row)
     return Raw(**found)
 
 

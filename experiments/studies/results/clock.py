@@ -154,13 +154,17 @@ def _noise_words() -> str:
 
 
 def _noise(rows: Sequence[dict[str, str]]) -> str:
-    tasks: dict[tuple[str, str], list[str]] = {}
+    parts: dict[tuple[str, str], list[list[float]]] = {}
     for row in rows:
-        scale = float(row["episodes"]) / max(float(row["snr"]), 1e-9)
-        cell = f"{scale:,.0f}" if scale < 1e6 else "not seen"
-        tasks.setdefault((row["task"], row["episodes"]), []).append(cell)
+        empty: list[list[float]] = [[] for _ in range(kept.PARTS)]
+        found = parts.setdefault((row["task"], row["episodes"]), empty)
+        found[int(row["part"])].append(float(row["snr"]))
+    lines = []
+    for (task, episodes), found in parts.items():
+        scales = [float(episodes) / max(float(np.median(x)), 1e-9) for x in found]
+        lines.append([task, episodes, *(f"{x:,.0f}" if x < 1e6 else "not seen" for x in scales)])
     header = ["task", "episodes an update", *(f"quarter {i + 1}" for i in range(kept.PARTS))]
-    return table(header, [[task, played, *cells] for (task, played), cells in tasks.items()])
+    return table(header, lines)
 
 
 def _stopped(group: kept.Group) -> str:
