@@ -7,6 +7,7 @@ import atexit
 import os
 import shutil
 import tempfile
+import zlib
 from importlib.metadata import version
 from pathlib import Path
 
@@ -43,6 +44,15 @@ scalarized.inspect = verify
 jax.config.update("jax_default_matmul_precision", "highest")
 
 
+def pytest_addoption(parser):
+    parser.addoption(
+        "--slow-share",
+        default="1",
+        metavar="K:TEXT",
+        help="of the slow tests, run one in K; TEXT says which, by chance but always the same",
+    )
+
+
 def pytest_collection_modifyitems(config, items):
     """Marks what slow.txt lists, and puts it first, so that no worker ends with a slow test."""
     slow = {line for line in SLOW.read_text().splitlines() if not line.startswith("#")}
@@ -55,9 +65,22 @@ def pytest_collection_modifyitems(config, items):
         if item.get_closest_marker("cpu") and jax.default_backend() != "cpu":
             item.add_marker(pytest.mark.skip(reason="it is for CPUs"))
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+    _deselect(config, items)
     whole = not (any("::" in each for each in config.args) or config.getoption("lf", False))
     collected = {item.path.name for item in items} if whole else set()
     config.stash[_STALE] = _stale(slow - found, collected)
+
+
+def _deselect(config, items):
+    """Takes those slow tests away that are of another share."""
+    shares, _, text = config.getoption("slow_share").partition(":")
+
+    def left_out(item):
+        of_all = zlib.crc32(f"{text} {item.nodeid}".encode())
+        return item.get_closest_marker("slow") and of_all % int(shares)
+
+    config.hook.pytest_deselected(items=[item for item in items if left_out(item)])
+    items[:] = [item for item in items if not left_out(item)]
 
 
 @pytest.fixture

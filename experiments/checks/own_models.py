@@ -121,14 +121,20 @@ def simulated(engine: str, env: Shown) -> np.ndarray:
 
 
 def alone(env: Shown) -> jax.Array:
-    """Simulates one episode by no engine, which compiles soonest."""
+    """Simulates one episode by no engine, which compiles soonest: the start takes no physics."""
 
     def step(state: Any, _: None) -> tuple[Any, jax.Array]:
-        state = env.step(state, acted(env, state.obs))
+        qpos = state.pipeline_state.qpos
+        state = env.step(state, control(qpos, env.action_size, jnp))
         return state, state.obs
 
-    play = jax.jit(lambda key: lax.scan(step, env.reset(key), None, STEPS)[1])
-    return play(jax.random.key(0))
+    def play(qpos: jax.Array, qvel: jax.Array) -> jax.Array:
+        reset = jax.eval_shape(env.set_state, qpos, qvel)
+        rest = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), reset)
+        start = dataclasses.replace(rest.pipeline_state, qpos=qpos, qvel=qvel)
+        return lax.scan(step, dataclasses.replace(rest, pipeline_state=start), None, STEPS)[1]
+
+    return jax.jit(play)(*env.initial(jax.random.key(0)))
 
 
 def acted(env: Shown, shown: jax.Array) -> jax.Array:
