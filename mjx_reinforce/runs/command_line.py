@@ -1,6 +1,7 @@
 """The command line of ``python -m mjx_reinforce.train``: presets, flags, and runs that go on."""
 
 import dataclasses
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -214,6 +215,8 @@ def refuse_full(
     if "RESOURCE_EXHAUSTED" not in str(error):
         raise error
     flags = f"{flag}, --num-episodes, --eval-episodes or --horizon"
+    if os.environ.get("XLA_PYTHON_CLIENT_PREALLOCATE", "").lower() in ("false", "0"):
+        flags += "; or unset XLA_PYTHON_CLIENT_PREALLOCATE, with which memory is in pieces"
     refuse(f"{part} does not fit into memory ({error}); lower {flags}", made)
 
 

@@ -245,6 +245,19 @@ def test_what_is_full_is_said_in_one_line(run, tmp_path, monkeypatch, capsys, er
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(("taken", "advised"), [("false", True), ("true", False), (None, False)])
+def test_memory_in_pieces_is_named(run, monkeypatch, capsys, taken, advised):
+    def fail(*_):
+        raise RuntimeError("RESOURCE_EXHAUSTED: 9 GB")
+
+    monkeypatch.setattr(train_module, "train", fail)
+    monkeypatch.delenv("XLA_PYTHON_CLIENT_PREALLOCATE", raising=False)
+    if taken:
+        monkeypatch.setenv("XLA_PYTHON_CLIENT_PREALLOCATE", taken)
+    assert run(*ARGUMENTS, "--output", "out") == 2
+    assert ("unset XLA_PYTHON_CLIENT_PREALLOCATE" in capsys.readouterr().err) == advised
+
+
 def test_another_error_is_not_said_to_be_of_memory(run, monkeypatch):
     def fail(*_):
         raise RuntimeError("INTERNAL")
