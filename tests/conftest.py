@@ -3,6 +3,7 @@
 They run on the CPU unless JAX_PLATFORMS names something else.
 """
 
+import argparse
 import atexit
 import os
 import shutil
@@ -44,10 +45,18 @@ scalarized.inspect = verify
 jax.config.update("jax_default_matmul_precision", "highest")
 
 
+def _share(words):
+    shares, _, text = words.partition(":")
+    if not (shares.isdecimal() and int(shares)):
+        raise argparse.ArgumentTypeError(f"must be K:TEXT, with K 1 or more, got {words!r}")
+    return int(shares), text
+
+
 def pytest_addoption(parser):
     parser.addoption(
         "--slow-share",
-        default="1",
+        type=_share,
+        default=(1, ""),
         metavar="K:TEXT",
         help="of the slow tests, run one in K; TEXT says which, by chance but always the same",
     )
@@ -73,11 +82,11 @@ def pytest_collection_modifyitems(config, items):
 
 def _deselect(config, items):
     """Takes those slow tests away that are of another share."""
-    shares, _, text = config.getoption("slow_share").partition(":")
+    shares, text = config.getoption("slow_share")
 
     def left_out(item):
-        of_all = zlib.crc32(f"{text} {item.nodeid}".encode())
-        return item.get_closest_marker("slow") and of_all % int(shares)
+        drawn = zlib.crc32(f"{text} {item.nodeid}".encode()) % shares == 0
+        return item.get_closest_marker("slow") and not drawn
 
     config.hook.pytest_deselected(items=[item for item in items if left_out(item)])
     items[:] = [item for item in items if not left_out(item)]

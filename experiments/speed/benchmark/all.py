@@ -14,6 +14,7 @@ and the figure.
 import concurrent.futures
 import dataclasses
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -119,24 +120,44 @@ def conduct(settings: Settings) -> None:
     every = {"cpu": list(CPU), "gpu": list(GPU), "train": list(GPU)}
     tasks = list(settings.tasks or every[settings.part])
     started = {task: start(task, i, date, settings) for i, task in enumerate(tasks)}
-    with concurrent.futures.ThreadPoolExecutor(len(tasks)) as pool:
+    try:
+        time_in_turn(started, settings, began)
+    finally:
+        for process in started.values():
+            stop(process)
+    print(f"{settings.part}: {time.monotonic() - began:.0f} s", flush=True)
+
+
+def time_in_turn(
+    started: dict[str, subprocess.Popen[str]], settings: Settings, began: float
+) -> None:
+    """Waits until tasks have compiled, and lets one after the other time."""
+    with concurrent.futures.ThreadPoolExecutor(len(started)) as pool:
         ready = {task: pool.submit(until, p.stdout, "compiled") for task, p in started.items()}
         concurrent.futures.wait(ready.values(), timeout=0.6 * 60 * settings.minutes)
         for task, process in started.items():
             if not ready[task].done() or not ready[task].result():
                 print(f"{task}: left out, not compiled in time or failed", flush=True)
-                process.kill()
-        print(f"compiled after {time.monotonic() - began:.0f} s", flush=True)
-        for process in started.values():
-            left = settings.minutes * 60 - (time.monotonic() - began)
-            if process.poll() is None and left > 0:
-                if settings.part == "cpu":
-                    quiet = named(two_cores())
-                    move = ["taskset", "-acp", quiet, str(process.pid)]
-                    subprocess.run(move, check=True, stdout=subprocess.DEVNULL)
-                print(*go(process, left), sep="\n", flush=True)
-            process.kill()
-    print(f"{settings.part}: {time.monotonic() - began:.0f} s", flush=True)
+                stop(process)
+    print(f"compiled after {time.monotonic() - began:.0f} s", flush=True)
+    for process in started.values():
+        left = settings.minutes * 60 - (time.monotonic() - began)
+        if process.poll() is None and left > 0:
+            if settings.part == "cpu":
+                quiet = named(two_cores())
+                move = ["taskset", "-acp", quiet, str(process.pid)]
+                subprocess.run(move, check=True, stdout=subprocess.DEVNULL)
+            print(*go(process, left), sep="\n", flush=True)
+        stop(process)
+
+
+def stop(process: subprocess.Popen[str]) -> None:
+    """Ends a task's process, which ends its compilers first: they would disturb the others."""
+    process.terminate()
+    try:
+        process.wait(timeout=30)
+    except subprocess.TimeoutExpired:
+        process.kill()
 
 
 def start(task: str, index: int, date: str, settings: Settings) -> subprocess.Popen[str]:
@@ -186,6 +207,7 @@ def go(process: subprocess.Popen[str], seconds: float) -> list[str]:
 
 def work(settings: Settings) -> None:
     """Compiles one task's engines, waits for its turn, times and appends."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # not at once: compilers are ended first
     import jax
 
     from experiments.speed.benchmark.rows import append, facts, measure, speed
