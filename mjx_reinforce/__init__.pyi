@@ -18,8 +18,8 @@ from mjx_reinforce.learners.estimators import (
 )
 from mjx_reinforce.learners.learner import Learner, TrainState, train_step
 from mjx_reinforce.learners.natural_gradient import natural_gradient
-from mjx_reinforce.learners.pace import AutoEpisodes, Cut
 from mjx_reinforce.learners.reinforce import reinforce
+from mjx_reinforce.learners.schedules import Cut
 from mjx_reinforce.learners.updates import each_step, full_batch, make_optimizer, minibatches
 from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
 from mjx_reinforce.policies.actor import Actor, act
@@ -73,7 +73,6 @@ from . import vector as vector
 __version__: str
 __all__ = [
     "Actor",
-    "AutoEpisodes",
     "Box",
     "Config",
     "Cut",

@@ -7,7 +7,6 @@ entries, A action entries.
 from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
@@ -91,7 +90,6 @@ class Trajectory:
       nonfinite: [N] True where the simulation left the finite numbers
       simulated: [] int32, env steps that were simulated for these episodes, those in which an
         episode was over already included
-      played: [N] whether an episode was played, None where all were; one that was not has no step
 
     Examples:
       >>> import jax, jax.numpy as jnp
@@ -111,7 +109,6 @@ class Trajectory:
     mask: jax.Array
     nonfinite: jax.Array
     simulated: jax.Array
-    played: jax.Array | None = None
 
     def __repr__(self) -> str:
         named = {"observation": self.observation, "action": self.action, "mask": self.mask}
@@ -127,12 +124,6 @@ class Trajectory:
             mask=self.mask[:steps],
         )
 
-    def num_played(self) -> int | jax.Array:
-        """Returns how many episodes [] were played; traced where not all were."""
-        if self.played is None:
-            return self.mask.shape[1]
-        return jnp.sum(self.played, dtype=jnp.int32)
-
     def episodes(self, part: slice) -> "Trajectory":
         """Returns a part of the episodes; ``simulated`` remains that of all."""
         return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
@@ -141,7 +132,6 @@ class Trajectory:
             reward=self.reward[:, part],
             mask=self.mask[:, part],
             nonfinite=self.nonfinite[part],
-            played=None if self.played is None else self.played[part],
         )
 
 

@@ -13,7 +13,6 @@ import jax.numpy as jnp
 import optax
 from optax import Params
 
-from mjx_reinforce.learners.pace import Noise
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.policies.policy import Policy
@@ -49,7 +48,7 @@ def visited_steps(trajectory: Trajectory) -> Visited:
     rounded up. Together they count as L. Of more than ``MAX_COMPARED`` episodes, every second,
     third, ... is taken.
     """
-    apart = _apart(trajectory)
+    apart = slice(None, None, -(-trajectory.mask.shape[1] // MAX_COMPARED))
     mask = trajectory.mask[:, apart]
     horizon, num_episodes = mask.shape
     each = min(horizon, MAX_COMPARED // num_episodes)
@@ -68,14 +67,6 @@ def visited_steps(trajectory: Trajectory) -> Visited:
         action=take(trajectory.action),
         weight=share / jnp.maximum(jnp.sum(length), 1),
     )
-
-
-def _apart(trajectory: Trajectory) -> slice | jax.Array:
-    """Returns which episodes are looked at, ``MAX_COMPARED`` at most, evenly apart."""
-    count = trajectory.mask.shape[1]
-    if trajectory.played is None or count <= MAX_COMPARED:
-        return slice(None, None, -(-count // MAX_COMPARED))
-    return jnp.arange(MAX_COMPARED) * trajectory.num_played() // MAX_COMPARED
 
 
 def policy_metrics(policy: Policy, before: Actor, after: Actor, visited: Visited) -> Metrics:
@@ -162,31 +153,6 @@ def signal_to_noise(mean: Params, each: Params, num_episodes: int) -> jax.Array:
     squares = jax.vmap(lambda tree: optax.tree.norm(tree, squared=True))(apart)
     noise = jnp.mean(squares) / (num_episodes - 1)
     return optax.tree.norm(mean, squared=True) / noise - 1
-
-
-def noise_of_groups(sums: Params, counts: jax.Array) -> Noise:
-    """Estimates the noise and the signal of a gradient from sums over groups of episodes.
-
-    The noise is the mean square between groups of an analysis of variance, sum_k n_k |g_k - g|^2 /
-    (K - 1), with g_k the mean of the n_k episodes of group k, and g that of all: unbiased for
-    tr Cov of one episode, where episodes are independent and alike. The signal is |g|^2 less the
-    noise over the number of episodes (as in McCandlish et al. 2018, arXiv:1812.06162, appendix
-    A.1). Other than ``signal_to_noise``, it needs no gradient of a single episode.
-
-    Args:
-      sums: the gradients of each group, summed over its episodes, a pytree of [K, ...].
-      counts: [K] how many these are; groups without any do not count, two at least have some.
-    """
-    total, groups = jnp.maximum(jnp.sum(counts), 1), jnp.sum(counts > 0)
-    mean = jax.tree.map(lambda g: jnp.sum(g, axis=0) / total, sums)
-    of_each = jnp.maximum(counts, 1)
-
-    def apart(group, count):
-        return optax.tree.norm(jax.tree.map(lambda g, m: g / count - m, group, mean), squared=True)
-
-    between = jnp.sum(counts * jax.vmap(apart)(sums, of_each))
-    noise = between / jnp.maximum(groups - 1, 1)
-    return Noise(signal=optax.tree.norm(mean, squared=True) - noise / total, noise=noise)
 
 
 def nan_unless(finite: jax.Array, metrics: Metrics) -> Metrics:

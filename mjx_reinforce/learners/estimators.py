@@ -142,8 +142,6 @@ def leave_one_out(discount: float | jax.Array = 0.99, *, ended: str = "zero") ->
     def update(state, trajectory):
         returns = _returns(trajectory, discount)
         counted = jnp.ones_like(trajectory.mask) if ended == "zero" else trajectory.mask
-        if trajectory.played is not None:
-            counted &= trajectory.played
         others = jnp.sum(counted, axis=1, keepdims=True) - counted
         sums = jnp.sum(jnp.where(counted, returns, 0.0), axis=1, keepdims=True)
         baseline = (sums - jnp.where(counted, returns, 0.0)) / jnp.maximum(others, 1)
@@ -183,9 +181,7 @@ def mean_log_prob(discount: float | jax.Array = 0.99) -> Estimator:
     def weigh(trajectory):
         returns = discounted_returns(trajectory.reward, discount)
         mean = _episode_mean(returns, trajectory.mask)
-        return jnp.broadcast_to(
-            replace_broken(mean, trajectory.nonfinite, trajectory.played), returns.shape
-        )
+        return jnp.broadcast_to(replace_broken(mean, trajectory.nonfinite), returns.shape)
 
     return _stateless(weigh)
 
@@ -221,7 +217,7 @@ def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
         centred = jnp.where(mask, returns - _episode_mean(returns, mask), 0.0)
         variance = jnp.sum(centred**2, axis=0) / jnp.maximum(jnp.sum(mask, axis=0) - 1, 1)
         normalized = centred / (jnp.sqrt(variance) + float(jnp.finfo(jnp.float32).eps))
-        return replace_broken(normalized, trajectory.nonfinite, trajectory.played)
+        return replace_broken(normalized, trajectory.nonfinite)
 
     return _stateless(weigh)
 
@@ -347,7 +343,7 @@ def shift_rewards(estimator: Estimator, shift: float | jax.Array) -> Estimator:
 def _returns(trajectory: Trajectory, discount: float | jax.Array) -> jax.Array:
     """Returns G [T, N]; of an episode that broke, the least of the others."""
     returns = discounted_returns(trajectory.reward, discount)
-    return replace_broken(returns, trajectory.nonfinite, trajectory.played)
+    return replace_broken(returns, trajectory.nonfinite)
 
 
 def _stateless(weigh: Callable[[Trajectory], jax.Array]) -> Estimator:
@@ -418,9 +414,7 @@ def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Ar
     return returns.reshape(-1, num_episodes)[:horizon]
 
 
-def replace_broken(
-    returns: jax.Array, broken: jax.Array, played: jax.Array | None = None
-) -> jax.Array:
+def replace_broken(returns: jax.Array, broken: jax.Array) -> jax.Array:
     """Returns the returns, of an episode that broke the least of the others'.
 
     What it earned until the simulation left the finite numbers is no return: where rewards are
@@ -430,10 +424,8 @@ def replace_broken(
     Args:
       returns: [..., N] such as G [T, N]; the others are those of the same step.
       broken: [N] ``Trajectory.nonfinite``; where all are, all returns are infinite.
-      played: [N] ``Trajectory.played``.
     """
-    without = broken if played is None else broken | ~played
-    least = jnp.min(jnp.where(without, jnp.inf, returns), axis=-1, keepdims=True)
+    least = jnp.min(jnp.where(broken, jnp.inf, returns), axis=-1, keepdims=True)
     return jnp.where(broken, least, returns)
 
 

@@ -22,8 +22,6 @@ def accumulate_gradient(
     loss: Callable[[Any, Any], tuple[jax.Array, Any]],
     params: Params,
     data: tuple[Any, ...],
-    *,
-    groups: int | None = None,
 ) -> tuple[jax.Array, Any, Any]:
     """Sums a loss, its gradient and its metrics over chunks of time.
 
@@ -32,19 +30,13 @@ def accumulate_gradient(
       params: what is differentiated.
       data: arrays [T, N, ...]; the last is the mask [T, N], and time steps after
         the last one with any True are not visited.
-      groups: K, which divides N: sums are over the episodes k, k + K, ... of each group k.
 
     Returns:
-      The loss [], its gradient like ``params``, and the metrics, all summed; with groups, a first
-      axis [K] more.
+      The loss [], its gradient like ``params``, and the metrics, all summed.
     """
     differentiate = jax.value_and_grad(loss, has_aux=True)
-    if groups is not None:
-        differentiate = jax.vmap(differentiate, in_axes=(None, 2))
 
     def visit(chunk):
-        if groups is not None:
-            chunk = jax.tree.map(lambda x: x.reshape(len(x), -1, groups, *x.shape[2:]), chunk)
         (value, metrics), grads = differentiate(params, chunk)
         return value, grads, metrics
 

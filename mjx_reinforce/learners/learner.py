@@ -13,10 +13,8 @@ from jax.flatten_util import ravel_pytree
 from mjx_reinforce.checks import check_kind, check_type
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
-from mjx_reinforce.fused import any_lane
 from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.diagnostics import Metrics
-from mjx_reinforce.learners.pace import Pace
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.policy import Policy
 from mjx_reinforce.types import Environment, PyTree, Trajectory
@@ -36,7 +34,6 @@ class TrainState:
       opt_state: the optimiser's state
       estimator_state: the estimator's, such as a critic
       start_key: [] what every episode is reset with, where all start alike; else None
-      pace: how many episodes the next update plays, where that follows the noise; else None
 
     Examples:
       >>> import jax
@@ -57,7 +54,6 @@ class TrainState:
     opt_state: Any
     estimator_state: Any
     start_key: jax.Array | None = None
-    pace: Pace | None = None
 
     def __repr__(self) -> str:
         seeds = f", seeds {list(self.key.shape)}" if self.key.shape else ""
@@ -110,8 +106,6 @@ class Learner(NamedTuple):
         else that changes by learning; consumes the key
       policy: the policy that is trained
       engine: how its episodes are played
-      room: the most episodes that an update can play, where that follows the noise
-      narrower: the same with less room, the least first; a step takes the first that has enough
 
     Examples:
       >>> import jax
@@ -129,8 +123,6 @@ class Learner(NamedTuple):
     learn: Callable[[TrainState, Any, jax.Array], tuple[TrainState, Metrics]]
     policy: Policy
     engine: Engine
-    room: int = 0
-    narrower: "tuple[Learner, ...]" = ()
 
     def __repr__(self) -> str:
         return f"Learner({self.policy!r}, {self.engine!r})"
@@ -151,10 +143,6 @@ class Learner(NamedTuple):
         self, state: TrainState, active: bool | jax.Array, guests: Guests | None
     ) -> tuple[TrainState, Metrics, Trajectory | None]:
         """Makes one update as ``step``; also returns the episodes of guests, if there are any."""
-        if self.narrower:
-            return self._in_room(
-                state, active, lambda learner: learner.step_with(state, active, guests)
-            )
         key, play_key, learn_key = jax.random.split(state.key, 3)
         if guests is not None and isinstance(self.play, Host):
             played, looked = self.play.with_guests(state, play_key, active, guests)
@@ -170,16 +158,6 @@ class Learner(NamedTuple):
         if active is not True:
             after = jax.tree.map(lambda new, old: jnp.where(active, new, old), after, state)
         return after, metrics, looked
-
-    def _in_room(
-        self, state: TrainState, active: bool | jax.Array, step: "Callable[[Learner], Any]"
-    ) -> Any:
-        """Makes a step with the first learner that has enough room, for all seeds that go on."""
-        assert state.pace is not None
-        number = jnp.where(active, state.pace.num_episodes, 0)
-        beyond = [any_lane(number > learner.room).astype(jnp.int32) for learner in self.narrower]
-        learners = (*self.narrower, self._replace(narrower=()))
-        return jax.lax.switch(sum(beyond), [functools.partial(step, x) for x in learners])
 
     def act(self, actor: Actor, observation: jax.Array) -> jax.Array:
         """Returns the outputs [..., K] of the policy's distribution; see ``policies.actor.act``."""
@@ -265,13 +243,12 @@ def _is_float(x: jax.Array) -> bool:
 def episode_metrics(trajectory: Trajectory) -> Metrics:
     """Returns what a person wants to know of the episodes."""
     returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
-    played = trajectory.played
     return {
-        "episodes": jnp.int32(trajectory.num_played()),
-        "episode_return": jnp.mean(returns, where=played),
-        "episode_return_min": jnp.min(returns, initial=jnp.inf, where=played),
-        "episode_return_max": jnp.max(returns, initial=-jnp.inf, where=played),
-        "episode_length": jnp.mean(lengths, where=played),
+        "episodes": jnp.int32(trajectory.mask.shape[1]),
+        "episode_return": jnp.mean(returns),
+        "episode_return_min": jnp.min(returns),
+        "episode_return_max": jnp.max(returns),
+        "episode_length": jnp.mean(lengths),
         "env_steps": jnp.sum(lengths),
         "simulated_steps": trajectory.simulated,
         "nonfinite_episodes": jnp.sum(trajectory.nonfinite),

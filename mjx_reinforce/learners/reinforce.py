@@ -17,7 +17,7 @@ from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.engines.episode import check_shapes, episode_keys
 from mjx_reinforce.fused import any_lane
-from mjx_reinforce.learners import counts, pace
+from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.contract import check_estimator, check_optimizer, check_update
 from mjx_reinforce.learners.diagnostics import (
     nan_unless,
@@ -37,8 +37,7 @@ from mjx_reinforce.learners.learner import (
     episode_metrics,
     keep_finite,
 )
-from mjx_reinforce.learners.pace import AutoEpisodes, Cut
-from mjx_reinforce.learners.schedules import Clock
+from mjx_reinforce.learners.schedules import Clock, Cut, check_cut
 from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_optimizer
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
@@ -85,7 +84,7 @@ def reinforce(
     estimator: Estimator | Callable[[jax.Array], Estimator] | None = None,
     optimizer: optax.GradientTransformation | None = None,
     update: Update | None = None,
-    num_episodes: int | AutoEpisodes = 16,
+    num_episodes: int = 16,
     horizon: int | None = None,
     cut: Cut | None = None,
     entropy_cost: float | jax.Array = 0.0,
@@ -118,8 +117,7 @@ def reinforce(
         its numbers change as the budget is used.
       optimizer: by default Adam at 1e-2 with the gradient's norm clipped at 1.
       update: how the gradient is spent, from ``updates``; by default in one optimiser step.
-      num_episodes: N, episodes an update; or ``AutoEpisodes()``, as many as the gradient's noise
-        asks for, between bounds. That needs the update ``full_batch``, which measures the noise.
+      num_episodes: N, episodes an update.
       horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
       cut: how many steps episodes have at most until a share of the budget is used, which is
         ``TrainState.progress``; by default they are never cut.
@@ -166,14 +164,10 @@ def reinforce(
         optimizer = make_optimizer()
     update = full_batch() if update is None else update
     check_update(update)
-    auto = None
-    if isinstance(num_episodes, AutoEpisodes):
-        pace.check_auto(num_episodes, update)
-        auto, num_episodes = num_episodes, num_episodes.most
     check_count("num_episodes", num_episodes)
     check_count("num_seeds", num_seeds)
     if cut is not None:
-        pace.check_cut(cut)
+        check_cut(cut)
     check_number("entropy_cost", entropy_cost)
     check_number("normalize_steps", normalize_steps, finite=False)
     check_number("normalize_min_std", normalize_min_std)
@@ -193,7 +187,6 @@ def reinforce(
         optimizer=optimizer,
         update=update,
         num_episodes=num_episodes,
-        auto=auto,
         horizon=check_horizon(env, horizon),
         cut=cut,
         entropy_cost=entropy_cost,
@@ -229,7 +222,6 @@ class _Reinforce:
     optimizer: optax.GradientTransformation
     update: Update
     num_episodes: int
-    auto: AutoEpisodes | None
     horizon: int
     cut: Cut | None
     entropy_cost: float | jax.Array
@@ -251,22 +243,12 @@ class _Reinforce:
         actor = jax.eval_shape(self._first_actor, jax.random.key(0))
         player = choice.ActingPolicy(self._act, actor, self.policy.distribution)
         chosen = choice.choose(engine, self.env, player, self.horizon)
-        if self.auto is None:
-            return self._with_engine(chosen)
-        *narrower, widest = (
-            dataclasses.replace(self, num_episodes=room)._with_engine(chosen)
-            for room in self.auto.rooms()
-        )
-        return widest._replace(narrower=tuple(narrower))
-
-    def _with_engine(self, engine: Engine) -> Learner:
-        play: Any = functools.partial(self._play, engine)
-        with_guests: Any = functools.partial(self._play_all, engine)
-        if engine.name == "native" and not self.one_start:
+        play: Any = functools.partial(self._play, chosen)
+        with_guests: Any = functools.partial(self._play_all, chosen)
+        if chosen.name == "native" and not self.one_start:
             # Elsewhere an episode that is not played still takes its place.
             play = Host(play, with_guests)
-        room = self.num_episodes
-        return Learner(self._init, play, self._learn, self.policy, engine, room=room)
+        return Learner(self._init, play, self._learn, self.policy, chosen)
 
     def _act(self, actor: Actor, observation: jax.Array) -> jax.Array:
         return act(self.policy, actor, observation)
@@ -293,19 +275,12 @@ class _Reinforce:
                 estimator_key, self.observation_size
             ),
             start_key=start_key,
-            pace=None if self.auto is None else pace.first_pace(self.auto),
         )
 
     def _play(
         self, engine: Engine, state: TrainState, key: jax.Array, active: bool | jax.Array = True
     ) -> Trajectory:
         return self._play_all(engine, state, key, active, None)[0]
-
-    def _chosen(self, state: TrainState, active: bool | jax.Array) -> Any:
-        """Returns which episodes are played, [] or [N]."""
-        if state.pace is None:
-            return active
-        return (jnp.arange(self.num_episodes) < state.pace.num_episodes) & active
 
     def _play_all(
         self,
@@ -319,7 +294,7 @@ class _Reinforce:
         play = functools.partial(self._play_part, engine)
         visitors = None if guests is None else (guests.keys, guests.deterministic(), guests.active)
         check_shapes((), (self.num_episodes,), active=active)
-        chosen = jnp.broadcast_to(self._chosen(state, active), self.num_episodes)
+        chosen = jnp.broadcast_to(active, self.num_episodes)
         keys = episode_keys(key, self.num_episodes)
         limit = None if self.cut is None else self.cut.limit(state.progress, self.horizon)
         given = state.actor, state.start_key, visitors, limit, keys, chosen
@@ -380,8 +355,6 @@ class _Reinforce:
         self, state: TrainState, trajectory: Trajectory, key: jax.Array
     ) -> tuple[TrainState, Metrics]:
         """Learns; where all episodes, of many seeds, were short, from their first steps alone."""
-        if self.auto is not None:
-            trajectory = dataclasses.replace(trajectory, played=trajectory.mask[0])
         few = max(self.horizon // _SHORT, 0 if self.cut is None else self.cut.steps)
         if not CHUNK_STEPS <= few < self.horizon or self.num_seeds * trajectory.mask.size < _MANY:
             return self._learn_from(state, trajectory, key)
@@ -405,13 +378,9 @@ class _Reinforce:
             samples=(scaled, trajectory.action, weight, mask),
             divisor=self._divisor(trajectory),
             clock=Clock(state.progress, counts.as_float(state.env_steps)),
-            played=trajectory.played,
             in_one_kernel=self._in_one_kernel,
         )
         params, opt_state, update_metrics = self.update(problem, key, actor.params, state.opt_state)
-        if self.auto is not None and state.pace is not None:
-            paced = pace.next_pace(state.pace, self.auto, update_metrics.pop("noise"))
-            state = dataclasses.replace(state, pace=paced)
         visited = visited_steps(trajectory)
         if self.max_kl is not None:
             params = within_kl(self.policy, actor, params, visited, self.max_kl)
@@ -446,9 +415,7 @@ class _Reinforce:
         """Returns what the sum over all steps is divided by."""
         if self.loss_per == "step":
             return jnp.maximum(jnp.sum(trajectory.mask), 1)
-        if trajectory.played is None:
-            return self.num_episodes
-        return jnp.maximum(trajectory.num_played(), 1)
+        return self.num_episodes
 
 
 def _part(devices: Devices, play: Callable[..., Any], *given: Any) -> tuple[Any, Any]:

@@ -1,8 +1,8 @@
-"""What changes as a run goes on: optax transformations that stand behind an optimiser.
+"""What changes as a run goes on: behind an optimiser, in the discount, in how episodes are cut.
 
-They go by the share of the budget that is used, which ``updates`` tells the optimiser of, or by the
-env steps played. Counted in env steps, a policy whose episodes are short keeps its rate and its
-noise, and one that has learned to play long ones settles soon.
+Optax transformations go by the share of the budget that is used, which ``updates`` tells the
+optimiser of, or by the env steps played. Counted in env steps, a policy whose episodes are short
+keeps its rate and its noise, and one that has learned to play long ones settles soon.
 """
 
 from typing import Any, NamedTuple
@@ -11,9 +11,47 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from mjx_reinforce.policies.arguments import check_count, check_number
+
 #: The standard deviation shrinks in so many steps. Each is far greater than float32's rounding of
 #: its logarithm, however many updates there are.
 _STEPS = 4096
+
+
+class Cut(NamedTuple):
+    """Episodes of training end after some steps, until a share of the budget is used.
+
+    On a GPU an update of cut episodes is done sooner. A policy that was trained on cut episodes
+    alone may fail later in an episode, where it never was.
+
+    Attributes:
+      steps: after which an episode ends
+      until: the share of the budget, in [0, 1], from which on episodes are whole
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, horizon=100, cut=mr.Cut(steps=20, until=0.5))
+      >>> state, metrics = learner.step(learner.init(jax.random.key(0)))
+      >>> int(metrics["episode_length"]) <= 20
+      True
+    """
+
+    steps: int
+    until: float
+
+    def limit(self, progress: jax.Array, horizon: int) -> jax.Array:
+        """Returns the most steps [] of an episode where this share [] of the budget is used."""
+        return jnp.where(progress < self.until, min(self.steps, horizon), horizon)
+
+
+def check_cut(cut: Cut) -> None:
+    """Raises ValueError for numbers that make no sense."""
+    check_count("cut.steps", cut.steps)
+    check_number("cut.until", cut.until)
+    if cut.until > 1:
+        raise ValueError(f"cut.until must be a share of the budget in [0, 1], got {cut.until}")
 
 
 class Clock(NamedTuple):

@@ -16,7 +16,7 @@ from jax import lax
 from optax import Params
 
 from mjx_reinforce.engines.chunks import while_any
-from mjx_reinforce.learners.diagnostics import noise_of_groups, signal_to_noise
+from mjx_reinforce.learners.diagnostics import signal_to_noise
 from mjx_reinforce.learners.gradients import accumulate_gradient, draw_steps
 from mjx_reinforce.learners.schedules import Clock
 from mjx_reinforce.policies.arguments import check_count, check_number
@@ -35,7 +35,6 @@ class Problem(NamedTuple):
     samples: observation [T, N, O], action [T, N, ...], weight [T, N] and mask [T, N]
     divisor: [] by which the sum over all samples is divided
     clock: how far the run was before the rollout
-    played: [N] which episodes were played, None where all were
     in_one_kernel: (params, samples) -> what ``accumulate_gradient`` returns, or None where that is
       to compute it
     """
@@ -45,14 +44,10 @@ class Problem(NamedTuple):
     samples: tuple[jax.Array, ...]
     divisor: int | jax.Array
     clock: Clock
-    played: jax.Array | None = None
     in_one_kernel: Callable[[Any, tuple[jax.Array, ...]], Any] = lambda params, samples: None
 
 
-#: Where the number of episodes follows the noise, it is measured between so many groups of them, at
-#: the cost of none.
-_GROUPS = 8
-#: Else the gradient's noise is measured on one of so many episodes, and on so many at most.
+#: The gradient's noise is measured on one of so many episodes, and on so many at most.
 _NOISE_SHARE, _NOISE_EPISODES = 32, 64
 
 #: (problem, key, params, opt_state) -> (params, opt_state, metrics); may consume the key. The
@@ -70,8 +65,6 @@ def full_batch() -> Update:
     Of two episodes or more, its metrics have ``gradient_snr``, the signal-to-noise ratio over
     episodes of that gradient, see ``diagnostics.signal_to_noise``. The noise is estimated from one
     episode in 32, at least from one and at most from 64: from few it is right on average alone.
-    Where only some episodes were played, it is estimated from all of these, and the metrics have
-    ``noise``, a ``pace.Noise``, besides.
 
     Examples:
       >>> import jax
@@ -90,15 +83,12 @@ def whole_rollout(turn: Turn) -> Update:
 
     def update(problem, key, params, opt_state):
         mask = problem.samples[-1]
-        if problem.played is None:
-            _, grads, sums = problem.in_one_kernel(params, problem.samples) or accumulate_gradient(
-                problem.surrogate, params, problem.samples
-            )
-            metrics = {}
-            if mask.shape[1] > 1:
-                metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
-        else:
-            grads, sums, metrics = _by_groups(problem, params)
+        _, grads, sums = problem.in_one_kernel(params, problem.samples) or accumulate_gradient(
+            problem.surrogate, params, problem.samples
+        )
+        metrics = {}
+        if mask.shape[1] > 1:
+            metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
         metrics["entropy"] = sums["entropy"] / jnp.maximum(jnp.sum(mask), 1)
         params, opt_state, step = _descend(
             problem,
@@ -110,7 +100,6 @@ def whole_rollout(turn: Turn) -> Update:
         )
         return params, opt_state, metrics | step
 
-    update.measures_noise = True  # pyright: ignore[reportFunctionMemberAccess]
     return update
 
 
@@ -126,26 +115,6 @@ def _signal_to_noise(problem: Problem, params: Params, grads: Params) -> jax.Arr
     each = jax.vmap(alone, in_axes=1)(jax.tree.map(lambda x: x[:, :few], problem.samples))
     mean = jax.tree.map(lambda g: g / num_episodes, grads)
     return signal_to_noise(mean, each, num_episodes)
-
-
-def _by_groups(problem: Problem, params: Params) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """Returns the gradient and the metrics of the surrogate, summed, and their noise."""
-    assert problem.played is not None
-    beyond = -problem.played.size % _GROUPS
-
-    def padded(x: jax.Array, axis: int) -> jax.Array:
-        return jnp.pad(x, [(0, beyond if k == axis else 0) for k in range(x.ndim)])
-
-    samples = jax.tree.map(lambda x: padded(x, 1), problem.samples)
-    counts = jnp.sum(padded(problem.played, 0).reshape(-1, _GROUPS), axis=0)
-    _, each, sums = accumulate_gradient(problem.surrogate, params, samples, groups=_GROUPS)
-    noise = noise_of_groups(each, counts)
-    grads, sums = jax.tree.map(lambda x: jnp.sum(x, axis=0), (each, sums))
-    return (
-        grads,
-        sums,
-        {"gradient_snr": noise.signal * jnp.sum(counts) / noise.noise, "noise": noise},
-    )
 
 
 def minibatches(num_updates: int, batch_size: int) -> Update:

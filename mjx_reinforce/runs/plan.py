@@ -174,12 +174,11 @@ def idle(busy: int, why: str) -> str:
 def training_seconds(config: Config, task: Task, speed: Speed) -> tuple[float, bool]:
     """Returns how long the networks that were measured take (s), and whether at most so long."""
     steps, bounded = _steps(config, task, useful_part(task, speed))
-    episodes = config.fewest_episodes  # with more, evaluations take less of it
     whole = config.horizon or task.horizon
-    played = config.eval_every * episodes * config.training_horizon(whole)
+    played = config.eval_every * config.episodes_per_update * config.training_horizon(whole)
     evaluated = 2 * config.eval_episodes * whole / played
     total = config.num_seeds * steps * (1 + evaluated)
-    return speed.seconds(total, config.num_seeds * episodes), bounded
+    return speed.seconds(total, config.num_seeds * config.episodes_per_update), bounded
 
 
 def _steps(config: Config, task: Task, useful: float) -> tuple[float, bool]:

@@ -55,16 +55,8 @@ class Config(
 
     @property
     def episodes_per_update(self) -> int:
-        """Episodes that a seed plays for an update, at most."""
-        if self.algorithm == "ars":
-            return 2 * self.num_directions
-        return self.max_episodes if self.num_episodes == "auto" else self.num_episodes
-
-    @property
-    def fewest_episodes(self) -> int:
-        """Episodes that a seed plays for an update, at least."""
-        auto = self.algorithm == "reinforce" and self.num_episodes == "auto"
-        return self.min_episodes if auto else self.episodes_per_update
+        """Episodes that a seed plays for an update."""
+        return 2 * self.num_directions if self.algorithm == "ars" else self.num_episodes
 
     def training_horizon(self, horizon: int) -> int:
         """Returns the time limit of a training episode of a task, in env steps.
@@ -89,7 +81,7 @@ class Config(
         if self.max_updates is not None:
             bounds.append(self.max_updates)
         if self.env_steps is not None:
-            bounds.append(-(-self.env_steps // self.fewest_episodes))
+            bounds.append(-(-self.env_steps // self.episodes_per_update))
         return min(self.eval_every, max(_ALWAYS_ROOM, min(bounds)))
 
 
@@ -194,9 +186,7 @@ def check_step_count(config: Config, horizon: int) -> None:
 
 def _check_reinforce(config: Config) -> None:
     """Raises ValueError for settings that do not go together."""
-    if config.num_episodes == "auto":
-        _check_auto(config)
-    elif config.estimator == "leave-one-out" and config.num_episodes < 2:
+    if config.estimator == "leave-one-out" and config.num_episodes < 2:
         raise ValueError(
             f"leave-one-out needs at least two episodes an update, got --num-episodes "
             f"{config.num_episodes}; raise it or choose --estimator reward-to-go"
@@ -231,20 +221,6 @@ def _check_reinforce(config: Config) -> None:
         raise ValueError(
             f"the learning rate would decay over {steps:,} optimiser steps, more than the 2^31 - 1 "
             "that can be counted; lower --decay-updates or --minibatch-updates"
-        )
-
-
-def _check_auto(config: Config) -> None:
-    """Raises ValueError for settings that do not go with a number of episodes that changes."""
-    if config.min_episodes > config.max_episodes:
-        raise ValueError(
-            f"--min-episodes must be at most --max-episodes {config.max_episodes}, got "
-            f"{config.min_episodes}"
-        )
-    if config.update not in ("full-batch", "natural-gradient"):
-        raise ValueError(
-            "--num-episodes auto needs --update full-batch or natural-gradient, for "
-            f"{config.update} does not measure the gradient's noise; choose one, or a number"
         )
 
 

@@ -37,7 +37,6 @@ class Range(enum.Enum):
         self.said, self.holds = said, holds
 
     AT_LEAST_1 = "at least 1", lambda x: x >= 1
-    AT_LEAST_2 = "at least 2: one alone shows no noise", lambda x: x >= 2
     AT_LEAST_0 = "at least 0", lambda x: x >= 0
     COUNTED = "at most 2^53, for no more is counted exactly", lambda x: x <= MAX_COUNT
     INT32 = "less than 2^31", lambda x: x <= MAX_OF_UPDATE
@@ -67,7 +66,6 @@ class Range(enum.Enum):
 
 #: What holds of numbers of a kind.
 COUNT = (Range.AT_LEAST_1, Range.INT32)
-SEVERAL = (Range.AT_LEAST_2, Range.INT32)
 TOTAL = (Range.AT_LEAST_1, Range.COUNTED)
 STEPS = (Range.AT_LEAST_1, Range.IN_A_ROW)
 LAYERS = (Range.LAYERS, Range.LAYERS_INT32, Range.FEW_LAYERS)

@@ -12,7 +12,6 @@ from mjx_reinforce.settings.declare import (
     NOT_NEGATIVE,
     POSITIVE,
     RATE,
-    SEVERAL,
     STEPS,
     TOTAL,
     Mark,
@@ -43,7 +42,6 @@ class Reader(enum.Enum):
     VALUE_BASELINE = "--estimator value-baseline", lambda c: c.estimator == "value-baseline"
     VALUE_MINIBATCHES = "--value-fit minibatches", lambda c: c.value_fit == "minibatches"
     LEAVE_ONE_OUT = "--estimator leave-one-out", lambda c: c.estimator == "leave-one-out"
-    AUTO_EPISODES = "--num-episodes auto", lambda c: c.num_episodes == "auto"
     CUT = "--train-horizon N", lambda c: c.train_horizon is not None
     STANDARDIZE = "--standardize", lambda c: c.standardize
     DIRECTORY = "--output DIR", lambda c: c.output is not None or c.resume is not None
@@ -131,13 +129,8 @@ class RunSettings:
         False, Mark.BUDGET, once="a run would end when others beside it are solved"
     )
     """Stop once every seed's last evaluation reached the environment's reward threshold."""
-    num_episodes: int | Literal["auto"] = _for_reinforce(16, *COUNT)
-    """Episodes that each seed plays for an update. auto: the number at which the noise of the
-    gradient equals its signal. With ars, use --num-directions."""
-    min_episodes: int = _for_reinforce(16, *SEVERAL, Reader.AUTO_EPISODES)
-    """Fewest episodes of an update, with --num-episodes auto."""
-    max_episodes: int = _for_reinforce(2048, *SEVERAL, Reader.AUTO_EPISODES)
-    """Most episodes of an update, with --num-episodes auto."""
+    num_episodes: int = _for_reinforce(16, *COUNT)
+    """Episodes that each seed plays for an update. With ars, use --num-directions."""
     horizon: int | None = setting(None, *COUNT)
     """Time limit of an episode in env steps. None: the environment's own limit."""
     train_horizon: int | None = setting(None, *COUNT)

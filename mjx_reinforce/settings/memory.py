@@ -61,8 +61,7 @@ def parts(config: Config, task: Task) -> list[MemoryPart]:
     values = task.observation + task.action + 3
     evaluated = seeds * (config.horizon or task.horizon) * 2 * config.eval_episodes
     follows = config.algorithm != "ars"  # a gradient; else it searches with many policies
-    room = "--max-episodes" if config.num_episodes == "auto" else "--num-episodes"
-    fewer = room if follows else "--num-directions"
+    fewer = "--num-episodes" if follows else "--num-directions"
     held = seeds * (min(horizon, _CHUNK) if follows else 1) * episodes * sum(config.hidden_sizes)
     policies = seeds if follows else seeds * 2 * config.num_directions
     network = _ACTIVATIONS * held + _PARAMETERS * policies * num_parameters(config, task)
@@ -209,7 +208,7 @@ def operations_per_step(config: Config, task: Task) -> float:
     policy = num_parameters(config, task)
     if config.algorithm == "ars":
         return _FORWARDS * policy
-    steps = config.fewest_episodes * config.training_horizon(task.horizon)
+    steps = config.episodes_per_update * config.training_horizon(task.horizon)
     learned = 1.0
     if config.update == "minibatches":
         learned = config.minibatch_updates * config.minibatch_size / steps

@@ -92,8 +92,8 @@ def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
 def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
     from mjx_reinforce.console.heartbeat import to_screen
     from mjx_reinforce.engines.native import outlook
-    from mjx_reinforce.learners.pace import AutoEpisodes, Cut
     from mjx_reinforce.learners.reinforce import reinforce
+    from mjx_reinforce.learners.schedules import Cut
 
     if config.engine in ("auto", "native") and (said := outlook.announcement(env)):
         to_screen(said)
@@ -106,9 +106,7 @@ def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any])
         estimator=_build_estimator(config, shared["horizon"]),
         optimizer=_build_optimizer(config),
         update=_build_update(config, shared["policy"]),
-        num_episodes=AutoEpisodes(config.min_episodes, config.max_episodes)
-        if config.num_episodes == "auto"
-        else config.num_episodes,
+        num_episodes=config.num_episodes,
         entropy_cost=config.entropy_cost,
         loss_per=config.loss_per,
         max_kl=config.max_kl,

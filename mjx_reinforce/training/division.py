@@ -8,7 +8,6 @@ rounding: the keys of an episode follow from its seed and its own number.
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +17,6 @@ from jax.sharding import PartitionSpec
 
 from mjx_reinforce.devices import NONE, RUNS, Devices
 from mjx_reinforce.engines.chunks import largest_divisor
-from mjx_reinforce.learners.pace import AutoEpisodes
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.state import RunState, shape_of_all
 from mjx_reinforce.types import PyTree
@@ -57,8 +55,7 @@ class Division:
         config = dataclasses.replace(config, num_seeds=self.width(num_seeds))
         if self.episodes == 1:
             return config
-        name = "max_episodes" if config.num_episodes == "auto" else "num_episodes"
-        return dataclasses.replace(config, **{name: config.episodes_per_update // self.episodes})
+        return dataclasses.replace(config, num_episodes=config.num_episodes // self.episodes)
 
     def jit(
         self,
@@ -157,15 +154,8 @@ def divide_run(config: Config, num_seeds: int) -> Division:
     by_seeds = Division(seeds=-(-num_seeds // width))
     if config.algorithm != "reinforce":
         return by_seeds
-    episodes = largest_divisor(math.gcd(*_rooms(config)), here)
+    episodes = largest_divisor(config.num_episodes, here)
     each = num_seeds * config.episodes_per_update / episodes
     enough = each >= _LEAST or jax.default_backend() == "cpu"
     # How many seeds' episodes a device plays, by either.
     return Division(episodes=episodes) if enough and num_seeds / episodes < width else by_seeds
-
-
-def _rooms(config: Config) -> list[int]:
-    """Returns the numbers of episodes that arrays of an update may have room for."""
-    if config.num_episodes == "auto":
-        return AutoEpisodes(config.min_episodes, config.max_episodes).rooms()
-    return [config.num_episodes]

@@ -50,7 +50,6 @@ def test_more_of_anything_needs_more(more):
     ("changes", "remedy"),
     [
         ({"num_episodes": 10**6}, "--num-episodes"),
-        ({"num_episodes": "auto", "max_episodes": 10**6}, "--max-episodes"),
         ({"hidden_sizes": (10**5, 10**5)}, "--hidden-sizes"),
         ({"eval_episodes": 10**6}, "--eval-episodes"),
     ],

@@ -180,11 +180,9 @@ def test_chunks_change_nothing_but_rounding(run):
     assert close(curves(Path("whole")), curves(Path("parts")))
 
 
-@pytest.mark.parametrize("episodes", ["4", "auto --min-episodes 2 --max-episodes 40"])
-def test_an_exact_run_does_not_depend_on_the_others(run, episodes):
+def test_an_exact_run_does_not_depend_on_the_others(run):
     """Neither on its chunk, nor on what is swept beside it."""
-    small = SMALL.replace("--num-episodes 4", f"--num-episodes {episodes}")
-    command = f"{small} --num-seeds 3 --max-updates 11 --exact"
+    command = f"{SMALL} --num-seeds 3 --max-updates 11 --exact"
     assert run(f"{command} {RATES} --output whole") == 0
     assert run(f"{command} {RATES} --chunk-runs 2 --output parts") == 0
     whole = curves(Path("whole"))
@@ -526,7 +524,6 @@ def test_values_are_read_as_their_settings_are():
         ("--over init-from a b", "cannot go over init-from"),
         ("--over like a b", "cannot go over like"),
         ("--update natural-gradient --over max-kl None 0.1", "from --max-kl, which is None"),
-        ("--min-episodes 9 --max-episodes 4 --over num-episodes 2 auto", "--min-episodes must be"),
         ("--over learning-rate 1 2 --num-seeds 2000000000", "results of 4,000,000,000 runs do not"),
         (
             "--over discount 0 1 --search random --budget 2000000000",

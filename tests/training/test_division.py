@@ -22,7 +22,6 @@ VARIANTS = {
     "natural-gradient": ({"update": "natural-gradient", "max_kl": 0.01}, EPISODES[1:]),
     "minibatches": ({"update": "minibatches", "minibatch_size": 16}, EPISODES[:1]),
     "each-step": ({"update": "each-step"}, EPISODES[:1]),
-    "auto": ({"num_episodes": "auto", "min_episodes": 8, "max_episodes": 32}, EPISODES[1:]),
     "one-start": ({"one_start": True, "max_kl": 0.01}, EPISODES[:1]),
     "vmap": ({"engine": "vmap", "standardize": False}, [*EPISODES[:1], *SEEDS[:1]]),
     "ars": ({"algorithm": "ars", "engine": "vmap", "num_directions": 2}, SEEDS[:1]),
@@ -65,8 +64,6 @@ def test_devices_change_nothing_but_rounding(tmp_path, name):
         (1, 65_536, 6, "gpu", Division(episodes=4)),
         (1, 7, 2, "cpu", ALONE),
         (1, 16, 8, "cpu", Division(episodes=8)),
-        (2, "auto", 8, "gpu", Division(seeds=2)),
-        (1, "auto", 8, "cpu", Division(episodes=8)),
     ],
 )
 def test_what_is_divided(monkeypatch, seeds, episodes, here, backend, expected):

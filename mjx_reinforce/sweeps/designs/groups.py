@@ -86,8 +86,6 @@ def learner_builder(env: Environment, config: Config) -> Callable[[dict[str, Any
     def build_learner(settings: dict[str, Any]) -> Any:
         # How REINFORCE plays depends on no traced number, and takes a second to write out.
         traced = build(env, dataclasses.replace(config, engine="vmap", **settings))[0]
-        pairs = zip(plain.narrower, traced.narrower, strict=True)
-        narrower = tuple(one._replace(learn=other.learn) for one, other in pairs)
-        return plain._replace(init=traced.init, learn=traced.learn, narrower=narrower)
+        return plain._replace(init=traced.init, learn=traced.learn)
 
     return build_learner
