@@ -19,7 +19,7 @@ from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment
 from mjx_reinforce.reports.findings import Findings, compute_findings
 from mjx_reinforce.reports.page import columns, document, learning, tables, tasks_page
-from mjx_reinforce.reports.page.document import PageFilm, Watch, encoded, film_of_median
+from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.listings import latex_tables, listings
 from mjx_reinforce.reports.page.vega import ONE, render_chart
@@ -52,9 +52,6 @@ class ReportSettings:
     labels: tuple[str, ...] = ()
     """Other names for configurations, each OLD=NEW; NEW has no "=" in it:
     --labels "estimator reinforce=REINFORCE" "estimator leave-one-out=leave-one-out baseline"."""
-    film: bool = True
-    """On the page of one run, show the seed with the median return; the film takes as long as
-    mjx_reinforce.watch."""
 
 
 def main() -> None:
@@ -67,7 +64,7 @@ def main() -> None:
         experiments = rename(sources.read_tasks(settings.sources), _new_names(settings.labels))
         output = settings.output or _default_output(settings.sources)
         check_output(output, settings.overwrite)
-        seconds = _write_all(experiments, output, film=settings.film)
+        seconds = _write_all(experiments, output)
     except (ValueError, OSError) as error:
         say_error(str(error))
         sys.exit(2)
@@ -148,11 +145,11 @@ def write_report(chosen: Sequence[Path], output: Path) -> float:
     return _write_all(rename(sources.read_tasks(chosen), {}), output)
 
 
-def _write_all(experiments: Sequence[Experiment], output: Path, *, film: bool = False) -> float:
+def _write_all(experiments: Sequence[Experiment], output: Path) -> float:
     """Writes the page of one task, or that of several, with a page of each beside it."""
     started = time.perf_counter()
     if len(experiments) == 1:
-        _write_page(compute_findings(experiments[0]), output, started, film=film)
+        _write_page(compute_findings(experiments[0]), output, started)
         return time.perf_counter() - started
     tasks = find_tasks(experiments)
     beside = _beside(output)
@@ -182,8 +179,8 @@ def _ours() -> str:
     return version("mjx-reinforce") or "not installed"
 
 
-def _write_page(findings: Findings, output: Path, started: float, *, film: bool = False) -> None:
-    """Writes the page of one task; ``film`` shows a run's median seed, too."""
+def _write_page(findings: Findings, output: Path, started: float) -> None:
+    """Writes the page of one task."""
     experiment = findings.experiment
     drawn, data = figures(findings), tables.chart_tables(findings)
     files = {
@@ -201,18 +198,10 @@ def _write_page(findings: Findings, output: Path, started: float, *, film: bool 
         write_bytes(beside / name, encoded(content))
     for figure in drawn:
         _write_figure(figure, data, labels, findings.experiment.title, beside)
-    shown = _film(experiment, beside / "film.gif") if film else None
     seconds = time.perf_counter() - started
     watch = how_to_watch(experiment, findings)
-    text = document.render(findings, drawn, data, files, watch, shown, _ours(), seconds)
+    text = document.render(findings, drawn, data, files, watch, _ours(), seconds)
     write_bytes(output, encoded(text))
-
-
-def _film(experiment: Experiment, output: Path) -> PageFilm | None:
-    """Returns the film of a run that has policies; runs of code of one's own are not played."""
-    directory = experiment.directories[0]
-    alone = len(experiment.configurations) == 1 and (directory / "policy").is_dir()
-    return film_of_median(directory, output) if alone and not env_flag(experiment.env) else None
 
 
 def _beside(output: Path) -> Path:

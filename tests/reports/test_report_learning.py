@@ -13,7 +13,6 @@ from fake_sweeps import make_sweep
 from measured_runs import make_measured_run
 from pages import CUT, content, run_report, visible
 from places import ROOT
-from saved_runs import make_run
 
 from mjx_reinforce import report
 from mjx_reinforce.reports import findings, sources, tasks
@@ -282,36 +281,6 @@ def test_names_that_cannot_be_are_refused(tmp_path, monkeypatch, capsys, label, 
         report.main()
     assert said in capsys.readouterr().err
     assert not (directory / "report.html").exists()
-
-
-def make_playable(directory):
-    """A run that has curves for a report, and policies for a film."""
-    return make_run(make_measured_run(directory))
-
-
-def test_the_page_of_a_run_shows_its_median_seed(tmp_path):
-    directory = make_playable(tmp_path / "run")
-    done = run_report(directory)
-    assert done.returncode == 0, done.stderr
-    text = (directory / "report.html").read_text(encoding="utf-8")
-    assert (directory / "report" / "film.gif").read_bytes().startswith(b"GIF8")
-    assert text.index("data:image/gif;base64,R0lGOD") < text.index('class="figures"')
-    assert re.search(r"CartPole-v1, seed 2[^:]*: return \d+", visible(directory / "report.html"))
-
-
-def test_a_run_that_cannot_be_filmed_says_why(tmp_path):
-    directory = make_playable(tmp_path / "run")
-    (directory / "policy" / "actor.npz").write_bytes(b"damaged")
-    done = run_report(directory)
-    assert done.returncode == 0, done.stderr
-    assert "There is no film: " in visible(directory / "report.html")
-
-
-def test_no_film_is_made_unasked(tmp_path):
-    directory = make_playable(tmp_path / "run")
-    assert run_report(directory, "--no-film").returncode == 0
-    assert "There is no film" not in visible(directory / "report.html")
-    assert not (directory / "report" / "film.gif").exists()
 
 
 def test_a_run_is_told_in_plain_words(tmp_path):

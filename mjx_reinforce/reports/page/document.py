@@ -1,14 +1,10 @@
 """The report as one HTML page that needs nothing but itself; how to cite the program."""
 
-import base64
 import datetime
 import json
 import math
-import subprocess
-import sys
 from collections.abc import Mapping
 from importlib import resources
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
@@ -44,17 +40,6 @@ _METHODS = (
     "Curves are read off, by linear interpolation, at the same env steps for all seeds, up to the "
     "end of the shortest.",
 )
-#: So long is waited for a film (s); a humanoid takes a minute to compile on few cores.
-_TIMEOUT = 600
-#: Length (s) and size (pixels) of the film: the page holds it, so that it has to be small.
-_FORM = ("--seconds", "8", "--width", "360", "--height", "270")
-
-
-class PageFilm(NamedTuple):
-    """A film for the page: what is seen in it, and the GIF as a data URL; or why there is none."""
-
-    said: str
-    url: str = ""
 
 
 class Watch(NamedTuple):
@@ -70,7 +55,6 @@ def render(
     chart_tables: Mapping[str, Table],
     files: Mapping[str, str],
     watch: Watch,
-    film: PageFilm | None,
     version: str,
     seconds: float,
 ) -> str:
@@ -82,7 +66,6 @@ def render(
       chart_tables: their data, by name.
       files: texts that can be downloaded, by name.
       watch: how to see the worst seed.
-      film: of a run, for its first screen.
       version: of this program.
       seconds: how long the report has taken so far.
     """
@@ -99,7 +82,6 @@ def render(
         **_text(findings, drawn),
         **provenance_rows(findings.experiment),
         watch=watch,
-        film=film,
         moments=content["moments"],
         version=version,
         seconds=seconds,
@@ -264,25 +246,3 @@ def bibtex(version: str) -> str:
         .replace("mjx_reinforce:", r"mjx\_reinforce:")
         .replace("{{The mjx_", r"{{The mjx\_")
     )
-
-
-def film_of_median(run: Path, output: Path) -> PageFilm:
-    """Films the seed of a run whose last return is the median, and returns the film.
-
-    Args:
-      run: the directory of a run with saved policies.
-      output: the .gif file, which is replaced.
-    """
-    command = [sys.executable, "-m", "mjx_reinforce.watch", str(run), "--seed", "median"]
-    command += [*_FORM, "--output", str(output), "--overwrite"]
-    try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=_TIMEOUT
-        )
-    except subprocess.TimeoutExpired:
-        return PageFilm(f"There is no film: it was not ready after {_TIMEOUT} s.")
-    if done.returncode:
-        lines = done.stderr.strip().splitlines() or [f"watch exited with {done.returncode}"]
-        return PageFilm(f"There is no film: {lines[-1].removeprefix('error: ')}.")
-    encoded = base64.b64encode(output.read_bytes()).decode()
-    return PageFilm(done.stdout.splitlines()[0], f"data:image/gif;base64,{encoded}")
