@@ -41,11 +41,8 @@ from mjx_reinforce.settings.own_code import check_named
 
 if TYPE_CHECKING:
     from mjx_reinforce.envs.base import MujocoEnv
-    from mjx_reinforce.export.takes import Take
     from mjx_reinforce.types import MjModel
 
-#: Positions that change by less do not show (m, rad).
-_STILL = 0.05
 #: Settings that are whole numbers, with the least and the greatest that is accepted.
 _RANGES = (
     *(("width", 1, 4096), ("height", 1, 4096)),
@@ -73,17 +70,13 @@ class WatchSettings:
     beside: Literal["untrained"] | SeedChoice | None = None
     """A second policy, on the left, from the same start: untrained (before and after), or another
     seed of the run, such as worst."""
-    push: float = 0.0
-    """Push the highest body with this force (N) along x, for 0.1 s every 3 s, now left, now right.
-    Shows that what stands still is held. The pendulums bear 10."""
     live: bool = False
     """Show episode after episode in MuJoCo's viewer, in place of a film; the mouse pulls at bodies
     (a double click selects, Ctrl and a drag pulls). Needs a screen."""
     backend: Literal["mjx", "mujoco", "gymnasium"] | None = None
     """Which simulation is filmed: "mjx", as in training; "mujoco", C MuJoCo, which starts at once;
     "gymnasium", the installed Gymnasium, and then the returns of --episodes in it and in mjx are
-    printed. By default mjx for a run, mujoco with --push or --live and for a policy of the package.
-    """
+    printed. By default mjx for a run, mujoco with --live and for a policy of the package."""
     episodes: int = 16
     """With --backend gymnasium: how many episodes are compared."""
     episode: int = 0
@@ -155,8 +148,6 @@ def film(settings: WatchSettings) -> None:
     frames = map(shown.draw, track(range(shown.length), "drawing", transient=True))
     write_film(output, frames, shown.rate, samples)
     print(f"{shown.length} frames in {output}")
-    if len(takes) == 1 and settings.push == 0 and _stands_still(takes[0]):
-        print("It hardly moves, since it is held; --push 10 shows what holds it.")
 
 
 def _take(
@@ -164,9 +155,9 @@ def _take(
 ) -> Any:
     """Returns the episode of one policy, and says what it earned."""
     from mjx_reinforce.export.takes import Take
-    from mjx_reinforce.playing.mujoco_playing import pushed_body, simulators
+    from mjx_reinforce.playing.mujoco_playing import simulators
 
-    by_name = simulators(settings.backend, env, role.player, source, settings.push)
+    by_name = simulators(settings.backend, env, role.player, source)
     name, play = list(by_name.items())[-1]
     with _waiting("compiling and playing"):
         episode = play(settings.episode, settings.noise)
@@ -174,16 +165,7 @@ def _take(
         print(f"{source.env}, {role.name}: return {episode.total:.1f} in {steps}")
         if len(by_name) > 1:
             print(compare(settings, by_name))
-    body = pushed_body(env.mj_model) if settings.push else 0
-    pushes = episode.pushes
-    dt = _within(env, "dt").dt
-    return Take(role.label, model, dt, episode.qpos, episode.rewards, pushes, body)
-
-
-def _stands_still(take: "Take") -> bool:
-    """Returns whether the film shows nothing after its first tenth."""
-    later = take.qpos[len(take.qpos) // 10 :]
-    return len(later) * take.dt > 5 and float(np.ptp(later, axis=0).max()) < _STILL
+    return Take(role.label, model, _within(env, "dt").dt, episode.qpos, episode.rewards)
 
 
 def _check_env(settings: WatchSettings, source: PolicySource) -> None:
@@ -242,13 +224,10 @@ def film_path(settings: WatchSettings, source: PolicySource) -> Path:
 
 def _check_together(settings: WatchSettings) -> None:
     """Raises ValueError for settings that exclude each other, or where --live has no screen."""
-    if not abs(settings.push) < float("inf"):
-        raise ValueError(f"--push must be finite, got {settings.push}")
-    for name in ("push", "live"):
-        if getattr(settings, name) and settings.backend not in (None, "mujoco"):
-            raise ValueError(
-                f"--{name} needs C MuJoCo, and --backend is {settings.backend}; leave one out"
-            )
+    if settings.live and settings.backend not in (None, "mujoco"):
+        raise ValueError(
+            f"--live needs C MuJoCo, and --backend is {settings.backend}; leave one out"
+        )
     if settings.live and settings.beside is not None:
         raise ValueError("--live shows one policy; leave --beside out")
     screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")

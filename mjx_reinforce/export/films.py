@@ -23,8 +23,6 @@ _COLORS = 255
 _NEEDS = {"glfw": "a screen", "osmesa": "the library OSMesa"}
 #: Pictures, spread over a film, whose colours it has.
 SAMPLES = 4
-#: The colour of an arrow: red, green, blue, opacity.
-_ARROW = (0.95, 0.35, 0.1, 1.0)
 
 
 class Renderer:
@@ -56,31 +54,16 @@ class Renderer:
         # Without this it closes itself when Python ends, too late for its own modules.
         weakref.finalize(self, self._renderer.close)
 
-    def draw(self, qpos: np.ndarray, push: float = 0.0, body: int = 0) -> np.ndarray:
+    def draw(self, qpos: np.ndarray) -> np.ndarray:
         """Returns a picture [height, width, 3] uint8.
 
         Args:
           qpos: [nq] generalised positions.
-          push: a force along x (N), drawn as an arrow of fixed length; none where it is 0.
-          body: the number of the body that it pushes.
         """
         self._data.qpos[:] = qpos
         self._forward(self._model, self._data)
         self._renderer.update_scene(self._data, self._camera)
-        if push:
-            self._add_arrow(self._data.xipos[body], np.sign(push))
         return self._renderer.render()
-
-    def _add_arrow(self, place: np.ndarray, sign: float) -> None:
-        """Adds an arrow along x that ends at a place [3] to the scene."""
-        mujoco, scene = import_mujoco(), self._renderer.scene
-        length = 0.25 * self._model.stat.extent
-        geom, kind = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_ARROW
-        scene.ngeom += 1
-        zero, no_turn = np.zeros(3), np.eye(3).ravel()
-        mujoco.mjv_initGeom(geom, kind, zero, zero, no_turn, np.array(_ARROW, np.float32))
-        start = place - [sign * length, 0, 0]
-        mujoco.mjv_connector(geom, kind, 0.08 * length, start, place)
 
 
 def import_gymnasium() -> Any:

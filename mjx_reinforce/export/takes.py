@@ -11,8 +11,6 @@ from mjx_reinforce.export.films import SAMPLES, Renderer
 
 #: Frames a second at most: what a film shows, and what GIF viewers play.
 MAX_RATE = 30
-#: How long a push, which lasts a few frames, is drawn (s).
-_PUSH_SHOWN = 0.4
 #: Heights of the strip that the words stand in, and of the words, in heights of the picture.
 _STRIP, _WORDS, _LEAST = 1 / 13, 1 / 19, 10
 _INK, _PAPER = (235, 240, 245), (28, 38, 48)
@@ -26,8 +24,6 @@ class Take(NamedTuple):
     dt: the duration of an env step (s)
     qpos: [L, nq] generalised positions (m, rad), the start's first
     rewards: [T] of each env step
-    pushes: [T] the force along x in each env step (N), if there was one
-    pushed: the number of the body that it pushed
     """
 
     label: str
@@ -35,8 +31,6 @@ class Take(NamedTuple):
     dt: float
     qpos: np.ndarray
     rewards: np.ndarray
-    pushes: np.ndarray | None = None
-    pushed: int = 0
 
 
 class Film(NamedTuple):
@@ -99,21 +93,13 @@ def side_by_side(
 
     length = max(1, math.ceil(lasting / interval - 1e-6))
     samples = [*range(0, length, -(-length // SAMPLES))]
-    for take in takes:
-        if take.pushes is not None and take.pushes.any():
-            first = 1 + int(np.flatnonzero(take.pushes)[0])
-            samples.append(min(length - 1, math.ceil(first * take.dt / interval)))
     return Film(1 / interval, length, samples, draw)
 
 
 def _picture(take: Take, renderer: Renderer, seconds: float) -> np.ndarray:
     """Returns a take's picture at a time (s)."""
     step = min(int(seconds / take.dt + 1e-6), len(take.qpos) - 1)
-    arrow = 0.0
-    if take.pushes is not None:
-        shown = take.pushes[max(0, step - round(_PUSH_SHOWN / take.dt)) : step]
-        arrow = float(shown[np.flatnonzero(shown)[-1]]) if shown.any() else 0.0
-    picture = renderer.draw(take.qpos[step], arrow, take.pushed)
+    picture = renderer.draw(take.qpos[step])
     total, time = np.sum(take.rewards[:step]), step * take.dt
     earned = f"{total:,.0f}" if abs(total) >= 100 else f"{total:.1f}"
     return caption(picture, take.label, f"return {earned}   {time:4.1f} s")

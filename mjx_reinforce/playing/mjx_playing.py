@@ -24,12 +24,10 @@ class Episode(NamedTuple):
 
     qpos: [L, nq] generalised positions (m, rad), the start's first
     rewards: [T], nan in a step that left the finite numbers
-    pushes: [T] the force along x that pushed in each step (N); None where nothing did
     """
 
     qpos: np.ndarray
     rewards: np.ndarray
-    pushes: np.ndarray | None = None
 
     @property
     def total(self) -> float:

@@ -23,25 +23,19 @@ if TYPE_CHECKING:
     from mjx_reinforce.types import Environment, MjModel
 
 
-#: A push: when the first begins, how often another does, and how long it lasts (s).
-FIRST, EVERY, LASTING = 2.0, 3.0, 0.1
-
-
 class Moment(NamedTuple):
     """What one env step left.
 
     reward: nan where the simulation left the finite numbers
     ended: whether the episode is over by its own rule
-    push: the force along x that acted (N)
     """
 
     reward: float
     ended: bool
-    push: float
 
 
 def mujoco_simulator(
-    env: "Environment", player: Player, horizon: int, push: float = 0.0
+    env: "Environment", player: Player, horizon: int
 ) -> Callable[[int, bool], Episode]:
     """Returns a function that plays in C MuJoCo.
 
@@ -49,10 +43,9 @@ def mujoco_simulator(
       env: a task of ``MujocoEnv``.
       player: the policy.
       horizon: T, the time limit in steps.
-      push: the force of the pushes (N), see ``push_at``.
 
     Returns:
-      As ``playing.simulator``.
+      As ``mjx_playing.simulator``.
 
     Raises:
       ValueError: C MuJoCo cannot play the task, see ``InMujoco``.
@@ -60,60 +53,37 @@ def mujoco_simulator(
     simulation = InMujoco(env)
 
     def play(episode: int, noise: bool) -> Episode:
-        steps = simulate(simulation, player, episode, noise, push)
-        played, qpos = [], []
+        steps = simulate(simulation, player, episode, noise)
+        rewards, qpos = [], []
         for moment in itertools.islice(steps, 1 + horizon):
             if moment is not None:
-                played.append(moment)
+                rewards.append(moment.reward)
             if moment is None or np.isfinite(moment.reward):
                 qpos.append(simulation.data.qpos.copy())
-        rewards, _, pushes = map(np.array, zip(*played, strict=True))
-        return Episode(np.stack(qpos), rewards, pushes if push else None)
+        return Episode(np.stack(qpos), np.array(rewards))
 
     return play
 
 
 def simulate(
-    simulation: InMujoco, player: Player, episode: int, noise: bool, push: float
+    simulation: InMujoco, player: Player, episode: int, noise: bool
 ) -> Iterator[Moment | None]:
     """Plays an episode until it ends by its own rule; yields None at its start, then each step."""
     rng = np.random.default_rng(episode) if noise else None
     observation, ended = simulation.reset(_start_key(episode)), False
-    body = pushed_body(simulation.env.mj_model)
     yield None
     while not ended:
-        force = push_at(simulation.data.time, push)
-        simulation.data.xfrc_applied[body, 0] += force
         observation, reward, ended = simulation.step(np.asarray(player.act(observation, rng)))
         simulation.data.xfrc_applied[:] = 0
         broken = not (np.isfinite(observation).all() and np.isfinite(reward))
         ended = ended or broken
-        yield Moment(np.nan if broken else reward, ended, force)
+        yield Moment(np.nan if broken else reward, ended)
 
 
 @jax.jit
 def _start_key(episode: int) -> jax.Array:
     """Returns the key of an episode's start; one program compiles sooner than its parts."""
     return jax.random.split(jax.random.fold_in(jax.random.key(0), episode))[0]
-
-
-def push_at(seconds: float, push: float) -> float:
-    """Returns the force at a time of an episode (N): pushes of ``push``, now left, now right."""
-    number, phase = divmod(seconds - FIRST, EVERY)
-    if number < 0 or phase >= LASTING:
-        return 0.0
-    return push if number % 2 == 0 else -push
-
-
-def pushed_body(model: "MjModel") -> int:
-    """Returns the number of the body that is pushed: the highest in the model's pose."""
-    import mujoco
-
-    kinds: Any = mujoco
-    data = kinds.MjData(model)
-    kinds.mj_kinematics(model, data)
-    kinds.mj_comPos(model, data)
-    return 1 + int(np.argmax(data.xipos[1:, 2]))
 
 
 def live(env: "MujocoEnv", model: "MjModel", player: Player, horizon: int, settings: Any) -> None:
@@ -126,7 +96,7 @@ def live(env: "MujocoEnv", model: "MjModel", player: Player, horizon: int, setti
       model: what is drawn, with the bodies of the task's own model.
       player: the policy.
       horizon: the time limit in steps.
-      settings: ``episode``, ``noise`` and ``push``, as in ``watch.WatchSettings``.
+      settings: ``episode`` and ``noise``, as in ``watch.WatchSettings``.
 
     Raises:
       ValueError: the viewer does not open, or C MuJoCo cannot play the task.
@@ -145,7 +115,7 @@ def live(env: "MujocoEnv", model: "MjModel", player: Player, horizon: int, setti
     with window:
         for episode in itertools.count(settings.episode):
             total, due = 0.0, time.monotonic()
-            steps = simulate(simulation, player, episode, settings.noise, settings.push)
+            steps = simulate(simulation, player, episode, settings.noise)
             for moment in itertools.islice(steps, 1 + horizon):
                 if not window.is_running():
                     return
@@ -162,7 +132,7 @@ def live(env: "MujocoEnv", model: "MjModel", player: Player, horizon: int, setti
 
 
 def simulators(
-    backend: str | None, env: "Environment", player: Player, source: PolicySource, push: float
+    backend: str | None, env: "Environment", player: Player, source: PolicySource
 ) -> dict[str, Callable[[int, bool], Episode]]:
     """Returns what plays an episode, by name; the last is filmed, others are compared with it.
 
@@ -171,7 +141,6 @@ def simulators(
       env: what is played.
       player: the policy.
       source: of the policy.
-      push: the force of the pushes (N), 0 for none.
 
     Raises:
       ValueError: the simulation cannot play it.
@@ -179,9 +148,9 @@ def simulators(
     horizon = source.horizon
     if backend is None:
         quick = source.run is None and isinstance(env, MujocoEnv)
-        backend = "mujoco" if quick or push else "mjx"
+        backend = "mujoco" if quick else "mjx"
     if backend == "mujoco":
-        return {"mujoco": mujoco_simulator(env, player, horizon, push)}
+        return {"mujoco": mujoco_simulator(env, player, horizon)}
     found: dict[str, Callable[[int, bool], Episode]] = {"mjx": simulator(env, player, horizon)}
     if backend == "gymnasium":
         if source.run is not None and source.run.env_set:

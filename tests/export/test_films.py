@@ -1,4 +1,4 @@
-"""Films of policies of the package, side by side and pushed, in C MuJoCo."""
+"""Films of policies of the package, side by side, in C MuJoCo."""
 
 import subprocess
 import sys
@@ -21,6 +21,7 @@ from mjx_reinforce.export.run_files import FOLDER
 from mjx_reinforce.export.scenery import dress
 from mjx_reinforce.playing import mjx_playing as playing
 from mjx_reinforce.playing import mujoco_playing
+from mjx_reinforce.playing.cast import untrained
 
 ASSETS = sorted(path.name for path in (FOLDER.parents[2] / "envs" / "assets").glob("*.xml"))
 
@@ -85,36 +86,18 @@ def test_c_mujoco_plays_the_same_episode(name):
     player, env = load(name), envs.make(name)
     ours = playing.simulator(env, player, 20)(3, False)
     theirs = mujoco_playing.mujoco_simulator(env, player, 20)(3, False)
-    assert theirs.pushes is None
     np.testing.assert_allclose(theirs.qpos, ours.qpos, atol=1e-4)
     np.testing.assert_allclose(theirs.rewards, ours.rewards, atol=1e-4)
 
 
 def test_an_episode_in_c_mujoco_ends_as_the_task_says():
+    """A trained policy stands until the time limit, an untrained one falls."""
     player, env = load("InvertedPendulum-v5"), envs.make("InvertedPendulum-v5")
     standing = mujoco_playing.mujoco_simulator(env, player, 30)(0, False)
-    falling = mujoco_playing.mujoco_simulator(env, player, 1000, 400.0)(0, False)
+    falling = mujoco_playing.mujoco_simulator(env, untrained(player), 1000)(0, False)
     assert len(standing.rewards) == 30 == len(standing.qpos) - 1
-    first = round(mujoco_playing.FIRST / env.dt)
-    assert first < len(falling.rewards) < first + 20
+    assert 2 < len(falling.rewards) < 200
     assert falling.rewards[-1] == 0
-    assert np.all(falling.pushes[:first] == 0)
-    assert np.any(falling.pushes[first:] == 400)
-
-
-def test_pushes_alternate():
-    at = [mujoco_playing.push_at(seconds, 7.0) for seconds in (0.0, 1.99, 2.05, 2.2, 5.05, 8.05)]
-    assert at == [0.0, 0.0, 7.0, 0.0, -7.0, 7.0]
-
-
-def test_a_pushed_policy_still_stands():
-    player, env = load("InvertedPendulum-v5"), envs.make("InvertedPendulum-v5")
-    assert env.mj_model.body(mujoco_playing.pushed_body(env.mj_model)).name == "pole"
-    calm, pushed = (
-        mujoco_playing.mujoco_simulator(env, player, 300, push)(0, False) for push in (0.0, 10.0)
-    )
-    assert len(calm.rewards) == len(pushed.rewards) == 300
-    assert np.ptp(pushed.qpos[100:, 0]) > 0.2 > 4 * np.ptp(calm.qpos[100:, 0])
 
 
 class Contacts(Pole):
@@ -176,19 +159,18 @@ def test_takes_stand_side_by_side(monkeypatch):
         def __init__(self, model, width, height):
             self.shape = height, width, 3
 
-        def draw(self, qpos, push, body):
-            return np.full(self.shape, qpos[0] + 100 * (push > 0), np.uint8)
+        def draw(self, qpos):
+            return np.full(self.shape, qpos[0], np.uint8)
 
     monkeypatch.setattr(takes, "Renderer", Flat)
     slow = takes.Take("slow", None, 0.1, np.arange(11.0)[:, None], np.ones(10))
     quick = takes.Take("quick", None, 0.05, 50 + np.arange(9.0)[:, None], np.ones(8))
-    quick = quick._replace(pushes=np.array([0, 0, 0, 0, 9, 0, 0, 0.0]))
     film = takes.side_by_side([slow, quick, slow], 40, 30, seconds=5.0, columns=2)
     assert (film.rate, film.length) == (pytest.approx(10.0), 11)
     shades = [[film.draw(i)[0, x] for x in (0, 40)] for i in range(film.length)]
     assert [int(left[0]) for left, _ in shades] == [*range(11)]
-    # It ends after 0.4 s, and then stands still; the push of its fifth step shows from then on.
-    assert [int(right[0]) for _, right in shades] == [50, 52, 54, 156, *[158] * 7]
+    # It ends after 0.4 s, and then stands still.
+    assert [int(right[0]) for _, right in shades] == [50, 52, 54, 56, *[58] * 7]
     assert film.draw(0).shape == (60, 80, 3)
     assert takes.side_by_side([slow], 40, 30, seconds=0.5).length == 5
     assert set(film.samples) >= {0, 3}
@@ -224,7 +206,7 @@ def test_a_gif_is_whole(tmp_path):
 
 def test_watch_plays_a_policy_of_the_package(tmp_path):
     """From its name to a film of it before and after training; it draws, so in its own process."""
-    options = ["--beside", "untrained", "--push", "10", "--seconds", "3"]
+    options = ["--beside", "untrained", "--seconds", "3"]
     options += ["--width", "120", "--height", "90"]
     command = [sys.executable, "-m", "mjx_reinforce.watch", "InvertedPendulum-v5", *options]
     ran = subprocess.run(command, check=True, capture_output=True, text=True, cwd=tmp_path)
@@ -236,7 +218,6 @@ def test_watch_plays_a_policy_of_the_package(tmp_path):
     assert frames == "75 frames in InvertedPendulum-v5.gif"
     shown = [*pictures(tmp_path / "InvertedPendulum-v5.gif")]
     assert shown[0].shape == (90, 240, 3)
-    assert np.abs(shown[48] - shown[54])[:, 120:].max() > 50  # the push moves it
     sky = shown[0][2]
     assert np.all(sky[:, 2] > sky[:, 0] + 10)
 

@@ -22,10 +22,10 @@ def chosen(monkeypatch):
     monkeypatch.setattr(mujoco_playing, "simulator", lambda *given: ("MJX", *given[2:]))
     monkeypatch.setattr(mujoco_playing, "gymnasium_simulator", lambda *given: ("1.4", "theirs"))
 
-    def of(backend, *, run=None, mujoco=False, push=0.0):
+    def of(backend, *, run=None, mujoco=False):
         env = MujocoEnv.__new__(Plain) if mujoco else Survive()
         source = PolicySource("Task-v0", 60, run)
-        return mujoco_playing.simulators(backend, env, PLAYER, source, push)  # pyright: ignore
+        return mujoco_playing.simulators(backend, env, PLAYER, source)  # pyright: ignore
 
     return of
 
@@ -44,9 +44,8 @@ class Plain(MujocoEnv):
     ("asked", "plays"),
     [
         ({}, {"mjx": ("MJX", 60)}),
-        ({"mujoco": True}, {"mujoco": ("C", 60, 0.0)}),  # quicker, and it is the package's policy
+        ({"mujoco": True}, {"mujoco": ("C", 60)}),  # quicker, and it is the package's policy
         ({"mujoco": True, "run": RUN}, {"mjx": ("MJX", 60)}),
-        ({"mujoco": True, "run": RUN, "push": 5.0}, {"mujoco": ("C", 60, 5.0)}),
     ],
 )
 def test_where_nothing_is_asked(chosen, asked, plays):
@@ -54,7 +53,7 @@ def test_where_nothing_is_asked(chosen, asked, plays):
 
 
 def test_what_is_asked(chosen):
-    assert chosen("mujoco", run=RUN) == {"mujoco": ("C", 60, 0.0)}
+    assert chosen("mujoco", run=RUN) == {"mujoco": ("C", 60)}
     assert chosen("mjx", mujoco=True) == {"mjx": ("MJX", 60)}
     both = chosen("gymnasium", run=RUN)
     assert [*both.items()] == [("mjx", ("MJX", 60)), ("gymnasium 1.4", "theirs")]

@@ -218,8 +218,6 @@ def test_a_simulator_that_is_not_there_is_named(tmp_path, monkeypatch):
         (["--output", "film.mp4"], "pip install mediapy imageio-ffmpeg"),
         (["--live"], "--live needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set"),
         (["--live", "--backend", "mjx"], "--live needs C MuJoCo, and --backend is mjx"),
-        (["--push", 9, "--backend", "mjx"], "--push needs C MuJoCo, and --backend is mjx"),
-        (["--push", "inf"], "--push must be finite, got inf"),
         (["--live", "--beside", "worst"], "--live shows one policy; leave --beside out"),
     ],
 )
