@@ -36,8 +36,6 @@ class Problem(NamedTuple):
     divisor: [] by which the sum over all samples is divided
     clock: how far the run was before the rollout
     played: [N] which episodes were played, None where all were
-    in_one_kernel: (params, samples) -> what ``accumulate_gradient`` returns, or None where that is
-      to compute it
     """
 
     surrogate: Callable[[Any, tuple[jax.Array, ...]], tuple[jax.Array, dict[str, jax.Array]]]
@@ -46,7 +44,6 @@ class Problem(NamedTuple):
     divisor: int | jax.Array
     clock: Clock
     played: jax.Array | None = None
-    in_one_kernel: Callable[[Any, tuple[jax.Array, ...]], Any] = lambda params, samples: None
 
 
 #: Where the number of episodes follows the noise, it is measured between so many groups of them, at
@@ -91,9 +88,7 @@ def whole_rollout(turn: Turn) -> Update:
     def update(problem, key, params, opt_state):
         mask = problem.samples[-1]
         if problem.played is None:
-            _, grads, sums = problem.in_one_kernel(params, problem.samples) or accumulate_gradient(
-                problem.surrogate, params, problem.samples
-            )
+            _, grads, sums = accumulate_gradient(problem.surrogate, params, problem.samples)
             metrics = {}
             if mask.shape[1] > 1:
                 metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
