@@ -167,7 +167,7 @@ def _export(
     key: str, name: str, program: Callable[..., Any], given: tuple[Any, ...]
 ) -> Callable[..., Any]:
     """Returns a program as it is kept, or as it was where JAX cannot export it."""
-    names = (*seam.targets(), *gpu_seam.targets(), gpu_seam.PTX)
+    names = (*seam.targets(), *gpu_seam.targets())
     unsafe = [export.DisabledSafetyCheck.custom_call(x) for x in names]
     try:
         exported = export.export(jax.jit(program), disabled_checks=unsafe)(*given)
