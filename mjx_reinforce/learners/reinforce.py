@@ -138,7 +138,7 @@ def reinforce(
       num_seeds: how many will learn at once, vmapped. It decides nothing but speed
         and rounding: of many, updates whose episodes are all short pass over their first steps
         alone.
-      engine: how episodes are played: "auto", "vmap", "fused" or "native", see
+      engine: how episodes are played: "auto", "vmap" or "native", see
         ``engines.choice``.
       devices: among which the episodes of an update are divided; they stay where they are played,
         and XLA divides what is computed from them. Their count divides every number of episodes

@@ -300,7 +300,7 @@ def test_another_engine_plays_where_kernels_are_not_launched(pendulum, monkeypat
     env, (actor, act, distribution) = pendulum
     who = choice.ActingPolicy(act, actor, distribution)
     chosen = choice.choose("auto", env, who, 50)
-    assert chosen.name == "fused"
+    assert chosen.name == "vmap"
     assert "libcuda.so.1, is not found" in chosen.why
     with pytest.raises(ValueError, match=r"libcuda.so.1, is not found"):
         choice.choose("native", env, who, 50)

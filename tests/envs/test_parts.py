@@ -188,11 +188,10 @@ def test_fields_of_the_model_are_those_of_mujoco_with_the_same_fields():
     assert np.abs(observed[plain] - observed[env]).max() > 0.05
 
 
-@pytest.mark.parametrize("engine", ["fused", "native"])
-def test_engines_play_what_was_drawn(engine):
+def test_machine_code_plays_what_was_drawn():
     """The same episodes as ``vmap``: with other goals, frictions and masses they would differ."""
     env = Reach(xml_file=SPEC)
-    learner = reinforce(env, num_episodes=4, horizon=8, engine=engine)
+    learner = reinforce(env, num_episodes=4, horizon=8, engine="native")
     like = reinforce(env, num_episodes=4, horizon=8, engine="vmap")
     key, state = jax.random.key(2), learner.init(jax.random.key(0))
     played, expected = (jax.jit(x.play)(state, key) for x in (learner, like))

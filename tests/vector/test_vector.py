@@ -16,7 +16,7 @@ from mjx_reinforce.engines.native.mapping import machine_map
 from mjx_reinforce.vector.episodes import AUTORESETS
 
 SPACE = Box(np.array([-3.0]), np.array([1.0]))
-ENGINES = ("native", "fused", "vmap")
+ENGINES = ("native", "vmap")
 
 
 def play(vec, steps, seed=0, actions_seed=1):
