@@ -1,7 +1,6 @@
 """How large the repository is; ``python tests/helpers/sizes.py [FOLDER]`` prints it.
 
-Code is what is neither a docstring nor a comment nor blank; the words of docs are those of all pages
-of ``docs/``.
+Code is what is neither a docstring nor a comment nor blank; the words are those of ``docs/``.
 """
 
 import ast
@@ -29,12 +28,16 @@ def code(path):
         for number in range(token.start[0], token.end[0] + 1)
     }
     for node in ast.walk(ast.parse(text)):
-        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(
-            node
-        ):
-            docstring = node.body[0]
+        docstring = _docstring(node)
+        if docstring is not None:
             lines -= set(range(docstring.lineno, docstring.end_lineno + 1))
     return len(lines)
+
+
+def _docstring(node):
+    """Returns the expression that is a node's docstring, None without one."""
+    documented = isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef))
+    return node.body[0] if documented and ast.get_docstring(node) else None
 
 
 def sizes(root):
@@ -72,7 +75,7 @@ def _long_functions(path):
     """Yields the functions of a file that are long without their docstring."""
     for node in ast.walk(ast.parse(path.read_text("utf-8"))):
         if isinstance(node, ast.FunctionDef):
-            docstring = node.body[0] if ast.get_docstring(node) else None
+            docstring = _docstring(node)
             less = docstring.end_lineno - docstring.lineno + 1 if docstring else 0
             if node.end_lineno - node.lineno + 1 - less > _LONG:
                 yield f"{path.name}:{node.name}"
