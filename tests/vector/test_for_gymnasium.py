@@ -122,7 +122,7 @@ def test_without_autoreset_what_has_ended_is_reset_first():
         *_, terminated, truncated, _ = env.step(actions)
         over = terminated | truncated
     assert over.all()
-    with pytest.raises(ValueError, match="2 of 2 environments have ended, such as 0; .*reset_mask"):
+    with pytest.raises(ValueError, match=r"2 of 2 environments .* as 0; .*reset_mask"):
         env.step(actions)
     env.reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(ValueError, match="1 of 2 environments have ended, such as 1;"):
