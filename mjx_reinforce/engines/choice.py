@@ -29,6 +29,12 @@ MAX_ENTRIES = 200
 _CPU_BRANCH_COST = 32
 
 
+#: This JAX multiplies wrongly on CPUs, in some functions that are mapped over some 16,000 rows and
+#: more, and says nothing (JAX's issue 39103). Where we looked, with 33,000 to 65,000 rows, no
+#: step, policy or gradient of ours was wrong.
+_WRONG_JAX = "0.10.2"
+
+
 #: What an engine plays with: a rollout, or a function of many environments.
 Made = TypeVar("Made")
 Rollout: TypeAlias = Callable[..., Trajectory]
@@ -123,6 +129,24 @@ def pick(
     Raises:
       ValueError: the name is unknown, or the engine cannot play this.
     """
+    made = _pick(name, env, in_machine_code, in_scalars, by_vmap)
+    if (made[0], jax.default_backend(), jax.__version__) == ("vmap", "cpu", _WRONG_JAX):
+        warnings.warn(
+            f"JAX {_WRONG_JAX} computes some products of many rows wrongly on CPUs, and the engine "
+            "is vmap, which leaves all to it; take another JAX (docs/troubleshooting.md)",
+            stacklevel=2,
+        )
+    return made
+
+
+def _pick(
+    name: str,
+    env: Environment,
+    in_machine_code: Callable[[], Made | str],
+    in_scalars: Callable[[], Made | str],
+    by_vmap: Made,
+) -> tuple[str, str, Made]:
+    """Returns what ``pick`` returns."""
     check_name("engine", name, dict.fromkeys(ENGINES))
     why, instead = "chosen by name", ""
     if name == "vmap":

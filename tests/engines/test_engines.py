@@ -1,5 +1,7 @@
 """Every engine plays the same step from the same state: limits, high speeds and falls included."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -125,3 +127,18 @@ def test_a_fault_of_the_writer_is_told_from_what_it_does_not_support(monkeypatch
     monkeypatch.setattr(evaluate, "_ARRAY_RULES", {})
     reason = engines.unsupported_by_fused(env, fused.vmap(env.step, in_axes=-1, out_axes=-1))
     assert reason.startswith("there is no rule for the primitive")
+
+
+@pytest.mark.parametrize(
+    ("name", "version", "told"),
+    [("vmap", "0.10.2", True), ("fused", "0.10.2", False), ("vmap", "0.11.2", False)],
+)
+def test_a_jax_that_multiplies_wrongly_is_told(name, version, told, monkeypatch):
+    """Where all is left to it."""
+    monkeypatch.setattr(jax, "__version__", version)
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    env = envs.make("CartPole-v1")
+    with warnings.catch_warnings(record=True) as met:
+        warnings.simplefilter("always")
+        engines.choose(name, env)
+    assert [str(x.message)[:10] for x in met] == ["JAX 0.10.2"] * told
