@@ -19,6 +19,12 @@ from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Environment, PyTree, Trajectory
 
+#: This JAX multiplies wrongly on CPUs, in some functions that are mapped over some 16,000 rows and
+#: more, and says nothing (JAX's issue 39103). Where we looked, with 33,000 to 65,000 rows, no
+#: step, policy or gradient of ours was wrong.
+_WRONG_JAX = "0.10.2"
+
+
 #: What an engine plays with: a rollout, or a function of many environments.
 Made = TypeVar("Made")
 Rollout: TypeAlias = Callable[..., Trajectory]
@@ -105,15 +111,22 @@ def pick(
     """
     check_name("engine", name, dict.fromkeys(ENGINES))
     why = "chosen by name"
-    if name == "vmap":
-        return name, why, by_vmap
-    made = in_machine_code()
-    if not isinstance(made, str):
-        device = "CPU" if jax.default_backend() == "cpu" else "GPU"
-        return "native", f"machine code for this {device}" if name == "auto" else why, made
-    if name == "native":
-        raise ValueError(f"the native engine cannot play this: {made}; choose auto")
-    return "vmap", f"machine code cannot play this: {made}", by_vmap
+    if name != "vmap":
+        made = in_machine_code()
+        if not isinstance(made, str):
+            device = "CPU" if jax.default_backend() == "cpu" else "GPU"
+            return "native", f"machine code for this {device}" if name == "auto" else why, made
+        if name == "native":
+            raise ValueError(f"the native engine cannot play this: {made}; choose auto")
+        why = f"machine code cannot play this: {made}"
+    if (jax.default_backend(), jax.__version__) == ("cpu", _WRONG_JAX):
+        warnings.warn(
+            f"JAX {_WRONG_JAX} computes some products of many rows wrongly on CPUs, and the engine "
+            "is vmap, which leaves all to it; with Python 3.12 or newer take a newer JAX "
+            "(docs/troubleshooting.md)",
+            stacklevel=2,
+        )
+    return "vmap", why, by_vmap
 
 
 def _from_any_key(

@@ -1,5 +1,7 @@
 """Every engine plays the same step from the same state: limits, high speeds and falls included."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -105,3 +107,19 @@ def test_auto_says_what_it_takes_and_why():
     assert "every episode has a policy of its own" in engines.choose("auto", pendulum).why
     with pytest.raises(ValueError, match=r"a policy of its own.*choose auto"):
         engines.choose("native", pendulum)
+
+
+@pytest.mark.parametrize(
+    ("name", "version", "told"),
+    [("vmap", "0.10.2", True), ("native", "0.10.2", False), ("vmap", "0.11.2", False)],
+)
+def test_a_jax_that_multiplies_wrongly_is_told(name, version, told, monkeypatch):
+    """Where all is left to it."""
+    monkeypatch.setattr(jax, "__version__", version)
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    env = envs.make("InvertedPendulum-v5")
+    player = engines.ActingPolicy(act, jnp.zeros(2), normal(env.action_space))
+    with warnings.catch_warnings(record=True) as met:
+        warnings.simplefilter("always")
+        engines.choose(name, env, player, 2)
+    assert [str(x.message)[:10] for x in met] == ["JAX 0.10.2"] * told

@@ -142,7 +142,8 @@ def test_a_block_of_broken_updates_is_one_line():
     metrics["skipped_update"] = np.zeros((4, 9), int)
     made = 6 + np.cumsum(metrics["active"], axis=0)
     assert progress.describe_nonfinite(progress.nonfinite_updates(metrics, made), 1000) == (
-        "updates 6 to 9: 9 of 1,000 seeds met numbers that are not finite (0, 1, 2, 3, 4, ...): "
+        "updates 6 to 9: 9 of 1,000 seeds met numbers that are not finite or beyond 1e10 "
+        "(0, 1, 2, 3, 4, ...): "
         "66 episodes, 0 updates skipped"  # the last seed made one update of four
     )
 
