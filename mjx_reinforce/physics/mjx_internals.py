@@ -43,6 +43,7 @@ from mujoco.mjx._src.collision_types import Collision, GeomInfo
 from mujoco.mjx._src.forward import _advance as advance
 from mujoco.mjx._src.math import make_frame
 from mujoco.mjx._src.smooth import solve_m
+from mujoco.mjx._src.support import muscle_gain
 
 from mjx_reinforce.fused import by_engine
 
@@ -59,6 +60,7 @@ __all__ = [
     "geom_pairs",
     "jax_fields",
     "make_frame",
+    "muscle_gain",
     "num_contacts",
     "rows_of",
     "solve_m",
