@@ -15,6 +15,7 @@ from mujoco import (  # a C extension
     mjtDisableBit,  # pyright: ignore[reportAttributeAccessIssue]
     mjtEnableBit,  # pyright: ignore[reportAttributeAccessIssue]
     mjtIntegrator,  # pyright: ignore[reportAttributeAccessIssue]
+    mjtJoint,  # pyright: ignore[reportAttributeAccessIssue]
     mjtSensor,  # pyright: ignore[reportAttributeAccessIssue]
     mjx,
 )
@@ -39,6 +40,7 @@ NOT_CARRIED = {
     "plugin": ("nplugin", "plugins", "remove them"),
     "plastic": ("nplastic", "plastic springs", "remove springyield"),
 }
+_WITHIN_MARGIN = "give it a margin of at most half of its range"
 _ON_JOINT = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
 #: What else MJX ignores in silence.
@@ -190,6 +192,13 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     for field, feature, remedy in (*NOT_CARRIED.values(), *_IGNORED):
         if np.any(getattr(model, field)):
             yield feature, remedy
+    scalar = model.jnt_type != mjtJoint.mjJNT_BALL
+    for kind, limited, ends, margin in (
+        ("joint", model.jnt_limited & scalar, model.jnt_range, model.jnt_margin),
+        ("tendon", model.tendon_limited, model.tendon_range, model.tendon_margin),
+    ):
+        if np.any(limited & (np.ptp(ends, axis=1) < 2 * margin)):
+            yield f"one of two limits that a {kind} meets at once", _WITHIN_MARGIN
     if model.opt.enableflags & mjtEnableBit.mjENBL_SLEEP:
         yield "sleeping bodies", 'remove <flag sleep="enable"/>'
     if model.opt.disableactuator:
