@@ -11,6 +11,7 @@ from mujoco import (  # a C extension
     mj_forward,  # pyright: ignore[reportAttributeAccessIssue]
     mj_rnePostConstraint,  # pyright: ignore[reportAttributeAccessIssue]
     mj_step,  # pyright: ignore[reportAttributeAccessIssue]
+    mjtWarning,  # pyright: ignore[reportAttributeAccessIssue]
 )
 
 from mjx_reinforce.envs import models
@@ -20,6 +21,13 @@ from mjx_reinforce.physics.mjx_internals import Simulation
 from mjx_reinforce.types import Environment, MjModel
 
 _LEAVE_OUT = "leave --backend mujoco out"
+#: What C MuJoCo warns of where it begins again in the middle of an episode.
+_RESETS = (mjtWarning.mjWARN_BADQPOS, mjtWarning.mjWARN_BADQVEL, mjtWarning.mjWARN_BADQACC)
+
+
+def was_reset(data: Any) -> bool:
+    """Returns whether C MuJoCo reset an ``MjData``, of which a number was NaN or beyond 1e10."""
+    return any(data.warning[kind].number for kind in _RESETS)
 
 
 class _Recorder(View):
@@ -101,6 +109,8 @@ class InMujoco:
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool]:
         """Returns the next observation [O], the reward, and whether the episode ended.
 
+        The reward is nan where MuJoCo has reset the simulation.
+
         Args:
           action: [A] as the policy gave it.
         """
@@ -111,7 +121,8 @@ class InMujoco:
             mj_rnePostConstraint(self.model, self.data)
         given = before, self._fields(), self._episode, np.asarray(action)
         observation, reward, ended = self._advance(*given)
-        return np.asarray(observation), float(reward), bool(ended)
+        reward = np.nan if was_reset(self.data) else float(reward)
+        return np.asarray(observation), reward, bool(ended)
 
     def _outcome(self, before, fields, episode, action):
         data, before = self._view(fields, episode), Before(before, self.env.mj_model, episode)

@@ -15,6 +15,7 @@ from mujoco import (  # a C extension
     mjtDisableBit,  # pyright: ignore[reportAttributeAccessIssue]
     mjtEnableBit,  # pyright: ignore[reportAttributeAccessIssue]
     mjtIntegrator,  # pyright: ignore[reportAttributeAccessIssue]
+    mjtJoint,  # pyright: ignore[reportAttributeAccessIssue]
     mjtSensor,  # pyright: ignore[reportAttributeAccessIssue]
     mjx,
 )
@@ -39,8 +40,17 @@ NOT_CARRIED = {
     "plugin": ("nplugin", "plugins", "remove them"),
     "plastic": ("nplastic", "plastic springs", "remove springyield"),
 }
+_WITHIN_MARGIN = "give it a margin of at most half of its range"
 _ON_JOINT = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
+_ONE_SIGN = "give two positive numbers, or two that are not"
+_RISING = "give a second number that is not below it, and a width above zero"
+#: Fields of a model that say how soft its constraints are.
+_SOFT = (
+    *("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}"),
+    *("tendon_{}_lim", "tendon_{}_fri"),
+)
+_NO_WIDTH = 1e-15  # mjMINVAL
 #: What else MJX ignores in silence.
 _IGNORED = (
     ("actuator_armature", "the armature of an actuator", _ON_JOINT),
@@ -79,6 +89,8 @@ _REMEDIES = {
 #: What MJX refuses and no step depends on: the energy, and a check of the inverse dynamics.
 _ONLY_REPORTS = int(mjtEnableBit.mjENBL_ENERGY | mjtEnableBit.mjENBL_FWDINV)
 _ELSE = "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
+#: What MuJoCo calls a model without a name.
+_NAMELESS = "MuJoCo Model"
 #: The name of a file, an ``MjSpec`` or an ``MjModel``, which MuJoCo does not declare.
 ModelSource: TypeAlias = Any
 
@@ -106,9 +118,18 @@ def load_model(xml_file: ModelSource) -> Any:
             text = _asset(xml_file)
             model = _compile_model(lambda text: MjSpec.from_string(text).compile(), text, xml_file)
     if not model.nu:
-        raise ValueError(f"the model {xml_file!r} has no actuators; add an <actuator> element")
+        raise ValueError(f"{_name(xml_file)} has no actuators; add an <actuator> element")
     model.opt.enableflags &= ~_ONLY_REPORTS
     return model
+
+
+def _name(xml_file: ModelSource) -> str:
+    """Returns what a message calls a model: its file, the name that it has itself, or neither."""
+    if isinstance(xml_file, MjSpec):
+        xml_file = xml_file.modelname
+    elif isinstance(xml_file, MjModel):
+        xml_file = xml_file.names.split(b"\0")[0].decode()
+    return "the model" if xml_file == _NAMELESS else f"the model {xml_file!r}"
 
 
 def is_own(xml_file: ModelSource) -> bool:
@@ -148,7 +169,7 @@ def _compile_model(
     try:
         return compiler(source)
     except Exception as error:  # mujoco.FatalError is no ValueError
-        raise ValueError(f"MuJoCo cannot compile {xml_file!r}: {explain(error)}") from error
+        raise ValueError(f"MuJoCo cannot compile {_name(xml_file)}: {explain(error)}") from error
 
 
 def make_data(model: "mjx.Model") -> mjx.Data:
@@ -167,10 +188,10 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
       ValueError: MJX cannot run it; the message names the feature and what to change.
     """
     for feature, remedy in _ignored(model):
-        raise ValueError(f"MJX cannot run {xml_file!r}: MJX would ignore {feature}; {remedy}")
+        raise ValueError(f"MJX cannot run {_name(xml_file)}: MJX would ignore {feature}; {remedy}")
     if mjtSensor.mjSENS_RANGEFINDER in model.sensor_type and not model.nmat:
         raise ValueError(
-            f"MJX cannot run {xml_file!r}: its rangefinders work only in a model that has a "
+            f"MJX cannot run {_name(xml_file)}: its rangefinders work only in a model that has a "
             'material, a bug of MJX; add <asset><material name="any"/></asset>'
         )
     try:
@@ -181,7 +202,7 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
     except NotImplementedError as error:
         feature = str(error)
         remedy = next((change for part, change in _REMEDIES.items() if part in feature), _ELSE)
-        raise ValueError(f"MJX cannot run {xml_file!r}: {feature}; {remedy}") from error
+        raise ValueError(f"MJX cannot run {_name(xml_file)}: {feature}; {remedy}") from error
     return converted
 
 
@@ -190,6 +211,20 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     for field, feature, remedy in (*NOT_CARRIED.values(), *_IGNORED):
         if np.any(getattr(model, field)):
             yield feature, remedy
+    scalar = model.jnt_type != mjtJoint.mjJNT_BALL
+    for kind, limited, ends, margin in (
+        ("joint", model.jnt_limited & scalar, model.jnt_range, model.jnt_margin),
+        ("tendon", model.tendon_limited, model.tendon_range, model.tendon_margin),
+    ):
+        if np.any(limited & (np.ptp(ends, axis=1) < 2 * margin)):
+            yield f"one of two limits that a {kind} meets at once", _WITHIN_MARGIN
+    for of in _SOFT:
+        ref = getattr(model, of.format("solref"))
+        low, high, width = getattr(model, of.format("solimp"))[:, :3].T
+        if np.any((ref[:, 0] > 0) != (ref[:, 1] > 0)):
+            yield "MuJoCo's default in place of a solref of mixed signs", _ONE_SIGN
+        if np.any((low > high) | ((width < _NO_WIDTH) & (low != high))):
+            yield "the first number of a solimp that does not rise", _RISING
     if model.opt.enableflags & mjtEnableBit.mjENBL_SLEEP:
         yield "sleeping bodies", 'remove <flag sleep="enable"/>'
     if model.opt.disableactuator:

@@ -11,6 +11,7 @@ import tomllib
 import pytest
 from places import ROOT
 from saved_runs import make_run
+from sizes import sizes as measured_sizes
 
 import mjx_reinforce
 
@@ -92,6 +93,14 @@ def test_folders_are_small():
     """A stranger sees at once what is in one."""
     sizes = collections.Counter(p.parent for p in FILES.values() if p.name != "__init__.py")
     assert {str(folder): n for folder, n in sizes.items() if n > 14} == {}
+
+
+def test_nothing_grows():
+    """Each size is at most its ceiling; a change that lowers a size lowers the ceiling with it."""
+    ceilings = tomllib.loads((TESTS / "ceilings.toml").read_text("utf-8"))
+    sizes = measured_sizes(ROOT)
+    assert sizes.keys() == ceilings.keys()
+    assert {name: size for name, size in sizes.items() if size > ceilings[name]} == {}
 
 
 def test_the_wheel_has_every_package():

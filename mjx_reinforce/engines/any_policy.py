@@ -50,7 +50,7 @@ def rollout(
       key: consumed; [N] the episodes' own, or [] and that of episode i is this one folded with i.
       num_episodes: N.
       horizon: T, the time limit in steps; reaching it ends an episode.
-      engine: "auto"; or "native", "fused" or "vmap". With "auto" a small policy is played in
+      engine: "auto"; "native" or "vmap". With "auto" a small policy is played in
         machine code, policy and all; a larger one by XLA, with the env step in machine code.
       deterministic: [] or [N] whether an episode takes the mode.
       active: [] or [N] whether an episode is played: else it has no step, and zeros stand for it.

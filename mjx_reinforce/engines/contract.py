@@ -14,6 +14,9 @@ from mjx_reinforce.types import Box, Discrete, Environment, PyTree, action_space
 #: What JAX raises where Python or NumPy asks for the value of a traced array.
 _NEED_VALUES = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
 _TRACED = "; it is compiled by JAX: write jnp.where for `if`, and jnp for numpy, math and float()"
+#: Ends of names of brax's and Playground's wrappers that map an environment, or reset it where an
+#: episode ends: what the last action led to is lost there.
+_NOT_HERE = ("AutoResetWrapper", "VmapWrapper")
 
 
 def check_environment(env: Environment) -> None:
@@ -24,12 +27,26 @@ def check_environment(env: Environment) -> None:
     """
     name = type(env).__name__
     check_parts(env)
+    _check_wrappers(env)
     _check_limits(name, env)
     _check_action_space(name, env)
     start = _shapes(name, "reset", env.reset, jax.random.key(0))
     _check_state(name, start)
     after = _shapes(name, "step", env.step, start, _action_shape(env))
     _check_same(name, start, after)
+
+
+def _check_wrappers(env: object) -> None:
+    """Raises ValueError for many environments, or one that begins its next episode by itself."""
+    wrapper: Any = env
+    while wrapper is not None:
+        name = type(wrapper).__name__
+        if name.endswith(_NOT_HERE):
+            raise BadEnvironmentError(
+                f"{name} does what is done here: give the environment that it wraps, its env, "
+                "as brax.envs.create(..., auto_reset=False) makes it"
+            )
+        wrapper = getattr(wrapper, "__dict__", {}).get("env")
 
 
 def _check_limits(name: str, env: object) -> None:

@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 import jax
 
 from mjx_reinforce import fused
-from mjx_reinforce.engines.choice import against_writing, branch_cost, pick
+from mjx_reinforce.engines.choice import pick
 from mjx_reinforce.engines.native import available, look
 from mjx_reinforce.engines.native.mapping import machine_map
 from mjx_reinforce.engines.native.outlook import check_seconds
 from mjx_reinforce.engines.native.program import refusal
 from mjx_reinforce.fused import jaxprs, size
+from mjx_reinforce.fused.vmap import MAX_OPERATIONS
 from mjx_reinforce.types import Environment, PyTree, observation_size
 
 #: Scalar operations of a step, before any fold away: between those of the tasks without contacts
@@ -26,7 +27,7 @@ MappedFunction = Callable[..., Any]
 class MapEngine(NamedTuple):
     """A way to map a function.
 
-    name: "vmap", "fused" or "native"
+    name: "vmap" or "native"; "fused" where XLA has the function written out in scalars
     why: the reason it was chosen, for people
     call: the function of a batch, whose first axis of every array is N
     seconds: wall time that making it took, most of it for machine code
@@ -56,21 +57,32 @@ def map_function(
       ValueError: the name is unknown, or the engine does not support the function.
     """
     began = time.perf_counter()
-
-    def in_scalars() -> MappedFunction | str:
-        mapped = fused.vmap(function, branch_cost=branch_cost())
-        batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((1, *x.shape), x.dtype), examples)
-        return against_writing(mapped, observation_size(env), *batch) or mapped
-
-    def in_machine_code() -> MappedFunction | str:
-        if name == "auto" and available.platform() == "gpu":
-            traced, _ = jaxprs.trace(function, *examples)
-            if size.num_scalars(traced) < _SMALL:
-                return "on a GPU XLA's kernels are faster for so small a step"
-        return machine_code(env, function, *examples)
-
-    made = pick(name, env, in_machine_code, in_scalars, jax.vmap(function))
+    made = _in_scalars(function, *examples) if name == "auto" else None
+    if made is None:
+        in_machine_code = functools.partial(machine_code, env, function, *examples)
+        made = pick(name, in_machine_code, jax.vmap(function))
     return MapEngine(*made, time.perf_counter() - began)
+
+
+def _in_scalars(
+    function: Callable[..., Any], *examples: PyTree
+) -> tuple[str, str, MappedFunction] | None:
+    """Returns a function that is small enough for XLA's kernels on a GPU, written out for them."""
+    if (
+        available.platform() != "gpu"
+        or size.num_scalars(jaxprs.trace(function, *examples)[0]) >= _SMALL
+    ):
+        return None
+    # On a GPU a real branch makes the host wait for its predicate: both sides are computed.
+    mapped = fused.vmap(function, branch_cost=MAX_OPERATIONS)
+    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((1, *x.shape), x.dtype), examples)
+    try:
+        written = mapped.write(*batch)
+    except Exception:  # whatever it is, another engine may play this
+        return None
+    if sum(written.operations.values()) > MAX_OPERATIONS:
+        return None
+    return "fused", "on a GPU XLA's kernels are the fastest for so small a step", mapped
 
 
 def machine_code(

@@ -91,7 +91,7 @@ def ars(
       shared_starts: the two episodes of a direction start alike; each has its own start in the
         paper.
       update: "paper", or "document" for that of a published notebook: ``document_increment``.
-      engine: "auto", "vmap" or "fused", see ``engines.choice``.
+      engine: "auto" or "vmap", see ``engines.choice``.
 
     Returns:
       The learner. Where sigma is zero the parameters stay.

@@ -26,7 +26,6 @@ from mjx_reinforce.learners.diagnostics import (
     within_kl,
 )
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
-from mjx_reinforce.learners.gpu.gradient import in_one_kernel
 from mjx_reinforce.learners.learner import (
     Guests,
     Host,
@@ -136,8 +135,8 @@ def reinforce(
       one_start: reset every episode of a seed with the same key, drawn once at ``init``.
       num_seeds: how many will learn at once, vmapped. It decides nothing but speed
         and rounding: of many, updates whose episodes are all short pass over their first steps
-        alone, and on some GPUs a kernel computes the gradient (``gpu.gradient``).
-      engine: how episodes are played: "auto", "vmap", "fused" or "native", see
+        alone.
+      engine: how episodes are played: "auto", "vmap" or "native", see
         ``engines.choice``.
       devices: among which the episodes of an update are divided; they stay where they are played,
         and XLA divides what is computed from them. Their count divides every number of episodes
@@ -378,7 +377,6 @@ class _Reinforce:
             samples=(scaled, trajectory.action, weight, mask),
             divisor=self._divisor(trajectory),
             clock=Clock(state.progress, counts.as_float(state.env_steps)),
-            in_one_kernel=self._in_one_kernel,
         )
         params, opt_state, update_metrics = self.update(problem, key, actor.params, state.opt_state)
         visited = visited_steps(trajectory)
@@ -401,15 +399,6 @@ class _Reinforce:
         sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
         diagnostics = nan_unless(sound, metrics | update_metrics | change)
         return state, episode_metrics(trajectory) | diagnostics | {"skipped_update": skipped}
-
-    def _in_one_kernel(self, params: Any, samples: tuple[jax.Array, ...]) -> Any:
-        """Returns the gradient as ``gpu.gradient.in_one_kernel`` does, or None."""
-        if self.devices is not None:  # samples are on several
-            return None
-        loss = functools.partial(_loss, self.policy.distribution)
-        return in_one_kernel(
-            self.policy, loss, self.entropy_cost, params, samples, seeds=self.num_seeds
-        )
 
     def _divisor(self, trajectory: Trajectory) -> int | jax.Array:
         """Returns what the sum over all steps is divided by."""
@@ -449,25 +438,14 @@ class _OneStart:
 
 def _surrogate(policy: Policy, entropy_cost: float | jax.Array) -> Callable[..., Any]:
     """Returns (params, samples) -> (minus the sum in the formula, the sum of the entropy)."""
+    distribution = policy.distribution
 
     def surrogate(params, chunk):
         observation, action, weight, mask = chunk
         outputs = policy.apply(params, observation)
-        return _loss(policy.distribution, outputs, action, weight, mask, entropy_cost)
+        entropy = distribution.entropy(outputs)
+        terms = distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
+        loss = -jnp.sum(jnp.where(mask, terms, 0.0))
+        return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
 
     return surrogate
-
-
-def _loss(
-    distribution: Distribution,
-    outputs: jax.Array,
-    action: jax.Array,
-    weight: jax.Array,
-    mask: jax.Array,
-    entropy_cost: float | jax.Array,
-) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Returns what ``_surrogate`` does, from the policy's outputs on."""
-    entropy = distribution.entropy(outputs)
-    terms = distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
-    loss = -jnp.sum(jnp.where(mask, terms, 0.0))
-    return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}

@@ -35,8 +35,6 @@ class Problem(NamedTuple):
     samples: observation [T, N, O], action [T, N, ...], weight [T, N] and mask [T, N]
     divisor: [] by which the sum over all samples is divided
     clock: how far the run was before the rollout
-    in_one_kernel: (params, samples) -> what ``accumulate_gradient`` returns, or None where that is
-      to compute it
     """
 
     surrogate: Callable[[Any, tuple[jax.Array, ...]], tuple[jax.Array, dict[str, jax.Array]]]
@@ -44,7 +42,6 @@ class Problem(NamedTuple):
     samples: tuple[jax.Array, ...]
     divisor: int | jax.Array
     clock: Clock
-    in_one_kernel: Callable[[Any, tuple[jax.Array, ...]], Any] = lambda params, samples: None
 
 
 #: The gradient's noise is measured on one of so many episodes, and on so many at most.
@@ -83,9 +80,7 @@ def whole_rollout(turn: Turn) -> Update:
 
     def update(problem, key, params, opt_state):
         mask = problem.samples[-1]
-        _, grads, sums = problem.in_one_kernel(params, problem.samples) or accumulate_gradient(
-            problem.surrogate, params, problem.samples
-        )
+        _, grads, sums = accumulate_gradient(problem.surrogate, params, problem.samples)
         metrics = {}
         if mask.shape[1] > 1:
             metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)

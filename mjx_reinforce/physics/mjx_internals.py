@@ -4,7 +4,7 @@ No other file imports MJX's private modules or reads the private part of its dat
 
 - Names that MJX keeps private, here without underscore: the imports, and ``advance``.
 - Fields of ``mjx.Data`` that only MJX's JAX implementation has: ``jax_fields``, ``with_solution``,
-  ``rows_of``, ``with_rows``, ``with_contact``, ``Simulation``, ``num_contacts``.
+  ``rows_of``, ``with_rows``, ``with_contact``, ``with_inertia``, ``Simulation``, ``num_contacts``.
 - Functions of MJX in which a name is given another meaning: ``collision_with`` and ``fenced``. They
   would do nothing, silently, if MJX stopped looking that name up; ``check_lookup`` raises then.
 
@@ -43,6 +43,7 @@ from mujoco.mjx._src.collision_types import Collision, GeomInfo
 from mujoco.mjx._src.forward import _advance as advance
 from mujoco.mjx._src.math import make_frame
 from mujoco.mjx._src.smooth import solve_m
+from mujoco.mjx._src.support import muscle_gain
 
 from mjx_reinforce.fused import by_engine
 
@@ -59,10 +60,12 @@ __all__ = [
     "geom_pairs",
     "jax_fields",
     "make_frame",
+    "muscle_gain",
     "num_contacts",
     "rows_of",
     "solve_m",
     "with_contact",
+    "with_inertia",
     "with_rows",
     "with_solution",
 ]
@@ -243,6 +246,11 @@ def with_rows(data: mjx.Data, rows: list[jax.Array]) -> mjx.Data:
 def with_contact(data: mjx.Data, contact: Any, dim: np.ndarray) -> mjx.Data:
     """Returns the data with other contacts, of these dimensions."""
     return cast(mjx.Data, data.tree_replace({"_impl.contact": contact.replace(dim=dim)}))
+
+
+def with_inertia(data: mjx.Data, matrix: jax.Array) -> mjx.Data:
+    """Returns the data with another inertia matrix, [nv, nv]."""
+    return cast(mjx.Data, data.tree_replace({"_impl.M": matrix}))
 
 
 class Simulation:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engines.episode import begin, hold, step
+from mjx_reinforce.envs.in_mujoco import was_reset
 from mjx_reinforce.export.films import import_gymnasium
 from mjx_reinforce.export.player import Player
 from mjx_reinforce.policies.actor import act
@@ -101,9 +102,11 @@ def gymnasium_simulator(player: Player, horizon: int) -> tuple[str, Callable[[in
         qpos, rewards, ended = [_positions(env)], [], False
         while not ended:
             observation, reward, terminated, truncated, _ = env.step(player.act(observation, rng))
-            qpos.append(_positions(env))
-            rewards.append(reward)
-            ended = terminated or truncated
+            broken = hasattr(env.unwrapped, "data") and was_reset(env.unwrapped.data)
+            rewards.append(np.nan if broken else reward)
+            if not broken:
+                qpos.append(_positions(env))
+            ended = terminated or truncated or broken
         return Episode(np.stack(qpos), np.asarray(rewards, float))
 
     return gymnasium.__version__, play

@@ -100,9 +100,6 @@ def mlp_policy(
         fixed = jnp.broadcast_to(params["constants"], (*batch, len(constants)))
         return jnp.concatenate([*outputs, fixed], axis=-1)
 
-    if len(networks) == 1:  # learners.gpu.gradient knows its derivative
-        # With the function that the mark is for: ``functools.wraps`` copies marks.
-        apply.network = apply, networks["network"]  # pyright: ignore[reportFunctionMemberAccess]
     return Policy(init, apply, distribution)
 
 

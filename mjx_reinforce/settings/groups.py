@@ -139,11 +139,11 @@ class RunSettings:
     """Cut until this share of the budget is used."""
     one_start: bool = False
     """Begin all training episodes, not evaluations, of a seed in one state."""
-    engine: Literal["auto", "vmap", "fused", "native"] = setting(
+    engine: Literal["auto", "vmap", "native"] = setting(
         "auto", once="it changes no result but by rounding"
     )
-    """How episodes are played: vmap (jax.vmap of the step), fused (written out as scalar
-    operations), native (machine code for this CPU or NVIDIA GPU), or auto, the fastest here."""
+    """How episodes are played: vmap (jax.vmap of the step), native (machine code for this CPU or
+    NVIDIA GPU), or auto, the fastest here."""
     like: Path | None = setting(None, Mark.PLACE, once="every configuration begins with it")
     """Take all settings from this run, except those on the command line."""
     init_from: str | None = setting(None, Mark.NOT_COMPILED, once="it is for one run")

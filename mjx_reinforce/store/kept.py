@@ -24,7 +24,6 @@ from mjx_reinforce.engines.native.available import made_for, platform
 from mjx_reinforce.engines.native.cpu import seam
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
 from mjx_reinforce.envs.settings import split_words
-from mjx_reinforce.learners.gpu.gradient import TRITON
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import Config, marked
@@ -168,7 +167,7 @@ def _export(
     key: str, name: str, program: Callable[..., Any], given: tuple[Any, ...]
 ) -> Callable[..., Any]:
     """Returns a program as it is kept, or as it was where JAX cannot export it."""
-    names = (*seam.targets(), *gpu_seam.targets(), gpu_seam.PTX, TRITON)
+    names = (*seam.targets(), *gpu_seam.targets())
     unsafe = [export.DisabledSafetyCheck.custom_call(x) for x in names]
     try:
         exported = export.export(jax.jit(program), disabled_checks=unsafe)(*given)

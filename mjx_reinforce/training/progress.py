@@ -149,7 +149,7 @@ def describe_nonfinite(updates: Arrays, num_seeds: int) -> str:
     named = ", ".join(map(str, seeds[:_NAMED])) + (", ..." if len(seeds) > _NAMED else "")
     when = f"update {first}" if first == last else f"updates {first} to {last}"
     return (
-        f"{when}: {len(seeds):,} of {num_seeds:,} seeds met numbers that are not finite "
-        f"({named}): {updates['episodes'].sum():,} episodes, "
+        f"{when}: {len(seeds):,} of {num_seeds:,} seeds met numbers that are not finite or beyond "
+        f"1e10 ({named}): {updates['episodes'].sum():,} episodes, "
         f"{updates['skipped'].sum():,} updates skipped"
     )

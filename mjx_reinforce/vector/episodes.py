@@ -4,7 +4,7 @@ All here is for one environment of N, and is mapped over them. The reset of an e
 the environment's own key alone, so what one plays does not depend on N.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -142,11 +142,13 @@ def _play(env: Environment, limit: int | None, state: VectorState, action: PyTre
     finite &= jnp.isfinite(after.done)
     reward = jnp.where(finite, after.reward, 0)
     length = jnp.where(over, 0, state.episode_length) + 1
-    truncated = jnp.zeros((), bool) if limit is None else length >= limit
+    truncated = cut = _time_is_up(after)
+    if limit is not None:
+        truncated |= length >= limit
     return VectorState(
         simulation=after,
         reward=reward,
-        terminated=(after.done != 0) | ~finite,
+        terminated=((after.done != 0) & ~cut) | ~finite,
         truncated=truncated,
         nonfinite=~finite,
         final_obs=after.obs,
@@ -155,3 +157,13 @@ def _play(env: Environment, limit: int | None, state: VectorState, action: PyTre
         episode_length=length,
         keys=state.keys,
     )
+
+
+def _time_is_up(state: Any) -> jax.Array:
+    """Returns whether an environment ended its episode [] by a time limit of its own.
+
+    brax's and Playground's ``EpisodeWrapper`` set ``done`` then, and tell why.
+    """
+    info = getattr(state, "info", None)
+    told = info.get("truncation", 0) if isinstance(info, Mapping) else 0
+    return jnp.asarray(told) != 0

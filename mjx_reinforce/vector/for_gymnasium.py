@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from mjx_reinforce.engines.episode import episode_keys
 from mjx_reinforce.engines.native.available import GENERATOR
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Discrete, Environment, PyTree
@@ -82,8 +81,9 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Begins new episodes.
 
         Args:
-          seed: of all environments, or one for each. Without one the environments go on drawing
-            from their keys; the first time it is drawn at random.
+          seed: one for each environment, or one number: the seed of environment i is that and i.
+            Without one the environments go on drawing from their keys; the first time it is drawn
+            at random.
           options: {"reset_mask": bool [N]} resets some of the environments and lets others be.
 
         Returns:
@@ -116,7 +116,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
           the finite numbers.
 
         Raises:
-          ValueError: the actions have another shape or kind, or are not finite numbers.
+          ValueError: the actions have another shape or kind, or are not finite numbers; or with
+            ``autoreset="disabled"`` an episode has ended and nobody has reset its environment.
         """
         state = self.advance(actions)
         flags = self._out(state.terminated), self._out(state.truncated)
@@ -130,6 +131,12 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self._check_open()
         if self.state is None:
             raise ValueError("call reset before step")
+        if self.vec.autoreset == "disabled" and (over := np.flatnonzero(self.state.done)).size:
+            raise ValueError(
+                f"{over.size} of {self.num_envs} environments have ended, such as {over[0]}; with "
+                "autoreset='disabled' reset them before the next step: "
+                "reset(options={'reset_mask': terminated | truncated})"
+            )
         state = self.state = self._step(self.state, self._actions(actions))
         return state
 
@@ -171,12 +178,12 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             )
 
     def _keys(self, seed: Seeds) -> jax.Array:
-        """Returns a key, or one for each environment."""
+        """Returns a key for each environment [N]."""
         if seed is None:
-            seed = int(np.random.SeedSequence().generate_state(1)[0])
+            seed = int(np.random.SeedSequence().generate_state(1, np.uint64)[0])
         if isinstance(seed, int | np.integer) and not isinstance(seed, bool):
             super().reset(seed=int(seed))
-            return _keys_of([int(seed)])[0]
+            return _keys_of(range(int(seed), int(seed) + self.num_envs))
         if not isinstance(seed, list | tuple | np.ndarray) or len(seed) != self.num_envs:
             raise ValueError(
                 f"seed must be a whole number, or a list of {self.num_envs}, one each, got {seed!r}"
@@ -193,7 +200,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             raise ValueError("the first reset must be of all environments: leave reset_mask out")
         state = self.state
         if seed is not None:
-            keys = jax.random.key_data(episode_keys(self._keys(seed), self.num_envs))
+            keys = jax.random.key_data(self._keys(seed))
             state = state.replace(keys=jnp.where(mask[:, None], keys, state.keys))  # pyright: ignore
         return self._restart(state, mask)
 

@@ -206,7 +206,7 @@ def test_solving_needs_a_threshold(run, tmp_path, monkeypatch, capsys):
 
 
 def test_a_run_beyond_all_memory_is_refused(run, tmp_path, capsys):
-    size = ["--engine", "fused", "--num-seeds", str(10**9)]
+    size = ["--engine", "vmap", "--num-seeds", str(10**9)]
     assert run(*ARGUMENTS, *size, "--output", "out") == 2
     error = capsys.readouterr().err
     assert "does not fit into memory" in error
@@ -353,7 +353,7 @@ def test_a_record_of_two_seeds_by_hand():
     np.testing.assert_array_equal(record.training()["episode_return"], [[3, 4], [np.nan] * 2])
     np.testing.assert_array_equal(record.training()["env_steps"], [[30, 40], [70, 40]])
     np.testing.assert_array_equal(record.training()["episodes"], [[2, 2], [4, 2]])
-    summary = record.summary("fused", 3.0, 2.0)
+    summary = record.summary("vmap", 3.0, 2.0)
     assert summary["env_steps_to_solve"] == [None, 0]
     # 2 (60 + 40) in training and 2 (2 + 2) in evaluations: each waits for the other.
     assert summary["useful_step_fraction"] == 116 / 160

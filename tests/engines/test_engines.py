@@ -1,14 +1,14 @@
 """Every engine plays the same step from the same state: limits, high speeds and falls included."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce import envs, fused, normal
+from mjx_reinforce import envs, normal
 from mjx_reinforce.engines import choice as engines
-from mjx_reinforce.engines import rollouts
-from mjx_reinforce.fused import evaluate
 from mjx_reinforce.types import action_space
 
 NUM_STATES = 10_000
@@ -56,7 +56,8 @@ def one_step(id, engine, solver="exact", **options):
     """Returns [N, nq + nv + 1]: positions, velocities and reward after one env step."""
     env = Wide(envs.make(id, solver=solver))
     distribution = normal(action_space(env))
-    play = rollouts.rollout if engine == "vmap" else engines.choose(engine, env).rollout
+    player = engines.ActingPolicy(act, jnp.zeros(2 * env.action_size), distribution)
+    play = engines.choose(engine, env, player, 2).rollout
     episodes = jax.jit(
         lambda actor, key: play(
             env,
@@ -90,38 +91,35 @@ def exact():
     return reference, error(one_step("InvertedPendulum-v5", "vmap", solver="mjx"), reference)
 
 
-def test_fused_is_plain_mjx_in_double_precision(exact):
+def test_machine_code_is_plain_mjx_in_double_precision(exact):
     with jax.enable_x64(True):
-        assert error(one_step("InvertedPendulum-v5", "fused"), exact[0]) < 1e-12
+        assert error(one_step("InvertedPendulum-v5", "native"), exact[0]) < 1e-12
 
 
 def test_single_precision_is_closer_than_plain_mjx(exact):
     """MJX's iterative solver ends 1e-3 from the optimum at the rail, the closed form 3e-5."""
     reference, plain_error = exact
-    fused = one_step("InvertedPendulum-v5", "fused")
-    assert error(fused, reference) < plain_error / 10
+    assert error(one_step("InvertedPendulum-v5", "native"), reference) < plain_error / 10
 
 
 def test_auto_says_what_it_takes_and_why():
     pendulum = envs.make("InvertedPendulum-v5")
-    assert engines.choose("auto", pendulum).name == "fused"
-    contacts = engines.choose("auto", envs.make("Hopper-v5"))
-    assert contacts.name == "vmap"
-    assert "contacts" in contacts.why
+    assert "every episode has a policy of its own" in engines.choose("auto", pendulum).why
     with pytest.raises(ValueError, match=r"a policy of its own.*choose auto"):
         engines.choose("native", pendulum)
 
 
-def test_a_fault_of_the_writer_is_told_from_what_it_does_not_support(monkeypatch):
-    """Its message has the exception's name, and another engine plays."""
-
-    def faulty(graph, eqn, *operands):
-        raise TypeError("a rule of ours")
-
-    monkeypatch.setitem(evaluate._ARRAY_RULES, "mul", faulty)
-    env = Wide(envs.make("InvertedPendulum-v5"))
-    reason = engines.unsupported_by_fused(env, fused.vmap(env.step, in_axes=-1, out_axes=-1))
-    assert "it cannot be written out (TypeError: a rule of ours" in reason
-    monkeypatch.setattr(evaluate, "_ARRAY_RULES", {})
-    reason = engines.unsupported_by_fused(env, fused.vmap(env.step, in_axes=-1, out_axes=-1))
-    assert reason.startswith("there is no rule for the primitive")
+@pytest.mark.parametrize(
+    ("name", "version", "told"),
+    [("vmap", "0.10.2", True), ("native", "0.10.2", False), ("vmap", "0.11.2", False)],
+)
+def test_a_jax_that_multiplies_wrongly_is_told(name, version, told, monkeypatch):
+    """Where all is left to it."""
+    monkeypatch.setattr(jax, "__version__", version)
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    env = envs.make("InvertedPendulum-v5")
+    player = engines.ActingPolicy(act, jnp.zeros(2), normal(env.action_space))
+    with warnings.catch_warnings(record=True) as met:
+        warnings.simplefilter("always")
+        engines.choose(name, env, player, 2)
+    assert [str(x.message)[:10] for x in met] == ["JAX 0.10.2"] * told

@@ -223,17 +223,17 @@ def test_the_first_that_works_is_taken(monkeypatch):
     """With what to try next; none where GPUs differ, for machine code is for one of them."""
     found = tuple(map(by, ("new", "old", "driver")))
     monkeypatch.setattr(assembler, "assemblers", lambda capability: found)
-    monkeypatch.setattr(seam, "_fails", lambda x: "it does" if x[0].name == "new" else None)
+    monkeypatch.setattr(seam, "_fails", lambda x: "it does" if x.name == "new" else None)
     assemblers = seam._assemblers.__wrapped__
-    assert assemblers() == found[1:]
+    assert assemblers() == (found[1:], None)
     monkeypatch.setattr(seam, "_fails", lambda x: "it does")
-    assert assemblers() == ()
+    assert assemblers() == ((), "it does")
     monkeypatch.setattr(seam, "_fails", lambda x: None)
     gpus = [type("GPU", (), {"compute_capability": x}) for x in ("9.0", "8.0")]
     monkeypatch.setattr(jax, "local_devices", lambda: gpus)
-    assert assemblers() == ()
+    assert assemblers() == ((), "its kernels are for GPUs of one kind, not 8.0 and 9.0")
     monkeypatch.setattr(jax, "local_devices", lambda: gpus[:1] * 2)
-    assert assemblers() == found
+    assert assemblers() == (found, None)
 
 
 @pytest.fixture
@@ -278,7 +278,7 @@ def test_a_program_calls_the_handler(in_memory, monkeypatch, tmp_path):
 def test_an_exported_program_finds_its_kernel_again(in_memory, monkeypatch, tmp_path):
     filled, registered = in_memory
     assemblers = (by("ptxas"),)
-    monkeypatch.setattr(seam, "_assemblers", lambda: assemblers)
+    monkeypatch.setattr(seam, "_assemblers", lambda: (assemblers, None))
     checks = list(map(export.DisabledSafetyCheck.custom_call, seam.targets()))
     x = jnp.zeros(1, jnp.int32)
     made = export.export(jax.jit(launch), platforms=("cuda",), disabled_checks=checks)(x)
@@ -291,6 +291,6 @@ def test_an_exported_program_finds_its_kernel_again(in_memory, monkeypatch, tmp_
     assert filled[1] == (KERNEL._replace(compiled=False), assemblers, tmp_path)
     again = jax.jit(export.deserialize(bytearray(content)).call).trace(x)
     assert seam._target(KERNEL.key) in again.lower(lowering_platforms=("cuda",)).as_text()
-    monkeypatch.setattr(seam, "_assemblers", lambda: ())
+    monkeypatch.setattr(seam, "_assemblers", lambda: ((), "no driver"))
     assert not seam.restore(content)
     assert seam.restore(b"a program without kernels")

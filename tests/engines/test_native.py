@@ -11,7 +11,7 @@ import pytest
 from players import actor_and_act, assert_same_episodes, both, played
 from toys import Bytes, Drifting, categorical
 
-from mjx_reinforce import Box, envs, reinforce
+from mjx_reinforce import Box, envs, fused, reinforce
 from mjx_reinforce.engines import choice, rollouts
 from mjx_reinforce.engines.native import available, objects, outlook, program, rollout
 from mjx_reinforce.engines.native.cpu import lanes, machine
@@ -41,11 +41,17 @@ def test_every_distribution_draws_the_same_noise(name):
     assert np.all(got.action[~got.mask] == 0)
 
 
+def in_scalars(env):
+    """Plays as ``vmap``, with the step written out."""
+    step = fused.vmap(env.step, in_axes=-1, out_axes=-1)
+    return functools.partial(rollouts.rollout, env_step=step)
+
+
 @pytest.mark.parametrize("hidden_sizes", [(), (7, 5, 6), (8, 6, 5)])
 def test_the_pendulum(hidden_sizes):
     env = envs.make("InvertedPendulum-v5")
-    fused, options = choice.choose("fused", env).rollout, {"horizon": 50, "num_episodes": 20}
-    got, want = both(env, actor_and_act(env, hidden_sizes), fused, **options)
+    options = {"horizon": 50, "num_episodes": 20}
+    got, want = both(env, actor_and_act(env, hidden_sizes), in_scalars(env), **options)
     assert not want.mask[:, -1].all()
     assert_same_episodes(got, want, rounding=2e-5)
 
@@ -68,8 +74,8 @@ def test_a_limit_for_each_episode():
 def test_tasks_without_contacts(id):
     env = envs.make(id)
     distribution = categorical(env.action_space.num_actions) if id == "CartPole-v1" else None
-    player, fused = actor_and_act(env, (4,), distribution=distribution), choice.choose("fused", env)
-    got, want = both(env, player, fused.rollout, horizon=20, num_seeds=2)
+    player = actor_and_act(env, (4,), distribution=distribution)
+    got, want = both(env, player, in_scalars(env), horizon=20, num_seeds=2)
     assert_same_episodes(got, want, rounding=1e-4)
 
 
@@ -317,7 +323,7 @@ def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
     )
     player = choice.ActingPolicy(act, actor, distribution)
     assert choice.choose("auto", env, player, 500).name == "native"
-    assert choice.choose("auto", env).name == "fused"
+    assert choice.choose("auto", env).name == "vmap"
 
     class Gamma(Drifting):
         def step(self, state, action):
@@ -327,7 +333,7 @@ def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
     gamma = Gamma()
     actor, act, distribution = actor_and_act(gamma, ())
     player = choice.ActingPolicy(act, actor, distribution)
-    assert choice.choose("auto", gamma, player, 500).name == "fused"
+    assert choice.choose("auto", gamma, player, 500).name == "vmap"
     with pytest.raises(ValueError, match=r"native engine cannot play this: .*lgamma.*choose auto"):
         choice.choose("native", gamma, player, 500)
     monkeypatch.setattr(available, "unavailable", lambda: "llvmlite is not installed")
@@ -340,7 +346,7 @@ def test_lanes_have_no_numbers_of_8_bits():
     env = Bytes()
     actor, act, distribution = actor_and_act(env, ())
     chosen = choice.choose("auto", env, choice.ActingPolicy(act, actor, distribution), 500)
-    assert chosen.name == "fused"
+    assert chosen.name == "vmap"
     assert "machine code cannot play this: its state has numbers of int8" in chosen.why
 
 
@@ -385,7 +391,7 @@ def test_auto_falls_back_whatever_the_writer_raises(error, monkeypatch):
             return after.replace(reward=after.reward + len(type(error).__name__))
 
     engine = chosen(Unseen())
-    assert engine.name == "fused"
+    assert engine.name == "vmap"
     assert f"it cannot be written out ({type(error).__name__}" in engine.why
     with pytest.raises(ValueError, match="native engine cannot play this: it cannot be written"):
         chosen(Unseen(), "native")

@@ -13,7 +13,7 @@ from players import actor_and_act, assert_same_episodes, both, played
 from scenes import MANY_FEET, Scene
 from toys import Bytes, Chain, Drifting, categorical
 
-from mjx_reinforce import envs
+from mjx_reinforce import envs, fused
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.native import available, objects, program, rollout, step
 from mjx_reinforce.engines.native.gpu import kernel as kernels
@@ -240,8 +240,8 @@ def test_the_buffer_has_room_for_the_threads_of_all_blocks(monkeypatch, tmp_path
     text = gpu_on_cpu.lowered(monkeypatch, one, jax.random.key(0))
     (kernel,) = ptx._LOADED.values()
     assert kernel.scratch > 0
-    (call,) = (line for line in text.splitlines() if "@__gpu$xla.gpu.ptx" in line)
-    assert "grid_x = 3 : i32" in call
+    (call,) = (line for line in text.splitlines() if "@mjx_reinforce_gpu_" in line)
+    assert "blocks = 3 : i32" in call
     assert f"tensor<{kernel.scratch * 96}xi32>)" in call
 
 
@@ -250,6 +250,11 @@ def test_a_gpu_that_llvm_does_not_know_is_refused():
     assert ".target sm_90" in ptx._compile(text, "9.0")
     with pytest.raises(RuntimeError, match="does not know GPUs of compute capability 99"):
         ptx._compile(text, "99.0")
+
+
+def test_what_no_kernel_computes_is_refused():
+    with pytest.raises(fused.UnsupportedPrimitive, match="cosh: no kernel"):
+        ptx._compile("declare double @cosh(double)\n", "9.0")
 
 
 def test_one_launch_for_all_seeds_in_loops(pendulum, monkeypatch):
@@ -267,12 +272,12 @@ def test_one_launch_for_all_seeds_in_loops(pendulum, monkeypatch):
         return jax.lax.scan(body, keys, length=3)
 
     text = gpu_on_cpu.lowered(monkeypatch, repeated, jax.random.split(jax.random.key(0), (2, 3)))
-    calls = [line for line in text.splitlines() if "@__gpu$xla.gpu.ptx" in line]
+    calls = [line for line in text.splitlines() if "@mjx_reinforce_gpu_" in line]
     assert len(calls) == 1
     assert "tensor<6x50x4x8xf32>" in calls[0]
     assert calls[0].count("operand_index") == len(kernels.RESULTS)
-    assert "grid_x = 2 : i32" in calls[0]
-    assert "block_x = 32 : i32" in calls[0]
+    assert "blocks = 2 : i32" in calls[0]
+    assert "threads = 32 : i32" in calls[0]
 
 
 @pytest.mark.cpu
@@ -285,7 +290,7 @@ def test_it_says_why_there_are_no_kernels(monkeypatch):
         assert "llvmlite>=0.48" in (seam.kernels_unavailable() or "")
     with jax.enable_x64(True):
         assert "float32 alone" in (seam.kernels_unavailable() or "")
-    assert "does not launch its kernels" in (seam.kernels_unavailable() or "")
+    assert "libcuda.so.1, is not found" in (seam.kernels_unavailable() or "")
 
 
 @pytest.mark.cpu
@@ -295,9 +300,9 @@ def test_another_engine_plays_where_kernels_are_not_launched(pendulum, monkeypat
     env, (actor, act, distribution) = pendulum
     who = choice.ActingPolicy(act, actor, distribution)
     chosen = choice.choose("auto", env, who, 50)
-    assert chosen.name == "fused"
-    assert "does not launch its kernels" in chosen.why
-    with pytest.raises(ValueError, match="does not launch its kernels"):
+    assert chosen.name == "vmap"
+    assert "libcuda.so.1, is not found" in chosen.why
+    with pytest.raises(ValueError, match=r"libcuda.so.1, is not found"):
         choice.choose("native", env, who, 50)
 
 

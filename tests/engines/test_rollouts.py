@@ -9,7 +9,7 @@ import pytest
 from toys import Chain, Toy, ToyState, categorical
 
 from mjx_reinforce import Distribution
-from mjx_reinforce.engines import choice, episode, rollouts
+from mjx_reinforce.engines import episode, rollouts
 
 #: Two entries of an action, noise added; the mode is what the network says.
 PLAIN = Distribution(
@@ -124,16 +124,14 @@ def test_episodes_of_given_keys():
         play(env, keys, num_episodes=5)
 
 
-@pytest.mark.parametrize("engine", ["vmap", "fused"])
-def test_only_active_episodes_are_played(engine):
+def test_only_active_episodes_are_played():
     """Seeds side by side, each with a choice of its own."""
     env, keys = Counter(length=8), jax.random.split(jax.random.key(0), 3)
     active = jnp.array([[True, False, True, False], [False] * 4, [True] * 4])
-    roll = choice.choose(engine, env).rollout
 
     def one(key, active):
         size = {"num_episodes": 4, "horizon": 100}
-        return roll(env, act, jnp.array([0.1, 2.0]), PLAIN, key, active=active, **size)
+        return rollouts.rollout(env, act, jnp.array([0.1, 2.0]), PLAIN, key, active=active, **size)
 
     some = jax.tree.map(np.asarray, jax.vmap(one)(keys, active))
     every = jax.tree.map(np.asarray, jax.vmap(one)(keys, jnp.ones((3, 4), bool)))

@@ -13,7 +13,7 @@ import pytest
 from jax import lax
 from scipy import special
 
-from mjx_reinforce.fused.backends.llvm_math import FUNCTIONS
+from mjx_reinforce.fused.backends.llvm_math import FUNCTIONS, RARE
 from mjx_reinforce.fused.backends.llvm_text import Text
 
 llvm = pytest.importorskip("llvmlite.binding", reason="machine code is written by llvmlite")
@@ -242,6 +242,8 @@ def test_float32_calls_no_library(triple, cpu, lanes, call):
     llvm.initialize_all_asmprinters()
     target = llvm.Target.from_triple(triple).create_target_machine(cpu=cpu, opt=2)
     for name, (_, operands, _) in CASES.items():
+        if name in RARE:
+            continue
         text = Text(lanes)
         kind = text.type("float32")
         values = [text.let(f"load {kind}, ptr %in{i}") for i in range(len(operands))]

@@ -36,10 +36,9 @@ def compute(function, *operands):
     return out
 
 
-def test_the_error_function_is_odd_and_its_complement_adds_to_one():
+def test_the_error_function_is_odd_and_rises():
     erf = compute(llvm_special.erf, X)
     np.testing.assert_array_equal(compute(llvm_special.erf, -X), -erf)
-    np.testing.assert_allclose(erf + compute(llvm_special.erfc, X), 1, rtol=2e-7)
     assert np.all(np.diff(erf[np.argsort(X)]) > 0)
 
 
@@ -48,15 +47,6 @@ def test_the_inverse_undoes_the_error_function():
     np.testing.assert_allclose(back, X / 2, rtol=1e-5)
     ends = compute(llvm_special.erf_inv, np.array([1, -1, 0, 2] * 4))
     np.testing.assert_array_equal(ends, [np.inf, -np.inf, 0, np.nan] * 4)
-
-
-def test_a_cube_root_is_one():
-    cubes = np.arange(-8, 8) ** 3
-    np.testing.assert_allclose(compute(llvm_special.cbrt, cubes), np.arange(-8, 8), rtol=1e-7)
-    tiny = np.float32(1e-30) * cubes
-    np.testing.assert_allclose(
-        compute(llvm_special.cbrt, tiny), 1e-10 * np.arange(-8, 8), rtol=2e-7
-    )
 
 
 @pytest.mark.parametrize("power", [-3, -2, -1, 0, 1, 2, 3])

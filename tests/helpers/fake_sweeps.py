@@ -53,7 +53,7 @@ def make_sweep(directory, *, num_seeds=12, evaluations=20, over=GRID, **changes)
         "configurations": numbered,
         "compile_seconds": 21.4,
         "run_seconds": 63.0,
-        "engine": "fused",
+        "engine": "vmap",
         "command": "python -m mjx_reinforce.sweep --over learning-rate 1e-3 3e-3 1e-2 3e-2",
         "python": "3.11.9",
         "packages": {"jax": "0.10.2", "mujoco": "4.0.0"},

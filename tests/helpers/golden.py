@@ -13,7 +13,7 @@ from places import ROOT
 from mjx_reinforce import envs, reinforce, train_step
 
 FOLDER = ROOT / "tests" / "engines" / "golden"
-ENGINES = ("vmap", "fused", "native")
+ENGINES = ("vmap", "native")
 
 
 def updated(engine):

@@ -136,7 +136,9 @@ def emulate(monkeypatch, threads=1, block=None):
 def lowered(monkeypatch, function, *args, assemblers=()):
     """Returns what XLA's compiler for NVIDIA GPUs gets, as text."""
     monkeypatch.setattr(available, "platform", lambda: "gpu")
-    monkeypatch.setattr(seam, "_assemblers", lambda: assemblers)
+    monkeypatch.setattr(seam, "_assemblers", lambda: (assemblers, None))
+    if not assemblers:
+        monkeypatch.setattr(seam, "_handler", lambda kernel, _: seam._target(kernel.key))
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
     monkeypatch.setattr(seam, "_grid", lambda items, most, blocks: (-(-items // 32), 32))
     traced = jax.jit(function).trace(*jax.tree.map(jnp.asarray, args))

@@ -55,6 +55,18 @@ SOURCES = {
         "8e32c117bbccf41f1c309d0a677dcf0b568575bf2d8fb0dc95a5a461f429d62c",
         "runge_kutta.runge_kutta_4",
     ),
+    "forward.implicit": (
+        "5dca724c13bb5edf35ac28d093b80635e5f35eae9b5c6363983ea3bbd5b568e8",
+        "inertia.implicitfast",
+    ),
+    "derivative.deriv_smooth_vel": (
+        "025065bdc7a99d3a56526cfb71b644516e4a257b611481be35042cb88a2526d8",
+        "inertia.implicitfast (which velocities the forces depend on)",
+    ),
+    "support.muscle_gain": (
+        "e50a61e39d67822707247bd7f436e684ffcd3698f7c5ba01b618919680eb586a",
+        "inertia.implicitfast (its derivative)",
+    ),
     "forward._advance": (
         "999ba748df645057050516c216bcfb3ea341d33207d413a9b570fe493f9d29ea",
         "mjx_internals.advance (runge_kutta)",

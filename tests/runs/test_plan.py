@@ -184,7 +184,7 @@ def test_an_accelerators_memory_counts_where_there_is_one(monkeypatch):
 
 def test_the_time_of_a_run_by_hand():
     task = Task(observation=4, action=1, horizon=100, useful=0.5, base_memory=0.0)
-    speed = Speed("fused", 10.0, latency=0.01, rate=1000.0)
+    speed = Speed("vmap", 10.0, latency=0.01, rate=1000.0)
     config = Config(num_seeds=2, num_episodes=5, env_steps=1000, eval_every=2, eval_episodes=5)
     # 1000 / 0.5 steps a seed, twice that with evaluations, two seeds; 10 at a time take 0.02 s.
     assert plan.training_seconds(config, task, speed) == (pytest.approx(8000 / 10 * 0.02), False)
@@ -304,9 +304,9 @@ def test_durations_are_for_people(seconds, said):
     assert plan.duration(seconds) == said
 
 
-@pytest.mark.parametrize("engine", ["fused", "vmap"])
+@pytest.mark.parametrize("engine", ["vmap", "native"])
 def test_a_plan_says_what_is_known(monkeypatch, engine):
-    speeds = {"Survive-v0": Speed("fused", 40.0, 1.0, 1e9)}
+    speeds = {"Survive-v0": Speed("vmap", 40.0, 1.0, 1e9)}
     monkeypatch.setattr(
         plan, "this_hardware", lambda: plan.Hardware("3 mills", speeds, 2, 1e9, True)
     )
@@ -317,7 +317,7 @@ def test_a_plan_says_what_is_known(monkeypatch, engine):
     assert text.startswith("Training 4 seeds of Survive-v0 by reinforce, 1,600 env steps each, on")
     assert "on 3 mills, with the engine" in text
     assert "0.5 GB of memory" in text
-    if engine == "fused":  # 1600 / 0.5 * 1.4 / 16 steps of a second, at twice the speed
+    if engine == "vmap":  # 1600 / 0.5 * 1.4 / 16 steps of a second, at twice the speed
         assert compiling == 40
         assert "takes about 20 s to 80 s" in text
         assert "training about 70 s to 4.7 min, more if some seeds' episodes stay short" in text

@@ -109,7 +109,7 @@ def test_first_weights_are_pytorchs(name):
             assert 0.8 * bound < float(jnp.max(jnp.abs(x))) <= bound
 
 
-@pytest.mark.parametrize("name", ["auto", "vmap", "fused", "native"])
+@pytest.mark.parametrize("name", ["auto", "vmap", "native"])
 def test_engines_have_names(name):
     assert command_line.parse(["--engine", name]).engine == name
     with pytest.raises(ValueError, match="or vmap, got 'mjx'"):

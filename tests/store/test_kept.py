@@ -123,19 +123,16 @@ def test_programs_depend_on_the_number_of_devices(monkeypatch):
     assert kept.key_of(CONFIG) != key
 
 
-@pytest.mark.parametrize("way", ["handler", "ptx"])
-def test_a_program_that_launches_a_gpus_kernel_is_kept(way, monkeypatch):
+def test_a_program_that_launches_a_gpus_kernel_is_kept(monkeypatch):
     kernel = ptx.Kernel("0" * 64, "", 1, 1, 0, compiled=True)
     monkeypatch.setattr(ptx, "_LOADED", {kernel.key: kernel})
     monkeypatch.setattr(gpu, "_handler", lambda kernel, _: gpu._target(kernel.key))
-    assemblers = (lambda x: x,) if way == "handler" else ()
 
     def add(x):
-        return gpu._call_by(assemblers, kernel, (1, 1), [jnp.ones(1, jnp.int32)], [x])
+        return gpu._call_by((), kernel, (1, 1), [jnp.ones(1, jnp.int32)], [x])
 
     kept._export("key", "evaluate", add, (jax.ShapeDtypeStruct((1,), np.int32),))
-    name = gpu._target(kernel.key) if way == "handler" else gpu.PTX
-    assert name.encode() in kept._read_program("key", "evaluate")
+    assert gpu._target(kernel.key).encode() in kept._read_program("key", "evaluate")
 
 
 def test_a_program_whose_kernel_is_gone_is_not_read(folder):

@@ -73,7 +73,7 @@ def test_a_record_is_restored_exactly(tmp_path):
         same(record.arrays(), copy.arrays())
         same(record.history(), copy.history())
         same(record.training(), copy.training())
-        assert repr(record.summary("fused", 1.0, 2.0)) == repr(copy.summary("fused", 1.0, 2.0))
+        assert repr(record.summary("vmap", 1.0, 2.0)) == repr(copy.summary("vmap", 1.0, 2.0))
         assert repr(record.progress()) == repr(copy.progress())
         both = []
         for x in (record, copy):
@@ -111,7 +111,7 @@ def test_a_test_counts_among_what_was_simulated():
     record.add_test({name: x.astype(np.int32) for name, x in tested.items()})
     useful = record.env_steps.sum() + counts["evaluated"] + 4 + 3 + 2
     fraction = useful / (counts["simulated"] + 5 + 9 + 7)
-    assert record.summary("fused", 1.0, 2.0)["useful_step_fraction"] == pytest.approx(fraction)
+    assert record.summary("vmap", 1.0, 2.0)["useful_step_fraction"] == pytest.approx(fraction)
 
 
 def test_a_seed_is_broken_while_nothing_of_it_is_finite():
@@ -142,7 +142,8 @@ def test_a_block_of_broken_updates_is_one_line():
     metrics["skipped_update"] = np.zeros((4, 9), int)
     made = 6 + np.cumsum(metrics["active"], axis=0)
     assert progress.describe_nonfinite(progress.nonfinite_updates(metrics, made), 1000) == (
-        "updates 6 to 9: 9 of 1,000 seeds met numbers that are not finite (0, 1, 2, 3, 4, ...): "
+        "updates 6 to 9: 9 of 1,000 seeds met numbers that are not finite or beyond 1e10 "
+        "(0, 1, 2, 3, 4, ...): "
         "66 episodes, 0 updates skipped"  # the last seed made one update of four
     )
 

@@ -58,6 +58,7 @@ def test_an_id_can_name_the_module():
 def test_shapes_spaces_and_metadata(cart):
     assert cart.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     assert (cart.num_envs, cart.spec.id) == (3, CART)
+    assert cart.spec.max_episode_steps == cart.unwrapped.vec.max_episode_steps == 500
     assert cart.single_action_space == gymnasium.spaces.Discrete(2)
     assert cart.observation_space.shape == (3, 4)
     observation, info = cart.reset(seed=1)
@@ -103,10 +104,31 @@ def test_a_seed_of_some_gives_each_a_start_of_its_own(cart):
 
 
 def test_a_seed_of_one_is_that_of_its_environment(cart):
-    """However many there are."""
+    """However many there are; one number is the first of several, as in Gymnasium."""
     alone = gymnasium.make_vec(CART, num_envs=1)
     several = cart.reset(seed=[4, 5, 6])[0]
-    np.testing.assert_array_equal(alone.reset(seed=[4])[0][0], several[0])
+    np.testing.assert_array_equal(alone.reset(seed=[5])[0][0], several[1])
+    np.testing.assert_array_equal(cart.reset(seed=4)[0], several)
+    own = gymnasium.make_vec("CartPole-v1", num_envs=3, vectorization_mode="sync")
+    np.testing.assert_array_equal(own.reset(seed=4)[0], own.reset(seed=[4, 5, 6])[0])
+
+
+def test_without_autoreset_what_has_ended_is_reset_first():
+    """As in Gymnasium, which raises an AssertionError."""
+    make = {"num_envs": 2, "autoreset": "disabled", "max_episode_steps": 3}
+    env, actions = gymnasium.make_vec(PENDULUM, **make), np.array([[0.0], [3.0]])
+    env.reset(seed=0)
+    for _ in range(3):
+        *_, terminated, truncated, _ = env.step(actions)
+        over = terminated | truncated
+    assert over.all()
+    with pytest.raises(ValueError, match=r"2 of 2 environments .* as 0; .*reset_mask"):
+        env.step(actions)
+    env.reset(options={"reset_mask": np.array([True, False])})
+    with pytest.raises(ValueError, match="1 of 2 environments have ended, such as 1;"):
+        env.step(actions)
+    env.reset(options={"reset_mask": over})
+    assert not np.any(env.step(actions)[3])
 
 
 def test_same_step_tells_the_last_observation():
@@ -285,7 +307,8 @@ def test_rendered():
 def test_seeds_of_64_bits(cart):
     """Those below 2^32 are `jax.random.key` of them; others are not those less 2^32."""
     vec = for_gymnasium.make("CartPole-v1", 3).vec
-    np.testing.assert_array_equal(cart.reset(seed=7)[0], vec.reset(jax.random.key(7)).obs)
+    keys = jax.vmap(jax.random.key)(np.arange(7, 10))
+    np.testing.assert_array_equal(cart.reset(seed=7)[0], vec.reset(keys).obs)
     assert np.any(cart.reset(seed=2**32 + 7)[0] != cart.reset(seed=7)[0])
     several = cart.reset(seed=[7, 2**32 + 7, 7])[0]
     np.testing.assert_array_equal(several[0], several[2])

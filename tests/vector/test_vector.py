@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.envs.wrappers.training import AutoResetWrapper, EpisodeWrapper, VmapWrapper
 from toys import Drifting
 
 from experiments.checks.vector_parity import GymnasiumSide, compare
@@ -16,7 +17,7 @@ from mjx_reinforce.engines.native.mapping import machine_map
 from mjx_reinforce.vector.episodes import AUTORESETS
 
 SPACE = Box(np.array([-3.0]), np.array([1.0]))
-ENGINES = ("native", "fused", "vmap")
+ENGINES = ("native", "vmap")
 
 
 def play(vec, steps, seed=0, actions_seed=1):
@@ -133,6 +134,30 @@ def test_a_number_that_is_not_finite_ends_the_episode():
     then = jax.jit(vec.step)(after, jnp.zeros((4, 1)))
     assert np.all(np.isfinite(then.obs))
     assert then.episode_length.tolist() == [2, 2, 0, 2]
+
+
+@pytest.mark.parametrize("engine", ["native", "vmap"])
+def test_a_time_limit_of_the_environments_own_truncates(engine):
+    """The wrapper of brax sets ``done`` at 12 steps; a cart that is only pushed falls before."""
+    env = EpisodeWrapper(envs.make("CartPole-v1"), episode_length=12, action_repeat=1)
+    vec = make_vec(env, 2, autoreset="same_step", engine=engine)
+    state, step = vec.reset(jax.random.key(0)), jax.jit(vec.step)
+    ends = []
+    for t in range(12):
+        state = step(state, jnp.array([t % 2, 1]))
+        ends.append((state.terminated, state.truncated))
+    terminated, truncated = np.array(ends).swapaxes(0, 1)  # [12, 2] each
+    assert terminated.sum(0).tolist() == [0, 1]
+    assert truncated.sum(0).tolist() == [1, 0]
+    assert np.abs(state.final_obs[0] - state.obs[0]).max() > 0.05
+
+
+@pytest.mark.parametrize("wrapper", [VmapWrapper, AutoResetWrapper])
+def test_what_begins_episodes_by_itself_is_refused(wrapper):
+    """What an action led to would be the next start."""
+    env = EpisodeWrapper(wrapper(envs.make("CartPole-v1")), episode_length=12, action_repeat=1)
+    with pytest.raises(ValueError, match=f"{wrapper.__name__} does what is done here"):
+        make_vec(env, 2)
 
 
 @pytest.mark.parametrize(

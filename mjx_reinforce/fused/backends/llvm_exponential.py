@@ -1,4 +1,4 @@
-"""Exponentials and hyperbolic functions of float32 lanes.
+"""Exponentials and the hyperbolic tangent of float32 lanes.
 
 Results below the smallest normal number are zero, as they are in XLA's threads.
 """
@@ -9,8 +9,8 @@ from mjx_reinforce.fused.backends.llvm_lanes import INFINITY, ROUND, Lanes
 
 #: The logarithm of 2 in two parts; the first has 9 bits, so that its product with 15 is exact.
 LN2 = (0.693359375, -2.12194440e-4)
-#: Beyond these, exp is below 2^-126 and above 2^128 and sinh and cosh are above 2^128.
-_LEAST, _GREATEST, _GREATEST_HYPERBOLIC = -87.33654, 88.72283, 89.41599
+#: Beyond these, exp is below 2^-126 and above 2^128.
+_LEAST, _GREATEST = -87.33654, 88.72283
 #: From here on tanh rounds to 1.
 _TANH_IS_1 = 9.02
 
@@ -50,21 +50,8 @@ def exp(x: Lanes, less: Lanes | None = None) -> Lanes:
     return (x <= _GREATEST).where(result, x * INFINITY)  # infinity or NaN
 
 
-def exp2(x: Lanes) -> Lanes:
-    """Returns 2^x. Coefficients: Cephes, exp2f.c."""
-    rounded = x + ROUND
-    rest = x - (rounded - ROUND)
-    result = rest.polynomial(
-        *(1.535336188319500e-4, 1.339887440266574e-3, 9.618437357674640e-3),
-        *(5.550332471162809e-2, 2.402264791363012e-1, 6.931472028550421e-1, 1),
-    )
-    result = _times_power_of_2(result, rounded.bits())
-    result = (x < -126.0).where(0.0, result)
-    return (x < 128.0).where(result, x * INFINITY)
-
-
 def _quarter_of_expm1(x: Lanes) -> Lanes:
-    """Returns (exp(x) - 1) / 4, which does not overflow where the hyperbolic functions do not."""
+    """Returns (exp(x) - 1) / 4, which overflows later."""
     rest, n = _reduced(x)
     scale = _power_of_2(n, offset=-2)
     return _exp_less_1(rest) * scale + (scale - 0.25)
@@ -79,22 +66,6 @@ def expm1(x: Lanes) -> Lanes:
 def logistic(x: Lanes) -> Lanes:
     """Returns 1 / (1 + exp(-x))."""
     return 1 / (exp(-x) + 1)
-
-
-def cosh(x: Lanes) -> Lanes:
-    """Returns the hyperbolic cosine."""
-    size = abs(x)
-    rest, n = _reduced(size)
-    half = _times_power_of_2(_exp_less_1(rest) * 0.5 + 0.5, n)
-    return (size <= _GREATEST_HYPERBOLIC).where(half + 0.25 / half, size * INFINITY)
-
-
-def sinh(x: Lanes) -> Lanes:
-    """Returns the hyperbolic sine: of y = exp(|x|) - 1 it is (y + y / (y + 1)) / 2."""
-    size = abs(x)
-    quarter = _quarter_of_expm1(size)
-    result = (quarter + quarter / (quarter * 4 + 1)) * 2
-    return (size <= _GREATEST_HYPERBOLIC).where(result, size * INFINITY).call("copysign", x)
 
 
 def tanh(x: Lanes) -> Lanes:

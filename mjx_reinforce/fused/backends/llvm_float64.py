@@ -33,6 +33,15 @@ def library(name: str) -> Callable[..., Lanes]:
     return write
 
 
+def rounded(name: str) -> Callable[..., Lanes]:
+    """Returns what calls a function of the C library for each lane of float32."""
+
+    def write(x: Lanes) -> Lanes:
+        return library(name)(x.convert("fpext", "float64")).convert("fptrunc", "float32")
+
+    return write
+
+
 def logistic(x: Lanes) -> Lanes:
     """Returns 1 / (1 + exp(-x))."""
     return 1 / (library("exp")(-x) + 1)

@@ -1,4 +1,4 @@
-"""Logarithms and inverse hyperbolic functions of float32 lanes.
+"""Logarithms of float32 lanes.
 
 An operand below the smallest normal number counts as zero in ``log``, as it does in XLA's threads.
 """
@@ -10,7 +10,6 @@ from mjx_reinforce.fused.backends.llvm_lanes import INFINITY, Lanes
 
 _SMALLEST = 2.0**-126
 _SQRT_HALF = 0x3F3504F3  # the bits of sqrt(1 / 2)
-_LARGE = 2.0**28  # its square and 1 more are the same number
 
 
 def _log_of_parts(less_1: Lanes, exponent: Lanes) -> Lanes:
@@ -44,27 +43,3 @@ def log1p(x: Lanes) -> Lanes:
     result = (x < INFINITY).where(_log_of_parts(less_1, exponent), x)
     result = (x > -1.0).where(result, (x < -1.0).where(math.nan, x * INFINITY))
     return result.call("copysign", x)
-
-
-def asinh(x: Lanes) -> Lanes:
-    """Returns the inverse hyperbolic sine, log(|x| + sqrt(x^2 + 1)) with the sign of x."""
-    size = abs(x)
-    square = size * size
-    is_large = size > _LARGE
-    less_1 = is_large.where(size, size + square / ((square + 1).call("sqrt") + 1))
-    return (log1p(less_1) + is_large.where(size.like(math.log(2)), 0.0)).call("copysign", x)
-
-
-def acosh(x: Lanes) -> Lanes:
-    """Returns the inverse hyperbolic cosine, log(x + sqrt(x^2 - 1))."""
-    above = x - 1
-    is_large = x > _LARGE
-    less_1 = is_large.where(x, above + (above * (above + 2)).call("sqrt"))
-    result = log1p(less_1) + is_large.where(x.like(math.log(2)), 0.0)
-    return (x < 1.0).where(math.nan, result)
-
-
-def atanh(x: Lanes) -> Lanes:
-    """Returns the inverse hyperbolic tangent, log((1 + |x|) / (1 - |x|)) / 2 with the sign of x."""
-    size = abs(x)
-    return (log1p(size * 2 / (1 - size)) * 0.5).call("copysign", x)

@@ -1,4 +1,4 @@
-"""Error functions, powers and cube roots of float32 lanes."""
+"""Error functions and powers of float32 lanes."""
 
 import math
 
@@ -42,14 +42,6 @@ def erf(x: Lanes) -> Lanes:
     return (size < 0.5).where(_erf_near_0(x), far)
 
 
-def erfc(x: Lanes) -> Lanes:
-    """Returns 1 - erf(x)."""
-    size = abs(x)
-    far = _erfc_of_greater(size)
-    far = (x < 0.0).where(2 - far, far)
-    return (size < 0.5).where(1 - _erf_near_0(x), far)
-
-
 def erf_inv(x: Lanes) -> Lanes:
     """Returns the inverse of the error function.
 
@@ -66,19 +58,6 @@ def erf_inv(x: Lanes) -> Lanes:
     )
     result = (w < 5).where(central, tail) * x
     return abs(x).compare("eq", 1).where(x * INFINITY, result)
-
-
-def cbrt(x: Lanes) -> Lanes:
-    """Returns the cube root: a third of the exponent, then Halley's method twice.
-
-    Below the smallest normal number an operand counts as zero.
-    """
-    size = abs(x)
-    root = (size.bits().write("udiv", 3) + 0x2A5137A0).bits()  # within 4 %
-    for _ in range(2):
-        ratio = size / (root * root)
-        root = root - root * (root - ratio) / (root * 2 + ratio)
-    return ((size >= 2.0**-126) & (size < INFINITY)).where(root.call("copysign", x), x)
 
 
 def _log2(x: Lanes) -> Lanes:

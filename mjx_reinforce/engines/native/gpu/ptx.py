@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from mjx_reinforce import fused
 from mjx_reinforce.engines.native import look, objects
 
 #: LLVM's name of NVIDIA's GPUs.
@@ -50,6 +51,7 @@ def load_kernel(
       folder: where kernels are kept; None keeps none.
 
     Raises:
+      UnsupportedPrimitive: the text calls the C library.
       RuntimeError: the text is no LLVM IR, or this LLVM has no code for such a GPU.
     """
     key = _key(source, capability)
@@ -112,6 +114,8 @@ def _compile(text: str, capability: str) -> str:
     import llvmlite
     import llvmlite.binding as llvm
 
+    if called := re.findall(r"^declare double @(\w+)\(", text, re.M):
+        raise fused.UnsupportedPrimitive(f"{', '.join(called)}: no kernel for GPUs computes it")
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
     target = llvm.Target.from_triple(TRIPLE).create_target_machine(

@@ -1,10 +1,8 @@
 """How JAX launches kernels on an NVIDIA GPU.
 
-A kernel is launched within compiled programs and loops without Python. A handler of JAX's foreign
-function interface launches machine code, which is assembled while XLA compiles. Where that fails,
-the kernel goes to XLA as PTX, in a call that XLA's GPU compiler knows itself, and the driver
-assembles it when the program first runs. Each way is tried once in each process before it is
-relied on.
+A kernel is launched within compiled programs and loops without Python: a handler of JAX's foreign
+function interface launches machine code, which is assembled while XLA compiles. Each assembler is
+tried once in each process before it is relied on.
 """
 
 import ctypes
@@ -23,11 +21,8 @@ from jax import lax
 
 from mjx_reinforce.engines.native import objects
 from mjx_reinforce.engines.native.gpu import assembler, launcher, ptx
-from mjx_reinforce.engines.native.gpu.kernel import ENTRY
 from mjx_reinforce.engines.native.gpu.scratch import WARP
 
-#: XLA's name of what launches a kernel in PTX.
-PTX = "__gpu$xla.gpu.ptx"
 #: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
 _OLDEST = (22,)
 #: A kernel that adds 1 to the number that is its second argument and its result.
@@ -70,32 +65,31 @@ def kernels_unavailable() -> str | None:
         llvm.Target.from_triple(ptx.TRIPLE)
     except RuntimeError as error:
         return f"this llvmlite has no code for GPUs: {error}"
-    return _refused()
+    return _assemblers()[1]
 
 
 @functools.cache
-def _refused() -> str | None:
-    """Returns why kernels are launched in neither way, None if they are."""
-    return None if _assemblers() else _fails(())
-
-
-@functools.cache
-def _assemblers() -> Assemblers:
-    """Returns what assembles kernels: one that works, and what to try next where it fails."""
+def _assemblers() -> tuple[Assemblers, str | None]:
+    """Returns what assembles kernels, with what to try next where it fails; or why nothing does."""
     capabilities = {getattr(x, "compute_capability", "") for x in jax.local_devices()}
-    if len(capabilities) > 1:  # machine code is for one of them
-        return ()
+    if len(capabilities) > 1:
+        return (), f"its kernels are for GPUs of one kind, not {' and '.join(sorted(capabilities))}"
     found = assembler.assemblers(compute_capability())
-    return next((found[k:] for k, x in enumerate(found) if _fails((x,)) is None), ())
+    why: str | None = "NVIDIA's driver, libcuda.so.1, is not found"
+    for k, each in enumerate(found):
+        why = _fails(each)
+        if why is None:
+            return found[k:], None
+    return (), why
 
 
-def _fails(assemblers: Assemblers) -> str | None:
+def _fails(each: assembler.Assembler) -> str | None:
     """Returns why a kernel is not launched, None if it is: in a loop, into its own results."""
-    key = hashlib.sha256(f"probe {[x.name for x in assemblers]}".encode()).hexdigest()
+    key = hashlib.sha256(f"probe {each.name}".encode()).hexdigest()
     probe = ptx.Kernel(key, _PROBE, threads=1, blocks=1, scratch=0, compiled=True)
 
     def add(_: Any, x: jax.Array) -> jax.Array:
-        return _call_by(assemblers, probe, (1, 1), [jnp.ones(1, jnp.int32)], [x])[0]
+        return _call_by((each,), probe, (1, 1), [jnp.ones(1, jnp.int32)], [x])[0]
 
     try:
         with jax.ensure_compile_time_eval():
@@ -121,9 +115,10 @@ def restore(program: bytes) -> bool:
     folder = objects.folder()
     for key in set(re.findall(rb"mjx_reinforce_gpu_([0-9a-f]{64})", program)):
         kernel = ptx.kept(key.decode(), folder) if folder else None
-        if kernel is None or not _assemblers():
+        assemblers, _ = _assemblers()
+        if kernel is None or not assemblers:
             return False
-        _handler(kernel, _assemblers())
+        _handler(kernel, assemblers)
     return True
 
 
@@ -247,7 +242,7 @@ def _call(
     They also write into ``scratch``, a buffer that begins with any values. Returns ``written`` as
     they leave it, and then that buffer.
     """
-    return _call_by(_assemblers(), kernel, grid, given, written, scratch)
+    return _call_by(_assemblers()[0], kernel, grid, given, written, scratch)
 
 
 def _call_by(
@@ -258,26 +253,13 @@ def _call_by(
     written: Sequence[jax.Array],
     scratch: Sequence[jax.ShapeDtypeStruct] = (),
 ) -> Sequence[jax.Array]:
-    """Launches a kernel that is assembled so, or is PTX for XLA where nothing does."""
+    """Launches a kernel that is assembled so."""
     results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
     aliases = {len(given) + k: k for k in range(len(results))}
     blocks, threads = map(np.int32, grid)
-    one = np.int32(1)
-    if assemblers:
-        target, attributes = _handler(kernel, assemblers), {"blocks": blocks, "threads": threads}
-    else:
-        target = PTX
-        attributes = {
-            "grid_x": blocks,
-            "block_x": threads,
-            "name": ENTRY,
-            "kernel_type": "ptx",  # XLA takes nothing else here
-            "kernel_data": kernel.text,
-            "shared_mem_bytes": np.int32(0),
-            **{f"{part}_{axis}": one for part in ("grid", "block") for axis in "yz"},
-        }
+    target = _handler(kernel, assemblers)
     call = jax.ffi.ffi_call(target, [*results, *scratch], input_output_aliases=aliases)
-    return call(*given, *written, **attributes)
+    return call(*given, *written, blocks=blocks, threads=threads)
 
 
 def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:

@@ -1,1 +1,0 @@
-"""The gradient of a small policy on an NVIDIA GPU: one kernel."""
