@@ -100,8 +100,7 @@ class Noise(NamedTuple):
     noise: jax.Array
 
 
-@struct.dataclass(kw_only=True)
-class Pace:
+class Pace(struct.PyTreeNode, kw_only=True):
     """How many episodes the next update plays, and what that follows from.
 
     num_episodes: [] int32

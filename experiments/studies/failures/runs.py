@@ -111,7 +111,7 @@ def _train(setting: Setting, seeds: range) -> Measured:
     def step(state: TrainState, going: jax.Array, values: Any, key: jax.Array) -> Any:
         learner = learner_of(values)
         state, metrics = learner.step(state, going)
-        size = {"num_episodes": _EPISODES, "horizon": env.max_episode_steps}
+        size: Any = {"num_episodes": _EPISODES, "horizon": env.max_episode_steps}
         played = evaluate(env, learner, state.actor, key, **size, active=going, sampled=False)
         return state, metrics | {"eval_return": played["eval_return"]}
 
