@@ -128,7 +128,7 @@ def numpy_source(plain: Arithmetic, name: str, env: str, seed: int) -> str:
     if plain.head == "argmax":
         shapes = f"[{size}] -> an integer, or [N, {size}] -> [N]"
     if plain.head == "mean":
-        shapes += "\n\nActions are not clipped: clip them to the actuators' range before you send them."
+        shapes += "\n\nActions are not clipped: clip to the actuators' range before you send it."
     body = "\n    ".join(_statements(plain))
     template = Path(__file__).with_name("numpy_policy.txt").read_text("utf-8")
     return template.format(name=name, shapes=shapes, env=ascii(env), seed=seed, body=body)

@@ -117,7 +117,7 @@ def test_the_numpy_file_is_short_and_needs_nothing_else(tmp_path, monkeypatch):
 def test_the_numpy_file_says_that_actions_may_leave_their_range(policy):
     plain = Arithmetic({"weight_0": np.ones((2, 1)), "bias_0": np.ones(1)}, 1, HEADS[policy])
     said = numpy_source(plain, "seed_0", "Task-v0", 0).split('"""')[1]
-    assert ("not clipped: clip them to the actuators' range" in said) == (policy == "normal")
+    assert ("not clipped: clip to the actuators' range" in said) == (policy == "normal")
 
 
 def test_names_in_files_stay_text(tmp_path, monkeypatch):
