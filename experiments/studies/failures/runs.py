@@ -111,13 +111,13 @@ def _train(setting: Setting, seeds: range) -> Measured:
     def step(state: TrainState, going: jax.Array, values: Any, key: jax.Array) -> Any:
         learner = learner_of(values)
         state, metrics = learner.step(state, going)
-        size: Any = {"num_episodes": _EPISODES, "horizon": env.max_episode_steps}
+        size = {"num_episodes": _EPISODES, "horizon": env.max_episode_steps}
         played = evaluate(env, learner, state.actor, key, **size, active=going, sampled=False)
         return state, metrics | {"eval_return": played["eval_return"]}
 
     def last(actor: Any, key: jax.Array) -> Any:
-        size = {"num_episodes": _LAST_EPISODES, "horizon": env.max_episode_steps}
-        return evaluate(env, plain, actor, key, **size)
+        horizon = env.max_episode_steps
+        return evaluate(env, plain, actor, key, num_episodes=_LAST_EPISODES, horizon=horizon)
 
     root = jax.random.key(SEED)
     keys = jax.random.split(jax.random.fold_in(root, 0), seeds.stop)[seeds.start :]
