@@ -7,11 +7,14 @@ directly. Nothing heavy is imported before ``make``.
 
 import re
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.checks import BadEnvironmentError, check_parts, explain
 from mjx_reinforce.physics.quiet import silence_mjx
 from mjx_reinforce.registry import check_name, load_definition, load_ours, load_own
+
+if TYPE_CHECKING:
+    from mjx_reinforce.envs.base import MujocoEnv
 
 silence_mjx()  # before any environment imports it
 
@@ -52,8 +55,8 @@ def names() -> list[str]:
     return sorted(_TABLE)
 
 
-def make(id: str, /, **kwargs: object) -> Any:
-    """Builds an environment.
+def make(id: str, /, **kwargs: object) -> "MujocoEnv":
+    """Builds an environment: a ``MujocoEnv``, except of the cart-poles and of classes of your own.
 
     Args:
       id: one of ``names()``, or "module:Class" for one of your own, importable from here.

@@ -18,8 +18,11 @@ from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 if TYPE_CHECKING:
     from mjx_reinforce.types import MjModel
 
-#: What is named in the class, by mjData's arrays whose rows it numbers.
-_POSITION_OF = {"site": "site_xpos", "body": "xpos"}
+#: Of a robot that stands on its own.
+_WALKING = """\
+        # To walk: forward = (data.qpos[0] - before.qpos[0]) / self.dt is its speed along x (m/s).
+        # To end where it falls: data.qpos[2] < {low:.2g} (m) in place of False.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,11 +98,15 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
     """
     timestep = float(model.opt.timestep)
     frame_skip = max(1, round(0.04 / timestep))
+    walks = model.njnt > 0 and _kind(model, 0) == "free"
     seen, observed = ["positions (m, rad)", "speeds (m/s, rad/s)"], ["data.qpos", "data.qvel"]
+    if walks:
+        observed[0] = "data.qpos[2:]"
     if model.nsensordata:
         seen.append("sensors")
         observed.append("data.sensordata")
-    constants = "".join(_constants(model))
+    pose = "self.mj_model.key_qpos[0]" if model.nkey else "self.mj_model.qpos0"
+    height = float((model.key_qpos[0] if model.nkey else model.qpos0)[2]) if walks else 0.0
     template = Path(__file__).with_name("new_task.txt").read_text("utf-8")
     return template.format(
         title=_title(module),
@@ -110,9 +117,13 @@ def class_source(model: "MjModel", xml: str, module: str) -> str:
         steps=round(5 / (frame_skip * timestep)) or 1,
         nq=model.nq,
         nv=model.nv,
-        constants=f"{constants}\n\n" if constants else "\n",
+        pose=pose,
+        pose_name="key frame 0" if model.nkey else "the model's pose",
+        unit="".join(_unit_quaternions(model)),
+        walking=_WALKING.format(low=height / 2) if walks else "",
         seen=", ".join(seen),
         observed=", ".join(observed),
+        without="  # without x and y" if walks else "",
         about=_about(model),
     )
 
@@ -124,30 +135,44 @@ def _title(module: str) -> str:
     return title if title.isidentifier() else f"Robot{title}"
 
 
-def _constants(model: "MjModel") -> Iterable[str]:
-    """Yields a line for each named site and body: its number, by which outcome finds it."""
-    taken = set()
-    for kind, array in _POSITION_OF.items():
-        count = {"site": model.nsite, "body": model.nbody}[kind]
-        for number in range(count):
-            name = getattr(model, kind)(number).name
-            constant = re.sub(r"\W+", "_", f"{kind}_{name}").upper()
-            if name and name != "world" and constant not in taken:
-                taken.add(constant)
-                yield f"{constant} = {number}  # data.{array}[{constant}] is where it is (m)\n"
+def _kind(model: "MjModel", joint: int) -> str:
+    return ("free", "ball", "slide", "hinge")[int(model.jnt_type[joint])]
+
+
+def _unit_quaternions(model: "MjModel") -> Iterable[str]:
+    """Yields a line for each quaternion of qpos, which noise makes longer or shorter."""
+    for joint in range(model.njnt):
+        if (kind := _kind(model, joint)) in ("free", "ball"):
+            first = int(model.jnt_qposadr[joint]) + 3 * (kind == "free")
+            part = f"{first}:{first + 4}"
+            yield f"        qpos = qpos.at[{part}].divide(jnp.linalg.norm(qpos[{part}]))\n"
 
 
 def _about(model: "MjModel") -> str:
-    """Returns the docstring of the class: what its positions and actions are."""
+    """Returns the docstring of the class: its positions, its actions, and what has a name."""
     joints = _listed(
-        f"{_safe_name(model.joint(i).name, 'joint', i)} at qpos[{int(model.jnt_qposadr[i])}]"
+        f"{_safe_name(model.joint(i).name, 'joint', i)} at {_place(model, i)}"
         for i in range(model.njnt)
     )
     actions = _listed(
         f"{_safe_name(_moved(model, i), 'actuator', i)}{_control_range(model, i)}"
         for i in range(model.nu)
     )
-    return f"What it should do.\n\n    Joints:\n{joints}\n    Actions:\n{actions}    "
+    counts = {"site": model.nsite, "body": model.nbody}
+    named = ((kind, getattr(model, kind)(i).name) for kind in counts for i in range(counts[kind]))
+    places = _listed(
+        f"data.{kind}({json.dumps(name)}).xpos" for kind, name in named if name not in ("", "world")
+    )
+    said = f"What it should do.\n\n    Joints:\n{joints}\n    Actions:\n{actions}"
+    return f"{said}\n    Places (m):\n{places}    " if places else f"{said}    "
+
+
+def _place(model: "MjModel", joint: int) -> str:
+    """Returns where the position of a joint is."""
+    first, kind = int(model.jnt_qposadr[joint]), _kind(model, joint)
+    if size := {"free": 7, "ball": 4}.get(kind):
+        return f"qpos[{first}:{first + size}], {kind}"
+    return f"qpos[{first}]"
 
 
 def _listed(lines: Iterable[str]) -> str:
@@ -173,7 +198,8 @@ def _moved(model: "MjModel", number: int) -> str:
 
 def _control_range(model: "MjModel", number: int) -> str:
     low, high = model.actuator_ctrlrange[number]
-    return f" in [{low:g}, {high:g}]" if model.actuator_ctrllimited[number] else ", unlimited"
+    limits = f" in [{low:g}, {high:g}]" if model.actuator_ctrllimited[number] else ", unlimited"
+    return f"{limits}, {model.key_ctrl[0, number]:g} in key frame 0" if model.nkey else limits
 
 
 if __name__ == "__main__":

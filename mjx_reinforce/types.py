@@ -78,8 +78,7 @@ class Environment(Protocol):
         ...
 
 
-@struct.dataclass(kw_only=True)
-class Trajectory:
+class Trajectory(struct.PyTreeNode, kw_only=True):
     """N complete episodes, time first.
 
     Attributes:
@@ -117,7 +116,7 @@ class Trajectory:
 
     def first(self, steps: int) -> "Trajectory":
         """Returns the first so many steps of every episode."""
-        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        return self.replace(
             observation=self.observation[:steps],
             action=self.action[:steps],
             reward=self.reward[:steps],
@@ -126,7 +125,7 @@ class Trajectory:
 
     def episodes(self, part: slice) -> "Trajectory":
         """Returns a part of the episodes; ``simulated`` remains that of all."""
-        return self.replace(  # pyright: ignore[reportAttributeAccessIssue]
+        return self.replace(
             observation=self.observation[:, part],
             action=self.action[:, part],
             reward=self.reward[:, part],

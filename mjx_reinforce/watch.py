@@ -92,7 +92,7 @@ class WatchSettings:
     width: int = 480
     """Pixels of each policy's picture."""
     height: int = 360
-    """Pixels."""
+    """Pixels, without the words below."""
     overwrite: bool = False
     """Replace a film that exists."""
 
@@ -147,7 +147,9 @@ def film(settings: WatchSettings) -> None:
     samples = [*map(shown.draw, shown.samples)]
     frames = map(shown.draw, track(range(shown.length), "drawing", transient=True))
     write_film(output, frames, shown.rate, samples)
-    print(f"{shown.length} frames in {output}")
+    lasting = max((len(take.qpos) - 1) * take.dt for take in takes)
+    cut = f": {settings.seconds:g} of {lasting:g} s; --seconds {lasting:g} shows all"
+    print(f"{shown.length} frames in {output}{cut * (settings.seconds < lasting)}")
 
 
 def _take(

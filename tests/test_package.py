@@ -3,12 +3,14 @@
 import ast
 import collections
 import graphlib
+import json
 import re
 import subprocess
 import sys
 import tomllib
 
 import pytest
+import setuptools
 from places import ROOT
 from saved_runs import make_run
 from sizes import sizes as measured_sizes
@@ -42,6 +44,18 @@ MAY_IMPORT_ENVS = {
     *("envs", "settings", "training", "store", "runs", "playing", "sweeps"),
     *("gym", "train", "vector", "watch", "new", "__main__"),
 }
+
+#: What a user writes, and what the checker is asked; its last line is wrong.
+TYPED = """import jax
+import mjx_reinforce as mr
+env = mr.envs.make("CartPole-v1")
+reveal_type(env)
+learner = mr.reinforce(env)
+state, metrics = mr.train_step(learner, learner.init(jax.random.key(0)))
+reveal_type(metrics)
+reveal_type(state.replace(progress=state.progress))
+mr.reinforce(env, num_episodez=3)
+"""
 
 
 def modules(root, parent):
@@ -104,9 +118,14 @@ def test_nothing_grows():
 
 
 def test_the_wheel_has_every_package():
+    """Found as setuptools finds them; nothing beside ours, such as the ``envs`` at the top."""
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]
-    packages = (name for name, path in FILES.items() if path.name == "__init__.py")
-    assert set(listed["packages"]) == {f"mjx_reinforce.{name}".strip(".") for name in packages}
+    found = setuptools.find_packages(str(ROOT), include=listed["packages"]["find"]["include"])
+    packages = {
+        name if path.name == "__init__.py" else name.rpartition(".")[0]
+        for name, path in FILES.items()
+    }
+    assert set(found) == {f"mjx_reinforce.{name}".strip(".") for name in packages}
 
 
 def test_the_wheel_has_every_file_that_is_no_module():
@@ -180,6 +199,22 @@ def test_type_checkers_see_the_public_names():
     imports = [node for node in nodes if node.module]
     assert {node.module.removeprefix("mjx_reinforce.") for node in imports} <= set(FILES)
     assert mjx_reinforce._HOME.keys() == {alias.name for node in imports for alias in node.names}
+
+
+def test_type_checkers_know_the_types(tmp_path):
+    """From another folder, as they see what is installed: ``pip install -e .`` too."""
+    (tmp_path / "own.py").write_text(TYPED)
+    command = ["-m", "pyright", "--outputjson", "--pythonpath", sys.executable, "own.py"]
+    done = subprocess.run([sys.executable, *command], capture_output=True, cwd=tmp_path)
+    said = json.loads(done.stdout)["generalDiagnostics"]
+    known = [re.findall('type of "(.*)" is "(.*)"', one["message"], re.I) for one in said]
+    assert [types[0] for types in known if types] == [
+        ("env", "MujocoEnv"),
+        ("metrics", "dict[str, Array]"),
+        ("state.replace(progress=state.progress)", "TrainState"),
+    ]
+    errors = [one["message"] for one in said if one["severity"] == "error"]
+    assert errors == ['No parameter named "num_episodez"']
 
 
 def test_slow_tests_are_tests(stale_lines):

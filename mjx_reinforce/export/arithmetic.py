@@ -127,6 +127,8 @@ def numpy_source(plain: Arithmetic, name: str, env: str, seed: int) -> str:
     shapes = f"[{size}] -> [{out}], or [N, {size}] -> [N, {out}]"
     if plain.head == "argmax":
         shapes = f"[{size}] -> an integer, or [N, {size}] -> [N]"
+    if plain.head == "mean":
+        shapes += "\n\nActions are not clipped: clip to the actuators' range before you send it."
     body = "\n    ".join(_statements(plain))
     template = Path(__file__).with_name("numpy_policy.txt").read_text("utf-8")
     return template.format(name=name, shapes=shapes, env=ascii(env), seed=seed, body=body)

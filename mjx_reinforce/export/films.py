@@ -26,7 +26,10 @@ SAMPLES = 4
 
 
 class Renderer:
-    """Draws a model at given positions, through its camera "track" if it has one."""
+    """Draws a model at given positions, through its camera "track" if it has one.
+
+    Otherwise the picture goes with the body of the first joint, if nothing ties it to its place.
+    """
 
     def __init__(self, model: "MjModel", width: int, height: int):
         """Opens MuJoCo's renderer for pictures of so many pixels.
@@ -42,10 +45,8 @@ class Renderer:
         model.vis.quality.offsamples = 0
         # Without a GPU a fine shadow takes half the time of a picture, and shows no better in it.
         model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, max(width, height))
-        cameras = [model.camera(i).name for i in range(model.ncam)]
-        self._camera = "track" if "track" in cameras else -1
+        self._camera, self._followed = _camera(model)
         self._model, self._data = model, mujoco.MjData(model)
-        self._forward = mujoco.mj_forward
         try:
             with warnings.catch_warnings(action="ignore"):  # GLFW's, before it fails
                 self._renderer = mujoco.Renderer(model, height, width)
@@ -60,10 +61,31 @@ class Renderer:
         Args:
           qpos: [nq] generalised positions.
         """
-        self._data.qpos[:] = qpos
-        self._forward(self._model, self._data)
-        self._renderer.update_scene(self._data, self._camera)
+        mujoco, data = import_mujoco(), self._data
+        data.qpos[:] = qpos
+        mujoco.mj_forward(self._model, data)
+        if self._followed is not None:
+            self._camera.lookat[:] = data.subtree_com[self._followed]
+        # MuJoCo lays an endless floor around the camera of the scene before, which may be far away.
+        mujoco.mjv_updateCamera(self._model, data, self._camera, self._renderer.scene)
+        self._renderer.update_scene(data, self._camera)
         return self._renderer.render()
+
+
+def _camera(model: "MjModel") -> tuple[Any, int | None]:
+    """Returns an ``MjvCamera``, and the number of the body that it looks at wherever that is."""
+    mujoco = import_mujoco()
+    camera = mujoco.MjvCamera()
+    mujoco.mjv_defaultFreeCamera(model, camera)
+    for number in range(model.ncam):
+        if model.camera(number).name == "track":
+            camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, number
+            return camera, None
+    first = model.jnt_bodyid[0] if model.njnt else -1  # the robot; what lies about comes later
+    ways = (model.jnt_type == mujoco.mjtJoint.mjJNT_FREE) | (
+        (model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (model.jnt_limited == 0)
+    )
+    return camera, int(first) if ways[model.jnt_bodyid == first].any() else None
 
 
 def import_gymnasium() -> Any:

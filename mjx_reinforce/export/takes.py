@@ -80,13 +80,13 @@ def side_by_side(
     lasting = max(min(len(take.qpos) * take.dt, seconds) for take in takes)
     renderers = [Renderer(take.model, width, height) for take in takes[:-1]]
     renderers.append(renderer or Renderer(takes[-1].model, width, height))
-    blank = np.full((height, width, 3), _PAPER, np.uint8)
 
     def draw(frame: int) -> np.ndarray:
         pictures = [
             _picture(take, renderer, frame * interval)
             for take, renderer in zip(takes, renderers, strict=True)
         ]
+        blank = np.full_like(pictures[0], _PAPER)
         pictures += [blank] * (-len(pictures) % columns)
         rows = [pictures[i : i + columns] for i in range(0, len(pictures), columns)]
         return np.concatenate([np.concatenate(row, axis=1) for row in rows])
@@ -106,18 +106,18 @@ def _picture(take: Take, renderer: Renderer, seconds: float) -> np.ndarray:
 
 
 def caption(picture: np.ndarray, left: str, right: str) -> np.ndarray:
-    """Returns a picture [H, W, 3] uint8 with a strip at its foot that says two things."""
+    """Returns a picture [H, W, 3] uint8 with a strip below it that says two things."""
     from PIL import Image, ImageDraw
 
     height, width = picture.shape[:2]
-    strip = max(_LEAST + 2, round(height * _STRIP))
+    strip = max(_LEAST + 2, 2 * round(height * _STRIP / 2))  # an .mp4 has an even height
     font, small = (_font(max(_LEAST, round(height * x))) for x in (_WORDS, _WORDS * 0.8))
-    image = Image.fromarray(picture)
+    image = Image.new("RGB", (width, height + strip), _PAPER)
+    image.paste(Image.fromarray(picture))
     draw = ImageDraw.Draw(image)
     if draw.textlength(left + right, font) > width - 3 * strip // 2:
         font = small
-    middle = height - strip // 2
-    draw.rectangle((0, height - strip, width, height), fill=_PAPER)
+    middle = height + strip // 2
     draw.text((strip // 3, middle), left, fill=_INK, font=font, anchor="lm")
     draw.text((width - strip // 3, middle), right, fill=_INK, font=font, anchor="rm")
     return np.asarray(image)

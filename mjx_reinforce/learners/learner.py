@@ -1,7 +1,6 @@
 """What a learner is: ``init``, then ``play`` and ``learn`` in turn, over one state pytree."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -20,8 +19,7 @@ from mjx_reinforce.policies.policy import Policy
 from mjx_reinforce.types import Environment, PyTree, Trajectory
 
 
-@struct.dataclass(kw_only=True)
-class TrainState:
+class TrainState(struct.PyTreeNode, kw_only=True):
     """All that the next update needs; it holds no environment state.
 
     Attributes:
@@ -164,7 +162,9 @@ class Learner(NamedTuple):
         return act(self.policy, actor, observation)
 
 
-@functools.partial(jax.jit, static_argnums=0)
+_step = jax.jit(Learner.step, static_argnums=0)
+
+
 def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics]:
     """Plays N episodes and makes one update, compiled.
 
@@ -200,7 +200,7 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
       (4, ())
     """
     check_kind("state", state, TrainState, "learner.init(jax.random.key(0))")
-    return learner.step(state)
+    return _step(learner, state)
 
 
 def check_horizon(env: Environment, horizon: int | None) -> int:

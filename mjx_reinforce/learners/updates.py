@@ -275,7 +275,7 @@ def make_optimizer(
       momentum: b1 of Adam; sgd has none.
 
     Raises:
-      ValueError: the name is unknown.
+      ValueError: the name is unknown, or a number in its place.
 
     Examples:
       >>> import jax.numpy as jnp
@@ -285,6 +285,8 @@ def make_optimizer(
       >>> step.tolist()
       [-0.5, -0.5]
     """
+    if not isinstance(name, str):
+        raise ValueError(f"the optimizer's name comes first, got {name!r}: write learning_rate=...")
     check_name("optimizer", name, dict.fromkeys(OPTIMIZERS))
     rate: Any = learning_rate
     if not callable(rate):

@@ -10,8 +10,7 @@ from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.policy import Policy
 
 
-@struct.dataclass(kw_only=True)
-class Actor:
+class Actor(struct.PyTreeNode, kw_only=True):
     """All that playing needs.
 
     Attributes:

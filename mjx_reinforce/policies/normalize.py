@@ -9,8 +9,7 @@ CLIP = 10.0
 _LEAST_STD = 1e-4
 
 
-@struct.dataclass(kw_only=True)
-class Normalizer:
+class Normalizer(struct.PyTreeNode, kw_only=True):
     """The mean and variance of the observations counted so far, in a form that can be merged.
 
     count: [] number of observations

@@ -11,6 +11,7 @@ import numpy as np
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.hosts.processes import Processes
 from mjx_reinforce.learners import counts
+from mjx_reinforce.reports.experiment import counted, say, setting_in_words
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.plan import duration, is_wrong
 from mjx_reinforce.settings.config import MAX_COUNT
@@ -30,6 +31,8 @@ from mjx_reinforce.training.progress import Progress
 
 #: More than this share of a sweep is all of it, up to rounding.
 _ALL = 1 - 1e-6
+#: So many values of a setting are named in a line.
+_NAMED = 6
 
 
 class Stage(NamedTuple):
@@ -216,6 +219,7 @@ class Conductor:
         states = saver.find(layout.shapes(len(runs.seed)), history)
         if states is None:
             states = self._begin(rung, stage, programs, runs, history)
+        self._display.say(self._heading(runs))
 
         def show() -> None:
             self._display.show_progress(self._progress(history, each))
@@ -234,6 +238,19 @@ class Conductor:
         if not keep:
             saver.remove()
         return True
+
+    def _heading(self, runs: Runs) -> str:
+        """Returns which configurations the lines that follow are of."""
+        every = self._prepared.configurations
+        here = [every[number] for number in np.unique(runs.configuration)]
+        said = []
+        for name in here[0]:
+            values = [*dict.fromkeys(say(values[name]) for values in here)]
+            if len(values) > _NAMED:
+                values[_NAMED - 1 : -1] = ["..."]
+            said.append(f"{setting_in_words(name)} {', '.join(values)}")
+        count = f"{counted(len(here), 'configuration')} of {len(every):,}"
+        return f"{'; '.join(said)} ({count}, {counted(len(runs.seed), 'run')})"
 
     def _interrupted(self) -> bool:
         return self._interrupt is not None and self._interrupt.number is not None

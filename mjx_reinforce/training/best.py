@@ -12,8 +12,7 @@ from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.training.programs import Looked
 
 
-@struct.dataclass(kw_only=True)
-class Best:
+class Best(struct.PyTreeNode, kw_only=True):
     """The best policies so far.
 
     actor: [S, ...] each seed's

@@ -20,8 +20,7 @@ from mjx_reinforce.types import PyTree, with_keys
 Seed = int | np.uint32 | jax.Array
 
 
-@struct.dataclass(kw_only=True)
-class RunState:
+class RunState(struct.PyTreeNode, kw_only=True):
     """All that R runs need to go on, such as the seeds of one configuration.
 
     train_states: [R, ...] the ``TrainState`` of every run

@@ -4,6 +4,7 @@ import csv
 import shutil
 import subprocess
 import sys
+import types
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +44,12 @@ def test_the_arm_is_paid_for_the_distance_of_the_ball(monkeypatch):
     assert np.all(np.linalg.norm(starts[:, 3:], axis=1) < 0.75)  # within reach
 
 
+def lint(file):
+    for check in (["check", "--select", "E,F,W"], ["format", "--check"]):
+        options = ["--isolated", "--line-length", "100", file]
+        subprocess.run([sys.executable, "-m", "ruff", *check, *options], check=True)
+
+
 def test_a_model_becomes_a_class_that_plays(tmp_path, monkeypatch, capsys):
     shutil.copy(EXAMPLES / "my_arm.xml", tmp_path / "my_robot-2.xml")
     monkeypatch.chdir(tmp_path)
@@ -56,11 +63,9 @@ def test_a_model_becomes_a_class_that_plays(tmp_path, monkeypatch, capsys):
     assert after.obs.shape == (12,)
     assert set(after.metrics) == {"reward_pose", "reward_control"}
     text = (tmp_path / "my_robot_2.py").read_text()
-    assert "SITE_TIP = 0" in text
+    assert 'data.site("tip").xpos' in text
     assert "shoulder in [-0.523599, 1.74533]" in text
-    for check in (["check", "--select", "E,F,W"], ["format", "--check"]):
-        options = ["--isolated", "--line-length", "100", "my_robot_2.py"]
-        subprocess.run([sys.executable, "-m", "ruff", *check, *options], check=True)
+    lint("my_robot_2.py")
 
 
 def test_names_of_a_model_cannot_break_the_class(tmp_path, monkeypatch):
@@ -70,8 +75,34 @@ def test_names_of_a_model_cannot_break_the_class(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     env = envs.make("sensed:Sensed")
     assert env.dt == pytest.approx(0.04)
-    assert env.observation_size == 8 + 7 + 3
-    assert (env.max_episode_steps, sys.modules["sensed"].SITE_END_EFFECTOR) == (125, 0)
+    assert env.observation_size == 8 - 2 + 7 + 3
+    assert env.max_episode_steps == 125
+    assert r'data.body("say \"it\"").xpos' in (tmp_path / "sensed.py").read_text()
+
+
+def test_a_walker_starts_in_its_key_frame(tmp_path, monkeypatch):
+    """It sees no place on the floor, its quaternion is one, and the reward asks for that pose."""
+    key = '<keyframe><key qpos="0 0 .2 .6 0 .8 0 -1" ctrl="-.5"/></keyframe></mujoco>'
+    text = SENSED.replace("<joint axis", '<joint name="j" range="-120 -30" axis')
+    (tmp_path / "kept.xml").write_text(text.replace("</mujoco>", key))
+    monkeypatch.chdir(tmp_path)
+    new.main(["kept.xml"])
+    monkeypatch.syspath_prepend(tmp_path)
+    env, home = envs.make("kept:Kept"), np.array([0, 0, 0.2, 0.6, 0, 0.8, 0, -1])
+    qpos, qvel = env.initial(jax.random.key(0))
+    np.testing.assert_allclose(qpos, home, atol=0.02)
+    assert np.linalg.norm(qpos[3:7]) == pytest.approx(1, abs=1e-6)
+    state = env.set_state(jnp.asarray(home), qvel)
+    np.testing.assert_allclose(state.obs[:6], home[2:], atol=1e-6)
+    assert env.outcome(None, types.SimpleNamespace(qpos=home), jnp.zeros(1))[0] == 0
+    text = (tmp_path / "kept.py").read_text()
+    lint("kept.py")
+    for said in (
+        "at qpos[0:7], free",
+        "j, unlimited, -0.5 in key frame 0",
+        "data.qpos[2] < 0.1 (m)",
+    ):
+        assert said in text
 
 
 @pytest.mark.parametrize(

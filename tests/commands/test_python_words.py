@@ -135,6 +135,8 @@ def test_a_search_is_refused(settings, message):
         (lambda: m.mlp_policy(1, NORMAL, 32), "hidden_sizes must be a tuple.* got 32"),
         (lambda: m.minibatches(2.5, 3), "num_updates must be a whole number, got 2.5"),
         (lambda: m.make_optimizer("adam", "0.1"), "learning_rate must be 0 or more .* got '0.1'"),
+        (lambda: m.make_optimizer(1e-2), r"name comes first, got 0.01: write learning_rate="),
+        (lambda: jax.vmap(m.make_optimizer)(jnp.ones(2)), "write learning_rate="),
         (lambda: m.load(3), "run must be text or Path, got 3"),
     ],
 )

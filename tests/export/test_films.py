@@ -135,6 +135,48 @@ def test_a_renderer_that_is_not_here_is_answered_with_egl(monkeypatch, name, nee
         films.Renderer(envs.make("Hopper-v5").mj_model, 8, 8)
 
 
+class Undrawn:
+    """MuJoCo's renderer up to where it needs OpenGL."""
+
+    def __init__(self, model, height, width):
+        self.model, self.scene = model, mujoco.MjvScene(model, 1000)
+
+    def update_scene(self, data, camera):
+        options, every = mujoco.MjvOption(), mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(self.model, data, options, None, camera, every, self.scene)
+
+    def render(self):
+        floor = next(x for x in self.scene.geoms if x.type == mujoco.mjtGeom.mjGEOM_PLANE)
+        return self.scene.camera[0].pos.copy(), floor.pos.copy()
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("joint", "rest", "goes"),
+    [
+        ("<freejoint/>", "", True),
+        ('<joint type="slide" axis="1 0 0"/><joint/>', "", True),
+        ('<joint type="slide" axis="1 0 0" limited="true" range="-1 1"/>', "", False),
+        ("<joint/>", '<body><freejoint/><geom size="1"/></body>', False),  # an arm and its ball
+        ("<freejoint/>", '<camera name="track" pos="0 0 9"/>', False),
+    ],
+)
+def test_pictures_go_with_the_robot_and_have_their_floor(monkeypatch, joint, rest, goes):
+    monkeypatch.setattr(mujoco, "Renderer", Undrawn)
+    xml = f"""<mujoco><worldbody><geom type="plane" size="0 0 .1"/>
+      <body>{joint}<geom size=".1"/></body>{rest}</worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    renderer = films.Renderer(model, 8, 8)
+    for x in (0.0, 500.0, -500.0):
+        qpos = model.qpos0.copy()
+        qpos[0] = x
+        camera, floor = renderer.draw(qpos)
+        assert abs(camera[0] - x * goes) < 10
+        assert abs(floor[0] - camera[0]) < 10
+
+
 @pytest.mark.parametrize("replace", [False, True])
 @pytest.mark.parametrize("name", ASSETS)
 def test_scenery_moves_nothing(name, replace):
@@ -171,7 +213,7 @@ def test_takes_stand_side_by_side(monkeypatch):
     assert [int(left[0]) for left, _ in shades] == [*range(11)]
     # It ends after 0.4 s, and then stands still.
     assert [int(right[0]) for _, right in shades] == [50, 52, 54, 56, *[58] * 7]
-    assert film.draw(0).shape == (60, 80, 3)
+    assert film.draw(0).shape == (2 * (30 + 12), 80, 3)  # each with its words below
     assert takes.side_by_side([slow], 40, 30, seconds=0.5).length == 5
     assert set(film.samples) >= {0, 3}
     with pytest.raises(ValueError, match="at least one take"):
@@ -215,9 +257,9 @@ def test_watch_plays_a_policy_of_the_package(tmp_path):
     assert after == (
         "InvertedPendulum-v5, the package's policy: return 1000.0 in 1000 steps in mujoco"
     )
-    assert frames == "75 frames in InvertedPendulum-v5.gif"
+    assert frames == "75 frames in InvertedPendulum-v5.gif: 3 of 40 s; --seconds 40 shows all"
     shown = [*pictures(tmp_path / "InvertedPendulum-v5.gif")]
-    assert shown[0].shape == (90, 240, 3)
+    assert shown[0].shape == (102, 240, 3)
     sky = shown[0][2]
     assert np.all(sky[:, 2] > sky[:, 0] + 10)
 

@@ -14,6 +14,7 @@ from toys import Drifting, Late, Signed, SignedTarget, Survive, Target, Toy
 from mjx_reinforce import Cut, mlp_policy, normal, reinforce, rollout, train_step
 from mjx_reinforce.engines.native import available
 from mjx_reinforce.learners import counts, estimators, gradients, updates
+from mjx_reinforce.learners import learner as learner_module
 from mjx_reinforce.learners.estimators import discounted_returns
 from mjx_reinforce.learners.value_baseline import value_baseline
 
@@ -135,12 +136,12 @@ def test_chunks_do_not_change_the_gradient(samples, monkeypatch):
 
 def test_one_trace_and_nothing_donated():
     learner = reinforce(Survive(), num_episodes=4)
-    before = train_step._cache_size()
+    before = learner_module._step._cache_size()
     state = jax.jit(learner.init)(jax.random.key(0))
     first = train_step(learner, state)
     again = train_step(learner, state)
     train_step(learner, first[0])
-    assert train_step._cache_size() == before + 1
+    assert learner_module._step._cache_size() == before + 1
     jax.tree.map(
         lambda x, y: np.testing.assert_array_equal(x, y),
         (first[0].actor, first[1]),

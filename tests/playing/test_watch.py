@@ -52,7 +52,7 @@ def test_the_film_is_the_episode(tmp_path, env_id):
     assert f"return {float(played.reward.sum()):.1f} in {length} steps" in said
     skip = {"InvertedPendulum-v5": 1, "CartPole-v1": 2}[env_id]
     with Image.open(tmp_path / "seed-1.gif") as film:
-        assert film.size == (96, 64)
+        assert film.size == (96, 64 + 12)
         pictures = []
         for i in range(film.n_frames):
             film.seek(i)

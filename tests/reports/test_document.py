@@ -39,7 +39,7 @@ def test_provenance_is_in_words():
         ("read from", "b, a"),
         ("compile time", "1,234.6 s"),
         ("run time", "2.0 s"),
-        ("git commit", "abc"),
+        ("last commit of the package's files", "abc"),
         ("packages", "jax 0.10.2; my own 1"),
         ("devices", "cpu, gpu"),
         ("x64", "off"),

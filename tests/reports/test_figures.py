@@ -6,7 +6,7 @@ import pytest
 from fake_sweeps import make_sweep
 
 from mjx_reinforce.reports import findings, sources
-from mjx_reinforce.reports.page import figures
+from mjx_reinforce.reports.page import figures, words
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +49,23 @@ def test_without_a_threshold_nothing_is_solved(found):
     numbers = {each.name: each.number for each in figures.figures(without_threshold(found))}
     assert "solved" not in numbers
     assert (numbers["curves"], numbers["distribution"]) == (2, 3)
+
+
+def test_a_threshold_far_above_all_returns_squeezes_no_figure(found, drawn):
+    far = findings.compute_findings(found.experiment._replace(threshold=123_456.0))
+    made = figures.figures(far)
+    assert "solved" not in [each.name for each in made]
+    assert "123456" not in json.dumps([each.spec for each in made])
+    assert "123,456.0, lies above the figure" in of(made, "curves").caption
+    assert "lies above" not in of(drawn, "curves").caption
+
+
+def test_defaults_are_named_where_settings_are_compared(found):
+    """What a reviewer asks first; of a task without settings of its own there is nothing to say."""
+    said = "chosen with one value of learning rate and discount"
+    assert any(said in one for one in words.caveats(found))
+    own = found._replace(experiment=found.experiment._replace(env="own:Task"))
+    assert not any(said in one for one in words.caveats(own))
 
 
 def test_one_configuration_has_no_ranks_and_no_settings(found):

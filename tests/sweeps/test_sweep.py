@@ -107,9 +107,16 @@ def test_a_seed_has_the_same_starts_in_every_configuration_and_as_in_train(run):
     assert np.allclose([float(row["eval_return"]) for row in rows[:2]], first[0][:2])
 
 
-def test_the_files_say_what_was_measured(run):
+def test_the_files_say_what_was_measured(run, capsys):
     command = f"{SMALL} --num-seeds 2 --max-updates 7 --over hidden-sizes none 3,3 {RATES}"
     assert run(f"{command} --output swept") == 0
+    said = capsys.readouterr().out.splitlines()
+    headings = [i for i, line in enumerate(said) if line.endswith(" of 6, 6 runs)")]
+    assert [said[i] for i in headings] == [
+        f"hidden sizes {layers}; learning rate 0.01, 0.03, 0.1 (3 configurations of 6, 6 runs)"
+        for layers in ("none", "3-3")
+    ]
+    assert all(said[i + 1].startswith("update ") for i in headings)
     rows = list(csv.DictReader(Path("swept/results.csv").read_text().splitlines()))
     assert [(row["configuration"], row["seed"]) for row in rows] == [
         (str(c), str(s)) for c in range(6) for s in range(2)

@@ -218,10 +218,20 @@ def test_the_end_table_has_counts():
     history = {"eval_return": returns, "env_steps": counts, "episodes": counts}
     more = {"status": "finished", "env": "Task-v0", "num_seeds": 1000, "env_steps_per_second": 1e6}
     more |= {"useful_step_fraction": 0.9999, "compile_seconds": 1.0, "run_seconds": 2.0}
+    more |= {
+        "threshold": 950.0,
+        "final_test_returns": [584.4] * 4,
+        "best_test_returns": [572.0] * 4,
+    }
     console = screen(80)
     display.print_summary(console, summarize(history, 950.0) | more, Path("t/[bold]x"))
     written = " ".join(console.file.getvalue().split())
-    for text in ("solved at the end │ 997 of 1,000", "ever solved │ 997 of 1,000", "99.9 %"):
+    for text in (
+        "seeds at 950, the task's threshold │ 997 of 1,000 at the end, 997 ever",
+        "last policies on fresh starts │ 584.4",
+        "best policies on fresh starts │ 572.0 (their evaluation was luck)",
+        "99.9 %",
+    ):
         assert text in written
     assert "nan, 1000.0" in written
     assert "not finite │ 1 of 1,000" in written

@@ -116,8 +116,8 @@ def _train(setting: Setting, seeds: range) -> Measured:
         return state, metrics | {"eval_return": played["eval_return"]}
 
     def last(actor: Any, key: jax.Array) -> Any:
-        size = {"num_episodes": _LAST_EPISODES, "horizon": env.max_episode_steps}
-        return evaluate(env, plain, actor, key, **size)
+        horizon = env.max_episode_steps
+        return evaluate(env, plain, actor, key, num_episodes=_LAST_EPISODES, horizon=horizon)
 
     root = jax.random.key(SEED)
     keys = jax.random.split(jax.random.fold_in(root, 0), seeds.stop)[seeds.start :]

@@ -201,6 +201,10 @@ def _table_numbers(listed: Mapping[str, Listing]) -> dict[str, int]:
     return {name: place for place, name in enumerate(names, start=1)}
 
 
+#: What the name of an entry of the provenance would not tell.
+_NAMES = {"git_commit": "last commit of the package's files"}
+
+
 def provenance_rows(experiment: Experiment) -> dict[str, Any]:
     """Returns where the numbers come from, as pairs of names and values."""
     directories = list(dict.fromkeys(map(str, experiment.directories)))
@@ -210,7 +214,7 @@ def provenance_rows(experiment: Experiment) -> dict[str, Any]:
         for name, seconds in experiment.timings.items()
     ]
     facts += [
-        (setting_in_words(name), _in_words(value))
+        (_NAMES.get(name) or setting_in_words(name), _in_words(value))
         for name, value in experiment.provenance.items()
         if value not in (None, "", [])
     ]

@@ -3,6 +3,8 @@
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from mjx_reinforce.reports.experiment import counted, ordered, setting_in_words
 from mjx_reinforce.reports.findings import Findings, swept, values_of
 from mjx_reinforce.reports.page import charts, tables
@@ -73,13 +75,30 @@ def _figure(findings: Findings, chart: Chart, **fields: Any) -> Figure:
     return Figure(spec=spec, **fields)
 
 
+def _line(findings: Findings) -> float | None:
+    """Returns the return that counts as solved, None where it would squeeze all that is drawn."""
+    threshold = findings.experiment.threshold
+    returns = np.concatenate([each.configuration.eval_return.ravel() for each in findings.results])
+    known = returns[np.isfinite(returns)]
+    if threshold is None or not known.size or threshold - known.max() > 0.5 * np.ptp(known):
+        return None
+    return threshold
+
+
+def _beyond(findings: Findings) -> str:
+    threshold = findings.experiment.threshold
+    if threshold is None or _line(findings) is not None:
+        return ""
+    return f" The return that counts as solved, {number(threshold)}, lies above the figure."
+
+
 def _final_figure(findings: Findings, place: int) -> Iterator[Figure]:
     if len(findings.results) == 1:
         return
     best = findings.results[0]
     yield _figure(
         findings,
-        charts.final(findings.labels, findings.experiment.threshold),
+        charts.final(findings.labels, _line(findings)),
         name="final",
         number=place,
         title="The return at the end",
@@ -100,14 +119,14 @@ def _curves_figure(findings: Findings, place: int) -> Iterator[Figure]:
     drawn = "; with one configuration shown, thin lines are single seeds, from worst to best"
     yield _figure(
         findings,
-        charts.curves(findings.labels, findings.experiment.threshold, float(findings.grid[-1])),
+        charts.curves(findings.labels, _line(findings), float(findings.grid[-1])),
         name="curves",
         number=place,
         title="Learning curves",
         caption=(
             "The interquartile mean over seeds of the return without exploration, and its 95 % "
             f"bootstrap interval{drawn}.{_SLIDER} Point at "
-            "a curve to read it."
+            f"a curve to read it.{_beyond(findings)}"
         ),
         alt="Return over env steps, a line and a band for each configuration that is shown.",
         tables=["curves", "seeds"],
@@ -116,7 +135,8 @@ def _curves_figure(findings: Findings, place: int) -> Iterator[Figure]:
 
 
 def _solved_figure(findings: Findings, place: int) -> Iterator[Figure]:
-    if findings.experiment.threshold is None:
+    solved = any(each.solving and each.solving.ever for each in findings.results)
+    if findings.experiment.threshold is None or not solved:
         return
     yield _figure(
         findings,
@@ -158,7 +178,7 @@ def _distribution(findings: Findings, place: int) -> Iterator[Figure]:
 def _profile_figure(findings: Findings, place: int) -> Iterator[Figure]:
     yield _figure(
         findings,
-        charts.profile(findings.labels, findings.experiment.threshold),
+        charts.profile(findings.labels, _line(findings)),
         name="profile",
         number=place,
         title="Performance profiles",
@@ -197,7 +217,7 @@ def _worst_figure(findings: Findings, place: int) -> Iterator[Figure]:
     which = "worst seed" if shown == 1 else f"worst {shown} seeds"
     yield _figure(
         findings,
-        charts.worst(findings.experiment.threshold),
+        charts.worst(_line(findings)),
         name="worst",
         number=place,
         title=f"The {which} of {best.configuration.label}",

@@ -16,6 +16,7 @@ from mjx_reinforce.reports.experiment import (
 from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.statistics import Estimate
 from mjx_reinforce.reports.statistics.comparisons import Comparison
+from mjx_reinforce.settings.tuned import OF_TASKS
 
 #: What counts as a difference after Holm's correction.
 LEVEL = 0.05
@@ -237,7 +238,14 @@ def _of_choice(findings: Findings) -> Iterator[str]:
             f"seeds, names another: {typical.configuration.label} "
             f"({number(typical.iqm.value)}, against {number(results[0].iqm.value)})."
         )
-    for name in results[0].configuration.settings:
+    settings = results[0].configuration.settings
+    if settings and findings.experiment.env in OF_TASKS:
+        yield (
+            "The other settings, where you gave none, are defaults that were chosen with one value "
+            f"of {' and '.join(map(setting_in_words, settings))}: tune them for each "
+            "configuration before you say which is better."
+        )
+    for name in settings:
         yield from _at_the_edge(findings, name)
 
 
