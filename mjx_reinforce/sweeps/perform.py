@@ -152,7 +152,6 @@ def _finish(
     """Writes the last files of a sweep, or those of one that was interrupted."""
     from mjx_reinforce.store.build import policy_settings
     from mjx_reinforce.sweeps.designs.grid import configure
-    from mjx_reinforce.sweeps.designs.rungs import winner
 
     def settings(number: int) -> tuple[dict[str, Any], dict[str, Any]]:
         [config] = configure(design.base, [prepared.configurations[number]])
@@ -164,8 +163,6 @@ def _finish(
 
     files.finish()
     if contents["status"] == "finished":
-        if design.search != "grid":
-            contents["winner"] = winner(files.measured)
         files.gather_policies(settings)
         files.remove_states()
     files.write(contents)

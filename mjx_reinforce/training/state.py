@@ -39,20 +39,15 @@ class Budget(NamedTuple):
 
     env_steps: [2] a count, see ``counts``; a run stops after the update that reaches it
     updates: [2] a count, how many updates it makes at most
-    all_env_steps: [2] how long schedules last; more than ``env_steps`` where a run goes on later
-    all_updates: [2] the same in updates
     """
 
     env_steps: counts.Count
     updates: counts.Count
-    all_env_steps: counts.Count
-    all_updates: counts.Count
 
     @classmethod
     def of(cls, env_steps: int | None, updates: int | None) -> "Budget":
         """Returns a budget, of which what has no limit has the greatest count."""
-        limits = [counts.from_int(MAX_COUNT if x is None else x) for x in (env_steps, updates)]
-        return cls(*limits, *limits)
+        return cls(*(counts.from_int(MAX_COUNT if x is None else x) for x in (env_steps, updates)))
 
 
 def budget_of(config: Config) -> Budget:

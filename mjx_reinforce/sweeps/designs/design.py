@@ -28,14 +28,11 @@ class SweepSettings:
     over: tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]] = ()
     """A setting and its values, such as `learning-rate 1e-3 3e-3`; again for further settings: all
     combinations are trained. Layers are written 32,32 (none: no layer)."""
-    search: Literal["grid", "random", "halving"] = "grid"
+    search: Literal["grid", "random"] = "grid"
     """grid: all combinations of the values. random: --budget of them, drawn: two numbers are the
-    ends of a range; names, and three values or more, are choices. halving: so many, all trained for
-    a part of the budget; the better half (by the interquartile mean over seeds) goes on to twice
-    that, until one has all of it. The choice flatters the winner's figure, so random and halving
-    train it again on fresh seeds, those of the next --seed."""
+    ends of a range; names, and three values or more, are choices."""
     budget: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """How many configurations random and halving begin with."""
+    """How many configurations random draws."""
     chunk_runs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Runs that are under way at once at most; as many as memory holds if not given."""
     exact: bool = False
@@ -50,7 +47,7 @@ class Design:
 
     base: the settings of all runs but those that are swept, and where its directory is
     over: the values of each setting that is swept
-    search: "grid", "random" or "halving"
+    search: "grid" or "random"
     budget: how many configurations are drawn, None for a grid
     given: other settings that the user chose; at least one configuration must read each
     exact: see ``SweepSettings``
@@ -70,7 +67,7 @@ class Design:
     resume: Path | None = None
 
     def count(self) -> int:
-        """Returns how many configurations it begins with."""
+        """Returns how many configurations it has."""
         return self.budget or math.prod(map(len, self.over.values()))
 
     def configurations(self) -> list[dict[str, Any]]:
@@ -163,11 +160,11 @@ def _check_search(design: Design) -> None:
     """Raises ValueError where the search and its budget do not go together."""
     if design.search == "grid":
         if design.budget is not None:
-            raise ValueError("--budget is of --search random and halving: leave it out, or add one")
-    elif design.search not in ("random", "halving"):
-        raise ValueError(f"--search must be grid, random or halving, got {design.search!r}")
+            raise ValueError("--budget is of --search random: leave it out, or add that")
+    elif design.search != "random":
+        raise ValueError(f"--search must be grid or random, got {design.search!r}")
     elif design.budget is None:
-        raise ValueError(f"--search {design.search} needs --budget, the number of configurations")
+        raise ValueError("--search random needs --budget, the number of configurations")
     elif design.budget < 2:
         raise ValueError(f"--budget must be at least 2, got {design.budget}")
 

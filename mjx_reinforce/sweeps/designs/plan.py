@@ -17,7 +17,6 @@ from mjx_reinforce.store.build import build, policy_settings
 from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.designs.grid import configure
 from mjx_reinforce.sweeps.designs.groups import Group, make_groups
-from mjx_reinforce.sweeps.designs.rungs import part_trained
 from mjx_reinforce.types import Environment
 
 #: Chunks take up to this part of the memory that is there.
@@ -106,7 +105,6 @@ def describe_plan(
     groups: Sequence[Group],
     parts: Sequence[GroupPlan],
     num_devices: int,
-    part_trained: float,
 ) -> str:
     """Returns a paragraph on what a sweep will do.
 
@@ -117,7 +115,6 @@ def describe_plan(
       groups: of configurations.
       parts: how the runs of each are divided.
       num_devices: on which they are.
-      part_trained: of the budgets of all runs, see ``rungs.part_trained``.
     """
     first, machine = groups[0].config, this_hardware()
     configurations = sum(len(group.members) for group in groups)
@@ -139,7 +136,7 @@ def describe_plan(
         f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
         f"of {first.env}, on {where}, with the engine {learners[0].engine.name}: "
         f"{counted(len(groups), 'compiled program')}, {counted(chunks, 'chunk')} of up to {side:,} "
-        f"runs. {_time(envs, horizons, learners, groups, num_devices, part_trained)}. "
+        f"runs. {_time(envs, horizons, learners, groups, num_devices)}. "
         f"It needs about {gigabytes(memory)} of memory beside the programs."
         f"{_idle_devices(side, num_devices)}"
     )
@@ -162,7 +159,6 @@ def _time(
     learners: Sequence[Any],
     groups: Sequence[Group],
     num_devices: int,
-    part_trained: float,
 ) -> str:
     """Returns about how long the training takes, where that is known."""
     total = 0.0
@@ -170,7 +166,7 @@ def _time(
         seconds = group_seconds(env, horizon, learner.engine.name, group, num_devices)
         if seconds is None:
             return "How long this takes here is not known"
-        total += part_trained * seconds
+        total += seconds
     compiling = duration(this_hardware().speeds[groups[0].config.env].compiling)
     return f"Compiling takes about {compiling} each, training about {duration(total)}"
 
@@ -251,7 +247,6 @@ def prepare_sweep(design: Design, limits: Sequence[int] | None, num_processes: i
         divide(group, limit, devices.count, exact=design.exact)
         for group, limit in zip(groups, limits, strict=True)
     ]
-    trained = part_trained(design.search, len(configurations))
-    plan = describe_plan(made, horizons, learners, groups, parts, devices.count, trained)
+    plan = describe_plan(made, horizons, learners, groups, parts, devices.count)
     engine = learners[0].engine.name, sum(learner.engine.seconds for learner in learners)
     return Prepared(made, horizons, devices, configurations, groups, list(limits), *engine, plan)
