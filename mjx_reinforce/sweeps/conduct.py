@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from mjx_reinforce.console.interrupt import Interrupt
-from mjx_reinforce.hosts.processes import Processes
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.plan import duration, is_wrong
 from mjx_reinforce.settings.config import MAX_COUNT
@@ -56,7 +55,6 @@ class Conductor:
         self,
         prepared: Prepared,
         design: Design,
-        processes: Processes,
         files: SweepFiles,
         display: Display,
         interrupt: Interrupt | None,
@@ -67,14 +65,13 @@ class Conductor:
         Args:
           prepared: its parts.
           design: what it is to do.
-          processes: that share its chunks.
           files: of the sweep.
           display: its screen.
           interrupt: what listens to signals, if anything does.
           ready: is called once, when the first program has been compiled, with how long that
             took (s), or when there is nothing to compile.
         """
-        self._prepared, self._design, self._processes = prepared, design, processes
+        self._prepared, self._design = prepared, design
         self._files, self._display = files, display
         self._interrupt = interrupt
         self._ready: Callable[[float], None] | None = ready
@@ -83,16 +80,6 @@ class Conductor:
 
     def conduct(self) -> bool:
         """Trains all groups; returns whether they ended, or were interrupted."""
-        return self._train_groups() and self._processes.meet()
-
-    def _begin_files(self, seconds: float) -> None:
-        """Calls ``ready``, once."""
-        ready, self._ready = self._ready, None
-        if ready is not None:
-            ready(seconds)
-
-    def _train_groups(self) -> bool:
-        """Trains the chunks that are this process's; returns whether they ended."""
         stages = self._left(self._stages())
         said = {stage.number: self._seconds(stage) for stage in stages}
         each = {number: 1.0 if seconds is None else seconds for number, seconds in said.items()}
@@ -114,8 +101,14 @@ class Conductor:
                     return False
                 self._done += each[stage.number] * len(runs.seed)
             self._correct(said[stage.number], stage.num_runs, self.clock.running - before)
-        self._begin_files(0.0)  # where this process had nothing to do
+        self._begin_files(0.0)  # where nothing was left to do
         return True
+
+    def _begin_files(self, seconds: float) -> None:
+        """Calls ``ready``, once."""
+        ready, self._ready = self._ready, None
+        if ready is not None:
+            ready(seconds)
 
     def _seconds(self, stage: Stage) -> float | None:
         """Returns about how long a run of a stage takes (s), None where that is not known."""
@@ -157,13 +150,11 @@ class Conductor:
         return divide(group, limit, devices.count, exact=self._design.exact)
 
     def _left(self, stages: Sequence[Stage]) -> list[Stage]:
-        """Returns what is still to be trained by this process."""
-        index, count = self._processes.index, self._processes.count
-        every = [runs.name for stage in stages for runs in stage.chunks]
-        mine = {
-            name for i, name in enumerate(every) if i % count == index and not self._files.has(name)
-        }
-        left = [stage.of([runs for runs in stage.chunks if runs.name in mine]) for stage in stages]
+        """Returns what is still to be trained."""
+        left = [
+            stage.of([runs for runs in stage.chunks if not self._files.has(runs.name)])
+            for stage in stages
+        ]
         return [stage for stage in left if stage.chunks]
 
     def _compile(self, stage: Stage) -> SlotPrograms:

@@ -37,7 +37,6 @@ class SweepFiles:
         threshold: float | None,
         *,
         going_on: bool,
-        first: bool,
     ):
         """Takes what the rows of results.csv are made of.
 
@@ -46,9 +45,7 @@ class SweepFiles:
           configurations: the values of what is swept, in each.
           threshold: the return that counts as solved, if any.
           going_on: whether what is in the directory is of this sweep.
-          first: whether this is the process that writes more than parts.
         """
-        self._first = first
         self._going_on = going_on
         self.directory, self.parts = directory, directory / "parts"
         self._configurations = [_spelled(values) for values in configurations]
@@ -114,8 +111,7 @@ class SweepFiles:
             "nonfinite": history.now["nonfinite"].astype(np.int32),
         }
         write_arrays(self._path(runs.name), part)
-        if self._first:
-            files.append_csv(self.directory / "results.csv", self._columns, self._rows(part))
+        files.append_csv(self.directory / "results.csv", self._columns, self._rows(part))
 
     def finish(self) -> None:
         """Joins the parts so far to results.csv and curves.npz, sorted by configuration."""

@@ -65,9 +65,9 @@ def restored(leaves: Sequence[jax.Array | np.ndarray], like: PyTree) -> Any:
     return with_keys(jax.tree.unflatten(jax.tree.structure(like), leaves), like)
 
 
-def seed_keys(seed: Seed, num_seeds: int) -> jax.Array:
-    """Returns the keys [S] that the seeds of a run begin with."""
-    return jax.random.split(_root_key(seed, domain=0), num_seeds)
+def seed_keys(seed: Seed, numbers: jax.Array | np.ndarray) -> jax.Array:
+    """Returns the keys [R] that the seeds numbered so begin with: those of ``jax.random.split``."""
+    return _for_each_seed(_root_key(seed, domain=0), numbers)
 
 
 def eval_keys(eval_seed: Seed, numbers: jax.Array | np.ndarray) -> jax.Array:
@@ -132,7 +132,7 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
                 f"the policies in {directory} have {name} {old}, and this run {value}; give "
                 f"{flag(name)} that value, or leave --init-from out"
             )
-    seeds = np.arange(config.num_seeds) % saved.num_seeds
+    seeds = (config.first_seed + np.arange(config.num_seeds)) % saved.num_seeds
     return jax.tree.map(lambda x: x[seeds], saved.actor)
 
 

@@ -179,6 +179,19 @@ def test_an_exact_run_does_not_depend_on_the_others(run):
     assert same({"": whole["eval_return"][:, 3:6]}, {"": beside["eval_return"][:, 3:6]})
 
 
+def test_shares_of_an_exact_sweep_are_the_whole_to_the_bit(run):
+    command = f"{SMALL} --max-updates 5 --exact {RATES}"
+    assert run(f"{command} --num-seeds 3 --output whole") == 0
+    assert run(f"{command} --seeds 0:1 --output first") == 0
+    assert run(f"{command} --seeds 1:3 --output second") == 0
+    whole, *shares = (read_results(Path(name)) for name in ("whole", "first", "second"))
+    for share, seeds in zip(shares, ([0], [1, 2]), strict=True):
+        assert sorted({*share.seed.tolist()}) == seeds
+        kept = np.isin(whole.seed, seeds)
+        np.testing.assert_array_equal(share.eval_return, whole.eval_return[:, kept])
+        np.testing.assert_array_equal(share.env_steps, whole.env_steps[:, kept])
+
+
 def test_numbers_of_shifts_dampings_and_values_are_traced():
     """As arguments of one program, side by side, they do what they do alone."""
     base = dataclasses.replace(

@@ -10,7 +10,6 @@ import numpy as np
 import tyro
 
 from mjx_reinforce.files import read_json
-from mjx_reinforce.hosts.processes import ProcessSettings, check_processes
 from mjx_reinforce.settings.config import Config, check_each, flag, marked, spoken
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.memory import check_memory, gigabytes, host_memory
@@ -36,9 +35,8 @@ class SweepSettings:
     chunk_runs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Runs that are under way at once at most; as many as memory holds if not given."""
     exact: bool = False
-    """Move every run by itself, on one device of each process, so that no result depends in any bit
-    on the runs beside it, on chunks, or on how many devices there are. It takes many times as
-    long."""
+    """Move every run by itself, on one device, so that no result depends in any bit on the runs
+    beside it, on chunks, or on how many devices there are. It takes many times as long."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -52,7 +50,6 @@ class Design:
     given: other settings that the user chose; at least one configuration must read each
     exact: see ``SweepSettings``
     chunk_runs: see ``SweepSettings``
-    processes: those that train it
     resume: the directory of a sweep that goes on
     """
 
@@ -63,7 +60,6 @@ class Design:
     given: Sequence[str] = ()
     exact: bool = False
     chunk_runs: int | None = None
-    processes: ProcessSettings = dataclasses.field(default_factory=ProcessSettings)
     resume: Path | None = None
 
     def count(self) -> int:
@@ -85,12 +81,6 @@ def as_record(design: Design) -> dict[str, Any]:
     over = {name: list(values) for name, values in design.over.items()}
     names = ("exact", "search", "budget")
     return {"settings": settings, "over": over, **{name: getattr(design, name) for name in names}}
-
-
-def flat(design: Design) -> dict[str, Any]:
-    """Returns what ``as_record`` does, the settings among the rest."""
-    record = as_record(design)
-    return record.pop("settings") | record
 
 
 def read_design(directory: Path) -> Design:
@@ -137,9 +127,6 @@ def check_design(design: Design) -> None:
     check_over(design.base, design.over)
     _check_search(design)
     _check_results(design)
-    check_processes(design.processes)
-    if design.processes.distributed and design.base.output is None and design.resume is None:
-        raise ValueError("--distributed needs --output, a directory that all processes see")
     configs = configure(design.base, design.configurations(), design.given)
     for config in configs:
         check_memory(dataclasses.replace(config, num_seeds=1))

@@ -64,7 +64,6 @@ def chunk_limit(
     group: Group,
     asked: int | None,
     num_devices: int,
-    num_processes: int,
 ) -> int:
     """Returns how many runs of a group a chunk may have.
 
@@ -73,15 +72,14 @@ def chunk_limit(
       horizon: the time limit of an episode in steps.
       group: whose runs are divided.
       asked: what the user said, or None for what memory holds.
-      num_devices: of each process.
-      num_processes: each of which is to have a chunk.
+      num_devices: among which a chunk is divided.
 
     Raises:
       ValueError: not even one run for each device fits into memory.
     """
     total = len(group.members) * group.config.num_seeds
     limit = _capacity(env, horizon, group, num_devices) if asked is None else asked
-    return min(limit, -(-total // num_processes))
+    return min(limit, total)
 
 
 def _capacity(env: Environment, horizon: int, group: Group, num_devices: int) -> int:
@@ -143,7 +141,7 @@ def describe_plan(
 
 
 def _idle_devices(side: int, num_devices: int) -> str:
-    """Returns a sentence where devices of this process stand idle, else nothing.
+    """Returns a sentence where devices stand idle, else nothing.
 
     Args:
       side: how many runs are under way at once at most.
@@ -218,13 +216,12 @@ class Prepared(NamedTuple):
     plan: str
 
 
-def prepare_sweep(design: Design, limits: Sequence[int] | None, num_processes: int) -> Prepared:
+def prepare_sweep(design: Design, limits: Sequence[int] | None) -> Prepared:
     """Returns what a sweep is made of.
 
     Args:
       design: of the sweep.
       limits: how many runs of each group a chunk may have, if the sweep goes on.
-      num_processes: that train it.
 
     Raises:
       ValueError: settings do not fit the environment, or a run does not fit into memory.
@@ -238,9 +235,8 @@ def prepare_sweep(design: Design, limits: Sequence[int] | None, num_processes: i
     built = [build(env, group.config) for env, group in zip(made, groups, strict=True)]
     learners, horizons = [list(x) for x in zip(*built, strict=True)]
     if limits is None:
-        share = devices.count, num_processes
         limits = [
-            chunk_limit(env, horizon, group, design.chunk_runs, *share)
+            chunk_limit(env, horizon, group, design.chunk_runs, devices.count)
             for env, horizon, group in zip(made, horizons, groups, strict=True)
         ]
     parts = [
