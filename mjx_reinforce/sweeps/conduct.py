@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 from mjx_reinforce.console.interrupt import Interrupt
@@ -43,10 +43,6 @@ class Stage(NamedTuple):
         """How many runs there are in its chunks."""
         return sum(len(runs.seed) for runs in self.chunks)
 
-    def of(self, runs: Sequence[Runs]) -> "Stage":
-        """Returns the stage with some of its chunks."""
-        return self._replace(chunks=list(runs))
-
 
 class Conductor:
     """Trains the chunks that have not ended yet; a file that cannot be written is an OSError."""
@@ -80,7 +76,7 @@ class Conductor:
 
     def conduct(self) -> bool:
         """Trains all groups; returns whether they ended, or were interrupted."""
-        stages = self._left(self._stages())
+        stages = self._stages()
         said = {stage.number: self._seconds(stage) for stage in stages}
         each = {number: 1.0 if seconds is None else seconds for number, seconds in said.items()}
         self._total = sum(each[stage.number] * stage.num_runs for stage in stages)
@@ -136,26 +132,19 @@ class Conductor:
         )
 
     def _stages(self) -> list[Stage]:
-        """Returns all runs."""
+        """Returns the runs that are still to be trained."""
         made = []
         for number, group in enumerate(self._prepared.groups):
-            count = self._divide(number).num_chunks
-            made.append(Stage(number, group, chunks.split_runs(group, f"{number:03d}", count)))
-        return made
+            parts = chunks.split_runs(group, f"{number:03d}", self._divide(number).num_chunks)
+            left = [runs for runs in parts if not self._files.has(runs.name)]
+            made.append(Stage(number, group, left))
+        return [stage for stage in made if stage.chunks]
 
     def _divide(self, number: int) -> GroupPlan:
         """Returns how the runs of a group are divided."""
         prepared = self._prepared
         group, limit, devices = prepared.groups[number], prepared.limits[number], prepared.devices
         return divide(group, limit, devices.count, exact=self._design.exact)
-
-    def _left(self, stages: Sequence[Stage]) -> list[Stage]:
-        """Returns what is still to be trained."""
-        left = [
-            stage.of([runs for runs in stage.chunks if not self._files.has(runs.name)])
-            for stage in stages
-        ]
-        return [stage for stage in left if stage.chunks]
 
     def _compile(self, stage: Stage) -> SlotPrograms:
         """Returns the programs of a group."""
