@@ -19,7 +19,7 @@ _HOME = {
 }
 #: Folders and files that are attributes too, also imported on first use.
 _MODULES = (
-    *("console", "engines", "envs", "export", "files", "fused", "hosts", "learners", "physics"),
+    *("console", "engines", "envs", "export", "files", "fused", "learners", "physics"),
     *("playing", "policies", "registry", "reports", "runs", "settings", "store", "sweeps"),
     *("training", "types", "vector"),
 )

@@ -55,7 +55,6 @@ from . import envs as envs
 from . import export as export
 from . import files as files
 from . import fused as fused
-from . import hosts as hosts
 from . import learners as learners
 from . import physics as physics
 from . import playing as playing

@@ -234,15 +234,16 @@ def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
     By its run, by the policy that its sweep kept, or, where that is an older one, trained again.
     """
     best = findings.results[0]
-    directory = experiment.directories[findings.order[0]]
-    seed = int(best.configuration.seed[tables.worst_seeds(best)[0]])
+    worst = tables.worst_seeds(best)[0]
+    seed, directory = int(best.configuration.seed[worst]), best.configuration.where[worst]
     if (directory / "config.json").is_file():
         return Watch(
             f"To watch the worst, seed {seed}:",
             f"python -m mjx_reinforce.watch {shlex.quote(str(directory))} --seed {seed}"
             + env_flag(experiment.env),
         )
-    number = findings.order[0] - experiment.directories.index(directory)
+    first = experiment.directories[findings.order[0]]
+    number = findings.order[0] - experiment.directories.index(first)
     place = directory / "policies" / f"{number:03d}"
     if seed in seeds_in(place):
         return Watch(

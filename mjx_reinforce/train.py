@@ -19,8 +19,7 @@ from mjx_reinforce.console.heartbeat import heartbeat, to_screen
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import accept_everything, silence_alarms
-from mjx_reinforce.hosts.processes import Processes, joined
-from mjx_reinforce.runs.command_line import parse_all, refuse, refuse_full, start
+from mjx_reinforce.runs.command_line import parse, refuse, refuse_full, start
 from mjx_reinforce.runs.directory import (
     check_writable,
     choose_directory,
@@ -32,7 +31,6 @@ from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.settings.own_code import code_flags
-from mjx_reinforce.store.provenance import versions
 from mjx_reinforce.training import resume
 
 if TYPE_CHECKING:
@@ -61,41 +59,32 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
     made: Sequence[Path] = ()
     try:
         with _collection_paused():
-            config, settings = parse_all(arguments)
+            config = parse(arguments)
             check(config)
             check_memory(config)
             check_installed(config)
-            common = {**resume.recordable(config), **versions()}
-            processes = held.enter_context(joined(settings, interrupt, common))
-            share = processes.share(config.num_seeds)
-            directory = Path()
-            if processes.index == 0:
-                directory, new = _directory(config)
-                held.enter_context(locked(directory))  # a folder in which another trains stays
-                made = new
-                interrupt.on_exit(lambda: remove_empty(made))
+            directory, new = _directory(config)
+            held.enter_context(locked(directory))  # a folder in which another trains stays
+            made = new
+            interrupt.on_exit(lambda: remove_empty(made))
             # A module of the user's is imported before JAX starts, which it may set up.
             env = None if envs.is_ours(config.env) else envs.make_set(config.env, config.env_set)
             configure_jax()
             with heartbeat(to_screen, None, "writing the simulation out"):
                 default = start(arguments, "train")[0]
-                ready, found = _start(env, config, default, processes, share)
+                ready, found = _start(env, config, default)
             if config.init_from is not None and found is None:
                 from mjx_reinforce.training.state import last_actors
 
                 last_actors(config, ready.policy)  # refused before anything is compiled
-            plan = make_plan(ready, config, processes.count)
+            plan = make_plan(ready, config)
     except ValueError as error:
         refuse(str(error), made)
     except (ImportError, MemoryError) as error:
         remedy = "see pip check, and ulimit -v where memory is short"
         refuse(f"cannot load what this package needs ({error}); {remedy}", made)
     try:
-        if processes.index:
-            return _serve(ready, config, processes, interrupt)
-        status = train(ready, found, config, plan, directory, interrupt, processes)
-        _end(processes, status)
-        return status
+        return train(ready, found, config, plan, directory, interrupt)
     except (RuntimeError, OSError) as error:
         begun = (directory / "config.json").exists()
         resumed = f"go on with --resume {directory}{code_flags(vars(config))}"
@@ -113,7 +102,7 @@ def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
 
 
 def _start(
-    env: "Environment | None", config: Config, default: Config, processes: Processes, share: slice
+    env: "Environment | None", config: Config, default: Config
 ) -> "tuple[Ready, Checkpoint | None]":
     """Returns a run that is ready, and the checkpoint from which it goes on, if any.
 
@@ -121,8 +110,6 @@ def _start(
       env: the environment, if it is the user's own.
       config: the settings.
       default: those that hold where the user gave none.
-      processes: that train it.
-      share: the seeds of this one. Only the first needs the checkpoint.
 
     Raises:
       ValueError: the settings do not fit the environment, or the run cannot go on here.
@@ -131,11 +118,10 @@ def _start(
     from mjx_reinforce.store.ready import get_ready
     from mjx_reinforce.training.state import shape_of_all
 
-    ready = get_ready(config, default, env, share)
-    if config.resume is None or processes.index:
+    ready = get_ready(config, default, env)
+    if config.resume is None:
         return ready, None
-    present = {**provenance(), "num_processes": processes.count}
-    resume.check_program(config.resume, present)
+    resume.check_program(config.resume, provenance())
     like = shape_of_all(ready.programs.like, config.num_seeds)
     if config.minutes is not None:  # more than any checkpoint has used
         config = dataclasses.replace(config, env_steps=MAX_COUNT)
@@ -148,24 +134,6 @@ def _start(
     return ready, found
 
 
-def _serve(ready: "Ready", config: Config, processes: Processes, interrupt: Interrupt) -> int:
-    """Trains seeds for process 0, which has the run's files; returns the exit status."""
-    from mjx_reinforce.hosts.shares import serve
-    from mjx_reinforce.training.programs import compile_run
-
-    state, programs = compile_run(ready.programs, config, processes.share(config.num_seeds))
-    interrupt.defer(lambda _: processes.stop(interrupt.number or 0))
-    return serve(processes, programs, state)
-
-
-def _end(processes: Processes, status: int) -> None:
-    """Lets the other processes of a run end, as this one does."""
-    if processes.count > 1:
-        from mjx_reinforce.hosts.shares import end
-
-        end(processes, status)
-
-
 def train(
     ready: "Ready",
     found: "Checkpoint | None",
@@ -173,7 +141,6 @@ def train(
     plan: Plan,
     directory: Path,
     interrupt: Interrupt,
-    processes: Processes,
 ) -> int:
     """Trains to the budget, a signal, or until nothing is finite, and writes the run's files.
 
@@ -184,7 +151,6 @@ def train(
       plan: what is said of it beforehand.
       directory: where the files go.
       interrupt: what listens to signals.
-      processes: that train it; this is the first.
 
     Returns:
       The exit status, see ``main``.
@@ -202,13 +168,11 @@ def train(
             from mjx_reinforce.runs.training import compile_driver, draw, summary_of
 
             loading = threading.Thread(target=load_libraries, daemon=True)
-            driver, seconds = compile_driver(
-                ready, config, found, display.say, processes, loading.start
-            )
+            driver, seconds = compile_driver(ready, config, found, display.say, loading.start)
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
         interrupt.defer(display.say)
         files = RunFiles(RunLog(directory), ready.policy, display.say)
-        files.begin(driver, found, processes.count)
+        files.begin(driver, found)
         driver.observers += [files, Screen(display, plan.correction)]
         display.start(seconds)
         driver.drive(lambda: interrupt.number is not None)

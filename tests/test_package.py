@@ -34,7 +34,7 @@ ORDER = (
         "engines",
     ),
     *("learners", "console", "settings", "vector", "gym", "export", "reports", "training"),
-    *("hosts", "store", "runs", "playing", "report", "sweeps", "sweep", "train", "watch", "new"),
+    *("store", "runs", "playing", "report", "sweeps", "sweep", "train", "watch", "new"),
     "__main__",
 )
 #: Commands of folders, found where ``python -m`` looks for them. They use what comes later.

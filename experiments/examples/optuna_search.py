@@ -1,7 +1,7 @@
 """Settings searched by Optuna: ask for some, train, stop what is hopeless, tell the return.
 
 ``pip install optuna``, then ``python experiments/examples/optuna_search.py --env Hopper-v5 --trials
-40``. Each trial compiles its own program; ``mjx-reinforce sweep --search halving`` shares one.
+40``. Each trial compiles its own program.
 """
 
 import argparse

@@ -45,7 +45,6 @@ def compare(devices: list[int], rounds: int, arguments: list[str], folder: Path)
     """Trains a sweep of one group on each number of devices in turn, and prints the table."""
     from mjx_reinforce.console.jax_setup import configure_jax
     from mjx_reinforce.devices import Devices
-    from mjx_reinforce.hosts.processes import Processes
     from mjx_reinforce.runs.display import Display
     from mjx_reinforce.sweeps.command_line import parse_design
     from mjx_reinforce.sweeps.conduct import Conductor, Stage
@@ -89,11 +88,11 @@ def compare(devices: list[int], rounds: int, arguments: list[str], folder: Path)
         there = prepared._replace(devices=Devices(count))
         values = there.configurations
         (folder / name).mkdir()
-        files = TimedFiles(folder / name, values, None, going_on=False, first=True)
+        files = TimedFiles(folder / name, values, None, going_on=False)
         display = Display()
         display.console.quiet = True
         files.open({"status": "running"})
-        return TimedConductor(there, design, Processes(), files, display, None, lambda _: None)
+        return TimedConductor(there, design, files, display, None, lambda _: None)
 
     def compiled(count: int) -> tuple[Any, float]:
         began = time.perf_counter()
@@ -105,7 +104,7 @@ def compare(devices: list[int], rounds: int, arguments: list[str], folder: Path)
 
     configure_jax()
     design = parse_design([*OVER, *arguments, "--output", str(folder / "none")])
-    prepared = prepare_sweep(design, None, 1)
+    prepared = prepare_sweep(design, None)
     with ThreadPoolExecutor() as pool:
         programs = dict(zip(devices, pool.map(compiled, devices), strict=True))
     parts = ("begin", "wide", "tail", "evaluate", "save")

@@ -64,11 +64,6 @@ class Interrupt:
         """
         self._say = say
 
-    def ask(self, number: int) -> None:
-        """Does what the first signal of that number does, unless one came before."""
-        if self.number is None:
-            self._act(number)
-
     def leave(self, status: int, say: Callable[[], Any] | None = None) -> NoReturn:
         """Ends the process with a status, from any thread.
 

@@ -12,6 +12,7 @@ import numpy as np
 from mjx_reinforce.export.policy_checks import is_number
 from mjx_reinforce.files import read_json
 from mjx_reinforce.registry import nearest
+from mjx_reinforce.settings.config import read_seeds
 
 #: A seed by its rank in the run's final evaluation, or by its number.
 SeedChoice = Literal["best", "worst", "median"] | int
@@ -29,7 +30,7 @@ class Run(NamedTuple):
     directory: where it is
     env: the id of its environment
     horizon: the time limit in env steps
-    seeds: the numbers of the seeds whose policies are here, where a sweep kept a few; else all are
+    seeds: the numbers of the seeds whose policies are here, where these are not 0, 1, ...
     env_set: settings of the environment, NAME=VALUE each
     """
 
@@ -78,6 +79,8 @@ def read_run(directory: str | Path) -> Run:
     if not (directory / "policy").is_dir():
         raise ValueError(f"{directory} has no policy yet: {_NOT_YET}")
     seeds = settings.get("seeds")
+    if isinstance(seeds, str):  # a share of a run; where a sweep kept a few it is a list
+        seeds = [*read_seeds(seeds)]
     if seeds is not None and not (
         isinstance(seeds, list) and all(type(seed) is int for seed in seeds)
     ):

@@ -19,6 +19,7 @@ class Configuration(NamedTuple):
     env_steps: [E, S] trained until then
     nonfinite: [S] updates that met numbers which are not finite
     seed: [S] each seed's number in its source
+    where: [S] the directory of each
     """
 
     label: str
@@ -27,6 +28,7 @@ class Configuration(NamedTuple):
     env_steps: np.ndarray
     nonfinite: np.ndarray
     seed: np.ndarray
+    where: Sequence[Path] = ()
 
 
 class Source(NamedTuple):

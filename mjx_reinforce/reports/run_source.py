@@ -9,6 +9,7 @@ from numpy.typing import DTypeLike
 
 from mjx_reinforce.files import read_json
 from mjx_reinforce.reports.experiment import Configuration, Source
+from mjx_reinforce.settings.config import read_seeds
 
 #: What config.json says besides the settings.
 PROVENANCE = (
@@ -29,7 +30,9 @@ def read_run_source(directory: Path) -> Source:
         raise ValueError(f"{directory / 'config.json'} is damaged: env is {config.get('env')!r}")
     path = directory / "summary.json"
     summary = read_json(path) if path.exists() else {"status": "running"}
-    columns = read_metrics(directory / "metrics.csv")
+    seeds = config.get("seeds")
+    first = read_seeds(seeds).start if isinstance(seeds, str) else 0
+    columns = read_metrics(directory / "metrics.csv", first)
     num_seeds = columns["eval_return"].shape[1]
     settings = {name: value for name, value in config.items() if name not in PROVENANCE}
     kept = {name: value for name, value in config.items() if name in PROVENANCE}
@@ -38,8 +41,9 @@ def read_run_source(directory: Path) -> Source:
         settings={},
         eval_return=columns["eval_return"],
         env_steps=columns["env_steps"],
-        nonfinite=_count_nonfinite(summary, path, num_seeds),
-        seed=np.arange(num_seeds),
+        nonfinite=_count_nonfinite(summary, path, columns["seed"]),
+        seed=columns["seed"],
+        where=[directory] * num_seeds,
     )
     return Source(
         directory=directory,
@@ -53,8 +57,10 @@ def read_run_source(directory: Path) -> Source:
     )
 
 
-def read_metrics(path: Path) -> dict[str, np.ndarray]:
-    """Returns the columns ``env_steps`` and ``eval_return`` of a metrics.csv, [E, S] each.
+def read_metrics(path: Path, first: int = 0) -> dict[str, np.ndarray]:
+    """Returns the columns ``env_steps`` and ``eval_return`` of a metrics.csv, and ``seed`` [S].
+
+    The columns are [E, S], of S seeds from ``first`` on.
 
     A last line or evaluation that is not whole, which a killed run may leave, is left out.
 
@@ -66,14 +72,16 @@ def read_metrics(path: Path) -> dict[str, np.ndarray]:
     seed = columns["seed"]
     if not len(seed):
         raise ValueError(f"{path} has no evaluation yet; wait for the first, or train again")
-    num_seeds = int(seed.max()) + 1
+    num_seeds = max(int(seed.max()) - first, 0) + 1
     whole = len(seed) // num_seeds * num_seeds
-    wrong = np.flatnonzero(seed != np.arange(len(seed)) % num_seeds)
+    wrong = np.flatnonzero(seed != first + np.arange(len(seed)) % num_seeds)
     if len(wrong) or not whole:
         row = int(wrong[0]) if len(wrong) else len(seed)
-        raise ValueError(f"{path} is damaged: line {row + 2} is not of seed {row % num_seeds}")
+        expected = first + row % num_seeds
+        raise ValueError(f"{path} is damaged: line {row + 2} is not of seed {expected}")
     shape = (-1, num_seeds)
-    return {name: columns[name][:whole].reshape(shape) for name in ("env_steps", "eval_return")}
+    found = {name: columns[name][:whole].reshape(shape) for name in ("env_steps", "eval_return")}
+    return found | {"seed": seed[:num_seeds]}
 
 
 def read_columns(path: Path, kinds: dict[str, Any]) -> dict[str, np.ndarray]:
@@ -124,12 +132,12 @@ def _reads_as(kind: DTypeLike, text: str) -> bool:
     return True
 
 
-def _count_nonfinite(summary: dict[str, Any], path: Path, num_seeds: int) -> np.ndarray:
-    """Returns how many updates of each seed met numbers that are not finite."""
+def _count_nonfinite(summary: dict[str, Any], path: Path, seed: np.ndarray) -> np.ndarray:
+    """Returns how many updates of each seed [S] met numbers that are not finite."""
     events = summary.get("nonfinite", [])
     try:
-        seeds = np.array([event["seed"] for event in events], np.int64)
-        return np.bincount(seeds, minlength=num_seeds)[:num_seeds]
+        seeds = np.array([event["seed"] for event in events], np.int64) - seed[0]
+        return np.bincount(seeds, minlength=len(seed))[: len(seed)]
     except (TypeError, KeyError, ValueError) as error:
         raise ValueError(f"{path} is damaged: nonfinite is no list of updates") from error
 

@@ -20,7 +20,7 @@ from mjx_reinforce.reports.experiment import (
 from mjx_reinforce.reports.run_source import number_entry, read_columns, timings
 
 #: Settings that say where and how a run was kept, not what was trained.
-_HOUSEKEEPING = ("output", "overwrite", "resume", "checkpoint_every", "num_seeds")
+_HOUSEKEEPING = ("output", "overwrite", "resume", "checkpoint_every", "num_seeds", "seeds")
 #: What should be the same of sources that are compared.
 _COMPARABLE = ("python", "packages", "git_commit", "device", "x64", "engine")
 
@@ -29,11 +29,12 @@ def read_experiment(sources: Sequence[Path]) -> Experiment:
     """Reads run directories and sweep directories as one experiment.
 
     The configurations of a sweep are told apart by what it swept; those of several sources by the
-    settings in which they differ too, or else by the names of their directories.
+    settings in which they differ too, or else by the names of their directories. Shares of a run or
+    sweep (--seeds) are joined.
 
     Raises:
       ValueError: there is no source, one is neither a run nor a sweep or is damaged (which file,
-        what is wrong in it), or they are of different tasks.
+        what is wrong in it), they are of different tasks, or shares do not fit each other.
     """
     if not sources:
         raise ValueError("there is nothing to report on: name a run or a sweep directory")
@@ -62,7 +63,10 @@ def read_tasks(sources: Sequence[Path]) -> list[Experiment]:
 
 def _experiment(found: Sequence[Source]) -> Experiment:
     """Returns the experiment of sources of one task."""
-    configurations = _told_apart(found)
+    joined = _join_shares(found)
+    configurations = _told_apart(joined)
+    if any(source.settings.get("seeds") for source in found):
+        _check_seeds(configurations)
     thresholds = [source.threshold for source in found if source.threshold is not None]
     provenance, disagree = _merge_provenance(found)
     timings = sum((Counter(source.timings) for source in found), Counter())
@@ -76,7 +80,7 @@ def _experiment(found: Sequence[Source]) -> Experiment:
         settings=_in_common([source.settings for source in found]),
         provenance=provenance,
         timings=dict(timings),
-        directories=[source.directory for source in found for _ in source.configurations],
+        directories=[source.directory for source in joined for _ in source.configurations],
         unfinished=[source.directory for source in found if source.status != "finished"],
         disagree=disagree,
     )
@@ -92,6 +96,75 @@ def _read_source(directory: Path) -> Source:
     raise ValueError(
         f"{directory} is neither a run nor a sweep: it has no config.json and no sweep.json"
     )
+
+
+def _join_shares(sources: Sequence[Source]) -> list[Source]:
+    """Returns the sources, of which those that are shares of one run or sweep are one.
+
+    Raises:
+      ValueError: shares have a seed in common.
+    """
+
+    def trained(source: Source) -> Any:
+        settings = {k: x for k, x in source.settings.items() if k not in _HOUSEKEEPING}
+        return settings, [part.settings for part in source.configurations]
+
+    joined = []
+    for source in sources:
+        alike = [other for other in sources if trained(other) == trained(source)]
+        if not any(other.settings.get("seeds") for other in alike):
+            joined.append(source)
+        elif source is alike[0]:
+            joined.append(_join(alike))
+    return joined
+
+
+def _join(shares: Sequence[Source]) -> Source:
+    """Returns shares of one run or sweep as one source."""
+    of_seed: dict[int, Path] = {}
+    for source in shares:
+        for seed in sorted({*np.concatenate([part.seed for part in source.configurations])}):
+            other = of_seed.setdefault(int(seed), source.directory)
+            if other != source.directory:
+                raise ValueError(
+                    f"{other} and {source.directory} both have seed {seed}, with equal settings: "
+                    "give each share other --seeds, or leave one of them out"
+                )
+    parts = zip(*(source.configurations for source in shares), strict=True)
+    return shares[0]._replace(configurations=[_join_parts(each) for each in parts])
+
+
+def _join_parts(parts: Sequence[Configuration]) -> Configuration:
+    """Returns one configuration of several shares; seeds that ended earlier repeat their last."""
+    length = max(len(part.eval_return) for part in parts)
+
+    def together(name: str) -> np.ndarray:
+        each = [getattr(part, name) for part in parts]
+        each = [np.concatenate([x, np.repeat(x[-1:], length - len(x), axis=0)]) for x in each]
+        return np.concatenate(each, axis=1)[:, order]
+
+    seed = np.concatenate([part.seed for part in parts])
+    order = np.argsort(seed)
+    where = [place for part in parts for place in part.where]
+    return parts[0]._replace(
+        eval_return=together("eval_return"),
+        env_steps=together("env_steps"),
+        nonfinite=np.concatenate([part.nonfinite for part in parts])[order],
+        seed=seed[order],
+        where=[where[i] for i in order],
+    )
+
+
+def _check_seeds(configurations: Sequence[Configuration]) -> None:
+    """Raises ValueError for shares of which no run can be made, and which cannot be compared."""
+    first, *others = configurations
+    for other in others:
+        if not np.intersect1d(first.seed, other.seed).size:
+            one, two = (f"{part.where[0]} ({part.label})" for part in (first, other))
+            raise ValueError(
+                f"{one} and {two} have no seed in common, so they cannot be compared, and their "
+                "settings differ, so they are no shares of one run: give equal --seeds or settings"
+            )
 
 
 def _told_apart(sources: Sequence[Source]) -> list[Configuration]:
@@ -181,7 +254,8 @@ def read_sweep_source(directory: Path) -> Source:
     for identity in np.unique(curves["configuration"]).tolist():
         if identity not in swept:
             raise ValueError(f"{path} is damaged: it does not name configuration {identity}")
-        parts.append(_configuration(swept[identity], curves, identity))
+        part = _configuration(swept[identity], curves, identity)
+        parts.append(part._replace(where=[directory] * len(part.seed)))
     settings = content.get("settings")
     return Source(
         directory=directory,

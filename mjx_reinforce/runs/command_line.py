@@ -11,10 +11,9 @@ from typing import Any, NoReturn
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import say_error
-from mjx_reinforce.hosts.processes import ProcessSettings, check_processes
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs.directory import remove_empty
-from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.config import Config, read_seeds
 from mjx_reinforce.settings.defaults import flag_value, for_arguments, named_code
 from mjx_reinforce.settings.flags import asks_brief_help, read_command_line
 from mjx_reinforce.settings.groups import GROUPS, MAIN, UNUSUAL
@@ -44,12 +43,7 @@ _DESCRIPTION = (
 
 
 def parse(arguments: Sequence[str]) -> Config:
-    """Returns the settings that a command line asks for, as ``parse_all``."""
-    return parse_all(arguments)[0]
-
-
-def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
-    """Returns the settings that a command line asks for, and its processes; --help exits.
+    """Returns the settings that a command line asks for; --help exits.
 
     Args:
       arguments: a preset's name, if any, then flags.
@@ -60,21 +54,20 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
         or is of the user's own environment, which is to be named again.
     """
     default, preset, flags, prog = start(arguments, command("train"))
-    config, processes = _read_config(flags, default, prog)
+    config = _read_config(flags, default, prog)
     if config.minutes is not None and flag_value(flags, "--env-steps"):
         raise ValueError(
             f"--minutes {config.minutes:g} and --env-steps {config.env_steps} both say when the "
             "run ends; leave one out"
         )
-    check_processes(processes)
     if preset is not None and config.like is not None:
         raise ValueError(f"--like has all settings of a run: leave the preset {preset} out")
     if config.resume is None:
-        return config, processes
+        return config
     if preset is not None:
         raise ValueError(f"--resume has the run's own settings: leave the preset {preset} out")
     known = resume.read_settings(config.resume)
-    asked, _ = _read_config(flags, known, prog)
+    asked = _read_config(flags, known, prog)
     resume.check_settings(known, asked)
     if resume.is_done(known, asked):
         print(
@@ -83,7 +76,7 @@ def parse_all(arguments: Sequence[str]) -> tuple[Config, ProcessSettings]:
         )
         sys.exit(0)
     check_resumed(known, arguments, config.resume)
-    return asked, processes
+    return asked
 
 
 def check_resumed(known: Config, arguments: Sequence[str], directory: Path) -> None:
@@ -130,17 +123,13 @@ def _default(arguments: Sequence[str]) -> Config:
     return dataclasses.replace(known, resume=None)
 
 
-def _read_config(
-    arguments: Sequence[str], default: Config, prog: str
-) -> tuple[Config, ProcessSettings]:
+def _read_config(arguments: Sequence[str], default: Config, prog: str) -> Config:
     """Returns the settings that flags ask for, with others as given; --help exits."""
-    groups = {**GROUPS, "hosts": ProcessSettings}
     said = _DESCRIPTION if asks_brief_help(arguments) else f"{_DESCRIPTION}\n\n{_names()}"
-    parsed = read_groups(groups, arguments, default, prog, said, _main_settings(default))
-    processes = parsed.pop("hosts")
-    config = join_groups(parsed)
+    parsed = read_groups(GROUPS, arguments, default, prog, said, _main_settings(default))
+    config = join_groups(parsed, arguments)
     check_read(config, changed(config, default))
-    return config, processes
+    return config
 
 
 def _main_settings(default: Config) -> list[str]:
@@ -180,9 +169,20 @@ def read_groups(
     return dict(vars(read_command_line(form, arguments, prog, description, main)))
 
 
-def join_groups(groups: Mapping[str, Any]) -> Config:
-    """Returns the settings of a run from their groups, which ``read_groups`` returned."""
-    return Config(**{name: x for group in groups.values() for name, x in vars(group).items()})
+def join_groups(groups: Mapping[str, Any], flags: Sequence[str]) -> Config:
+    """Returns the settings of a run from their groups, which ``read_groups`` returned.
+
+    Raises:
+      ValueError: the flags say by --seeds and by --num-seeds how many seeds there are.
+    """
+    config = Config(**{name: x for group in groups.values() for name, x in vars(group).items()})
+    if config.seeds is None:
+        return config
+    if flag_value(flags, "--num-seeds"):
+        raise ValueError(
+            f"--seeds {config.seeds} says how many seeds there are: leave --num-seeds out"
+        )
+    return dataclasses.replace(config, num_seeds=len(read_seeds(config.seeds)))
 
 
 def _names() -> str:

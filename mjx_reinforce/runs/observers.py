@@ -42,13 +42,12 @@ class RunFiles:
         #: Where rows go besides metrics.csv.
         self._sinks: list[Queue] = []
 
-    def begin(self, driver: Driver, found: Checkpoint | None, num_processes: int) -> None:
+    def begin(self, driver: Driver, found: Checkpoint | None) -> None:
         """Writes the first files, or takes the run and its files back to where it goes on."""
         config, log = driver.config, self._log
         self._due = SaveDue(config.checkpoint_every)
         if config.resume is None:
-            where = {"output": str(log.directory), "num_processes": num_processes}
-            settings = dataclasses.asdict(config) | where
+            settings = dataclasses.asdict(config) | {"output": str(log.directory)}
             del settings["resume"]
             log.begin(settings)
             self._sinks = open_sinks(config, log.directory, None)

@@ -1,6 +1,5 @@
 """What a run will do, how long that takes about, and how much memory it needs."""
 
-import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -78,19 +77,17 @@ class Plan(NamedTuple):
         return f"training takes about {duration(seconds)} in all, not {said} as was said"
 
 
-def make_plan(ready: "Ready", config: Config, num_processes: int = 1) -> Plan:
+def make_plan(ready: "Ready", config: Config) -> Plan:
     """Returns the plan of a run on this machine.
 
     Args:
       ready: the run, a ``ready.Ready``.
       config: its settings.
-      num_processes: that share its seeds.
 
     Raises:
       ValueError: the run does not fit into the memory that is here.
     """
     what = _what(config)
-    config = dataclasses.replace(config, num_seeds=-(-config.num_seeds // num_processes))
     task, machine = task_of(ready.policy, ready.horizon, config), this_hardware()
     division = ready.programs.division
     if not machine.shared:
@@ -112,7 +109,7 @@ def make_plan(ready: "Ready", config: Config, num_processes: int = 1) -> Plan:
         if not bounded and useful_part(task, speed) < 1:
             time += ", more if some seeds' episodes stay short, since all wait for the last"
     memory = gigabytes(base + needed(config, task))
-    where = _where(machine, num_processes, division)
+    where = _where(machine, division)
     text = (
         f"Training {what} on {where}, with the engine {ready.engine}: "
         f"{ready.why}. {time}. It needs about {memory} of memory.{_idle(machine, division)}"
@@ -140,8 +137,8 @@ def run_seconds(config: Config, task: Task, machine: Hardware, speed: Speed) -> 
     return (seconds + steps * beyond / rate) / machine.faster, bounded
 
 
-def _where(machine: Hardware, num_processes: int, division: "Division") -> str:
-    """Returns on what a run trains: these devices of each process."""
+def _where(machine: Hardware, division: "Division") -> str:
+    """Returns on what a run trains."""
     import jax
 
     here, name = jax.local_device_count(), machine.name
@@ -151,7 +148,7 @@ def _where(machine: Hardware, num_processes: int, division: "Division") -> str:
         name = f"{division.count} devices {each}, which share the {what}"
     elif here > 1 and not machine.shared:
         name += f", the first of the {here} here (more would not make so few episodes faster),"
-    return name if num_processes == 1 else f"{num_processes} processes, each on {name}"
+    return name
 
 
 def _idle(machine: Hardware, division: "Division") -> str:

@@ -162,7 +162,7 @@ def run(
         files = None
         if config.output is not None:
             files = RunFiles(RunLog(config.output), ready.policy, display.say)
-            files.begin(driver, None, 1)
+            files.begin(driver, None)
             driver.observers.append(files)
         driver.observers += [Screen(display, plan.correction), Callbacks(observers)]
         display.start(seconds)

@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mjx_reinforce.hosts.processes import Processes
 from mjx_reinforce.learners import counts
 from mjx_reinforce.reports.curves import draw_learning_curve
 from mjx_reinforce.settings.config import Config
@@ -27,7 +26,6 @@ def compile_driver(
     config: Config,
     found: "Checkpoint | None" = None,
     say: Callable[[str], None] = lambda text: None,
-    processes: Processes | None = None,
     meanwhile: Callable[[], object] = lambda: None,
 ) -> tuple[Driver, float]:
     """Returns a run before its first update, and how long it took to compile, in seconds.
@@ -37,16 +35,10 @@ def compile_driver(
       config: its settings.
       found: the checkpoint from which it will go on, if any.
       say: shows a line to the user.
-      processes: that train it, of which this is the first; by default this one alone.
       meanwhile: begins other work in Python; called once the rest of the time is XLA's.
     """
     started = time.perf_counter()
-    share = slice(None) if processes is None else processes.share(config.num_seeds)
-    state, programs = compile_run(ready.programs, config, share, meanwhile)
-    if processes is not None and processes.count > 1:
-        from mjx_reinforce.hosts.shares import lead
-
-        state, programs = lead(processes, programs, state, config.num_seeds)
+    state, programs = compile_run(ready.programs, config, meanwhile)
     seconds = ready.engine_seconds + time.perf_counter() - started
     if config.init_from is not None and found is None:
         state = begin_with(state, last_actors(config, ready.policy))

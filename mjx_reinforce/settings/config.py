@@ -54,6 +54,11 @@ class Config(
         return f"Config({changed_fields(self)})"
 
     @property
+    def first_seed(self) -> int:
+        """The number of the first seed."""
+        return 0 if self.seeds is None else read_seeds(self.seeds).start
+
+    @property
     def episodes_per_update(self) -> int:
         """Episodes that a seed plays for an update."""
         return 2 * self.num_directions if self.algorithm == "ars" else self.num_episodes
@@ -83,6 +88,15 @@ class Config(
         if self.env_steps is not None:
             bounds.append(-(-self.env_steps // self.episodes_per_update))
         return min(self.eval_every, max(_ALWAYS_ROOM, min(bounds)))
+
+
+def read_seeds(text: str) -> range:
+    """Returns the numbers of seeds that --seeds names, or raises ValueError."""
+    first, _, end = text.partition(":")
+    numbers = [int(x) if x.isascii() and x.isdigit() else -1 for x in (first, end)]
+    if not 0 <= numbers[0] < numbers[1] <= MAX_OF_UPDATE:
+        raise ValueError(f"--seeds must be FIRST:END, such as 64:128 for 64 seeds, got {text!r}")
+    return range(*numbers)
 
 
 @functools.cache
@@ -117,6 +131,11 @@ def check_each(config: Config) -> None:
     """Raises ValueError for a setting that makes no sense whatever the others are."""
     for field in dataclasses.fields(Config):
         check_type(flag(field.name), getattr(config, field.name), field.type)
+    if config.seeds is not None and len(read_seeds(config.seeds)) != config.num_seeds:
+        raise ValueError(
+            f"--seeds {config.seeds} names {len(read_seeds(config.seeds))} seeds, and num_seeds is "
+            f"{config.num_seeds}: make them agree"
+        )
     envs.check_id(config.env)
     split_words(config.env_set)
     if config.algorithm not in ALGORITHMS and not is_own(config.algorithm):

@@ -107,6 +107,11 @@ class RunSettings:
     out changes of the parameters; its settings are in the group "search". Or module:name."""
     num_seeds: int = setting(4, Range.AT_LEAST_1, once="every configuration has as many seeds")
     """Number of independent seeds, trained together in one compiled program."""
+    seeds: str | None = setting(
+        None, Mark.NOT_COMPILED, once="every configuration has the same seeds"
+    )
+    """FIRST:END, the seeds FIRST to END - 1 in place of --num-seeds: a share of a larger run, for
+    one of several machines. `report A B` joins shares."""
     seed: int = setting(
         0,
         Range.SEED,

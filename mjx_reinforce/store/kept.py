@@ -39,8 +39,8 @@ from mjx_reinforce.types import PyTree, is_key, plain
 _PROGRAMS = ("begin", "advance", "evaluate")
 
 
-def key_of(config: Config, share: slice = slice(None)) -> str | None:
-    """Returns a name for all that the programs of a run depend on, for all seeds or a share.
+def key_of(config: Config) -> str | None:
+    """Returns a name for all that the programs of a run depend on.
 
     None where nothing is kept: on what is neither a CPU nor a GPU, of code or a model of the
     user's, and where JAX is to look for NaNs or kernels are to be described, neither of which is
@@ -61,7 +61,6 @@ def key_of(config: Config, share: slice = slice(None)) -> str | None:
     settings = {k: v for k, v in recordable(config).items() if k not in inputs}
     known = {
         "settings": settings | {"block": config.block_length},
-        "share": (share.start, share.stop),
         "sources": objects.source_digest("mjx_reinforce"),
         "made_by": made_by,
         "numpy": version("numpy"),

@@ -34,25 +34,22 @@ class Ready(NamedTuple):
     programs: Programs
 
 
-def get_ready(
-    config: Config, default: Config, env: Environment | None = None, share: slice = slice(None)
-) -> Ready:
+def get_ready(config: Config, default: Config, env: Environment | None = None) -> Ready:
     """Returns what the settings come to; from disk, if they did before.
 
     Args:
       config: the settings.
       default: those that hold where the user gave none.
       env: the environment; by default the one that the settings name, built if it is needed.
-      share: which of the seeds are trained here, see ``shares``.
 
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    key = kept.key_of(config, share)
-    ready = None if key is None else _found(key, config, share)
+    key = kept.key_of(config)
+    ready = None if key is None else _found(key, config)
     if ready is None:
         built = envs.make_set(config.env, config.env_set) if env is None else env
-        ready = made(built, config, share)
+        ready = made(built, config)
         if key is not None:
             facts = ready._asdict()
             del facts["programs"], facts["engine_seconds"]
@@ -62,45 +59,39 @@ def get_ready(
     return ready
 
 
-def _found(key: str, config: Config, share: slice) -> Ready | None:
+def _found(key: str, config: Config) -> Ready | None:
     """Returns what is on disk of the settings; None if nothing is."""
     found = kept.read_programs(key)
     if found is None and config.resume is not None:
         # A run that is resumed has its time limit from config.json, also one that was not given.
-        first = kept.key_of(dataclasses.replace(config, horizon=None), share)
+        first = kept.key_of(dataclasses.replace(config, horizon=None))
         found = None if first is None else kept.read_programs(first)
         if found is not None and found[0]["horizon"] != config.horizon:
             return None
     if found is None:
         return None
     facts, programs = found
-    programs = programs._replace(division=_division(config, share))
+    programs = programs._replace(division=divide_run(config))
     check_step_count(config, facts["horizon"])
     return Ready(**facts, engine_seconds=0.0, programs=programs)
 
 
-def made(
-    env: Environment,
-    config: Config,
-    share: slice = slice(None),
-    division: Division | None = None,
-) -> Ready:
-    """Returns what the settings come to in an environment, for all seeds or a share of them.
+def made(env: Environment, config: Config, division: Division | None = None) -> Ready:
+    """Returns what the settings come to in an environment.
 
     Args:
       env: what is trained on.
       config: the settings.
-      share: of the seeds.
       division: among which devices they are divided; by default as ``divide_run`` says.
 
     Raises:
       ValueError: the settings do not fit the environment.
     """
     if division is None:
-        division = _division(config, share)
+        division = divide_run(config)
     devices = division.devices() if division.episodes > 1 else None
     learner, horizon = build(env, config, devices=devices)
-    width = division.width(_num_seeds(config, share))
+    width = division.width(config.num_seeds)
     threshold = getattr(env, "reward_threshold", None)
     return Ready(
         horizon=horizon,
@@ -111,11 +102,3 @@ def made(
         engine_seconds=learner.engine.seconds,
         programs=programs_of(env, lambda _: learner, horizon, config, width, division=division),
     )
-
-
-def _division(config: Config, share: slice) -> Division:
-    return divide_run(config, _num_seeds(config, share))
-
-
-def _num_seeds(config: Config, share: slice) -> int:
-    return len(range(config.num_seeds)[share])

@@ -51,6 +51,7 @@ def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
     size = -(-total // num_chunks)
     runs = np.arange(total)
     seed, place = np.divmod(runs, len(group.members))
+    seed += group.config.first_seed
     return [
         Runs(f"{name}-{i:04d}", place[part], group.members[place[part]], seed[part])
         for i, part in enumerate(runs[start : start + size] for start in range(0, total, size))

@@ -9,7 +9,6 @@ from pathlib import Path
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, silence_alarms
-from mjx_reinforce.hosts.processes import ProcessSettings
 from mjx_reinforce.runs.command_line import (
     check_resumed,
     join_groups,
@@ -51,7 +50,7 @@ def parse_design(arguments: Sequence[str]) -> Design:
       ValueError: see ``runs.command_line.parse`` and ``grid.read_over``.
     """
     default, preset, flags, prog = start(arguments, command("sweep"))
-    base, settings, processes = _read_flags(flags, default, prog)
+    base, settings = _read_flags(flags, default, prog)
     if base.resume is None:
         return Design(
             base=base,
@@ -61,31 +60,28 @@ def parse_design(arguments: Sequence[str]) -> Design:
             budget=settings.budget,
             exact=settings.exact,
             chunk_runs=settings.chunk_runs,
-            processes=processes,
         )
     if preset is not None:
         raise ValueError(f"--resume has the sweep's own settings: leave the preset {preset} out")
     return _resumed(flags, base.resume, prog)
 
 
-def _read_flags(
-    flags: Sequence[str], default: Config, prog: str
-) -> tuple[Config, SweepSettings, ProcessSettings]:
-    """Returns the settings of the runs, of the sweep, and of its processes; --help exits."""
-    groups = {"sweep": SweepSettings, "hosts": ProcessSettings, **GROUPS}
+def _read_flags(flags: Sequence[str], default: Config, prog: str) -> tuple[Config, SweepSettings]:
+    """Returns the settings of the runs and of the sweep; --help exits."""
+    groups = {"sweep": SweepSettings, **GROUPS}
     parsed = read_groups(groups, flags, default, prog, _ABOUT_SWEEPS, _MAIN)
-    settings, processes = parsed.pop("sweep"), parsed.pop("hosts")
-    return join_groups(parsed), settings, processes
+    settings = parsed.pop("sweep")
+    return join_groups(parsed, flags), settings
 
 
 def _resumed(flags: Sequence[str], directory: Path, prog: str) -> Design:
     """Returns the sweep in a directory; raises ValueError if flags would change it."""
     design = read_design(directory)
-    base, settings, processes = _read_flags(flags, design.base, prog)
+    base, settings = _read_flags(flags, design.base, prog)
     if dataclasses.replace(base, resume=None) != design.base or settings != SweepSettings():
         raise ValueError(f"the sweep in {directory} goes on as it is: give --resume alone")
     check_resumed(base, flags, directory)
-    return dataclasses.replace(design, processes=processes, resume=directory)
+    return dataclasses.replace(design, resume=directory)
 
 
 def main() -> None:

@@ -3,26 +3,22 @@
 import dataclasses
 import functools
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from mjx_reinforce.console.interrupt import Interrupt
-from mjx_reinforce.hosts.processes import Processes
-from mjx_reinforce.learners import counts
 from mjx_reinforce.reports.experiment import counted, say, setting_in_words
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.plan import duration, is_wrong
 from mjx_reinforce.settings.config import MAX_COUNT
-from mjx_reinforce.sweeps import chunks, results
+from mjx_reinforce.sweeps import chunks
 from mjx_reinforce.sweeps.ahead import Stopwatch, one_ahead
 from mjx_reinforce.sweeps.chunks import Runs, Saver
-from mjx_reinforce.sweeps.designs import rungs
 from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.designs.groups import Group, learner_builder
 from mjx_reinforce.sweeps.designs.plan import GroupPlan, Prepared, divide, group_seconds
-from mjx_reinforce.sweeps.designs.rungs import Rung
 from mjx_reinforce.sweeps.history import History
 from mjx_reinforce.sweeps.programs import SlotPrograms, compile_programs
 from mjx_reinforce.sweeps.results import SweepFiles
@@ -36,10 +32,10 @@ _NAMED = 6
 
 
 class Stage(NamedTuple):
-    """The runs of one group in one rung.
+    """The runs of one group.
 
     number: of the group in the sweep
-    group: its configurations and their budget
+    group: its configurations
     chunks: its runs
     """
 
@@ -52,10 +48,6 @@ class Stage(NamedTuple):
         """How many runs there are in its chunks."""
         return sum(len(runs.seed) for runs in self.chunks)
 
-    def of(self, runs: Sequence[Runs]) -> "Stage":
-        """Returns the stage with some of its chunks."""
-        return self._replace(chunks=list(runs))
-
 
 class Conductor:
     """Trains the chunks that have not ended yet; a file that cannot be written is an OSError."""
@@ -64,7 +56,6 @@ class Conductor:
         self,
         prepared: Prepared,
         design: Design,
-        processes: Processes,
         files: SweepFiles,
         display: Display,
         interrupt: Interrupt | None,
@@ -75,48 +66,25 @@ class Conductor:
         Args:
           prepared: its parts.
           design: what it is to do.
-          processes: that share its chunks.
           files: of the sweep.
           display: its screen.
           interrupt: what listens to signals, if anything does.
           ready: is called once, when the first program has been compiled, with how long that
             took (s), or when there is nothing to compile.
         """
-        self._prepared, self._design, self._processes = prepared, design, processes
+        self._prepared, self._design = prepared, design
         self._files, self._display = files, display
         self._interrupt = interrupt
         self._ready: Callable[[float], None] | None = ready
-        self._num_rungs = rungs.num_rungs(design.search, len(prepared.configurations))
-        self._rungs_done, self._total, self._done = 0, 0.0, 0.0
-        self._before: list[Stage] = []
-        self._compiled: dict[int, SlotPrograms] = {}
+        self._total, self._done = 0.0, 0.0
         self.clock = Stopwatch()
 
     def conduct(self) -> bool:
-        """Trains all rungs; returns whether they ended, or were interrupted."""
-        groups, search = self._prepared.groups, self._design.search
-        for rung in rungs.plan_rungs(groups, search, self._files.measured):
-            if not self._train_rung(rung):
-                return False
-            if not self._processes.meet():
-                return False
-            self._rungs_done += 1
-        return True
-
-    def _begin_files(self, seconds: float) -> None:
-        """Calls ``ready``, once."""
-        ready, self._ready = self._ready, None
-        if ready is not None:
-            ready(seconds)
-
-    def _train_rung(self, rung: Rung) -> bool:
-        """Trains the chunks of a rung that are this process's; returns whether they ended."""
-        every = self._stages(rung)
-        stages = self._left(every)
-        said = {stage.number: self._seconds(rung, stage) for stage in stages}
+        """Trains all groups; returns whether they ended, or were interrupted."""
+        stages = self._stages()
+        said = {stage.number: self._seconds(stage) for stage in stages}
         each = {number: 1.0 if seconds is None else seconds for number, seconds in said.items()}
         self._total = sum(each[stage.number] * stage.num_runs for stage in stages)
-        self._done = 0.0
         programs = one_ahead([functools.partial(self._compile, stage) for stage in stages])
         for stage in stages:
             began = time.perf_counter()
@@ -127,18 +95,23 @@ class Conductor:
             before = self.clock.running
             for runs in stage.chunks:
                 began, waited = time.perf_counter(), self.clock.compiling
-                ended = self._train(rung, stage, compiled, runs, each[stage.number])
+                ended = self._train(stage, compiled, runs, each[stage.number])
                 waited = self.clock.compiling - waited
                 self.clock.running += time.perf_counter() - began - waited
                 if not ended:
                     return False
                 self._done += each[stage.number] * len(runs.seed)
             self._correct(said[stage.number], stage.num_runs, self.clock.running - before)
-        self._begin_files(0.0)  # where this process had nothing to do
-        self._before = every
+        self._begin_files(0.0)  # where nothing was left to do
         return True
 
-    def _seconds(self, rung: Rung, stage: Stage) -> float | None:
+    def _begin_files(self, seconds: float) -> None:
+        """Calls ``ready``, once."""
+        ready, self._ready = self._ready, None
+        if ready is not None:
+            ready(seconds)
+
+    def _seconds(self, stage: Stage) -> float | None:
         """Returns about how long a run of a stage takes (s), None where that is not known."""
         prepared, group = self._prepared, stage.group
         env = prepared.envs[stage.number]
@@ -146,7 +119,7 @@ class Conductor:
             env, prepared.horizons[stage.number], prepared.engine, group, prepared.devices.count
         )
         runs = len(group.members) * group.config.num_seeds
-        return None if seconds is None else rung.added * seconds / runs
+        return None if seconds is None else seconds / runs
 
     def _correct(self, said: float | None, num_runs: int, took: float) -> None:
         """Says what the rest takes, if the runs that ended took quite another time than was said.
@@ -163,52 +136,36 @@ class Conductor:
             "yellow",
         )
 
-    def _stages(self, rung: Rung) -> list[Stage]:
-        """Returns all runs of a rung."""
+    def _stages(self) -> list[Stage]:
+        """Returns the runs that are still to be trained."""
         made = []
-        for number, group in rung.groups.items():
-            name, count = f"{rung.name}-{number:03d}", self._divide(number, group).num_chunks
-            made.append(Stage(number, group, chunks.split_runs(group, name, count)))
-        return made
+        for number, group in enumerate(self._prepared.groups):
+            parts = chunks.split_runs(group, f"{number:03d}", self._divide(number).num_chunks)
+            left = [runs for runs in parts if not self._files.has(runs.name)]
+            made.append(Stage(number, group, left))
+        return [stage for stage in made if stage.chunks]
 
-    def _divide(self, number: int, group: Group) -> GroupPlan:
-        """Returns how the runs of a group in some rung are divided."""
-        limit, devices = self._prepared.limits[number], self._prepared.devices.count
-        return divide(group, limit, devices, exact=self._design.exact)
-
-    def _left(self, stages: Sequence[Stage]) -> list[Stage]:
-        """Returns what is still to be trained by this process."""
-        index, count = self._processes.index, self._processes.count
-        every = [runs.name for stage in stages for runs in stage.chunks]
-        mine = {
-            name for i, name in enumerate(every) if i % count == index and not self._files.has(name)
-        }
-        left = [stage.of([runs for runs in stage.chunks if runs.name in mine]) for stage in stages]
-        return [stage for stage in left if stage.chunks]
+    def _divide(self, number: int) -> GroupPlan:
+        """Returns how the runs of a group are divided."""
+        prepared = self._prepared
+        group, limit, devices = prepared.groups[number], prepared.limits[number], prepared.devices
+        return divide(group, limit, devices.count, exact=self._design.exact)
 
     def _compile(self, stage: Stage) -> SlotPrograms:
-        """Returns the programs of a group, which are those of its runs in the first rung."""
-        if stage.number not in self._compiled:
-            number = stage.number
-            env, whole = self._prepared.envs[number], self._prepared.groups[number]
-            programs = compile_programs(
-                env,
-                learner_builder(env, whole.config),
-                self._prepared.horizons[number],
-                whole.config,
-                tuple(whole.settings),
-                self._divide(stage.number, whole).widths,
-                self._prepared.devices,
-                self.clock,
-            )
-            if self._num_rungs == 1:
-                return programs
-            self._compiled[stage.number] = programs
-        return self._compiled[stage.number].of(stage.group.config)
+        """Returns the programs of a group."""
+        env, config = self._prepared.envs[stage.number], stage.group.config
+        return compile_programs(
+            env,
+            learner_builder(env, config),
+            self._prepared.horizons[stage.number],
+            config,
+            tuple(stage.group.settings),
+            self._divide(stage.number).widths,
+            self._prepared.devices,
+            self.clock,
+        )
 
-    def _train(
-        self, rung: Rung, stage: Stage, programs: SlotPrograms, runs: Runs, each: float
-    ) -> bool:
+    def _train(self, stage: Stage, programs: SlotPrograms, runs: Runs, each: float) -> bool:
         """Trains a chunk, from its last checkpoint if there is one; returns whether it ended.
 
         ``each`` is what a run of it takes, as ``_part_done`` counts.
@@ -218,7 +175,7 @@ class Conductor:
         saver = Saver(self._files.checkpoints(runs.name), config, layout, self._display.say)
         states = saver.find(layout.shapes(len(runs.seed)), history)
         if states is None:
-            states = self._begin(rung, stage, programs, runs, history)
+            states = chunks.initial_states(programs, stage.group, runs)
         self._display.say(self._heading(runs))
 
         def show() -> None:
@@ -230,13 +187,9 @@ class Conductor:
         if not drive(chunk, self._interrupted):
             saver.save(states, history)
             return False
-        keep = self._design.search == "halving"
-        if keep:  # for the next rung
-            saver.save(states, history)
         self._files.keep_policies(runs, history, layout.states(states).train_states.actor)
         self._files.add(runs, history)
-        if not keep:
-            saver.remove()
+        saver.remove()
         return True
 
     def _heading(self, runs: Runs) -> str:
@@ -255,20 +208,6 @@ class Conductor:
     def _interrupted(self) -> bool:
         return self._interrupt is not None and self._interrupt.number is not None
 
-    def _begin(
-        self, rung: Rung, stage: Stage, programs: SlotPrograms, runs: Runs, history: History
-    ) -> np.ndarray:
-        """Returns the first states of a chunk: new ones, or those at the end of a rung before."""
-        if rung.before is None:
-            return chunks.initial_states(programs, stage.group, runs)
-        before = next(old for old in self._before if old.number == stage.number)
-        shapes = programs.layout.shapes
-        states = results.last_states(self._files, before.chunks, shapes, self._display.say)
-        states = results.select_runs(states, before.chunks, runs)
-        history.now["updates"] = counts.to_int(states.train_states.num_updates)
-        history.now["env_steps"] = counts.to_int(states.train_states.env_steps)
-        return programs.layout.rows(states)
-
     def _part_done(self, more: float = 0.0) -> float:
         """Returns the part of the whole sweep that is done.
 
@@ -278,8 +217,7 @@ class Conductor:
         Args:
           more: what of the present chunk is done.
         """
-        rung = (self._done + more) / self._total if self._total else 0.0
-        return (self._rungs_done + rung) / self._num_rungs
+        return (self._done + more) / self._total if self._total else 0.0
 
     def _progress(self, history: History, each: float) -> Progress:
         """Returns how far the chunk is, or the whole sweep where that differs."""

@@ -11,11 +11,9 @@ from mjx_reinforce.console.heartbeat import heartbeat, to_screen
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.files import read_json, write_json
-from mjx_reinforce.hosts.processes import Processes, joined
 from mjx_reinforce.runs.directory import choose_directory, locked, make_directory
 from mjx_reinforce.settings.own_code import code_flags
-from mjx_reinforce.store.provenance import versions
-from mjx_reinforce.sweeps.designs.design import Design, as_record, check_design, flat
+from mjx_reinforce.sweeps.designs.design import Design, as_record, check_design
 from mjx_reinforce.training.resume import check_same_program
 
 if TYPE_CHECKING:
@@ -60,15 +58,11 @@ def perform(
         _finish_again(directory, known)
         return directory, True
     with contextlib.ExitStack() as held:
-        common = {**flat(design), **versions()}
-        processes = held.enter_context(joined(design.processes, interrupt, common))
-        if processes.index == 0:
-            new = make_directory(directory, design.base.overwrite) if design.resume is None else []
-            held.enter_context(locked(directory))  # a folder in which another trains stays
-            made += new
+        new = make_directory(directory, design.base.overwrite) if design.resume is None else []
+        held.enter_context(locked(directory))  # a folder in which another trains stays
+        made += new
         configure_jax()
-        going = _perform(design, directory, known, processes, interrupt, report, quiet)
-        return directory, going
+        return directory, _perform(design, directory, known, interrupt, report, quiet)
 
 
 def _finish_again(directory: Path, known: Mapping[str, Any]) -> None:
@@ -84,7 +78,6 @@ def _perform(
     design: Design,
     directory: Path,
     known: Mapping[str, Any],
-    processes: Processes,
     interrupt: Interrupt | None,
     report: bool,
     quiet: bool,
@@ -96,15 +89,14 @@ def _perform(
     from mjx_reinforce.sweeps.results import SweepFiles
 
     with heartbeat((lambda text: None) if quiet else to_screen, None, "writing the simulation out"):
-        prepared = prepare_sweep(design, known.get("chunk_runs"), processes.count)
+        prepared = prepare_sweep(design, known.get("chunk_runs"))
     contents = _contents(design, prepared, known)
     if known:
         _check_same_sweep(directory, known, contents)
     configurations, threshold = prepared.configurations, contents["threshold"]
-    first = processes.index == 0
-    files = SweepFiles(directory, configurations, threshold, going_on=bool(known), first=first)
+    files = SweepFiles(directory, configurations, threshold, going_on=bool(known))
     with Display() as display, contextlib.ExitStack() as compiling:
-        display.console.quiet = quiet or not first
+        display.console.quiet = quiet
         display.say(prepared.plan)
         compiling.enter_context(display.compiling(None))
 
@@ -114,35 +106,30 @@ def _perform(
             display.start(seconds)
             if interrupt is not None:
                 interrupt.defer(display.say)
-            if first:
-                files.open(contents)
-            processes.meet()
+            files.open(contents)
 
         if interrupt is not None:
             interrupt.restore_screen(display.console.show_cursor)
-        conductor = Conductor(prepared, design, processes, files, display, interrupt, ready)
+        conductor = Conductor(prepared, design, files, display, interrupt, ready)
         conductor.clock.compiling += prepared.engine_seconds
         ended = conductor.conduct()
-        if not ended and interrupt is not None and interrupt.number is not None:
-            processes.stop(interrupt.number)
         contents |= {
             "status": "finished" if ended else "interrupted",
             "compile_seconds": contents["compile_seconds"] + conductor.clock.compiling,
             "run_seconds": contents["run_seconds"] + conductor.clock.running,
         }
-        if first:
-            _finish(design, prepared, files, contents)
-            written = None
-            if ended and report:
-                display.say("writing the report")
-                written = _report(directory)
-                contents["statistics_seconds"] = written.seconds
-                files.write(contents)
-                for sentence in written.answer:
-                    display.say(sentence.translate(_PLAIN_QUOTES))
-            display.say(_last_line(directory, contents))
-            if written is not None:
-                display.show_commands(_watch(directory, written.best, vars(design.base)))
+        _finish(design, prepared, files, contents)
+        written = None
+        if ended and report:
+            display.say("writing the report")
+            written = _report(directory)
+            contents["statistics_seconds"] = written.seconds
+            files.write(contents)
+            for sentence in written.answer:
+                display.say(sentence.translate(_PLAIN_QUOTES))
+        display.say(_last_line(directory, contents))
+        if written is not None:
+            display.show_commands(_watch(directory, written.best, vars(design.base)))
     return ended
 
 
@@ -152,7 +139,6 @@ def _finish(
     """Writes the last files of a sweep, or those of one that was interrupted."""
     from mjx_reinforce.store.build import policy_settings
     from mjx_reinforce.sweeps.designs.grid import configure
-    from mjx_reinforce.sweeps.designs.rungs import winner
 
     def settings(number: int) -> tuple[dict[str, Any], dict[str, Any]]:
         [config] = configure(design.base, [prepared.configurations[number]])
@@ -164,8 +150,6 @@ def _finish(
 
     files.finish()
     if contents["status"] == "finished":
-        if design.search != "grid":
-            contents["winner"] = winner(files.measured)
         files.gather_policies(settings)
         files.remove_states()
     files.write(contents)

@@ -48,15 +48,10 @@ def gather(
         beside its seeds.
     """
     shutil.rmtree(directory / "policies", ignore_errors=True)
-    rungs: dict[int, list[Arrays]] = {}
-    for path in parts.glob("policies-[0-9]*.npz"):
-        rungs.setdefault(int(path.stem.split("-")[1]), []).append(read_arrays(path))
-    kept: dict[int, Arrays] = {}
-    for rung in sorted(rungs):  # a later one has what the earlier went on to
-        for number in np.unique(np.concatenate([part["configuration"] for part in rungs[rung]])):
-            kept[int(number)] = _ends(_parts_of(rungs[rung], number))
-    for number, arrays in kept.items():
-        _write_policies(directory / "policies" / f"{number:03d}", arrays, *settings(number))
+    kept = [read_arrays(path) for path in sorted(parts.glob("policies-[0-9]*.npz"))]
+    for number in np.unique(np.concatenate([part["configuration"] for part in kept])).tolist():
+        place = directory / "policies" / f"{number:03d}"
+        _write_policies(place, _ends(_parts_of(kept, number)), *settings(number))
 
 
 def _write_policies(

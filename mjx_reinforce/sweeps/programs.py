@@ -50,8 +50,7 @@ class SlotPrograms(NamedTuple):
       states [W, B], where W is the greatest width
     slots: by their width, the widest first; the narrower ones may still be compiling
     rides: as ``Programs.rides``
-    config: the settings of what is to do now
-    whole: the settings of all that a run is to do, in one or more parts
+    config: the settings of the group
     limits: the budget of each run, on all devices
     devices: among which a slot is divided
     layout: of the bytes of states
@@ -62,15 +61,10 @@ class SlotPrograms(NamedTuple):
     slots: dict[int, "Future[Slot]"]
     rides: bool
     config: Config
-    whole: Config
     limits: Budget
     devices: Devices
     layout: StateRows
     clock: Stopwatch
-
-    def of(self, config: Config) -> "SlotPrograms":
-        """Returns the same programs for settings with a part of the budget, or another seed."""
-        return self._replace(config=config, limits=_limits(config, self.whole, self.devices))
 
     def begin(self, numbers: np.ndarray, settings: Arrays) -> np.ndarray:
         """Returns the first states [R, B] of runs, from the numbers [R] of their seeds.
@@ -192,17 +186,10 @@ def compile_programs(
     slots = {width: started(functools.partial(compile_for, width)) for width in widths}
     first = started(functools.partial(_compile_first, programs, layout, devices, widest))
     slots[widest].result()
-    limits = _limits(config, config, devices)
+    limits = devices.put(budget_of(config), NONE)
     return SlotPrograms(
-        first.result(), slots, programs.rides, config, config, limits, devices, layout, clock
+        first.result(), slots, programs.rides, config, limits, devices, layout, clock
     )
-
-
-def _limits(config: Config, whole: Config, devices: Devices) -> Budget:
-    """Returns the budget of a part of what runs are to do, on all devices."""
-    part, all_of_it = budget_of(config), budget_of(whole)
-    budget = part._replace(all_env_steps=all_of_it.env_steps, all_updates=all_of_it.updates)
-    return devices.put(budget, NONE)
 
 
 def _compile_first(

@@ -2,8 +2,6 @@
 
 A part is what one chunk of runs measured. It is written whole, when the chunk ends, and is all that
 results.csv and curves.npz are made of: all else that a crash leaves is written again.
-
-Runs that go on with another budget begin with the last states of the chunks that they were in.
 """
 
 import shutil
@@ -11,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 
 from mjx_reinforce import files
@@ -22,7 +19,6 @@ from mjx_reinforce.sweeps import policies
 from mjx_reinforce.sweeps.chunks import Runs
 from mjx_reinforce.sweeps.history import History
 from mjx_reinforce.training import checkpoint
-from mjx_reinforce.training.state import RunState
 
 _MEASURED = (
     *("seed", "final_return", "best_return", "env_steps_to_solve"),
@@ -41,7 +37,6 @@ class SweepFiles:
         threshold: float | None,
         *,
         going_on: bool,
-        first: bool,
     ):
         """Takes what the rows of results.csv are made of.
 
@@ -50,9 +45,7 @@ class SweepFiles:
           configurations: the values of what is swept, in each.
           threshold: the return that counts as solved, if any.
           going_on: whether what is in the directory is of this sweep.
-          first: whether this is the process that writes more than parts.
         """
-        self._first = first
         self._going_on = going_on
         self.directory, self.parts = directory, directory / "parts"
         self._configurations = [_spelled(values) for values in configurations]
@@ -118,8 +111,7 @@ class SweepFiles:
             "nonfinite": history.now["nonfinite"].astype(np.int32),
         }
         write_arrays(self._path(runs.name), part)
-        if self._first and runs.name.startswith("0-"):  # other rungs continue rows that are there
-            files.append_csv(self.directory / "results.csv", self._columns, self._rows(part))
+        files.append_csv(self.directory / "results.csv", self._columns, self._rows(part))
 
     def finish(self) -> None:
         """Joins the parts so far to results.csv and curves.npz, sorted by configuration."""
@@ -141,20 +133,13 @@ class SweepFiles:
         for folder in self.parts.glob("*/"):
             checkpoint.remove_checkpoints(folder)
 
-    def measured(self, rung: str) -> Arrays:
-        """Returns what the chunks of a rung measured so far, sorted; empty if nothing."""
-        paths = sorted(self.parts.glob(f"{rung}-*.npz"))
-        return join_parts([read_arrays(path, stored=True) for path in paths]) if paths else {}
-
     def _path(self, chunk: str) -> Path:
         return self.parts / f"{chunk}.npz"
 
     def _all(self) -> Arrays:
-        """Returns what all chunks measured so far, without those of fresh seeds."""
-        rungs = []
-        while measured := self.measured(str(len(rungs))):
-            rungs.append(measured)
-        return follow(rungs) if rungs else {}
+        """Returns what all chunks measured so far, sorted; empty if nothing."""
+        paths = sorted(self.parts.glob("[0-9]*.npz"))
+        return join_parts([read_arrays(path, stored=True) for path in paths]) if paths else {}
 
     def _write_rows(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Replaces results.csv at once."""
@@ -192,31 +177,6 @@ def join_parts(parts: Sequence[Arrays]) -> Arrays:
     return {name: x[..., order] for name, x in joined.items()}
 
 
-def follow(rungs: Sequence[Arrays]) -> Arrays:
-    """Returns the measurements of runs that went on from rung to rung; others repeat their last.
-
-    Args:
-      rungs: from ``join_parts``; each of runs that were in the one before, beginning with its last
-        evaluation once more.
-    """
-    joined = rungs[0]
-    runs = list(zip(joined["configuration"].tolist(), joined["seed"].tolist(), strict=True))
-    places = {run: i for i, run in enumerate(runs)}
-    for rung in rungs[1:]:
-        index = [
-            places[run]
-            for run in zip(rung["configuration"].tolist(), rung["seed"].tolist(), strict=True)
-        ]
-        for name in ("eval_return", "env_steps"):
-            later = np.repeat(joined[name][-1:], len(rung[name]) - 1, axis=0)
-            later[:, index] = rung[name][1:]
-            joined = joined | {name: np.concatenate([joined[name], later])}
-        nonfinite = joined["nonfinite"].copy()
-        nonfinite[index] += rung["nonfinite"]
-        joined = joined | {"nonfinite": nonfinite}
-    return joined
-
-
 def _fill(curves: np.ndarray, length: int) -> np.ndarray:
     """Returns curves [E, R] with the last row repeated up to ``length``."""
     return np.concatenate([curves, np.repeat(curves[-1:], length - len(curves), axis=0)])
@@ -232,44 +192,3 @@ def _spelled(values: Mapping[str, Any]) -> dict[str, Any]:
         else x
         for name, x in values.items()
     }
-
-
-def last_states(
-    files: SweepFiles,
-    chunks: Sequence[Runs],
-    shape_of: Callable[[int], RunState],
-    say: Callable[[str], None],
-) -> RunState:
-    """Returns the last states of the runs of several chunks, side by side.
-
-    Args:
-      files: of the sweep.
-      chunks: which ended, and were kept.
-      shape_of: the shapes of the states of so many runs.
-      say: shows a line about a damaged file.
-
-    Raises:
-      ValueError: the states of a chunk are not there.
-    """
-    states = []
-    for runs in chunks:
-        folder = files.checkpoints(runs.name)
-        found = next(checkpoint.read_checkpoints(folder, shape_of(len(runs.seed)), say), None)
-        if found is None:
-            raise ValueError(f"the last states in {folder} are damaged; start another sweep")
-        states.append(jax.device_get(found.state))
-    return jax.tree.map(lambda *xs: np.concatenate(xs), *states)
-
-
-def select_runs(states: RunState, of: Sequence[Runs], runs: Runs) -> RunState:
-    """Returns the states of some runs.
-
-    Args:
-      states: of the runs of the chunks ``of``, side by side.
-      of: these chunks.
-      runs: those that go on.
-    """
-    keys = [(c, s) for old in of for c, s in zip(old.configuration, old.seed, strict=True)]
-    place = {key: i for i, key in enumerate(keys)}
-    chosen = [place[key] for key in zip(runs.configuration, runs.seed, strict=True)]
-    return jax.tree.map(lambda x: x[chosen], states)

@@ -52,11 +52,11 @@ def block_of_updates(
         return ~(used | counts.reached(state.train_states.num_updates, budget.updates))
 
     def progress(state: RunState, budget: Budget) -> jax.Array:
-        """Returns the share [R] of its whole budget that each run has used."""
+        """Returns the share [R] of its budget that each run has used."""
         env_steps = counts.as_float(state.train_states.env_steps)
         updates = counts.as_float(state.train_states.num_updates)
         # No run goes on whose budget is nothing.
-        limits = (counts.as_float(x) for x in (budget.all_env_steps, budget.all_updates))
+        limits = (counts.as_float(x) for x in budget)
         one, other = (jnp.maximum(limit, 1.0) for limit in limits)
         return jnp.minimum(jnp.maximum(env_steps / one, updates / other), 1.0)
 

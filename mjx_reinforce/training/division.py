@@ -142,14 +142,13 @@ def _first(devices: Devices, num_seeds: int) -> Callable[[PyTree], Any]:
 ALONE = Division()
 
 
-def divide_run(config: Config, num_seeds: int) -> Division:
+def divide_run(config: Config) -> Division:
     """Returns how a run is divided among the devices of this process.
 
     Args:
       config: its settings.
-      num_seeds: S, how many of its seeds this process trains.
     """
-    here = jax.local_device_count()
+    here, num_seeds = jax.local_device_count(), config.num_seeds
     width = -(-num_seeds // here)
     by_seeds = Division(seeds=-(-num_seeds // width))
     if config.algorithm != "reinforce":

@@ -114,7 +114,7 @@ def programs_of(
     def begin(
         seed: Seed, eval_seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]
     ) -> tuple[RunState, jax.Array]:
-        keys = state.seed_keys(seed, config.num_seeds)[numbers]
+        keys = state.seed_keys(seed, numbers)
         states = RunState(
             train_states=jax.vmap(first)(keys, settings),
             eval_keys=state.eval_keys(eval_seed, numbers),
@@ -149,7 +149,6 @@ def compiling(pool: ThreadPoolExecutor, *programs: tuple[Any, Sequence[Any]]) ->
 def compile_run(
     programs: Programs,
     config: Config,
-    share: slice = slice(None),
     meanwhile: Callable[[], object] = lambda: None,
 ) -> tuple[RunState, RunPrograms]:
     """Returns the state before the first update, and the compiled programs of a run.
@@ -157,11 +156,10 @@ def compile_run(
     Args:
       programs: of the run.
       config: its settings.
-      share: which of its seeds they are for; all by default.
       meanwhile: begins other work in Python; called once the rest of the time is XLA's.
     """
-    numbers = np.arange(config.num_seeds, dtype=np.uint32)[share]
-    division, num_seeds = programs.division, len(numbers)
+    division, num_seeds = programs.division, config.num_seeds
+    numbers = config.first_seed + np.arange(num_seeds, dtype=np.uint32)
     place, view = division.place, functools.partial(division.view, num_seeds=num_seeds)
     like = division.shapes(programs.like, num_seeds)
 

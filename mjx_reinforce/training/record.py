@@ -154,6 +154,7 @@ class RunRecord:
         self._simulated += _sum(metrics["simulated_steps"])
         self._broken_in_a_row = progress.broken_in_a_row(self._broken_in_a_row, metrics)
         met = progress.nonfinite_updates(metrics, updates)
+        met["seed"] += self._config.first_seed
         self._tables["nonfinite"].append(met)
         self._remember(metrics | {"episode_return": returns})
         return met
@@ -182,7 +183,8 @@ class RunRecord:
         self._count(result)
         self.seconds = seconds
         return rows.of_evaluation(
-            result, self._last, self.updates, self.episodes, self.env_steps, seconds
+            *(result, self._last, self.updates, self.episodes, self.env_steps, seconds),
+            first_seed=self._config.first_seed,
         )
 
     def add_test(self, result: Arrays) -> None:

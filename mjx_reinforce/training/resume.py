@@ -22,11 +22,11 @@ PLACES = marked(Mark.PLACE)
 #: Entries of config.json on which every number of a run depends, besides its settings.
 _PROGRAM = (
     *("packages", "git_commit", "device", "cpu", "cores", "machine_code", "jax_settings"),
-    *("x64", "xla_flags", "num_processes"),
+    *("x64", "xla_flags"),
 )
 _DEVICES = "--xla_force_host_platform_device_count"
 #: Settings that files of version 0.1 lack; there the default held.
-_LATER = ("env_set",)
+_LATER = ("env_set", "seeds")
 _OTHER = "damaged, or of another version of the program; resume with the version that wrote it"
 
 
@@ -158,11 +158,6 @@ def check_same_program(
             changed = [key for key in {**old, **new} if old.get(key) != new.get(key)]
             if changed:
                 name, old, new = changed[0], old.get(changed[0]), new.get(changed[0])
-        if old != new and name == "num_processes":
-            raise ValueError(
-                f"{directory} was begun on {old or 1} processes, and here there are {new}; resume "
-                "it with --distributed on as many, wherever they are"
-            )
         if old != new:
             raise ValueError(
                 f"{directory} was begun with {name} {old}, and here it is {new}, so its numbers "

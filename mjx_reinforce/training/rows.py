@@ -38,6 +38,7 @@ def of_evaluation(
     episodes: np.ndarray,
     env_steps: np.ndarray,
     seconds: float,
+    first_seed: int = 0,
 ) -> Cells:
     """Returns the cells of all seeds; a return is NaN if one of its episodes was not finite.
 
@@ -49,10 +50,11 @@ def of_evaluation(
       episodes: [S] how many were played for them.
       env_steps: [S] and how many env steps.
       seconds: wall time since compilation ended.
+      first_seed: the number of the first seed.
     """
     num_seeds = len(updates)
     columns: dict[str, Sequence[str]] = {
-        "seed": _cells(np.arange(num_seeds)),
+        "seed": _cells(first_seed + np.arange(num_seeds)),
         "update": _cells(updates),
         "episodes": _cells(episodes),
         "env_steps": _cells(env_steps),

@@ -38,20 +38,15 @@ class Budget(NamedTuple):
 
     env_steps: [2] a count, see ``counts``; a run stops after the update that reaches it
     updates: [2] a count, how many updates it makes at most
-    all_env_steps: [2] how long schedules last; more than ``env_steps`` where a run goes on later
-    all_updates: [2] the same in updates
     """
 
     env_steps: counts.Count
     updates: counts.Count
-    all_env_steps: counts.Count
-    all_updates: counts.Count
 
     @classmethod
     def of(cls, env_steps: int | None, updates: int | None) -> "Budget":
         """Returns a budget, of which what has no limit has the greatest count."""
-        limits = [counts.from_int(MAX_COUNT if x is None else x) for x in (env_steps, updates)]
-        return cls(*limits, *limits)
+        return cls(*(counts.from_int(MAX_COUNT if x is None else x) for x in (env_steps, updates)))
 
 
 def budget_of(config: Config) -> Budget:
@@ -69,9 +64,9 @@ def restored(leaves: Sequence[jax.Array | np.ndarray], like: PyTree) -> Any:
     return with_keys(jax.tree.unflatten(jax.tree.structure(like), leaves), like)
 
 
-def seed_keys(seed: Seed, num_seeds: int) -> jax.Array:
-    """Returns the keys [S] that the seeds of a run begin with."""
-    return jax.random.split(_root_key(seed, domain=0), num_seeds)
+def seed_keys(seed: Seed, numbers: jax.Array | np.ndarray) -> jax.Array:
+    """Returns the keys [R] that the seeds numbered so begin with: those of ``jax.random.split``."""
+    return _for_each_seed(_root_key(seed, domain=0), numbers)
 
 
 def eval_keys(eval_seed: Seed, numbers: jax.Array | np.ndarray) -> jax.Array:
@@ -136,7 +131,7 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
                 f"the policies in {directory} have {name} {old}, and this run {value}; give "
                 f"{flag(name)} that value, or leave --init-from out"
             )
-    seeds = np.arange(config.num_seeds) % saved.num_seeds
+    seeds = (config.first_seed + np.arange(config.num_seeds)) % saved.num_seeds
     return jax.tree.map(lambda x: x[seeds], saved.actor)
 
 

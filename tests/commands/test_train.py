@@ -17,7 +17,7 @@ import pytest
 from places import HELPERS
 from toys import Survive
 
-from mjx_reinforce import load_policy
+from mjx_reinforce import load, load_policy
 from mjx_reinforce import train as train_module
 from mjx_reinforce.files import append_csv, create_csv
 from mjx_reinforce.policies import normalize
@@ -33,6 +33,28 @@ ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]
 def read(directory):
     with (directory / "metrics.csv").open(newline="") as file:
         return list(csv.DictReader(file)), json.loads((directory / "summary.json").read_text())
+
+
+def test_shares_are_parts_of_the_whole_run(run, tmp_path):
+    """Up to rounding; their seeds have the numbers of the whole run, also where one is loaded."""
+    assert run(*ARGUMENTS, "--output", "whole") == 0
+    common = [*ARGUMENTS[:2], *ARGUMENTS[4:]]
+    for seeds in ("0:1", "1:3"):
+        assert run(*common, "--seeds", seeds, "--output", f"share-{seeds[0]}") == 0
+    whole = read(tmp_path / "whole")[0]
+    for first, name in ((0, "share-0"), (1, "share-1")):
+        rows = read(tmp_path / name)[0]
+        assert {int(row["seed"]) for row in rows} == {0: {0}, 1: {1, 2}}[first]
+        for row in rows:
+            (same,) = (x for x in whole if all(x[k] == row[k] for k in ("seed", "update")))
+            assert row["env_steps"] == same["env_steps"]
+            np.testing.assert_allclose(float(row["eval_return"]), float(same["eval_return"]), 1e-4)
+    assert json.loads((tmp_path / "share-1" / "config.json").read_text())["seeds"] == "1:3"
+    assert load(tmp_path / "share-1", 2).seed == 2
+    with pytest.raises(ValueError, match="policies of the seeds 1 and 2, not 0"):
+        load(tmp_path / "share-1", 0)
+    assert run("--resume", "share-1", "--env-steps", "2500") == 0
+    assert {row["seed"] for row in read(tmp_path / "share-1")[0]} == {"1", "2"}
 
 
 def test_a_run_leaves_its_files(run, tmp_path):

@@ -10,7 +10,7 @@ ONE = {"learning_rate": [1e-3, 3e-3]}
 
 
 def make_measured_run(
-    directory, *, num_seeds=3, evaluations=4, offset=0.0, summary=None, **settings
+    directory, *, num_seeds=3, first=0, evaluations=4, offset=0.0, summary=None, **settings
 ):
     """Writes what a run leaves that a report reads: seed s returns 100 s + 10 e + offset."""
     directory.mkdir(parents=True)
@@ -23,7 +23,7 @@ def make_measured_run(
         writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
         writer.writeheader()
         for e in range(evaluations):
-            for s in range(num_seeds):
+            for s in range(first, first + num_seeds):
                 value = 100.0 * s + 10 * e + offset
                 writer.writerow({"seed": s, "env_steps": 50 * e, "eval_return": value})
     return directory

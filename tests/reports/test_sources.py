@@ -43,6 +43,62 @@ def test_runs_are_told_apart_by_what_differs(tmp_path):
     assert "learning_rate" not in found.settings
 
 
+def make_shares(folder, *, second=3, **changes):
+    first = make_measured_run(folder / "a", num_seeds=3, seeds="0:3")
+    settings = {"seeds": f"{second}:{second + 2}"} | changes
+    said = {"nonfinite": [{"seed": second, "update": 1}]}
+    made = {"num_seeds": 2, "first": second, "evaluations": 3, "summary": said}
+    return make_measured_run(folder / "b", **made, **settings), first
+
+
+def test_shares_of_a_run_are_one_run(tmp_path):
+    """Whichever is first; a seed that ended earlier repeats its last evaluation."""
+    shares = make_shares(tmp_path)
+    found = sources.read_experiment(shares)
+    (part,) = found.configurations
+    whole = make_measured_run(tmp_path / "whole", num_seeds=5)
+    (like,) = sources.read_experiment([whole]).configurations
+    expected = like.eval_return.copy()
+    expected[3, 3:] = expected[2, 3:]
+    np.testing.assert_array_equal(part.eval_return, expected)
+    assert part.seed.tolist() == [0, 1, 2, 3, 4]
+    assert part.nonfinite.tolist() == [0, 0, 0, 1, 0]
+    assert [path.name for path in part.where] == ["a", "a", "a", "b", "b"]
+
+
+def test_shares_of_a_sweep_are_one_sweep(tmp_path):
+    shares = [make_sweep(tmp_path / name, num_seeds=2) for name in ("a", "b")]
+    for number, share in enumerate(shares):
+        content = json.loads((share / "sweep.json").read_text())
+        content["settings"]["seeds"] = f"{2 * number}:{2 * number + 2}"
+        (share / "sweep.json").write_text(json.dumps(content))
+        with np.load(share / "curves.npz") as archive:
+            curves = dict(archive)
+        curves["seed"] += 2 * number
+        np.savez(share / "curves.npz", **curves)
+        lines = (share / "results.csv").read_text().splitlines()
+        place = lines[0].split(",").index("seed")
+        rows = [line.split(",") for line in lines]
+        for row in rows[1:]:
+            row[place] = str(int(row[place]) + 2 * number)
+        (share / "results.csv").write_text("".join(",".join(row) + "\n" for row in rows))
+    found = sources.read_experiment(shares)
+    assert len(found.configurations) == 16
+    assert all(part.seed.tolist() == [0, 1, 2, 3] for part in found.configurations)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"second": 2}, "b and .*a both have seed 2, with equal settings"),
+        ({"learning_rate": 0.5}, "no seed in common, .* and their settings differ"),
+    ],
+)
+def test_shares_that_do_not_fit_are_refused(tmp_path, changes, said):
+    with pytest.raises(ValueError, match=said):
+        sources.read_experiment(make_shares(tmp_path, **changes))
+
+
 def test_a_run_that_goes_on_is_read_so_far(tmp_path):
     directory = make_measured_run(tmp_path / "a", summary={"status": "running"})
     (directory / "summary.json").unlink()

@@ -333,7 +333,7 @@ def test_a_plan_says_what_is_known(monkeypatch, engine):
 def test_a_plan_says_how_many_devices_stand_idle(monkeypatch, seeds, episodes, here, idle):
     monkeypatch.setattr(jax, "local_device_count", lambda: here)
     config = Config(num_seeds=seeds, num_episodes=episodes)
-    said = plan._idle(plan.this_hardware(), divide_run(config, seeds))
+    said = plan._idle(plan.this_hardware(), divide_run(config))
     verb = "stands" if idle == 1 else "stand"
     assert said == "" if idle is None else f"Of {here} devices here, {idle} {verb} idle" in said
 

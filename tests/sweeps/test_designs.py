@@ -1,4 +1,4 @@
-"""The design of a sweep: its grid, its draws, its groups in chunks, its rungs."""
+"""The design of a sweep: its grid, its draws, its groups in chunks."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import pytest
 
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps import chunks
-from mjx_reinforce.sweeps.designs import design, grid, plan, rungs
+from mjx_reinforce.sweeps.designs import design, grid, plan
 from mjx_reinforce.sweeps.designs.groups import Group, make_groups
 
 CONFIG = Config(env_steps=1000, max_updates=7, num_seeds=3, num_episodes=16)
@@ -163,51 +163,3 @@ def test_settings_of_the_environment_are_swept_as_words():
 def test_a_setting_of_the_environment_that_cannot_be_swept_is_refused(over, said):
     with pytest.raises(ValueError, match=said):
         grid.check_over(Config(), over)
-
-
-# The rungs.
-
-
-def measured(returns):
-    """What a rung measured of configurations with two seeds each."""
-    numbers = np.repeat(list(returns), 2)
-    last = np.array([value for pair in returns.values() for value in pair], np.float32)
-    return {"configuration": numbers, "eval_return": np.stack([np.zeros_like(last), last])}
-
-
-def test_the_best_are_those_of_the_last_returns():
-    found = measured({4: (1, 2), 7: (9, 8), 2: (5, 5), 3: (np.nan, np.nan), 6: (5, 5)})
-    assert rungs.best(found, 1) == [7]
-    assert rungs.best(found, 2) == [2, 7]
-    assert rungs.best(found, 4) == [2, 4, 6, 7]
-
-
-def test_halving_halves_the_configurations_and_doubles_the_budget():
-    returns = {i: (i, i) for i in range(5)}
-    seen = []
-
-    def result(name):
-        members = np.concatenate([each.members for each in seen[-1].groups.values()])
-        assert name == seen[-1].name
-        return measured({i: returns[i] for i in members.tolist()})
-
-    for rung in rungs.plan_rungs([group()], "halving", result):
-        seen.append(rung)
-    chosen = [rung.groups[0].members.tolist() for rung in seen]
-    assert chosen == [[0, 1, 2, 3, 4], [2, 3, 4], [3, 4], [4], [4]]
-    budgets = [rung.groups[0].config for rung in seen]
-    assert [config.env_steps for config in budgets] == [125, 250, 500, 1000, 1000]
-    assert [config.max_updates for config in budgets] == [1, 2, 4, 7, 7]
-    assert [config.seed for config in budgets] == [0, 0, 0, 0, 1]
-    assert [rung.before for rung in seen] == [None, "0", "1", "2", None]
-    assert len(seen) == rungs.num_rungs("halving", 5)
-    np.testing.assert_allclose(seen[1].groups[0].settings["learning_rate"], [0.2, 0.3, 0.4])
-    steps = sum(r.added * r.groups[0].config.env_steps * len(r.groups[0].members) for r in seen)
-    assert rungs.part_trained("halving", 5) == pytest.approx(steps / (5 * 1000))
-
-
-def test_a_grid_is_one_rung_of_the_whole_budget():
-    (rung,) = rungs.plan_rungs([group()], "grid", measured)
-    assert rung.groups[0].config == CONFIG
-    assert rungs.num_rungs("grid", 5) == 1
-    assert rungs.part_trained("grid", 5) == 1.0

@@ -12,8 +12,8 @@ BASE = Config(
 OVER = {"num_episodes": [2, 4], "learning_rate": [1e-3, 1e-2, 1e-1]}
 
 
-def prepared(limits=None, num_processes=1, **changes):
-    return prepare_sweep(Design(base=BASE, over=OVER, **changes), limits, num_processes)
+def prepared(limits=None, **changes):
+    return prepare_sweep(Design(base=BASE, over=OVER, **changes), limits)
 
 
 def test_a_group_is_what_shares_its_programs():
@@ -41,4 +41,4 @@ def test_exact_sweeps_have_one_device_and_trace_every_number():
 def test_a_task_that_refuses_its_settings():
     wrong = Config(env="ContinuousCartPole-v0", env_set=("no_such=1",), env_steps=10)
     with pytest.raises(ValueError, match="no_such"):
-        prepare_sweep(Design(base=wrong, over=OVER), None, 1)
+        prepare_sweep(Design(base=wrong, over=OVER), None)

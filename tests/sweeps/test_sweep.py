@@ -27,7 +27,7 @@ from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.store.build import build
 from mjx_reinforce.sweeps import chunks, conduct, perform, programs
 from mjx_reinforce.sweeps import command_line as sweep_command
-from mjx_reinforce.sweeps.designs import design, plan, rungs
+from mjx_reinforce.sweeps.designs import design, plan
 from mjx_reinforce.sweeps.designs.design import Design, check_design, read_design
 from mjx_reinforce.sweeps.designs.grid import configure, grid, read_over
 from mjx_reinforce.sweeps.designs.groups import learner_builder, make_groups
@@ -151,20 +151,6 @@ def test_a_sweep_whose_estimate_is_wrong_says_so_after_a_group(run, monkeypatch,
     assert ", not about 28 h as was said: the rest takes about " in lines[0]
 
 
-@pytest.mark.parametrize(
-    ("kind", "configurations", "part"),
-    [
-        ("grid", 8, 1.0),
-        ("random", 8, 9 / 8),
-        # An eighth of the budget for 8, half of 1/4, 1/2 and 1 for 4, 2 and 1, and all for fresh.
-        ("halving", 8, (8 / 8 + 4 / 8 + 2 / 4 + 1 / 2 + 1) / 8),
-        ("halving", 5, (5 / 8 + 3 / 8 + 2 / 4 + 1 / 2 + 1) / 5),
-    ],
-)
-def test_the_time_of_a_search_is_that_of_what_it_trains(kind, configurations, part):
-    assert rungs.part_trained(kind, configurations) == pytest.approx(part)
-
-
 def test_a_sweeps_plan_counts_value_networks(monkeypatch):
     """Six configurations of 128 seeds: announced with 27 s, it was not done in 11 minutes."""
     monkeypatch.setattr(runs_plan, "num_cores", lambda: 2)
@@ -198,6 +184,19 @@ def test_an_exact_run_does_not_depend_on_the_others(run):
     assert run(f"{command} {more} --output beside") == 0
     beside = curves(Path("beside"))
     assert same({"": whole["eval_return"][:, 3:6]}, {"": beside["eval_return"][:, 3:6]})
+
+
+def test_shares_of_an_exact_sweep_are_the_whole_to_the_bit(run):
+    command = f"{SMALL} --max-updates 5 --exact {RATES}"
+    assert run(f"{command} --num-seeds 3 --output whole") == 0
+    assert run(f"{command} --seeds 0:1 --output first") == 0
+    assert run(f"{command} --seeds 1:3 --output second") == 0
+    whole, *shares = (read_results(Path(name)) for name in ("whole", "first", "second"))
+    for share, seeds in zip(shares, ([0], [1, 2]), strict=True):
+        assert sorted({*share.seed.tolist()}) == seeds
+        kept = np.isin(whole.seed, seeds)
+        np.testing.assert_array_equal(share.eval_return, whole.eval_return[:, kept])
+        np.testing.assert_array_equal(share.env_steps, whole.env_steps[:, kept])
 
 
 def test_numbers_of_shifts_dampings_and_values_are_traced():
@@ -581,45 +580,6 @@ def test_a_flag_that_one_configuration_reads_is_accepted():
         configure(Config(decay_steps=None), grid({"final_learning_rate": [1e-3, 1e-2]}))
 
 
-def test_halving_goes_on_with_the_better_half(run, monkeypatch):
-    """The winner's training is that of a run alone, and its last figure is of other seeds.
-
-    Every rung has the programs of the first.
-    """
-    compiled = []
-
-    def compile_programs(*arguments):
-        compiled.append(arguments)
-        return programs.compile_programs(*arguments)
-
-    monkeypatch.setattr(conduct, "compile_programs", compile_programs)
-    over = "--over learning-rate 1e-3 1e-1 --over estimator leave-one-out total-return "
-    command = f"{SMALL} --num-seeds 3 --max-updates 20 --search halving --budget 5 {over}"
-    assert run(f"{command} --output swept") == 0
-    assert len(compiled) == 2  # of an estimator each
-    results = read_results(Path("swept"))
-    configurations = results.configurations
-    rates = [values["learning_rate"] for values in configurations]
-    assert len(set(rates)) == 5
-    assert all(1e-3 <= rate <= 1e-1 for rate in rates)
-    last = results.env_steps[-1].reshape(5, 3)
-    winner = json.loads(Path("swept/sweep.json").read_text())["winner"]
-    chosen = winner["configuration"]
-    assert np.all(last[chosen] == last.max(axis=0))
-    alone = f"{SMALL} --num-seeds 3 --max-updates 20 "
-    alone += f"--learning-rate {rates[chosen]} --estimator {configurations[chosen]['estimator']}"
-    assert run(f"{alone} --output alone", train_module) == 0
-    summary = json.loads(Path("alone/summary.json").read_text())
-    runs = results.configuration == chosen
-    final = results.eval_return[-1, runs]
-    assert np.allclose(final, summary["final_returns"], rtol=1e-4, equal_nan=True)
-    assert results.env_steps[-1, runs].tolist() == summary["env_steps"]
-    assert run(f"{alone} --seed 1 --output fresh", train_module) == 0
-    summary = json.loads(Path("fresh/summary.json").read_text())
-    assert np.allclose(winner["final_returns"], summary["final_returns"], rtol=1e-4)
-    assert winner["iqm"] == pytest.approx(summary["iqm"], rel=1e-4)
-
-
 def test_programs_have_run_once_for_no_run_before_they_train(run, monkeypatch):
     """A GPU's driver translates kernels when they first run: that is compiling too."""
     made, block_of_updates = [], training_programs.block_of_updates
@@ -639,30 +599,6 @@ def test_programs_have_run_once_for_no_run_before_they_train(run, monkeypatch):
     jax.effects_barrier()
     assert made[0] == 0
     assert sum(made) >= 3
-
-
-def test_half_the_configurations_stay_until_one_is_left():
-    returns = {"configuration": np.repeat(np.arange(6), 2), "eval_return": np.zeros((3, 12))}
-    returns["eval_return"][-1] = [5, 5, 1, 1, 9, 9, np.nan, np.nan, 5, 5, 7, 7]
-    assert rungs.best(returns, 3) == [0, 2, 5]  # of two that are equal, the first
-    configs = configure(Config(), grid({"learning_rate": [1e-4, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2]}))
-    groups = make_groups(configs, ["learning_rate"], exact=False)
-
-    def measured(name):
-        assert name == str(len(seen) - 1)
-        kept = seen[-1].groups[0].members
-        return {"configuration": kept, "eval_return": kept[None].astype(float)}
-
-    seen = []
-    for rung in rungs.plan_rungs(groups, "halving", measured):
-        seen.append(rung)
-    assert [rung.name for rung in seen] == ["0", "1", "2", "3", "fresh"]
-    kept = [rung.groups[0].members.tolist() for rung in seen]
-    assert kept == [[0, 1, 2, 3, 4, 5], [3, 4, 5], [4, 5], [5], [5]]
-    budgets = [rung.groups[0].config.env_steps for rung in seen]
-    assert budgets == [35_000, 70_000, 140_000, 280_000, 280_000]
-    assert [rung.groups[0].config.seed for rung in seen] == [0, 0, 0, 0, 1]
-    assert seen[-1].groups[0].settings["learning_rate"].tolist() == [3e-2]
 
 
 def test_ranges_are_drawn_as_their_settings_are():

@@ -70,7 +70,7 @@ def test_what_is_divided(monkeypatch, seeds, episodes, here, backend, expected):
     monkeypatch.setattr(jax, "local_device_count", lambda: here)
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     config = Config(num_seeds=seeds, num_episodes=episodes)
-    division = divide_run(config, seeds)
+    division = divide_run(config)
     assert division == expected
     each = division.of_each(config, seeds)
     assert division.seeds * each.num_seeds >= seeds

@@ -14,10 +14,18 @@ from mjx_reinforce.reports.statistics.aggregates import interval
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store import ready
 from mjx_reinforce.training.programs import compile_run
-from mjx_reinforce.training.state import budget_of
+from mjx_reinforce.training.state import budget_of, seed_keys
 from mjx_reinforce.types import plain, with_keys
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
+
+
+def test_the_keys_of_seeds_are_those_of_a_split():
+    """Whichever of them are asked for, and however many there are."""
+    root = jax.random.fold_in(jax.random.key(7), 0)
+    split = jax.random.key_data(jax.random.split(root, 9))
+    keys = seed_keys(7, np.array([2, 8], np.uint32))
+    np.testing.assert_array_equal(jax.random.key_data(keys), split[np.array([2, 8])])
 
 
 def test_they_have_run_once_without_an_update():

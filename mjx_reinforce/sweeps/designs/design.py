@@ -10,7 +10,6 @@ import numpy as np
 import tyro
 
 from mjx_reinforce.files import read_json
-from mjx_reinforce.hosts.processes import ProcessSettings, check_processes
 from mjx_reinforce.settings.config import Config, check_each, flag, marked, spoken
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.memory import check_memory, gigabytes, host_memory
@@ -28,20 +27,16 @@ class SweepSettings:
     over: tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]] = ()
     """A setting and its values, such as `learning-rate 1e-3 3e-3`; again for further settings: all
     combinations are trained. Layers are written 32,32 (none: no layer)."""
-    search: Literal["grid", "random", "halving"] = "grid"
+    search: Literal["grid", "random"] = "grid"
     """grid: all combinations of the values. random: --budget of them, drawn: two numbers are the
-    ends of a range; names, and three values or more, are choices. halving: so many, all trained for
-    a part of the budget; the better half (by the interquartile mean over seeds) goes on to twice
-    that, until one has all of it. The choice flatters the winner's figure, so random and halving
-    train it again on fresh seeds, those of the next --seed."""
+    ends of a range; names, and three values or more, are choices."""
     budget: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """How many configurations random and halving begin with."""
+    """How many configurations random draws."""
     chunk_runs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Runs that are under way at once at most; as many as memory holds if not given."""
     exact: bool = False
-    """Move every run by itself, on one device of each process, so that no result depends in any bit
-    on the runs beside it, on chunks, or on how many devices there are. It takes many times as
-    long."""
+    """Move every run by itself, on one device, so that no result depends in any bit on the runs
+    beside it, on chunks, or on how many devices there are. It takes many times as long."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -50,12 +45,11 @@ class Design:
 
     base: the settings of all runs but those that are swept, and where its directory is
     over: the values of each setting that is swept
-    search: "grid", "random" or "halving"
+    search: "grid" or "random"
     budget: how many configurations are drawn, None for a grid
     given: other settings that the user chose; at least one configuration must read each
     exact: see ``SweepSettings``
     chunk_runs: see ``SweepSettings``
-    processes: those that train it
     resume: the directory of a sweep that goes on
     """
 
@@ -66,11 +60,10 @@ class Design:
     given: Sequence[str] = ()
     exact: bool = False
     chunk_runs: int | None = None
-    processes: ProcessSettings = dataclasses.field(default_factory=ProcessSettings)
     resume: Path | None = None
 
     def count(self) -> int:
-        """Returns how many configurations it begins with."""
+        """Returns how many configurations it has."""
         return self.budget or math.prod(map(len, self.over.values()))
 
     def configurations(self) -> list[dict[str, Any]]:
@@ -88,12 +81,6 @@ def as_record(design: Design) -> dict[str, Any]:
     over = {name: list(values) for name, values in design.over.items()}
     names = ("exact", "search", "budget")
     return {"settings": settings, "over": over, **{name: getattr(design, name) for name in names}}
-
-
-def flat(design: Design) -> dict[str, Any]:
-    """Returns what ``as_record`` does, the settings among the rest."""
-    record = as_record(design)
-    return record.pop("settings") | record
 
 
 def read_design(directory: Path) -> Design:
@@ -140,9 +127,6 @@ def check_design(design: Design) -> None:
     check_over(design.base, design.over)
     _check_search(design)
     _check_results(design)
-    check_processes(design.processes)
-    if design.processes.distributed and design.base.output is None and design.resume is None:
-        raise ValueError("--distributed needs --output, a directory that all processes see")
     configs = configure(design.base, design.configurations(), design.given)
     for config in configs:
         check_memory(dataclasses.replace(config, num_seeds=1))
@@ -163,11 +147,11 @@ def _check_search(design: Design) -> None:
     """Raises ValueError where the search and its budget do not go together."""
     if design.search == "grid":
         if design.budget is not None:
-            raise ValueError("--budget is of --search random and halving: leave it out, or add one")
-    elif design.search not in ("random", "halving"):
-        raise ValueError(f"--search must be grid, random or halving, got {design.search!r}")
+            raise ValueError("--budget is of --search random: leave it out, or add that")
+    elif design.search != "random":
+        raise ValueError(f"--search must be grid or random, got {design.search!r}")
     elif design.budget is None:
-        raise ValueError(f"--search {design.search} needs --budget, the number of configurations")
+        raise ValueError("--search random needs --budget, the number of configurations")
     elif design.budget < 2:
         raise ValueError(f"--budget must be at least 2, got {design.budget}")
 

@@ -17,7 +17,6 @@ from mjx_reinforce.store.build import build, policy_settings
 from mjx_reinforce.sweeps.designs.design import Design
 from mjx_reinforce.sweeps.designs.grid import configure
 from mjx_reinforce.sweeps.designs.groups import Group, make_groups
-from mjx_reinforce.sweeps.designs.rungs import part_trained
 from mjx_reinforce.types import Environment
 
 #: Chunks take up to this part of the memory that is there.
@@ -65,7 +64,6 @@ def chunk_limit(
     group: Group,
     asked: int | None,
     num_devices: int,
-    num_processes: int,
 ) -> int:
     """Returns how many runs of a group a chunk may have.
 
@@ -74,15 +72,14 @@ def chunk_limit(
       horizon: the time limit of an episode in steps.
       group: whose runs are divided.
       asked: what the user said, or None for what memory holds.
-      num_devices: of each process.
-      num_processes: each of which is to have a chunk.
+      num_devices: among which a chunk is divided.
 
     Raises:
       ValueError: not even one run for each device fits into memory.
     """
     total = len(group.members) * group.config.num_seeds
     limit = _capacity(env, horizon, group, num_devices) if asked is None else asked
-    return min(limit, -(-total // num_processes))
+    return min(limit, total)
 
 
 def _capacity(env: Environment, horizon: int, group: Group, num_devices: int) -> int:
@@ -106,7 +103,6 @@ def describe_plan(
     groups: Sequence[Group],
     parts: Sequence[GroupPlan],
     num_devices: int,
-    part_trained: float,
 ) -> str:
     """Returns a paragraph on what a sweep will do.
 
@@ -117,7 +113,6 @@ def describe_plan(
       groups: of configurations.
       parts: how the runs of each are divided.
       num_devices: on which they are.
-      part_trained: of the budgets of all runs, see ``rungs.part_trained``.
     """
     first, machine = groups[0].config, this_hardware()
     configurations = sum(len(group.members) for group in groups)
@@ -139,14 +134,14 @@ def describe_plan(
         f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
         f"of {first.env}, on {where}, with the engine {learners[0].engine.name}: "
         f"{counted(len(groups), 'compiled program')}, {counted(chunks, 'chunk')} of up to {side:,} "
-        f"runs. {_time(envs, horizons, learners, groups, num_devices, part_trained)}. "
+        f"runs. {_time(envs, horizons, learners, groups, num_devices)}. "
         f"It needs about {gigabytes(memory)} of memory beside the programs."
         f"{_idle_devices(side, num_devices)}"
     )
 
 
 def _idle_devices(side: int, num_devices: int) -> str:
-    """Returns a sentence where devices of this process stand idle, else nothing.
+    """Returns a sentence where devices stand idle, else nothing.
 
     Args:
       side: how many runs are under way at once at most.
@@ -162,7 +157,6 @@ def _time(
     learners: Sequence[Any],
     groups: Sequence[Group],
     num_devices: int,
-    part_trained: float,
 ) -> str:
     """Returns about how long the training takes, where that is known."""
     total = 0.0
@@ -170,7 +164,7 @@ def _time(
         seconds = group_seconds(env, horizon, learner.engine.name, group, num_devices)
         if seconds is None:
             return "How long this takes here is not known"
-        total += part_trained * seconds
+        total += seconds
     compiling = duration(this_hardware().speeds[groups[0].config.env].compiling)
     return f"Compiling takes about {compiling} each, training about {duration(total)}"
 
@@ -222,13 +216,12 @@ class Prepared(NamedTuple):
     plan: str
 
 
-def prepare_sweep(design: Design, limits: Sequence[int] | None, num_processes: int) -> Prepared:
+def prepare_sweep(design: Design, limits: Sequence[int] | None) -> Prepared:
     """Returns what a sweep is made of.
 
     Args:
       design: of the sweep.
       limits: how many runs of each group a chunk may have, if the sweep goes on.
-      num_processes: that train it.
 
     Raises:
       ValueError: settings do not fit the environment, or a run does not fit into memory.
@@ -242,16 +235,14 @@ def prepare_sweep(design: Design, limits: Sequence[int] | None, num_processes: i
     built = [build(env, group.config) for env, group in zip(made, groups, strict=True)]
     learners, horizons = [list(x) for x in zip(*built, strict=True)]
     if limits is None:
-        share = devices.count, num_processes
         limits = [
-            chunk_limit(env, horizon, group, design.chunk_runs, *share)
+            chunk_limit(env, horizon, group, design.chunk_runs, devices.count)
             for env, horizon, group in zip(made, horizons, groups, strict=True)
         ]
     parts = [
         divide(group, limit, devices.count, exact=design.exact)
         for group, limit in zip(groups, limits, strict=True)
     ]
-    trained = part_trained(design.search, len(configurations))
-    plan = describe_plan(made, horizons, learners, groups, parts, devices.count, trained)
+    plan = describe_plan(made, horizons, learners, groups, parts, devices.count)
     engine = learners[0].engine.name, sum(learner.engine.seconds for learner in learners)
     return Prepared(made, horizons, devices, configurations, groups, list(limits), *engine, plan)
