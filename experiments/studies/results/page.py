@@ -280,7 +280,6 @@ python -m experiments.studies.results train DIR        # every task, one after t
 python -m experiments.studies.results sensitivity DIR  # moves every setting
 python -m experiments.studies.results play DIR         # Gymnasium and films
 python -m experiments.studies.results seconds DIR      # runs that were given a time
-python -m experiments.speed.peers sb3                  # Stable-Baselines3 in the same seconds
 python -m experiments.studies.results page DIR         # this page
 python -m experiments.studies.results readme           # the tables of README.md
 ```
