@@ -59,7 +59,7 @@ def test_actions_have_bounds():
 
 
 def test_its_ppo_trains(monkeypatch):
-    """With the function that brax 0.14.2 calls and JAX 0.10 has no more, as docs/vector.md has it."""
+    """With the function that brax 0.14.2 calls and JAX 0.10 has no more (docs/vector.md)."""
     monkeypatch.setattr(
         jax,
         "device_put_replicated",
