@@ -20,9 +20,8 @@ from typing import Any
 
 import jax
 import tyro
-from rich.console import Console
-from rich.table import Table
 
+from experiments.kit.markdown import table
 from experiments.kit.rows import now
 from experiments.speed.benchmark.ours import ENGINES, rollouts, training
 from experiments.speed.benchmark.peers import peers
@@ -67,12 +66,8 @@ def main() -> None:
     """Measures, prints and writes."""
     settings = tyro.cli(Settings, prog="python -m experiments.speed.benchmark", description=__doc__)
     if settings.quick:
-        few: dict[str, Any] = {
-            "batch": (128, 1024, 4096),
-            "max_mjx_batch": 128,
-            "repeats": 3,
-            "train": False,
-        }
+        few: dict[str, Any] = {"batch": (128, 1024, 4096), "max_mjx_batch": 128}
+        few |= {"repeats": 3, "train": False}
         settings = dataclasses.replace(settings, **few)
     jax.config.update("jax_default_matmul_precision", "highest")
     said = facts(now(), "")
@@ -80,7 +75,8 @@ def main() -> None:
     for env in settings.env:
         ours = list(engines(env, settings))
         rows += [said | row for row in measure(ours + peers(env), settings.repeats)]
-    show(rows)
+    header = (*(key.replace("_", " ") for key in SHOWN), "env steps/s", "ns a step of an episode")
+    print(table(header, []), *map(line, rows), sep="\n")
     if settings.csv:
         append(settings.csv, rows)
 
@@ -100,14 +96,10 @@ def engines(env_id: str, settings: Settings):
                 yield training(env_id, name, max(batches), settings.steps, sizes)
 
 
-def show(rows: list[dict[str, Any]]) -> None:
-    """Prints the table."""
-    columns = (*(key.replace("_", " ") for key in SHOWN), "env steps/s", "ns a step of an episode")
-    table = Table(*columns)
-    for row in rows:
-        cells = (row.get(key) for key in SHOWN)
-        table.add_row(*(_format(x) for x in cells), f"{speed(row):,.0f}", latency(row))
-    Console(width=160).print(table)
+def line(row: dict[str, Any]) -> str:
+    """Returns a row of the table."""
+    cells = ["" if (x := row.get(key)) is None else str(x) for key in SHOWN]
+    return f"| {' | '.join([*cells, f'{speed(row):,.0f}', latency(row)])} |"
 
 
 def latency(row: dict[str, Any]) -> str:
@@ -121,10 +113,6 @@ def fits(batch: int) -> bool:
     if available.platform() == "cpu":
         return batch <= this_machine().lanes * (os.cpu_count() or 1)
     return batch <= THREADS * jax.devices()[0].core_count
-
-
-def _format(value: Any) -> str:
-    return "" if value is None else f"{value:.1f}" if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":
