@@ -107,7 +107,7 @@ def untrained(player: Player) -> Any:
     return player._replace(actor=actor)
 
 
-#: Where runs are put that name no other place, see ``files.choose_directory``.
+#: Where runs are put that name no other place, see ``runs.directory.choose_directory``.
 RUNS = Path("runs")
 
 

@@ -52,7 +52,7 @@ def mujoco_simulator(
       push: the force of the pushes (N), see ``push_at``.
 
     Returns:
-      As ``playing.simulator``.
+      (seed of the start state, whether actions are drawn or the policy's mode) -> the episode.
 
     Raises:
       ValueError: C MuJoCo cannot play the task, see ``InMujoco``.

@@ -92,7 +92,7 @@ def setting(default: Value, *marks: enum.Enum, once: str | None = None) -> Value
 
     Args:
       default: its value where the user gives none.
-      marks: what holds of it: members of ``Range``, ``settings.Reader`` and ``Mark``.
+      marks: what holds of it: members of ``Range``, ``groups.Reader`` and ``Mark``.
       once: why a sweep cannot go over it; None if it can.
     """
     return dataclasses.field(default=default, metadata={"marks": marks, "once": once})

@@ -152,7 +152,7 @@ def _of_levels(findings: Findings) -> Iterator[str]:
 
 
 def speed_table(findings: Findings) -> dict[str, Any]:
-    """Returns the table of who learns faster: the fastest first, as ``document._summary``."""
+    """Returns the table of who learns faster: the fastest first."""
     compared = findings.results[:COMPARED]
     if len(compared) < 2:
         return {}

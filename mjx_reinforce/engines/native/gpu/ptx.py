@@ -45,7 +45,7 @@ def load_kernel(
 
     Args:
       source: all that the text of the kernel depends on, or a hash of it.
-      write: returns ``player.kernel_text``.
+      write: returns ``kernel.kernel_text``.
       capability: the compute capability of the GPU, such as "9.0".
       folder: where kernels are kept; None keeps none.
 
