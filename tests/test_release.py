@@ -7,20 +7,12 @@ import subprocess
 import sys
 import tomllib
 
-import pytest
 from places import ROOT
 
 import mjx_reinforce
 from mjx_reinforce.reports.page.document import YEAR
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
-#: Packages that conda-forge calls otherwise than PyPI.
-CONDA_NAMES = {
-    "mujoco": "mujoco-python",
-    "matplotlib": "matplotlib-base",
-    "tensorboardX": "tensorboardx",
-    "flatbuffers": "python-flatbuffers",
-}
 
 
 def text(name):
@@ -45,7 +37,6 @@ def test_citation_and_changelog_agree():
     assert newest == (version, date)
     assert int(date[:4]) == YEAR
     assert PROJECT["tool"]["setuptools_scm"]["fallback_version"] == f"{version}.dev0"
-    assert f'version: "{version}"' in text("conda/recipe.yaml")
 
 
 def test_a_tag_that_does_not_agree_is_refused():
@@ -72,22 +63,6 @@ def test_constraints_are_the_versions_of_the_figures():
         known = json.loads(path.read_text(encoding="utf-8"))["packages"]
         found = {name: x for name, x in known.items() if name != "mjx-reinforce"}
         assert found == pinned | ({"flax": "0.12.10"} if path.stem in older_flax else {})
-
-
-def test_conda_asks_for_what_pip_does():
-    run = text("conda/recipe.yaml").partition("  run:\n")[2].partition("\n\n")[0]
-    asked = dict(re.findall(r"- (\S+) (\S+)", run))
-    assert asked.pop("python") == PROJECT["project"]["requires-python"]
-    parts = (re.match(r"([\w.-]+)(.*)", each) for each in PROJECT["project"]["dependencies"])
-    assert asked == {CONDA_NAMES.get(part[1], part[1]): part[2] for part in parts}
-
-
-@pytest.mark.parametrize("kind", ["cpu", "cuda"])
-def test_images_install_extras_that_exist(kind):
-    lines = text(f"docker/{kind}.Dockerfile")
-    extras = re.search(r"\.whl\)\[(.*)\]", lines)[1].split(",")
-    assert set(extras) <= set(PROJECT["project"]["optional-dependencies"])
-    assert ("cuda" in extras) == (kind == "cuda")
 
 
 def test_a_release_runs_what_main_must_pass():

@@ -46,16 +46,13 @@ class Training:
         env: str,
         *,
         cache: Path,
-        screen: Path | None = None,
     ):
-        """Starts a run or sweep, or goes on with it; ``screen`` gets a file of its output."""
+        """Starts a run or sweep, or goes on with it."""
         begun = (run / "config.json").exists() or (run / "sweep.json").exists()
         first = ["--env", env, *COMMANDS[command], "--output", run.name]
         arguments = ["--resume", run.name] if begun else first
         self.run = run
-        with tempfile.NamedTemporaryFile(
-            "wb", dir=screen or run.parent, suffix=".txt", delete=False
-        ) as said:
+        with tempfile.NamedTemporaryFile("wb", dir=run.parent, suffix=".txt", delete=False) as said:
             self._said = Path(said.name)
             self.process = subprocess.Popen(
                 [sys.executable, "-m", f"mjx_reinforce.{command}", *arguments],

@@ -45,7 +45,7 @@ def mujoco_simulator(
       horizon: T, the time limit in steps.
 
     Returns:
-      As ``mjx_playing.simulator``.
+      (seed of the start state, whether actions are drawn or the policy's mode) -> the episode.
 
     Raises:
       ValueError: C MuJoCo cannot play the task, see ``InMujoco``.

@@ -3,7 +3,6 @@
 import pytest
 
 from experiments.kit.rows import threads
-from experiments.speed.benchmark import __main__ as command
 from experiments.speed.benchmark import rows, tables
 from experiments.speed.benchmark.peers import c_mujoco, warp_room
 
@@ -32,15 +31,6 @@ def test_tables_are_those_of_the_raw_rows(path):
     text = path.read_text(encoding="utf-8")
     assert tables.page(text, tables.last_calls(rows.read())) == text
     assert "<!-- end -->" in text
-
-
-def test_the_time_of_a_step_is_that_of_episodes_played_at_once(monkeypatch):
-    assert command.fits(4)
-    assert not command.fits(10**6)
-    monkeypatch.setattr(command, "fits", lambda batch: batch <= 512)
-    assert command.latency(ROW) == "256,000"  # 20 steps of 512 episodes in 5.12 ms
-    for other in ({"batch": 513}, {"engine": "fused"}, {"what": "training"}):
-        assert command.latency(ROW | other) == ""
 
 
 def test_rows_come_back_with_every_repetition(tmp_path):

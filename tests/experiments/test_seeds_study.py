@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from experiments.studies.seeds import __main__ as seeds
 from experiments.studies.seeds import few as seeds_few
-from experiments.studies.seeds import findings, words
-from experiments.studies.seeds import page as seeds_page
 from experiments.studies.seeds import runs as seeds_runs
 from experiments.studies.seeds.answers import (
     CONTRASTS,
@@ -18,12 +17,11 @@ from experiments.studies.seeds.answers import (
 )
 from experiments.studies.seeds.few import any_pair, few_seeds
 from experiments.studies.seeds.runs import Task, load, measure, save
-from mjx_reinforce.reports.statistics import iqm
 
 #: With a rate more than in the study, so that two are below its best and two are not.
 FACTORS = seeds_runs.FACTORS | {"learning_rate": [3e-3, 1e-2, 3e-2, 1e-1]}
 SHAPE = tuple(len(values) for values in FACTORS.values())
-SEEDS, BUDGET, COUNTS = 200, 1000, (3, 5, 10, 30, 100)
+SEEDS, BUDGET, COUNTS = 200, 1000, seeds_few.COUNTS
 LEARNED, _, _, GAMMA, NORMALISE = CONTRASTS
 
 
@@ -50,8 +48,6 @@ def made_up(name, baseline, normalise):
         average_return=returns - 10,
         steps_to_solve=np.where(returns >= 50, 500.0, BUDGET),
         env_steps=np.full(returns.shape, BUDGET),
-        grid=np.linspace(0, BUDGET, 3),
-        curves=np.repeat(iqm(returns, axis=-1)[..., None], 3, axis=-1),
         record={
             "env": name,
             "num_seeds": SEEDS,
@@ -151,22 +147,23 @@ def test_rates_without_a_failure_have_an_interval(tasks):
     assert [difference.low, difference.high] == pytest.approx([-half, half], rel=1e-4)
 
 
-def test_the_page_says_what_the_numbers_are(tasks, tmp_path, monkeypatch):
+def test_the_tables_say_what_the_numbers_are(tasks, tmp_path, monkeypatch):
     monkeypatch.setattr(seeds_few, "_DRAWS", 20)
-    seeds_page.write(findings.find(tasks, COUNTS), tmp_path)
-    page = (tmp_path / "seeds.md").read_text("utf-8")
-    assert "a learned baseline is better than no baseline on Up-v0; a learned baseline is" in page
-    assert "| gamma^t against no gamma^t | no difference found | no difference found |" in page
-    assert (
-        "On Up-v0 the learning rate decides: with both at the same one, normalisation gives the "
-        "higher average return at 0.003 and 0.01, no normalisation at 0.03 and 0.1."
-    ) in page
-    assert "On Down-v0 the learning rate decides" not in page
-    assert all((tmp_path / name).is_file() for name in _linked(page))
-
-
-def _linked(page):
-    return [part.partition(")")[0] for part in page.split("](")[1:]]
+    for task in tasks:
+        (tmp_path / task.name).mkdir()
+        save(task, tmp_path / task.name)
+    page = tmp_path / "seeds.md"
+    marks = ("tasks", "effects", "few", "pairs")
+    page.write_text("".join(f"<!-- {name} -->\nbefore\n<!-- end -->\n" for name in marks))
+    seeds.write([tmp_path / task.name for task in tasks], page)
+    text = page.read_text()
+    assert "before" not in text
+    assert "| Up-v0 | 0 | 50 | 32 and 32 | 1,000 | 0.0 % | 0 | vmap | 1 s, 2 s |" in text
+    row = next(x for x in text.splitlines() if x.startswith(f"| {LEARNED.name} | Up-v0 |"))
+    assert "**+5." in row
+    assert row.endswith("| 100 % |")
+    assert f"| final return | Up-v0 | {LEARNED.name} | yes |" in text
+    assert text.count("| average return | Down-v0 |") == len(CONTRASTS) + 1
 
 
 def test_few_seeds_against_the_normal_distribution(tasks):
@@ -259,20 +256,3 @@ def test_arms_that_end_alike_name_nobody_wrong(tasks):
     found = few_seeds([alike], ["final return"], COUNTS)
     assert all(few.equal and not few.sure and few.needed is None for few in found)
     assert not any(few.equal for few in few_seeds(tasks[:1], ["final return"], COUNTS))
-
-
-def test_what_is_better_by_another_measure_says_by_which(monkeypatch):
-    monkeypatch.setattr(seeds_few, "_DRAWS", 20)
-    task = made_up("Fast-v0", 0.0, 0.0)
-    steps = np.random.default_rng(1).uniform(300, 700, task.steps_to_solve.shape)
-    steps[FACTORS["estimator"].index("value-baseline")] -= 300
-    task = task._replace(steps_to_solve=steps)
-    answers = words.short_answers(findings.find([task], COUNTS))
-    (row,) = [line for line in answers.splitlines() if line.startswith(f"| {LEARNED.name} |")]
-    assert "a learned baseline: much better (9" in row
-    assert row.endswith("% in env steps to solve) |")
-    failed = np.full_like(task.final_return, 60.0)
-    failed[FACTORS["estimator"].index("value-baseline"), ..., :80:2] = 0.0  # of one half alone
-    found = findings.find([task._replace(final_return=failed)], COUNTS)
-    (row,) = [line for line in words.short_answers(found).splitlines() if LEARNED.name in line]
-    assert row.endswith("better in env steps to solve, worse in solved at the end |")

@@ -1,14 +1,12 @@
-"""How far every environment is from the installed Gymnasium, in one table.
+"""How far every environment is from the installed Gymnasium: the tables of docs/parity.md.
 
     python -m experiments.checks.parity                               # all, minutes a task on a CPU
-    python -m experiments.checks.parity --env Hopper-v5 --states 500 --csv rows.csv
+    python -m experiments.checks.parity --env Hopper-v5 --states 500
 
 Four questions to each environment, in double and in single precision: how far one env step from
 the same state leads apart; whether the same states end the episode; whether episodes start from the
 same distribution; whether a fixed policy earns the same distribution of returns. A task that
 Gymnasium lacks is compared with a transcription of the document it comes from.
-
-docs/parity.csv has the rows of docs/parity.md, whose tables `tables.py` writes.
 
 The states are those that random actions reach from a reset, and as many pushed from there: onto the
 joints' limits and past them, faster, into the floor, over the point of falling. Actions go 20 %
@@ -16,45 +14,26 @@ beyond their bounds.
 """
 
 import dataclasses
-import datetime
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
 import tyro
-from rich.console import Console
-from rich.progress import Progress
-from rich.table import Table
 from scipy import stats
 
 from experiments.checks.parity.native import Native
 from experiments.checks.parity.sides import Ours, Outcome, Peer, make_peer, stack
 from experiments.checks.parity.states import draw_states
-from experiments.kit import rows as kit
+from experiments.kit.markdown import table
 from mjx_reinforce import envs
-from mjx_reinforce.store.provenance import provenance, version
 from mjx_reinforce.types import Discrete
 
 DTYPES = ("float64", "float32")
-#: What a row in a file says besides.
-ORIGIN = ("date", "commit", "jax", "mujoco", "gymnasium", "engine", "tolerance")
-KEYS = (
-    "env",
-    "dtype",
-    "states",
-    "qpos",
-    "qvel",
-    "observation",
-    "reward",
-    "terminated_mismatches",
-    "terminated_rounding",
-    "reset_observation",
-    "reset_p_value",
-    "return_p_value",
-)
+KEYS = ("env", "dtype", "states", "qpos", "qvel", "observation", "reward")
+KEYS += ("terminated_mismatches", "terminated_rounding")
+KEYS += ("reset_observation", "reset_p_value", "return_p_value")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,8 +60,6 @@ class Settings:
     """At which Gymnasium's constraint solver stops; by default its own 1e-8. Given one, it is
     Newton's for all tasks (the Humanoids have PGS, which ends 1e-3 early); 0 tells Gymnasium's
     distance from the optimum, which is most of what is seen in double precision, from ours."""
-    csv: Path | None = None
-    """Where to append the rows, task by task."""
 
 
 def peer_steps(peer: Peer, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray) -> Outcome:
@@ -246,20 +223,15 @@ class Theirs(NamedTuple):
         return cls(peer, cases, peer_steps(peer, *cases), starts)
 
 
-def compare(
-    env_id: str, dtype: str, theirs: Theirs, settings: Settings, say: Callable[[str], None]
-) -> dict[str, Any]:
-    """Returns the row of one environment in one precision; ``say`` hears what comes next."""
+def compare(env_id: str, dtype: str, theirs: Theirs, settings: Settings) -> dict[str, Any]:
+    """Returns the row of one environment in one precision."""
     with jax.enable_x64(dtype == "float64"):
         ours = (Native if settings.engine == "native" else Ours)(env_id, settings.batch)
-        say("starts")
         starts = ours.starts(settings.seed, settings.resets)
         row = {"env": env_id, "dtype": dtype, "states": settings.states}
         row |= reset_errors(starts, theirs.peer, theirs.starts, dtype)
-        say("steps")
         eps = float(np.finfo(dtype).eps)
         row |= step_errors(ours, theirs.peer, theirs.states, theirs.expected, eps)
-        say("returns")
         policy = fixed_policy(ours.env, starts.observation.shape[1], settings.seed)
         horizon = min(settings.horizon, ours.env.max_episode_steps)
         returns = ours.returns(policy, settings.seed, horizon)
@@ -269,62 +241,26 @@ def compare(
 
 
 def main() -> None:
-    """Compares, prints and writes."""
+    """Compares and prints, a row for each task and precision."""
     settings = tyro.cli(Settings, prog="python -m experiments.checks.parity", description=__doc__)
     jax.config.update("jax_default_matmul_precision", "highest")
-    console, rows, made = Console(width=180), [], origin(settings)
-    with Progress(console=console) as progress:
-        task = progress.add_task("", total=len(settings.env) * len(settings.dtype))
-        for env_id in settings.env:
-
-            def say(what: str, name: str = env_id):
-                progress.update(task, description=f"{name}, {what}")
-
-            say("Gymnasium")
-            theirs = Theirs.play(
-                env_id,
-                states=settings.states,
-                resets=settings.resets,
-                seed=settings.seed,
-                tolerance=settings.tolerance,
-            )
-            both = []
-            for dtype in settings.dtype:
-                both.append(compare(env_id, dtype, theirs, settings, say))
-                progress.advance(task)
-            if settings.csv:
-                append(settings.csv, both, made)
-            rows += both
-    show(console, rows)
-
-
-def origin(settings: Settings) -> dict[str, Any]:
-    """Returns what all rows of a run say: when and of what it was made."""
-    made: dict[str, Any] = {name: version(name) for name in ("jax", "mujoco", "gymnasium")}
-    made |= {"date": datetime.date.today().isoformat(), "commit": provenance()["git_commit"]}
-    return made | {"engine": settings.engine, "tolerance": settings.tolerance}
-
-
-def append(path: Path, rows: list[dict[str, Any]], made: dict[str, Any]) -> None:
-    """Adds rows to a file, with their origin; a new file gets its first line."""
-    kit.append(path, [made | kit.rounded(row, 3) for row in rows], [*ORIGIN, *KEYS])
-
-
-def show(console: Console, rows: list[dict[str, Any]]) -> None:
-    """Prints the table."""
-    table = Table(*(key.replace("_", " ") for key in KEYS))
-    for row in rows:
-        table.add_row(*(_format(row[key]) for key in KEYS))
-    console.print(table)
-    console.print(
+    played = {name: getattr(settings, name) for name in ("states", "resets", "seed", "tolerance")}
+    print(
         "qpos to reward, reset observation: largest absolute error. terminated rounding: mismatches"
         "\nthat Gymnasium decides either way within rounding, not counted before. p-values: "
-        "Kolmogorov-Smirnov, of starts\nBonferroni-corrected; of many rows some are small."
+        "Kolmogorov-Smirnov, of starts\nBonferroni-corrected; of many rows some are small.\n"
     )
+    print(table([key.replace("_", " ") for key in KEYS], []))
+    for env_id in settings.env:
+        theirs = Theirs.play(env_id, **played)
+        for dtype in settings.dtype:
+            print(line(compare(env_id, dtype, theirs, settings)), flush=True)
 
 
-def _format(value: Any) -> str:
-    return f"{value:.2g}" if isinstance(value, float) else str(value)
+def line(row: dict[str, Any]) -> str:
+    """Returns a row of the table."""
+    cells = [f"{x:.1g}" if isinstance(x, float) else str(x) for x in row.values()]
+    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":

@@ -1,130 +1,292 @@
-"""How fast every engine is, beside what a user would otherwise pick, in one table from one run.
+"""Makes the rows of docs/benchmarks.csv: everything that README.md and the documents say of speed.
 
-    python -m experiments.speed.benchmark --quick          # two minutes on a CPU
-    python -m experiments.speed.benchmark --csv rows.csv   # everything
+    python -m experiments.speed.benchmark gpu --minutes 8 --commit $(git rev-parse HEAD)
+    python -m experiments.speed.benchmark cpu --minutes 4 --commit $(git rev-parse HEAD)
+
+Each task has a process of its own. All compile at once, on all cores. When all have (or six
+tenths of the minutes are over, and what has not compiled is left out), one after the other times
+its engines and peers, interleaved, while nothing else runs, and appends its rows: a call that is
+cut off keeps what was timed. On a CPU a process has two threads from its start, and all are timed
+on the same two cores (``taskset``). `tables.py` makes the tables.
+``cpu --tasks Hopper-v5 --csv rows.csv`` times one task on the machine at hand, in some minutes.
 
 All engines play the same looping task: an episode that ends starts again from its own start state,
-so that every simulated step is a real one. A rollout has a policy, its noise, and all that is
-recorded for an update. Runs are interleaved and the median is shown; compare rows of one run with
-each other, not with another machine's. `all.py` makes the rows of docs/benchmarks.csv.
-
-With MJX_REINFORCE_DEBUG=1 the native engine describes its kernels, see docs/engine.md. The last
-column is the time of one env step of one episode, which is what an update of few episodes waits
-for. The column is empty where the batch is too large for all episodes to be played at once.
+so that every simulated step is a real one. Compare rows of one call with each other, not with
+another machine's. With MJX_REINFORCE_DEBUG=1 the native engine describes its kernels.
 """
 
+import concurrent.futures
 import dataclasses
 import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import IO, Literal, NamedTuple
 
-import jax
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from experiments.kit.rows import now
-from experiments.speed.benchmark.ours import ENGINES, rollouts, training
-from experiments.speed.benchmark.peers import peers
-from experiments.speed.benchmark.rows import append, facts, measure, speed
-from mjx_reinforce.engines.native import available
-from mjx_reinforce.engines.native.cpu.machine import this_machine
+from experiments.speed.benchmark.rows import RAW, Candidate
 
-#: Threads of a multiprocessor that the longest programs leave room for.
-THREADS = 256
-SHOWN = ("task", "what", "engine", "precision", "batch", "steps", "compile_seconds")
+
+class Sizes(NamedTuple):
+    """How much of a task is timed on a GPU; episodes fill an H100 or an H200 once or more often.
+
+    MuJoCo Warp needs room beside the record of native's episodes, which XLA copies: a Humanoid's,
+    of 200 env steps, left too little of 80 GB.
+
+    batch, steps: of native's episodes
+    few: native is timed with so many episodes too, and MuJoCo Warp with so many worlds
+    mjx: the episodes of plain MJX, each number that is tried
+    mjx_steps: their env steps
+    warp: the worlds of MuJoCo Warp, each number that is tried
+    """
+
+    batch: int
+    steps: int
+    mjx: tuple[int, ...] = ()
+    mjx_steps: int = 0
+    warp: tuple[int, ...] = (8_192, 32_768)
+    few: tuple[int, ...] = ()
+
+
+#: What stands first is timed first, and so kept where a call is cut off.
+GPU = {
+    "InvertedPendulum-v5": Sizes(262_144, 200, (16_384, 65_536), 50, (32_768, 131_072)),
+    "Hopper-v5": Sizes(33_792, 1_000, (8_192, 32_768), 10, few=(2_048,)),
+    "HalfCheetah-v5": Sizes(33_792, 1_000, (8_192, 32_768), 10, few=(2_048,)),
+    "Walker2d-v5": Sizes(33_792, 1_000, (32_768,), 5, few=(2_048,)),
+    "Ant-v5": Sizes(33_792, 500, (32_768,), 2, few=(2_048,)),
+    "Pusher-v5": Sizes(67_584, 100, (32_768,), 10),
+    "Reacher-v5": Sizes(540_672, 50, (16_384, 65_536), 50, (32_768, 131_072)),
+    "Swimmer-v5": Sizes(135_168, 200, (8_192,), 20, (32_768, 131_072)),
+    "InvertedDoublePendulum-v5": Sizes(135_168, 200, (4_096,), 20, (32_768, 131_072)),
+    "CartPole-v1": Sizes(262_144, 200, warp=()),
+    "Humanoid-v5": Sizes(33_792, 100, few=(2_048,)),
+    "HumanoidStandup-v5": Sizes(33_792, 100, few=(2_048,)),
+}
+#: Episodes and env steps of native's on two cores.
+CPU = {
+    "InvertedPendulum-v5": (8_192, 100),
+    "Hopper-v5": (2_048, 20),
+    "HalfCheetah-v5": (2_048, 20),
+    "Walker2d-v5": (2_048, 20),
+    "Ant-v5": (512, 20),
+    "Humanoid-v5": (512, 20),
+    "HumanoidStandup-v5": (512, 20),
+    "Pusher-v5": (2_048, 20),
+    "Reacher-v5": (2_048, 50),
+    "Swimmer-v5": (2_048, 50),
+    "InvertedDoublePendulum-v5": (2_048, 50),
+}
+#: The task that also shows the engines beside native on a CPU.
+SHOWN_ON_CPU = "InvertedPendulum-v5"
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Measure engines and peers: rollouts with their policy, and whole training updates."""
+    """Measure all that the documents say of speed, on a GPU or on two cores of a CPU."""
 
-    env: tuple[str, ...] = ("InvertedPendulum-v5",)
-    """Environments."""
-    engine: tuple[str, ...] = ("plain MJX", "fused", "native")
-    """Rows of the table: "plain MJX", "plain MJX, 1 iteration", vmap, fused and native."""
-    precision: tuple[str, ...] = ("float32", "float64")
-    """Of the native engine on a CPU; all else of ours plays in float32."""
-    batch: tuple[int, ...] = (128, 512, 2048, 8192)
-    """Episodes played at once."""
-    max_mjx_batch: int = 2048
-    """Plain MJX is not run on more, which takes minutes on a CPU."""
-    steps: int = 100
-    """Env steps of each episode."""
-    repeats: int = 5
-    """Timed runs of each row; the median is shown."""
-    train: bool = True
-    """Also measure training updates (16-32 and 64-64 networks) at the greatest batch."""
-    policy: Path | None = None
-    """The policy folder of a run, instead of an untrained 16-32 network."""
-    csv: Path | None = None
-    """Where to append the rows, with every repetition's speed."""
-    quick: bool = False
-    """InvertedPendulum with few episodes and no training, in under two minutes."""
+    part: tyro.conf.Positional[Literal["gpu", "train", "cpu"]]
+    """gpu: rollouts; train: training on a GPU; cpu: rollouts on two cores."""
+    minutes: float = 5.0
+    """What this may take; what is not done by then is left out."""
+    csv: Path = RAW
+    """Where to append the rows."""
+    commit: str = ""
+    """Of the code that is measured."""
+    repeats: int = 4
+    """Timed runs of each row, after one that warms up."""
+    tasks: tuple[str, ...] = ()
+    """All of the part if not given."""
+    shrink: int = 1
+    """Divide episodes and worlds by this, to try the script; such rows are worth nothing."""
+    worker: str = ""
+    """The call that this process times its only task for."""
 
 
 def main() -> None:
-    """Measures, prints and writes."""
+    """Starts a process for each task, or is one."""
     settings = tyro.cli(Settings, prog="python -m experiments.speed.benchmark", description=__doc__)
-    if settings.quick:
-        few: dict[str, Any] = {
-            "batch": (128, 1024, 4096),
-            "max_mjx_batch": 128,
-            "repeats": 3,
-            "train": False,
-        }
-        settings = dataclasses.replace(settings, **few)
+    if settings.worker:
+        work(settings)
+    else:
+        conduct(settings)
+
+
+def conduct(settings: Settings) -> None:
+    """Lets all tasks compile at once, then time one by one."""
+    began = time.monotonic()
+    date = now()
+    every = {"cpu": list(CPU), "gpu": list(GPU), "train": list(GPU)}
+    tasks = list(settings.tasks or every[settings.part])
+    started = {task: start(task, i, date, settings) for i, task in enumerate(tasks)}
+    try:
+        time_in_turn(started, settings, began)
+    finally:
+        for process in started.values():
+            stop(process)
+    print(f"{settings.part}: {time.monotonic() - began:.0f} s", flush=True)
+
+
+def time_in_turn(
+    started: dict[str, subprocess.Popen[str]], settings: Settings, began: float
+) -> None:
+    """Waits until tasks have compiled, and lets one after the other time."""
+    with concurrent.futures.ThreadPoolExecutor(len(started)) as pool:
+        ready = {task: pool.submit(until, p.stdout, "compiled") for task, p in started.items()}
+        concurrent.futures.wait(ready.values(), timeout=0.6 * 60 * settings.minutes)
+        for task, process in started.items():
+            if not ready[task].done() or not ready[task].result():
+                print(f"{task}: left out, not compiled in time or failed", flush=True)
+                stop(process)
+    print(f"compiled after {time.monotonic() - began:.0f} s", flush=True)
+    for process in started.values():
+        left = settings.minutes * 60 - (time.monotonic() - began)
+        if process.poll() is None and left > 0:
+            if settings.part == "cpu":
+                quiet = named(two_cores())
+                move = ["taskset", "-acp", quiet, str(process.pid)]
+                subprocess.run(move, check=True, stdout=subprocess.DEVNULL)
+            print(*go(process, left), sep="\n", flush=True)
+        stop(process)
+
+
+def stop(process: subprocess.Popen[str]) -> None:
+    """Ends a task's process, which ends its compilers first: they would disturb the others."""
+    process.terminate()
+    try:
+        process.wait(timeout=30)
+    except subprocess.TimeoutExpired:
+        process.kill()
+
+
+def start(task: str, index: int, date: str, settings: Settings) -> subprocess.Popen[str]:
+    """Starts a task's process; on a CPU, held to two of the machine's threads."""
+    command = [sys.executable, "-m", "experiments.speed.benchmark", settings.part]
+    command += ["--tasks", task, "--worker", date]
+    for name in ("minutes", "csv", "commit", "repeats", "shrink"):
+        command.append(f"--{name}={getattr(settings, name)}")
+    environment = os.environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
+    if settings.part == "cpu":
+        environment["JAX_PLATFORMS"] = "cpu"
+        usable = sorted(os.sched_getaffinity(0))
+        first = 2 * (index % (len(usable) // 2))
+        command = ["taskset", "-c", named(usable[first : first + 2]), *command]
+    pipe = subprocess.PIPE
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment, text=True)
+
+
+def two_cores() -> list[int]:
+    """Returns a hardware thread of each of two cores, or two threads where it has one core."""
+    usable = sorted(os.sched_getaffinity(0))
+    place = "/sys/devices/system/cpu/cpu{}/topology/thread_siblings_list"
+    cores = {}
+    for thread in usable:
+        siblings = Path(place.format(thread))
+        cores.setdefault(siblings.read_text() if siblings.exists() else thread, thread)
+    return list(cores.values())[:2] if len(cores) > 1 else usable[:2]
+
+
+def named(threads: list[int]) -> str:
+    """Returns threads as ``taskset`` takes them."""
+    return ",".join(str(thread) for thread in threads)
+
+
+def until(stream: IO[str] | None, word: str) -> bool:
+    """Reads lines up to a word; returns whether it came."""
+    return stream is not None and any(line.strip() == word for line in stream)
+
+
+def go(process: subprocess.Popen[str], seconds: float) -> list[str]:
+    """Lets a process time, for so long at most; returns what it printed."""
+    try:
+        return process.communicate("go\n", timeout=seconds)[0].splitlines()
+    except subprocess.TimeoutExpired:
+        return ["no time left"]
+
+
+def work(settings: Settings) -> None:
+    """Compiles one task's engines, waits for its turn, times and appends."""
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))  # not at once: compilers are ended first
+    import jax
+
+    from experiments.speed.benchmark.rows import append, facts, measure, speed
+
     jax.config.update("jax_default_matmul_precision", "highest")
-    said = facts(now(), "")
-    rows = []
-    for env in settings.env:
-        ours = list(engines(env, settings))
-        rows += [said | row for row in measure(ours + peers(env), settings.repeats)]
-    show(rows)
-    if settings.csv:
-        append(settings.csv, rows)
-
-
-def engines(env_id: str, settings: Settings):
-    """Generates what is to be timed of every engine, batch and precision."""
-    precisions = settings.precision if jax.default_backend() == "cpu" else ("float32",)
-    for name in settings.engine:
-        plain = ENGINES[name][0] == "vmap"
-        batches = [b for b in settings.batch if not plain or b <= settings.max_mjx_batch]
-        for precision in precisions if name == "native" else ("float32",):
-            yield from rollouts(
-                env_id, name, batches, settings.steps, precision, policy=settings.policy
-            )
-        if settings.train:
-            for sizes in ((16, 32), (64, 64)):
-                yield training(env_id, name, max(batches), settings.steps, sizes)
-
-
-def show(rows: list[dict[str, Any]]) -> None:
-    """Prints the table."""
-    columns = (*(key.replace("_", " ") for key in SHOWN), "env steps/s", "ns a step of an episode")
-    table = Table(*columns)
+    (task,) = settings.tasks
+    prepare = {"gpu": on_gpu, "train": trainings, "cpu": on_cpu}[settings.part]
+    candidates = prepare(task, settings.shrink)
+    print("compiled", flush=True)
+    if sys.stdin.readline().strip() != "go":
+        return
+    said = facts(settings.worker, settings.commit)
+    rows = [row | said for row in measure(candidates(), settings.repeats)]
+    append(settings.csv, rows)
     for row in rows:
-        cells = (row.get(key) for key in SHOWN)
-        table.add_row(*(_format(x) for x in cells), f"{speed(row):,.0f}", latency(row))
-    Console(width=160).print(table)
+        words = (row[key] for key in ("task", "what", "engine", "precision", "batch"))
+        print(*words, f"{speed(row):.3g} env steps/s", sep=", ", flush=True)
 
 
-def latency(row: dict[str, Any]) -> str:
-    """Returns the time of one env step of one episode (ns), if all of a rollout play at once."""
-    together = row["engine"] == "native" and row["what"].startswith("rollout")
-    return f"{1e9 * row['batch'] / speed(row):,.0f}" if together and fits(row["batch"]) else ""
+def added(task: str, worlds: int) -> list[Candidate]:
+    """MuJoCo Warp with so many worlds; where it fails, its reason is printed instead."""
+    from experiments.speed.benchmark.peers import mujoco_warp
+
+    try:
+        candidate = mujoco_warp(task, worlds)
+        candidate.run()
+    except Exception as error:  # whatever it raises, the other rows stand
+        print(f"{task}: MuJoCo Warp, {worlds} worlds: {error!r}", file=sys.stderr, flush=True)
+        return []
+    return [candidate]
 
 
-def fits(batch: int) -> bool:
-    """Returns whether the native engine surely plays so many episodes at once, of any task."""
-    if available.platform() == "cpu":
-        return batch <= this_machine().lanes * (os.cpu_count() or 1)
-    return batch <= THREADS * jax.devices()[0].core_count
+def on_gpu(task: str, shrink: int) -> Callable[[], list[Candidate]]:
+    """Native, plain MJX, C MuJoCo and MuJoCo Warp; records wait, for all tasks share the GPU."""
+    from experiments.speed.benchmark.ours import rollout_of, rollouts
+    from experiments.speed.benchmark.peers import c_mujoco
+
+    sizes = GPU[task]
+    native = rollout_of(task, "native", sizes.steps)
+    native(128).run()  # the machine code is the same for any number of episodes
+    plain = [batch // shrink for batch in sizes.mjx]
+    others = rollouts(task, "plain MJX", plain, sizes.mjx_steps) if plain else []
+    if sizes.warp:
+        others.append(c_mujoco(task))
+        added(task, 128)  # compiles
+
+    def candidates() -> list[Candidate]:
+        ours = [native(batch // shrink) for batch in (*sizes.few, sizes.batch)]
+        worlds = (*sizes.few, *sizes.warp)
+        return sum((added(task, number // shrink) for number in worlds), ours + others)
+
+    return candidates
 
 
-def _format(value: Any) -> str:
-    return "" if value is None else f"{value:.1f}" if isinstance(value, float) else str(value)
+def trainings(task: str, shrink: int) -> Callable[[], list[Candidate]]:
+    """Training updates of a 64-64 policy."""
+    from experiments.speed.benchmark.ours import training
+
+    update = training(task, "native", GPU[task].batch // shrink, 100)
+    return lambda: [update]
+
+
+def on_cpu(task: str, shrink: int) -> Callable[[], list[Candidate]]:
+    """Native in both precisions beside C MuJoCo and Gymnasium, on the threads of this process."""
+    from experiments.speed.benchmark.ours import rollouts
+    from experiments.speed.benchmark.peers import peers
+
+    batch, steps = CPU[task]
+    batches = [batch // shrink]
+    candidates = rollouts(task, "native", batches, steps)
+    candidates += rollouts(task, "native", batches, steps, "float64")
+    if task == SHOWN_ON_CPU:
+        candidates += rollouts(task, "plain MJX", [128, 512], steps)
+    candidates += peers(task)
+    return lambda: candidates
 
 
 if __name__ == "__main__":

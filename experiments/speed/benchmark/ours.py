@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from experiments.speed.benchmark.rows import Candidate
-from mjx_reinforce import Actor, act, envs, load_policy, mlp_policy, reinforce
+from mjx_reinforce import Actor, act, envs, mlp_policy, reinforce
 from mjx_reinforce.engines.choice import ActingPolicy, choose
 from mjx_reinforce.learners.reinforce import default_distribution
 from mjx_reinforce.policies import normalize
@@ -21,9 +20,6 @@ from mjx_reinforce.types import action_space, observation_size
 #: Name in the table -> engine, and the solver of the environment's physics.
 ENGINES = {
     "plain MJX": ("vmap", "mjx"),
-    "plain MJX, 1 iteration": ("vmap", "fast"),
-    "vmap": ("vmap", "exact"),
-    "fused": ("fused", "exact"),
     "native": ("native", "exact"),
 }
 
@@ -60,26 +56,22 @@ class Loop:
 
 
 def rollouts(
-    env_id: str,
-    name: str,
-    batches: list[int],
-    steps: int,
-    precision: str = "float32",
-    *,
-    policy: Path | None = None,
+    env_id: str, name: str, batches: list[int], steps: int, precision: str = "float32"
 ) -> list[Candidate]:
     """Whole rollouts with a policy, its noise and all that an update needs, for every batch."""
     with jax.enable_x64(precision == "float64"):
-        return list(map(rollout_of(env_id, name, steps, precision, policy=policy), batches))
+        return list(map(rollout_of(env_id, name, steps, precision), batches))
 
 
 def rollout_of(
-    env_id: str, name: str, steps: int, precision: str = "float32", *, policy: Path | None = None
+    env_id: str, name: str, steps: int, precision: str = "float32"
 ) -> Callable[[int], Candidate]:
     """Makes the machine code of a rollout; returns what compiles a program of so many episodes."""
     engine_name, solver = ENGINES[name]
     env = Loop(make(env_id, solver), steps)
-    network, actor = the_policy(env, policy)
+    size = observation_size(env)
+    network = mlp_policy(size, default_distribution(action_space(env)), (16, 32))
+    actor = Actor(params=network.init(jax.random.key(0)), normalizer=normalize.init(size))
     play_act = functools.partial(act, network)
     began = time.perf_counter()
     player = ActingPolicy(play_act, actor, network.distribution)
@@ -91,21 +83,18 @@ def rollout_of(
             sizes = {"num_episodes": batch, "horizon": steps}
             return engine.rollout(env, play_act, actor, network.distribution, key, **sizes)
 
-        what = "rollout, untrained 16-32 policy" if policy is None else f"rollout, {policy}"
-        row = {"what": what, "engine": name, "task": env_id, "precision": precision}
-        row |= {"batch": batch, "steps": steps}
+        row = {"what": "rollout, untrained 16-32 policy", "engine": name, "task": env_id}
+        row |= {"precision": precision, "batch": batch, "steps": steps}
         return compiled(row, play, actor, batch * steps, choosing)
 
     return of
 
 
-def training(
-    env_id: str, name: str, batch: int, steps: int, sizes: tuple[int, ...] = (64, 64)
-) -> Candidate:
-    """Whole updates in float32: rollout, estimator, gradient and optimiser."""
+def training(env_id: str, name: str, batch: int, steps: int) -> Candidate:
+    """Whole updates of a 64-64 policy in float32: rollout, estimator, gradient and optimiser."""
     engine_name, solver = ENGINES[name]
     env = Loop(make(env_id, solver), steps)
-    policy = mlp_policy(observation_size(env), default_distribution(action_space(env)), sizes)
+    policy = mlp_policy(observation_size(env), default_distribution(action_space(env)), (64, 64))
     began = time.perf_counter()
     learner = reinforce(env, policy=policy, num_episodes=batch, engine=engine_name)
     choosing = time.perf_counter() - began
@@ -114,8 +103,12 @@ def training(
     def update(state, key):
         return learner.step(dataclasses.replace(state, key=key))
 
-    what = f"training, untrained {sizes[0]}-{sizes[1]} policy"
-    row = {"what": what, "engine": name, "task": env_id, "precision": "float32"}
+    row = {
+        "what": "training, untrained 64-64 policy",
+        "engine": name,
+        "task": env_id,
+        "precision": "float32",
+    }
     row |= {"batch": batch, "steps": steps}
     return compiled(row, update, state, batch * steps, choosing)
 
@@ -124,15 +117,6 @@ def make(env_id: str, solver: str) -> Any:
     """Builds an environment; one without a MuJoCo model has no solver."""
     env = envs.make(env_id)
     return envs.make(env_id, solver=solver) if hasattr(env, "mj_model") else env
-
-
-def the_policy(env: Any, directory: Path | None) -> tuple[Any, Actor]:
-    """A trained policy's first seed, or a fresh 16-32 network."""
-    if directory is not None:
-        return load_policy(directory, seed=0)
-    size = observation_size(env)
-    policy = mlp_policy(size, default_distribution(action_space(env)), (16, 32))
-    return policy, Actor(params=policy.init(jax.random.key(0)), normalizer=normalize.init(size))
 
 
 def compiled(

@@ -179,16 +179,6 @@ def gpu(raw: Raw) -> str:
     return f"{origin(raw.gpu + raw.train)}\n\n{table(header, rows)}"
 
 
-def warp(raw: Raw) -> str:
-    """What MuJoCo Warp had room for, and its settings."""
-    rows = []
-    for task in tasks_of(raw.gpu):
-        if row := best(raw.gpu, task, "MuJoCo Warp"):
-            sizes, _, rest = row["settings"].partition("; ")
-            rows.append((task, sizes, rest))
-    return table(("task", "room for each world", "settings"), rows)
-
-
 def cpu(raw: Raw) -> str:
     """All tasks on two cores of a CPU."""
     rows = []
@@ -211,24 +201,11 @@ def cpu(raw: Raw) -> str:
     return f"{origin(raw.cpu)}\n\n{table(header, rows)}"
 
 
-def engines(raw: Raw) -> str:
-    """All engines on two cores, where they were measured."""
-    rows = []
-    for row in raw.cpu:
-        if plain := best(raw.cpu, row["task"], "plain MJX"):
-            cells = (row["task"], row["engine"], row["precision"], at(row), rate(row))
-            rows.append((*cells, ratio(row, plain)))
-    header = ("task", "engine", "precision", "episodes x steps", "env steps/s", "/ plain MJX")
-    return table(header, rows)
-
-
 TABLES: dict[str, Callable[[Raw], str]] = {
     "speed": readme,
     "speed in words": words,
     "speed on a GPU": gpu,
-    "MuJoCo Warp's settings": warp,
     "speed on two cores": cpu,
-    "engines on two cores": engines,
 }
 
 

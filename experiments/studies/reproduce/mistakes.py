@@ -1,46 +1,15 @@
-"""Mistakes of document 001's program that no setting of ours has."""
+"""A mistake of document 001's program that no setting of ours has."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.stats import norm
 
-from mjx_reinforce import Box, Policy
 from mjx_reinforce.learners.learner import Learner
 
 STALE = "stale first observation"
-_CLAMP = 1e-6
-
-
-def clamped_log_prob(outputs: Any, action: Any, low: Any, high: Any) -> jax.Array:
-    """Returns the log-density [...] of truncated Normals as torchrl computes it.
-
-    Its distribution functions are clamped at 1e-6: with the mean far beyond a bound, what is left
-    is a Normal's density without its constant, which pushes the mean on where the return is poor.
-
-    Args:
-      outputs: [..., 2 A] the means and the logarithms of the standard deviations.
-      action: [..., A].
-      low: [A] lower bounds.
-      high: [A] upper bounds.
-    """
-    mean, log_std = jnp.split(outputs, 2, axis=-1)
-
-    def probability(x):
-        return jnp.clip(norm.cdf((x - mean) * jnp.exp(-log_std)), _CLAMP, 1 - _CLAMP)
-
-    mass = jnp.maximum(probability(high) - probability(low), _CLAMP)
-    return jnp.sum(norm.logpdf(action, mean, jnp.exp(log_std)) - jnp.log(mass), axis=-1)
-
-
-def clamped(policy: Policy, space: Box) -> Policy:
-    """Returns a policy of truncated Normals whose density is ``clamped_log_prob``."""
-    log_prob = functools.partial(clamped_log_prob, low=space.low, high=space.high)
-    return policy._replace(distribution=policy.distribution._replace(log_prob=log_prob))
 
 
 class _StaleStart:

@@ -10,7 +10,6 @@ from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.export.films import SAMPLES, gif, import_mujoco
 from mjx_reinforce.export.takes import Film, Take, side_by_side
 from mjx_reinforce.files import write_bytes
-from mjx_reinforce.playing.cast import untrained
 from mjx_reinforce.watch import scene
 
 #: The tasks side by side, and the size of a file at most (bytes).
@@ -21,15 +20,12 @@ _FEWER_COLORS = (128, 64, 32, 16, 8)
 
 
 def write(folder: Path, arm: Path | None) -> None:
-    """Writes tasks.gif, before-and-after.gif and, of a run of my_arm:Arm, arm.gif."""
+    """Writes tasks.gif and, of a run of my_arm:Arm, arm.gif."""
     import_mujoco()
     configure_jax()
     folder.mkdir(parents=True, exist_ok=True)
     tasks = [_take(load(name), name.removesuffix("-v5")) for name in _TASKS]
     save(folder / "tasks.gif", side_by_side(tasks, 160, 176, seconds=2.5, max_rate=12))
-    hopper = load("Hopper-v5")
-    both = [_take(untrained(hopper), "before training"), _take(hopper, "after training")]
-    save(folder / "before-and-after.gif", side_by_side(both, 240, 240, seconds=4.0, max_rate=12))
     if arm is not None:
         player = load(arm)
         balls = [_take(player, f"ball {i + 1}", episode=i) for i in range(3)]

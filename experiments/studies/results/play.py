@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.studies.results.files import POLICIES, write_played
 from experiments.studies.results.films import save
+from experiments.studies.results.kept import POLICIES, write_played
 from experiments.studies.results.runs import ended
 from experiments.studies.results.tasks import ROOT, Task
 from mjx_reinforce import Player, envs, load
@@ -28,7 +28,7 @@ def play(tasks: Iterable[Task], directory: Path, films: Path, num_episodes: int)
     Args:
       tasks: of the results.
       directory: of the stages; the returns go to DIR/play/TASK.csv.
-      films: the folder of films, TASK-best.gif and TASK-median.gif.
+      films: the folder of films, TASK-best.gif.
       num_episodes: of each policy in each simulation.
     """
     import_mujoco()
@@ -44,7 +44,8 @@ def play(tasks: Iterable[Task], directory: Path, films: Path, num_episodes: int)
         ours = own_simulation(run, load(run.directory), num_episodes)
         rows: list[dict[str, Any]] = []
         for policy in POLICIES:
-            rows += _play(run, policy, num_episodes, ours, films / f"{task.name}-{policy}.gif")
+            film = films / f"{task.name}-best.gif" if policy == "best" else None
+            rows += _play(run, policy, num_episodes, ours, film)
         write_played(path, rows)
 
 
@@ -88,8 +89,10 @@ def own_simulation(run: Run, player: Player, num_episodes: int) -> Any:
     return returns
 
 
-def _play(run: Run, policy: Any, num_episodes: int, ours: Any, film: Path) -> list[dict[str, Any]]:
-    """Plays one policy, films it, and returns a row for each episode."""
+def _play(
+    run: Run, policy: Any, num_episodes: int, ours: Any, film: Path | None
+) -> list[dict[str, Any]]:
+    """Plays one policy, films it if so wished, and returns a row for each episode."""
     from mjx_reinforce.export.player import load_seed
     from mjx_reinforce.playing.mjx_playing import gymnasium_simulator
 
@@ -102,7 +105,8 @@ def _play(run: Run, policy: Any, num_episodes: int, ours: Any, film: Path) -> li
     }
     for name, values in returns.items():
         print(f"{policy}, seed {player.seed}: mean return {np.mean(values):.1f} in {name}")
-    _film(film, run.env, f"{run.env}, {policy} seed", episodes)
+    if film is not None:
+        _film(film, run.env, f"{run.env}, {policy} seed", episodes)
     return [
         {
             "policy": policy,

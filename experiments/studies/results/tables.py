@@ -1,34 +1,29 @@
-"""The tables of docs/results.md."""
+"""The tables of docs/results.md and README.md."""
 
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy import stats
 
 from experiments.kit.markdown import fixed, percent, table
-from experiments.studies.results.files import POLICIES, STAY_SOLVED, Columns, Result, tested_returns
-from experiments.studies.results.measures import (
-    Comparison,
-    compare,
-    published_interval,
-    solved_within,
-    steps_quantile,
-    verdict,
-)
-from mjx_reinforce.reports.experiment import setting_in_words
-from mjx_reinforce.reports.statistics import Estimate
+from experiments.studies.results import kept
+from experiments.studies.results.kept import POLICIES, Columns, Group, Result
+from experiments.studies.results.tasks import PUBLISHED_SEEDS
+from mjx_reinforce.reports.statistics import Estimate, finite_or_nan
 from mjx_reinforce.reports.statistics.aggregates import interval
 
 #: Env steps within which the pendulum should be solved.
 WITHIN = (50_000, 100_000)
+PEERS = ("Stable-Baselines3 PPO", "Stable-Baselines3 SAC")
+#: The tasks of README.md.
+_README = ("Hopper-v5", "HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5", "Swimmer-v5")
 
 
 def number(x: float) -> str:
     """Returns a return with one decimal, two if it is small."""
-    if not math.isfinite(x):
-        return "none"
     return fixed(x, 2 if abs(x) < 10 else 1)
 
 
@@ -42,178 +37,191 @@ def seconds(x: float) -> str:
     return f"{x:.1f} s" if x < 120 else f"{x / 60:.1f} min"
 
 
-def machine(facts: dict[str, Any]) -> str:
-    """Returns where a run was trained."""
-    if facts["device"] == "cpu":
-        return f"{facts['cpu_count']} CPU cores"
-    return f"{facts['num_devices']} {facts['device']}"
+def published_interval(mean: float, deviation: float) -> Estimate:
+    """Returns a published mean with its 95 % interval by Student's t over the published seeds."""
+    t = stats.t.ppf(0.975, PUBLISHED_SEEDS - 1)
+    half = float(t) * deviation / math.sqrt(PUBLISHED_SEEDS)
+    return Estimate(mean, mean - half, mean + half)
 
 
-def mean_of(result: Result) -> Estimate:
-    """Returns the mean over seeds of the last policies' returns, with its interval."""
-    return interval("mean", tested_returns(result))
+def verdict(ours: Estimate, published: tuple[float, float] | None) -> str:
+    """Returns where our mean is: "above", "below" or "not apart" from a published one.
+
+    Args:
+      ours: with its interval; NaN where a seed failed.
+      published: mean and standard deviation over seeds; None where there is none.
+    """
+    if published is None:
+        return "none published"
+    if not (math.isfinite(ours.low) and math.isfinite(ours.high)):
+        return "none: a seed failed"
+    theirs = published_interval(*published)
+    if ours.low > theirs.high:
+        return "above"
+    return "below" if ours.high < theirs.low else "not apart"
 
 
-def verdict_of(result: Result) -> str:
-    """Returns where our mean is beside the published one."""
-    return verdict(mean_of(result), result.task.published)
-
-
-def comparison(played: Columns | None, policy: str) -> Comparison | None:
-    """Returns a policy's returns here and in Gymnasium, None if it was not played."""
-    if played is None:
-        return None
-    chosen = played["policy"] == policy
-    ours = played["simulation"] == "ours"
-    returns = played["return"]
-    return compare(returns[chosen & ours], returns[chosen & ~ours])
-
-
-def results_table(results: Sequence[Result]) -> str:
-    """Returns the table of all tasks."""
-    header = [
-        *("task", "seeds", "env steps a seed", "IQM (95 %)", "mean (95 %)", "worst seed"),
-        *(
-            "solved at the end (threshold)",
-            "published (95 %)",
-            "our mean is",
-            "training, compiling",
-        ),
-        *("machine", "Gymnasium: best, median seed"),
-    ]
-    return table(header, map(_result_row, results))
+def of_tasks(results: Sequence[Result]) -> str:
+    """Returns the table of all tasks by env steps."""
+    header = ["task", "seeds", "env steps a seed", "IQM (95 %)", "mean (95 %)", "worst seed"]
+    header += ["solved at the end (threshold)", "published (95 %)", "our mean is"]
+    return table([*header, "training, compiling", "machine"], map(_result_row, results))
 
 
 def _result_row(result: Result) -> list[str]:
-    tested, facts = tested_returns(result), result.facts
+    tested, facts = finite_or_nan(result.seeds["test_return"]), result.facts
     threshold, published = facts["threshold"], result.task.published
     solved = "no threshold"
     if threshold is not None:
         solved = f"{int(np.sum(tested >= threshold)):,} of {len(tested):,} ({threshold:,g})"
-    theirs = "none" if published is None else estimate(published_interval(*published))
-    played = [comparison(result.played, policy) for policy in POLICIES]
+    machine = f"{facts['num_devices']} {facts['device']}"
     return [
         result.task.name,
         f"{len(tested):,}",
         f"{facts['settings']['env_steps']:,}",
-        estimate(interval("iqm", tested)),
-        estimate(mean_of(result)),
-        number(worst(tested)),
+        *(estimate(interval(of, tested)) for of in ("iqm", "mean")),
+        "failed" if np.isnan(tested).any() else number(tested.min()),
         solved,
-        theirs,
-        verdict_of(result),
+        "none" if published is None else estimate(published_interval(*published)),
+        verdict(interval("mean", tested), published),
         f"{seconds(facts['run_seconds'])}, {seconds(facts['compile_seconds'])}",
-        machine(facts),
-        ", ".join(number(one.gymnasium.value) for one in played if one) or "not played",
+        f"{facts['cpu_count']} CPU cores" if facts["device"] == "cpu" else machine,
     ]
 
 
-def _least_share(result: Result) -> str:
-    least = result.facts["least_share_solved"]
-    return "not trained for as long" if least is None else percent(least, 2)
-
-
-def worst(returns: np.ndarray) -> float:
-    """Returns the least of returns [S]; one that is not finite is the worst."""
-    return float(np.min(np.where(np.isfinite(returns), returns, -np.inf)))
-
-
-def pendulum_table(results: Sequence[Result]) -> str:
-    """Returns how soon, how surely and for how long the pendulum is solved."""
-    start, stop = STAY_SOLVED
+def pendulum(results: Sequence[Result]) -> str:
+    """Returns how soon and how surely the pendulum is solved, by the evaluations on the way."""
+    rows = []
+    for result in results:
+        steps = np.sort(result.seeds["env_steps_to_solve"])
+        within = [int(np.sum(steps <= limit)) for limit in WITHIN]
+        sizes = result.facts["settings"]["hidden_sizes"]
+        rows.append(
+            [
+                f"{' and '.join(map(str, sizes))} units" if sizes else "linear",
+                f"{len(steps):,}",
+                *(f"{percent(count / len(steps), 2)} ({count:,})" for count in within),
+                *(_steps(steps[math.ceil(share * len(steps)) - 1]) for share in (0.5, 0.99)),
+            ]
+        )
     header = ["policy", "seeds", *(f"solved within {limit:,}" for limit in WITHIN)]
-    header += [f"least share solved, {start:,} to {stop:,}"]
-    header += ["median env steps to solve", "99 % of seeds within"]
-    return table(header, map(_pendulum_row, results))
-
-
-def _pendulum_row(result: Result) -> list[str]:
-    steps = result.seeds["env_steps_to_solve"]
-    sizes = result.facts["settings"]["hidden_sizes"]
-    within = [solved_within(steps, limit) for limit in WITHIN]
-    return [
-        f"{' and '.join(map(str, sizes))} units" if sizes else "linear",
-        f"{len(steps):,}",
-        *(f"{percent(count / len(steps), 2)} ({count:,})" for count in within),
-        _least_share(result),
-        *(_steps(steps_quantile(steps, share)) for share in (0.5, 0.99)),
-    ]
+    return table([*header, "median env steps to solve", "99 % of seeds within"], rows)
 
 
 def _steps(x: float) -> str:
     return f"{x:,.0f}" if math.isfinite(x) else "never"
 
 
-def play_table(played: Mapping[str, Columns], films: Mapping[str, Path], docs: Path) -> str:
-    """Returns the returns of policies here and in Gymnasium, with links to films that exist.
+def gpu(groups: Sequence[Group], docs: Path) -> str:
+    """Returns the table of runs on GPUs, beside the figures of published.csv in a folder."""
+    rows = [
+        [
+            group.task,
+            group.device.removeprefix("NVIDIA ").split()[0],
+            str(len(group.final)),
+            f"{number(group.minute.mean())}, {number(group.minute.min())}",
+            estimate(interval("mean", group.final)),
+            *map(number, (group.final.min(), group.final.max())),
+            seconds(group.seconds) + _stopped(group),
+            f"{group.env_steps:.2g}".replace("e+0", "e").replace("e+", "e"),
+            *(_published(docs, group.task, algorithm) for algorithm in ("PPO", "SAC")),
+        ]
+        for group in groups
+        if group.is_gpu
+    ]
+    header = ["task", "on", "seeds", "after a minute: mean, worst", "at the end: mean (95 %)"]
+    header += ["worst", "best seed", "seconds, all seeds", "env steps a seed", "PPO, published"]
+    return table([*header, "SAC, published"], rows)
 
-    Args:
-      played: by a name, what was played.
-      films: by that name, what the names of its films begin with, below ``docs``.
-      docs: the folder.
-    """
+
+def _published(docs: Path, task: str, algorithm: str) -> str:
+    figure = kept.published(docs / "published.csv", task, algorithm)
+    if figure is None:
+        return "none"
+    return f"{number(figure.mean)} ({figure.source}, {figure.env_steps / 1e6:.2g} million)"
+
+
+def cpu(groups: Sequence[Group], docs: Path) -> str:
+    """Returns the table of runs on two threads, beside those of peers.csv in a folder."""
+    others = kept.peers(docs / "peers.csv")
+    rows = [
+        [
+            group.task,
+            group.device,
+            str(len(group.final)),
+            _spread(group.minute),
+            f"{_spread(group.final)} after {seconds(group.seconds)}{_stopped(group)}",
+            *(
+                _peer(others.get((group.task, peer, group.device.rpartition(", ")[2]), {}))
+                for peer in PEERS
+            ),
+        ]
+        for group in groups
+        if not group.is_gpu
+    ]
+    header = ["task", "on", "runs", "after a minute: median (worst, best)", "at the end"]
+    return table([*header, "PPO: 1, 10 minutes", "SAC: 1, 10 minutes"], rows)
+
+
+def _stopped(group: Group) -> str:
+    return " (stopped)" if group.stopped else ""
+
+
+def _spread(values: np.ndarray) -> str:
+    low, middle, high = (number(float(f(values))) for f in (np.min, np.median, np.max))
+    return f"{middle} ({low}, {high})"
+
+
+def _peer(budgets: dict[float, list[float]]) -> str:
+    found = (budgets.get(seconds) for seconds in (60.0, 600.0))
+    cells = ", ".join(number(float(np.mean(x))) if x else "not run" for x in found)
+    return cells if budgets else "not run"
+
+
+def compare(ours: ArrayLike, theirs: ArrayLike) -> tuple[Estimate, Estimate, Estimate]:
+    """Returns the means of returns [N] in two simulations, and theirs less ours, by Welch."""
+    ours, theirs = np.asarray(ours, float), np.asarray(theirs, float)
+    difference = float(theirs.mean() - ours.mean())
+    low = high = difference
+    if ours.std() > 0 or theirs.std() > 0:
+        welch = stats.ttest_ind(theirs, ours, equal_var=False).confidence_interval(0.95)
+        low, high = float(welch.low), float(welch.high)
+    return interval("mean", ours), interval("mean", theirs), Estimate(difference, low, high)
+
+
+def play(played: Mapping[str, Columns], docs: Path) -> str:
+    """Returns the returns of policies here and in Gymnasium, with links to films that exist."""
     rows = []
-    for name, columns in played.items():
+    for task, columns in played.items():
         for policy in POLICIES:
-            if (found := comparison(columns, policy)) is None:
-                continue
-            film = Path(f"{films.get(name, '')}-{policy}.gif")
-            seed = columns["seed"][columns["policy"] == policy][0]
-            rows.append(
-                [
-                    *(name, f"{policy} ({seed})"),
-                    *map(estimate, (found.ours, found.gymnasium, found.difference)),
-                    "yes" if found.within else "no",
-                    f"[film]({film.as_posix()})" if (docs / film).exists() else "none",
-                ]
-            )
-    header = ["task", "policy (seed)", "here", "Gymnasium", "Gymnasium less here"]
-    return table([*header, "within our interval", "film"], rows)
+            mine, ours = columns["policy"] == policy, columns["simulation"] == "ours"
+            returns = columns["return"]
+            found = compare(returns[mine & ours], returns[mine & ~ours])
+            film = Path("films", f"{task}-{policy}.gif")
+            shown = f"[film]({film.as_posix()})" if (docs / film).exists() else ""
+            label = f"{policy} ({columns['seed'][mine][0]})"
+            rows.append([task, label, *map(estimate, found), shown])
+    header = ["task", "policy (seed)", "here", "Gymnasium", "Gymnasium less here", "film"]
+    return table(header, rows)
 
 
-def moved_table(results: Sequence[Result]) -> str:
-    """Returns which settings, moved alone, surely change what the defaults reach."""
+def readme(groups: Sequence[Group], docs: Path) -> str:
+    """Returns the table of README.md; of several CPUs the one with the most runs counts."""
     rows = []
-    for result in results:
-        if result.moved is None:
-            continue
-        name, value, low, high = moved_measure(result)
-        shown = _share if name == "solved" else number
-        labels = [_label(result.moved, row) for row in range(len(value))]
-        worse = [row for row in range(len(value)) if high[row] < low[0]]
-        better = [row for row in range(len(value)) if low[row] > high[0]]
-        rows.append(
-            [
-                result.task.name,
-                *(f"{result.moved[column][0]:,}" for column in ("seeds", "env_steps")),
-                f"{'solved' if name == 'solved' else 'IQM'} {shown(value[0])}",
-                *(
-                    "; ".join(f"{labels[row]}: {shown(value[row])}" for row in chosen) or "none"
-                    for chosen in (worse, better)
-                ),
-            ]
-        )
-    return table(
-        ["task", "seeds of each", "env steps a seed", "defaults", "surely worse", "surely better"],
-        rows,
-    )
+    for task in _README:
+        mine = [group for group in groups if group.task == task]
+        on_gpu = [group for group in mine if group.is_gpu]
+        on_cpu = sorted((x for x in mine if not x.is_gpu), key=lambda x: len(x.final))
+        cells = [_round(np.median(on_cpu[-1].minute)) if on_cpu else "", "", "", ""]
+        if on_gpu:
+            cells[1] = _round(on_gpu[0].minute.mean())
+            cells[2] = f"{_round(on_gpu[0].final.mean())} in {seconds(on_gpu[0].seconds)}"
+        if figure := kept.published(docs / "published.csv", task, "PPO"):
+            cells[3] = _round(figure.mean)
+        rows.append([task, *cells])
+    header = ["task", "two cores, a minute", "one H100, a minute", "one H100, at the end", "PPO"]
+    return table(header, rows)
 
 
-def moved_measure(result: Result) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns what a sweep is judged by, and it with its interval, [C] each.
-
-    It is the share of seeds solved at the end where the defaults solve half of them, else the IQM.
-    """
-    moved = result.moved
-    assert moved is not None
-    if moved["solved"][0] >= 0.5:
-        return "solved", moved["solved"], moved["solved_low"], moved["solved_high"]
-    return "iqm", moved["iqm"], moved["low"], moved["high"]
-
-
-def _label(moved: dict[str, np.ndarray], row: int) -> str:
-    return f"{setting_in_words(str(moved['setting'][row]))} {moved['value'][row]}"
-
-
-def _share(x: float) -> str:
-    return percent(x, 1)
+def _round(x: np.floating | float) -> str:
+    return fixed(float(x), 1 if abs(x) < 100 else 0)

@@ -2,15 +2,17 @@
 
 ``python -m experiments.studies.seeds train --task CartPole-v1 --output DIR`` trains 36
 configurations of 1,024 seeds each; the same command goes on with it if it was stopped. It leaves
-DIR/study.npz. ``python -m experiments.studies.seeds page [DIR ...]`` writes docs/seeds.md, its
-pictures and its tables from such files, one a task, in about a minute and without a GPU.
+DIR/study.npz. ``python -m experiments.studies.seeds page`` writes the tables of docs/seeds.md from
+such files in docs/seeds/data, in about a minute and without a GPU.
 """
 
 import argparse
 import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
+from experiments.kit.markdown import filled
 from experiments.kit.places import DOCS
 
 
@@ -26,12 +28,13 @@ def main() -> None:
     train.add_argument("--num-seeds", type=int, default=1024, help="of each configuration")
     train.add_argument("--env-steps", type=int, help="of a run; the task's default if not given")
     train.add_argument("--horizon", type=int, help="steps of an episode; the task's if not given")
-    page = commands.add_parser("page", help="write the page")
-    page.add_argument("sources", nargs="*", type=Path, help="of train; docs/seeds/data/* if none")
-    page.add_argument("--docs", type=Path, default=DOCS, help="where; docs/ if not given")
+    commands.add_parser("page", help="write the tables")
     arguments = parser.parse_args()
     try:
-        _train(arguments) if arguments.command == "train" else _page(arguments)
+        if arguments.command == "train":
+            _train(arguments)
+        else:
+            write(sorted((DOCS / "seeds" / "data").iterdir()), DOCS / "seeds.md")
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)
@@ -47,13 +50,19 @@ def _train(arguments: argparse.Namespace) -> None:
         sys.exit(130)
 
 
-def _page(arguments: argparse.Namespace) -> None:
-    from experiments.studies.seeds import findings, runs
-    from experiments.studies.seeds import page as seeds_page
+def write(sources: Sequence[Path], page: Path) -> None:
+    """Writes the tables of a page again, between their marks, of what was measured."""
+    from experiments.studies.seeds import answers, few, runs, tables
 
-    sources = arguments.sources or sorted((DOCS / "seeds" / "data").iterdir())
-    found = findings.find([runs.load(source) for source in sources])
-    seeds_page.write(found, arguments.docs)
+    tasks, measures = [runs.load(source) for source in sources], ("final return", "average return")
+    pairs = [few.any_pair(task, measure, few.COUNTS) for measure in measures for task in tasks]
+    made = {
+        "tasks": lambda: tables.task_table(tasks),
+        "effects": lambda: tables.effects_table(tasks, answers.effects(tasks)),
+        "few": lambda: tables.few_table(few.few_seeds(tasks, measures, few.COUNTS)),
+        "pairs": lambda: tables.pairs_table(pairs),
+    }
+    page.write_text(filled(page.read_text("utf-8"), made), encoding="utf-8")
 
 
 if __name__ == "__main__":

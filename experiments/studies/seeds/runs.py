@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +11,6 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.files import read_arrays, read_json, write_arrays
-from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.reports.statistics.survival import time_to_threshold
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.sweeps.designs.design import Design, read_design
@@ -29,7 +27,7 @@ FACTORS: dict[str, list[Any]] = {
     "standardize": [True, False],
     "learning_rate": [3e-3, 1e-2, 3e-2],
 }
-#: Points in training, evenly spaced in env steps, at which curves are kept.
+#: Points in training, evenly spaced in env steps, over which returns are averaged.
 _GRID = 57
 
 
@@ -46,8 +44,6 @@ class Task(NamedTuple):
     steps_to_solve: [..., S] env steps at the first evaluation at or above the threshold, the
       whole budget where that came later or never
     env_steps: [..., S] env steps that were trained
-    grid: [G] env steps
-    curves: [..., G] interquartile mean over seeds of the return at these
     record: what sweep.json says, and ``nonfinite_runs``, runs that met numbers that are not finite
     """
 
@@ -60,12 +56,10 @@ class Task(NamedTuple):
     average_return: np.ndarray
     steps_to_solve: np.ndarray
     env_steps: np.ndarray
-    grid: np.ndarray
-    curves: np.ndarray
     record: dict[str, Any]
 
 
-_ARRAYS = ("final_return", "average_return", "steps_to_solve", "env_steps", "grid", "curves")
+_ARRAYS = ("final_return", "average_return", "steps_to_solve", "env_steps")
 
 
 def base_settings(task: str, num_seeds: int) -> Config:
@@ -149,8 +143,6 @@ def measure(directory: Path) -> Task:
         threshold=threshold,
         budget=budget,
         untrained=float(np.mean(returns[0])),
-        grid=grid,
-        curves=iqm(curves.reshape(math.prod(shape), -1, _GRID), axis=1).reshape(*shape, _GRID),
         record=record,
         **{name: x.reshape(*shape, -1) for name, x in measured.items()},
     )
@@ -168,5 +160,5 @@ def load(path: Path) -> Task:
     """Returns what ``save`` wrote, from the file or its directory; ValueError without one."""
     arrays = read_arrays(path / "study.npz" if path.is_dir() else path)
     kept: dict[str, Any] = json.loads(str(arrays.pop("facts")))
-    kept.update({name: x.astype(float) for name, x in arrays.items()})
+    kept.update({name: arrays[name].astype(float) for name in _ARRAYS})
     return Task(**kept)

@@ -1,37 +1,33 @@
-"""Tables of docs/seeds.md, and those beside it (CSV)."""
+"""The tables of docs/seeds.md."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from experiments.kit import rows as kit
 from experiments.kit.markdown import fixed, number, percent, table
-from experiments.studies.seeds.answers import LEVEL, MEASURES, Contrast, Effect
-from experiments.studies.seeds.few import FewSeeds
-from experiments.studies.seeds.findings import Findings
+from experiments.studies.seeds.answers import CONTRASTS, LEVEL, MEASURES, Effect
+from experiments.studies.seeds.few import AnyPair, FewSeeds
 from experiments.studies.seeds.runs import Task
 
-#: Numbers of seeds in the tables of the comparisons, and of any pair.
-FEW, _MANY = (3, 5, 10), (3, 5, 10, 30, 100)
+#: Numbers of seeds in the table of the comparisons.
+FEW = (3, 5, 10)
 
 
-def effects_table(found: Findings, contrasts: Sequence[Contrast]) -> str:
-    """Returns the differences of some contrasts: a row a task, at the best rates and over all."""
+def effects_table(tasks: Sequence[Task], effects: Sequence[Effect]) -> str:
+    """Returns all differences: two rows a task, at the best rates and over all settings."""
     rows = []
-    for contrast in contrasts:
-        for task in found.tasks:
+    for contrast in CONTRASTS:
+        for task in tasks:
             for where in ("best", "all"):
-                group = found.of(contrast, task, where)
+                wanted = (task.name, contrast.name, where)
+                group = [e for e in effects if (e.task, e.contrast, e.where) == wanted]
                 rates = group[0].rates
                 spoken = " / ".join(map(_rates, rates)) if rates else "all settings"
                 average = next(e for e in group if e.measure == "average return")
-                cells = [_cell(task, effect) for effect in group]
                 better = percent(average.improvement, 0) if rates else ""
+                cells = [_cell(task, effect) for effect in group]
                 rows.append([contrast.name, task.name, spoken, *cells, better])
-    header = ["", "task", "learning rates", *MEASURES, "better seed"]
-    return table(header, rows)
+    return table(["", "task", "learning rates", *MEASURES, "better seed"], rows)
 
 
 def _rates(rates: Sequence[float]) -> str:
@@ -61,10 +57,10 @@ def _shower(task: Task, measure: str) -> Callable[[float], str]:
     return lambda x: fixed(x, digits)
 
 
-def few_table(found: Findings) -> str:
+def few_table(found: Sequence[FewSeeds]) -> str:
     """Returns how often few seeds name the wrong arm: a row a comparison."""
     rows = []
-    for x in found.few:
+    for x in found:
         cells = ["no", *("equal" for _ in FEW), ""]
         if not x.equal:
             wrong = [percent(x.wrong[n], 1) for n in FEW]
@@ -74,13 +70,13 @@ def few_table(found: Findings) -> str:
     return table([*header, "seeds for 80 % power"], rows)
 
 
-def pairs_table(found: Findings) -> str:
+def pairs_table(found: Sequence[AnyPair]) -> str:
     """Returns the same of any two configurations: a row a task."""
     rows = [
-        [x.measure, x.task, f"{x.pairs:,}", *(percent(x.wrong[n], 1) for n in _MANY)]
-        for x in found.pairs
+        [x.measure, x.task, f"{x.pairs:,}", *(percent(x.wrong[n], 1) for n in x.wrong)]
+        for x in found
     ]
-    header = ["by the mean", "task", "pairs", *(f"{n} seeds" for n in _MANY)]
+    header = ["by the mean", "task", "pairs", *(f"{n} seeds" for n in found[0].wrong)]
     return table(header, rows)
 
 
@@ -102,38 +98,3 @@ def task_table(tasks: Sequence[Task]) -> str:
     header = ["task", "untrained", "solved at", "hidden units", "env steps a run"]
     header += ["runs cut short", "runs not finite", "engine", "compiling, training"]
     return table(header, rows)
-
-
-def effect_row(effect: Effect) -> dict[str, Any]:
-    """Returns an effect as a row of effects.csv."""
-    row = effect._asdict()
-    difference, rates = row.pop("difference"), row.pop("rates") or ((), ())
-    row |= {"first_learning_rate": _rates(rates[0]), "second_learning_rate": _rates(rates[1])}
-    return row | {f"difference_{name}": x for name, x in difference._asdict().items()}
-
-
-def wrong_rows(found: Findings) -> Iterable[dict[str, Any]]:
-    """Yields the rows of wrong_winner.csv."""
-    for x in (*found.few, *found.pairs):
-        what = x.contrast if isinstance(x, FewSeeds) else f"any of {x.pairs} pairs"
-        yield {"task": x.task, "comparison": what, "measure": x.measure} | {
-            f"{count} seeds": wrong for count, wrong in x.wrong.items()
-        }
-
-
-def arm_rows(tasks: Sequence[Task]) -> Iterable[dict[str, Any]]:
-    """Yields every configuration of the sweeps with the mean of each measure over its seeds."""
-    for task in tasks:
-        shape = task.final_return.shape[:-1]
-        for index in np.ndindex(shape):
-            settings = {
-                name: values[i]
-                for (name, values), i in zip(task.factors.items(), index, strict=True)
-            }
-            means = {name: m.values(task)[index].mean() for name, m in MEASURES.items()}
-            yield {"task": task.name} | settings | means
-
-
-def write_csv(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Writes rows with the same columns."""
-    kit.write(path, [kit.rounded(row, 6) for row in rows])

@@ -1,39 +1,65 @@
-"""Returns against seconds: what is kept of runs that were given a time, and who else had as long.
+"""The small files in data: what is kept of runs, and what docs/results.md is made of.
 
-``gather`` reads directories of runs (DIR/ANY-NAME, each of ``mjx_reinforce.train``) and adds them
-to two small files: seconds.csv has a row for each seed, seconds-curves.csv the mean over the seeds
-of a task on a machine, at times on a logarithmic grid. What ``play DIR`` played of them
-goes to seconds-play-TASK.csv.
+``of_tasks`` are the runs that ``train`` made: TASK.json has a run's settings, machine and times,
+TASK-seeds.csv a row for each seed. ``clock`` are runs that were given a time: seconds.csv has a row
+for each seed, seconds-curves.csv the mean over the seeds of a task on a machine, at times on a
+logarithmic grid, seconds-play-TASK.csv the episodes that ``play`` played of them.
 """
 
 import itertools
+import math
 import shutil
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from experiments.kit.rows import read
-from experiments.studies.results.files import Columns, read_played
-from mjx_reinforce.files import csv_bytes, read_json, write_bytes
-from mjx_reinforce.reports.run_source import read_columns, read_metrics
+from experiments.studies.results.runs import ended
+from experiments.studies.results.tasks import Task
+from mjx_reinforce.files import csv_bytes, read_json, write_bytes, write_json
+from mjx_reinforce.reports.run_source import PROVENANCE, read_columns, read_metrics
+from mjx_reinforce.reports.statistics import steps_to_solve
 from mjx_reinforce.reports.statistics.aggregates import interval
 
+#: The policies that are played, by rank in the final evaluation.
+POLICIES = ("best", "median")
 #: A budget of everybody (s).
 MINUTE = 60.0
-_SEEDS, _CURVES, _PLAYED = "seconds.csv", "seconds-curves.csv", "seconds-play-"
-_NOISE = "seconds-noise.csv"
-#: Parts of a run, by updates, over which the gradient's noise is summed up.
-PARTS = 4
-_NUMBERS = ("minute", "final", "best", "seconds", "env_steps", "compile_seconds")
-_KEYS = ("task", "device", "root", "seed", "status", "commit")
-_CURVE_NUMBERS = ("seconds", "mean", "low", "high")
 _POINTS = 40
+_SEEDS, _CURVES, _PLAYED = "seconds.csv", "seconds-curves.csv", "seconds-play-"
+_COLUMNS = ("task", "device", "root", "seed", "status", "commit", "minute", "final", "best")
+_COLUMNS += ("seconds", "env_steps", "compile_seconds")
+_CURVE = ("seconds", "mean", "low", "high")
+_EPISODE = {"policy": str, "seed": int, "simulation": str, "episode": int, "return": float}
+_SEED: tuple[str, ...] = (
+    "seed",
+    "env_steps",
+    "test_return",
+    "final_return",
+    "best_return",
+    "env_steps_to_solve",
+)
+
+Columns = dict[str, np.ndarray]
+
+
+class Result(NamedTuple):
+    """What is kept of a task.
+
+    facts: of its run: settings, machine, times
+    seeds: by column, [S] of each seed; ``env_steps_to_solve`` is inf where it never was;
+      ``test_return`` is the last policy's on starts that nothing else used
+    """
+
+    task: Task
+    facts: dict[str, Any]
+    seeds: Columns
 
 
 class Group(NamedTuple):
-    """The runs of one task on one machine.
+    """The runs of one task on one machine that were given a time.
 
     task, device: which; the device in words
     minute: each seed's return [S] at its last evaluation within ``MINUTE``; of a run that ended
@@ -43,7 +69,6 @@ class Group(NamedTuple):
     seconds: training time of all seeds together, evaluations included; the median of several runs
     env_steps: a seed's, the mean
     stopped: whether a run was stopped before its end
-    rows: of the file
     """
 
     task: str
@@ -53,10 +78,45 @@ class Group(NamedTuple):
     seconds: float
     env_steps: float
     stopped: bool
-    rows: list[dict[str, str]]
+
+    @property
+    def is_gpu(self) -> bool:
+        """Whether the device is a GPU."""
+        return "threads" not in self.device
 
 
-def gather(directory: Path, folder: Path) -> list[str]:
+def gather_tasks(tasks: Iterable[Task], directory: Path, folder: Path) -> None:
+    """Writes the small files of those tasks whose runs in a directory have ended."""
+    for task in tasks:
+        run = directory / task.name
+        if not ended(run):
+            continue
+        config, summary = read_json(run / "config.json"), read_json(run / "summary.json")
+        found = read_metrics(run / "metrics.csv")
+        returns, steps = found["eval_return"], found["env_steps"]
+        solved = steps_to_solve(returns, steps, summary["threshold"])
+        solved = [math.inf if x is None else x for x in solved]
+        test, best = summary["final_test_returns"], np.fmax.reduce(returns)
+        seeds = zip(range(len(test)), steps[-1], test, returns[-1], best, solved, strict=True)
+        rows = [dict(zip(_SEED, (f"{x:.9g}" for x in row), strict=True)) for row in seeds]
+        write_bytes(folder / f"{task.name}-seeds.csv", csv_bytes(_SEED, rows))
+        names = ("status", "threshold", "engine", "num_seeds", "compile_seconds", "run_seconds")
+        facts = {k: summary[k] for k in names} | {k: config[k] for k in PROVENANCE if k in config}
+        facts["settings"] = {k: v for k, v in config.items() if k not in (*PROVENANCE, "output")}
+        write_json(folder / f"{task.name}.json", facts)
+
+
+def of_tasks(tasks: Iterable[Task], folder: Path) -> list[Result]:
+    """Returns what is kept of those tasks of which something is."""
+    kinds = dict.fromkeys(_SEED, np.float64)
+    return [
+        Result(task, read_json(path), read_columns(folder / f"{task.name}-seeds.csv", kinds))
+        for task in tasks
+        if (path := folder / f"{task.name}.json").exists()
+    ]
+
+
+def gather_clock(directory: Path, folder: Path) -> list[str]:
     """Adds the runs of a directory to the small files; returns what was added, in words.
 
     Args:
@@ -64,13 +124,15 @@ def gather(directory: Path, folder: Path) -> list[str]:
       folder: of the small files. What they have of the same task and machine is replaced.
     """
     rows: list[dict[str, Any]] = []
-    noise: list[dict[str, Any]] = []
     returns: dict[tuple[str, str], list[tuple[np.ndarray, np.ndarray]]] = {}
     for run in sorted(directory.iterdir()):
         if not (run / "summary.json").exists() or not (run / "metrics.csv").exists():
             continue
         config, summary = read_json(run / "config.json"), read_json(run / "summary.json")
-        times, steps, evaluated = _evaluations(run / "metrics.csv")
+        found = read_metrics(run / "metrics.csv")
+        evaluated = found["eval_return"]
+        times = read_columns(run / "metrics.csv", {"wall_seconds": np.float64})["wall_seconds"]
+        times = times[: evaluated.size].reshape(evaluated.shape)[:, 0]
         if len(times) < 2:
             continue
         known = {
@@ -84,40 +146,17 @@ def gather(directory: Path, folder: Path) -> list[str]:
         }
         minute = evaluated[np.searchsorted(times, MINUTE, "right") - 1]
         final = summary.get("final_test_returns", evaluated[-1])
-        best = np.fmax.reduce(evaluated)
+        best, steps = np.fmax.reduce(evaluated), found["env_steps"][-1]
         rows += [
             known | {"seed": seed, "minute": a, "final": b, "best": c, "env_steps": d}
-            for seed, (a, b, c, d) in enumerate(zip(minute, final, best, steps[-1], strict=True))
+            for seed, (a, b, c, d) in enumerate(zip(minute, final, best, steps, strict=True))
         ]
-        noise += _noise_rows(run / "metrics.csv", known, config["num_episodes"])
         returns.setdefault((known["task"], known["device"]), []).append((times, evaluated))
-    _replace(folder / _SEEDS, (*_KEYS, *_NUMBERS), rows)
-    _replace(folder / _CURVES, ("task", "device", *_CURVE_NUMBERS), list(_curve_rows(returns)))
-    _replace(folder / _NOISE, ("task", "device", "root", "episodes", "part", "snr"), noise)
+    _replace(folder / _SEEDS, _COLUMNS, rows)
+    _replace(folder / _CURVES, ("task", "device", *_CURVE), list(_curve_rows(returns)))
     for path in directory.glob("play/*.csv"):
         shutil.copyfile(path, folder / f"{_PLAYED}{path.name}")
     return [f"{task} on {device}: {len(found)} runs" for (task, device), found in returns.items()]
-
-
-def _evaluations(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns when evaluations were [E] (s of training), env steps and returns [E, S]."""
-    found = read_metrics(path)
-    returns = found["eval_return"]
-    seconds = read_columns(path, {"wall_seconds": np.float64})["wall_seconds"]
-    return seconds[: returns.size].reshape(returns.shape)[:, 0], found["env_steps"], returns
-
-
-def _noise_rows(path: Path, known: dict[str, Any], episodes: int | str) -> list[dict[str, Any]]:
-    """Returns of each part of a run the median ``gradient_snr`` over evaluations and seeds."""
-    snr = [float(row["gradient_snr"]) for row in _read(path) if row.get("gradient_snr")]
-    shared = {name: known[name] for name in ("task", "device", "root")} | {"episodes": episodes}
-    parts = np.array_split(np.array(snr), PARTS) if len(snr) >= PARTS else []
-    return [shared | {"part": i, "snr": float(np.median(x))} for i, x in enumerate(parts)]
-
-
-def noise(folder: Path) -> list[dict[str, str]]:
-    """Returns the rows on the gradient's noise: ``episodes`` of an update, ``part``, ``snr``."""
-    return _read(folder / _NOISE)
 
 
 def _device(config: dict[str, Any]) -> str:
@@ -133,15 +172,12 @@ def _curve_rows(
     for (task, device), runs in returns.items():
         first = max(times[1] for times, _ in runs)
         last = min(times[-1] for times, _ in runs)
-        if last <= first:
-            continue
-        for second in np.geomspace(first, last, _POINTS):
+        for second in np.geomspace(first, last, _POINTS) if last > first else ():
             at = np.concatenate(
                 [x[np.searchsorted(times, second * (1 + 1e-9), "right") - 1] for times, x in runs]
             )
-            found = interval("mean", at)
-            numbers = (second, found.value, found.low, found.high)
-            yield {"task": task, "device": device} | dict(zip(_CURVE_NUMBERS, numbers, strict=True))
+            numbers = (second, *interval("mean", at))
+            yield {"task": task, "device": device} | dict(zip(_CURVE, numbers, strict=True))
 
 
 def _replace(path: Path, names: Sequence[str], rows: list[dict[str, Any]]) -> None:
@@ -159,8 +195,8 @@ def _read(path: Path) -> list[dict[str, str]]:
     return read(path) if path.exists() else []
 
 
-def load(folder: Path) -> list[Group]:
-    """Returns what is kept, by task and machine."""
+def clock(folder: Path) -> list[Group]:
+    """Returns what is kept of runs that were given a time, by task and machine."""
     groups = []
     rows = sorted(_read(folder / _SEEDS), key=lambda row: (row["task"], row["device"]))
     for (task, device), found in itertools.groupby(rows, lambda row: (row["task"], row["device"])):
@@ -169,30 +205,34 @@ def load(folder: Path) -> list[Group]:
             np.array([float(row[name]) for row in mine])
             for name in ("minute", "final", "seconds", "env_steps")
         )
-        over = (seconds <= MINUTE) & np.array([row["status"] == "finished" for row in mine])
-        minute = np.where(over, final, minute)
-        stopped = any(row["status"] != "finished" for row in mine)
+        finished = np.array([row["status"] == "finished" for row in mine])
+        minute = np.where((seconds <= MINUTE) & finished, final, minute)
         of_time = float(np.median(seconds))
-        groups.append(Group(task, device, minute, final, of_time, steps.mean(), stopped, mine))
+        groups.append(Group(task, device, minute, final, of_time, steps.mean(), not finished.all()))
     return groups
 
 
-def curves(folder: Path) -> dict[tuple[str, str], dict[str, np.ndarray]]:
+def curves(folder: Path) -> dict[tuple[str, str], Columns]:
     """Returns by task and machine the columns ``seconds``, ``mean``, ``low`` and ``high``."""
     found: dict[tuple[str, str], list[dict[str, str]]] = {}
     for row in _read(folder / _CURVES):
         found.setdefault((row["task"], row["device"]), []).append(row)
     return {
-        key: {name: np.array([float(row[name]) for row in rows]) for name in _CURVE_NUMBERS}
+        key: {name: np.array([float(row[name]) for row in rows]) for name in _CURVE}
         for key, rows in found.items()
     }
 
 
 def played(folder: Path) -> dict[str, Columns]:
-    """Returns by task what was played of its runs."""
+    """Returns by task the episodes that were played of its runs, by column."""
     paths = {path.stem.removeprefix(_PLAYED): path for path in sorted(folder.glob(f"{_PLAYED}*"))}
-    found = {task: read_played(path) for task, path in paths.items()}
-    return {task: columns for task, columns in found.items() if columns is not None}
+    return {task: read_columns(path, _EPISODE) for task, path in paths.items()}
+
+
+def write_played(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Writes the returns of episodes; the columns are ``policy``, ``seed``, ``simulation``, ..."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, csv_bytes(tuple(_EPISODE), rows))
 
 
 def peers(path: Path) -> dict[tuple[str, str, str], dict[float, list[float]]]:
@@ -214,13 +254,7 @@ class Figure(NamedTuple):
 
 
 def published(path: Path, task: str, algorithm: str) -> Figure | None:
-    """Returns the best published mean of an algorithm on a task, whatever its version.
-
-    Args:
-      path: of published.csv.
-      task: an environment's id.
-      algorithm: "PPO" or "SAC".
-    """
+    """Returns the best mean of "PPO" or "SAC" in published.csv, whatever the task's version."""
     name = task.rpartition("-")[0]
     rows = [x for x in _read(path) if x["task"] == name and x["algorithm"].startswith(algorithm)]
     if not rows:
