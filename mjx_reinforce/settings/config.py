@@ -95,7 +95,9 @@ def read_seeds(text: str) -> range:
     first, _, end = text.partition(":")
     numbers = [int(x) if x.isascii() and x.isdigit() else -1 for x in (first, end)]
     if not 0 <= numbers[0] < numbers[1] <= MAX_OF_UPDATE:
-        raise ValueError(f"--seeds must be FIRST:END, such as 64:128 for 64 seeds, got {text!r}")
+        raise ValueError(
+            f"--seeds must be FIRST:END, such as 64:128, got {text!r}; --num-seeds says how many"
+        )
     return range(*numbers)
 
 

@@ -103,7 +103,7 @@ def test_folders_that_may_not_be_entered_are_named(tmp_path, command, message):
         ("--algorithm ars --estimator value-baseline --value-fits 3", "would do nothing"),
         ("--algorithm ars --max-grad-norm None", "--max-grad-norm None would do nothing"),
         ("--num-directions 4", "--num-directions 4 would do nothing: only --algorithm ars"),
-        ("--seeds 4:4", "--seeds must be FIRST:END, such as 64:128 for 64 seeds, got '4:4'"),
+        ("--seeds 4:4", "--seeds must be FIRST:END, such as 64:128, got '4:4'"),
         ("--seeds 64", "--seeds must be FIRST:END"),
         ("--seeds 0:4 --num-seeds 4", "--seeds 0:4 says how many seeds there are"),
         ("--shared-starts --step-size 0.5", "--step-size 0.5 --shared-starts would do nothing"),

@@ -60,7 +60,7 @@ def watched(tmp_path):
     """The files of a run that has begun, its log, what it said, and the run."""
     said, log, run = [], Log(tmp_path), Run(tmp_path)
     files = RunFiles(log, {"policy": "normal"}, said.append)
-    files.begin(run, None, 1)
+    files.begin(run, None)
     assert log.written == ["begin"]
     log.written.clear()
     return files, log, said, run
