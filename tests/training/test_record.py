@@ -217,11 +217,16 @@ def test_the_end_table_has_counts():
     history = {"eval_return": returns, "env_steps": counts, "episodes": counts}
     more = {"status": "finished", "env": "Task-v0", "num_seeds": 1000, "env_steps_per_second": 1e6}
     more |= {"useful_step_fraction": 0.9999, "compile_seconds": 1.0, "run_seconds": 2.0}
+    two = {name: values[:, :2] for name, values in history.items()}
+    console = screen(200)
+    display.print_summary(console, summarize(two, 950.0) | more | {"num_seeds": 2}, Path("t"))
+    assert "586.8 (no interval: too few seeds)" in " ".join(console.file.getvalue().split())
     console = screen(80)
     display.print_summary(console, summarize(history, 950.0) | more, Path("t/[bold]x"))
     written = " ".join(console.file.getvalue().split())
     for text in ("solved at the end │ 997 of 1,000", "ever solved │ 997 of 1,000", "99.9 %"):
         assert text in written
+    assert "(95 %" in written
     assert "nan, 1000.0" in written
     assert "not finite │ 1 of 1,000" in written
     assert "Files in t/[bold]x" in written
