@@ -72,7 +72,7 @@ def test_a_run_leaves_its_files(run, tmp_path):
     assert summary["env"] == "Survive-v0"
     assert summary["num_seeds"] == 3
     assert len(summary["env_steps_to_solve"]) == len(summary["episodes_to_solve"]) == 3
-    assert summary["iqm_ci"][0] <= summary["iqm"] <= summary["iqm_ci"][1]
+    assert summary["iqm_ci"] == [None, None]  # of three seeds
     assert 0 < summary["useful_step_fraction"] <= 1
     for name in ("compile_seconds", "run_seconds", "env_steps_per_second", "engine", "solve_rate"):
         assert name in summary

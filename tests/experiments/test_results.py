@@ -28,11 +28,14 @@ CPU = {"device": "cpu", "cpu": "zen, 8 lanes", "cores": 2, "cpu_count": 8, "git_
         (8, 9.28, (10.0, 1.0), "below"),
         (8, 9.29, (10.0, 1.0), "not apart"),
         (0, 2, None, "none published"),
-        (math.nan, 2, (0.0, 1.0), "none: a seed failed"),
         (1000, 1000, (1000.0, 0.0), "not apart"),
     ],
 )
 def test_verdict_asks_whether_the_intervals_overlap(low, high, published, expected):
+    none = math.nan, math.nan
+    assert tables.verdict(Estimate(math.nan, *none), (0.0, 1.0)) == "none: a seed failed"
+    assert tables.verdict(Estimate(1000.0, *none), (900.0, 1.0)) == "no interval"
+    assert tables.verdict(Estimate(1000.0, *none), (1000.0, 0.0)) == "not apart"
     assert tables.verdict(Estimate((low + high) / 2, low, high), published) == expected
 
 
@@ -145,7 +148,7 @@ def test_the_tables_of_both_pages(folder):
         "| Hopper-v5 | best (3) | 998.5 (",
         "| [film](films/Hopper-v5-best.gif) |\n| Hopper-v5 | median (3) |",
         "| InvertedPendulum-v5 | 2 | 90,000 | 6.00 (",
-        "| 4.00 | 1 of 2 (5) | 1,000.0 (1,000.0 to 1,000.0) | below | 10.0 min, 3.0 s | 8 CPU ",
+        "| 4.00 | 1 of 2 (5) | 1,000.0 (1,000.0 to 1,000.0) | no interval | 10.0 min, 3.0 s | 8 CPU ",
         "| linear | 2 | 50.00 % (1) | 100.00 % (2) | 30,000 | 60,000 |",
     ):
         assert line in page

@@ -318,16 +318,25 @@ def test_outputs_that_cannot_be_are_refused(tmp_path, name):
         report.check_output(tmp_path / name, overwrite=False)
 
 
-def test_ties_are_said_as_ties(tmp_path):
-    """Equal means are not "0.0 above", and p = 1 is not "or more"."""
-    directory = make_sweep(tmp_path / "sweep", num_seeds=8, over=ONE)
+@pytest.mark.parametrize(
+    ("seeds", "why", "none"),
+    [
+        (8, "comes by chance too often", "all seeds are alike"),
+        (3, "too few to tell", "too few seeds"),
+    ],
+)
+def test_ties_are_said_as_ties(tmp_path, seeds, why, none):
+    """Equal means are not "0.0 above", and p = 1 is not "or more"; no interval has no width."""
+    directory = make_sweep(tmp_path / "sweep", num_seeds=seeds, over=ONE)
     with np.load(directory / "curves.npz") as archive:
         arrays = dict(archive)
     arrays["eval_return"][-1] = 1000.0
     np.savez(directory / "curves.npz", **arrays)
     said = " ".join(words.answer(findings.compute_findings(sources.read_experiment([directory]))))
     assert "The mean equals that of the next" in said
-    assert "chance too often (p = 1)." in said
+    assert f"1,000.0 (no interval: {none})." in said
+    assert why in said
+    assert "(p = 1)." in said
 
 
 def test_a_configuration_that_ended_earlier_stays_at_its_end(tmp_path):

@@ -223,6 +223,10 @@ def test_the_end_table_has_counts():
         "final_test_returns": [584.4] * 4,
         "best_test_returns": [572.0] * 4,
     }
+    two = {name: values[:, :2] for name, values in history.items()}
+    console = screen(200)
+    display.print_summary(console, summarize(two, 950.0) | more | {"num_seeds": 2}, Path("t"))
+    assert "586.8 (no interval: too few seeds)" in " ".join(console.file.getvalue().split())
     console = screen(80)
     display.print_summary(console, summarize(history, 950.0) | more, Path("t/[bold]x"))
     written = " ".join(console.file.getvalue().split())
@@ -233,6 +237,7 @@ def test_the_end_table_has_counts():
         "99.9 %",
     ):
         assert text in written
+    assert "(95 %" in written
     assert "nan, 1000.0" in written
     assert "not finite │ 1 of 1,000" in written
     assert "Files in t/[bold]x" in written

@@ -28,7 +28,9 @@ def number(x: float) -> str:
 
 
 def estimate(found: Estimate) -> str:
-    """Returns a number and its interval: "3.20 (3.10 to 3.30)"."""
+    """Returns a number and its interval, "3.20 (3.10 to 3.30)", or that there is none."""
+    if not (math.isfinite(found.low) and math.isfinite(found.high)):
+        return f"{number(found.value)} (no interval)"
     return f"{number(found.value)} ({number(found.low)} to {number(found.high)})"
 
 
@@ -53,9 +55,11 @@ def verdict(ours: Estimate, published: tuple[float, float] | None) -> str:
     """
     if published is None:
         return "none published"
-    if not (math.isfinite(ours.low) and math.isfinite(ours.high)):
-        return "none: a seed failed"
     theirs = published_interval(*published)
+    if not math.isfinite(ours.value):
+        return "none: a seed failed"
+    if not (math.isfinite(ours.low) and math.isfinite(ours.high)):
+        return "not apart" if ours.value == theirs.value else "no interval"
     if ours.low > theirs.high:
         return "above"
     return "below" if ours.high < theirs.low else "not apart"
