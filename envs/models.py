@@ -15,11 +15,14 @@ from mujoco import (  # a C extension
     mjtDisableBit,  # pyright: ignore[reportAttributeAccessIssue]
     mjtEnableBit,  # pyright: ignore[reportAttributeAccessIssue]
     mjtIntegrator,  # pyright: ignore[reportAttributeAccessIssue]
+    mjtJoint,  # pyright: ignore[reportAttributeAccessIssue]
     mjtSensor,  # pyright: ignore[reportAttributeAccessIssue]
     mjx,
 )
 
 from mjx_reinforce.checks import explain
+from mjx_reinforce.physics.contacts import UNLIKE_C
+from mjx_reinforce.physics.mjx_internals import geom_pairs
 
 #: Everything that MuJoCo carries from a step to the next, by its names in mjData; mjdata.h lists it
 #: as mjtState. Here is what an env step hands to the next.
@@ -39,6 +42,7 @@ NOT_CARRIED = {
     "plugin": ("nplugin", "plugins", "remove them"),
     "plastic": ("nplastic", "plastic springs", "remove springyield"),
 }
+_WITHIN_MARGIN = "give it a margin of at most half of its range"
 _ON_JOINT = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
 #: What else MJX ignores in silence.
@@ -174,6 +178,10 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
             'material, a bug of MJX; add <asset><material name="any"/></asset>'
         )
     try:
+        for pair in geom_pairs(model):
+            kinds = tuple(mjx.GeomType(model.geom_type[geom]) for geom in pair[:2])
+            if kinds in UNLIKE_C:
+                raise NotImplementedError(f"{kinds} collisions, which MJX gets wrong")
         # Not on JAX's first device, which may be another process's.
         converted = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
         # Notices what the model alone does not show; its arrays are not made.
@@ -190,6 +198,13 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     for field, feature, remedy in (*NOT_CARRIED.values(), *_IGNORED):
         if np.any(getattr(model, field)):
             yield feature, remedy
+    scalar = model.jnt_type != mjtJoint.mjJNT_BALL
+    for kind, limited, ends, margin in (
+        ("joint", model.jnt_limited & scalar, model.jnt_range, model.jnt_margin),
+        ("tendon", model.tendon_limited, model.tendon_range, model.tendon_margin),
+    ):
+        if np.any(limited & (np.ptp(ends, axis=1) < 2 * margin)):
+            yield f"one of two limits that a {kind} meets at once", _WITHIN_MARGIN
     if model.opt.enableflags & mjtEnableBit.mjENBL_SLEEP:
         yield "sleeping bodies", 'remove <flag sleep="enable"/>'
     if model.opt.disableactuator:
@@ -197,5 +212,8 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     for flag, values in (("spring", "stiffness"), ("damper", "damping")):
         if model.opt.disableflags & getattr(mjtDisableBit, f"mjDSBL_{flag.upper()}"):
             yield f'parts of <flag {flag}="disable"/>', f"remove it, and give no {values}"
+    for flag in ("nativeccd", "multiccd"):
+        if model.opt.disableflags & getattr(mjtDisableBit, f"mjDSBL_{flag.upper()}"):
+            yield f'<flag {flag}="disable"/>', "remove it"
     if model.opt.integrator == mjtIntegrator.mjINT_DISCRETE:
         yield "the integrator INT_DISCRETE", _REMEDIES["INT_IMPLICIT"]

@@ -29,9 +29,12 @@ _MAX_ROWS_TOGETHER = 2
 
 
 def supports(model: mjx.Model, data: mjx.Data) -> bool:
-    """Returns whether all rows are limits of scalar joints, at most two to a kinematic tree."""
-    joints = _limited_joints(model)
-    only_limits = jax_fields(data).efc_J.shape[0] == joints.size
+    """Returns whether all rows are limits of scalar joints, at most two to a kinematic tree.
+
+    ``nl`` counts the rows of limits, which a flag may disable, also those of balls and tendons.
+    """
+    fields, joints = jax_fields(data), _limited_joints(model)
+    only_limits = fields.efc_J.shape[0] == fields.nl == joints.size
     return only_limits and max(map(len, _coupled_rows(model, joints))) <= _MAX_ROWS_TOGETHER
 
 

@@ -1,16 +1,18 @@
 """C MuJoCo's step in MJX, with constraint solvers that do less work for the same answer.
 
-The stages are MJX's own, in MJX's order, with five exceptions:
+The stages are MJX's own, in MJX's order, with six exceptions:
 
 - ``constraints`` solves for the constraint forces in closed form, or not at all where no constraint
   is active, or with a line search that ends when it is exact.
 - ``contacts`` finds the contacts of capsules as C MuJoCo 4.0 does; MJX 3.17 departs from it.
 - ``runge_kutta`` turns free and ball joints as C MuJoCo 4.0 does; MJX 3.17 departs from it.
+- ``inertia.implicitfast`` leaves actuators at a limit out of the derivative by velocity and adds
+  the turning of free bodies, as C MuJoCo 4.0 does; MJX 3.17 departs from it.
 - ``inertia`` solves from the leaves of the kinematic tree to its root, where it is written out.
 - ``forward`` computes the sensors of accelerations without constraints too, where MJX skips them.
 
-Gymnasium runs C MuJoCo, so its answer is the one we want. For a model without such contacts and
-joints, such as InvertedPendulum's, a step equals ``mjx.step``.
+Gymnasium runs C MuJoCo, so its answer is the one we want. For a model without such contacts,
+joints and ``implicitfast``, such as InvertedPendulum's, a step equals ``mjx.step``.
 """
 
 import functools
@@ -32,7 +34,7 @@ def step(
     """Advances the simulation by one timestep, as ``mj_step`` of C MuJoCo 4.0.
 
     Equal to ``mjx.step(model, data)`` where the model has no contacts of capsules and, if its
-    integrator is Runge-Kutta, no free or ball joints.
+    integrator is Runge-Kutta, no free or ball joints; ``implicitfast`` is C's own.
 
     Args:
       model: an MJX model made with impl='jax'.
@@ -54,7 +56,7 @@ def step(
     if integrator == mjx.IntegratorType.EULER:
         return inertia.euler(model, data)
     if integrator == mjx.IntegratorType.IMPLICITFAST:
-        return mjx.implicit(model, data)
+        return inertia.implicitfast(model, data)
     raise NotImplementedError(f"MJX has no integrator {integrator}")
 
 

@@ -56,6 +56,10 @@ REFUSED = {
     ),
     '<actuator><general joint="j" gaintype="user"/></actuator>': "GAIN_USER.*<motor>",
     '<option><flag override="enable"/></option>': "ENBL_OVERRIDE.*solref",
+    '<tendon><fixed range="0 1" margin=".6"><joint joint="j" coef="1"/></fixed></tendon>': (
+        "two limits that a tendon meets.*margin of at most half"
+    ),
+    '<default><joint range="-1 2" margin=".03"/></default>': "two limits that a joint meets",
     '<sensor><user dim="1"/></sensor>': "SENS_USER.*remove those sensors",
     '<sensor><rangefinder site="s"/></sensor>': 'rangefinders.*<material name="any"/>',
 }
@@ -63,8 +67,8 @@ REFUSED = {
 
 @pytest.mark.parametrize("element", REFUSED)
 def test_what_mjx_lacks_beside_options(element):
-    text = f"""<mujoco><worldbody><site name="t"/><body name="b"><joint name="j"/>
-        <geom size="1"/><site name="s"/></body></worldbody>{element}</mujoco>"""
+    text = f"""<mujoco>{element}<worldbody><site name="t"/><body name="b"><joint name="j"/>
+        <geom size="1"/><site name="s"/></body></worldbody></mujoco>"""
     model = mujoco.MjModel.from_xml_string(text)  # pyright: ignore[reportAttributeAccessIssue]
     with pytest.raises(ValueError, match=REFUSED[element]):
         models.to_mjx(model, "mine.xml")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from mjx_reinforce.physics import limits
+from mjx_reinforce.physics import constraints, limits
 from mjx_reinforce.physics.mjx_internals import jax_fields
 
 XML = """
@@ -110,6 +110,21 @@ def test_only_two_limits_to_a_tree_are_supported(old, new, supported):
     model = mjx.put_model(mujoco.MjModel.from_xml_string(xml), impl="jax")  # pyright: ignore
     data = mjx.make_data(model, impl="jax")
     assert limits.supports(model, data) == supported
+
+
+def test_as_many_rows_of_friction_are_no_limits():
+    friction = XML.replace('limited="true"', 'limited="true" frictionloss=".3"')
+    friction = friction.replace("/><worldbody>", '><flag limit="disable"/></option><worldbody>')
+    model = mujoco.MjModel.from_xml_string(friction)  # pyright: ignore
+    model.opt.tolerance = 0
+    data = mujoco.MjData(model)  # pyright: ignore
+    data.qpos[:], data.qvel[:] = STATES[4], (3, -2, 1, -4)
+    mujoco.mj_forward(model, data)  # pyright: ignore
+    with jax.enable_x64(True):
+        in_jax, start = mjx.put_model(model, impl="jax"), mjx.put_data(model, data, impl="jax")
+        qacc = np.asarray(jax.jit(lambda data: constraints.solve(in_jax, data).qacc)(start))
+    assert data.nefc == limits._limited_joints(in_jax).size
+    np.testing.assert_allclose(qacc, data.qacc, rtol=1e-9)
 
 
 def test_rows_are_those_of_the_limited_joints():
