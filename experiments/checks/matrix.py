@@ -15,7 +15,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,6 @@ from jax import lax
 
 from experiments.checks.mechanisms import MOTOR, Mechanism, Start, mechanisms
 from mjx_reinforce import normal
-from mjx_reinforce.engines import rollouts
 from mjx_reinforce.engines.native import rollout as native
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
@@ -34,54 +33,66 @@ from mjx_reinforce.physics import step as physics
 mujoco: Any = importlib.import_module("mujoco")  # pyright does not know what is in it
 
 FRAME_SKIP = 2
-STEPS = 20
-#: What is equal.
+#: What counts as equal.
 EQUAL = 1e-9
 #: What is compared; of bodies, all but the world.
-FIELDS = (
-    *("time", "qpos", "qvel", "act", "qacc", "sensordata", "xpos", "xquat", "subtree_com", "cvel"),
-    *("ten_length", "actuator_length", "actuator_force", "qfrc_bias", "qfrc_passive"),
-    *("qfrc_actuator", "qfrc_constraint"),
-)
 BODIES = ("xpos", "xquat", "subtree_com", "cvel")
-ENGINES = {"vmap": rollouts.rollout, "native": native.rollout}
+FIELDS = (
+    *BODIES,
+    *("qpos", "qvel", "act", "qacc", "sensordata", "ten_length", "actuator_length"),
+    *("actuator_force", "qfrc_bias", "qfrc_passive", "qfrc_actuator", "qfrc_constraint"),
+)
 #: So many mechanisms with contacts are kept apart by the bits of contype.
 BITS = 31
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Simulate mechanisms of all kinds, and compare with C MuJoCo."""
+
+    native: bool = False
+    """Simulate each mechanism alone, by machine code, from its first start."""
+    only: tuple[str, ...] = ()
+    """Axes or names of mechanisms, by default all."""
+    output: Path = Path("docs/own_models.csv")
+    """A row for each mechanism under each option: the worst start, or the refusal."""
 
 
 class Cell(NamedTuple):
     """A mechanism from one start: the largest error, and the field that has it or the refusal."""
 
     axis: str
-    case: str
+    option: str
     mechanism: str
     start: str
     error: float
     words: str
 
+    @property
+    def verdict(self) -> str:
+        """Whether it is equal, refused or differs."""
+        if np.isnan(self.error):
+            return "refused"
+        return "equal" if self.error < EQUAL else "differing"
+
 
 class Shown(MujocoEnv):
-    """A model that shows what MuJoCo computes, from a start, forever."""
+    """A model that shows what MuJoCo computes, from a start on, forever."""
 
-    begin: tuple[Any, Any]
-
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Settings(MujocoEnv.Settings):
-        """Arguments of Shown."""
-
-        frame_skip: int = FRAME_SKIP
-        max_episode_steps: int = STEPS
-        reward_threshold: float | None = None
-
-    settings: Settings
+    def __init__(self, model: Any, start: Start, steps: int):
+        """Takes a model, and where it starts."""
+        super().__init__(
+            xml_file=model, frame_skip=FRAME_SKIP, max_episode_steps=steps, reward_threshold=None
+        )
+        self.start = start
 
     def initial(self, rng: jax.Array) -> tuple[Any, Any]:
         """Returns the start."""
-        return self.begin
+        return jnp.asarray(self.start[0]), jnp.asarray(self.start[1])
 
     def observe(self, data: Any) -> jax.Array:
-        """Returns all fields, one after the other."""
-        return jnp.concatenate([jnp.ravel(x) for x in fields(data)])
+        """Returns the time, and all fields, one after the other."""
+        return jnp.concatenate([jnp.ravel(x) for x in (data.time, *fields(data))])
 
     def outcome(self, before: Any, data: Any, action: jax.Array) -> tuple[Any, Any, dict]:
         """Earns nothing."""
@@ -90,211 +101,175 @@ class Shown(MujocoEnv):
 
 def fields(data: Any) -> list[Any]:
     """Returns each field of a simulation."""
-    whole = [getattr(data, name) for name in FIELDS]
-    return [x[1:] if name in BODIES else x for name, x in zip(FIELDS, whole, strict=True)]
+    return [getattr(data, name)[name in BODIES :] for name in FIELDS]
 
 
-def control(time: Any, start: Any, first: Any = 0, xp: Any = np) -> Any:
+def control(start: Any, time: Any, xp: Any = np) -> Any:
     """Returns the control [A], that of the start in slow motion."""
-    return start * xp.cos(9 * time + xp.arange(start.shape[-1]) - first)
+    return start * xp.cos(9 * time)
 
 
-def by_c(xml: str, start: Start, steps: int) -> list[np.ndarray]:
+def by_c(each: Mechanism, start: Start) -> list[np.ndarray]:
     """Returns each field by C MuJoCo after every env step, [T, ...], whose solver goes on."""
-    model = mujoco.MjModel.from_xml_string(xml)
+    model = mujoco.MjModel.from_xml_string(each.xml)
     model.opt.tolerance, model.opt.ls_tolerance, model.opt.iterations = 0, 0, 200
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.act[:], ctrl = start
     shown = []
-    for _ in range(steps):
-        data.ctrl[:] = control(data.time, ctrl)
+    for _ in range(each.steps):
+        data.ctrl[:] = control(ctrl, data.time)
         mujoco.mj_step(model, data, FRAME_SKIP)
-        shown.append([np.array(x, ndmin=1).ravel() for x in fields(data)])
+        shown.append([x.flatten() for x in fields(data)])
     return [np.stack(field) for field in zip(*shown, strict=True)]
 
 
-def merged(together: Sequence[Mechanism]) -> Any:
-    """Returns a model, an ``MjSpec``, of a pendulum and of mechanisms that do not touch."""
-    spec = mujoco.MjSpec.from_string(MOTOR.replace("<option/>", together[0].option))
-    contacts = 0
-    for i, mechanism in enumerate(together):
-        child = mujoco.MjSpec.from_string(mechanism.xml)
-        geoms = [geom for geom in child.geoms if geom.contype or geom.conaffinity]
-        for geom in geoms:
-            geom.contype = geom.conaffinity = 1 << contacts
-        contacts += bool(geoms)
-        spec.attach(child, prefix=f"{i}/", frame=spec.worldbody.add_frame())
-    return spec
-
-
-def programs(all_of_them: Sequence[Mechanism]) -> Iterator[list[Mechanism]]:
-    """Yields mechanisms that one model has: of one axis, one option, one solver."""
-    groups: dict[Any, list[Mechanism]] = {}
-    for each in all_of_them:
-        # Rows of friction lead to another solver.
-        key = each.axis, each.option, "frictionloss" in each.xml, len(each.starts)
-        groups.setdefault(key, []).append(each)
-    for group in groups.values():
-        size = BITS if "freejoint" in group[-1].xml else len(group)
-        yield from (group[i : i + size] for i in range(0, len(group), size))
-
-
-def load(together: Sequence[Mechanism]) -> tuple[Any, Any]:
-    """Returns the model of these mechanisms, and MJX's; raises ValueError as ``make`` does."""
-    model = models.load_model(merged(together))
-    return model, models.to_mjx(model, "it")
-
-
-def refusal(each: Mechanism) -> str:
-    """Returns why ``make`` refuses a mechanism, or nothing."""
-    try:
-        load([each])
-    except ValueError as error:
-        return str(error)
-    return ""
-
-
-def by_us(model: Any, in_mjx: Any, starts: Any, first: Any, steps: int) -> list[np.ndarray]:
+def by_us(model: Any, starts: Start, steps: int) -> list[np.ndarray]:
     """Returns each field after every env step from every start, [S, T, ...], by no engine."""
+    in_mjx = models.to_mjx(model, "it")
 
     def play(start: Start) -> list[jax.Array]:
-        qpos, qvel, act, ctrl = start
+        def physics_step(_: Any, data: Any) -> Any:
+            return physics.like(physics.step(in_mjx, data), data)
 
         def step(data: Any, _: None) -> tuple[Any, list[jax.Array]]:
-            data = data.replace(ctrl=control(data.time, ctrl, first, jnp))
-            data = lax.fori_loop(
-                0, FRAME_SKIP, lambda _, x: physics.like(physics.step(in_mjx, x), x), data
-            )
+            data = data.replace(ctrl=control(ctrl, data.time, jnp))
+            data = lax.fori_loop(0, FRAME_SKIP, physics_step, data)
             return data, fields(data)
 
-        data = models.make_data(model).replace(qpos=qpos, qvel=qvel, act=act, ctrl=ctrl)
+        qpos, qvel, act, ctrl = start
+        data = models.make_data(model).replace(qpos=qpos, qvel=qvel, act=act)
         return lax.scan(step, data, None, steps)[1]
 
     shown = jax.jit(jax.vmap(play))(starts)
     return [np.asarray(x).reshape(*x.shape[:2], -1) for x in shown]
 
 
-def by_engine(engine: str, model: Any, starts: Any, first: Any) -> list[np.ndarray]:
-    """Returns each field after every env step from the first start, [1, T, ...], in an engine."""
-    env = Shown(xml_file=model)
-    *env.begin, _, ctrl = (jnp.asarray(x[0]) for x in starts)
+def by_machine_code(model: Any, start: Start, steps: int) -> list[np.ndarray]:
+    """Returns each field after every env step, [1, T, ...], without activations at the start."""
+    env = Shown(model, start, steps)
     distribution = normal(env.action_space, rescale=False)
 
     def act(constants: jax.Array, observation: jax.Array) -> jax.Array:
-        time = observation[..., :1]
-        action = jnp.broadcast_to(control(time, ctrl, first, jnp), (*time.shape[:-1], ctrl.size))
-        fixed = jnp.broadcast_to(constants, (*time.shape[:-1], constants.size))
+        action = control(jnp.asarray(start[3]), observation[..., :1], jnp)
+        fixed = jnp.broadcast_to(constants, (*action.shape[:-1], constants.size))
         return jnp.concatenate([action, fixed], axis=-1)
 
     @jax.jit
     def play(constants: jax.Array) -> jax.Array:
-        lengths: Any = {"num_episodes": 1, "horizon": STEPS + 1, "deterministic": True}
-        played = ENGINES[engine](env, act, constants, distribution, jax.random.key(0), **lengths)
-        return played.observation[1:, 0]
+        lengths: Any = {"num_episodes": 1, "horizon": steps + 1, "deterministic": True}
+        key = jax.random.key(0)
+        return native.rollout(env, act, constants, distribution, key, **lengths).observation[1:, 0]
 
     shown = np.asarray(play(jnp.asarray(distribution.constants, jnp.result_type(float))))
-    sizes = [x.size for x in fields(models.make_data(env.mj_model))]
-    return [x[None] for x in np.split(shown, np.cumsum(sizes)[:-1], axis=1)]
+    sizes = [1, *(x.size for x in fields(models.make_data(model)))]
+    return [x[None] for x in np.split(shown, np.cumsum(sizes)[:-1], axis=1)[1:]]
 
 
-def compare(together: Sequence[Mechanism], engine: str = "alone") -> Iterator[Cell]:
-    """Yields the cells of mechanisms that one model has, from every start."""
+def load(parts: Sequence[Mechanism]) -> Any:
+    """Returns one model of mechanisms that do not touch; raises ValueError as ``make`` does."""
+    spec = mujoco.MjSpec.from_string(f"<mujoco>{parts[-1].option}</mujoco>")
+    contacts = 0
+    for i, each in enumerate(parts):
+        child = mujoco.MjSpec.from_string(each.xml)
+        geoms = [geom for geom in child.geoms if geom.contype or geom.conaffinity]
+        for geom in geoms:
+            geom.contype = geom.conaffinity = 1 << contacts
+        contacts += bool(geoms)
+        spec.attach(child, prefix=f"{i}/", frame=spec.worldbody.add_frame())
+    model = models.load_model(spec)
+    models.to_mjx(model, "it")
+    return model
+
+
+def refusal(parts: Sequence[Mechanism]) -> str:
+    """Returns why ``make`` refuses some mechanisms, or nothing."""
     try:
-        model, in_mjx = load(together)
+        load(parts)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+def programs(chosen: Sequence[Mechanism]) -> Iterator[list[Mechanism]]:
+    """Yields mechanisms that one model has: of one axis, one option and one solver."""
+    groups: dict[Any, list[Mechanism]] = {}
+    for each in chosen:
+        # Rows of friction lead to another solver, which flags do not change.
+        other = "frictionloss" in each.xml and each.axis != "flags"
+        key = each.axis, each.option, other, len(each.starts)
+        groups.setdefault(key, []).append(each)
+    for group in groups.values():
+        size = len(group) if group[0].axis == "actuators" else BITS
+        yield from (group[i : i + size] for i in range(0, len(group), size))
+
+
+def compare(together: Sequence[Mechanism], native: bool = False) -> Iterator[Cell]:
+    """Yields the cells of mechanisms that one model has, from every start."""
+    model = mujoco.MjModel.from_xml_string(MOTOR)
+    rest = model.qpos0, np.zeros(model.nv), np.zeros(0), np.zeros(model.nu)
+    motor = Mechanism("", "", "", MOTOR, dict.fromkeys(together[0].starts, rest), together[0].steps)
+    parts = [motor, *together]
+    try:
+        model = load(parts)
     except ValueError:
-        refused = {each: words for each in together if (words := refusal(each))}
+        refused = {each: words for each in together if (words := refusal([motor, each]))}
         for each, words in refused.items():
-            yield from (Cell(*each.words, start, np.nan, words) for start in each.starts)
-        if together := [each for each in together if each not in refused]:
-            yield from compare(together, engine)
+            yield from (Cell(*each.title, start, np.nan, words) for start in each.starts)
+        if left := [each for each in together if each not in refused]:
+            yield from compare(left, native)
         return
-    first = np.zeros(model.nu)
-    base = mujoco.MjModel.from_xml_string(MOTOR)
-    rest = (base.qpos0, np.zeros(base.nv), np.zeros(base.na), np.zeros(base.nu))
-    names = list(together[0].starts)
-    starts = [
-        [np.concatenate(x) for x in zip(rest, *(list(e.starts.values())[s] for e in together))]
-        for s in range(len(names))
-    ]
-    place, used = 0, base.nu
-    for each in together:
-        size = next(iter(each.starts.values()))[3].size
-        first[used : used + size], used = used, used + size
-    stacked = [np.stack(x) for x in zip(*starts, strict=True)]
-    steps = together[0].steps
-    if engine == "alone":
-        shown = by_us(model, in_mjx, stacked, first, steps)
+    each_start = zip(*(each.starts.values() for each in parts), strict=True)
+    starts = [tuple(map(np.concatenate, zip(*start, strict=True))) for start in each_start]
+    if native:
+        shown = by_machine_code(model, starts[0], motor.steps)
     else:
-        shown = by_engine(engine, model, stacked, first)
-    done = [x[0].size for x in by_c(MOTOR, rest, 1)]
-    done[0] = 0
-    for each in together:
+        stacked = tuple(map(np.stack, zip(*starts, strict=True)))
+        shown = by_us(model, stacked, motor.steps)
+    for each in parts:
         sizes = []
-        for s, (name, start) in enumerate(each.starts.items()):
-            theirs = by_c(each.xml, start, steps)
-            sizes = [x.shape[1] for x in theirs]
+        for ours, (name, start) in zip(zip(*shown, strict=True), each.starts.items(), strict=False):
+            theirs = by_c(each, start)
+            sizes = [field.shape[1] for field in theirs]
             errors = [
-                np.max(
-                    np.abs(x[s, :, at : at + y.shape[1]] - y) / np.maximum(1, np.abs(y)),
-                    initial=0.0,
-                )
-                for x, y, at in zip(shown, theirs, done, strict=True)
+                np.max(np.abs(x[:, :n] - y) / np.maximum(1, np.abs(y)), initial=0.0)
+                for x, y, n in zip(ours, theirs, sizes, strict=True)
             ]
-            worst = int(np.argmax(errors))
-            yield Cell(*each.words, name, float(errors[worst]), FIELDS[worst])
-        done = [at + size for at, size in zip(done, sizes, strict=True)]
-        done[0] = 0
+            worst = int(np.argmax(np.nan_to_num(errors, nan=np.inf)))
+            if each is not motor:
+                error = float(np.nan_to_num(errors[worst], nan=np.inf))
+                yield Cell(*each.title, name, error, FIELDS[worst])
+        shown = [x[..., n:] for x, n in zip(shown, sizes, strict=True)]
 
 
-@dataclasses.dataclass(frozen=True)
-class Settings:
-    """Simulate mechanisms of all kinds, and compare with C MuJoCo."""
-
-    engine: Literal["alone", "vmap", "native"] = "alone"
-    """What simulates them: the step itself, many at once; or an engine, one by one."""
-    only: tuple[str, ...] = ()
-    """Axes or names of mechanisms, by default all."""
-    output: Path = Path("docs/own_models.csv")
-    """A row for each mechanism under each option: the worst start, or the refusal."""
-
-
-def kind(cell: Cell) -> str:
-    """Returns whether a cell is equal, refused or differs."""
-    return "refused" if np.isnan(cell.error) else "equal" if cell.error < EQUAL else "differing"
-
-
-def worst(cells: Sequence[Cell]) -> Iterator[tuple[Cell, int]]:
-    """Yields of each mechanism under each option the cell of the largest error, and how many."""
-    for _, group in groupby(cells, key=lambda cell: cell[:3]):
-        of_one = list(group)
-        yield max(of_one, key=lambda cell: np.nan_to_num(cell.error, nan=np.inf)), len(of_one)
+def summarized(cells: Sequence[Cell]) -> Iterator[tuple[Any, ...]]:
+    """Yields of each mechanism under each option how many starts, and the one that is worst."""
+    yield "axis", "option", "mechanism", "starts", "worst start", "error", "field or refusal"
+    for title, group in groupby(cells, key=lambda cell: cell[:3]):
+        starts = list(group)
+        worst = max(starts, key=lambda cell: np.nan_to_num(cell.error, nan=np.inf))
+        yield *title, len(starts), worst.start, f"{worst.error:.1e}", worst.words
 
 
 def main(settings: Settings) -> None:
-    """Prints how many cells are equal on each axis, and those that differ; writes all."""
+    """Prints the counts of each program and the cells that differ, and writes all."""
     jax.config.update("jax_enable_x64", True)
     wanted = set(settings.only)
-    chosen = [x for x in mechanisms() if not wanted or wanted & {x.axis, x.name}]
-    cells = []
+    chosen = [each for each in mechanisms() if not wanted or wanted & {each.axis, each.name}]
+    cells: list[Cell] = []
     for together in programs(chosen):
         began = time.process_time()
-        parts = [together] if settings.engine == "alone" else [[each] for each in together]
-        found = [cell for part in parts for cell in compare(part, settings.engine)]
+        parts = [[each] for each in together] if settings.native else [together]
+        found = [cell for part in parts for cell in compare(part, settings.native)]
+        counts, seconds = Counter(cell.verdict for cell in found), time.process_time() - began
+        print(f"{' '.join(together[0].title[:2])}: {dict(counts)}, {seconds:.0f} s", flush=True)
+        for cell in found:
+            if cell.verdict == "differing":
+                print(f"  {cell.mechanism}, {cell.start}: {cell.error:.0e} of {cell.words}")
         cells += found
-        seconds, counts = time.process_time() - began, Counter(map(kind, found))
-        print(f"{together[0].axis} {together[0].case}: {dict(counts)}, {seconds:.0f} s", flush=True)
-        for cell in filter(lambda cell: kind(cell) == "differing", found):
-            print(f"  {cell.mechanism}, {cell.start}: {cell.error:.0e} of {cell.words}", flush=True)
-    print(
-        f"{len(cells)} cells: {dict(Counter(map(kind, cells)))}, {time.process_time():.0f} s of CPU"
-    )
+    counts, seconds = Counter(cell.verdict for cell in cells), time.process_time()
+    print(f"{len(cells)} cells: {dict(counts)}; {seconds:.0f} s of CPU")
     with settings.output.open("w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(
-            ("axis", "option", "mechanism", "starts", "worst", "error", "field or refusal")
-        )
-        for cell, starts in worst(cells):
-            rows.writerow((*cell[:3], starts, cell.start, f"{cell.error:.1e}", cell.words))
+        csv.writer(file, lineterminator="\n").writerows(summarized(cells))
 
 
 if __name__ == "__main__":

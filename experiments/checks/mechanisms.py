@@ -1,6 +1,7 @@
 """Mechanisms that each have one feature of MuJoCo, and what `matrix.py` crosses them with."""
 
 import dataclasses
+import functools
 import importlib
 import itertools
 import re
@@ -284,14 +285,14 @@ ACTUATORS = {
 }
 #: Actuators with an activation.
 STATEFUL = ("intvelocity", "integrator", "filter", "filterexact", "affine filter")
-#: What bounds an actuator: of the actuator, of its joint, of its tendon.
+#: What bounds an actuator: whose attribute, and its value.
 CLAMPS = {
-    "none": "",
-    "forcerange": 'forcerange="-.4 .3"',
-    "ctrlrange": 'ctrlrange="0 .2"',
-    "actrange": 'actrange="-.1 .2"',
-    "joint": 'actuatorfrcrange="-.4 .3"',
-    "tendon": 'actuatorfrcrange="-.4 .3"',
+    "none": ("actuator", "none", ""),
+    "forcerange": ("actuator", "forcerange", "-.4 .3"),
+    "ctrlrange": ("actuator", "ctrlrange", "0 .2"),
+    "actrange": ("actuator", "actrange", "-.1 .2"),
+    "its joint's range": ("joint", "actuatorfrcrange", "-.4 .3"),
+    "its tendon's range": ("tendon", "actuatorfrcrange", "-.4 .3"),
 }
 #: Where an actuator starts: the joint's velocity, the activation, the control.
 ACTUATED = {
@@ -326,14 +327,14 @@ POSES = {
     "flat": ((1, 1, 0, 0), 2, -0.002),
     "on edge": ((0.9, 0.3, 0.2, 0.1), 2, -0.002),
     "deep": ((0.9, 0.1, 0.3, 0.2), 2, -0.03),
-    "side by side": ((1, 1, 0, 0), 0, -0.002),
+    "side by side": ((1, 0, 0, 0), 0, -0.002),
 }
 MARGIN = {"within the margin": ((0.9, 0.2, 0.1, 0.2), 2, 0.005)}
-#: Flags that disable something; what no step reads is disabled together.
+#: Flags that disable something; those that have nothing to do with one another, together.
 FLAGS = (
-    *("constraint", "equality", "frictionloss", "limit", "contact", "spring", "damper", "gravity"),
-    *("clampctrl", "warmstart", "filterparent", "actuation", "refsafe", "sensor", "eulerdamp"),
-    "midphase autoreset nativeccd island multiccd",
+    *("constraint", "equality", "frictionloss", "limit", "contact", "spring", "damper"),
+    *("gravity eulerdamp", "clampctrl refsafe warmstart", "actuation sensor filterparent"),
+    *("midphase autoreset island", "nativeccd", "multiccd"),
 )
 #: What they are crossed with: each kind of constraint row, and what else they disable.
 ROWS = (
@@ -384,92 +385,94 @@ class Mechanism:
         return re.findall("<option.*?</option>", self.xml, re.DOTALL)[0]
 
     @property
-    def words(self) -> tuple[str, str, str]:
-        """The name of it."""
+    def title(self) -> tuple[str, str, str]:
+        """Axis, option and name."""
         return self.axis, self.case, self.name
 
 
-def _pushed(xml: str) -> dict[str, Start]:
+def _pushed(model: Any) -> dict[str, Start]:
     """Returns starts at a model's own pose, beside it, and far from it on both sides."""
-    model = mujoco.MjModel.from_xml_string(xml)
     speed, starts = 0.3 * np.cos(1 + np.arange(model.nv)), {}
-    for name, size in {"at its pose": 0.0, "near": 0.1, "far": 1.5, "far back": -1.5}.items():
+    for name, size in {"at its pose": 0, "near": 0.1, "far": 1.5, "far back": -1.5}.items():
         qpos = model.qpos0.copy()
-        mujoco.mj_integratePos(model, qpos, speed, size * (0.1 if "freejoint" in xml else 1))
-        starts[name] = qpos, speed, np.zeros(model.na), np.ones(model.nu)
+        mujoco.mj_integratePos(model, qpos, speed, size * (0.1 if model.njnt == 1 else 1))
+        starts[name] = qpos, speed, np.zeros(model.na), np.cos(np.arange(model.nu))
     return starts
 
 
-def _actuated_starts(xml: str) -> dict[str, Start]:
-    model = mujoco.MjModel.from_xml_string(xml)
+def _actuated_starts(model: Any) -> dict[str, Start]:
+    """Returns starts of a pendulum."""
     return {
         name: (np.full(1, 0.1), np.full(1, qvel), np.full(model.na, act), np.full(model.nu, ctrl))
         for name, (qvel, act, ctrl) in ACTUATED.items()
     }
 
 
-def _posed(xml: str, poses: dict[str, Any]) -> dict[str, Start]:
-    """Returns starts in which the free body is so far from the other geom, found by C MuJoCo."""
-    model = mujoco.MjModel.from_xml_string(xml)
-    data, starts = mujoco.MjData(model), {}
-    for name, (quaternion, axis, gap) in poses.items():
-        axis = 2 if "plane" in xml or "hfield" in xml else axis
-        at = np.array([0.03, 0.02, 0.03, *np.array(quaternion) / np.linalg.norm(quaternion)])
-        low, high = 0.0, 3.0
-        while high - low > 1e-9:
-            at[axis] = (low + high) / 2
-            data.qpos[:] = at
-            mujoco.mj_fwdPosition(model, data)
-            touching = (data.contact.dist < 0).any()
-            low, high = (at[axis], high) if touching else (low, at[axis])
-        at[axis] = low + gap
-        starts[name] = at.copy(), 0.3 * np.cos(1 + np.arange(6)), np.zeros(0), np.zeros(0)
-    return starts
-
-
-def _moving(_: str) -> dict[str, Start]:
-    none = np.zeros(0)
+def _moving(model: Any) -> dict[str, Start]:
+    """Returns starts of a free body on a plane."""
     return {
-        name: (np.array([0, 0, 0.099 + up, 1, 0, 0, 0]), np.array(qvel, float), none, none)
+        name: (model.qpos0 + up * np.eye(7)[2], np.array(qvel, float), np.zeros(0), np.zeros(0))
         for name, (up, qvel) in MOVING.items()
     }
 
 
-def _clamped(actuator: str, clamp: str) -> str:
+def _posed(model: Any, poses: dict[str, Any]) -> dict[str, Start]:
+    """Returns starts in which the free body is so far from the other geom, found by C MuJoCo."""
+    data, starts = mujoco.MjData(model), {}
+    endless = model.geom_type[0] <= int(mujoco.mjtGeom.mjGEOM_HFIELD)
+    for name, (quaternion, axis, gap) in poses.items():
+        along = np.eye(7)[2 if endless else axis]
+        at = np.array([0.03, 0.02, 0.03, *np.array(quaternion) / np.linalg.norm(quaternion)])
+        low, high = 0.0, 3.0
+        while high - low > 1e-9:
+            middle = (low + high) / 2
+            data.qpos[:] = at + middle * along
+            mujoco.mj_fwdPosition(model, data)
+            low, high = (middle, high) if (data.contact.dist < 0).any() else (low, middle)
+        starts[name] = at + (low + gap) * along, 0.3 * np.cos(1 + np.arange(6)), at[:0], at[:0]
+    return starts
+
+
+def _clamped(actuator: str, clamp: str, integrator: str) -> str:
     """Returns a pendulum with an actuator that is bounded so."""
-    on, attribute = "tendon" if clamp == "tendon" else "joint", CLAMPS[clamp].partition("=")[0]
-    element = ACTUATORS[actuator].format(on='tendon="t"' if on == "tendon" else 'joint="a"')
-    if clamp not in ("joint", "tendon"):
-        element = re.sub(f'{attribute}="[^"]*"', "", element) if attribute else element
-        element = element.replace("/>", f" {CLAMPS[clamp]}/>")
-    joint, tendon = (CLAMPS[clamp] if clamp == each else "" for each in ("joint", "tendon"))
-    return _PENDULUM.format(joint=joint, tendon=tendon, actuator=element, option="{option}")
+    whose, attribute, bounds = CLAMPS[clamp]
+    bounded = dict.fromkeys(("actuator", "joint", "tendon"), "") | {
+        whose: f'{attribute}="{bounds}"'
+    }
+    element = ACTUATORS[actuator].format(on='tendon="t"' if whose == "tendon" else 'joint="a"')
+    if bounds and whose == "actuator":
+        element = re.sub(f' {attribute}="[^"]*"', "", element)
+        element = element.replace("/>", f" {bounded['actuator']}/>")
+    return _PENDULUM.format_map(
+        bounded | {"actuator": element, "option": f'integrator="{integrator}"'}
+    )
 
 
 def mechanisms() -> Iterator[Mechanism]:
     """Yields all mechanisms."""
+
+    def made(axis: str, case: str, name: str, xml: str, starts: Any, steps: int = 5) -> Mechanism:
+        model = mujoco.MjModel.from_xml_string(xml)
+        return Mechanism(axis, case, name, xml, starts(model), steps)
+
     for name, xml in MODELS.items():
-        yield Mechanism("features", "", name, xml, _pushed(xml), 20)
-    for actuator, clamp in itertools.product(ACTUATORS, CLAMPS):
-        if clamp == "actrange" and actuator not in STATEFUL:
-            continue
-        for integrator in INTEGRATORS:
-            xml = _clamped(actuator, clamp).replace("{option}", f'integrator="{integrator}"')
-            yield Mechanism(
-                "actuators", integrator, f"{actuator}, {clamp}", xml, _actuated_starts(xml)
-            )
-    for i, below in enumerate(BELOW):
-        for geom in list(BELOW)[max(i, 2) :]:
-            parts = {"geom": ABOVE[geom], "floor": BELOW[below], "top": _ASSETS, "pos": "0 0 0"}
-            xml = _scene(**parts)
-            yield Mechanism("geoms", "", f"{geom} on {below}", xml, _posed(xml, POSES))
-            xml = xml.replace('geom name="thing"', 'geom name="thing" margin=".02"')
-            yield Mechanism("geoms", "margin", f"{geom} on {below}", xml, _posed(xml, MARGIN))
-    for flag in FLAGS:
-        disabled = "<flag " + " ".join(f'{each}="disable"' for each in flag.split()) + "/>"
-        for name in ROWS:
-            xml = MODELS[name].replace("<option >", f"<option >{disabled}")
-            yield Mechanism("flags", flag, name, xml, _pushed(xml))
+        yield made("features", "", name, xml, _pushed, 20)
+    for case, actuator, clamp in itertools.product(INTEGRATORS, ACTUATORS, CLAMPS):
+        if clamp != "actrange" or actuator in STATEFUL:
+            xml = _clamped(actuator, clamp, case)
+            yield made("actuators", case, f"{actuator}, {clamp}", xml, _actuated_starts)
+    for (i, below), geom in itertools.product(enumerate(BELOW), ABOVE):
+        if geom in list(BELOW)[i:]:
+            parts = {"floor": BELOW[below], "top": _ASSETS, "pos": "0 0 0"}
+            for case, margin, poses in (("", "", POSES), ("margin", 'margin=".02"', MARGIN)):
+                xml = _scene(f"{ABOVE[geom]} {margin}", **parts)
+                starts = functools.partial(_posed, poses=poses)
+                yield made("geoms", case, f"{geom} on {below}", xml, starts)
+    for flag, name in itertools.product(FLAGS, ROWS):
+        disabled = "".join(f' {each}="disable"' for each in flag.split())
+        xml = MODELS[name].replace("<option >", f"<option ><flag{disabled}/>")
+        yield made("flags", flag, name, xml, _pushed)
     for option, condim, geom in itertools.product(CONES, (1, 3, 4, 6), TOUCHING):
-        xml = _scene(f'{TOUCHING[geom]} condim="{condim}" friction="1 .02 .01"', option=option)
-        yield Mechanism("cones", option, f"{geom}, condim {condim}", xml, _moving(xml))
+        friction = f'condim="{condim}" friction="1 .02 .01" priority="1"'
+        xml = _scene(f"{TOUCHING[geom]} {friction}", option=option)
+        yield made("cones", option, f"{geom}, condim {condim}", xml, _moving)
