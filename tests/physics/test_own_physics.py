@@ -45,8 +45,6 @@ DIFFERENT = {
     "CG": 1e-2,
     "noslip": 0.5,
     "ellipsoid fluid": 0.1,
-    "box on a plane": 10,
-    "cylinder on a plane": 1,
     "mesh on a box": 1,
     "sphere on a heightfield": 0.5,
     "box on a box": 200,
