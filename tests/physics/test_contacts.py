@@ -39,7 +39,7 @@ REACH = {
 }
 REACH["mesh"] = REACH["box"]
 #: Of a capsule and a cylinder C's own search for the contact ends at 1e-6.
-TOLERANCE = {("capsule", "cylinder"): 1e-5}
+TOLERANCE = {("cylinder", "capsule"): 1e-5}
 
 
 def poses(first, second):
@@ -50,7 +50,7 @@ def poses(first, second):
     nearly = Rotation.from_euler("xyz", [1, 2, 30], degrees=True) * lying
     cases = [
         (lying, up, 0.002, [0.03, 0.02, 0]),
-        (tilted, up, 0.004, [0.03, 0.02, 0]),
+        (tilted, up, 0.02, [0.03, 0.02, 0]),
         (nearly, up, 0.012, [0.05, 0.03, 0]),
         (nearly, up, 0.0005, [0.05, 0.03, 0]),
         (Rotation.from_euler("z", 20, degrees=True) * lying, across, 0.004, [0, 0.01, 0.02]),
@@ -71,8 +71,9 @@ def compiled(first, second):
 
 RIGHT = [
     *(("plane", x) for x in ("box", "cylinder", "sphere", "capsule", "ellipsoid")),
-    *(("sphere", x) for x in ("cylinder", "sphere", "capsule", "box", "mesh")),
-    *(("capsule", x) for x in ("cylinder", "capsule", "box", "mesh")),
+    *(("cylinder", x) for x in ("sphere", "capsule")),
+    *(("sphere", x) for x in ("sphere", "capsule", "box", "mesh")),
+    *(("capsule", x) for x in ("capsule", "box", "mesh")),
 ]
 
 
@@ -91,6 +92,7 @@ def test_contacts_are_those_of_mujoco(pair):
         unoptimized = {"xla_backend_optimization_level": 0}
         found = jax.jit(jax.vmap(collide), compiler_options=unoptimized)(qpos)
         found = jax.tree.map(np.asarray, found)
+    touching = 0
     for i, place in enumerate(qpos):
         data.qpos[:7] = place
         mujoco.mj_forward(model, data)  # pyright: ignore[reportAttributeAccessIssue]
@@ -100,15 +102,17 @@ def test_contacts_are_those_of_mujoco(pair):
             for k in touches
         ]
         theirs = [np.concatenate([[c.dist], c.pos, c.frame]) for c in data.contact]
-        assert len(ours) == len(theirs) >= 1 - (i > 2), (i, ours, theirs)
+        assert len(ours) == len(theirs), (i, ours, theirs)
+        touching += bool(ours)
         key = lambda row: tuple(np.round(row[:4], 4) + 0.0)  # noqa: E731
         for mine, exact in zip(sorted(ours, key=key), sorted(theirs, key=key), strict=True):
             np.testing.assert_allclose(mine, exact, rtol=0, atol=TOLERANCE.get(pair, 1e-12))
+    assert touching >= 3
 
 
 def test_the_search_along_a_capsule_is_written_out():
     """A loop in XLA stalls jaxlib 0.10.2."""
-    mx = models.to_mjx(compiled("capsule", "cylinder"), "pair")
+    mx = models.to_mjx(compiled("cylinder", "capsule"), "pair")
     program = jax.jit(lambda data: contacts.fwd_position(mx, data)).lower(models.make_data(mx))
     assert "stablehlo.while" not in program.as_text()
 
