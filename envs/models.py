@@ -45,6 +45,14 @@ NOT_CARRIED = {
 _WITHIN_MARGIN = "give it a margin of at most half of its range"
 _ON_JOINT = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
+_ONE_SIGN = "give two positive numbers, or two that are not"
+_RISING = "give a second number that is not below it, and a width above zero"
+#: Fields of a model that say how soft its constraints are.
+_SOFT = (
+    *("dof_{}", "eq_{}", "geom_{}", "jnt_{}", "pair_{}"),
+    *("tendon_{}_lim", "tendon_{}_fri"),
+)
+_NO_WIDTH = 1e-15  # mjMINVAL
 #: What else MJX ignores in silence.
 _IGNORED = (
     ("actuator_armature", "the armature of an actuator", _ON_JOINT),
@@ -205,6 +213,13 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     ):
         if np.any(limited & (np.ptp(ends, axis=1) < 2 * margin)):
             yield f"one of two limits that a {kind} meets at once", _WITHIN_MARGIN
+    for of in _SOFT:
+        ref = getattr(model, of.format("solref"))
+        low, high, width = getattr(model, of.format("solimp"))[:, :3].T
+        if np.any((ref[:, 0] > 0) != (ref[:, 1] > 0)):
+            yield "MuJoCo's default in place of a solref of mixed signs", _ONE_SIGN
+        if np.any((low > high) | ((width < _NO_WIDTH) & (low != high))):
+            yield "the first number of a solimp that does not rise", _RISING
     if model.opt.enableflags & mjtEnableBit.mjENBL_SLEEP:
         yield "sleeping bodies", 'remove <flag sleep="enable"/>'
     if model.opt.disableactuator:

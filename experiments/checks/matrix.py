@@ -113,6 +113,7 @@ def by_c(each: Mechanism, start: Start) -> list[np.ndarray]:
     """Returns each field by C MuJoCo after every env step, [T, ...], whose solver goes on."""
     model = mujoco.MjModel.from_xml_string(each.xml)
     model.opt.tolerance, model.opt.ls_tolerance, model.opt.iterations = 0, 0, 200
+    model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-12, 200
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:], data.act[:], ctrl = start
     shown = []

@@ -70,6 +70,8 @@ def _iterate(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, ja
     Returns:
       The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
     """
+    if not jax_fields(data).contact.dim.size:  # MJX's solver fails on elliptic cones of none
+        model = model.replace(opt=model.opt.replace(cone=mjx.ConeType.PYRAMIDAL))
     if newton.supports(model, data):
         return touching.solve_touching(newton.solve_newton, model, data)
     data = mjx.solve(model, data)

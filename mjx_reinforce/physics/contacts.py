@@ -33,6 +33,7 @@ from jax import lax
 from mujoco import mjx
 
 from mjx_reinforce.fused import by_engine
+from mjx_reinforce.physics import inertia
 from mjx_reinforce.physics.mjx_internals import (
     Collision,
     GeomInfo,
@@ -292,7 +293,7 @@ def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     data = mjx.camlight(model, data)
     data = mjx.tendon(model, data)
     data = mjx.crb(model, data)
-    data = mjx.tendon_armature(model, data)
+    data = inertia.tendon_armature(model, data)
     data = mjx.factor_m(model, data)
     data = _collision(model, data)
     data = make_constraint(model, data)

@@ -12,7 +12,32 @@ import numpy as np
 from mujoco import mjx
 
 from mjx_reinforce.fused import by_engine
-from mjx_reinforce.physics.mjx_internals import advance, jax_fields, muscle_gain, solve_m
+from mjx_reinforce.physics.mjx_internals import (
+    advance,
+    jax_fields,
+    muscle_gain,
+    solve_m,
+    with_inertia,
+)
+
+
+def tendon_armature(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Adds the armature of tendons, as ``mjx.tendon_armature``.
+
+    As in C, it does not couple degrees of freedom of two branches of a tree.
+    """
+    data = mjx.tendon_armature(model, data)
+    matrix = jax_fields(data).M
+    if matrix.ndim == 1 or not model.ntendon:  # a sparse one has no place for it
+        return data
+    return with_inertia(data, jnp.where(_coupled(model), matrix, 0))
+
+
+def _coupled(model: mjx.Model) -> np.ndarray:
+    """Returns where C's inertia matrix has entries, [nv, nv]."""
+    lower = np.zeros((model.nv, model.nv), bool)
+    lower[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = True
+    return lower | lower.T
 
 
 def inverse_times(model: mjx.Model, data: mjx.Data, force: jax.Array) -> jax.Array:
@@ -61,9 +86,7 @@ def implicitfast(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     change = timestep * _velocity_derivative(model, data)
     force = data.qfrc_smooth + data.qfrc_constraint
     inertia = mjx.full_m(model, data)
-    coupled = np.zeros((model.nv, model.nv), bool)
-    coupled[np.repeat(np.arange(model.nv), model.M_rownnz), model.M_colind] = True
-    qacc = solve(inertia - jnp.where(coupled | coupled.T, change, 0), force)
+    qacc = solve(inertia - jnp.where(_coupled(model), change, 0), force)
     for body in _free_bodies(model):
         dofs = np.flatnonzero(model.dof_bodyid == body)
         block = (inertia - change)[dofs[:, None], dofs]

@@ -4,7 +4,7 @@ No other file imports MJX's private modules or reads the private part of its dat
 
 - Names that MJX keeps private, here without underscore: the imports, and ``advance``.
 - Fields of ``mjx.Data`` that only MJX's JAX implementation has: ``jax_fields``, ``with_solution``,
-  ``rows_of``, ``with_rows``, ``with_contact``, ``Simulation``, ``num_contacts``.
+  ``rows_of``, ``with_rows``, ``with_contact``, ``with_inertia``, ``Simulation``, ``num_contacts``.
 - Functions of MJX in which a name is given another meaning: ``collision_with`` and ``fenced``. They
   would do nothing, silently, if MJX stopped looking that name up; ``check_lookup`` raises then.
 
@@ -57,6 +57,7 @@ __all__ = [
     "rows_of",
     "solve_m",
     "with_contact",
+    "with_inertia",
     "with_rows",
     "with_solution",
 ]
@@ -211,6 +212,11 @@ def with_rows(data: mjx.Data, rows: list[jax.Array]) -> mjx.Data:
 def with_contact(data: mjx.Data, contact: Any, dim: np.ndarray) -> mjx.Data:
     """Returns the data with other contacts, of these dimensions."""
     return cast(mjx.Data, data.tree_replace({"_impl.contact": contact.replace(dim=dim)}))
+
+
+def with_inertia(data: mjx.Data, matrix: jax.Array) -> mjx.Data:
+    """Returns the data with another inertia matrix, [nv, nv]."""
+    return cast(mjx.Data, data.tree_replace({"_impl.M": matrix}))
 
 
 class Simulation:

@@ -1,6 +1,6 @@
 """C MuJoCo's step in MJX, with constraint solvers that do less work for the same answer.
 
-The stages are MJX's own, in MJX's order, with six exceptions:
+The stages are MJX's own, in MJX's order, with seven exceptions:
 
 - ``constraints`` solves for the constraint forces in closed form, or not at all where no constraint
   is active, or with a line search that ends when it is exact.
@@ -8,6 +8,7 @@ The stages are MJX's own, in MJX's order, with six exceptions:
 - ``runge_kutta`` turns free and ball joints as C MuJoCo 4.0 does; MJX 3.17 departs from it.
 - ``inertia.implicitfast`` leaves actuators at a limit out of the derivative by velocity and adds
   the turning of free bodies, as C MuJoCo 4.0 does; MJX 3.17 departs from it.
+- ``inertia.tendon_armature`` couples no branches of a tree, as C MuJoCo 4.0 does not.
 - ``inertia`` solves from the leaves of the kinematic tree to its root, where it is written out.
 - ``forward`` computes the sensors of accelerations without constraints too, where MJX skips them.
 

@@ -60,6 +60,9 @@ REFUSED = {
         "two limits that a tendon meets.*margin of at most half"
     ),
     '<default><joint range="-1 2" margin=".03"/></default>': "two limits that a joint meets",
+    '<default><joint solreflimit="-100 1"/></default>': "solref of mixed signs.*two positive",
+    '<default><geom solimp=".95 .9"/></default>': "solimp that does not rise.*not below",
+    '<default><joint solimpfriction=".9 .95 0"/></default>': "solimp that does not rise.*width",
     '<sensor><user dim="1"/></sensor>': "SENS_USER.*remove those sensors",
     '<sensor><rangefinder site="s"/></sensor>': 'rangefinders.*<material name="any"/>',
 }

@@ -13,7 +13,9 @@ SMOOTH = np.float32([3.0, 4.0])
 
 def data_of(rows=((0.0, 0.0), (0.0, 0.0)), dist=(0.1,), margin=(0.0,), ne=0, nf=0, nl=1):
     """Two rows, one of a limit and one of a contact."""
-    contact = types.SimpleNamespace(dist=jnp.float32(dist), includemargin=jnp.float32(margin))
+    contact = types.SimpleNamespace(
+        dist=jnp.float32(dist), includemargin=jnp.float32(margin), dim=np.array([3])
+    )
     fields = types.SimpleNamespace(
         efc_J=jnp.float32(rows), efc_force=jnp.ones(2), ne=ne, nf=nf, nl=nl, contact=contact
     )

@@ -8,7 +8,7 @@ import pytest
 from mujoco import mjx
 
 from mjx_reinforce import fused
-from mjx_reinforce.physics import inertia
+from mjx_reinforce.physics import contacts, inertia
 
 #: A free body with two legs of two joints.
 XML = """
@@ -102,6 +102,24 @@ def test_without_implicit_damping_euler_is_that_of_mjx():
     after = inertia.euler(in_jax, data).qvel
     assert jnp.array_equal(after, mjx.euler(in_jax, data).qvel)
     assert not np.allclose(after, mjx.euler(damped, data).qvel)
+
+
+def test_tendon_armature_couples_what_it_does_in_c():
+    """Siblings are not coupled, a parent and its child are."""
+    xml = """<mujoco><worldbody><body><joint name="a" axis="0 1 0"/><geom size=".1" pos=".1 0 0"/>
+      <body pos=".1 0 0"><joint name="b"/><geom size=".1" pos=".1 .1 0"/></body>
+      <body pos="-.1 0 0"><joint name="c"/><geom size=".1" pos="-.1 .1 0"/></body></body>
+      </worldbody><tendon><fixed armature=".01"><joint joint="a" coef="1"/>
+      <joint joint="b" coef="2"/><joint joint="c" coef="-1"/></fixed></tendon></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)  # pyright: ignore
+    in_jax, data = mjx.put_model(model, impl="jax"), mujoco.MjData(model)  # pyright: ignore
+    data.qvel[:] = 1, 2, 3
+    mujoco.mj_forward(model, data)  # pyright: ignore
+    found = jax.jit(lambda data: contacts.fwd_position(in_jax, data))
+    matrix = mjx.full_m(in_jax, found(mjx.put_data(model, data, impl="jax")))
+    solved = np.linalg.solve(matrix, data.qfrc_smooth)
+    assert matrix[0, 1] != 0
+    np.testing.assert_allclose(solved, data.qacc_smooth, rtol=1e-5)
 
 
 def test_zeros_stay_zeros():
