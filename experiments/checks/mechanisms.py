@@ -96,6 +96,18 @@ def _scene(geom: str, **parts: str) -> str:
     return _SCENE.format_map({**empty, "floor": plane, "pos": "0 0 .099", "geom": geom, **parts})
 
 
+def _wrapped(pin: str, side: str = "") -> str:
+    return _arm(
+        world=f'<geom name="pin" {pin} zaxis="0 1 0" pos=".35 0 .55"/>'
+        '<site name="side" pos=".35 0 .55"/>',
+        rest=_SPATIAL.format('stiffness="40" springlength=".2"', f'<geom geom="pin" {side}/>'),
+    )
+
+
+def _equal(equality: str, tendon: str = "", **parts: str) -> str:
+    return _arm(rest=f"{tendon}<equality>{equality}</equality>", **parts)
+
+
 def _sensors(*sensors: str) -> str:
     return _arm(rest=f"<sensor>{''.join(f'<{sensor}/>' for sensor in sensors)}</sensor>")
 
@@ -123,7 +135,6 @@ MODELS = {
     "site with refsite": _actuated(
         '<position site="tip" refsite="wall" gear="1 0 1 0 0 0" kp="30"/>'
     ),
-    "tendon transmission": _actuated('<motor tendon="t"/>', _FIXED.format("")),
     "armature of an actuator": _actuated('<motor joint="a" armature=".05"/>'),
     "damping of an actuator": _actuated('<motor joint="a" damping=".3"/>'),
     "adhesion": _actuated('<adhesion body="lower" ctrlrange="0 1" gain="2"/>'),
@@ -139,6 +150,13 @@ MODELS = {
     "ball joint": _arm(hinge='type="ball" damping=".05"'),
     "slide joint": _arm(hinge='type="slide" axis="1 0 0" stiffness="50" damping="1"'),
     "joint limit": _arm(joint='range="-6 6"'),
+    "joint limit, margin": _arm(joint='range="-6 6" margin=".05"'),
+    "both joint limits at once": _arm(joint='range="-1 1" margin=".1"'),
+    "limit off, one row": _scene(
+        'type="sphere" condim="1" priority="1"',
+        flags='<flag limit="disable"/>',
+        world='<body pos="3 0 0"><joint range="-6 6"/><geom size=".1" contype="0"/></body>',
+    ),
     "ball limit": _arm(hinge='type="ball" range="0 20"'),
     "armature": _arm(joint='armature=".1"'),
     "joint spring": _arm(joint='stiffness="5" springref="20"'),
@@ -157,21 +175,9 @@ MODELS = {
     "tendon limit": _arm(rest=_FIXED.format('range="-.1 .1"')),
     "tendon friction": _arm(rest=_FIXED.format('frictionloss=".3"')),
     "tendon armature": _arm(rest=_SPATIAL.format('armature=".2"', "")),
-    "tendon over a sphere": _arm(
-        world='<geom name="pin" type="sphere" size=".1" pos=".35 0 .55"/>',
-        rest=_SPATIAL.format('stiffness="40" springlength=".2"', '<geom geom="pin"/>'),
-    ),
-    "tendon over a cylinder": _arm(
-        world='<geom name="pin" type="cylinder" size=".1 .2" zaxis="0 1 0" pos=".35 0 .55"/>',
-        rest=_SPATIAL.format('stiffness="40" springlength=".2"', '<geom geom="pin"/>'),
-    ),
-    "tendon through a cylinder": _arm(
-        world='<geom name="pin" type="cylinder" size=".1 .2" zaxis="0 1 0" pos=".35 0 .55"/>'
-        '<site name="side" pos=".35 0 .55"/>',
-        rest=_SPATIAL.format(
-            'stiffness="40" springlength=".2"', '<geom geom="pin" sidesite="side"/>'
-        ),
-    ),
+    "tendon over a sphere": _wrapped('type="sphere" size=".1"'),
+    "tendon over a cylinder": _wrapped('type="cylinder" size=".1 .2"'),
+    "tendon through a cylinder": _wrapped('type="cylinder" size=".1 .2"', 'sidesite="side"'),
     "pulley": _arm(
         rest=_SPATIAL.format(
             'stiffness="40" springlength=".2"',
@@ -179,23 +185,11 @@ MODELS = {
         )
     ),
     # Equalities
-    "connect": _arm(
-        rest='<equality><connect body1="lower" body2="world" anchor=".3 0 0"/></equality>'
-    ),
-    "weld": _arm(rest='<equality><weld body1="lower" body2="world"/></equality>'),
-    "weld to mocap": _arm(
-        world='<body name="hand" mocap="true" pos=".7 0 1"/>',
-        rest='<equality><weld body1="lower" body2="hand" relpose="0 0 0 1 0 0 0"/></equality>',
-    ),
-    "joint equality": _arm(
-        rest='<equality><joint joint1="b" joint2="a" polycoef=".1 .5 .2 0 0"/></equality>'
-    ),
-    "tendon equality": _arm(
-        rest=_FIXED.format("") + '<equality><tendon tendon1="t" polycoef=".1 0 0 0 0"/></equality>'
-    ),
-    "inactive equality": _arm(
-        rest='<equality><weld body1="lower" body2="world" active="false"/></equality>'
-    ),
+    "connect": _equal('<connect body1="lower" body2="world" anchor=".3 0 0"/>'),
+    "weld": _equal('<weld body1="lower" body2="world"/>'),
+    "joint equality": _equal('<joint joint1="b" joint2="a" polycoef=".1 .5 .2 0 0"/>'),
+    "tendon equality": _equal('<tendon tendon1="t" polycoef=".1 0 0 0 0"/>', _FIXED.format("")),
+    "inactive equality": _equal('<weld body1="lower" body2="world" active="false"/>'),
     # Sensors
     "sensors of positions": _sensors(
         'jointpos joint="a"',
@@ -313,14 +307,7 @@ BELOW = {
     "capsule": 'type="capsule" size=".2 .4"',
     "sphere": 'type="sphere" size=".4"',
 }
-ABOVE = {
-    "box": 'type="box"',
-    "mesh": 'type="mesh" mesh="m"',
-    "cylinder": 'type="cylinder"',
-    "ellipsoid": 'type="ellipsoid"',
-    "capsule": 'type="capsule"',
-    "sphere": 'type="sphere"',
-}
+ABOVE = ("box", "mesh", "cylinder", "ellipsoid", "capsule", "sphere")
 #: How a geom lies on another: turned by a quaternion, moved up (or aside), and how far apart.
 POSES = {
     "upright": ((1, 0, 0, 0), 2, -0.002),
@@ -465,7 +452,8 @@ def mechanisms() -> Iterator[Mechanism]:
         if geom in list(BELOW)[i:]:
             parts = {"floor": BELOW[below], "top": _ASSETS, "pos": "0 0 0"}
             for case, margin, poses in (("", "", POSES), ("margin", 'margin=".02"', MARGIN)):
-                xml = _scene(f"{ABOVE[geom]} {margin}", **parts)
+                mesh = 'mesh="m"' if geom == "mesh" else ""
+                xml = _scene(f'type="{geom}" {mesh} {margin}', **parts)
                 starts = functools.partial(_posed, poses=poses)
                 yield made("geoms", case, f"{geom} on {below}", xml, starts)
     for flag, name in itertools.product(FLAGS, ROWS):
