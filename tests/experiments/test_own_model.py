@@ -55,6 +55,7 @@ REFUSED = {
         "TRN_SLIDERCRANK.*<connect>"
     ),
     '<actuator><general joint="j" gaintype="user"/></actuator>': "GAIN_USER.*<motor>",
+    '<option><flag multiccd="disable"/></option>': 'ignore <flag multiccd="disable"/>; remove it',
     '<option><flag override="enable"/></option>': "ENBL_OVERRIDE.*solref",
     '<sensor><user dim="1"/></sensor>': "SENS_USER.*remove those sensors",
     '<sensor><rangefinder site="s"/></sensor>': 'rangefinders.*<material name="any"/>',
