@@ -9,6 +9,7 @@ words.
 
 import csv
 import dataclasses
+import functools
 import importlib
 import time
 from collections import Counter
@@ -32,7 +33,6 @@ from mjx_reinforce.physics import step as physics
 
 mujoco: Any = importlib.import_module("mujoco")  # pyright does not know what is in it
 
-FRAME_SKIP = 2
 #: What counts as equal.
 EQUAL = 1e-9
 #: What is compared; of bodies, all but the world.
@@ -82,7 +82,7 @@ class Shown(MujocoEnv):
     def __init__(self, model: Any, start: Start, steps: int):
         """Takes a model, and where it starts."""
         super().__init__(
-            xml_file=model, frame_skip=FRAME_SKIP, max_episode_steps=steps, reward_threshold=None
+            xml_file=model, frame_skip=1, max_episode_steps=steps, reward_threshold=None
         )
         self.start = start
 
@@ -110,7 +110,7 @@ def control(start: Any, time: Any, xp: Any = np) -> Any:
 
 
 def by_c(each: Mechanism, start: Start) -> list[np.ndarray]:
-    """Returns each field by C MuJoCo after every env step, [T, ...], whose solver goes on."""
+    """Returns each field by C MuJoCo after every step, [T, ...], whose solver goes on."""
     model = mujoco.MjModel.from_xml_string(each.xml)
     model.opt.tolerance, model.opt.ls_tolerance, model.opt.iterations = 0, 0, 200
     model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-12, 200
@@ -119,22 +119,20 @@ def by_c(each: Mechanism, start: Start) -> list[np.ndarray]:
     shown = []
     for _ in range(each.steps):
         data.ctrl[:] = control(ctrl, data.time)
-        mujoco.mj_step(model, data, FRAME_SKIP)
+        mujoco.mj_step(model, data)
         shown.append([x.flatten() for x in fields(data)])
     return [np.stack(field) for field in zip(*shown, strict=True)]
 
 
 def by_us(model: Any, starts: Start, steps: int) -> list[np.ndarray]:
-    """Returns each field after every env step from every start, [S, T, ...], by no engine."""
+    """Returns each field after every step from every start, [S, T, ...], by no engine."""
     in_mjx = models.to_mjx(model, "it")
+    forward = jax.jit(functools.partial(physics.forward, in_mjx))
 
     def play(start: Start) -> list[jax.Array]:
-        def physics_step(_: Any, data: Any) -> Any:
-            return physics.like(physics.step(in_mjx, data), data)
-
         def step(data: Any, _: None) -> tuple[Any, list[jax.Array]]:
-            data = data.replace(ctrl=control(ctrl, data.time, jnp))
-            data = lax.fori_loop(0, FRAME_SKIP, physics_step, data)
+            given = data.replace(ctrl=control(ctrl, data.time, jnp))
+            data = physics.like(physics.step(in_mjx, given, forward), data)
             return data, fields(data)
 
         qpos, qvel, act, ctrl = start
@@ -146,7 +144,7 @@ def by_us(model: Any, starts: Start, steps: int) -> list[np.ndarray]:
 
 
 def by_machine_code(model: Any, start: Start, steps: int) -> list[np.ndarray]:
-    """Returns each field after every env step, [1, T, ...], without activations at the start."""
+    """Returns each field after every step, [1, T, ...], without activations at the start."""
     env = Shown(model, start, steps)
     distribution = normal(env.action_space, rescale=False)
 

@@ -364,7 +364,7 @@ class Mechanism:
     name: str
     xml: str
     starts: dict[str, Start] = dataclasses.field(compare=False)
-    steps: int = 5
+    steps: int = 10
 
     @property
     def option(self) -> str:
@@ -438,12 +438,12 @@ def _clamped(actuator: str, clamp: str, integrator: str) -> str:
 def mechanisms() -> Iterator[Mechanism]:
     """Yields all mechanisms."""
 
-    def made(axis: str, case: str, name: str, xml: str, starts: Any, steps: int = 5) -> Mechanism:
+    def made(axis: str, case: str, name: str, xml: str, starts: Any, steps: int = 10) -> Mechanism:
         model = mujoco.MjModel.from_xml_string(xml)
         return Mechanism(axis, case, name, xml, starts(model), steps)
 
     for name, xml in MODELS.items():
-        yield made("features", "", name, xml, _pushed, 20)
+        yield made("features", "", name, xml, _pushed, 40)
     for case, actuator, clamp in itertools.product(INTEGRATORS, ACTUATORS, CLAMPS):
         if clamp != "actrange" or actuator in STATEFUL:
             xml = _clamped(actuator, clamp, case)
