@@ -21,6 +21,8 @@ from mujoco import (  # a C extension
 )
 
 from mjx_reinforce.checks import explain
+from mjx_reinforce.physics.contacts import UNLIKE_C
+from mjx_reinforce.physics.mjx_internals import geom_pairs
 
 #: Everything that MuJoCo carries from a step to the next, by its names in mjData; mjdata.h lists it
 #: as mjtState. Here is what an env step hands to the next.
@@ -195,6 +197,10 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
             'material, a bug of MJX; add <asset><material name="any"/></asset>'
         )
     try:
+        for pair in geom_pairs(model):
+            kinds = tuple(mjx.GeomType(model.geom_type[geom]) for geom in pair[:2])
+            if kinds in UNLIKE_C:
+                raise NotImplementedError(f"{kinds} collisions, which MJX gets wrong")
         # Not on JAX's first device, which may be another process's.
         converted = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
         # Notices what the model alone does not show; its arrays are not made.
@@ -232,5 +238,8 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     for flag, values in (("spring", "stiffness"), ("damper", "damping")):
         if model.opt.disableflags & getattr(mjtDisableBit, f"mjDSBL_{flag.upper()}"):
             yield f'parts of <flag {flag}="disable"/>', f"remove it, and give no {values}"
+    for flag in ("nativeccd", "multiccd"):
+        if model.opt.disableflags & getattr(mjtDisableBit, f"mjDSBL_{flag.upper()}"):
+            yield f'<flag {flag}="disable"/>', "remove it"
     if model.opt.integrator == mjtIntegrator.mjINT_DISCRETE:
         yield "the integrator INT_DISCRETE", _REMEDIES["INT_IMPLICIT"]

@@ -11,15 +11,10 @@ No other file imports MJX's private modules or reads the private part of its dat
 ``tests/physics/test_mjx_internals.py`` holds a hash of each MJX function that this package replaces
 or whose source it depends on: a new MJX fails there first.
 
-``fenced`` makes two changes for XLA's CPU backend; neither changes an answer.
-
-- A body's pose needs every entry of its parent's. XLA fuses the whole chain and then computes the
-  parent's entries again for each entry of the child: time grows exponentially with depth. Pusher's
-  arm, ten bodies deep, takes a second a state; with a fence between levels, 50 us.
-- The contacts of cylinders and ellipsoids are found in ten steps of gradient descent, a loop that
-  depends on nothing else in the forward pass. jaxlib 0.10.2 runs such a loop beside other work, and
-  for some programs (Pusher, 512 episodes) waits forever for it. Here the steps are written out for
-  XLA, and a loop for ``fused``.
+``fenced`` makes a change for XLA's CPU backend that changes no answer. A body's pose needs every
+entry of its parent's. XLA fuses the whole chain and then computes the parent's entries again for
+each entry of the child: time grows exponentially with depth. Pusher's arm, ten bodies deep, takes a
+second a state; with a fence between levels, 50 us.
 """
 
 import contextlib
@@ -33,10 +28,9 @@ from importlib import metadata
 from typing import Any, cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import collision_driver, collision_sdf, scan
+from mujoco.mjx._src import collision_driver, scan
 from mujoco.mjx._src.collision_driver import geom_pairs
 from mujoco.mjx._src.collision_primitive import collider
 from mujoco.mjx._src.collision_types import Collision, GeomInfo
@@ -44,8 +38,6 @@ from mujoco.mjx._src.forward import _advance as advance
 from mujoco.mjx._src.math import make_frame
 from mujoco.mjx._src.smooth import solve_m
 from mujoco.mjx._src.support import muscle_gain
-
-from mjx_reinforce.fused import by_engine
 
 __all__ = [
     "Collision",
@@ -116,8 +108,6 @@ for _function, _module, _name in (
     ("collision", collision_driver, "_COLLISION_FUNC"),
     ("flat", scan, "_nvmap"),
     ("body_tree", scan, "_nvmap"),
-    ("_optim", collision_sdf, "_gradient_descent"),
-    ("_gradient_descent", collision_sdf, "_gradient_step"),
 ):
     check_lookup(_module, _function, _name)
 
@@ -151,19 +141,14 @@ def collision_with(
 
 _lock = threading.RLock()
 _level = scan._nvmap
-_descent = collision_sdf._gradient_descent
 
 
 def fenced(fn: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns a function that traces MJX with a fence between levels and without that loop."""
+    """Returns a function that traces MJX with a fence between levels."""
 
     @functools.wraps(fn)
     def traced(*args: Any) -> Any:
-        with (
-            _lock,
-            _swapped(scan, "_nvmap", _fenced_level),
-            _swapped(collision_sdf, "_gradient_descent", _descend_gradient),
-        ):
+        with _lock, _swapped(scan, "_nvmap", _fenced_level):
             return fn(*args)
 
     return traced
@@ -172,25 +157,6 @@ def fenced(fn: Callable[..., Any]) -> Callable[..., Any]:
 def _fenced_level(*inputs: Any) -> Any:
     """Computes one level of bodies, and lets nothing of it be computed again."""
     return jax.lax.optimization_barrier(_level(*inputs))
-
-
-def _descend_gradient(
-    objective: Callable[..., Any], x: jax.Array, niter: int
-) -> tuple[Any, jax.Array]:
-    """Returns the least distance found [] and where [3], as MJX's ``_gradient_descent``."""
-
-    @jax.jit  # not inlined: JAX vmaps it once for all iterations
-    def step(state: collision_sdf.GradientState) -> collision_sdf.GradientState:
-        return collision_sdf._gradient_step(objective, state)
-
-    def written_out(x: jax.Array) -> tuple[Any, jax.Array]:
-        far = jnp.asarray(1e10, x.dtype)
-        state = collision_sdf.GradientState(dist=far, x=x)  # type: ignore
-        for _ in range(niter):
-            state = step(state)
-        return state.dist, state.x
-
-    return by_engine(lambda x: _descent(objective, x, niter), written_out, x)
 
 
 @contextlib.contextmanager

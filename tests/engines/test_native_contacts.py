@@ -44,7 +44,7 @@ def test_contacts(xml, room, monkeypatch):
         forward = jax.jit(jax.vmap(env.forward, in_axes=(0, None)))
         moved = [np.asarray(forward(starts.info, x)) for x in (1e-15, 1e-14, 1e-13, -1e-13, -1e-12)]
     jax.clear_caches()
-    # MJX's descent to a cylinder jumps between contacts in some of these states, for any rounding.
+    # A capsule in a cylinder jumps between ways out in some of these states, for any rounding.
     scale = 1 + np.abs(theirs).max(axis=1)
     steady = [np.abs(x - theirs).max(axis=1) / scale < 1e-9 for x in moved]
     steady = np.all(steady, axis=0)

@@ -13,12 +13,10 @@ from pathlib import Path
 
 import gymnasium
 import jax
-import jax.numpy as jnp
 import mujoco
-import numpy as np
 import pytest
 from mujoco import mjx
-from mujoco.mjx._src import collision_driver, collision_primitive, collision_sdf
+from mujoco.mjx._src import collision_driver, collision_primitive
 from places import ROOT
 
 from mjx_reinforce.physics import contacts, mjx_internals
@@ -114,18 +112,6 @@ SOURCES = {
     "collision_primitive.capsule_capsule": (
         "a09b10b02f182204a1375e510d25694c808dff68f3b233a6a47f2139f9712f88",
         "contacts.capsule_capsule",
-    ),
-    "collision_sdf._optim": (
-        "d0a96222f2c77316da1f6cb3c4dd4004b2d1acb462adf045819f761db60c2be1",
-        "mjx_internals.fenced",
-    ),
-    "collision_sdf._gradient_descent": (
-        "59f702536303dc6e02f806fa630a06630863511196101bd72d8b47c38c217e9d",
-        "mjx_internals._descend_gradient",
-    ),
-    "collision_sdf._gradient_step": (
-        "162e9cca8019ef4c4dd3e8d666a9a841d1e256d6a2fd67b1501fa8ae37426b5f",
-        "mjx_internals._descend_gradient",
     ),
     "scan._nvmap": (
         "b9c9d6b469719fd11bc3b06d61bd4674d4dda3341aab4332add1416072af941a",
@@ -252,28 +238,3 @@ def test_mjx_is_left_as_it_is():
     assert table == collision_driver._COLLISION_FUNC
     capsules = mjx.GeomType.CAPSULE, mjx.GeomType.CAPSULE
     assert table[capsules] is collision_primitive.capsule_capsule
-
-
-def test_descent_to_a_cylinder_is_written_out():
-    """A loop there stalls jaxlib 0.10.2."""
-    model = mujoco.MjModel.from_xml_path(str(PUSHER))  # pyright: ignore
-    mjx_model, data = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
-    functions = [
-        lambda data: contacts.fwd_position(mjx_model, data),
-        mjx_internals.fenced(lambda data: contacts.fwd_position(mjx_model, data)),
-    ]
-    plain, ours = (jax.jit(function).lower(data).as_text() for function in functions)
-    assert "stablehlo.while" in plain
-    assert "stablehlo.while" not in ours
-
-
-def test_the_written_out_descent_is_mjxs():
-    def objective(x):
-        return jnp.sum(jnp.array([1.0, 0.3, 0.1]) * (x - jnp.array([0.3, -0.2, 0.1])) ** 2)
-
-    start = jnp.array([1.0, 2.0, -3.0])
-    dist, place = mjx_internals._descend_gradient(objective, start, 10)
-    expected, there = collision_sdf._gradient_descent(objective, start, 10)
-    np.testing.assert_allclose(dist, expected, rtol=1e-4)
-    np.testing.assert_allclose(place, there, rtol=1e-4, atol=1e-5)
-    assert dist < objective(start)

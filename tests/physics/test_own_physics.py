@@ -1,4 +1,4 @@
-"""A user's own model is simulated as by C MuJoCo, refused in words, or named in parity.md."""
+"""What a task on a user's own model carries from step to step."""
 
 import jax
 import jax.numpy as jnp
@@ -6,51 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from experiments.checks import own_models
-from experiments.checks.feature_models import MODELS
+from experiments.checks import matrix
+from experiments.checks.mechanisms import MODELS, mechanisms
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
-
-#: What is refused, and what the refusal says.
-REFUSED = {
-    "armature of an actuator": "would ignore the armature of an actuator",
-    "damping of an actuator": "would ignore the damping of an actuator",
-    "actearly": "would ignore actearly of an actuator",
-    "polynomial spring": "would ignore the polynomial stiffness of a joint",
-    "polynomial damping": "would ignore the polynomial damping of a joint",
-    "polynomial spring of a tendon": "would ignore the polynomial stiffness of a tendon",
-    "disabled actuators": "would ignore disabled groups of actuators",
-    "disabled springs": 'would ignore parts of <flag spring="disable"/>',
-    "disabled dampers": 'would ignore parts of <flag damper="disable"/>',
-    "sleep": "would ignore sleeping bodies",
-    "adhesion": "mjTRN_BODY",
-    "slider-crank": "mjTRN_SLIDERCRANK",
-    "delay": "would ignore delays",
-    "plugin": "would ignore plugins",
-    "springyield": "would ignore plastic springs",
-    "implicit": 'set <option integrator="implicitfast"/>',
-    "discrete": 'set <option integrator="implicitfast"/>',
-    "PGS": 'set <option solver="Newton"/>',
-    "adhesive geom": "would ignore adhesive geoms",
-    "moving surface": "would ignore moving surfaces",
-    "rangefinder": "a bug of MJX",
-    "flex": "Flex",
-}
-#: Where MJX itself computes something else; docs/parity.md says how much.
-DIFFERENT = {
-    "tendon through a cylinder": 1e-6,
-    "connect": 5,
-    "weld": 1e-3,
-    "weld to mocap": 1e-6,
-    "CG": 1e-2,
-    "noslip": 0.5,
-    "ellipsoid fluid": 0.1,
-    "box on a plane": 10,
-    "cylinder on a plane": 1,
-    "mesh on a box": 1,
-    "sphere on a heightfield": 0.5,
-    "box on a box": 200,
-}
 
 
 def test_every_state_of_mujoco_is_accounted_for():
@@ -62,23 +21,12 @@ def test_every_state_of_mujoco_is_accounted_for():
     assert {f"mjSTATE_{named.get(name, name).upper()}" for name in known} == bits - combined
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_own_models(name):
-    [(_, error, words)] = own_models.compare(name, ("alone",))
-    if name in REFUSED:
-        assert np.isnan(error)
-        assert REFUSED[name] in words
-    elif name in DIFFERENT:
-        assert 1e-9 < error < DIFFERENT[name], words
-    else:
-        assert error < 1e-9, words
-
-
 @pytest.mark.parametrize("name", ["muscle", "filter, RK4"])
-@pytest.mark.parametrize("engine", own_models.ENGINES)
-def test_engines_carry_activations(engine, name):
-    [(_, error, words)] = own_models.compare(name, (engine,))
-    assert error < 1e-9, words
+def test_machine_code_carries_activations(name):
+    [mechanism] = [each for each in mechanisms() if each.name == name and each.axis == "features"]
+    with jax.enable_x64(True):
+        [cell] = matrix.compare([mechanism], native=True)
+    assert cell.verdict == "equal", cell
 
 
 class Watched(MujocoEnv):

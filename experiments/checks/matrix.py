@@ -1,0 +1,275 @@
+"""Mechanisms crossed with options and starts, simulated by us and by C MuJoCo.
+
+Compiling is the cost: mechanisms with the same options are bodies of one model that do not touch
+one another, and their starts are a batch. C simulates each alone, and its solver goes on to the
+optimum. The error of a cell (a mechanism from one start) is the largest of what MuJoCo computes, in
+double precision: relative where a number is greater than one. What is not simulated is refused, in
+words.
+"""
+
+import csv
+import dataclasses
+import functools
+import importlib
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jax import lax
+
+from experiments.checks.mechanisms import MOTOR, Mechanism, Start, mechanisms
+from mjx_reinforce import normal
+from mjx_reinforce.engines.native import rollout as native
+from mjx_reinforce.envs import models
+from mjx_reinforce.envs.base import MujocoEnv
+from mjx_reinforce.physics import step as physics
+
+mujoco: Any = importlib.import_module("mujoco")  # pyright does not know what is in it
+
+#: What counts as equal.
+EQUAL = 1e-9
+#: What is compared; of bodies, all but the world.
+BODIES = ("xpos", "xquat", "subtree_com", "cvel")
+FIELDS = (
+    *BODIES,
+    *("qpos", "qvel", "act", "qacc", "sensordata", "ten_length", "actuator_length"),
+    *("actuator_force", "qfrc_bias", "qfrc_passive", "qfrc_actuator", "qfrc_constraint"),
+)
+#: So many mechanisms with contacts are kept apart by the bits of contype.
+BITS = 31
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """Simulate mechanisms of all kinds, and compare with C MuJoCo."""
+
+    native: bool = False
+    """Simulate each mechanism alone, by machine code, from its first start."""
+    only: tuple[str, ...] = ()
+    """Axes or names of mechanisms, by default all."""
+    output: Path = Path("docs/own_models.csv")
+    """A row for each mechanism under each option: the worst start, or the refusal."""
+
+
+class Cell(NamedTuple):
+    """A mechanism from one start: the largest error, and the field that has it or the refusal."""
+
+    axis: str
+    option: str
+    mechanism: str
+    start: str
+    error: float
+    words: str
+
+    @property
+    def verdict(self) -> str:
+        """Whether it is equal, refused or differs."""
+        if np.isnan(self.error):
+            return "refused"
+        return "equal" if self.error < EQUAL else "differing"
+
+
+class Shown(MujocoEnv):
+    """A model that shows what MuJoCo computes, from a start on, forever."""
+
+    def __init__(self, model: Any, start: Start, steps: int):
+        """Takes a model, and where it starts."""
+        super().__init__(
+            xml_file=model, frame_skip=1, max_episode_steps=steps, reward_threshold=None
+        )
+        self.start = start
+
+    def initial(self, rng: jax.Array) -> tuple[Any, Any]:
+        """Returns the start."""
+        return jnp.asarray(self.start[0]), jnp.asarray(self.start[1])
+
+    def observe(self, data: Any) -> jax.Array:
+        """Returns the time, and all fields, one after the other."""
+        return jnp.concatenate([jnp.ravel(x) for x in (data.time, *fields(data))])
+
+    def outcome(self, before: Any, data: Any, action: jax.Array) -> tuple[Any, Any, dict]:
+        """Earns nothing."""
+        return jnp.zeros(()), False, {}
+
+
+def fields(data: Any) -> list[Any]:
+    """Returns each field of a simulation."""
+    return [getattr(data, name)[name in BODIES :] for name in FIELDS]
+
+
+def control(start: Any, time: Any, xp: Any = np) -> Any:
+    """Returns the control [A], that of the start in slow motion."""
+    return start * xp.cos(9 * time)
+
+
+def by_c(each: Mechanism, start: Start) -> list[np.ndarray]:
+    """Returns each field by C MuJoCo after every step, [T, ...], whose solver goes on."""
+    model = mujoco.MjModel.from_xml_string(each.xml)
+    model.opt.tolerance, model.opt.ls_tolerance, model.opt.iterations = 0, 0, 200
+    model.opt.ccd_tolerance, model.opt.ccd_iterations = 1e-12, 200
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.act[:], ctrl = start
+    shown = []
+    for _ in range(each.steps):
+        data.ctrl[:] = control(ctrl, data.time)
+        mujoco.mj_step(model, data)
+        shown.append([x.flatten() for x in fields(data)])
+    return [np.stack(field) for field in zip(*shown, strict=True)]
+
+
+def by_us(model: Any, starts: Start, steps: int) -> list[np.ndarray]:
+    """Returns each field after every step from every start, [S, T, ...], by no engine."""
+    in_mjx = models.to_mjx(model, "it")
+    forward = jax.jit(functools.partial(physics.forward, in_mjx))
+
+    def play(start: Start) -> list[jax.Array]:
+        def step(data: Any, _: None) -> tuple[Any, list[jax.Array]]:
+            given = data.replace(ctrl=control(ctrl, data.time, jnp))
+            data = physics.like(physics.step(in_mjx, given, forward), data)
+            return data, fields(data)
+
+        qpos, qvel, act, ctrl = start
+        data = models.make_data(model).replace(qpos=qpos, qvel=qvel, act=act)
+        return lax.scan(step, data, None, steps)[1]
+
+    shown = jax.jit(jax.vmap(play))(starts)
+    return [np.asarray(x).reshape(*x.shape[:2], -1) for x in shown]
+
+
+def by_machine_code(model: Any, start: Start, steps: int) -> list[np.ndarray]:
+    """Returns each field after every step, [1, T, ...], without activations at the start."""
+    env = Shown(model, start, steps)
+    distribution = normal(env.action_space, rescale=False)
+
+    def act(constants: jax.Array, observation: jax.Array) -> jax.Array:
+        action = control(jnp.asarray(start[3]), observation[..., :1], jnp)
+        fixed = jnp.broadcast_to(constants, (*action.shape[:-1], constants.size))
+        return jnp.concatenate([action, fixed], axis=-1)
+
+    @jax.jit
+    def play(constants: jax.Array) -> jax.Array:
+        lengths: Any = {"num_episodes": 1, "horizon": steps + 1, "deterministic": True}
+        key = jax.random.key(0)
+        return native.rollout(env, act, constants, distribution, key, **lengths).observation[1:, 0]
+
+    shown = np.asarray(play(jnp.asarray(distribution.constants, jnp.result_type(float))))
+    sizes = [1, *(x.size for x in fields(models.make_data(model)))]
+    return [x[None] for x in np.split(shown, np.cumsum(sizes)[:-1], axis=1)[1:]]
+
+
+def load(parts: Sequence[Mechanism]) -> Any:
+    """Returns one model of mechanisms that do not touch; raises ValueError as ``make`` does."""
+    spec = mujoco.MjSpec.from_string(f"<mujoco>{parts[-1].option}</mujoco>")
+    contacts = 0
+    for i, each in enumerate(parts):
+        child = mujoco.MjSpec.from_string(each.xml)
+        geoms = [geom for geom in child.geoms if geom.contype or geom.conaffinity]
+        for geom in geoms:
+            geom.contype = geom.conaffinity = 1 << contacts
+        contacts += bool(geoms)
+        spec.attach(child, prefix=f"{i}/", frame=spec.worldbody.add_frame())
+    model = models.load_model(spec)
+    models.to_mjx(model, "it")
+    return model
+
+
+def refusal(parts: Sequence[Mechanism]) -> str:
+    """Returns why ``make`` refuses some mechanisms, or nothing."""
+    try:
+        load(parts)
+    except ValueError as error:
+        return str(error)
+    return ""
+
+
+def programs(chosen: Sequence[Mechanism]) -> Iterator[list[Mechanism]]:
+    """Yields mechanisms that one model has: of one axis, one option and one solver."""
+    groups: dict[Any, list[Mechanism]] = {}
+    for each in chosen:
+        # Rows of friction lead to another solver, which flags do not change.
+        other = "frictionloss" in each.xml and each.axis != "flags"
+        key = each.axis, each.option, other, len(each.starts)
+        groups.setdefault(key, []).append(each)
+    for group in groups.values():
+        size = len(group) if group[0].axis == "actuators" else BITS
+        yield from (group[i : i + size] for i in range(0, len(group), size))
+
+
+def compare(together: Sequence[Mechanism], native: bool = False) -> Iterator[Cell]:
+    """Yields the cells of mechanisms that one model has, from every start."""
+    model = mujoco.MjModel.from_xml_string(MOTOR)
+    rest = model.qpos0, np.zeros(model.nv), np.zeros(0), np.zeros(model.nu)
+    motor = Mechanism("", "", "", MOTOR, dict.fromkeys(together[0].starts, rest), together[0].steps)
+    parts = [motor, *together]
+    try:
+        model = load(parts)
+    except ValueError:
+        refused = {each: words for each in together if (words := refusal([motor, each]))}
+        for each, words in refused.items():
+            yield from (Cell(*each.title, start, np.nan, words) for start in each.starts)
+        if left := [each for each in together if each not in refused]:
+            yield from compare(left, native)
+        return
+    each_start = zip(*(each.starts.values() for each in parts), strict=True)
+    starts = [tuple(map(np.concatenate, zip(*start, strict=True))) for start in each_start]
+    if native:
+        shown = by_machine_code(model, starts[0], motor.steps)
+    else:
+        stacked = tuple(map(np.stack, zip(*starts, strict=True)))
+        shown = by_us(model, stacked, motor.steps)
+    for each in parts:
+        sizes = []
+        for ours, (name, start) in zip(zip(*shown, strict=True), each.starts.items(), strict=False):
+            theirs = by_c(each, start)
+            sizes = [field.shape[1] for field in theirs]
+            errors = [
+                np.max(np.abs(x[:, :n] - y) / np.maximum(1, np.abs(y)), initial=0.0)
+                for x, y, n in zip(ours, theirs, sizes, strict=True)
+            ]
+            worst = int(np.argmax(np.nan_to_num(errors, nan=np.inf)))
+            if each is not motor:
+                error = float(np.nan_to_num(errors[worst], nan=np.inf))
+                yield Cell(*each.title, name, error, FIELDS[worst])
+        shown = [x[..., n:] for x, n in zip(shown, sizes, strict=True)]
+
+
+def summarized(cells: Sequence[Cell]) -> Iterator[tuple[Any, ...]]:
+    """Yields of each mechanism under each option how many starts, and the one that is worst."""
+    yield "axis", "option", "mechanism", "starts", "worst start", "error", "field or refusal"
+    for title, group in groupby(cells, key=lambda cell: cell[:3]):
+        starts = list(group)
+        worst = max(starts, key=lambda cell: np.nan_to_num(cell.error, nan=np.inf))
+        yield *title, len(starts), worst.start, f"{worst.error:.1e}", worst.words
+
+
+def main(settings: Settings) -> None:
+    """Prints the counts of each program and the cells that differ, and writes all."""
+    jax.config.update("jax_enable_x64", True)
+    wanted = set(settings.only)
+    chosen = [each for each in mechanisms() if not wanted or wanted & {each.axis, each.name}]
+    cells: list[Cell] = []
+    for together in programs(chosen):
+        began = time.process_time()
+        parts = [[each] for each in together] if settings.native else [together]
+        found = [cell for part in parts for cell in compare(part, settings.native)]
+        counts, seconds = Counter(cell.verdict for cell in found), time.process_time() - began
+        print(f"{' '.join(together[0].title[:2])}: {dict(counts)}, {seconds:.0f} s", flush=True)
+        for cell in found:
+            if cell.verdict == "differing":
+                print(f"  {cell.mechanism}, {cell.start}: {cell.error:.0e} of {cell.words}")
+        cells += found
+    counts, seconds = Counter(cell.verdict for cell in cells), time.process_time()
+    print(f"{len(cells)} cells: {dict(counts)}; {seconds:.0f} s of CPU")
+    with settings.output.open("w", encoding="utf-8", newline="") as file:
+        csv.writer(file, lineterminator="\n").writerows(summarized(cells))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Settings))

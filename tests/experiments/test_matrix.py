@@ -1,0 +1,91 @@
+"""Every cell of the matrix is as docs/own_models.csv and docs/parity.md say."""
+
+import csv
+import re
+from fnmatch import fnmatch
+
+import jax
+import numpy as np
+import pytest
+from places import ROOT
+
+from experiments.checks import matrix
+from experiments.checks.mechanisms import mechanisms
+
+ALL = list(mechanisms())
+PROGRAMS = {" ".join((*each[0].title, str(len(each)))): each for each in matrix.programs(ALL)}
+#: A servo at its clamps, and two geoms that C and MJX collide in another way.
+SAMPLE = (
+    ("actuators", "implicitfast", "position, forcerange"),
+    ("actuators", "implicitfast", "affine filter, joint"),
+    ("actuators", "implicitfast", "damper, tendon"),
+    ("actuators", "implicitfast", "muscle, ctrlrange"),
+)
+
+
+def written():
+    """Returns the row of each mechanism under each option, by its title."""
+    with (ROOT / "docs" / "own_models.csv").open(encoding="utf-8", newline="") as file:
+        return {tuple(row.values())[:3]: row for row in csv.DictReader(file)}
+
+
+def check(cells):
+    """Checks cells against what is written: who is refused, and else the largest error."""
+    _, *found = matrix.summarized(cells)
+    rows = written()
+    for *title, _, start, error, words in found:
+        row = rows[tuple(title)]
+        if row["error"] == "nan" or float(row["error"]) < matrix.EQUAL:
+            assert np.isnan(float(error)) == (row["error"] == "nan"), (title, words)
+            assert not float(error) >= matrix.EQUAL, (title, start, words)
+            assert error != "nan" or words == row["field or refusal"]
+        else:
+            assert float(error) == pytest.approx(float(row["error"]), rel=0.5), (title, start)
+
+
+def test_a_sample_is_as_written():
+    with jax.enable_x64(True):
+        check(list(matrix.compare([each for each in ALL if each.title in SAMPLE])))
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_all_is_as_written(name):
+    with jax.enable_x64(True):
+        check(list(matrix.compare(PROGRAMS[name])))
+
+
+def test_every_clamp_is_reached():
+    """From some start, what is clamped moves in another way than what is not."""
+    actuated = {each.name: each for each in ALL if each.title[:2] == ("actuators", "Euler")}
+    for name, each in actuated.items():
+        free = actuated[f"{name.rpartition(', ')[0]}, none"]
+        differs = [
+            not np.array_equal(matrix.by_c(each, x)[5], matrix.by_c(free, x)[5])
+            for x in each.starts.values()
+        ]
+        assert any(differs) == (each is not free), name
+        assert not all(differs), name
+
+
+def test_the_table_of_parity_is_that_of_the_matrix():
+    """It has what differs, with the largest error, and what is refused, and nothing else."""
+    text = (
+        (ROOT / "docs" / "parity.md").read_text(encoding="utf-8").partition("## Your own models")[2]
+    )
+    table = re.findall(r"^\| (`.+?`) \| (\S+) \|", text, re.MULTILINE)
+    found = {pattern: [] for cells, _ in table for pattern in re.findall("`(.+?)`", cells)}
+    for title, row in written().items():
+        error, name = float(row["error"]), " ".join(filter(None, title))
+        if not error < matrix.EQUAL:
+            matching = [pattern for pattern in found if fnmatch(name, pattern)]
+            assert matching, name
+            for pattern in matching:
+                found[pattern].append(error)
+    for cells, said in table:
+        errors = [error for pattern in re.findall("`(.+?)`", cells) for error in found[pattern]]
+        assert errors, cells
+        assert (
+            said == "refused"
+            if np.isnan(errors).all()
+            else float(said) == float(f"{max(errors):.0e}")
+        )
