@@ -241,5 +241,8 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     for flag in ("nativeccd", "multiccd"):
         if model.opt.disableflags & getattr(mjtDisableBit, f"mjDSBL_{flag.upper()}"):
             yield f'<flag {flag}="disable"/>', "remove it"
+    alone = mjtDisableBit.mjDSBL_CONSTRAINT | mjtDisableBit.mjDSBL_CONTACT
+    if model.opt.disableflags & alone == mjtDisableBit.mjDSBL_CONSTRAINT and any(geom_pairs(model)):
+        yield '<flag constraint="disable"/> for contacts', 'add contact="disable" to it'
     if model.opt.integrator == mjtIntegrator.mjINT_DISCRETE:
         yield "the integrator INT_DISCRETE", _REMEDIES["INT_IMPLICIT"]

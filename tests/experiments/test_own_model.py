@@ -56,6 +56,9 @@ REFUSED = {
     ),
     '<actuator><general joint="j" gaintype="user"/></actuator>': "GAIN_USER.*<motor>",
     '<option><flag multiccd="disable"/></option>': 'ignore <flag multiccd="disable"/>; remove it',
+    '<option><flag constraint="disable"/></option><worldbody><geom size="1"/></worldbody>': (
+        'for contacts; add contact="disable"'
+    ),
     '<option><flag override="enable"/></option>': "ENBL_OVERRIDE.*solref",
     '<tendon><fixed range="0 1" margin=".6"><joint joint="j" coef="1"/></fixed></tendon>': (
         "two limits that a tendon meets.*margin of at most half"
