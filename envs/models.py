@@ -197,10 +197,13 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
             'material, a bug of MJX; add <asset><material name="any"/></asset>'
         )
     try:
-        for pair in geom_pairs(model):
-            kinds = tuple(mjx.GeomType(model.geom_type[geom]) for geom in pair[:2])
+        for *geoms, pair in geom_pairs(model):
+            kinds = tuple(mjx.GeomType(kind) for kind in model.geom_type[geoms])
             if kinds in UNLIKE_C:
                 raise NotImplementedError(f"{kinds} collisions, which MJX gets wrong")
+            margin = model.geom_margin[geoms].sum() if pair < 0 else model.pair_margin[pair]
+            if kinds[1] == mjx.GeomType.BOX and kinds[0] != mjx.GeomType.PLANE and margin:
+                raise NotImplementedError(f"{kinds} margin/gap, which MJX ignores")
         # Not on JAX's first device, which may be another process's.
         converted = mjx.put_model(model, impl="jax", device=jax.local_devices()[0])
         # Notices what the model alone does not show; its arrays are not made.

@@ -59,6 +59,9 @@ REFUSED = {
     '<option><flag constraint="disable"/></option><worldbody><geom size="1"/></worldbody>': (
         'for contacts; add contact="disable"'
     ),
+    '<default><geom type="box" margin=".1"/></default><worldbody><geom size="1 1 1"/></worldbody>': (
+        "margin/gap, which MJX ignores; remove margin"
+    ),
     '<option><flag override="enable"/></option>': "ENBL_OVERRIDE.*solref",
     '<tendon><fixed range="0 1" margin=".6"><joint joint="j" coef="1"/></fixed></tendon>': (
         "two limits that a tendon meets.*margin of at most half"
