@@ -59,7 +59,7 @@ REFUSED = {
     '<option><flag constraint="disable"/></option><worldbody><geom size="1"/></worldbody>': (
         'for contacts; add contact="disable"'
     ),
-    '<default><geom type="box" margin=".1"/></default><worldbody><geom size="1 1 1"/></worldbody>': (
+    '<worldbody><geom type="box" size="1 1 1" margin=".1"/></worldbody>': (
         "margin/gap, which MJX ignores; remove margin"
     ),
     '<option><flag override="enable"/></option>': "ENBL_OVERRIDE.*solref",
