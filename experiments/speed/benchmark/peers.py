@@ -6,15 +6,12 @@ import math
 import time
 from typing import Any
 
-import jax
 import numpy as np
 
 from experiments.kit.rows import threads
 from experiments.speed.benchmark.rows import Candidate
 from mjx_reinforce import envs
 
-#: Worlds that MuJoCo Warp simulates at once.
-WARP_WORLDS = (8192, 32768)
 #: Env steps that MuJoCo Warp's worlds have gone through before they are timed.
 WARP_BEFORE = 50
 #: What MuJoCo Warp may have too little room for: `OverflowType`, without the limits of iterations.
@@ -22,12 +19,8 @@ WARP_ROOM = ("NEFC", "NJMAX_NNZ", "BROADPHASE", "NARROWPHASE", "CCD", "EPA_HORIZ
 
 
 def peers(env_id: str) -> list[Candidate]:
-    """C MuJoCo on all threads; where it can run, MuJoCo Warp and Gymnasium's vector env."""
-    candidates = []
-    if hasattr(envs.make(env_id), "mj_model"):
-        candidates.append(c_mujoco(env_id))
-        if importlib.util.find_spec("warp") and jax.default_backend() == "gpu":
-            candidates += [mujoco_warp(env_id, batch) for batch in WARP_WORLDS]
+    """C MuJoCo on all threads, and Gymnasium's vector environment where it can run."""
+    candidates = [c_mujoco(env_id)] if hasattr(envs.make(env_id), "mj_model") else []
     if _in_gymnasium(env_id):
         candidates.append(gymnasium_vector(env_id))
     return candidates
