@@ -13,8 +13,6 @@ from mjx_reinforce.physics.mjx_internals import jax_fields
 
 PAIR = """
 <mujoco>
-  <asset><mesh name="m" vertex="-.2 -.15 -.1  .2 -.15 -.1  .2 .15 -.1  -.2 .15 -.1
-                                -.2 -.15 .1  .2 -.15 .1  .2 .15 .1  -.2 .15 .1"/></asset>
   <worldbody><geom type="{}"/><body><freejoint/><geom type="{}"/></body>
     <body pos="9 9 9"><joint name="j"/><geom size=".1" contype="0" conaffinity="0"/></body>
   </worldbody>
@@ -27,7 +25,6 @@ GEOMS = {
     "ellipsoid": 'ellipsoid" size=".2 .15 .1',
     "cylinder": 'cylinder" size=".15 .1',
     "box": 'box" size=".2 .15 .1',
-    "mesh": 'mesh" mesh="m',
 }
 HALF = np.array([0.2, 0.15, 0.1])
 #: The point of a geom that is farthest along a direction, both in its own frame.
@@ -39,18 +36,10 @@ FARTHEST = {
         np.sign(n) * [0, 0, 0.1] + n * [0.15, 0.15, 0] / max(np.hypot(*n[:2]), 1e-9)
     ),
     "box": lambda n: HALF * np.sign(n),
-    "mesh": lambda n: HALF * np.sign(n),
     "plane": lambda n: np.zeros(3),
 }
-#: C's search for the contact of a capsule and a cylinder ends at 1e-6; at the edges of boxes and
-#: meshes MJX adds about as much to its denominators.
-TOLERANCE = {
-    ("cylinder", "capsule"): 1e-5,
-    ("sphere", "box"): 2e-6,
-    ("sphere", "mesh"): 2e-6,
-    ("capsule", "box"): 4e-5,
-    ("capsule", "mesh"): 2e-6,
-}
+#: C's search for the contact of a capsule and a cylinder ends at 1e-6.
+TOLERANCE = {("cylinder", "capsule"): 1e-5}
 
 
 def poses(first, second):
@@ -84,8 +73,8 @@ def compiled(first, second):
 RIGHT = [
     *(("plane", x) for x in ("box", "cylinder", "sphere", "capsule", "ellipsoid")),
     *(("cylinder", x) for x in ("sphere", "capsule")),
-    *(("sphere", x) for x in ("sphere", "capsule", "box", "mesh")),
-    *(("capsule", x) for x in ("capsule", "box", "mesh")),
+    *(("sphere", x) for x in ("sphere", "capsule")),
+    ("capsule", "capsule"),
 ]
 
 
