@@ -312,6 +312,7 @@ ABOVE = ("box", "mesh", "cylinder", "ellipsoid", "capsule", "sphere")
 POSES = {
     "upright": ((1, 0, 0, 0), 2, -0.002),
     "flat": ((1, 1, 0, 0), 2, -0.002),
+    "nearly flat": ((1, 0.03, 0.04, 0), 2, -0.015),
     "on edge": ((0.9, 0.3, 0.2, 0.1), 2, -0.002),
     "deep": ((0.9, 0.1, 0.3, 0.2), 2, -0.03),
     "side by side": ((1, 0, 0, 0), 0, -0.002),
