@@ -14,6 +14,7 @@ from mujoco import (  # a C extension
     MjSpec,  # pyright: ignore[reportAttributeAccessIssue]
     mjtDisableBit,  # pyright: ignore[reportAttributeAccessIssue]
     mjtEnableBit,  # pyright: ignore[reportAttributeAccessIssue]
+    mjtEq,  # pyright: ignore[reportAttributeAccessIssue]
     mjtIntegrator,  # pyright: ignore[reportAttributeAccessIssue]
     mjtJoint,  # pyright: ignore[reportAttributeAccessIssue]
     mjtSensor,  # pyright: ignore[reportAttributeAccessIssue]
@@ -42,6 +43,11 @@ NOT_CARRIED = {
     "plugin": ("nplugin", "plugins", "remove them"),
     "plastic": ("nplastic", "plastic springs", "remove springyield"),
 }
+_OFF = (
+    *(mjtDisableBit.mjDSBL_CONSTRAINT, mjtDisableBit.mjDSBL_CONTACT),
+    mjtDisableBit.mjDSBL_EQUALITY,
+)
+_HOLDS = (int(mjtEq.mjEQ_CONNECT), int(mjtEq.mjEQ_WELD))
 _WITHIN_MARGIN = "give it a margin of at most half of its range"
 _ON_JOINT = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
@@ -244,8 +250,11 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     for flag in ("nativeccd", "multiccd"):
         if model.opt.disableflags & getattr(mjtDisableBit, f"mjDSBL_{flag.upper()}"):
             yield f'<flag {flag}="disable"/>', "remove it"
-    alone = mjtDisableBit.mjDSBL_CONSTRAINT | mjtDisableBit.mjDSBL_CONTACT
-    if model.opt.disableflags & alone == mjtDisableBit.mjDSBL_CONSTRAINT and any(geom_pairs(model)):
+    # MJX adds up the forces on a body of rows that are not there.
+    off = [bool(model.opt.disableflags & bit) for bit in _OFF]
+    if off[0] and not off[1] and any(geom_pairs(model)):
         yield '<flag constraint="disable"/> for contacts', 'add contact="disable" to it'
+    if (off[0] or off[2]) and np.isin(model.eq_type, _HOLDS).any():
+        yield '<flag equality="disable"/> for a connect or a weld', 'give it active="false"'
     if model.opt.integrator == mjtIntegrator.mjINT_DISCRETE:
         yield "the integrator INT_DISCRETE", _REMEDIES["INT_IMPLICIT"]

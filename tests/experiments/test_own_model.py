@@ -62,6 +62,9 @@ REFUSED = {
     '<worldbody><geom type="box" size="1 1 1" margin=".1"/></worldbody>': (
         "margin/gap, which MJX ignores; remove margin"
     ),
+    '<option><flag equality="disable"/></option><equality><weld body1="b"/></equality>': (
+        'for a connect or a weld; give it active="false"'
+    ),
     '<option><flag override="enable"/></option>': "ENBL_OVERRIDE.*solref",
     '<tendon><fixed range="0 1" margin=".6"><joint joint="j" coef="1"/></fixed></tendon>': (
         "two limits that a tendon meets.*margin of at most half"
