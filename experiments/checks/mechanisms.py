@@ -308,16 +308,17 @@ BELOW = {
     "sphere": 'type="sphere" size=".4"',
 }
 ABOVE = ("box", "mesh", "cylinder", "ellipsoid", "capsule", "sphere")
-#: How a geom lies on another: turned by a quaternion, moved up (or aside), and how far apart.
+#: How a geom lies on another: turned by a quaternion, from which x, moved up (or aside), how close.
 POSES = {
-    "upright": ((1, 0, 0, 0), 2, -0.002),
-    "flat": ((1, 1, 0, 0), 2, -0.002),
-    "nearly flat": ((1, 0.03, 0.04, 0), 2, -0.015),
-    "on edge": ((0.9, 0.3, 0.2, 0.1), 2, -0.002),
-    "deep": ((0.9, 0.1, 0.3, 0.2), 2, -0.03),
-    "side by side": ((1, 0, 0, 0), 0, -0.002),
+    "upright": ((1, 0, 0, 0), 0.03, 2, -0.002),
+    "flat": ((1, 1, 0, 0), 0.03, 2, -0.002),
+    "nearly flat": ((1, 0.03, 0.04, 0), 0.03, 2, -0.015),
+    "on edge": ((0.9, 0.3, 0.2, 0.1), 0.03, 2, -0.002),
+    "over the edge": ((0.9, 0.1, 0.4, 0.1), 0.41, 2, -0.002),
+    "deep": ((0.9, 0.1, 0.3, 0.2), 0.03, 2, -0.03),
+    "side by side": ((1, 0, 0, 0), 0.03, 0, -0.002),
 }
-MARGIN = {"within the margin": ((0.9, 0.2, 0.1, 0.2), 2, 0.005)}
+MARGIN = {"within the margin": ((0.9, 0.2, 0.1, 0.2), 0.03, 2, 0.005)}
 #: Flags that disable something; those that have nothing to do with one another, together.
 FLAGS = (
     *("constraint", "equality", "frictionloss", "limit", "contact", "spring", "damper"),
@@ -408,9 +409,9 @@ def _posed(model: Any, poses: dict[str, Any]) -> dict[str, Start]:
     """Returns starts in which the free body is so far from the other geom, found by C MuJoCo."""
     data, starts = mujoco.MjData(model), {}
     endless = model.geom_type[0] <= int(mujoco.mjtGeom.mjGEOM_HFIELD)
-    for name, (quaternion, axis, gap) in poses.items():
+    for name, (quaternion, x, axis, gap) in poses.items():
         along = np.eye(7)[2 if endless else axis]
-        at = np.array([0.03, 0.02, 0.03, *np.array(quaternion) / np.linalg.norm(quaternion)])
+        at = np.array([x, 0.02, 0.03, *np.array(quaternion) / np.linalg.norm(quaternion)])
         low, high = 0.0, 3.0
         while high - low > 1e-9:
             middle = (low + high) / 2
