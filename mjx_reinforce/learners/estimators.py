@@ -6,7 +6,9 @@ and never sees the policy. With the discounted return to go written
 
     G[t] = r[t] + discount * G[t + 1],
 
-every estimator here but two is unbiased for the same gradient; they differ in variance.
+most estimators here are unbiased for the same gradient, that of a step's own action on what it is
+worth from there, and differ in variance. ``total_return`` is for the gradient of the discounted
+return from the start, in which step t counts discount^t: the same only without a discount.
 ``standardize`` divides the weights of an update by a number that it computes from them, so that
 its gradient has another length, and is no longer exactly unbiased. ``mean_log_prob`` and
 ``normalized_returns`` come from published programs, and say what they follow instead.
@@ -64,6 +66,8 @@ class Estimator(NamedTuple):
 
 def total_return(discount: float | jax.Array = 0.99) -> Estimator:
     """Weights every action of an episode by the return of the whole, G[0] (Williams 1992).
+
+    Rewards from before an action add noise alone. Those after it are discounted from the start.
 
     Examples:
       >>> import jax, jax.numpy as jnp
@@ -273,7 +277,8 @@ def discount_weights(estimator: Estimator, discount: float | jax.Array = 0.99) -
     Without that factor the gradient is not that of the discounted return from
     the start, nor of any other objective (Nota and Thomas 2020,
     arXiv:1906.07073); with it, late steps hardly count. Most programs leave it
-    out, and so does everything here unless wrapped in this.
+    out, and so does everything here unless wrapped in this, but for ``total_return``, which
+    has it already and would discount twice.
 
     Examples:
       >>> import jax, jax.numpy as jnp

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mjx_reinforce.reports.statistics import iqm, iqm_interval, smooth
+from mjx_reinforce.reports.statistics import enough, iqm, iqm_interval, smooth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,7 +58,8 @@ def draw_learning_curve(
     _draw_mean(axes, grid, steps, returns, "tab:blue", "deterministic policy")
     if threshold is not None:
         axes.axhline(threshold, color="0.3", linestyle="--", linewidth=1, label="solved")
-    seeds = f"interquartile mean of {num_seeds} seeds, 95 % interval" if num_seeds > 1 else "1 seed"
+    seeds = f"interquartile mean of {num_seeds} seeds" if num_seeds > 1 else "1 seed"
+    seeds += ", 95 % interval" if enough(num_seeds) else ""
     failed = int(np.sum(~np.isfinite(returns[-1])))
     seeds += f"; {failed:,} of {num_seeds:,} not finite at the end" if failed else ""
     axes.set(xlabel=f"{axis.replace('_', ' ')} of a seed", ylabel="return", title=f"{env}, {seeds}")

@@ -18,7 +18,7 @@ from rich.text import Text
 
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.heartbeat import heartbeat
-from mjx_reinforce.reports.statistics import iqm
+from mjx_reinforce.reports.statistics import enough, iqm
 from mjx_reinforce.runs.plan import duration
 from mjx_reinforce.settings.own_code import env_flag
 from mjx_reinforce.training import progress
@@ -148,9 +148,10 @@ def print_summary(console: Console, summary: dict[str, Any], directory: Path) ->
     num_seeds = f"{summary['num_seeds']:,}"
     table = Table(title=escape(f"{summary['env']}, {num_seeds} seeds"), show_header=False)
     low, high = summary["iqm_ci"]
-    known = not (math.isnan(low) and math.isnan(high))
-    interval = f"  (95 % interval {low:.1f} to {high:.1f})" if known else ""
-    table.add_row("return, interquartile mean over seeds", f"{summary['iqm']:.1f}{interval}")
+    known = math.isfinite(low) and math.isfinite(high)
+    interval = f"95 % interval {low:.1f} to {high:.1f}" if known else "no interval"
+    interval += "" if enough(summary["num_seeds"]) else ": too few seeds"
+    table.add_row("return, interquartile mean over seeds", f"{summary['iqm']:.1f}  ({interval})")
     returns = np.array(summary["final_returns"])
     table.add_row("worst and best seed", f"{returns.min():.1f}, {np.fmax.reduce(returns):.1f}")
     if failed := summary["seeds_nonfinite_at_end"]:

@@ -115,10 +115,7 @@ class Tempting(Toy):
 
 
 class Chain:
-    """Two arms, up to three pulls; arm 0 may end the episode. Rewards depend on pull and arm.
-
-    The expected return of a policy is a sum over 2^3 sequences, so its gradient is exact.
-    """
+    """Two arms, up to three pulls; arm 0 may end the episode. Rewards depend on pull and arm."""
 
     max_episode_steps = 3
     action_size = 2
@@ -135,22 +132,6 @@ class Chain:
         done = (t == 2) | ((t == 1) & (action == 0))
         obs = jnp.roll(state.obs, 1)
         return state.replace(obs=obs, reward=reward, done=done.astype(state.obs.dtype))
-
-
-def expected_return(logits, discount):
-    """The exact discounted return of Chain under softmax ``logits`` [3, 2]."""
-    log_probs = jax.nn.log_softmax(logits)
-    total = 0.0
-    for first in range(2):
-        for second in range(2):
-            for third in range(2):
-                arms = (first, second) if second == 0 else (first, second, third)
-                if second == 0 and third == 1:
-                    continue
-                probability = jnp.exp(sum(log_probs[t, arm] for t, arm in enumerate(arms)))
-                earned = sum(discount**t * Chain.rewards[t, arm] for t, arm in enumerate(arms))
-                total = total + probability * earned
-    return total
 
 
 def categorical(num_actions):

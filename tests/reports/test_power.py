@@ -33,10 +33,6 @@ def test_small_effects_need_many_seeds_or_too_many():
     assert seeds_needed(NORMAL, NORMAL) is None
 
 
-def test_two_constants_need_two_seeds():
-    assert seeds_needed(np.full(9, 2.0), np.full(9, 1.0)) == 2
-
-
 def test_failed_seeds_are_the_worst():
     x, y = np.full(100, 10.0), np.full(100, 10.0)
     y[:50] = np.nan

@@ -19,10 +19,13 @@ QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
 
 
 def published_interval(mean: float, deviation: float) -> Estimate:
-    """Returns a published mean with its 95 % interval by Student's t over the published seeds."""
+    """Returns a published mean with its 95 % interval by Student's t over the published seeds.
+
+    Seeds that are all alike have none.
+    """
     t = stats.t.ppf(0.975, PUBLISHED_SEEDS - 1)
     half = float(t) * deviation / math.sqrt(PUBLISHED_SEEDS)
-    return Estimate(mean, mean - half, mean + half)
+    return Estimate(mean, mean - half, mean + half) if half else Estimate(mean, math.nan, math.nan)
 
 
 def verdict(ours: Estimate, published: tuple[float, float] | None) -> str:
@@ -34,9 +37,11 @@ def verdict(ours: Estimate, published: tuple[float, float] | None) -> str:
     """
     if published is None:
         return "none published"
-    if not (math.isfinite(ours.low) and math.isfinite(ours.high)):
+    if math.isnan(ours.value):
         return "none: a seed failed"
     theirs = published_interval(*published)
+    if not np.all(np.isfinite([*ours, *theirs])):
+        return "not apart" if ours.value == theirs.value else "no interval"
     if ours.low > theirs.high:
         return "above"
     return "below" if ours.high < theirs.low else "not apart"
@@ -141,9 +146,9 @@ def compare(ours: ArrayLike, theirs: ArrayLike) -> Comparison:
     ours, theirs = np.asarray(ours, float), np.asarray(theirs, float)
     first, second = interval("mean", ours), interval("mean", theirs)
     difference = float(second.value - first.value)
-    low = high = difference
+    low = high = math.nan
     if ours.std() > 0 or theirs.std() > 0:
         welch = stats.ttest_ind(theirs, ours, equal_var=False).confidence_interval(0.95)
         low, high = float(welch.low), float(welch.high)
-    within = bool(first.low <= second.value <= first.high)
+    within = bool(first.low <= second.value <= first.high) or difference == 0
     return Comparison(first, second, Estimate(difference, low, high), within)

@@ -19,6 +19,7 @@ _VERDICTS = {
     "above": "above the published figure",
     "not apart": "not apart from the published figure",
     "below": "below the published figure",
+    "no interval": "without an interval to compare",
     "none published": "without a published figure",
     "none: a seed failed": "no mean, since a seed left the finite numbers",
 }

@@ -33,7 +33,9 @@ def number(x: float) -> str:
 
 
 def estimate(found: Estimate) -> str:
-    """Returns a number and its interval: "3.20 (3.10 to 3.30)"."""
+    """Returns a number and its interval, "3.20 (3.10 to 3.30)", or that there is none."""
+    if not (math.isfinite(found.low) and math.isfinite(found.high)):
+        return f"{number(found.value)} (no interval)"
     return f"{number(found.value)} ({number(found.low)} to {number(found.high)})"
 
 

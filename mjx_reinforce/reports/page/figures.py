@@ -10,7 +10,7 @@ from mjx_reinforce.reports.findings import Findings, swept, values_of
 from mjx_reinforce.reports.page import charts, tables
 from mjx_reinforce.reports.page.distributions import edges, slider_stops
 from mjx_reinforce.reports.page.vega import Chart, renamed, specification
-from mjx_reinforce.reports.page.words import interval_in_words, number
+from mjx_reinforce.reports.page.words import number, within
 
 #: So many configurations are shown at first, the best.
 SHOWN = 4
@@ -108,8 +108,8 @@ def _final_figure(findings: Findings, place: int) -> Iterator[Figure]:
         ),
         alt=(
             f"{counted(len(findings.results), 'row')}, best first. The best, "
-            f"{best.configuration.label}, is at {number(best.mean.value)}, 95 % interval "
-            f"{interval_in_words(best.mean)}. Table 1 has every number."
+            f"{best.configuration.label}, is at {number(best.mean.value)}, {within(best.mean)}. "
+            "Table 1 has every number."
         ),
         tables=["final"],
     )

@@ -104,9 +104,8 @@ def _half_solved(result: Result) -> str:
     solving = result.solving
     if solving is None or math.isnan(solving.median.value):
         return "fewer than half of its seeds solve it"
-    bounds = interval_in_words(solving.median, steps)
-    bounds = "" if bounds == "no interval" else f" (95 % interval {bounds})"
-    return f"half of its seeds have after {steps(solving.median.value)} env steps{bounds}"
+    bounds = words.within(solving.median, steps)
+    return f"half of its seeds have after {steps(solving.median.value)} env steps ({bounds})"
 
 
 def _of_area(findings: Findings) -> Iterator[str]:

@@ -12,7 +12,14 @@ from mjx_reinforce.reports.page.columns import Table, short
 from mjx_reinforce.reports.page.figures import SHOWN, Figure, task_figures
 from mjx_reinforce.reports.page.listings import Listing, listings
 from mjx_reinforce.reports.page.tables import task_tables
-from mjx_reinforce.reports.page.words import LEVEL, interval_in_words, number, p_value, percent
+from mjx_reinforce.reports.page.words import (
+    LEVEL,
+    interval_in_words,
+    number,
+    p_value,
+    percent,
+    within,
+)
 from mjx_reinforce.reports.tasks import Faster, Tasks, in_order
 
 _SCORE = "A score of 0 is that of untrained policies; table 1 says what 1 is in each task."
@@ -52,7 +59,7 @@ def tasks_figures(tasks: Tasks) -> list[Figure]:
     best = tasks.overall[0]
     alt = (
         f"{counted(len(names), 'row')}, best first. The best, {best.label}, is at "
-        f"{number(float(best.mean.value))}, 95 % interval {interval_in_words(best.mean)}."
+        f"{number(float(best.mean.value))}, {within(best.mean)}."
     )
     spec = vega.specification(chart, names, names[:SHOWN], 0.0, 0) | {"description": alt}
     caption = (
@@ -146,13 +153,11 @@ def tasks_answer(tasks: Tasks) -> list[str]:
     """Returns the answer in a few sentences; the speed first, where the best scores are equal."""
     best = tasks.overall[0]
     envs = counted(len(tasks.findings), "task")
-    mean = f"{number(float(best.mean.value))} (95 % interval {interval_in_words(best.mean)})"
+    mean = f"{number(float(best.mean.value))} ({within(best.mean)})"
     if len(tasks.overall) == 1:
         return [f"Over {envs}, the mean score is {mean}.", _SCORE]
     second = tasks.overall[1]
-    next_mean = (
-        f"{number(float(second.mean.value))} (95 % interval {interval_in_words(second.mean)})"
-    )
+    next_mean = f"{number(float(second.mean.value))} ({within(second.mean)})"
     said = [
         f"Over {envs}, the greatest mean score is that of {best.label}: {mean}.",
         f"The next is {second.label}: {next_mean}. {_SCORE}",

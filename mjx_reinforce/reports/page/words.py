@@ -12,9 +12,10 @@ from mjx_reinforce.reports.experiment import (
     ordered,
     say,
     setting_in_words,
+    shared_seeds,
 )
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.statistics import Estimate
+from mjx_reinforce.reports.statistics import Estimate, enough
 from mjx_reinforce.reports.statistics.comparisons import Comparison
 from mjx_reinforce.settings.tuned import OF_TASKS
 
@@ -36,6 +37,12 @@ def interval_in_words(estimate: Estimate, form: Callable[[float], str] = number)
     if math.isnan(estimate.low) or math.isnan(estimate.high):
         return "no interval"
     return f"{form(float(estimate.low))} to {form(float(estimate.high))}"
+
+
+def within(estimate: Estimate, form: Callable[[float], str] = number) -> str:
+    """Returns an interval with its level, "95 % interval 997.0 to 999.0", or that there is none."""
+    said = interval_in_words(estimate, form)
+    return said if said == "no interval" else f"95 % interval {said}"
 
 
 def percent(share: float) -> str:
@@ -78,10 +85,9 @@ def answer(findings: Findings) -> list[str]:
 
 def _headline(findings: Findings) -> str:
     best, env = findings.results[0], findings.experiment.env
-    mean = (
-        f"a mean return of {number(best.mean.value)} (95 % interval {interval_in_words(best.mean)})"
-    )
-    mean = mean.replace("(95 % interval no interval)", "(one seed, so there is no interval)")
+    why = "all seeds are alike" if enough(len(best.final)) else "too few seeds"
+    bounds = within(best.mean).replace("no interval", f"no interval: {why}")
+    mean = f"a mean return of {number(best.mean.value)} ({bounds})"
     if len(findings.results) == 1:
         return _learned(findings, env, mean)
     name = best.configuration.label
@@ -121,20 +127,26 @@ def _ahead(findings: Findings) -> Iterator[str]:
     where = "The mean" if len(sizes) == 1 else "Over the seeds that all have, the mean"
     yield (
         f"{where} {_above(float(next_best.difference.value))} that of the next, {label} "
-        f"(95 % interval {interval_in_words(next_best.difference)}; {p_value(next_best.adjusted)} "
+        f"({within(next_best.difference)}; {p_value(next_best.adjusted)} "
         f"after Holm's correction for {counted(len(findings.comparisons), 'pair')}). Of two seeds, "
         "one of each, that of the best ends higher with a probability of "
-        f"{percent(improvement.value)} (95 % interval "
-        f"{interval_in_words(improvement, percent)}; ties count half)."
+        f"{percent(improvement.value)} ({within(improvement, percent)}; ties count half)."
     )
     ties = unsure(findings)
     if ties:
         least = p_value(min(c.adjusted for c in against if c.adjusted >= LEVEL))
         names = [f"“{each.configuration.label}”" for each in ties[:3]]
         more = f" and {len(ties) - 3} more" if len(ties) > 3 else ""
+        seeds = len(shared_seeds(findings.results[:COMPARED]))
+        can = len(findings.comparisons) * 2.0 ** (1 - seeds) < LEVEL
+        why = (
+            "a difference as large comes by chance too often"
+            if can
+            else f"{counted(seeds, 'seed')} are too few to tell, whatever they say"
+        )
         yield (
-            f"It cannot be told from {', '.join(names)}{more}: a difference as large comes by "
-            f"chance too often ({least}{'' if least == 'p = 1' else ' or more'})."
+            f"It cannot be told from {', '.join(names)}{more}: {why} "
+            f"({least}{'' if least == 'p = 1' else ' or more'})."
         )
 
 
@@ -152,14 +164,12 @@ def _solving(findings: Findings) -> Iterator[str]:
     kept = f"; {fell:,} had solved it and fell back" if fell else ""
     yield (
         f"{solving.at_end:,} of {whose}{counted(seeds, 'seed')} solve the task at the end "
-        f"({percent(float(solving.rate.value))}, 95 % interval "
-        f"{interval_in_words(solving.rate, percent)}; solved is a return of "
-        f"{number(findings.experiment.threshold or 0.0)}){kept}."
+        f"({percent(float(solving.rate.value))}, {within(solving.rate, percent)}; solved is a "
+        f"return of {number(findings.experiment.threshold or 0.0)}){kept}."
     )
     if not math.isnan(solving.median.value):
-        bounds = interval_in_words(solving.median, steps)
-        bounds = "" if bounds == "no interval" else f" (95 % interval {bounds})"
-        yield f"Half of them had solved it after {steps(solving.median.value)} env steps{bounds}."
+        half = f"{steps(solving.median.value)} env steps ({within(solving.median, steps)})"
+        yield f"Half of them had solved it after {half}."
 
 
 def _few(findings: Findings) -> list[str]:
@@ -195,7 +205,8 @@ def _of_seeds(findings: Findings) -> Iterator[str]:
     if min(sizes) < _FEW_SEEDS:
         yield (
             f"{counted(min(sizes), 'seed')} of a configuration are few: below {_FEW_SEEDS}, a "
-            "bootstrap interval holds the truth less often than 95 % of the time."
+            "bootstrap interval holds the truth less often than 95 % of the time, and below six "
+            "there is none, nor a p below 0.05."
         )
     if len(set(sizes)) > 1:
         yield (

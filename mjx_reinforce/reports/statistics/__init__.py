@@ -26,6 +26,29 @@ class Estimate(NamedTuple):
     high: Any
 
 
+def enough(num_seeds: int, confidence: float = 0.95) -> bool:
+    """Returns whether so many seeds can bear an interval: at 95 %, six can.
+
+    All seeds lie on one side of the truth, if a seed is as likely to lie on either, with the
+    probability 2^(1 - n). No interval within the range of fewer holds the truth as often as it
+    says, and no test of signs rejects.
+    """
+    return 2.0 ** (1 - num_seeds) <= 1 - confidence
+
+
+def alike(values: np.ndarray, size: Any = 0.0) -> np.ndarray:
+    """Returns where values [..., S] differ by no more than the rounding of float32 numbers, [...].
+
+    Args:
+      values: finite or -inf.
+      size: [...] of the numbers that were rounded, where that is more than the values'.
+    """
+    low, high = np.min(values, axis=-1), np.max(values, axis=-1)
+    largest = np.maximum(np.maximum(np.abs(low), np.abs(high)), size)
+    with np.errstate(invalid="ignore"):  # where all failed
+        return high - low <= np.finfo(np.float32).eps * np.where(largest < np.inf, largest, 0.0)
+
+
 def worst_if_not_finite(values: ArrayLike) -> np.ndarray:
     """Returns the values, -inf for those that are not finite: a seed that failed is the worst."""
     values = np.asarray(values, float)
@@ -68,8 +91,10 @@ def iqm_interval(
       confidence: the interval's level.
 
     Returns:
-      Its lower and upper ends. One seed gives no interval and both ends are NaN; an end is NaN
-      too where so many seeds failed that there is no mean in the resamples around it.
+      Its lower and upper ends. Both are NaN of fewer than six seeds (see ``enough``) and of fewer
+      than eleven that are all alike: as many as that are, one time in twenty, also where a quarter
+      of all seeds differs. An end is NaN too where so many seeds failed that there is no mean in
+      the resamples around it.
 
     Examples:
       >>> import numpy as np
@@ -85,6 +110,8 @@ def iqm_interval(
 
 def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
     """Returns a confidence interval of the mean of values [..., S]; as ``iqm_interval``.
+
+    Seeds that are all alike, however many, do not show how far a rare other would move the mean.
 
     Examples:
       >>> import numpy as np
@@ -103,13 +130,15 @@ def _expanded_percentiles(
     *shape, num_seeds = values.shape
     points = worst_if_not_finite(values).reshape(-1, num_seeds)
     ends = np.full((2, len(points)), np.nan)
-    if num_seeds > 1:
+    if enough(num_seeds, confidence):
         # Only means without trimming were seen to spread too little (interval_coverage.py).
         shrinkage = 1.0 if cut else math.sqrt(1 - 1 / num_seeds)
         tail = expanded_tail(confidence, num_seeds - 1, shrinkage)
         for first in range(0, len(points), _POINTS):
             some = slice(first, first + _POINTS)
             ends[:, some] = percentiles(resampled_trim_means(points[some], cut), tail)
+        if (1 - cut) ** num_seeds > 1 - confidence:
+            ends[:, alike(points)] = np.nan
     low, high = finite_or_nan(ends).reshape(2, *shape)
     return low[()], high[()]
 

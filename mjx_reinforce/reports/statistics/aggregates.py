@@ -8,7 +8,9 @@ from scipy import stats
 
 from mjx_reinforce.reports.statistics import (
     Estimate,
+    alike,
     bootstrap,
+    enough,
     finite_or_nan,
     iqm,
     iqm_interval,
@@ -55,7 +57,7 @@ def interval(
 
     Returns:
       Arrays [...]. NaN stands for what does not exist: a statistic that a failed seed decides, an
-      end that such resamples decide, both ends for one seed.
+      end that such resamples decide, both ends where seeds are too few or all alike.
 
     Raises:
       ValueError: an unknown statistic.
@@ -85,19 +87,19 @@ def median_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[np.nda
     The k-th lowest and the k-th highest of S values enclose the median with a probability that
     the binomial distribution gives, whatever the values' distribution; the ends are interpolated
     between the two k whose probabilities enclose the level (Hettmansperger and Sheather 1986,
-    Statistics and Probability Letters 4). Fewer than six seeds have no interval at 95 %: it is
-    then from the lowest to the highest, which covers the median of five with 93.75 %.
+    Statistics and Probability Letters 4). Fewer than six seeds have no interval at 95 %: from the
+    lowest to the highest covers the median of five with 93.75 %.
 
     Args:
       values: [..., S]; not finite where a seed failed.
       confidence: the interval's level.
 
     Returns:
-      Its lower and upper ends [...]; NaN for one seed, and for an end that is a failed seed.
+      Its lower and upper ends [...]; NaN for too few seeds, and for an end that is a failed seed.
     """
     ordered = np.sort(worst_if_not_finite(values), axis=-1)
     num_seeds = ordered.shape[-1]
-    if num_seeds < 2:
+    if not enough(num_seeds, confidence):
         return np.full(ordered.shape[:-1], np.nan), np.full(ordered.shape[:-1], np.nan)
     k = max(int(stats.binom.ppf((1 - confidence) / 2, num_seeds, 0.5)), 1)
     wide, narrow = 1 - 2 * stats.binom.cdf([k - 1, k], num_seeds, 0.5)
@@ -157,11 +159,12 @@ def _stratified(
     sizes = np.unique(strata, return_counts=True)[1]
     value = finite_or_nan(_of_strata(statistic, rows, strata, fraction))
     ends = np.full((2, len(rows)), np.nan)
-    if sizes.min() > 1:
+    if sizes.min() > 2 and enough(len(strata) - len(sizes) + 1, confidence):
         shrinkage = math.sqrt(1 - 1 / sizes.min())
         tail = bootstrap.expanded_tail(confidence, len(strata) - len(sizes), shrinkage)
         for row, some in enumerate(rows):
             ends[:, row] = bootstrap.percentiles(resampled(statistic, some, strata, fraction), tail)
+        ends[:, alike(ends.T)] = np.nan
     low, high = finite_or_nan(ends)
     return Estimate(*(array.reshape(values.shape[:-1])[()] for array in (value, low, high)))
 

@@ -1,6 +1,7 @@
 """Which of two configurations is better, by how much, and how sure that is."""
 
 import itertools
+import math
 import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from mjx_reinforce.reports.statistics import Estimate, worst_if_not_finite
+from mjx_reinforce.reports.statistics import Estimate, alike, enough, worst_if_not_finite
 from mjx_reinforce.reports.statistics.aggregates import wilson
 
 
@@ -58,7 +59,8 @@ def probability_of_improvement(
       x: [..., S] values of one configuration; a seed that failed is worse than every other.
       y: [..., S'] values of another.
       paired: both have the same seeds in the same order. The value is that without, but the
-        interval takes account of the luck that they share (Munzel 1999, Statistics in Medicine 18).
+        interval takes account of the luck that they share (Munzel 1999, Statistics in Medicine 18);
+        too few show nothing of that luck, and count as one trial each.
       confidence: the interval's level.
 
     Raises:
@@ -79,7 +81,8 @@ def probability_of_improvement(
     else:
         raise ValueError(f"paired values must be as many: {x.shape[-1]} and {y.shape[-1]} given")
     fewest = min(x.shape[-1], y.shape[-1])
-    known = (variance > 0) & (rate > 0) & (rate < 1)
+    known = (variance > 1e-20) & (rate > 0) & (rate < 1)  # which is more than rounding
+    known &= not paired or enough(fewest, confidence)
     trials = np.where(known, rate * (1 - rate) / np.where(known, variance, 1), fewest)
     return wilson(rate * trials, trials, confidence)
 
@@ -110,6 +113,9 @@ def failures_as_worst(x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarra
 def paired_difference(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> Difference:
     """Returns how much higher the mean of x is than that of y on the same seeds: paired t-test.
 
+    The test knows only the pairs that it can tell apart, those that differ. That all K of them
+    favour the same one has the probability 2^(1 - K) without any difference, so p is no less.
+
     Args:
       x: [..., S] values of one configuration. A seed that failed counts as the worst finite value
         of both configurations, so the difference it makes is understated.
@@ -117,8 +123,8 @@ def paired_difference(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> D
       confidence: the interval's level.
 
     Returns:
-      Arrays [...]. Where x and y differ by the same on every seed, the interval has no width, and
-      the p value is 1 for no difference, else 0. One seed has neither.
+      Arrays [...]. The interval is NaN where all differences are equal, for they do not show how
+      far others would be from them, and of fewer than six seeds.
 
     Raises:
       ValueError: x and y differ in number.
@@ -132,19 +138,25 @@ def paired_difference(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> D
     """
     if np.shape(x) != np.shape(y):
         raise ValueError(f"paired values must be as many: {np.size(x)} and {np.size(y)} given")
-    difference = np.subtract(*failures_as_worst(x, y))
-    value = difference.mean(axis=-1)
-    if difference.shape[-1] < 2:
-        return Difference(value, *np.full((3, *value.shape), np.nan))
+    x, y = failures_as_worst(x, y)
+    difference, size = x - y, np.max(np.maximum(np.abs(x), np.abs(y)), axis=-1)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)  # of equal differences, for which see below
         test = stats.ttest_1samp(difference, 0, axis=-1)
         low, high = test.confidence_interval(confidence)
-    equal = np.ptp(difference, axis=-1) == 0
-    p_value = np.where(equal, np.where(value == 0, 1.0, 0.0), np.asarray(test[1]))
-    return Difference(
-        value, np.where(equal, value, low)[()], np.where(equal, value, high)[()], p_value[()]
-    )
+    told_apart = np.sum(difference != 0, axis=-1)
+    p_value = np.maximum(np.nan_to_num(np.asarray(test[1])), np.minimum(2.0 ** (1 - told_apart), 1))
+    hidden = alike(difference, size) | (not enough(difference.shape[-1], confidence))
+    low, high = (np.where(hidden, np.nan, end)[()] for end in (low, high))
+    return Difference(difference.mean(axis=-1), low, high, p_value[()])
+
+
+def least_p(first: int, second: int) -> float:
+    """Returns the least two-sided p value of a test of two groups of so many seeds, in any order.
+
+    Without a difference, all orders are alike, and in two of them a group is all above the other.
+    """
+    return 2 / math.comb(first + second, first)
 
 
 def paired_rates(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> Difference:

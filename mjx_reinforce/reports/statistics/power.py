@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike
 from scipy import stats
 
 from mjx_reinforce.reports.statistics import iqm
-from mjx_reinforce.reports.statistics.comparisons import failures_as_worst
+from mjx_reinforce.reports.statistics.comparisons import failures_as_worst, least_p
 
 _EXPERIMENTS = 2000
 #: Up to so many seeds tests are drawn; beyond, means are as good as normal.
@@ -21,7 +21,8 @@ def seeds_needed(
     """Returns how many seeds each of two configurations needs to be told apart.
 
     It is the least number at which Welch's t-test of so many seeds, drawn with replacement from x
-    and from y, names the better one at the level ``alpha`` with the probability ``power``.
+    and from y, names the better one at the level ``alpha`` with the probability ``power``; four
+    at 5 %, or more, for of fewer no order is rare enough.
 
     Args:
       x: [S] values of one configuration, of many seeds; a seed that failed counts as the worst
@@ -62,7 +63,8 @@ def _power_by_seeds(x: np.ndarray, y: np.ndarray, alpha: float) -> np.ndarray:
     degrees = np.arange(1, 2 * _DRAWN_SEEDS)
     freedom = np.where(np.isnan(freedom), 1.0, freedom)  # where nothing varies
     critical = np.interp(freedom, degrees, stats.t.isf(alpha / 2, degrees))
-    return np.mean(t > critical, axis=0)
+    rare_enough = np.array([least_p(n, n) <= alpha for n in count.tolist()])
+    return np.mean(t > critical, axis=0) * rare_enough
 
 
 def _by_normal_approximation(x: np.ndarray, y: np.ndarray, power: float, alpha: float) -> int:

@@ -38,9 +38,9 @@ def cvar_interval(
       confidence: the interval's level.
 
     Returns:
-      Its lower and upper ends [...]. NaN where the data do not bound it: with a failed seed, or
-      fewer than five seeds in the tail (50 seeds, for a tenth), as nothing is known of what lies
-      below them.
+      Its lower and upper ends [...]. NaN where the data do not bound it: with a failed seed, a tail
+      of seeds that are all alike, or fewer than five seeds in the tail (50 seeds, for a tenth), as
+      nothing is known of what lies below them.
     """
     ordered = np.sort(worst_if_not_finite(values), axis=-1)
     num_seeds = ordered.shape[-1]
@@ -68,7 +68,7 @@ def _bootstrap_t(ordered: np.ndarray, fraction: float, confidence: float) -> np.
     value, error = value[:, 0], error[:, 0]
     with np.errstate(invalid="ignore"):
         ends = np.stack([value - high * error, value - low * error])
-    return middle[:, 0] + np.where(error > 0, ends, value)
+    return middle[:, 0] + np.where(error > 0, ends, np.nan)
 
 
 def _cvar_and_error(
