@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 from mjx_reinforce.reports.experiment import say
 from mjx_reinforce.reports.findings import Findings, swept
 from mjx_reinforce.reports.statistics import Estimate
-from mjx_reinforce.reports.tasks import Tasks
 
 #: Columns by name, all of one length. ``configuration`` holds places among the results.
 Table = dict[str, list[Any]]
@@ -147,22 +146,3 @@ def _no_formula(cell: object) -> Any:
         return cell if math.isfinite(float(cell)) else f"'{cell}"
     except ValueError:
         return f"'{cell}"
-
-
-def scores(tasks: Tasks) -> Table:
-    """Returns a row for each configuration, task and seed, in full digits."""
-    parts: list[Table] = []
-    for place, each in enumerate(tasks.overall):
-        for findings, final, area in zip(tasks.findings, each.scores, each.areas, strict=True):
-            result = next(r for r in findings.results if r.configuration.label == each.label)
-            parts.append(
-                {
-                    "configuration": [place] * len(final),
-                    "task": [findings.experiment.env] * len(final),
-                    "seed": result.configuration.seed.tolist(),
-                    "final_return": result.final.tolist(),
-                    "score": final.tolist(),
-                    "score_while_training": area.tolist(),
-                }
-            )
-    return join_tables(parts)

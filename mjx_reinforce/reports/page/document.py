@@ -69,39 +69,18 @@ def render(
       version: of this program.
       seconds: how long the report has taken so far.
     """
+    import vl_convert
+
+    stops = short(findings.grid[slider_stops(findings)], 7)
     content = {
         "labels": findings.labels,
         "specs": {figure.name: figure.spec for figure in drawn},
         "tables": {**chart_tables, **vega.ONE},
-        "moments": short(findings.grid[slider_stops(findings)], 7),
+        "moments": stops,
         "files": files,
+        "row": charts.ROW,
+        "light": vega.LIGHT,
     }
-    return fill(
-        "page.html",
-        content,
-        **_text(findings, drawn),
-        **provenance_rows(findings.experiment),
-        watch=watch,
-        moments=content["moments"],
-        version=version,
-        seconds=seconds,
-    )
-
-
-def fill(
-    name: str, content: Mapping[str, Any], *, version: str, seconds: float, **text: object
-) -> str:
-    """Returns the page that a template makes.
-
-    Args:
-      name: of the template.
-      content: what page.js draws: ``labels``, ``specs``, ``tables``, ``moments`` and ``files``.
-      version: of this program.
-      seconds: how long the report has taken so far.
-      text: what the template says.
-    """
-    import vl_convert
-
     loader = jinja2.Environment(
         loader=jinja2.FunctionLoader(_read_template),
         autoescape=True,
@@ -110,11 +89,14 @@ def fill(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return loader.get_template(name).render(
-        **text,
+    return loader.get_template("page.html").render(
+        **_text(findings, drawn),
+        **provenance_rows(findings.experiment),
+        watch=watch,
+        moments=stops,
         bibtex=bibtex(version),
         date=f"{datetime.date.today():%d %B %Y}".lstrip("0"),
-        files=[(name, _size_in_words(text)) for name, text in content["files"].items()],
+        files=[(name, _size_in_words(text)) for name, text in files.items()],
         version=version,
         seconds=f"{seconds:.1f} s",
         light=vega.LIGHT,
@@ -124,7 +106,7 @@ def fill(
         css=Markup(_read_template("page.css")),
         script=Markup(_read_template("page.js")),
         vega_bundle=Markup(vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")),
-        content=Markup(_json({**content, "row": charts.ROW, "light": vega.LIGHT})),
+        content=Markup(_json(content)),
     )
 
 
