@@ -20,7 +20,6 @@ from mjx_reinforce.reports.findings import Findings, compute_findings
 from mjx_reinforce.reports.page import columns, document, learning, tables
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
-from mjx_reinforce.reports.page.listings import latex_tables, listings
 from mjx_reinforce.reports.page.vega import ONE, render_chart
 from mjx_reinforce.settings.defaults import check_task, of_task
 from mjx_reinforce.settings.flags import read_command_line
@@ -31,7 +30,7 @@ from mjx_reinforce.training.resume import recordable
 
 _ABOUT = (
     "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG, "
-    "SVG, PDF) and tables (CSV, LaTeX) in a folder beside it."
+    "SVG) and tables (CSV) in a folder beside it."
 )
 
 
@@ -137,24 +136,16 @@ def _write(experiment: Experiment, output: Path) -> WrittenReport:
     started = time.perf_counter()
     findings = compute_findings(experiment)
     drawn, data = figures(findings), tables.chart_tables(findings)
-    files = {
-        "results.csv": columns.results_csv(findings),
-        "summary.csv": columns.summary_csv(findings),
-    }
-    if findings.comparisons:
-        files["pairs.csv"] = columns.pairs_csv(findings)
-    if findings.learning.levels:
-        files["effects.csv"] = columns.effects_csv(findings)
-    beside, labels = _beside(output), findings.labels
+    results, beside, labels = columns.results_csv(findings), _beside(output), findings.labels
     beside.mkdir(exist_ok=True)
-    texts = {**files, **_tables(findings, data), **latex_tables(listings(findings))}
-    for name, content in texts.items():
+    texts = {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
+    for name, content in {**texts, "results.csv": results}.items():
         write_bytes(beside / name, encoded(content))
     for figure in drawn:
         _write_figure(figure, data, labels, experiment.title, beside)
     seconds = time.perf_counter() - started
     watch, ours = how_to_watch(experiment, findings), version("mjx-reinforce") or "not installed"
-    text = document.render(findings, drawn, data, files, watch, ours, seconds)
+    text = document.render(findings, drawn, data, results, watch, ours, seconds)
     write_bytes(output, encoded(text))
     return WrittenReport(
         time.perf_counter() - started, learning.headline(findings), findings.order[0]
@@ -166,11 +157,6 @@ def _beside(output: Path) -> Path:
     return output.with_suffix("")
 
 
-def _tables(findings: Findings, data: Mapping[str, columns.Table]) -> dict[str, str]:
-    labels = findings.labels
-    return {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
-
-
 def _write_figure(
     figure: Figure,
     data: Mapping[str, columns.Table],
@@ -178,7 +164,7 @@ def _write_figure(
     title: str,
     folder: Path,
 ) -> None:
-    """Writes a figure as PNG, SVG and PDF."""
+    """Writes a figure as PNG and SVG."""
     names = [*figure.tables, *figure.hidden, *ONE]
     needed = {name: columns.rows({**data, **ONE}[name], labels) for name in names}
     for ending, picture in render_chart(figure.spec, needed, title).items():

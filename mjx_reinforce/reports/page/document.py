@@ -53,7 +53,7 @@ def render(
     findings: Findings,
     drawn: list[Figure],
     chart_tables: Mapping[str, Table],
-    files: Mapping[str, str],
+    results: str,
     watch: Watch,
     version: str,
     seconds: float,
@@ -64,7 +64,7 @@ def render(
       findings: the figures.
       drawn: the charts.
       chart_tables: their data, by name.
-      files: texts that can be downloaded, by name.
+      results: ``results.csv``.
       watch: how to see the worst seed.
       version: of this program.
       seconds: how long the report has taken so far.
@@ -77,7 +77,7 @@ def render(
         "specs": {figure.name: figure.spec for figure in drawn},
         "tables": {**chart_tables, **vega.ONE},
         "moments": stops,
-        "files": files,
+        "results": results,
         "row": charts.ROW,
         "light": vega.LIGHT,
     }
@@ -96,7 +96,7 @@ def render(
         moments=stops,
         bibtex=bibtex(version),
         date=f"{datetime.date.today():%d %B %Y}".lstrip("0"),
-        files=[(name, _size_in_words(text)) for name, text in files.items()],
+        size=_size_in_words(results),
         version=version,
         seconds=f"{seconds:.1f} s",
         light=vega.LIGHT,

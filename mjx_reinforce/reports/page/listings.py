@@ -1,7 +1,6 @@
-"""The report's tables, as the page shows them and as LaTeX files hold them."""
+"""The report's tables, as the page shows them."""
 
 import math
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -137,51 +136,6 @@ def _fate(findings: Findings, result: Result, s: int) -> dict[str, Any]:
         (_how_it_ended(findings, result, s), ""),
     ]
     return {"label": result.configuration.label, "cells": cells}
-
-
-#: What LaTeX would take for a command, and what it prints for it.
-_SPECIAL = {
-    **{each: f"\\{each}" for each in "&%$#_{}"},
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    "\u00a0": "~",
-    "\u2013": "--",
-    "“": "``",
-    "”": "''",
-}
-
-
-def latex_tables(listed: Mapping[str, Listing]) -> dict[str, str]:
-    """Returns the files by name: a ``tabular`` for each table of the page."""
-    return {f"table-{name}.tex": tabular(**listing) for name, listing in listed.items()}
-
-
-def tabular(header: Sequence[str], rows: Sequence[Mapping]) -> str:
-    """Returns a table as a ``tabular`` of booktabs; intervals stand in brackets after their value.
-
-    Args:
-      header: the names of the columns.
-      rows: a ``label`` and ``cells`` each, see ``listings.Listing``.
-    """
-    ranked = len(header) > 1 + len(rows[0]["cells"])
-    lines = []
-    for place, row in enumerate(rows, start=1):
-        cells = [f"{value} ({below})" if below else value for value, below in row["cells"]]
-        lines.append([*([str(place)] if ranked else []), row["label"], *cells])
-    kinds = "r" * ranked + "l" + "r" * (len(header) - ranked - 1)
-    body = [" & ".join(map(escaped, line)) + r" \\" for line in lines]
-    names = " & ".join(map(escaped, header)) + r" \\"
-    parts = [rf"\begin{{tabular}}{{{kinds}}}", r"\toprule", names, r"\midrule", *body]
-    return "\n".join([*parts, r"\bottomrule", r"\end{tabular}", ""])
-
-
-def escaped(text: str) -> str:
-    """Returns a text that LaTeX prints as it is."""
-    return "".join(_SPECIAL.get(each, each) for each in text)
 
 
 def _how_it_ended(findings: Findings, result: Result, s: int) -> str:

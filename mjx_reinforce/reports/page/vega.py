@@ -116,7 +116,6 @@ def render_chart(spec: dict[str, Any], datasets: dict[str, Any], title: str) -> 
     return {
         "png": vl_convert.svg_to_png(svg, scale=2),
         "svg": svg.encode(),
-        "pdf": vl_convert.svg_to_pdf(svg),
     }
 
 

@@ -2,7 +2,7 @@
 (() => {
   "use strict";
   const content = JSON.parse(document.getElementById("content").textContent);
-  const {labels, specs, tables, moments, files} = content;
+  const {labels, specs, tables, moments, results} = content;
   const views = {};
   // Vega's number for errors alone: it warns where a chart has nothing to show, which is no mistake.
   const ERRORS = 1;
@@ -157,8 +157,8 @@
     savePicture(button.dataset.png, "png")));
   each("[data-svg]", (button) => button.addEventListener("click", () =>
     savePicture(button.dataset.svg, "svg")));
-  each("[data-file]", (button) => button.addEventListener("click", () =>
-    save(button.dataset.file, files[button.dataset.file], "text/csv")));
+  document.getElementById("results-csv").addEventListener("click", () =>
+    save("results.csv", results, "text/csv"));
   const refill = () => each("details.data[open] .numbers", fill);
   boxes.forEach((box) => box.addEventListener("change", () => { applyAll(); refill(); }));
   each("[data-choose]", (button) => button.addEventListener("click", () => {
