@@ -1,21 +1,14 @@
-"""What a report says of how fast configurations learn, and of each setting on average."""
+"""What a report says of how fast configurations learn."""
 
 import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from mjx_reinforce.reports.experiment import COMPARED, Result, counted, say, setting_in_words
+from mjx_reinforce.reports.experiment import COMPARED, Result, counted
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.learning import Level, fastest
+from mjx_reinforce.reports.learning import fastest
 from mjx_reinforce.reports.page import words
 from mjx_reinforce.reports.page.words import LEVEL, interval_in_words, number, p_value, steps
-
-#: The measures of a setting's effect, as the page calls them.
-MEASURES = {
-    "return": "return at the end",
-    "area": "return while training",
-    "steps": "env steps to solve",
-}
 
 
 def learning_answer(findings: Findings) -> list[str]:
@@ -41,7 +34,7 @@ def sentences(findings: Findings) -> list[str]:
     """Returns who learns faster and how sure that is; nothing of one configuration."""
     if not findings.comparisons:
         return []
-    return [*_of_speed(findings), *_of_area(findings), *_of_levels(findings)]
+    return [*_of_speed(findings), *_of_area(findings)]
 
 
 def pace(findings: Findings) -> tuple[str, list[str]]:
@@ -130,26 +123,6 @@ def _of_area(findings: Findings) -> Iterator[str]:
     )
 
 
-def _of_levels(findings: Findings) -> Iterator[str]:
-    """Yields the best value of each setting by the speed, or the area, and how sure it is."""
-    levels = findings.learning.levels
-    for setting in dict.fromkeys(each.setting for each in levels):
-        own = [each for each in levels if each.setting == setting]
-        measure = "steps" if "steps" in own[0].means else "area"
-        best = next(each for each in own if each.adjusted[measure] is None)
-        others = [float(each.adjusted[measure] or 0.0) for each in own if each is not best]
-        sure = sum(p < LEVEL for p in others)
-        what = "needs the fewest env steps to solve" if measure == "steps" else "learns most"
-        told = (
-            "all other values" if sure == len(others) else f"{sure} of {len(others)} other values"
-        )
-        told = "no other value" if not sure else told
-        yield (
-            f"Averaged over the other settings, {setting_in_words(setting)} {say(best.value)} "
-            f"{what}; that is sure (p below {LEVEL}) against {told}."
-        )
-
-
 def speed_table(findings: Findings) -> dict[str, Any]:
     """Returns the table of who learns faster: the fastest first."""
     compared = findings.results[:COMPARED]
@@ -194,31 +167,3 @@ def _p_against(adjusted: dict[frozenset[int], float], i: int, best: int, said: s
 def short_p(value: float) -> str:
     """Returns a p value without its name: "0.012", "< 0.001", "1"."""
     return p_value(value).removeprefix("p = ").removeprefix("p ")
-
-
-def effects_table(findings: Findings) -> dict[str, Any]:
-    """Returns the table of main effects: a row for each value of each setting, or nothing."""
-    levels = findings.learning.levels
-    if not levels:
-        return {}
-    measures = list(levels[0].means)
-    header = ["setting", "averaged over"]
-    for measure in measures:
-        header += [MEASURES[measure], "p, Holm"]
-    listed = []
-    for level in levels:
-        cells = [(counted(level.number, "configuration"), "")]
-        for measure in measures:
-            form = steps if measure == "steps" else number
-            estimate = level.means[measure]
-            cells.append((form(float(estimate.value)), interval_in_words(estimate, form)))
-            cells.append((_p_of(level, measure), ""))
-        listed.append(
-            {"label": f"{setting_in_words(level.setting)} {say(level.value)}", "cells": cells}
-        )
-    return {"header": header, "rows": listed}
-
-
-def _p_of(level: Level, measure: str) -> str:
-    adjusted = level.adjusted[measure]
-    return "best" if adjusted is None else short_p(adjusted)

@@ -21,7 +21,6 @@ def listings(findings: Findings) -> dict[str, Listing]:
         "results": _results_table(findings),
         "speed": learning.speed_table(findings),
         "against": _against(findings),
-        "effects": learning.effects_table(findings),
         "worst": _worst(findings),
     }
     return {name: listing for name, listing in found.items() if listing}
