@@ -17,7 +17,7 @@ from mjx_reinforce.files import check_folder, write_bytes
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment, relabel
 from mjx_reinforce.reports.findings import Findings, compute_findings
-from mjx_reinforce.reports.page import columns, document, learning, tables
+from mjx_reinforce.reports.page import columns, document, tables, words
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.vega import ONE, render_chart
@@ -147,9 +147,7 @@ def _write(experiment: Experiment, output: Path) -> WrittenReport:
     watch, ours = how_to_watch(experiment, findings), version("mjx-reinforce") or "not installed"
     text = document.render(findings, drawn, data, results, watch, ours, seconds)
     write_bytes(output, encoded(text))
-    return WrittenReport(
-        time.perf_counter() - started, learning.headline(findings), findings.order[0]
-    )
+    return WrittenReport(time.perf_counter() - started, words.headline(findings), findings.order[0])
 
 
 def _beside(output: Path) -> Path:

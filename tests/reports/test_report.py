@@ -46,7 +46,7 @@ def test_the_page_needs_nothing_else(written):
 def test_the_page_says_what_was_found(written, found):
     said = visible(written[1])
     best = found.results[0]
-    for sentence in (*words.answer(found), *words.caveats(found)):
+    for sentence in (*words.headline(found), *words.caveats(found)):
         assert " ".join(sentence.split()) in said
     assert f"{best.solving.at_end} of its 40 seeds solve the task at the end" in said
     for each in found.results:
@@ -319,7 +319,7 @@ def test_ties_are_said_as_ties(tmp_path):
         arrays = dict(archive)
     arrays["eval_return"][-1] = 1000.0
     np.savez(directory / "curves.npz", **arrays)
-    said = " ".join(words.answer(findings.compute_findings(sources.read_experiment([directory]))))
+    said = " ".join(words.headline(findings.compute_findings(sources.read_experiment([directory]))))
     assert "The mean equals that of the next" in said
     assert "chance too often (p = 1)." in said
 

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import jinja2
 from markupsafe import Markup
 
-from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
+from mjx_reinforce.reports.experiment import COMPARED, Experiment, counted, say, setting_in_words
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.page import charts, learning, vega, words
+from mjx_reinforce.reports.page import charts, vega, words
 from mjx_reinforce.reports.page.columns import Table, short
 from mjx_reinforce.reports.page.distributions import slider_stops
 from mjx_reinforce.reports.page.figures import SHOWN, Figure
@@ -35,8 +35,11 @@ _METHODS = (
     "configurations for independent; where they have the same seeds, p is a little too large.",
     "The return while training is the area under a seed's learning curve, by its width in env "
     "steps.",
-    "Returns of pairs are compared seed by seed. The p values of each table are corrected for the "
-    "number of pairs (Holm 1979).",
+    f"The best configurations, at most {COMPARED}, are compared in pairs: their returns seed by "
+    "seed, on the seeds that all have. The p values of each table are corrected for the number of "
+    "pairs (Holm 1979).",
+    "A return is the mean of an evaluation's episodes, without exploration. A seed has the same "
+    "starts at every evaluation.",
     "Curves are read off, by linear interpolation, at the same env steps for all seeds, up to the "
     "end of the shortest.",
 )
@@ -159,9 +162,9 @@ def _text(findings: Findings, drawn: list[Figure]) -> dict[str, Any]:
         "title": findings.experiment.title,
         "asked": findings.experiment.asked,
         "contents": contents,
-        "answer": learning.learning_answer(findings),
+        "answer": words.headline(findings),
         "key_figures": key_figures(findings),
-        "distrust": words.caveats(findings),
+        "distrust": list(words.caveats(findings)),
         "figures": {name: figures.get(name) for name in names},
         "failures": failures,
         "labels": findings.labels,

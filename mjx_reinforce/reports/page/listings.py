@@ -7,8 +7,8 @@ import numpy as np
 
 from mjx_reinforce.reports.experiment import COMPARED, Result, counted
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.page import learning, tables, words
-from mjx_reinforce.reports.page.words import interval_in_words, number, percent, steps
+from mjx_reinforce.reports.page import tables, words
+from mjx_reinforce.reports.page.words import interval_in_words, number, percent, short_p, steps
 
 #: A table: its ``header``, and ``rows`` of a ``label`` and ``cells``, pairs of a value and what
 #: stands below it. Where the header has a column more, the first is the rank of the row.
@@ -19,7 +19,7 @@ def listings(findings: Findings) -> dict[str, Listing]:
     """Returns the tables of a report by name, in the order of the page."""
     found = {
         "results": _results_table(findings),
-        "speed": learning.speed_table(findings),
+        "speed": _speed_table(findings),
         "against": _against(findings),
         "worst": _worst(findings),
     }
@@ -81,6 +81,47 @@ def _results_table(findings: Findings) -> dict[str, Any]:
     return {"header": header, "rows": listed}
 
 
+def _speed_table(findings: Findings) -> dict[str, Any]:
+    """Returns the table of who learns faster: the fastest first."""
+    compared = findings.results[:COMPARED]
+    if len(compared) < 2:
+        return {}
+    solving = findings.experiment.threshold is not None
+    header = ["", "configuration"]
+    if solving:
+        header += ["steps until half solved", "mean steps to solve", "log-rank p, Holm"]
+    header += ["return while training", "p of it, Holm"]
+    best_area = max(range(len(compared)), key=lambda i: float(compared[i].area.value))
+    order = sorted(range(len(compared)), key=lambda i: _slowness(compared[i]))
+    speeds = {frozenset((e.first, e.second)): e.adjusted for e in findings.learning.speeds}
+    areas = {frozenset((e.first, e.second)): e.adjusted for e in findings.learning.areas}
+    listed = []
+    for i in order:
+        each, cells = compared[i], []
+        if each.solving is not None:
+            median, mean = each.solving.median, each.solving.mean
+            cells.append((steps(median.value), interval_in_words(median, steps)))
+            cells.append((steps(float(mean.value)), interval_in_words(mean, steps)))
+            cells.append((_p_against(speeds, i, order[0], "fastest"), ""))
+        cells.append((number(float(each.area.value)), interval_in_words(each.area)))
+        cells.append((_p_against(areas, i, best_area, "greatest"), ""))
+        listed.append({"label": each.configuration.label, "cells": cells})
+    return {"header": header, "rows": listed}
+
+
+def _slowness(result: Result) -> float:
+    """Returns what orders results, fastest first: steps to solve, or else the falling area."""
+    return float(result.solving.mean.value if result.solving else -result.area.value)
+
+
+def _p_against(adjusted: dict[frozenset[int], float], i: int, best: int, said: str) -> str:
+    """Returns the p value of a result against the best, or what the best is."""
+    if i == best:
+        return said
+    pair = frozenset((i, best))
+    return short_p(adjusted[pair]) if pair in adjusted else "none"
+
+
 def matrix(findings: Findings) -> list[dict[str, Any]]:
     """Returns who beats whom: a row and a cell for each configuration, None on the diagonal."""
     if not findings.comparisons:
@@ -117,8 +158,8 @@ def _against(findings: Findings) -> Listing:
                     percent(float(pair.improvement.value)),
                     interval_in_words(pair.improvement, percent),
                 ),
-                (learning.short_p(pair.p_value), ""),
-                (learning.short_p(pair.adjusted), ""),
+                (short_p(pair.p_value), ""),
+                (short_p(pair.adjusted), ""),
             ],
         }
         for pair in words.of_best(findings)
