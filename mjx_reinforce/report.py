@@ -1,7 +1,6 @@
 """``python -m mjx_reinforce.report RUN_OR_SWEEP`` makes a page of what runs and sweeps found."""
 
 import dataclasses
-import re
 import shlex
 import sys
 import time
@@ -16,14 +15,12 @@ from mjx_reinforce.console.streams import accept_everything, say_error
 from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.files import check_folder, write_bytes
 from mjx_reinforce.reports import sources
-from mjx_reinforce.reports.experiment import Experiment
+from mjx_reinforce.reports.experiment import Experiment, relabel
 from mjx_reinforce.reports.findings import Findings, compute_findings
-from mjx_reinforce.reports.page import columns, document, learning, tables, tasks_page
+from mjx_reinforce.reports.page import columns, document, tables, words
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
-from mjx_reinforce.reports.page.listings import latex_tables, listings
 from mjx_reinforce.reports.page.vega import ONE, render_chart
-from mjx_reinforce.reports.tasks import find_tasks, rename
 from mjx_reinforce.settings.defaults import check_task, of_task
 from mjx_reinforce.settings.flags import read_command_line
 from mjx_reinforce.settings.own_code import env_flag
@@ -33,7 +30,7 @@ from mjx_reinforce.training.resume import recordable
 
 _ABOUT = (
     "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG, "
-    "SVG, PDF) and tables (CSV, LaTeX) in a folder beside it."
+    "SVG) and tables (CSV) in a folder beside it."
 )
 
 
@@ -42,8 +39,7 @@ class ReportSettings:
     """What is reported on, and where the page goes."""
 
     sources: tyro.conf.Positional[tuple[Path, ...]]
-    """Run or sweep directories. Several of one task are compared; those of several tasks are put
-    together by normalized scores."""
+    """Run or sweep directories of one task, which are compared."""
     output: Path | None = None
     """The page. By default report.html in the run or sweep that it is of, or, of several, in the
     current folder. Its pictures and tables go into a folder of the same name without .html."""
@@ -61,10 +57,11 @@ def main() -> None:
         settings = read_command_line(ReportSettings, sys.argv[1:], command("report"), _ABOUT)
         if settings.output is not None:
             check_output(settings.output, settings.overwrite)
-        experiments = rename(sources.read_tasks(settings.sources), _new_names(settings.labels))
+        names = _new_names(settings.labels)
+        experiment = relabel(sources.read_experiment(settings.sources), names)
         output = settings.output or _default_output(settings.sources)
         check_output(output, settings.overwrite)
-        seconds = _write_all(experiments, output)
+        seconds = _write(experiment, output).seconds
     except (ValueError, OSError) as error:
         say_error(str(error))
         sys.exit(2)
@@ -119,18 +116,8 @@ class WrittenReport(NamedTuple):
     best: int
 
 
-def write_sweep(directory: Path, output: Path) -> WrittenReport:
-    """Does what ``write_report`` does for one sweep, and returns what the page says first."""
-    started = time.perf_counter()
-    findings = compute_findings(sources.read_experiment([directory]))
-    _write_page(findings, output, started)
-    return WrittenReport(
-        time.perf_counter() - started, learning.headline(findings), findings.order[0]
-    )
-
-
-def write_report(chosen: Sequence[Path], output: Path) -> float:
-    """Writes the page, and its pictures and tables beside it; returns how long it took (s).
+def write_report(chosen: Sequence[Path], output: Path) -> WrittenReport:
+    """Writes the page, and its pictures and tables beside it.
 
     Replaces what is there; ``check_output`` refuses that.
 
@@ -139,79 +126,33 @@ def write_report(chosen: Sequence[Path], output: Path) -> float:
       output: the page.
 
     Raises:
-      ValueError: a source is damaged, or tasks have no configuration in common.
+      ValueError: a source is damaged, or they are of several tasks.
       OSError: a file cannot be read or written.
     """
-    return _write_all(rename(sources.read_tasks(chosen), {}), output)
+    return _write(sources.read_experiment(chosen), output)
 
 
-def _write_all(experiments: Sequence[Experiment], output: Path) -> float:
-    """Writes the page of one task, or that of several, with a page of each beside it."""
+def _write(experiment: Experiment, output: Path) -> WrittenReport:
     started = time.perf_counter()
-    if len(experiments) == 1:
-        _write_page(compute_findings(experiments[0]), output, started)
-        return time.perf_counter() - started
-    tasks = find_tasks(experiments)
-    beside = _beside(output)
-    beside.mkdir(exist_ok=True)
-    pages = []
-    for each, shared in zip(experiments, tasks.findings, strict=True):
-        name = re.sub(r"[^\w.-]", "_", each.env)
-        page = beside / f"{name}.html"
-        whole = len(shared.results) == len(each.configurations)
-        _write_page(shared if whole else compute_findings(each), page, started)
-        pages.append((page.name, f"{beside.name}/{page.name}"))
-    drawn, data = tasks_page.tasks_figures(tasks), tasks_page.tasks_chart_tables(tasks)
-    labels = tasks_page.labels(tasks)
-    files = {"scores.csv": columns.table_csv(columns.scores(tasks), labels)}
-    texts = {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
-    for name, content in {**files, **texts, **latex_tables(tasks_page.listed(tasks))}.items():
-        write_bytes(beside / name, encoded(content))
-    for figure in drawn:
-        _write_figure(figure, data, labels, figure.title, beside)
-    seconds = time.perf_counter() - started
-    text = tasks_page.render_tasks(tasks, drawn, data, files, pages, _ours(), seconds)
-    write_bytes(output, encoded(text))
-    return time.perf_counter() - started
-
-
-def _ours() -> str:
-    return version("mjx-reinforce") or "not installed"
-
-
-def _write_page(findings: Findings, output: Path, started: float) -> None:
-    """Writes the page of one task."""
-    experiment = findings.experiment
+    findings = compute_findings(experiment)
     drawn, data = figures(findings), tables.chart_tables(findings)
-    files = {
-        "results.csv": columns.results_csv(findings),
-        "summary.csv": columns.summary_csv(findings),
-    }
-    if findings.comparisons:
-        files["pairs.csv"] = columns.pairs_csv(findings)
-    if findings.learning.levels:
-        files["effects.csv"] = columns.effects_csv(findings)
-    beside, labels = _beside(output), findings.labels
+    results, beside, labels = columns.results_csv(findings), _beside(output), findings.labels
     beside.mkdir(exist_ok=True)
-    texts = {**files, **_tables(findings, data), **latex_tables(listings(findings))}
-    for name, content in texts.items():
+    texts = {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
+    for name, content in {**texts, "results.csv": results}.items():
         write_bytes(beside / name, encoded(content))
     for figure in drawn:
-        _write_figure(figure, data, labels, findings.experiment.title, beside)
+        _write_figure(figure, data, labels, experiment.title, beside)
     seconds = time.perf_counter() - started
-    watch = how_to_watch(experiment, findings)
-    text = document.render(findings, drawn, data, files, watch, _ours(), seconds)
+    watch, ours = how_to_watch(experiment, findings), version("mjx-reinforce") or "not installed"
+    text = document.render(findings, drawn, data, results, watch, ours, seconds)
     write_bytes(output, encoded(text))
+    return WrittenReport(time.perf_counter() - started, words.headline(findings), findings.order[0])
 
 
 def _beside(output: Path) -> Path:
     """Returns the folder for a page's pictures and tables."""
     return output.with_suffix("")
-
-
-def _tables(findings: Findings, data: Mapping[str, columns.Table]) -> dict[str, str]:
-    labels = findings.labels
-    return {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
 
 
 def _write_figure(
@@ -221,7 +162,7 @@ def _write_figure(
     title: str,
     folder: Path,
 ) -> None:
-    """Writes a figure as PNG, SVG and PDF."""
+    """Writes a figure as PNG and SVG."""
     names = [*figure.tables, *figure.hidden, *ONE]
     needed = {name: columns.rows({**data, **ONE}[name], labels) for name in names}
     for ending, picture in render_chart(figure.spec, needed, title).items():

@@ -54,7 +54,7 @@ class Findings(NamedTuple):
     order: of each result, the place of its configuration in the experiment
     grid: [K] env steps
     comparisons: of all pairs of the best results, which are numbered by their places here
-    learning: how fast the configurations learn, and what each setting does
+    learning: how fast the configurations learn
     """
 
     experiment: Experiment

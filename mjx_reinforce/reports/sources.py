@@ -43,26 +43,9 @@ def read_experiment(sources: Sequence[Path]) -> Experiment:
     if len(envs) > 1:
         raise ValueError(
             f"these are of different tasks ({', '.join(envs)}), whose returns cannot be compared; "
-            "make a report of each"
+            "make a page of each task, and a table and a figure of all with "
+            "experiments/examples/all_tasks.py"
         )
-    return _experiment(found)
-
-
-def read_tasks(sources: Sequence[Path]) -> list[Experiment]:
-    """Reads run and sweep directories as one experiment for each task, in their order.
-
-    Raises:
-      ValueError: as ``read_experiment`` does, but not for different tasks.
-    """
-    if not sources:
-        raise ValueError("there is nothing to report on: name a run or a sweep directory")
-    found = [_read_source(Path(source)) for source in dict.fromkeys(sources)]
-    envs = dict.fromkeys(source.env for source in found)
-    return [_experiment([source for source in found if source.env == env]) for env in envs]
-
-
-def _experiment(found: Sequence[Source]) -> Experiment:
-    """Returns the experiment of sources of one task."""
     joined = _join_shares(found)
     configurations = _told_apart(joined)
     if any(source.settings.get("seeds") for source in found):

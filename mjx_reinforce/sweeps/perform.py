@@ -161,7 +161,7 @@ def _report(directory: Path) -> "WrittenReport":
 
     for part in [*directory.glob(".report.html.*"), *(directory / "report").glob(".*")]:
         part.unlink()
-    return report.write_sweep(directory, directory / "report.html")
+    return report.write_report([directory], directory / "report.html")
 
 
 def _contents(design: Design, prepared: "Prepared", known: Mapping[str, Any]) -> dict[str, Any]:

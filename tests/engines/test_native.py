@@ -411,7 +411,7 @@ class Panorama(Drifting):
 def test_wide_observations_are_not_for_machine_code():
     engine = chosen(Panorama())
     assert engine.name == "vmap"
-    assert "fused does not support this environment: its observation has 2,000" in engine.why
+    assert "because of an observation of 2,000 entries" in engine.why
     assert "109 s, more than 80 s, because of an observation of 2,000 entries" in engine.why
     assert outlook.announcement(Panorama()) is None
     assert outlook.announcement(Drifting()) is None

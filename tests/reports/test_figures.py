@@ -122,17 +122,3 @@ def test_no_more_are_shown_at_first_than_the_best(found, monkeypatch):
     for figure in figures._final_figure(found, 1):
         (shown,) = [x["value"] for x in figure.spec["params"] if x["name"] == "shown"]
         assert shown == found.labels[:2]
-
-
-def test_figures_of_one_of_several_tasks_have_its_number(found, drawn):
-    first, second = figures.task_figures(found, 3, 5)
-    assert (first.name, second.name) == ("curves-3", "solved-3")
-    assert (first.number, second.number) == (5, 6)
-    assert first.title == "InvertedPendulum-v5: learning curves"
-    assert second.title == "InvertedPendulum-v5: how many have solved it"
-    assert (first.tables, first.listed) == (["curves-3", "seeds-3"], "curves-3")
-    assert "slider" not in first.caption
-    assert "the table says how many did" in second.caption
-    assert set(named(first.spec)) - {"one"} == {"curves-3", "seeds-3"}
-    assert "curves-3" not in json.dumps(of(drawn, "curves").spec)
-    assert len(figures.task_figures(without_threshold(found), 0, 1)) == 1

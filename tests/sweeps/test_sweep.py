@@ -454,7 +454,7 @@ def test_what_a_kill_left_of_a_report_goes(tmp_path, monkeypatch):
     for path in left:
         path.write_text("half")
     nothing = WrittenReport(0.0, [], 0)
-    monkeypatch.setattr("mjx_reinforce.report.write_sweep", lambda directory, output: nothing)
+    monkeypatch.setattr("mjx_reinforce.report.write_report", lambda chosen, output: nothing)
     assert perform._report(tmp_path) == nothing
     assert not any(path.exists() for path in left)
 

@@ -62,16 +62,14 @@ def curves(labels: Sequence[str], threshold: float | None, end: float) -> Chart:
     return alt.layer(*layers, *threshold_line(threshold, "y"), height=_HEIGHT)
 
 
-def final(
-    labels: Sequence[str], threshold: float | None, title: str = "return at the end"
-) -> Chart:
-    """The final return, or what the title says, of each configuration, a row each, best first.
+def final(labels: Sequence[str], threshold: float | None) -> Chart:
+    """The final return of each configuration, a row each, best first.
 
     Data: ``final`` (configuration, place, value, low, high, tenth, ninetieth).
     """
     rows = alt.Chart(alt.NamedData("final"))
     y = alt.Y("place:Q", axis=None, scale=alt.Scale(domain=[len(labels) - 0.4, -0.6]))
-    x = alt.X("value:Q", title=title, scale=alt.Scale(zero=False, padding=12))
+    x = alt.X("value:Q", title="return at the end", scale=alt.Scale(zero=False, padding=12))
     colours = series(labels, legend=False)
     tips = [
         "configuration:N",

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 
 from mjx_reinforce.reports.experiment import say
 from mjx_reinforce.reports.findings import Findings, swept
-from mjx_reinforce.reports.statistics import Estimate
-from mjx_reinforce.reports.tasks import Tasks
 
 #: Columns by name, all of one length. ``configuration`` holds places among the results.
 Table = dict[str, list[Any]]
@@ -62,68 +60,6 @@ def results_csv(findings: Findings) -> str:
     return _csv(lines)
 
 
-def summary_csv(findings: Findings) -> str:
-    """Returns the figures of each configuration, best first, in full digits."""
-    listed = []
-    for place, result in enumerate(findings.results):
-        row: dict[str, Any] = {
-            "rank": place + 1,
-            "configuration": result.configuration.label,
-            "seeds": len(result.final),
-        }
-        for name in ("mean", "iqm", "tail", "area"):
-            row |= _with_ends(name, getattr(result, name))
-        row["not_finite_at_end"] = int(np.sum(~np.isfinite(result.final)))
-        if (solving := result.solving) is not None:
-            row |= {"solved_at_end": solving.at_end, "ever_solved": solving.ever}
-            row |= _with_ends("solve_rate", solving.rate)
-            row |= _with_ends("median_steps", solving.median)
-            row |= _with_ends("mean_steps", solving.mean)
-            row["fell_back"] = int(solving.fell.sum())
-        listed.append(row)
-    return _csv([list(listed[0]), *(list(row.values()) for row in listed)])
-
-
-def _with_ends(name: str, estimate: Estimate) -> dict[str, Any]:
-    """Returns an estimate and the ends of its interval, by the names of their columns."""
-    return {name: estimate.value, f"{name}_low": estimate.low, f"{name}_high": estimate.high}
-
-
-def pairs_csv(findings: Findings) -> str:
-    """Returns a row for each pair of the best configurations: how they differ, and how surely."""
-    labels = findings.labels
-    speeds = {(each.first, each.second): each for each in findings.learning.speeds}
-    listed = []
-    for ends, areas in zip(findings.comparisons, findings.learning.areas, strict=True):
-        row: dict[str, Any] = {"configuration": labels[ends.first], "other": labels[ends.second]}
-        for name, pair in (("return", ends), ("area", areas)):
-            row |= _with_ends(f"{name}_difference", pair.difference)
-            row |= _with_ends(f"{name}_improvement", pair.improvement)
-            row |= {f"{name}_p": pair.p_value, f"{name}_p_holm": pair.adjusted}
-        if speeds:
-            speed = speeds[ends.first, ends.second]
-            row |= {"log_rank_p": speed.p_value, "log_rank_p_holm": speed.adjusted}
-        listed.append(row)
-    return _csv([list(listed[0]), *(list(row.values()) for row in listed)])
-
-
-def effects_csv(findings: Findings) -> str:
-    """Returns a row for each value of each setting, averaged over the other settings."""
-    listed = []
-    for level in findings.learning.levels:
-        row: dict[str, Any] = {
-            "setting": level.setting,
-            "value": say(level.value),
-            "configurations": level.number,
-        }
-        for name, estimate in level.means.items():
-            p_value = level.adjusted[name]
-            row |= _with_ends(name, estimate)
-            row[f"{name}_p_holm"] = "best" if p_value is None else p_value
-        listed.append(row)
-    return _csv([list(listed[0]), *(list(row.values()) for row in listed)])
-
-
 def table_csv(table: Table, labels: Sequence[str]) -> str:
     """Returns a table as a CSV file."""
     listed = rows(table, labels)
@@ -147,22 +83,3 @@ def _no_formula(cell: object) -> Any:
         return cell if math.isfinite(float(cell)) else f"'{cell}"
     except ValueError:
         return f"'{cell}"
-
-
-def scores(tasks: Tasks) -> Table:
-    """Returns a row for each configuration, task and seed, in full digits."""
-    parts: list[Table] = []
-    for place, each in enumerate(tasks.overall):
-        for findings, final, area in zip(tasks.findings, each.scores, each.areas, strict=True):
-            result = next(r for r in findings.results if r.configuration.label == each.label)
-            parts.append(
-                {
-                    "configuration": [place] * len(final),
-                    "task": [findings.experiment.env] * len(final),
-                    "seed": result.configuration.seed.tolist(),
-                    "final_return": result.final.tolist(),
-                    "score": final.tolist(),
-                    "score_while_training": area.tolist(),
-                }
-            )
-    return join_tables(parts)

@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import jinja2
 from markupsafe import Markup
 
-from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
+from mjx_reinforce.reports.experiment import COMPARED, Experiment, counted, say, setting_in_words
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.page import charts, learning, vega, words
+from mjx_reinforce.reports.page import charts, vega, words
 from mjx_reinforce.reports.page.columns import Table, short
 from mjx_reinforce.reports.page.distributions import slider_stops
 from mjx_reinforce.reports.page.figures import SHOWN, Figure
@@ -35,8 +35,11 @@ _METHODS = (
     "configurations for independent; where they have the same seeds, p is a little too large.",
     "The return while training is the area under a seed's learning curve, by its width in env "
     "steps.",
-    "Returns of pairs are compared seed by seed. The p values of each table are corrected for the "
-    "number of pairs (Holm 1979).",
+    f"The best configurations, at most {COMPARED}, are compared in pairs: their returns seed by "
+    "seed, on the seeds that all have. The p values of each table are corrected for the number of "
+    "pairs (Holm 1979).",
+    "A return is the mean of an evaluation's episodes, without exploration. A seed has the same "
+    "starts at every evaluation.",
     "Curves are read off, by linear interpolation, at the same env steps for all seeds, up to the "
     "end of the shortest.",
 )
@@ -53,7 +56,7 @@ def render(
     findings: Findings,
     drawn: list[Figure],
     chart_tables: Mapping[str, Table],
-    files: Mapping[str, str],
+    results: str,
     watch: Watch,
     version: str,
     seconds: float,
@@ -64,44 +67,23 @@ def render(
       findings: the figures.
       drawn: the charts.
       chart_tables: their data, by name.
-      files: texts that can be downloaded, by name.
+      results: ``results.csv``.
       watch: how to see the worst seed.
       version: of this program.
       seconds: how long the report has taken so far.
     """
+    import vl_convert
+
+    stops = short(findings.grid[slider_stops(findings)], 7)
     content = {
         "labels": findings.labels,
         "specs": {figure.name: figure.spec for figure in drawn},
         "tables": {**chart_tables, **vega.ONE},
-        "moments": short(findings.grid[slider_stops(findings)], 7),
-        "files": files,
+        "moments": stops,
+        "results": results,
+        "row": charts.ROW,
+        "light": vega.LIGHT,
     }
-    return fill(
-        "page.html",
-        content,
-        **_text(findings, drawn),
-        **provenance_rows(findings.experiment),
-        watch=watch,
-        moments=content["moments"],
-        version=version,
-        seconds=seconds,
-    )
-
-
-def fill(
-    name: str, content: Mapping[str, Any], *, version: str, seconds: float, **text: object
-) -> str:
-    """Returns the page that a template makes.
-
-    Args:
-      name: of the template.
-      content: what page.js draws: ``labels``, ``specs``, ``tables``, ``moments`` and ``files``.
-      version: of this program.
-      seconds: how long the report has taken so far.
-      text: what the template says.
-    """
-    import vl_convert
-
     loader = jinja2.Environment(
         loader=jinja2.FunctionLoader(_read_template),
         autoescape=True,
@@ -110,11 +92,14 @@ def fill(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return loader.get_template(name).render(
-        **text,
+    return loader.get_template("page.html").render(
+        **_text(findings, drawn),
+        **provenance_rows(findings.experiment),
+        watch=watch,
+        moments=stops,
         bibtex=bibtex(version),
         date=f"{datetime.date.today():%d %B %Y}".lstrip("0"),
-        files=[(name, _size_in_words(text)) for name, text in content["files"].items()],
+        size=_size_in_words(results),
         version=version,
         seconds=f"{seconds:.1f} s",
         light=vega.LIGHT,
@@ -124,7 +109,7 @@ def fill(
         css=Markup(_read_template("page.css")),
         script=Markup(_read_template("page.js")),
         vega_bundle=Markup(vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")),
-        content=Markup(_json({**content, "row": charts.ROW, "light": vega.LIGHT})),
+        content=Markup(_json(content)),
     )
 
 
@@ -177,9 +162,9 @@ def _text(findings: Findings, drawn: list[Figure]) -> dict[str, Any]:
         "title": findings.experiment.title,
         "asked": findings.experiment.asked,
         "contents": contents,
-        "answer": learning.learning_answer(findings),
+        "answer": words.headline(findings),
         "key_figures": key_figures(findings),
-        "distrust": words.caveats(findings),
+        "distrust": list(words.caveats(findings)),
         "figures": {name: figures.get(name) for name in names},
         "failures": failures,
         "labels": findings.labels,

@@ -9,12 +9,11 @@ from mjx_reinforce.reports.experiment import counted, ordered, setting_in_words
 from mjx_reinforce.reports.findings import Findings, swept, values_of
 from mjx_reinforce.reports.page import charts, tables
 from mjx_reinforce.reports.page.distributions import edges, slider_stops
-from mjx_reinforce.reports.page.vega import Chart, renamed, specification
+from mjx_reinforce.reports.page.vega import Chart, specification
 from mjx_reinforce.reports.page.words import number, within
 
 #: So many configurations are shown at first, the best.
 SHOWN = 4
-_SLIDER = " The dotted line is the slider's time below."
 
 
 class Figure(NamedTuple):
@@ -46,25 +45,6 @@ def figures(findings: Findings) -> list[Figure]:
     first = _final_figure, _curves_figure, _solved_figure, _distribution, _profile_figure
     for build in (*first, _sensitivity, _worst_figure):
         made += [*build(findings, made[-1].number + 1 if made else 1)]
-    return made
-
-
-def task_figures(findings: Findings, task: int, place: int) -> list[Figure]:
-    """Returns the figures of one of several tasks; their names, and their data's, end in -TASK."""
-    made: list[Figure] = []
-    for build in (_curves_figure, _solved_figure):
-        for figure in build(findings, place + len(made)):
-            names = [*figure.tables, *figure.hidden]
-            made.append(
-                figure._replace(
-                    name=f"{figure.name}-{task}",
-                    title=f"{findings.experiment.env}: {figure.title[0].lower()}{figure.title[1:]}",
-                    caption=figure.caption.replace(_SLIDER, "").replace("table 1", "the table"),
-                    spec=renamed(figure.spec, {name: f"{name}-{task}" for name in names}),
-                    tables=[f"{name}-{task}" for name in figure.tables],
-                    listed=f"{figure.listed}-{task}",
-                )
-            )
     return made
 
 
@@ -125,8 +105,8 @@ def _curves_figure(findings: Findings, place: int) -> Iterator[Figure]:
         title="Learning curves",
         caption=(
             "The interquartile mean over seeds of the return without exploration, and its 95 % "
-            f"bootstrap interval{drawn}.{_SLIDER} Point at "
-            f"a curve to read it.{_beyond(findings)}"
+            f"bootstrap interval{drawn}. The dotted line is the "
+            f"slider's time below. Point at a curve to read it.{_beyond(findings)}"
         ),
         alt="Return over env steps, a line and a band for each configuration that is shown.",
         tables=["curves", "seeds"],

@@ -1,15 +1,14 @@
-"""The report's tables, as the page shows them and as LaTeX files hold them."""
+"""The report's tables, as the page shows them."""
 
 import math
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from mjx_reinforce.reports.experiment import COMPARED, Result, counted
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.page import learning, tables, words
-from mjx_reinforce.reports.page.words import interval_in_words, number, percent, steps
+from mjx_reinforce.reports.page import tables, words
+from mjx_reinforce.reports.page.words import interval_in_words, number, percent, short_p, steps
 
 #: A table: its ``header``, and ``rows`` of a ``label`` and ``cells``, pairs of a value and what
 #: stands below it. Where the header has a column more, the first is the rank of the row.
@@ -20,9 +19,8 @@ def listings(findings: Findings) -> dict[str, Listing]:
     """Returns the tables of a report by name, in the order of the page."""
     found = {
         "results": _results_table(findings),
-        "speed": learning.speed_table(findings),
+        "speed": _speed_table(findings),
         "against": _against(findings),
-        "effects": learning.effects_table(findings),
         "worst": _worst(findings),
     }
     return {name: listing for name, listing in found.items() if listing}
@@ -83,6 +81,47 @@ def _results_table(findings: Findings) -> dict[str, Any]:
     return {"header": header, "rows": listed}
 
 
+def _speed_table(findings: Findings) -> dict[str, Any]:
+    """Returns the table of who learns faster: the fastest first."""
+    compared = findings.results[:COMPARED]
+    if len(compared) < 2:
+        return {}
+    solving = findings.experiment.threshold is not None
+    header = ["", "configuration"]
+    if solving:
+        header += ["steps until half solved", "mean steps to solve", "log-rank p, Holm"]
+    header += ["return while training", "p of it, Holm"]
+    best_area = max(range(len(compared)), key=lambda i: float(compared[i].area.value))
+    order = sorted(range(len(compared)), key=lambda i: _slowness(compared[i]))
+    speeds = {frozenset((e.first, e.second)): e.adjusted for e in findings.learning.speeds}
+    areas = {frozenset((e.first, e.second)): e.adjusted for e in findings.learning.areas}
+    listed = []
+    for i in order:
+        each, cells = compared[i], []
+        if each.solving is not None:
+            median, mean = each.solving.median, each.solving.mean
+            cells.append((steps(median.value), interval_in_words(median, steps)))
+            cells.append((steps(float(mean.value)), interval_in_words(mean, steps)))
+            cells.append((_p_against(speeds, i, order[0], "fastest"), ""))
+        cells.append((number(float(each.area.value)), interval_in_words(each.area)))
+        cells.append((_p_against(areas, i, best_area, "greatest"), ""))
+        listed.append({"label": each.configuration.label, "cells": cells})
+    return {"header": header, "rows": listed}
+
+
+def _slowness(result: Result) -> float:
+    """Returns what orders results, fastest first: steps to solve, or else the falling area."""
+    return float(result.solving.mean.value if result.solving else -result.area.value)
+
+
+def _p_against(adjusted: dict[frozenset[int], float], i: int, best: int, said: str) -> str:
+    """Returns the p value of a result against the best, or what the best is."""
+    if i == best:
+        return said
+    pair = frozenset((i, best))
+    return short_p(adjusted[pair]) if pair in adjusted else "none"
+
+
 def matrix(findings: Findings) -> list[dict[str, Any]]:
     """Returns who beats whom: a row and a cell for each configuration, None on the diagonal."""
     if not findings.comparisons:
@@ -119,8 +158,8 @@ def _against(findings: Findings) -> Listing:
                     percent(float(pair.improvement.value)),
                     interval_in_words(pair.improvement, percent),
                 ),
-                (learning.short_p(pair.p_value), ""),
-                (learning.short_p(pair.adjusted), ""),
+                (short_p(pair.p_value), ""),
+                (short_p(pair.adjusted), ""),
             ],
         }
         for pair in words.of_best(findings)
@@ -137,51 +176,6 @@ def _fate(findings: Findings, result: Result, s: int) -> dict[str, Any]:
         (_how_it_ended(findings, result, s), ""),
     ]
     return {"label": result.configuration.label, "cells": cells}
-
-
-#: What LaTeX would take for a command, and what it prints for it.
-_SPECIAL = {
-    **{each: f"\\{each}" for each in "&%$#_{}"},
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    "\u00a0": "~",
-    "\u2013": "--",
-    "“": "``",
-    "”": "''",
-}
-
-
-def latex_tables(listed: Mapping[str, Listing]) -> dict[str, str]:
-    """Returns the files by name: a ``tabular`` for each table of the page."""
-    return {f"table-{name}.tex": tabular(**listing) for name, listing in listed.items()}
-
-
-def tabular(header: Sequence[str], rows: Sequence[Mapping]) -> str:
-    """Returns a table as a ``tabular`` of booktabs; intervals stand in brackets after their value.
-
-    Args:
-      header: the names of the columns.
-      rows: a ``label`` and ``cells`` each, see ``listings.Listing``.
-    """
-    ranked = len(header) > 1 + len(rows[0]["cells"])
-    lines = []
-    for place, row in enumerate(rows, start=1):
-        cells = [f"{value} ({below})" if below else value for value, below in row["cells"]]
-        lines.append([*([str(place)] if ranked else []), row["label"], *cells])
-    kinds = "r" * ranked + "l" + "r" * (len(header) - ranked - 1)
-    body = [" & ".join(map(escaped, line)) + r" \\" for line in lines]
-    names = " & ".join(map(escaped, header)) + r" \\"
-    parts = [rf"\begin{{tabular}}{{{kinds}}}", r"\toprule", names, r"\midrule", *body]
-    return "\n".join([*parts, r"\bottomrule", r"\end{tabular}", ""])
-
-
-def escaped(text: str) -> str:
-    """Returns a text that LaTeX prints as it is."""
-    return "".join(_SPECIAL.get(each, each) for each in text)
 
 
 def _how_it_ended(findings: Findings, result: Result, s: int) -> str:

@@ -38,15 +38,6 @@ def chart_tables(findings: Findings) -> dict[str, Table]:
     }
 
 
-def task_tables(findings: Findings) -> dict[str, Table]:
-    """Returns the data of the charts that the page of several tasks shows of each task."""
-    return {
-        "curves": _curves(findings),
-        "seeds": _seeds(findings),
-        "solved": _solved(findings),
-    }
-
-
 def _curves(findings: Findings) -> Table:
     parts = []
     for place, result in enumerate(findings.results):

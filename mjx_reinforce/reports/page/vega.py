@@ -5,7 +5,7 @@ Charts name a colour as a CSS variable, so that one drawing fits both grounds an
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import altair as alt
@@ -116,21 +116,7 @@ def render_chart(spec: dict[str, Any], datasets: dict[str, Any], title: str) -> 
     return {
         "png": vl_convert.svg_to_png(svg, scale=2),
         "svg": svg.encode(),
-        "pdf": vl_convert.svg_to_pdf(svg),
     }
-
-
-def renamed(spec: Any, names: Mapping[str, str]) -> Any:
-    """Returns a specification whose data have other names."""
-    if isinstance(spec, list):
-        return [renamed(part, names) for part in spec]
-    if not isinstance(spec, dict):
-        return spec
-    found = {key: renamed(part, names) for key, part in spec.items()}
-    data = found.get("data")
-    if isinstance(data, dict) and data.get("name") in names:
-        found["data"] = data | {"name": names[data["name"]]}
-    return found
 
 
 def shown_rows(data: str) -> alt.Chart:

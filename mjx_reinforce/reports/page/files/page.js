@@ -2,7 +2,7 @@
 (() => {
   "use strict";
   const content = JSON.parse(document.getElementById("content").textContent);
-  const {labels, specs, tables, moments, files} = content;
+  const {labels, specs, tables, moments, results} = content;
   const views = {};
   // Vega's number for errors alone: it warns where a chart has nothing to show, which is no mistake.
   const ERRORS = 1;
@@ -43,7 +43,7 @@
       if (Array.isArray(part)) return part.forEach(change);
       if (!part || typeof part !== "object") return;
       const {x, y} = part.encoding ?? {};
-      if (x?.field === "env_steps" && toggles.x?.checked) {
+      if (x?.field === "env_steps" && toggles.x.checked) {
         x.scale = {...x.scale, type: "log"};
         const steps = numbersOf("curves", "env_steps").filter((step) => step > 0);
         const decades = Math.log10(Math.max(...steps) / Math.min(...steps));
@@ -51,7 +51,7 @@
         const powers = [1, 10, 100, 1e3, 1e4, 1e5, 1e6, 1e7, 1e8];
         x.axis = {...x.axis, values: powers.flatMap((p) => leading.map((d) => d * p))};
       }
-      if (y?.field && y.field !== "share" && toggles.y?.checked) {
+      if (y?.field && y.field !== "share" && toggles.y.checked) {
         const all = numbers("curves");
         const [low, high] = [Math.min(...all), Math.max(...all)];
         const powers = [1, 10, 100, 1e3, 1e4, 1e5, 1e6];
@@ -63,7 +63,7 @@
     };
     change(copy);
     copy.params = (copy.params ?? []).map((param) =>
-      param.name === "logarithmic" ? {...param, value: Boolean(toggles.x?.checked)} : param);
+      param.name === "logarithmic" ? {...param, value: toggles.x.checked} : param);
     return copy;
   };
 
@@ -74,7 +74,7 @@
     return view.runAsync();
   };
   const state = () => {
-    const moment = slider ? Number(slider.value) : moments.length - 1;
+    const moment = Number(slider.value);
     return {shown: shown(), moment, at: moments[moment]};
   };
   const apply = (name) => {
@@ -157,8 +157,8 @@
     savePicture(button.dataset.png, "png")));
   each("[data-svg]", (button) => button.addEventListener("click", () =>
     savePicture(button.dataset.svg, "svg")));
-  each("[data-file]", (button) => button.addEventListener("click", () =>
-    save(button.dataset.file, files[button.dataset.file], "text/csv")));
+  document.getElementById("results-csv").addEventListener("click", () =>
+    save("results.csv", results, "text/csv"));
   const refill = () => each("details.data[open] .numbers", fill);
   boxes.forEach((box) => box.addEventListener("change", () => { applyAll(); refill(); }));
   each("[data-choose]", (button) => button.addEventListener("click", () => {
@@ -167,7 +167,7 @@
     applyAll();
     refill();
   }));
-  Object.values(toggles).forEach((toggle) => toggle?.addEventListener("change", async () => {
+  Object.values(toggles).forEach((toggle) => toggle.addEventListener("change", async () => {
     for (const name of ["curves", "solved"]) if (name in specs) await draw(name);
   }));
   // On paper, charts are as wide as PRINTED pixels here, whatever the window: it is not resized.
@@ -182,19 +182,17 @@
   };
   addEventListener("beforeprint", () => redraw(PRINTED, 0.8));
   addEventListener("afterprint", () => redraw(document.querySelector("figure").clientWidth, 1));
-  if (slider) {
-    const output = document.getElementById("moment-said");
-    const tell = () => {
-      const moment = Number(slider.value);
-      const text = moment === moments.length - 1
-        ? "the end: the last evaluation of each seed, as in table 1"
-        : `${moments[moment].toLocaleString("en")} env steps of a seed`;
-      output.textContent = text;
-      slider.setAttribute("aria-valuetext", text);
-    };
-    slider.addEventListener("input", () => { tell(); applyAll(); });
-    tell();
-  }
+  const output = document.getElementById("moment-said");
+  const tell = () => {
+    const moment = Number(slider.value);
+    const text = moment === moments.length - 1
+      ? "the end: the last evaluation of each seed, as in table 1"
+      : `${moments[moment].toLocaleString("en")} env steps of a seed`;
+    output.textContent = text;
+    slider.setAttribute("aria-valuetext", text);
+  };
+  slider.addEventListener("input", () => { tell(); applyAll(); });
+  tell();
   (async () => {
     for (const name of Object.keys(specs)) await draw(name);
     document.documentElement.dataset.ready = "yes";
