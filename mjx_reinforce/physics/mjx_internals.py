@@ -35,7 +35,7 @@ from mujoco.mjx._src.collision_driver import geom_pairs
 from mujoco.mjx._src.collision_primitive import collider
 from mujoco.mjx._src.collision_types import Collision, GeomInfo
 from mujoco.mjx._src.forward import _advance as advance
-from mujoco.mjx._src.math import make_frame
+from mujoco.mjx._src.math import make_frame, quat_mul_axis
 from mujoco.mjx._src.smooth import solve_m
 from mujoco.mjx._src.support import muscle_gain
 
@@ -54,6 +54,7 @@ __all__ = [
     "make_frame",
     "muscle_gain",
     "num_contacts",
+    "quat_mul_axis",
     "rows_of",
     "solve_m",
     "with_contact",
