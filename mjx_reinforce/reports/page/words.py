@@ -138,12 +138,13 @@ def _ahead(findings: Findings) -> Iterator[str]:
         if len(findings.comparisons) * 2.0 ** (1 - seeds) >= LEVEL:
             why = f"{counted(seeds, 'seed')} are too few to tell, whatever they say"
         least += "" if least == "p = 1" else " or more"
-        names = _listed([f"“{findings.labels[each.second]}”" for each in ties])
+        names = _listed([findings.labels[each.second] for each in ties])
         yield f"It cannot be told from {names}: {why} ({least})."
 
 
 def _listed(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(f"“{name}”" for name in names[:3]) + more
 
 
 def _solving(findings: Findings) -> Iterator[str]:
