@@ -52,11 +52,11 @@ def test_it_says_its_version(call):
     assert call("--version") == (0, f"mjx-reinforce {version}\n", "")
 
 
-@pytest.mark.parametrize("name", commands.COMMANDS)
-def test_every_command_explains_itself(call, name):
-    status, out, _ = call(name, "--help")
-    assert status == 0
-    assert out.startswith(f"usage: mjx-reinforce {name} ")
+def test_every_command_explains_itself(call):
+    for name in commands.COMMANDS:
+        status, out, _ = call(name, "--help")
+        assert status == 0
+        assert out.startswith(f"usage: mjx-reinforce {name} ")
 
 
 @pytest.mark.parametrize(
@@ -120,16 +120,6 @@ def test_help_shows_what_makes_the_task(call, words, more, fewer):
     assert not set(fewer.split()) & set(shown)
 
 
-@pytest.mark.parametrize("columns", [60, 200])
-def test_help_wraps_at_words(call, monkeypatch, columns):
-    monkeypatch.setenv("COLUMNS", str(columns))
-    shown = call("train", "--help", "all")[1]
-    assert max(map(len, shown.splitlines())) <= columns
-    words = set(shown.split())
-    for word in ("learning_curve.png,", "InvertedPendulum-v5,", "independent", "interrupted,"):
-        assert word in words, word
-
-
 def test_text_wraps_at_words():
     text = f"{'word ' * 30}\n  name    {'what ' * 30}\nmjx_reinforce.{'x' * 70} --flag"
     for columns in (20, 60, 200):
@@ -143,36 +133,19 @@ def test_text_wraps_at_words():
 # Numbers.
 
 
-@pytest.mark.parametrize(
-    ("text", "number"),
-    [
-        ("1e6", 10**6),
-        ("2_000_000", 2 * 10**6),
-        ("1e12", 10**12),
-        ("7", 7),
-        ("-3", -3),
-        ("1.5e1", 15),
-    ],
-)
-def test_whole_numbers_are_read_as_people_write_them(text, number):
-    assert whole_number(text) == number
-
-
-@pytest.mark.parametrize("text", ["1.5", "", "many", "nan", "inf", "1e-3", "1e999999999", "1,000"])
-def test_what_is_no_whole_number_is_refused(text):
-    with pytest.raises(ValueError, match="takes a whole number, such as 4 or 2e6"):
-        whole_number(text)
+def test_whole_numbers_are_read_as_people_write_them():
+    numbers = {"1e6": 10**6, "2_000_000": 2 * 10**6, "1e12": 10**12, "-3": -3, "1.5e1": 15}
+    assert {text: whole_number(text) for text in numbers} == numbers
+    for text in ("1.5", "", "many", "nan", "inf", "1e-3", "1e999999999", "1,000"):
+        with pytest.raises(ValueError, match="takes a whole number, such as 4 or 2e6"):
+            whole_number(text)
 
 
 def test_a_budget_with_an_exponent_is_that_budget_and_picks_its_settings():
-    for text in ("2e8", "--env_steps=2e8", "200_000_000"):
-        arguments = [text] if text.startswith("--") else ["--env-steps", text]
+    for arguments in (["--env-steps", "2e8"], ["--env_steps=200_000_000"]):
         config = parse(["--env", "Ant-v5", *arguments])
         assert config == of_task("Ant-v5", 200_000_000)
         assert config.num_episodes != of_task("Ant-v5", 500_000).num_episodes
-    assert parse(["--hidden-sizes", "3e1", "32"]).hidden_sizes == (30, 32)
-    assert parse(["--decay-steps", "1e6"]).decay_steps == 10**6
-    assert parse(["--num-episodes", "1e2"]).num_episodes == 100
 
 
 # What a task is.
@@ -201,17 +174,20 @@ def test_tasks_are_listed_as_ever():
     assert done.stdout.splitlines() == envs.names()
 
 
-@pytest.mark.parametrize(
-    ("typed", "meant"),
-    [
-        *(("hopper", "Hopper-v5"), ("Hopper-v4", "Hopper-v5"), ("cheetah", "HalfCheetah-v5")),
-        *(("walker", "Walker2d-v5"), ("Hoper-v5", "Hopper-v5"), ("HUMANOID-V5", "Humanoid-v5")),
-        *(("cartpole-v1", "CartPole-v1"), ("cartpol-v0", "CartPole-v0"), ("xyz", None)),
-        *(("Pong-v5", None), ("nope", None), ("InvertedPendulum", "InvertedPendulum-v5")),
-    ],
-)
-def test_the_nearest_name_is_found(typed, meant):
-    assert registry.nearest(typed, envs.names()) == meant
+def test_the_nearest_name_is_found():
+    meant = {
+        "Hopper-v5": "hopper Hopper-v4 Hoper-v5",
+        "HalfCheetah-v5": "cheetah",
+        "Walker2d-v5": "walker",
+        "Humanoid-v5": "HUMANOID-V5",
+        "CartPole-v1": "cartpole-v1",
+        "CartPole-v0": "cartpol-v0",
+        "InvertedPendulum-v5": "InvertedPendulum",
+        None: "xyz nope Pong-v5",
+    }
+    for right, words in meant.items():
+        for typed in words.split():
+            assert registry.nearest(typed, envs.names()) == right, typed
 
 
 # The newest run.
@@ -237,73 +213,40 @@ def test_without_a_name_the_newest_run_plays(call, monkeypatch, tmp_path):
 # Mistakes.
 
 #: What a stranger may type after ``mjx-reinforce``, and what the answer must say.
+#: What each flag and word may mean is in settings/test_hints.py.
 MISTAKES = {
     # The task, or the command, is not where it belongs.
     "Hopper-v5": "'Hopper-v5' is a task: write mjx-reinforce train --env Hopper-v5",
-    "train Hopper-v5": "'Hopper-v5' is a task: write --env Hopper-v5",
     "train --num-seeds 3 Hopper-v5": "'Hopper-v5' is a task: write --env Hopper-v5",
     "sweep Hopper-v5 --over discount 0.9 1": "'Hopper-v5' is a task: write --env Hopper-v5",
-    "train hopper": "unknown task 'hopper'. Did you mean --env Hopper-v5?",
     "train --env Hoper-v5": "unknown environment 'Hoper-v5'. Did you mean 'Hopper-v5'?",
-    "train --env cheetah": "Did you mean 'HalfCheetah-v5'?",
     "train --env nope": "unknown environment 'nope'. Known: Ant-v5,",
-    "train --no-such": "unknown flag '--no-such'. (See mjx-reinforce train --help.)",
     "train --env my_arm": "Your own is named module:Class.",
-    "train my_arm:Arm": "'my_arm:Arm' is a task: write --env my_arm:Arm",
-    "train my_arm.py": "'my_arm.py' is a file; a task is a class in one: write --env module:Class",
-    "train runs/first": "'runs/first' is a directory: --output runs/first writes a run there",
     "envs Hoper": "Did you mean 'Hopper-v5'?",
     "envs --env Hopper-v5": "unknown flag '--env': leave it out",
     "trian": "Did you mean the command mjx-reinforce train?",
     "play runs/first": "Did you mean the command mjx-reinforce watch?",
-    "train watch": "'watch' is a command of its own: mjx-reinforce watch",
     "train train": "the command 'train' is given twice",
     "train --seed 1 sweep": "'sweep' is a command of its own: mjx-reinforce sweep",
-    "gymnasium-tutorail": "Did you mean 'gymnasium-tutorial'?",
     # Flags of other libraries, and misspelt ones.
     "train --seeds 3": "'3'; --num-seeds says how many",
-    "train --lr 0.1": "unknown flag '--lr'. Did you mean '--learning-rate'?",
     "train --lr=0.1": "unknown flag '--lr'. Did you mean '--learning-rate'?",
-    "train --steps 1e6": "unknown flag '--steps'. Did you mean '--env-steps'?",
-    "train --total_timesteps 1e6": "Did you mean '--env-steps'?",
-    "train --gamma 0.9": "Did you mean '--discount'?",
-    "train --batch-size 32": "Did you mean '--num-episodes'?",
     "train -n 3": "Did you mean '--num-seeds'?",
-    "train --num-sedes 3": "Did you mean '--num-seeds'?",
     "train -env Hopper-v5": "unknown flag '-env': write --env",
-    "train --Env Hopper-v5": "unknown flag '--Env': write --env",
-    "train --num-seeds 3 \N{EM DASH}env Hopper-v5": "unknown flag '\N{EM DASH}env': write --env",
-    "train env=Hopper-v5": "'env=Hopper-v5' lacks its dashes: write --env Hopper-v5",
-    "train --no-learning-rate": "--learning-rate is no switch but takes a value",
-    "train --version": "mjx-reinforce --version says it",
-    "train --config mine.json": "config.json; mjx-reinforce train --like RUN repeats them",
-    "train --device cuda": "JAX_PLATFORMS=cuda before the command",
-    "train --over discount 0.9 1": "unknown flag '--over': it is one of mjx-reinforce sweep",
-    "watch --run runs/first": "unknown flag '--run': leave it out",
+    "train -- --num-seeds 3": "leave -- out",
+    "train --num-seeds 3 gymnasium-tutorial": "a preset comes before all flags",
     # Values.
-    "train --env": "--env needs a value after it",
-    "train --env-steps 1.5": "takes a whole number, such as 4 or 2e6, or None, got '1.5'",
     "train --env-steps 1M": "--env-steps takes a whole number, such as 4 or 2e6, or None, got '1M'",
-    "train --num-seeds many": "--num-seeds takes a whole number, such as 4 or 2e6, got 'many'",
-    "train --num-episodes few": "a whole number, such as 4 or 2e6, got 'few'",
     "train --decay-steps long": "such as 4 or 2e6, or None or budget, got 'long'",
-    "train --learning-rate 0,1": "--learning-rate takes a number, such as 0.5, got '0,1'",
     "train --hidden-sizes 64,64": "takes whole numbers with spaces between them, such as 32 32",
-    "train --standardize False": "it takes no value, got 'False'; --no-standardize switches it off",
-    "train --num-seeds 3 4": "no flag takes '4': --num-seeds takes one value",
-    "train --algorithm PPO": "ars or reinforce, or module:name for your own, got 'PPO'",
-    "watch Hopper-v5 --backend isaac": "--backend takes gymnasium or mjx or mujoco, got 'isaac'",
-    "watch Hopper-v5 --beside x": "or None or untrained or best or worst or median, got 'x'",
+    "train --engine kernel": "--engine takes auto or native or vmap, got 'kernel'",
     "train --output=": "--output takes a path or None, got ''",
-    "train --estimator value_baseline": "Did you mean 'value-baseline'?",
+    "watch Hopper-v5 --beside x": "or None or untrained or best or worst or median, got 'x'",
     "watch --seed first": "--seed takes a whole number, such as 4 or 2e6, or best or worst or",
     "watch --output film.avi runs/first": "runs/first is no run directory",
     "watch runs/first runs/second": "no flag takes 'runs/second'",
     # What is swept, reported, exported.
     "sweep": "nothing is swept: give --over a setting and its values, such as --over learning-rate",
-    "sweep --over lr 0.1 0.2": "unknown setting 'lr' after --over. Did you mean 'learning-rate'?",
-    "sweep --over learning-rate 0.1,0.2": "'0.1,0.2', which is no number; write spaces between",
-    "sweep --over num-episodes 1.5 2": "'1.5', which is no whole number",
     "report": "there is nothing to report on: name a run or a sweep directory",
     "report nowhere": "there is no directory nowhere; name that of a run or a sweep",
     "export": "mjx-reinforce export needs RUN and --to",

@@ -21,6 +21,7 @@ SENSED = """<mujoco><option timestep="0.002"/><worldbody>
   <actuator><motor joint="j"/></actuator><sensor><gyro site="end-effector"/></sensor></mujoco>"""
 
 
+@pytest.mark.slow
 def test_the_arm_learns_to_reach(tmp_path):
     command = [sys.executable, "-m", "mjx_reinforce.train", "--env", "my_arm:Arm"]
     options = ["--num-episodes", "64", "--env-steps", "300_000", "--num-seeds", "2"]
@@ -32,6 +33,7 @@ def test_the_arm_learns_to_reach(tmp_path):
     assert returns[-1] > returns[0] / 2  # both are negative: half of the way is left
 
 
+@pytest.mark.slow
 def test_the_arm_is_paid_for_the_distance_of_the_ball(monkeypatch):
     monkeypatch.syspath_prepend(EXAMPLES)
     env = envs.make("my_arm:Arm")
@@ -105,22 +107,22 @@ def test_a_walker_starts_in_its_key_frame(tmp_path, monkeypatch):
         assert said in text
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["nothing.xml"], "there is no model"),
-        (["model.urdf"], "model.urdf is no model; give an MJCF file that ends in .xml"),
-        (["arm.xml", "--output", "json.py"], "json.py would hide Python's json"),
-        (["arm.xml", "--output", "my-arm.py"], "Python cannot import 'my-arm.py'"),
-        (["arm.xml", "--output", "../arm.py"], "must be in the folder of arm.xml"),
-        (["arm.xml", "--output", "there.py"], "there.py exists; pass --overwrite"),
-        (["still.xml"], "has no actuators"),
-        (["broken.xml"], "MuJoCo cannot compile"),
-        (["pgs.xml"], 'set <option solver="Newton"/>'),
-        (["arm.xml", "--outptu", "a.py"], "Did you mean '--output'?"),
-    ],
-)
-def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
+WRONG = {
+    "nothing.xml": "there is no model",
+    "model.urdf": "model.urdf is no model; give an MJCF file that ends in .xml",
+    "arm.xml --output json.py": "json.py would hide Python's json",
+    "arm.xml --output my-arm.py": "Python cannot import 'my-arm.py'",
+    "arm.xml --output ../arm.py": "must be in the folder of arm.xml",
+    "arm.xml --output there.py": "there.py exists; pass --overwrite",
+    "still.xml": "has no actuators",
+    "broken.xml": "MuJoCo cannot compile",
+    "pgs.xml": 'set <option solver="Newton"/>',
+    "arm.xml --outptu a.py": "Did you mean '--output'?",
+}
+
+
+@pytest.mark.parametrize("arguments", WRONG)
+def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments):
     arm = (EXAMPLES / "my_arm.xml").read_text()
     texts = {"arm": arm, "still": "<mujoco/>", "broken": "<mujoco"}
     texts["pgs"] = arm.replace("<option", '<option solver="PGS"')
@@ -129,8 +131,8 @@ def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
     (tmp_path / "there.py").write_text("")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match="2"):
-        new.main(arguments)
+        new.main(arguments.split())
     error = capsys.readouterr().err
-    assert message in error
+    assert WRONG[arguments] in error
     assert error.count("\n") == 1
     assert not (tmp_path / "arm.py").exists()

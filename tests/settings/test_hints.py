@@ -64,7 +64,14 @@ def test_flags_that_a_form_has_not():
         (["--version"], "--version says it"),
         (["--over", "lr"], "it is one of "),
         (["--zzzzzz"], "unknown flag '--zzzzzz'. (See prog --help.)"),
-        (["--overwrite", "yes"], "--no-overwrite switches it off"),
+        (["--overwrite", "yes"], "it takes no value, got 'yes'; --no-overwrite switches it off"),
+        (["--n-seeds", "3"], "Did you mean '--num-seeds'?"),
+        (
+            ["--gamma", "1"],
+            "unknown flag '--gamma'. (See prog --help.)",
+        ),  # the form has no discount
+        (["--config", "mine.json"], "config.json; mjx-reinforce train --like RUN repeats them"),
+        (["--device", "cuda"], "JAX_PLATFORMS=cuda before the command"),
         (["--learning-rate", "1", "2"], "--learning-rate takes one value; "),
         (["--num-seeds", "4", "8"], "--num-seeds takes one value, also in a sweep: all have as"),
     ],
@@ -79,6 +86,7 @@ def test_what_was_meant(words, said):
         ("Hopper-v5", "is a task: write --env Hopper-v5"),
         ("own:Crane", "is a task: write --env own:Crane"),
         ("Hoper-v5", "unknown task 'Hoper-v5'. Did you mean --env Hopper-v5?"),
+        ("hopper", "unknown task 'hopper'. Did you mean --env Hopper-v5?"),
         ("seeds=4", "lacks its dashes: write --seeds 4"),
         ("arm.xml", "is a model: "),
         ("own.py", "a task is a class in one: write --env module:Class"),
@@ -112,5 +120,8 @@ def test_every_hint_names_a_flag_that_some_command_has():
 
 
 def test_no_name_of_another_library_is_a_flag_of_ours():
-    assert other_names("--lr") == ["--learning-rate"]
-    assert other_names("--learning-rate") == ()
+    for theirs, ours in {"lr": "learning-rate", "steps": "env-steps", "gamma": "discount"}.items():
+        assert f"--{ours}" in other_names(f"--{theirs}")
+        assert other_names(f"--{ours}") == ()
+    assert "--env-steps" in other_names("--total-timesteps")
+    assert "--num-episodes" in other_names("--batch-size")

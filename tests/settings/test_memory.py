@@ -46,21 +46,6 @@ def test_more_of_anything_needs_more(more):
     assert needed(**more) > needed()
 
 
-@pytest.mark.parametrize(
-    ("changes", "remedy"),
-    [
-        ({"num_episodes": 10**6}, "--num-episodes"),
-        ({"hidden_sizes": (10**5, 10**5)}, "--hidden-sizes"),
-        ({"eval_episodes": 10**6}, "--eval-episodes"),
-    ],
-)
-def test_what_is_too_large_is_refused_with_the_setting_to_lower(changes, remedy):
-    config = dataclasses.replace(CONFIG, **changes)
-    with pytest.raises(ValueError, match=f"does not fit into memory.*\nlower .*{remedy}"):
-        memory.check_fits(config, TASK, 1e9, 0.0)
-    memory.check_fits(config, TASK, 1e15, 0.0)
-
-
 def test_what_a_program_needs_besides_counts():
     total = needed()
     memory.check_fits(CONFIG, TASK, total + 10, 10)
@@ -68,9 +53,6 @@ def test_what_a_program_needs_besides_counts():
         memory.check_fits(CONFIG, TASK, total + 9, 10)
 
 
-@pytest.mark.parametrize(
-    ("size", "said"),
-    [(1, "1 MB"), (3e6, "3 MB"), (6e7, "0.1 GB"), (1.24e9, "1.2 GB"), (1.24e12, "1,240 GB")],
-)
-def test_sizes_are_for_people(size, said):
-    assert memory.gigabytes(size) == said
+def test_sizes_are_for_people():
+    said = {1: "1 MB", 3e6: "3 MB", 6e7: "0.1 GB", 1.24e9: "1.2 GB", 1.24e12: "1,240 GB"}
+    assert {size: memory.gigabytes(size) for size in said} == said

@@ -61,14 +61,6 @@ def test_words_that_are_no_values_are_refused(given, said):
 # The search.
 
 
-def test_draws_are_different_and_the_same_for_a_seed():
-    over = {"learning_rate": [1e-4, 1e-1], "estimator": ["total-return", "reward-to-go"]}
-    drawn = design.draw_configurations(over, 50, seed=3)
-    assert len({tuple(entry.values()) for entry in drawn}) == 50
-    assert drawn == design.draw_configurations(over, 50, seed=3)
-    assert all(1e-4 <= entry["learning_rate"] <= 1e-1 for entry in drawn)
-
-
 @pytest.mark.parametrize(
     ("over", "said"),
     [

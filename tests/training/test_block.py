@@ -74,6 +74,14 @@ def test_it_is_over_when_all_runs_are(advance):
     assert int(advance([1], Budget.of(5, None), begun=5)[1].made) == 0
 
 
+def test_runs_count_beyond_32_bits(advance):
+    """A budget that ends beyond 2^32 env steps, and the share of it."""
+    budget, begun = Budget.of(2**32 + 200, None), 2**32 - 50
+    updates, result = advance([100, 1], budget, begun=begun)
+    assert updates == [3, 4]
+    np.testing.assert_allclose(result.metrics["share"][:, 0], 1, atol=1e-6)
+
+
 def test_schedules_are_told_the_share_of_the_budget(advance):
     _, result = advance([10], Budget.of(40, None))
     np.testing.assert_allclose(result.metrics["share"][:, 0], [0, 0.25, 0.5, 0.75])

@@ -15,7 +15,7 @@ from mjx_reinforce.runs import display
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import progress
 from mjx_reinforce.training.evaluation import evaluate
-from mjx_reinforce.training.progress import Progress
+from mjx_reinforce.training.progress import Progress, as_events
 from mjx_reinforce.training.record import RunRecord
 from mjx_reinforce.types import Trajectory
 
@@ -82,25 +82,66 @@ def test_a_record_is_restored_exactly(tmp_path):
         assert repr(both[0]) == repr(both[1])
 
 
-def test_a_record_of_nothing_is_restored():
-    record, copy = (RunRecord(Config(num_seeds=2), None) for _ in range(2))
-    copy.restore(record.arrays())
-    same(record.arrays(), copy.arrays())
-    assert copy.add_evaluation(evaluation(1, 2), 0.5)["train_return"] == ["", ""]
+METRICS = {  # two updates of two seeds; the second seed stands still in the second update
+    "active": np.array([[True, True], [True, False]]),
+    "env_steps": np.array([[30, 40], [40, 0]], np.int32),
+    "episodes": np.array([[2, 2], [2, 2]], np.int32),
+    "simulated_steps": np.array([[50, 60], [40, 0]], np.int32),
+    "episode_return": np.array([[3.0, 4.0], [5.0, 0.0]], np.float32),
+    "episode_length": np.array([[15.0, 20.0], [20.0, 0.0]], np.float32),
+    "entropy": np.array([[0.5, 0.25], [0.125, 0.0]], np.float32),
+    "gradient_norm": np.array([[1.0, 2.0], [3.0, 0.0]], np.float32),
+    "nonfinite_episodes": np.array([[0, 0], [2, 7]], np.int32),
+    "skipped_update": np.array([[0, 0], [1, 1]], np.int32),
+}
+
+
+def test_a_record_of_two_seeds_by_hand():
+    config = Config(num_seeds=2, num_episodes=2, env_steps=60, stop_when_solved=True)
+    record = RunRecord(config, threshold=8.0)
+    first = record.add_evaluation(evaluation(1, 9), 0.5)
+    assert first["train_return"] == ["", ""]
+    assert not record.finished()
+    assert record.progress().fraction == 0
+    met = record.add_updates(METRICS)
+    assert as_events(met) == [{"seed": 0, "update": 1, "episodes": 2, "skipped": True}]
+    second = record.add_evaluation(evaluation(7, 10), 2.00009)
+    keys = ("seed", "update", "episodes", "env_steps", "wall_seconds", "train_return")
+    assert [*zip(*(second[key] for key in keys), strict=True)] == [
+        ("0", "2", "4", "70", "2.000", "nan"),
+        ("1", "1", "2", "40", "2.000", "4.0"),
+    ]
+    assert second["skipped_update"] == ["1", "0"]
+    progress = record.progress()
+    assert progress[:-3] == (40 / 60, 2, 55.0, 8.5, 7.0, 0, 2)
+    np.testing.assert_allclose(progress[-3:], [55, 110 / 1.5, 1.5 / 2], rtol=1e-3)
+    assert not record.finished()
+    np.testing.assert_array_equal(record.training()["episode_return"], [[3, 4], [np.nan] * 2])
+    np.testing.assert_array_equal(record.training()["env_steps"], [[30, 40], [70, 40]])
+    np.testing.assert_array_equal(record.training()["episodes"], [[2, 2], [4, 2]])
+    summary = record.summary("vmap", 3.0, 2.0)
+    assert summary["env_steps_to_solve"] == [None, 0]
+    # 50 + 60 + 40 in training and 2 (7 + 7) in evaluations.
+    assert summary["useful_step_fraction"] == (70 + 40 + 2 * 12) / (150 + 2 * 14)
+    assert summary["env_steps_per_second"] == 55
+    assert len(summary["nonfinite"]) == 1
+    record.add_evaluation(evaluation(8, 8), 2.0)
+    assert record.finished()
 
 
 def test_a_block_waits_for_its_evaluation():
-    record = RunRecord(Config(num_seeds=3, max_updates=100), 2.0)
+    record, nothing = (RunRecord(Config(num_seeds=3, max_updates=100), 2.0) for _ in range(2))
+    nothing.restore(record.arrays())
+    same(record.arrays(), nothing.arrays())
     assert not record.evaluated()
-    record.add_evaluation(evaluation(1, 2, 3), 0.1)
+    assert record.add_evaluation(evaluation(1, 2, 3), 0.1)["train_return"] == [""] * 3
     assert record.evaluated()
     record.add_updates(block(np.random.default_rng(0), 4, 3))
     assert not record.evaluated()
-    copy = RunRecord(Config(num_seeds=3, max_updates=100), 2.0)
-    copy.restore(record.arrays())
-    assert not copy.evaluated()
-    copy.add_evaluation(evaluation(1, 2, 3), 0.2)
-    assert copy.evaluated()
+    nothing.restore(record.arrays())
+    assert not nothing.evaluated()
+    nothing.add_evaluation(evaluation(1, 2, 3), 0.2)
+    assert nothing.evaluated()
 
 
 def test_a_test_counts_among_what_was_simulated():
@@ -148,21 +189,9 @@ def test_a_block_of_broken_updates_is_one_line():
     )
 
 
-@pytest.mark.parametrize(
-    ("fraction", "shown"),
-    [
-        (1.0, "100.0 %"),
-        (1 - 1e-12, "99.9 %"),
-        (0.9999, "99.9 %"),
-        (0.57, "57.0 %"),
-        (0.29, "29.0 %"),
-        (0.5, "50.0 %"),
-        (1e-5, "0.0 %"),
-        (0.0, "0.0 %"),
-    ],
-)
-def test_percentages_are_rounded_down(fraction, shown):
-    assert display.percent_done(fraction) == shown
+def test_percentages_are_rounded_down():
+    shown = {1.0: "100.0 %", 1 - 1e-12: "99.9 %", 0.57: "57.0 %", 0.29: "29.0 %", 1e-5: "0.0 %"}
+    assert {fraction: display.percent_done(fraction) for fraction in shown} == shown
 
 
 def screen(width):
