@@ -76,16 +76,6 @@ def begun_again(weights):
     return lax.scan(turn, jnp.zeros((SIZE, SIZE)), None, length=4)[0]
 
 
-def inside_a_loop(weights):
-    """The sums begin anew in each round of an outer loop."""
-
-    def turn(carry, _):
-        return added_up(weights + 0.1 * jnp.tanh(carry[0, :4])), carry.sum()
-
-    last, sums = lax.scan(turn, jnp.zeros((SIZE, SIZE)), None, length=5)
-    return last, sums
-
-
 def never_read(weights):
     """The angle goes on from round to round; its cosine and the last weight are read afterwards."""
 
@@ -120,15 +110,7 @@ def loops_of(function):
     return list(within(written.schedule))
 
 
-FUNCTIONS = [
-    added_up,
-    twice,
-    start_read_again,
-    begun_again,
-    inside_a_loop,
-    never_read,
-    ends_early,
-]
+FUNCTIONS = [added_up, twice, start_read_again, begun_again, never_read, ends_early]
 
 
 @pytest.mark.parametrize("few", [True, False], ids=["in registers", "in place"])

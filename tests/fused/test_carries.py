@@ -11,43 +11,29 @@ from mjx_reinforce.fused.rules import iterate
 X = jnp.ones(3)
 
 
-def body_of(step, *carry):
-    """Returns the program of a loop's body, and how many variables its carry has."""
-    return jaxprs.trace(step, *carry)[0], len(carry)
+def scanned(a, b):
+    return lax.scan(lambda c, _: ((c[0], c[1] + c[0]), None), (a, b), length=3)[0]
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda a, b: (a, b + 1),
-        jax.jit(lambda a, b: (a, b + 1)),
-        jax.checkpoint(lambda a, b: (a, b * a)),
-        lambda a, b: lax.scan(lambda c, _: ((c[0], c[1] + c[0]), None), (a, b), length=3)[0],
-        lambda a, b: lax.while_loop(lambda c: c[1][0] < 9, lambda c: (c[0], c[1] + 1), (a, b)),
-        lambda a, b: lax.cond(b[0] > 0, lambda: (a, b), lambda: (a, b + 1)),
-    ],
-    ids=["itself", "jit", "checkpoint", "scan", "while", "cond"],
-)
-def test_what_is_handed_on_through_calls_is_kept(call):
-    assert carries.keeps(*_at(body_of(call, X, X))) == [True, False]
+KEPT = {
+    "itself": lambda a, b: (a, b + 1),
+    "jit": jax.jit(lambda a, b: (a, b + 1)),
+    "checkpoint": jax.checkpoint(lambda a, b: (a, b * a)),
+    "scan": scanned,
+    "while": lambda a, b: lax.while_loop(lambda c: c[1][0] < 9, lambda c: (c[0], c[1] + 1), (a, b)),
+    "cond": lambda a, b: lax.cond(b[0] > 0, lambda: (a, b), lambda: (a, b + 1)),
+}
+CHANGED = {
+    "exchanged": lambda a, b: (b, a),
+    "exchanged in a branch": lambda a, b: lax.cond(a[0] > 0, lambda: (a, b), lambda: (b, a)),
+    "computed": lambda a, b: (jnp.zeros(3), b + 0),
+}
 
 
-def _at(body):
-    program, count = body
-    return program, 0, count
-
-
-@pytest.mark.parametrize(
-    "step",
-    [
-        lambda a, b: (b, a),
-        lambda a, b: lax.cond(a[0] > 0, lambda: (a, b), lambda: (b, a)),
-        lambda a, b: (jnp.zeros(3), b + 0),
-    ],
-    ids=["exchanged", "exchanged in a branch", "computed"],
-)
-def test_what_is_exchanged_or_computed_is_not_kept(step):
-    assert carries.keeps(*_at(body_of(step, X, X))) == [False, False]
+def test_what_is_handed_on_through_calls_is_kept():
+    steps = KEPT | CHANGED
+    kept = {name: carries.keeps(jaxprs.trace(f, X, X)[0], 0, 2) for name, f in steps.items()}
+    assert kept == {name: [name in KEPT, False] for name in steps}
 
 
 def test_the_carry_may_begin_behind_constants():
@@ -63,17 +49,14 @@ def test_lanes_differ_where_something_that_differs_arrives_in_the_end():
     assert carries.spread(step, [True, False, False, False]) == [True, True, True, False]
 
 
-@pytest.mark.parametrize(
-    ("function", "expected"),
-    [
+def test_loops_are_found_in_calls_too():
+    for function, expected in (
         (lambda x: x + 1, False),
         (lambda x: lax.fori_loop(0, 9, lambda _, y: y + 1, x), True),
         (jax.jit(lambda x: lax.while_loop(lambda y: y[0] < 9, lambda y: y + 1, x)), True),
         (lambda x: lax.cond(x[0] > 0, lambda: lax.cumsum(x), lambda: x), False),
-    ],
-)
-def test_loops_are_found_in_calls_too(function, expected):
-    assert carries.has_loops(jaxprs.trace(function, X)[0]) is expected
+    ):
+        assert carries.has_loops(jaxprs.trace(function, X)[0]) is expected
 
 
 @pytest.mark.parametrize("outer", ["scan", "while"])

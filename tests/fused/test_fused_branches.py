@@ -5,40 +5,52 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from mapped import (
-    BRANCHES,
-    assert_same,
-    batch_of,
-    heavy,
-    primitives,
-)
+from mapped import assert_same, batch_of, heavy, line_search, primitives
 
 from mjx_reinforce import fused
 
+BRANCHES = [
+    lambda x: lax.cond(x > 0, jnp.sin, jnp.cos, x),
+    lambda x: lax.cond(x > 0, heavy, jnp.cos, x),
+    lambda x: lax.cond(x > 0, jnp.cos, heavy, x),
+    lambda x: lax.cond(x > 0, heavy, lambda y: heavy(2 * y), x),
+    lambda x: lax.switch((x + 2).astype(jnp.int32) - 1, [jnp.sin, heavy, jnp.cos, lambda y: y], x),
+    lambda x: lax.cond(x > 0, lambda: lax.cond(x > 1, heavy, jnp.sin, x), lambda: x),
+    lambda x: lax.cond(True, jnp.sin, jnp.cos, x),
+    lambda x: lax.fori_loop(0, 9, lambda i, y: lax.cond(y > 1, heavy, jnp.exp, y), x),
+]
 
-@pytest.mark.parametrize("fn", BRANCHES)
-def test_branches(fn):
-    assert_same(fn, batch_of(), rtol=1e-5)
+
+def repeated(x):
+    return lax.fori_loop(0, 20, lambda i, y: 0.9 * y + i, x)
+
+
+@pytest.mark.parametrize("fn", [*BRANCHES, repeated, line_search])
+def test_branches_are_those_of_jax_and_a_nan_stays_in_its_lane(fn):
+    x = batch_of(low=0.3 if fn is line_search else -2)
+    mapped = jax.jit(fused.vmap(fn))
+    results = mapped(x), jax.jit(jax.vmap(fn))(x), mapped(x.at[2].set(jnp.nan))
+    for ours, theirs, dirty in zip(*map(jax.tree.leaves, results), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=2e-6)
+        np.testing.assert_array_equal(np.delete(dirty, 2), np.delete(ours, 2))
 
 
 def conds(function, cost):
     """How many branches of a function may be skipped."""
-    jaxpr = jax.make_jaxpr(fused.vmap(function, branch_cost=cost))(batch_of()).jaxpr
-    return list(primitives(jaxpr)).count("cond")
+    return primitives(fused.vmap(function, branch_cost=cost), batch_of()).count("cond")
 
 
 def long(x):
     return jnp.sin(jnp.cos(jnp.exp(x)))
 
 
-@pytest.mark.parametrize(("cost", "count"), [(3, 0), (2, 1)])
-@pytest.mark.parametrize("order", [(long, jnp.abs), (jnp.abs, long)])
-def test_a_branch_is_skipped_where_it_costs_more(cost, count, order):
-    function = lambda x: lax.cond(x > 0, *order, x)  # noqa: E731
-    assert conds(function, cost) == count
-    np.testing.assert_allclose(
-        fused.vmap(function, branch_cost=cost)(batch_of()), jax.vmap(function)(batch_of()), 1e-5
-    )
+def test_a_branch_is_skipped_where_it_costs_more():
+    for order in ((long, jnp.abs), (jnp.abs, long)):
+        function = lambda x, order=order: lax.cond(x > 0, *order, x)  # noqa: E731
+        assert [conds(function, cost) for cost in (3, 2)] == [0, 1]
+        for cost in (3, 2):
+            got = fused.vmap(function, branch_cost=cost)(batch_of())
+            np.testing.assert_allclose(got, jax.vmap(function)(batch_of()), 1e-5)
 
 
 def test_a_branch_with_a_loop_is_skipped_whatever_it_costs():

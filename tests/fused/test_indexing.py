@@ -1,73 +1,66 @@
 """Rules for windows of an array: gather, scatter, dynamic slices; at known and unknown places."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from jax import lax
-from mapped import assert_folds, assert_same, batch_of, count
+from mapped import assert_all_same, batch_of, count
 
-X = np.arange(12, dtype=np.float32).reshape(3, 4)
 PLACES = np.array([2, -1, 7, 0], np.int32)  # of which two are outside an axis of three
+TWICE = np.array([0, 0, 2])
 
 
-@pytest.mark.parametrize("mode", ["clip", "fill"])
-def test_a_row_outside_is_the_nearest_or_the_fill_value(mode):
-    assert_folds(lambda x: x.at[PLACES].get(mode=mode), X)
-    assert_folds(lambda x: x.at[PLACES, 1].get(mode=mode, fill_value=7.0), X)
-    assert_folds(lambda x: x.at[:, PLACES].get(mode=mode), X.astype(np.int32))
+def taken(x, i, mode):
+    return x.at[i].get(mode=mode), x.at[:, i].get(mode=mode), x.at[i, 1].get(mode=mode)
 
 
-@pytest.mark.parametrize("dtype", [np.int32, np.uint8, bool, np.float32])
-def test_the_fill_value_of_a_dtype(dtype):
-    assert_folds(lambda x: x.at[np.array([5])].get(mode="fill"), np.ones(3, dtype))
+#: Functions of x [3, 4] and of a place that a lane knows alone.
+CASES = {
+    f"take, {mode}": lambda x, i, mode=mode: (taken(x, PLACES, mode), taken(x, i, mode))
+    for mode in ("clip", "fill")
+}
+CASES |= {
+    f"{change}, {mode}": lambda x, i, change=change, mode=mode: (
+        getattr(x.at[PLACES[:3]], change)(2.5, mode=mode),
+        getattr(x.at[i], change)(0.5, mode=mode),
+    )
+    for change, mode in itertools.product(
+        ("set", "add", "subtract", "multiply", "min", "max"), ("clip", "drop")
+    )
+}
+CASES |= {
+    f"a window at {start}": lambda x, i, start=start: (
+        lax.dynamic_slice(x, start, (2, 3)),
+        lax.dynamic_update_slice(x, -x[:2, :3], start),
+    )
+    for start in ((0, 0), (1, 2), (9, -9))
+}
+CASES |= {
+    "the fill value of a dtype": lambda x, i: [
+        x.astype(kind).at[np.array([5])].get(mode="fill")
+        for kind in (np.int32, np.uint8, bool, np.float32)
+    ],
+    "a fill value": lambda x, i: x.at[PLACES].get(mode="fill", fill_value=7.0),
+    "a window at a place": lambda x, i: lax.dynamic_slice(x, (i, i), (2, 2)),
+    "a window is written": lambda x, i: lax.dynamic_update_slice(x, x[:1, :2], (i, i)),
+    "two places": lambda x, i: (x[i, i + 1], x[i, :2], x.at[1:3, i].max(0.2)),
+    "columns": lambda x, i: x.at[:, i].add(x[:, 0]),
+    "an entry that is named twice": lambda x, i: (x.at[TWICE].add(1.0), x.at[TWICE, 1].mul(3.0)),
+    "no place": lambda x, i: (x.at[TWICE[:0]].set(1.0), x.at[TWICE[:0], 1].add(1.0)),
+    "each row its own": lambda x, i: (
+        jnp.take_along_axis(x, TWICE[:, None], axis=1),
+        jax.vmap(lambda row, k: row[k])(x, TWICE),
+        x[np.arange(3), TWICE],
+    ),
+}
 
 
-@pytest.mark.parametrize("change", ["set", "add", "subtract", "multiply", "min", "max"])
-@pytest.mark.parametrize("mode", ["clip", "drop"])
-def test_an_entry_is_changed_where_it_is_inside(change, mode):
-    places = np.array([1, 4, 2], np.int32)
-    assert_folds(lambda x: getattr(x.at[places], change)(2.5, mode=mode), jnp.asarray(X))
-
-
-def test_an_entry_that_is_named_twice_is_changed_twice():
-    assert_folds(lambda x: x.at[np.array([1, 1])].add(1.0), jnp.asarray(X))
-
-
-@pytest.mark.parametrize("start", [(0, 0), (1, 2), (9, -9)])
-def test_a_window_is_moved_inside(start):
-    assert_folds(lambda x: lax.dynamic_slice(x, start, (2, 3)), X)
-    assert_folds(lambda x: lax.dynamic_update_slice(x, -X[:2, :3], start), X)
-
-
-@pytest.mark.parametrize("mode", ["clip", "fill"])
-def test_a_place_that_a_lane_knows_alone_is_selected(mode):
-    places = jnp.arange(6, dtype=jnp.int32) - 1  # -1 to 4, of an axis of three
-
-    def read(x, i):
-        return x.at[i].get(mode=mode), lax.dynamic_slice(x, (i,), (2,))
-
-    assert_same(read, batch_of(3), places)
-
-
-@pytest.mark.parametrize("change", ["set", "add", "max"])
-@pytest.mark.parametrize("mode", ["clip", "drop"])
-def test_a_place_that_a_lane_knows_alone_is_changed(change, mode):
-    places = jnp.arange(6, dtype=jnp.int32) + jnp.int32(-1)
-
-    def write(x, i):
-        return getattr(x.at[i], change)(0.5, mode=mode)
-
-    assert_same(write, batch_of(3), jnp.maximum(places, 0))
+def test_windows_are_read_and_changed():
+    assert_all_same(CASES, batch_of(3, 4), jnp.int32([-5, -1, 0, 1, 2, 7]))
 
 
 def test_known_places_cost_nothing():
     assert count(lambda x: x[np.array([2, 0, 1])], jnp.ones(3)) == 0
     assert count(lambda x, i: x[i], jnp.ones(3), jnp.int32(0)) > 0
-
-
-def test_rows_of_a_batch_are_read_each_by_its_own():
-    rows, columns = np.arange(3), np.array([3, 0, 2])
-    assert_folds(lambda x: jnp.take_along_axis(x, columns[:, None], axis=1), X)
-    assert_folds(jax.vmap(lambda x, i: x[i]), X, columns)
-    assert_folds(lambda x: x[rows, columns], X)

@@ -1,17 +1,16 @@
 """The instructions of each operation: NumPy's results, also of NaN, infinities and zeros."""
 
-import ctypes
-
 import numpy as np
 import pytest
 from jax import lax
+from lane_code import call, engine
 
 from mjx_reinforce.fused.backends.llvm_operations import OPERATIONS
 from mjx_reinforce.fused.backends.llvm_text import Text
 from mjx_reinforce.fused.errors import UnsupportedPrimitive
 from mjx_reinforce.fused.ops import Op
 
-llvm = pytest.importorskip("llvmlite.binding", reason="machine code is written by llvmlite")
+pytest.importorskip("llvmlite", reason="machine code is written by llvmlite")
 
 LANES = 16
 INFINITY = np.inf
@@ -27,53 +26,21 @@ U, V = I.view(np.uint32), J.view(np.uint32)
 B = I % 2 == 0
 
 
-def compiled(op, dtype, kinds):
-    text = Text(LANES)
-
-    def place(number):
-        return f"%in{number}"
-
-    loaded = []
-    for number, kind in enumerate(kinds):
-        stored = np.dtype(np.int8) if kind == np.bool_ else kind
-        value = text.let(f"load {text.type(stored)}, ptr {place(number)}, align 1")
-        if kind == np.bool_:
-            value = text.let(f"trunc {text.type(stored)} {value} to {text.type(kind)}")
-        loaded.append(value)
-    result, stored = OPERATIONS[op.name](text, op, dtype, kinds, loaded), dtype
-    if dtype == np.bool_:
-        stored = np.dtype(np.int8)
-        result = text.let(f"zext {text.type(dtype)} {result} to {text.type(stored)}")
-    text.line(f"store {text.type(stored)} {result}, ptr %out, align 1")
-    text.line("ret void")
-    pointers = ", ".join(f"ptr {place(number)}" for number in range(len(kinds)))
-    return llvm.parse_assembly(text.function(f"void @f({pointers}, ptr %out)"))
-
-
 def run(name, *operands, dtype=None, **params):
-    """What the instructions make of the operands."""
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    machine = llvm.Target.from_default_triple().create_target_machine(opt=1, jit=True)
+    """What the instructions make of vectors."""
     kinds = [x.dtype for x in operands]
     dtype = np.dtype(dtype or kinds[-1])
-    module = compiled(Op(name, tuple(sorted(params.items()))), dtype, kinds)
-    module.verify()
-    engine = llvm.create_mcjit_compiler(module, machine)
-    engine.finalize_object()
-    out = np.zeros(LANES, dtype)
-    function = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * (1 + len(operands)))
-    given = [np.ascontiguousarray(x) for x in operands]
-    function(engine.get_function_address("f"))(*(x.ctypes.data for x in (*given, out)))
-    return out
+    op = Op(name, tuple(sorted(params.items())))
+    write = lambda text, names: OPERATIONS[name](text, op, dtype, kinds, names)  # noqa: E731
+    return call(engine(write, kinds, dtype, LANES), operands, np.zeros(LANES, dtype))
 
 
-def assert_bits(got, want):
+def assert_bits(got, want, told=""):
     """Equal numbers, equal signs of zeros, and NaN where NaN is."""
-    np.testing.assert_array_equal(got, want)
+    np.testing.assert_array_equal(got, want, err_msg=told)
     if got.dtype.kind == "f":
         number = ~np.isnan(want)
-        np.testing.assert_array_equal(np.signbit(got)[number], np.signbit(want)[number])
+        np.testing.assert_array_equal(np.signbit(got)[number], np.signbit(want)[number], told)
 
 
 def shifted(x, y, how):
@@ -81,7 +48,7 @@ def shifted(x, y, how):
     by, bits = y.view(np.uint32).astype(np.int64), x.view(np.uint32).astype(np.int64)
     inside = by < 32
     by = np.minimum(by, 31)
-    if how == "right":
+    if how == "right_arithmetic":
         return (x.astype(np.int64) >> by).astype(np.int32)
     moved = bits << by if how == "left" else bits >> by
     return np.where(inside, moved & 0xFFFFFFFF, 0).astype(np.uint32).view(x.dtype)
@@ -92,102 +59,74 @@ def nearest_away(x):
 
 
 FLOATS = {
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "div": np.divide,
-    "rem": np.fmod,
-    "neg": np.negative,
-    "abs": np.abs,
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "rem": np.fmod,
+    "neg": np.negative, "abs": np.abs, "floor": np.floor, "ceil": np.ceil, "sqrt": np.sqrt,
     "sign": lambda x: np.where(x == 0, x, np.sign(x)),  # XLA's keeps the sign of a zero
-    "floor": np.floor,
-    "ceil": np.ceil,
-    "sqrt": np.sqrt,
     "rsqrt": lambda x: np.float32(1) / np.sqrt(x),
-}
+}  # fmt: skip
 INTEGERS = {
-    "add": np.add,
-    "sub": np.subtract,
-    "mul": np.multiply,
-    "and": np.bitwise_and,
-    "or": np.bitwise_or,
-    "xor": np.bitwise_xor,
-    "max": np.maximum,
-    "min": np.minimum,
-    "neg": np.negative,
-    "abs": np.abs,
-    "not": np.invert,
-    "sign": np.sign,
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "and": np.bitwise_and,
+    "or": np.bitwise_or, "xor": np.bitwise_xor, "max": np.maximum, "min": np.minimum,
+    "neg": np.negative, "abs": np.abs, "not": np.invert, "sign": np.sign,
     "population_count": lambda x: [bin(n).count("1") for n in x.view(np.uint32).tolist()],
     "clz": lambda x: [32 - n.bit_length() for n in x.view(np.uint32).tolist()],
-}
+}  # fmt: skip
 COMPARISONS = {
-    "eq": np.equal,
-    "ne": np.not_equal,
-    "lt": np.less,
-    "le": np.less_equal,
-    "gt": np.greater,
+    "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater,
     "ge": np.greater_equal,
-}
+}  # fmt: skip
 
 
-@pytest.mark.parametrize("name", FLOATS)
-def test_floats(name):
-    operands = [X, Y][: FLOATS[name].nin if isinstance(FLOATS[name], np.ufunc) else 1]
-    with np.errstate(all="ignore"):
-        want = FLOATS[name](*operands)
-    assert_bits(run(name, *operands), want)
+def operands_of(function, *operands):
+    return operands[: function.nin if isinstance(function, np.ufunc) else 1]
 
 
-@pytest.mark.parametrize("name", ["max", "min"])
-def test_extremes_are_nan_where_either_is(name):
-    want = {"max": np.maximum, "min": np.minimum}[name](X, Y)
-    np.testing.assert_array_equal(run(name, X, Y), want)
-    np.testing.assert_array_equal(run(name, Y, X), want)
+def test_floats():
+    for name, function in FLOATS.items():
+        operands = operands_of(function, X, Y)
+        with np.errstate(all="ignore"):
+            want = function(*operands)
+        assert_bits(run(name, *operands), want, name)
+
+
+def test_extremes_are_nan_where_either_is():
+    for name, function in {"max": np.maximum, "min": np.minimum}.items():
+        np.testing.assert_array_equal(run(name, X, Y), function(X, Y))
+        np.testing.assert_array_equal(run(name, Y, X), function(X, Y))
 
 
 @pytest.mark.parametrize("kind", [np.int32, np.uint32])
-@pytest.mark.parametrize("name", INTEGERS)
-def test_integers(name, kind):
+def test_integers(kind):
     """Also the least, which has no negative of its own; unsigned ones are never negative."""
-    if (name, kind) == ("abs", np.uint32):
-        pytest.skip("JAX has none")
-    function = INTEGERS[name]
-    operands = [I.view(kind), J.view(kind)]
-    operands = operands[: function.nin if isinstance(function, np.ufunc) else 1]
-    with np.errstate(all="ignore"):
-        want = np.asarray(function(*operands), kind)
-    assert_bits(run(name, *operands), want)
+    for name, function in INTEGERS.items():
+        if (name, kind) == ("abs", np.uint32):
+            continue  # JAX has none
+        operands = operands_of(function, I.view(kind), J.view(kind))
+        with np.errstate(all="ignore"):
+            want = np.asarray(function(*operands), kind)
+        assert_bits(run(name, *operands), want, name)
 
 
-@pytest.mark.parametrize("operands", [(X, Y), (I, J), (U, V), (X, X)], ids=["f", "i", "u", "same"])
-@pytest.mark.parametrize("name", COMPARISONS)
-def test_comparisons(name, operands):
+def test_comparisons():
     """With NaN all are false, except that it is unequal."""
-    want = COMPARISONS[name](*operands)
-    assert_bits(run(name, *operands, dtype=bool), want)
-    assert want.any() or operands[0] is operands[1]
+    for name, function in COMPARISONS.items():
+        for operands in ((X, Y), (I, J), (U, V), (X, X)):
+            want = function(*operands)
+            assert_bits(run(name, *operands, dtype=bool), want, name)
+            assert want.any() or operands[0] is operands[1]
 
 
-@pytest.mark.parametrize("name", ["div", "rem"])
-def test_integers_are_divided_towards_zero(name):
+def test_integers_are_divided_towards_zero():
     """By zero, and where the quotient is no int32, XLA's results are in another test."""
     divides = (J != 0) & ~((I == -(2**31)) & (J == -1))
     quotient = np.trunc(I.astype(np.float64) / np.where(J == 0, 1, J)).astype(np.int64)
-    want = quotient if name == "div" else I - quotient * J
-    np.testing.assert_array_equal(run(name, I, J)[divides], want[divides])
+    for name, want in {"div": quotient, "rem": I - quotient * J}.items():
+        np.testing.assert_array_equal(run(name, I, J)[divides], want[divides])
 
 
-@pytest.mark.parametrize(
-    ("name", "how"),
-    [
-        ("shift_left", "left"),
-        ("shift_right_logical", "logical"),
-        ("shift_right_arithmetic", "right"),
-    ],
-)
-def test_shifts(name, how):
-    assert_bits(run(name, I, J), shifted(I, J, how))
+def test_shifts():
+    for name in ("left", "right_logical", "right_arithmetic"):
+        assert_bits(run(f"shift_{name}", I, J), shifted(I, J, name), name)
 
 
 def test_rounding_has_two_ways():
@@ -217,32 +156,26 @@ def test_bools():
     assert_bits(run("min", B, both), B & both)
 
 
-@pytest.mark.parametrize("after", [np.int32, np.uint32, np.int8])
-def test_a_float_out_of_range_becomes_the_nearest_integer(after):
-    limits = np.iinfo(after)
+def converted(x, after):
+    return run("convert_element_type", x, dtype=after, new_dtype=np.dtype(after))
+
+
+def test_a_float_out_of_range_becomes_the_nearest_integer():
     exact = np.nan_to_num(np.trunc(X.astype(np.float64)), nan=0.0)
-    want = np.clip(exact, limits.min, limits.max).astype(after)
-    assert_bits(run("convert_element_type", X, dtype=after, new_dtype=np.dtype(after)), want)
+    for after in (np.int32, np.uint32, np.int8):
+        limits = np.iinfo(after)
+        assert_bits(converted(X, after), np.clip(exact, limits.min, limits.max).astype(after))
 
 
-@pytest.mark.parametrize(
-    ("x", "after"),
-    [
-        (I, np.float32),
-        (U, np.float32),
-        (B, np.float32),
-        (B, np.int32),
-        (I, np.bool_),
-        (X, np.bool_),
-        (I, np.int8),
-        (X, np.float64),
-        (U, np.float64),
-    ],
-)
-def test_conversions(x, after):
-    assert_bits(
-        run("convert_element_type", x, dtype=after, new_dtype=np.dtype(after)), x.astype(after)
-    )
+def test_conversions():
+    for x, *kinds in (
+        (I, np.float32, np.bool_, np.int8),
+        (U, np.float32, np.float64),
+        (B, np.float32, np.int32),
+        (X, np.bool_, np.float64),
+    ):
+        for after in kinds:
+            assert_bits(converted(x, after), x.astype(after), f"{x.dtype} to {after}")
 
 
 def test_bits_stay():

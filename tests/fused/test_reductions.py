@@ -1,83 +1,66 @@
-"""Rules that combine the elements of an array, on constants: what JAX computes, bit by bit."""
+"""Rules that combine the elements of an array: what JAX computes, bit by bit."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from jax import lax
-from mapped import assert_folds, folded
+from mapped import BATCH, assert_all_same, folded
 
-X = np.array([[3, -1, 2, -1], [0.5, 4, 4, -7]], np.float32)
-NAN = np.array([1, np.nan, 3, -np.inf, np.nan, -0.0, 0.0], np.float32)
-
-
-@pytest.mark.parametrize("axis", [None, 0, 1])
-@pytest.mark.parametrize("reduce", [jnp.sum, jnp.prod, jnp.max, jnp.min])
-def test_reductions(reduce, axis):
-    assert_folds(lambda x: reduce(x, axis=axis), X)
-    assert_folds(lambda x: reduce(x, axis=axis), X.astype(np.int32))
+#: Whole numbers, so that no order of a sum rounds otherwise; some of a row are equal.
+X = np.random.default_rng(0).integers(-4, 5, (BATCH, 2, 4)).astype(np.float32)
+NAN, INFINITY = np.nan, np.inf
+ROW = np.float32([NAN, 1, INFINITY, -INFINITY, -NAN, -0.0, 0.0, -0.0, 0.0, 1, 2, 2])
+ROWS = np.stack([np.roll(ROW, shift) for shift in range(BATCH)])
 
 
-@pytest.mark.parametrize("reduce", [jnp.all, jnp.any, lambda x, axis: lax.reduce_xor(x, (axis,))])
-def test_reductions_of_bools(reduce):
-    assert_folds(lambda x: reduce(x, axis=1), X > 0)
+def of_each(function, values):
+    return {f"{function.__name__} {value}": (function, value) for value in values}
 
 
-@pytest.mark.parametrize("reduce", [jnp.sum, jnp.prod])
-def test_nothing_to_combine(reduce):
-    assert_folds(reduce, np.zeros((0,), np.float32))
+CASES = {
+    name: lambda x, row, reduce=reduce, axis=axis: (
+        reduce(x, axis=axis),
+        reduce(x.astype(jnp.int32), axis=axis),
+    )
+    for each in (jnp.sum, jnp.prod, jnp.max, jnp.min)
+    for name, (reduce, axis) in of_each(each, (None, 0, 1)).items()
+}
+CASES |= {
+    name: lambda x, row, cumulate=cumulate, reverse=reverse: [
+        cumulate(x, axis, reverse) for axis in (0, 1)
+    ]
+    for each in (lax.cumsum, lax.cumprod, lax.cummax, lax.cummin)
+    for name, (cumulate, reverse) in of_each(each, (False, True)).items()
+}
+CASES |= {
+    "all": lambda x, row: (x > 0).all(1),
+    "any": lambda x, row: (x > 3).any(),
+    "xor": lambda x, row: lax.reduce_xor(x > 0, (1,)),
+    "a sum of nothing": lambda x, row: x[:, :0].sum(),
+    "a product of nothing": lambda x, row: x[:, :0].prod(),
+    # The first of equal ones; the first NaN where there is one.
+    "argmax": lambda x, row: (jnp.argmax(x, 0), jnp.argmax(x.astype(int), 1), jnp.argmax(row)),
+    "argmin": lambda x, row: (jnp.argmin(x, 0), jnp.argmin(x.astype(int), 1), jnp.argmin(row)),
+    "sort": lambda x, row: (jnp.sort(x, 1), jnp.sort(x, 0)[::-1], jnp.sort(row)),
+    "a stable order": lambda x, row: jnp.argsort(x.ravel().astype(int)),
+    "an order by two keys": lambda x, row: lax.sort((x[0], x[1], jnp.arange(4.0)), num_keys=2),
+    # By their bits: 0 above -0, NaN above infinity; the first of equal ones is the first.
+    "the largest": lambda x, row: [lax.top_k(row, k) for k in (0, 1, 3, 11)],
+    "the largest of rows": lambda x, row: (lax.top_k(x, 3), lax.top_k(x.astype(int).ravel(), 8)),
+}
+
+
+def test_reductions_prefixes_and_orders():
+    assert_all_same(CASES, X, ROWS, rtol=0, atol=0)
 
 
 def test_a_sum_is_from_the_first_to_the_last():
-    parts = np.array([1e8, 1, -1e8, 1], np.float32)
-    (total,) = folded(jnp.sum, parts)
+    (total,) = folded(jnp.sum, np.float32([1e8, 1, -1e8, 1]))
     assert total == np.float32(np.float32(np.float32(1e8 + 1) - 1e8) + 1) == 1
 
 
-@pytest.mark.parametrize("reverse", [False, True])
-@pytest.mark.parametrize("cumulate", [lax.cumsum, lax.cumprod, lax.cummax, lax.cummin])
-def test_prefixes(cumulate, reverse):
-    for axis in (0, 1):
-        assert_folds(lambda x, axis=axis: cumulate(x, axis, reverse), X)
-
-
 def test_prefixes_of_logarithms():
-    assert_folds(lambda x: lax.cumlogsumexp(x), np.array([0, 1, -np.inf, 3], np.float32), rtol=1e-6)
-    equal = np.array([-np.inf, -np.inf, 2], np.float32)
-    assert_folds(lambda x: lax.cumlogsumexp(x), equal, rtol=1e-6)
-
-
-@pytest.mark.parametrize("extreme", [jnp.argmax, jnp.argmin])
-def test_where_the_extreme_is(extreme):
-    """The first of equal ones; the first NaN where there is one."""
-    for axis in (0, 1):
-        assert_folds(lambda x, axis=axis: extreme(x, axis), X)
-    assert_folds(extreme, NAN)
-    assert_folds(extreme, np.array([2, 5, 5, 1, 1], np.int32))
-
-
-def test_order():
-    assert_folds(jnp.sort, NAN)
-    assert_folds(lambda x: jnp.sort(x, axis=0), X)
-    assert_folds(jnp.argsort, np.array([2, 1, 2, 1, 0], np.int32))  # stable
-
-
-def test_order_by_two_keys_takes_the_rest_along():
-    first, second = np.array([1, 0, 1, 0], np.int32), np.array([3, 9, 2, 8], np.int32)
-    rest = np.arange(4, dtype=np.float32)
-    assert_folds(lambda *x: lax.sort(x, num_keys=2), first, second, rest)
-    assert [
-        x.tolist() for x in folded(lambda *x: lax.sort(x, num_keys=2), first, second, rest)
-    ] == [
-        [0, 0, 1, 1],
-        [8, 9, 2, 3],
-        [3, 1, 2, 0],
-    ]
-
-
-@pytest.mark.parametrize("k", [1, 3])
-def test_the_largest(k):
-    """Of equal ones the first, -0 below 0, and NaN above all."""
-    assert_folds(lambda x: jax.lax.top_k(x, k), X)
-    assert_folds(lambda x: jax.lax.top_k(x, k), np.array([-0.0, 0.0, -1, np.nan], np.float32))
-    assert_folds(lambda x: jax.lax.top_k(x, k), np.array([5, 7, 7, 2], np.int32))
+    """Of infinite and equal terms, and of NaN, too."""
+    inf = INFINITY
+    x = [[0, 1, -inf, 3], [-inf, -inf, 1, 2], [inf, inf, 1, 2], [inf, -inf, 1, 2], [NAN, 1, 2, 3]]
+    assert_all_same({"": jax.lax.cumlogsumexp}, np.float32(x))

@@ -9,6 +9,7 @@ from jax import lax
 
 from mjx_reinforce import fused
 from mjx_reinforce.fused import scalarized
+from mjx_reinforce.fused.nodes import Node
 from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
 from mjx_reinforce.fused.passes.verify import verify
 
@@ -21,95 +22,75 @@ def program(x):
     return gated + kept.sum(), (x > 1).astype(jnp.int32)
 
 
-def steps_of(written, kind):
-    return next(step for step in written.schedule if isinstance(step, kind))
+def first(written, kind):
+    """The first loop, gate or addition of a program."""
+    found = (x for x in written.schedule if isinstance(x, kind))
+    return next(x for x in found if kind is not Node or x.op.name == "add")
 
 
-def wrong_dtype(written):
-    node = next(x for x in written.schedule if getattr(x, "op", None) and x.op.name == "add")
-    node.args = (node.args[0], np.int32(1))
+def put(array, place, value):
+    array[place] = value
 
 
-def wrong_arity(written):
-    node = next(x for x in written.schedule if getattr(x, "op", None) and x.op.name == "add")
-    node.args = node.args[:1]
+def replace(written, kind, **parts):
+    step = first(written, kind)
+    put(written.schedule, written.schedule.index(step), dataclasses.replace(step, **parts))
 
 
-def use_before(written):
-    written.schedule.reverse()
+def change_carry(written):
+    carries = first(written, LiveLoop).carries
+    carries[0] = carries[0]._replace(next=np.int32(0))
 
 
-def lost(written):
-    written.schedule.remove(steps_of(written, LiveLoop))
+def change_operands(written, *operands):
+    node = first(written, Node)
+    node.args = (node.args[0], *operands)
 
 
-def out_of_scope(written):
-    gate = steps_of(written, LiveGate)
-    inner = gate.body[-1]
-    written.outputs[0][0] = inner
-
-
-def changed_carry(written):
-    loop = steps_of(written, LiveLoop)
-    loop.carries[0] = loop.carries[0]._replace(next=np.int32(0))
-
-
-def shared_carry(written):
-    carry = steps_of(written, LiveLoop).carries[0]
-    carry.leaf.varying = False
-
-
-def endless(written):
-    loop = steps_of(written, LiveLoop)
-    at = written.schedule.index(loop)
-    written.schedule[at] = dataclasses.replace(loop, length=None, active=None)
-
-
-def lost_record(written):
-    steps_of(written, LiveLoop).records[0].outs.pop()
-
-
-def no_predicate(written):
-    gate = steps_of(written, LiveGate)
-    at = written.schedule.index(gate)
-    written.schedule[at] = dataclasses.replace(gate, predicate=gate.outs[0].cold)
-
-
-def in_vain(written):
-    written.outputs[0][0] = np.float32(1)
-
-
-def wrong_result(written):
-    written.outputs[1][0] = np.float32(1)
-
-
-def too_few_results(written):
-    written.outputs[1].pop()
-
-
+ONE = np.float32(1)
+#: name -> (what breaks a program, what is said of it)
 FAULTS = {
-    wrong_dtype: r"add \(\d+\) takes .*float32.*int32.* to float32",
-    wrong_arity: r"add \(\d+\) takes",
-    use_before: r"is read where it is not known",
-    lost: r"a leaf \(\d+\) is read where it is not known",
-    out_of_scope: r"is read where it is not known",
-    changed_carry: r"a carry is float32 and also .*int32",
-    shared_carry: r"varies otherwise|does not vary",
-    endless: r"a loop never ends",
-    lost_record: r"a loop keeps too few records",
-    no_predicate: r"a gate's predicate is no bool",
-    in_vain: r"is computed and never read",
-    wrong_result: r"a result is int32 and also .*float32",
-    too_few_results: r"a result has too few scalars",
+    "wrong dtype": (
+        lambda x: change_operands(x, np.int32(1)),
+        r"add \(\d+\) takes .*float32.*int32.* to float32",
+    ),
+    "wrong arity": (change_operands, r"add \(\d+\) takes"),
+    "used before": (lambda x: x.schedule.reverse(), "is read where it is not known"),
+    "lost": (
+        lambda x: x.schedule.remove(first(x, LiveLoop)),
+        r"a leaf \(\d+\) is read where it is not known",
+    ),
+    "out of scope": (
+        lambda x: put(x.outputs[0], 0, first(x, LiveGate).body[-1]),
+        "is read where it is not known",
+    ),
+    "changed carry": (change_carry, r"a carry is float32 and also .*int32"),
+    "shared carry": (
+        lambda x: setattr(first(x, LiveLoop).carries[0].leaf, "varying", False),
+        "varies otherwise|does not vary",
+    ),
+    "endless": (lambda x: replace(x, LiveLoop, length=None, active=None), "a loop never ends"),
+    "lost record": (
+        lambda x: first(x, LiveLoop).records[0].outs.pop(),
+        "a loop keeps too few records",
+    ),
+    "no predicate": (
+        lambda x: replace(x, LiveGate, predicate=first(x, LiveGate).outs[0].cold),
+        "a gate's predicate is no bool",
+    ),
+    "in vain": (lambda x: put(x.outputs[0], 0, ONE), "is computed and never read"),
+    "wrong result": (lambda x: put(x.outputs[1], 0, ONE), r"a result is int32 and also .*float32"),
+    "too few results": (lambda x: x.outputs[1].pop(), "a result has too few scalars"),
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.__name__)
-def test_a_planted_fault_is_found(fault):
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_planted_fault_is_found(name):
+    fault, message = FAULTS[name]
     written = fused.scalarize(program, jnp.ones(2), branch_cost=1)
     verify(written)
     fault(written)
-    with pytest.raises(AssertionError, match=FAULTS[fault]):
+    with pytest.raises(AssertionError, match=message):
         verify(written)
 
 

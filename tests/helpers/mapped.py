@@ -20,12 +20,30 @@ def batch_of(*shape, seed=0, low=-2.0, high=2.0):
 
 
 def assert_same(fn, *args, in_axes: Any = 0, out_axes: Any = 0, rtol=2e-6, atol=2e-6):
-    expected = jax.vmap(fn, in_axes, out_axes)(*args)
+    """``fused.vmap`` and ``jax.vmap`` compute the same, which is returned."""
+    expected = jax.jit(jax.vmap(fn, in_axes, out_axes))(*args)
     actual = jax.jit(fused.vmap(fn, in_axes, out_axes))(*args)
     assert jax.tree.structure(actual) == jax.tree.structure(expected)
-    for x, y in zip(jax.tree.leaves(actual), jax.tree.leaves(expected), strict=True):
-        assert (x.shape, x.dtype) == (y.shape, y.dtype)
-        np.testing.assert_allclose(x, y, rtol=rtol, atol=atol)
+    named = jax.tree_util.tree_leaves_with_path(expected)
+    for x, (path, y) in zip(jax.tree.leaves(actual), named, strict=True):
+        assert (x.shape, x.dtype) == (y.shape, y.dtype), path
+        np.testing.assert_allclose(x, y, rtol=rtol, atol=atol, err_msg=str(path))
+    return expected
+
+
+def assert_all_same(functions, *args, rtol=2e-6, atol=2e-6):
+    """So do many functions in one program; of constants the rules make the same in NumPy."""
+
+    def together(*values):
+        return {name: fn(*values) for name, fn in functions.items()}
+
+    expected = assert_same(together, *args, rtol=rtol, atol=atol)
+    named = jax.tree_util.tree_leaves_with_path(expected)
+    for lane in range(len(args[0])):
+        results = folded(together, *(x[lane] for x in args))
+        for x, (path, y) in zip(results, named, strict=True):
+            assert (x.shape, x.dtype) == (y.shape[1:], y.dtype), path
+            np.testing.assert_allclose(x, y[lane], rtol=rtol, atol=atol, err_msg=str(path))
 
 
 def folded(fn, *args):
@@ -38,27 +56,24 @@ def folded(fn, *args):
     return results
 
 
-def assert_folds(fn, *args, rtol=0.0):
-    """The rules make of constants what JAX computes, in its shapes and dtypes."""
-    results, expected = folded(fn, *args), jax.tree.leaves(fn(*map(jnp.asarray, args)))
-    for x, y in zip(results, expected, strict=True):
-        assert (x.shape, x.dtype) == (y.shape, y.dtype)
-        np.testing.assert_allclose(x, y, rtol=rtol, atol=0)
-
-
 def count(fn, *examples):
     return sum(fused.scalarize(fn, *examples).operations.values())
 
 
-def primitives(jaxpr):
-    """Lists every primitive of a jaxpr, inner ones included."""
+def equations(jaxpr):
+    """Yields every equation of a jaxpr, inner ones included."""
     for eqn in jaxpr.eqns:
-        yield eqn.primitive.name
+        yield eqn
         for value in eqn.params.values():
             for inner in value if isinstance(value, (list, tuple)) else [value]:
                 inner = getattr(inner, "jaxpr", inner)
                 if hasattr(inner, "eqns"):
-                    yield from primitives(inner)
+                    yield from equations(inner)
+
+
+def primitives(fn, *args):
+    """Lists every primitive of a function, inner ones included."""
+    return [eqn.primitive.name for eqn in equations(jax.make_jaxpr(fn)(*args).jaxpr)]
 
 
 def collatz(n):
@@ -86,15 +101,3 @@ def line_search(x, length=50):
 
 def heavy(x):
     return lax.fori_loop(0, 30, lambda _, y: jnp.cos(y) * x, x)
-
-
-BRANCHES = [
-    lambda x: lax.cond(x > 0, jnp.sin, jnp.cos, x),
-    lambda x: lax.cond(x > 0, heavy, jnp.cos, x),
-    lambda x: lax.cond(x > 0, jnp.cos, heavy, x),
-    lambda x: lax.cond(x > 0, heavy, lambda y: heavy(2 * y), x),
-    lambda x: lax.switch((x + 2).astype(jnp.int32) - 1, [jnp.sin, heavy, jnp.cos, lambda y: y], x),
-    lambda x: lax.cond(x > 0, lambda: lax.cond(x > 1, heavy, jnp.sin, x), lambda: x),
-    lambda x: lax.cond(True, jnp.sin, jnp.cos, x),
-    lambda x: lax.fori_loop(0, 9, lambda i, y: lax.cond(y > 1, heavy, jnp.exp, y), x),
-]
