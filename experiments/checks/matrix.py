@@ -218,11 +218,11 @@ def compare(together: Sequence[Mechanism], native: bool = False) -> Iterator[Cel
             yield from compare(left, native)
         return
     each_start = zip(*(each.starts.values() for each in parts), strict=True)
-    starts = [tuple(map(np.concatenate, zip(*start, strict=True))) for start in each_start]
+    starts: Any = [tuple(map(np.concatenate, zip(*x, strict=True))) for x in each_start]
     if native:
         shown = by_machine_code(model, starts[0], motor.steps)
     else:
-        stacked = tuple(map(np.stack, zip(*starts, strict=True)))
+        stacked: Any = tuple(map(np.stack, zip(*starts, strict=True)))
         shown = by_us(model, stacked, motor.steps)
     for each in parts:
         sizes = []
