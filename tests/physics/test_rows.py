@@ -88,3 +88,37 @@ def test_a_disabled_constraint_has_no_row():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(rows, "by_engine", lambda *_, **__: pytest.fail("it makes rows"))
         assert jnp.size(jax_fields(rows.make_constraint(disabled, data)).efc_J) == 0
+
+
+HELD = """
+<mujoco><worldbody>
+  <body name="a" pos="0 0 1">
+    <freejoint/><geom size=".1"/><site name="a" pos=".1 .02 0" euler="20 0 0"/>
+  </body>
+  <body name="b" pos=".5 0 1">
+    <joint type="ball"/><geom size=".1"/><site name="b" pos="-.1 .02 .01"/>
+    <body name="c" pos=".3 0 0"><joint axis="0 1 0"/><geom size=".05"/></body>
+  </body>
+  <body name="hand" mocap="true" pos=".9 .3 1" euler="0 60 0"/>
+</worldbody><equality>
+  <weld site1="a" site2="b" torquescale=".4"/><connect body1="a" body2="c" anchor=".1 0 .02"/>
+  <weld body1="c" body2="hand" relpose=".1 0 0 1 0 0 0"/>
+</equality></mujoco>
+"""
+
+
+def test_connects_and_welds_ask_for_what_c_asks():
+    """With the change of the Jacobian, which MJX leaves out."""
+    model = mujoco.MjModel.from_xml_string(HELD)  # pyright: ignore
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)  # pyright: ignore
+    mujoco.mj_integratePos(model, data.qpos, rng.standard_normal(model.nv), 0.3)  # pyright: ignore
+    data.qvel[:] = 3 * rng.standard_normal(model.nv)
+    mujoco.mj_forward(model, data)  # pyright: ignore
+    with jax.enable_x64(True):
+        ours, start = mjx.put_model(model, impl="jax"), mjx.put_data(model, data, impl="jax")
+        found = jax.jit(lambda data: jax_fields(rows.make_constraint(ours, data)).efc_aref)(start)
+        plain = jax_fields(mjx.make_constraint(ours, start)).efc_aref
+    connect_first = [*range(6, 9), *range(6), *range(9, 15)]
+    theirs = data.efc_aref[connect_first]
+    np.testing.assert_allclose(found[:15], theirs, rtol=1e-10, atol=1e-10)
+    assert np.abs(found[:15] - plain[:15]).max() > 1
