@@ -38,7 +38,8 @@ def test_a_table_and_a_figure_of_all_tasks(tmp_path, capsys):
         score = [(1000 - i - 20) / (one - 20) for one in (950, 500)]
         assert row[1] == "20"
         assert float(row[2].split()[0]) == pytest.approx(np.mean(score), abs=1e-3)
-    assert [float(row[-1]) for row in rows[:2]] == [1, 1]
+    assert float(rows[0][-1]) == 1
+    assert float(rows[1][-1]) > 0.05
     assert float(rows[2][-1]) < 1e-6
     assert (tmp_path / "figure.png").read_bytes().startswith(b"\x89PNG")
 
