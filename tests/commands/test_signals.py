@@ -60,6 +60,7 @@ def ctrl_c_is_heard():
 def start(directory, *arguments, real=False, cache=None):
     command = ["-m", "mjx_reinforce.train"] if real else ["-c", TRAIN.format(here=str(HELPERS))]
     environment = dict(os.environ) | ({"JAX_COMPILATION_CACHE_DIR": str(cache)} if cache else {})
+    environment["PYTHONWARNINGS"] = "ignore:JAX 0.10.2"  # of the vmap engine on a CPU
     return subprocess.Popen(
         [sys.executable, *command, *map(str, arguments)],
         cwd=directory,
