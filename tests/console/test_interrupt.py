@@ -10,6 +10,7 @@ BEGUN = """
 import os, signal, sys, time
 from mjx_reinforce.console.interrupt import Interrupt
 
+signal.signal(signal.{name}, signal.SIG_DFL)  # whatever the shell of the tests does with it
 with Interrupt() as interrupt:
     interrupt.defer(lambda said: None)
     if {asked}:

@@ -292,8 +292,8 @@ def test_only_the_budget_may_change(run, parts, capsys, arguments, message):
         (lambda old: {"eval_every": None}, "eval_every is None: it is damaged, or of another"),
         (
             lambda old: {"engine": "kernel"},
-            "engine is 'kernel', not one of auto, vmap, fused, native: it is damaged, or of "
-            "another version of the program; resume with the version that wrote it",
+            "engine is 'kernel', not one of auto, vmap, native: it is damaged, or of another "
+            "version of the program; resume with the version that wrote it",
         ),
     ],
 )
