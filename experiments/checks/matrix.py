@@ -195,7 +195,7 @@ def programs(chosen: Sequence[Mechanism]) -> Iterator[list[Mechanism]]:
     for each in chosen:
         # Rows of friction lead to another solver, which flags do not change.
         other = "frictionloss" in each.xml and each.axis != "flags"
-        key = each.axis, each.option, other, len(each.starts)
+        key = each.axis, each.case, each.option, other
         groups.setdefault(key, []).append(each)
     for group in groups.values():
         size = len(group) if group[0].axis == "actuators" else BITS
@@ -206,7 +206,9 @@ def compare(together: Sequence[Mechanism], native: bool = False) -> Iterator[Cel
     """Yields the cells of mechanisms that one model has, from every start."""
     model = mujoco.MjModel.from_xml_string(MOTOR)
     rest = model.qpos0, np.zeros(model.nv), np.zeros(0), np.zeros(model.nu)
-    motor = Mechanism("", "", "", MOTOR, dict.fromkeys(together[0].starts, rest), together[0].steps)
+    motor = Mechanism(
+        "", "", "", MOTOR, lambda _: dict.fromkeys(together[0].starts, rest), together[0].steps
+    )
     parts = [motor, *together]
     try:
         model = load(parts)
