@@ -69,6 +69,7 @@ def test_every_public_function_has_types():
             assert inspect.Signature.empty not in [*typed, signature.return_annotation], name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name",
     [path.name for path in sorted(DOCS.glob("*.md")) if blocks(path.read_text("utf-8"), "python")],
@@ -81,6 +82,7 @@ def test_python_of_page_runs(name, tmp_path):
     subprocess.run(command, check=True, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [path.stem for path in sorted(DOCS.glob("notebooks/*.py"))])
 def test_notebook_runs(name, tmp_path):
     """As a program, from its first cell to its last; it draws its picture."""

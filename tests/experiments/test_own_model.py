@@ -25,6 +25,7 @@ ONE_JOINT = """
 """
 
 
+@pytest.mark.slow
 def test_the_script_learns():
     command = [sys.executable, "-W", "ignore", str(SCRIPT)]
     printed = subprocess.run(command, check=True, capture_output=True, text=True).stdout
