@@ -19,7 +19,7 @@ CHOSEN = [
     for each in ALL
     if each.axis in ("features", "actuators")
     or each.title[:2]
-    in (("geoms", ""), ("flags", "equality limit"), ("cones", 'cone="elliptic" impratio="5"'))
+    in (("geoms", ""), ("flags", "equality limit"), ("cones", 'cone="elliptic" impratio="1"'))
 ]
 PROGRAMS = {" ".join((*each[0].title, str(len(each)))): each for each in matrix.programs(CHOSEN)}
 #: Actuators at their clamps.
