@@ -19,25 +19,25 @@ if TYPE_CHECKING:
 silence_mjx()  # before any environment imports it
 
 _CART_POLE = "mjx_reinforce.envs.tasks.cart_pole:CartPole"
-_INVERTED_PENDULUM = "mjx_reinforce.envs.tasks.inverted_pendulum:InvertedPendulum"
+_INVERTED_PENDULUM = "mjx_reinforce.envs.tasks.pendulums:InvertedPendulum"
 
 #: id -> ("module:Class" or a callable, constructor arguments). One line a task.
 _TABLE: dict[str, tuple[str | Callable[..., Any], dict[str, Any]]] = {
     "InvertedPendulum-v5": (_INVERTED_PENDULUM, {}),
     "InvertedPendulum-v4": (_INVERTED_PENDULUM, {"reward_at_fall": 1.0}),
     "InvertedDoublePendulum-v5": (
-        "mjx_reinforce.envs.tasks.inverted_double_pendulum:InvertedDoublePendulum",
+        "mjx_reinforce.envs.tasks.pendulums:InvertedDoublePendulum",
         {},
     ),
-    "Reacher-v5": ("mjx_reinforce.envs.tasks.reacher:Reacher", {}),
-    "Pusher-v5": ("mjx_reinforce.envs.tasks.pusher:Pusher", {}),
-    "Swimmer-v5": ("mjx_reinforce.envs.tasks.swimmer:Swimmer", {}),
-    "HalfCheetah-v5": ("mjx_reinforce.envs.tasks.half_cheetah:HalfCheetah", {}),
-    "Hopper-v5": ("mjx_reinforce.envs.tasks.hopper:Hopper", {}),
-    "Walker2d-v5": ("mjx_reinforce.envs.tasks.walker2d:Walker2d", {}),
+    "Reacher-v5": ("mjx_reinforce.envs.tasks.arms:Reacher", {}),
+    "Pusher-v5": ("mjx_reinforce.envs.tasks.arms:Pusher", {}),
+    "Swimmer-v5": ("mjx_reinforce.envs.tasks.planar:Swimmer", {}),
+    "HalfCheetah-v5": ("mjx_reinforce.envs.tasks.planar:HalfCheetah", {}),
+    "Hopper-v5": ("mjx_reinforce.envs.tasks.planar:Hopper", {}),
+    "Walker2d-v5": ("mjx_reinforce.envs.tasks.planar:Walker2d", {}),
     "Ant-v5": ("mjx_reinforce.envs.tasks.ant:Ant", {}),
-    "Humanoid-v5": ("mjx_reinforce.envs.tasks.humanoid:Humanoid", {}),
-    "HumanoidStandup-v5": ("mjx_reinforce.envs.tasks.humanoid_standup:HumanoidStandup", {}),
+    "Humanoid-v5": ("mjx_reinforce.envs.tasks.humanoids:Humanoid", {}),
+    "HumanoidStandup-v5": ("mjx_reinforce.envs.tasks.humanoids:HumanoidStandup", {}),
     "CartPole-v1": (_CART_POLE, {}),
     "CartPole-v0": (_CART_POLE, {"max_episode_steps": 200, "reward_threshold": 195.0}),
     "ContinuousCartPole-v0": ("mjx_reinforce.envs.tasks.cart_pole:ContinuousCartPole", {}),

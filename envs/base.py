@@ -228,10 +228,6 @@ class MujocoEnv(Env):
         forward = functools.partial(self._evaluate, model)
         return forward, self._step_of(model, forward)
 
-    def _view(self, data: mjx.Data, episode: dict[str, jax.Array]) -> View:
-        """Returns a simulation as the task reads it."""
-        return View(data, self.mj_model, episode)
-
     def _forward_state(
         self, qpos: jax.Array, qvel: jax.Array, episode: dict[str, jax.Array]
     ) -> State:
@@ -240,7 +236,7 @@ class MujocoEnv(Env):
         # MJX normalises quaternions in qpos itself; MuJoCo does so when it steps.
         forward, _ = self._physics_of(episode)
         data = physics.like(forward(start).replace(qpos=qpos), start)
-        state, view = self._physics(data, episode), self._view(data, episode)
+        state, view = self._physics(data, episode), View(data, self.mj_model, episode)
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
         terms = self._checked_outcome(self._before(state, start), view, action)[2]
@@ -266,7 +262,7 @@ class MujocoEnv(Env):
         if self.contact_forces:
             fields = {k: v for k, v in before.episode.items() if k in models.RANDOM}
             data = mjx.rne_postconstraint(self.model.replace(**fields), data)
-        view = self._view(data, before.episode)
+        view = View(data, self.mj_model, before.episode)
         reward, terminated, terms = self._checked_outcome(self._before(before, start), view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
@@ -320,3 +316,39 @@ class MujocoEnv(Env):
     def backend(self) -> str:
         """The physics engine, for brax's interface."""
         return "mjx"
+
+
+class NearPose(MujocoEnv):
+    """A task that starts near its model's pose."""
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(MujocoEnv.Settings):
+        """Arguments of these tasks."""
+
+        max_episode_steps: int = 1000
+        reset_noise_scale: float
+        """Half the width of the start distribution where it is uniform, its standard deviation
+        where it is normal (m, rad, m/s, rad/s)."""
+
+        def __post_init__(self):
+            """Raises ValueError for a value that is out of its range."""
+            super().__post_init__()
+            if self.reset_noise_scale < 0:
+                raise ValueError(
+                    f"reset_noise_scale must be 0 or more, got {self.reset_noise_scale}"
+                )
+
+    settings: Settings
+    #: Whether the starting velocities are normal; otherwise they are uniform.
+    normal_velocity = False
+
+    def initial(self, rng):
+        """Draws qpos [nq] around the model's pose and qvel [nv] around rest."""
+        qpos_key, qvel_key = jax.random.split(rng)
+        model, noise = self.mj_model, self.settings.reset_noise_scale
+        qpos = jax.random.uniform(qpos_key, (model.nq,), minval=-noise, maxval=noise)
+        if self.normal_velocity:
+            qvel = noise * jax.random.normal(qvel_key, (model.nv,))
+        else:
+            qvel = jax.random.uniform(qvel_key, (model.nv,), minval=-noise, maxval=noise)
+        return jnp.asarray(model.qpos0, qpos.dtype) + qpos, qvel

@@ -5,14 +5,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
-from mujoco import (  # a C extension
-    MjData,  # pyright: ignore[reportAttributeAccessIssue]
-    mj_forward,  # pyright: ignore[reportAttributeAccessIssue]
-    mj_rnePostConstraint,  # pyright: ignore[reportAttributeAccessIssue]
-    mj_step,  # pyright: ignore[reportAttributeAccessIssue]
-    mjtWarning,  # pyright: ignore[reportAttributeAccessIssue]
-)
 
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
@@ -20,9 +14,11 @@ from mjx_reinforce.envs.parts import Named, View
 from mjx_reinforce.physics.mjx_internals import Simulation
 from mjx_reinforce.types import Environment, MjModel
 
+#: MuJoCo's own names; it is a C extension without stubs.
+_C: Any = mujoco
 _LEAVE_OUT = "leave --backend mujoco out"
 #: What C MuJoCo warns of where it begins again in the middle of an episode.
-_RESETS = (mjtWarning.mjWARN_BADQPOS, mjtWarning.mjWARN_BADQVEL, mjtWarning.mjWARN_BADQACC)
+_RESETS = (_C.mjtWarning.mjWARN_BADQPOS, _C.mjtWarning.mjWARN_BADQVEL, _C.mjtWarning.mjWARN_BADQACC)
 
 
 def was_reset(data: Any) -> bool:
@@ -79,7 +75,7 @@ class InMujoco:
             raise ValueError(
                 f"{own.__name__} has steps of its own, which MuJoCo does not know; {_LEAVE_OUT}"
             )
-        self.env, self.model, self.data = env, env.mj_model, MjData(env.mj_model)
+        self.env, self.model, self.data = env, env.mj_model, _C.MjData(env.mj_model)
         self._episode, _ = jax.eval_shape(env.draw, jax.random.key(0))
         self._sizes = Simulation(jax.eval_shape(lambda: models.make_data(env.mj_model)))
         recorder = _Recorder(self._sizes, env.mj_model)
@@ -100,9 +96,9 @@ class InMujoco:
         """Begins an episode and returns its first observation [O]; consumes the key."""
         self._episode, (qpos, qvel) = self._start(rng)
         self.model = _with_fields(self.env.mj_model, self._episode)
-        model, data = self.model, MjData(self.model)
+        model, data = self.model, _C.MjData(self.model)
         data.qpos[:], data.qvel[:] = qpos, qvel
-        mj_forward(model, data)
+        _C.mj_forward(model, data)
         self.data = data
         return np.asarray(self._observe(self._fields(), self._episode))
 
@@ -116,9 +112,9 @@ class InMujoco:
         """
         before = self._kept()
         self.data.ctrl[:] = action
-        mj_step(self.model, self.data, self.env.frame_skip)
+        _C.mj_step(self.model, self.data, self.env.frame_skip)
         if self.env.contact_forces:
-            mj_rnePostConstraint(self.model, self.data)
+            _C.mj_rnePostConstraint(self.model, self.data)
         given = before, self._fields(), self._episode, np.asarray(action)
         observation, reward, ended = self._advance(*given)
         reward = np.nan if was_reset(self.data) else float(reward)

@@ -1,7 +1,4 @@
-"""What the locomotion tasks share: how they start, what moving earns, what actions cost.
-
-Walkers are paid for health, and persons pay for contacts, too.
-"""
+"""What the locomotion tasks share: what moving and health earn, and what actions cost."""
 
 import abc
 import dataclasses
@@ -10,54 +7,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.envs.base import MujocoEnv
-from mjx_reinforce.envs.settings import Interval, check_range
+from mjx_reinforce.envs.base import NearPose
+from mjx_reinforce.envs.settings import Interval
 from mjx_reinforce.physics.mjx_internals import Simulation
 
 
-class Body(MujocoEnv):
+class Body(NearPose):
     """A body that starts near its model's pose and pays for its actions."""
 
     @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Settings(MujocoEnv.Settings):
+    class Settings(NearPose.Settings):
         """Arguments of every locomotion task."""
 
-        max_episode_steps: int = 1000
         reward_threshold: float | None = None
         ctrl_cost_weight: float
         """What one unit of squared action costs."""
-        reset_noise_scale: float
-        """Half the width of the start distribution where it is uniform, its standard deviation
-        where it is normal (m, rad, m/s, rad/s)."""
         exclude_current_positions_from_observation: bool = True
         """Whether to leave x, and y where the body can move along it, out of the observation."""
-
-        def __post_init__(self):
-            """Raises ValueError for a value that is out of its range."""
-            super().__post_init__()
-            if self.reset_noise_scale < 0:
-                raise ValueError(
-                    f"reset_noise_scale must be 0 or more, got {self.reset_noise_scale}"
-                )
 
     settings: Settings
     #: How many entries of qpos say where in the world the body is: x, or x and y. They come first.
     num_places = 2
-    #: Whether the starting velocities are normal; otherwise they are uniform.
-    normal_velocity = False
     #: The observation clips velocities to this (m/s, rad/s).
     max_velocity = np.inf
-
-    def initial(self, rng):
-        """Draws qpos [nq] around the model's pose and qvel [nv] around rest."""
-        qpos_key, qvel_key = jax.random.split(rng)
-        model, noise = self.mj_model, self.settings.reset_noise_scale
-        qpos = jax.random.uniform(qpos_key, (model.nq,), minval=-noise, maxval=noise)
-        if self.normal_velocity:
-            qvel = noise * jax.random.normal(qvel_key, (model.nv,))
-        else:
-            qvel = jax.random.uniform(qvel_key, (model.nv,), minval=-noise, maxval=noise)
-        return jnp.asarray(model.qpos0, qpos.dtype) + qpos, qvel
 
     def observe(self, data):
         """Returns qpos, without the place in the world if that is excluded, and qvel."""
@@ -123,11 +95,6 @@ class Healthy(Runner):
         healthy_z_range: Interval
         """Heights of a healthy torso (m), bounds excluded."""
 
-        def __post_init__(self):
-            """Raises ValueError for a value that is out of its range."""
-            super().__post_init__()
-            check_range("healthy_z_range", self.healthy_z_range)
-
     settings: Settings
 
     @abc.abstractmethod
@@ -143,84 +110,7 @@ class Healthy(Runner):
         return ~self.is_healthy(data) & self.settings.terminate_when_unhealthy
 
 
-class PlanarWalker(Healthy):
-    """A body in the x, z plane that must stay up and upright."""
-
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Settings(Healthy.Settings):
-        """Arguments of the planar walkers."""
-
-        healthy_angle_range: Interval
-        """Angles of a healthy torso (rad), bounds excluded."""
-
-        def __post_init__(self):
-            """Raises ValueError for a value that is out of its range."""
-            super().__post_init__()
-            check_range("healthy_angle_range", self.healthy_angle_range)
-
-    settings: Settings
-    num_places = 1
-    max_velocity = 10.0
-
-    def is_healthy(self, data):
-        """Returns whether height and angle are within their ranges."""
-        z, angle = data.qpos[1], data.qpos[2]
-        ranges = self.settings
-        return within(z, ranges.healthy_z_range) & within(angle, ranges.healthy_angle_range)
-
-    def outcome(self, before, data, action):
-        """Adds how far above its starting pose the torso is (m)."""
-        reward, terminated, terms = super().outcome(before, data, action)
-        height = data.qpos[1] - self.mj_model.qpos0[1]
-        return reward, terminated, terms | {"z_distance_from_origin": height}
-
-
 def within(x: jax.Array, bounds: Interval) -> jax.Array:
     """Returns whether x lies strictly between two bounds; NaN does not."""
     low, high = bounds
     return (low < x) & (x < high)
-
-
-class Person(Body):
-    """A person with the model of Gymnasium's humanoids."""
-
-    @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Settings(Body.Settings):
-        """Arguments of both tasks."""
-
-        frame_skip: int = 5
-        ctrl_cost_weight: float = 0.1
-        reset_noise_scale: float = 1e-2
-        include_cinert_in_observation: bool = True
-        """Whether to observe inertias and masses."""
-        include_cvel_in_observation: bool = True
-        """Whether to observe the bodies' velocities."""
-        include_qfrc_actuator_in_observation: bool = True
-        """Whether to observe the motors' torques."""
-        include_cfrc_ext_in_observation: bool = True
-        """Whether to observe the contact forces."""
-
-    settings: Settings
-    contact_forces = True
-
-    def contact_cost(self, data: Simulation, weight: float, bounds: Interval) -> jax.Array:
-        """Returns what the contacts cost [].
-
-        Args:
-          data: the simulation after the env step.
-          weight: what one unit of squared contact force costs.
-          bounds: the least and the greatest cost.
-        """
-        return jnp.clip(weight * jnp.sum(jnp.square(data.cfrc_ext)), *bounds)
-
-    def observe(self, data):
-        """Returns positions, velocities and, unless left out, inertias, motions and forces."""
-        chosen = self.settings
-        parts = [
-            (True, super().observe(data)),
-            (chosen.include_cinert_in_observation, data.cinert[1:]),
-            (chosen.include_cvel_in_observation, data.cvel[1:]),
-            (chosen.include_qfrc_actuator_in_observation, data.qfrc_actuator[6:]),
-            (chosen.include_cfrc_ext_in_observation, data.cfrc_ext[1:]),
-        ]
-        return jnp.concatenate([part.ravel() for included, part in parts if included])

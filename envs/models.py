@@ -8,23 +8,16 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import jax
+import mujoco
 import numpy as np
-from mujoco import (  # a C extension
-    MjModel,  # pyright: ignore[reportAttributeAccessIssue]
-    MjSpec,  # pyright: ignore[reportAttributeAccessIssue]
-    mjtDisableBit,  # pyright: ignore[reportAttributeAccessIssue]
-    mjtEnableBit,  # pyright: ignore[reportAttributeAccessIssue]
-    mjtEq,  # pyright: ignore[reportAttributeAccessIssue]
-    mjtIntegrator,  # pyright: ignore[reportAttributeAccessIssue]
-    mjtJoint,  # pyright: ignore[reportAttributeAccessIssue]
-    mjtSensor,  # pyright: ignore[reportAttributeAccessIssue]
-    mjx,
-)
+from mujoco import MjModel, MjSpec, mjx  # pyright: ignore[reportAttributeAccessIssue]
 
 from mjx_reinforce.checks import explain
 from mjx_reinforce.physics.contacts import UNLIKE_C
 from mjx_reinforce.physics.mjx_internals import geom_pairs
 
+#: MuJoCo's own names; it is a C extension without stubs.
+_C: Any = mujoco
 #: Everything that MuJoCo carries from a step to the next, by its names in mjData; mjdata.h lists it
 #: as mjtState. Here is what an env step hands to the next.
 CARRIED = ("time", "qpos", "qvel", "act", "qacc_warmstart")
@@ -44,10 +37,10 @@ NOT_CARRIED = {
     "plastic": ("nplastic", "plastic springs", "remove springyield"),
 }
 _OFF = (
-    *(mjtDisableBit.mjDSBL_CONSTRAINT, mjtDisableBit.mjDSBL_CONTACT),
-    mjtDisableBit.mjDSBL_EQUALITY,
+    *(_C.mjtDisableBit.mjDSBL_CONSTRAINT, _C.mjtDisableBit.mjDSBL_CONTACT),
+    _C.mjtDisableBit.mjDSBL_EQUALITY,
 )
-_HOLDS = (int(mjtEq.mjEQ_CONNECT), int(mjtEq.mjEQ_WELD))
+_HOLDS = (int(_C.mjtEq.mjEQ_CONNECT), int(_C.mjtEq.mjEQ_WELD))
 _WITHIN_MARGIN = "give it a margin of at most half of its range"
 _ON_JOINT = "give it to the joint, times the square of gear"
 _ONE_NUMBER = "give one number"
@@ -95,7 +88,7 @@ _REMEDIES = {
     "Flex": "remove the flexible body",
 }
 #: What MJX refuses and no step depends on: the energy, and a check of the inverse dynamics.
-_ONLY_REPORTS = int(mjtEnableBit.mjENBL_ENERGY | mjtEnableBit.mjENBL_FWDINV)
+_ONLY_REPORTS = int(_C.mjtEnableBit.mjENBL_ENERGY | _C.mjtEnableBit.mjENBL_FWDINV)
 _ELSE = "remove it; MuJoCo's documentation lists what MJX supports under 'MJX, feature parity'"
 #: What MuJoCo calls a model without a name.
 _NAMELESS = "MuJoCo Model"
@@ -197,7 +190,7 @@ def to_mjx(model: MjModel, xml_file: ModelSource) -> mjx.Model:
     """
     for feature, remedy in _ignored(model):
         raise ValueError(f"MJX cannot run {_name(xml_file)}: MJX would ignore {feature}; {remedy}")
-    if mjtSensor.mjSENS_RANGEFINDER in model.sensor_type and not model.nmat:
+    if _C.mjtSensor.mjSENS_RANGEFINDER in model.sensor_type and not model.nmat:
         raise ValueError(
             f"MJX cannot run {_name(xml_file)}: its rangefinders work only in a model that has a "
             'material, a bug of MJX; add <asset><material name="any"/></asset>'
@@ -226,7 +219,7 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
     for field, feature, remedy in (*NOT_CARRIED.values(), *_IGNORED):
         if np.any(getattr(model, field)):
             yield feature, remedy
-    scalar = model.jnt_type != mjtJoint.mjJNT_BALL
+    scalar = model.jnt_type != _C.mjtJoint.mjJNT_BALL
     for kind, limited, ends, margin in (
         ("joint", model.jnt_limited & scalar, model.jnt_range, model.jnt_margin),
         ("tendon", model.tendon_limited, model.tendon_range, model.tendon_margin),
@@ -240,15 +233,15 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
             yield "MuJoCo's default in place of a solref of mixed signs", _ONE_SIGN
         if np.any((low > high) | ((width < _NO_WIDTH) & (low != high))):
             yield "the first number of a solimp that does not rise", _RISING
-    if model.opt.enableflags & mjtEnableBit.mjENBL_SLEEP:
+    if model.opt.enableflags & _C.mjtEnableBit.mjENBL_SLEEP:
         yield "sleeping bodies", 'remove <flag sleep="enable"/>'
     if model.opt.disableactuator:
         yield "disabled groups of actuators", "remove actuatorgroupdisable, or those actuators"
     for flag, values in (("spring", "stiffness"), ("damper", "damping")):
-        if model.opt.disableflags & getattr(mjtDisableBit, f"mjDSBL_{flag.upper()}"):
+        if model.opt.disableflags & getattr(_C.mjtDisableBit, f"mjDSBL_{flag.upper()}"):
             yield f'parts of <flag {flag}="disable"/>', f"remove it, and give no {values}"
     for flag in ("nativeccd", "multiccd"):
-        if model.opt.disableflags & getattr(mjtDisableBit, f"mjDSBL_{flag.upper()}"):
+        if model.opt.disableflags & getattr(_C.mjtDisableBit, f"mjDSBL_{flag.upper()}"):
             yield f'<flag {flag}="disable"/>', "remove it"
     # MJX adds up the forces on a body of rows that are not there.
     off = [bool(model.opt.disableflags & bit) for bit in _OFF]
@@ -256,5 +249,5 @@ def _ignored(model: MjModel) -> Iterator[tuple[str, str]]:
         yield '<flag constraint="disable"/> for contacts', 'add contact="disable" to it'
     if (off[0] or off[2]) and np.isin(model.eq_type, _HOLDS).any():
         yield '<flag equality="disable"/> for a connect or a weld', 'give it active="false"'
-    if model.opt.integrator == mjtIntegrator.mjINT_DISCRETE:
+    if model.opt.integrator == _C.mjtIntegrator.mjINT_DISCRETE:
         yield "the integrator INT_DISCRETE", _REMEDIES["INT_IMPLICIT"]

@@ -8,28 +8,20 @@ from mjx_reinforce.physics.mjx_internals import Simulation
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import MjModel
 
-#: Kind -> what comes before the name of a field of mjData, such as in ``site_xpos``.
-_PREFIXES = {
-    "body": "",
-    "geom": "geom_",
-    "site": "site_",
-    "camera": "cam_",
-    "tendon": "ten_",
-    "actuator": "actuator_",
+#: Kind -> how many of it a model has, and what comes before the name of a field of mjData, such as
+#: in ``site_xpos``; the fields of joints and sensors are found in other ways.
+_KINDS = {
+    "body": ("nbody", ""),
+    "geom": ("ngeom", "geom_"),
+    "site": ("nsite", "site_"),
+    "camera": ("ncam", "cam_"),
+    "tendon": ("ntendon", "ten_"),
+    "actuator": ("nu", "actuator_"),
+    "joint": ("njnt", ""),
+    "sensor": ("nsensor", "sensor"),
 }
 #: Fields of mjData with a row for each joint; others that a joint has are those of its dofs.
 _OF_JOINTS = ("xanchor", "xaxis")
-#: Kind -> how many of it a model has.
-_SIZES = {
-    "body": "nbody",
-    "geom": "ngeom",
-    "site": "nsite",
-    "camera": "ncam",
-    "tendon": "ntendon",
-    "actuator": "nu",
-    "joint": "njnt",
-    "sensor": "nsensor",
-}
 
 
 class Part:
@@ -37,19 +29,20 @@ class Part:
 
     def __init__(self, data: Any, model: MjModel, kind: str, name: str):
         """Finds the part; raises ValueError for a name that the model has not."""
-        names = [getattr(model, kind)(i).name for i in range(getattr(model, _SIZES[kind]))]
+        size, self._prefix = _KINDS[kind]
+        names = [getattr(model, kind)(i).name for i in range(getattr(model, size))]
         check_name(kind, name, dict.fromkeys(filter(None, names)))
         self._data, self._model, self._kind, self.id = data, model, kind, names.index(name)
 
     def __getattr__(self, field: str) -> jax.Array:
         data, model = self._data, self._model
-        if self._kind == "sensor":
-            start, size = int(model.sensor_adr[self.id]), int(model.sensor_dim[self.id])
-            return getattr(data, f"sensor{field}")[start : start + size]
         if self._kind == "joint" and field not in _OF_JOINTS:
             return getattr(data, field)[self._rows(field)]
-        plain = self._kind == "joint" or field == "ctrl"
-        return getattr(data, field if plain else f"{_PREFIXES[self._kind]}{field}")[self.id]
+        rows = getattr(data, field if field == "ctrl" else f"{self._prefix}{field}")
+        if self._kind == "sensor":
+            start, size = int(model.sensor_adr[self.id]), int(model.sensor_dim[self.id])
+            return rows[start : start + size]
+        return rows[self.id]
 
     def _rows(self, field: str) -> slice:
         """Returns the rows of a joint in ``qpos``, or in a field of the degrees of freedom."""

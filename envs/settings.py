@@ -12,6 +12,7 @@ from typing import Any
 from mjx_reinforce.checks import check_type, is_nan, read_as, spoken_kind
 from mjx_reinforce.registry import check_name
 
+#: A range (low, high), of which ``EpisodeSettings`` checks that it contains something.
 Interval = tuple[float, float]
 
 
@@ -27,6 +28,14 @@ class EpisodeSettings:
     def __post_init__(self):
         """Raises ValueError for a value that is out of its range."""
         check_positive("max_episode_steps", self.max_episode_steps)
+        for field in dataclasses.fields(self):
+            # The same object: other pairs of numbers may be of any order.
+            if field.type is Interval:
+                low, high = bounds = getattr(self, field.name)
+                if not low < high:
+                    raise ValueError(
+                        f"{field.name} must be (low, high) with low < high, got {bounds}"
+                    )
 
 
 def build_settings(env: Any, arguments: dict[str, Any]) -> Any:
@@ -119,10 +128,3 @@ def check_positive(name: str, value: int) -> None:
     """Raises ValueError for a number below 1."""
     if value < 1:
         raise ValueError(f"{name} must be 1 or more, got {value}")
-
-
-def check_range(name: str, bounds: Interval) -> None:
-    """Raises ValueError for a range that contains nothing."""
-    low, high = bounds
-    if not low < high:
-        raise ValueError(f"{name} must be (low, high) with low < high, got {bounds}")

@@ -23,13 +23,14 @@ from mjx_reinforce.learners.schedules import Cut
 from mjx_reinforce.learners.updates import each_step, full_batch, make_optimizer, minibatches
 from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
 from mjx_reinforce.policies.actor import Actor, act
+from mjx_reinforce.policies.distributions.bounded import (
+    clipped_normal,
+    tanh_normal,
+    truncated_normal,
+)
 from mjx_reinforce.policies.distributions.categorical import categorical
-from mjx_reinforce.policies.distributions.clipped_normal import clipped_normal
-from mjx_reinforce.policies.distributions.deterministic import deterministic
 from mjx_reinforce.policies.distributions.distribution import Distribution
-from mjx_reinforce.policies.distributions.normal import normal
-from mjx_reinforce.policies.distributions.tanh_normal import tanh_normal
-from mjx_reinforce.policies.distributions.truncated_normal import truncated_normal
+from mjx_reinforce.policies.distributions.gaussian import deterministic, normal
 from mjx_reinforce.policies.policy import Policy, mlp_policy
 from mjx_reinforce.reports.statistics import iqm, iqm_interval, mean_interval
 from mjx_reinforce.reports.statistics.comparisons import (

@@ -12,13 +12,13 @@ from mjx_reinforce.checks import explain
 
 #: Action distributions: name -> "module:function" of an action space.
 DISTRIBUTIONS = {
-    "normal": "mjx_reinforce.policies.distributions.normal:normal",
-    "normal-softplus": "mjx_reinforce.policies.distributions.normal:normal_softplus",
-    "normal-sigmoid": "mjx_reinforce.policies.distributions.normal:normal_sigmoid",
-    "truncated-normal": "mjx_reinforce.policies.distributions.truncated_normal:truncated_normal",
-    "clipped-normal": "mjx_reinforce.policies.distributions.clipped_normal:clipped_normal",
-    "tanh-normal": "mjx_reinforce.policies.distributions.tanh_normal:tanh_normal",
-    "deterministic": "mjx_reinforce.policies.distributions.deterministic:deterministic",
+    "normal": "mjx_reinforce.policies.distributions.gaussian:normal",
+    "normal-softplus": "mjx_reinforce.policies.distributions.gaussian:normal_softplus",
+    "normal-sigmoid": "mjx_reinforce.policies.distributions.gaussian:normal_sigmoid",
+    "truncated-normal": "mjx_reinforce.policies.distributions.bounded:truncated_normal",
+    "clipped-normal": "mjx_reinforce.policies.distributions.bounded:clipped_normal",
+    "tanh-normal": "mjx_reinforce.policies.distributions.bounded:tanh_normal",
+    "deterministic": "mjx_reinforce.policies.distributions.gaussian:deterministic",
     "categorical": "mjx_reinforce.policies.distributions.categorical:categorical",
 }
 

@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 
 from mjx_reinforce.envs.locomotion import Healthy
-from mjx_reinforce.envs.settings import Interval, check_range
+from mjx_reinforce.envs.settings import Interval
 
 
 class Ant(Healthy):
@@ -44,11 +44,6 @@ class Ant(Healthy):
         reset_noise_scale: float = 0.1
         include_cfrc_ext_in_observation: bool = True
         """Whether to observe the contact forces."""
-
-        def __post_init__(self):
-            """Raises ValueError for a value that is out of its range."""
-            super().__post_init__()
-            check_range("contact_force_range", self.contact_force_range)
 
     settings: Settings
     normal_velocity = True

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from mjx_reinforce.policies.networks import MLP
+from mjx_reinforce.policies.policy import MLP
 
 #: Units of one iteration. Their activations do not wait for each other, and the sums of the next
 #: layer stay in registers from one to the next.

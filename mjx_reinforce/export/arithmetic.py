@@ -7,7 +7,7 @@ import numpy as np
 
 from mjx_reinforce.export.policy_files import SavedPolicy, saved_action_space
 from mjx_reinforce.policies import normalize
-from mjx_reinforce.policies.distributions.action_range import middle_and_half_range
+from mjx_reinforce.policies.distributions.distribution import middle_and_half_range
 from mjx_reinforce.policies.distributions.gaussian import gaussian_outputs
 from mjx_reinforce.registry import check_name
 from mjx_reinforce.types import Discrete

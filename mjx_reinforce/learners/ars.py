@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.typing import ArrayLike
 from optax import Params
 
 from mjx_reinforce.checks import check_type
@@ -25,37 +26,22 @@ from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.engines.rollouts import episode_returns
-from mjx_reinforce.learners import counts
-from mjx_reinforce.learners.ars_increments import (
-    check_linear,
-    document_increment,
-    overwrite_bias,
-    paper_increment,
-)
-from mjx_reinforce.learners.diagnostics import nan_unless, signal_to_noise
+from mjx_reinforce.learners import contract, diagnostics
 from mjx_reinforce.learners.estimators import replace_broken
 from mjx_reinforce.learners.learner import (
     Learner,
     Metrics,
     TrainState,
-    check_horizon,
     episode_metrics,
     keep_finite,
 )
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.arguments import check_count, check_key, check_number
-from mjx_reinforce.policies.contract import check_policy
 from mjx_reinforce.policies.distributions.categorical import categorical
-from mjx_reinforce.policies.distributions.deterministic import deterministic
+from mjx_reinforce.policies.distributions.gaussian import deterministic
 from mjx_reinforce.policies.policy import Policy, mlp_policy
-from mjx_reinforce.types import (
-    Discrete,
-    Environment,
-    Trajectory,
-    action_space,
-    observation_size,
-)
+from mjx_reinforce.types import Discrete, Environment, Trajectory, action_space, observation_size
 
 
 def ars(
@@ -108,34 +94,8 @@ def ars(
       >>> metrics["episodes"].item()  # two a direction
       4
     """
-    check_environment(env)
-    horizon = check_horizon(env, horizon)
-    check_count("num_directions", num_directions)
-    check_type("top_directions", top_directions, int | None)
-    check_type("shared_starts", shared_starts, bool)
-    check_number("normalize_steps", normalize_steps, finite=False)
-    check_number("normalize_min_std", normalize_min_std)
-    top = num_directions if top_directions is None else top_directions
-    _check_numbers(num_directions, top, step_size, noise_std, update)
-    size = observation_size(env)
-    if policy is not None:
-        check_policy(policy, env, size)
-    search = _RandomSearch(
-        env=env,
-        policy=policy or _zero_policy(env, size),
-        engine=choice.choose(engine, env),
-        num_directions=num_directions,
-        top_directions=top,
-        step_size=step_size,
-        noise_std=noise_std,
-        horizon=horizon,
-        normalize_steps=normalize_steps,
-        normalize_min_std=normalize_min_std,
-        shared_starts=shared_starts,
-        update=update,
-        observation_size=size,
-    )
-    return Learner(search.init, search.play, search.learn, search.policy, search.engine)
+    search = _RandomSearch(**locals())
+    return Learner(search.init, search.play, search.learn, search.policy, search.plays)
 
 
 class Trial(NamedTuple):
@@ -149,13 +109,12 @@ class Trial(NamedTuple):
     trajectory: Trajectory
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+@dataclasses.dataclass(kw_only=True, eq=False)
 class _RandomSearch:
-    """The arguments of ``ars``, and what it does with them; ``observation_size`` is O."""
+    """The arguments of ``ars``, checked and completed, and what it does with them."""
 
     env: Environment
     policy: Policy
-    engine: Engine
     num_directions: int
     top_directions: int
     step_size: float | jax.Array
@@ -165,25 +124,45 @@ class _RandomSearch:
     normalize_min_std: float | jax.Array
     shared_starts: bool
     update: str
-    observation_size: int
+    engine: str
+    observation_size: int = dataclasses.field(init=False)
+    plays: Engine = dataclasses.field(init=False)
 
     def __post_init__(self):
+        check_environment(self.env)
+        self.horizon = contract.check_horizon(self.env, self.horizon)
+        check_count("num_directions", self.num_directions)
+        check_type("top_directions", self.top_directions, int | None)
+        check_type("shared_starts", self.shared_starts, bool)
+        check_number("normalize_steps", self.normalize_steps, finite=False)
+        check_number("normalize_min_std", self.normalize_min_std)
+        if self.top_directions is None:
+            self.top_directions = self.num_directions
+        if not 1 <= self.top_directions <= self.num_directions:
+            raise ValueError(
+                f"top_directions must lie in [1, {self.num_directions}], got {self.top_directions}"
+            )
+        check_number("step_size", self.step_size, positive=True)
+        check_number("noise_std", self.noise_std, positive=True)
+        if self.update not in ("paper", "document"):
+            raise ValueError(f"update must be 'paper' or 'document', got {self.update!r}")
+        if self.update == "document" and self.top_directions != self.num_directions:
+            raise ValueError("update='document' uses all directions: leave top_directions out")
+        self.observation_size = observation_size(self.env)
+        if self.policy is None:
+            self.policy = _zero_policy(self.env, self.observation_size)
+        else:
+            contract.check_policy(self.policy, self.env, self.observation_size)
         if self.update == "document":
-            check_linear(self.policy)
+            _check_linear(self.policy)
+        self.plays = choice.choose(self.engine, self.env)
 
     def init(self, key: jax.Array) -> TrainState:
         check_key(key)
         policy_key, key = jax.random.split(key)
         normalizer = normalize.init(self.observation_size)
-        return TrainState(
-            key=key,
-            num_updates=counts.zero(),
-            env_steps=counts.zero(),
-            progress=jnp.zeros(()),
-            actor=Actor(params=self.policy.init(policy_key), normalizer=normalizer),
-            opt_state=(),
-            estimator_state=(),
-        )
+        actor = Actor(params=self.policy.init(policy_key), normalizer=normalizer)
+        return TrainState(key=key, actor=actor)
 
     def play(self, state: TrainState, key: jax.Array, active: bool | jax.Array = True) -> Trial:
         directions_key, episodes_key = jax.random.split(key)
@@ -193,7 +172,7 @@ class _RandomSearch:
         params = self._perturb(state.actor.params, directions)
 
         def one_way(params, key):
-            return self.engine.rollout(
+            return self.plays.rollout(
                 self.env,
                 self._act_each,
                 Actor(params=params, normalizer=state.actor.normalizer),
@@ -217,24 +196,20 @@ class _RandomSearch:
         else:
             increment = document_increment(trial.directions, returns, self.noise_std)
         moved = jax.tree.map(lambda p, d: p + self.step_size * d, actor.params, increment)
-        normalizer = normalize.update(
-            actor.normalizer,
-            trajectory.observation,
-            trajectory.mask & ~trajectory.nonfinite,
-            self.normalize_steps,
-            self.normalize_min_std,
-        )
+        counted = trajectory.mask & ~trajectory.nonfinite
+        limits = self.normalize_steps, self.normalize_min_std
+        normalizer = normalize.update(actor.normalizer, trajectory.observation, counted, *limits)
         learned = Actor(params=self._tie(moved), normalizer=normalizer)
         actor, skipped = keep_finite(learned, actor)
-        diagnostics = {
+        measured = {
             "entropy": jnp.zeros(()),
             "gradient_norm": optax.tree.norm(increment),
             "return_std": jnp.std(returns),
         }
         if self.num_directions > 1:
-            diagnostics["gradient_snr"] = _step_signal_to_noise(trial.directions, returns)
+            measured["gradient_snr"] = _step_signal_to_noise(trial.directions, returns)
         sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
-        metrics = episode_metrics(trajectory) | nan_unless(sound, diagnostics)
+        metrics = episode_metrics(trajectory) | diagnostics.nan_unless(sound, measured)
         return dataclasses.replace(state, actor=actor), metrics | {"skipped_update": skipped}
 
     def _act_each(self, actor: Actor, observation: jax.Array) -> jax.Array:
@@ -277,7 +252,7 @@ def _step_signal_to_noise(directions: Params, returns: jax.Array) -> jax.Array:
     difference = returns[0] - returns[1]
     each = jax.vmap(lambda r, delta: jax.tree.map(lambda x: r * x, delta))(difference, directions)
     mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
-    return signal_to_noise(mean, each, len(difference))
+    return diagnostics.signal_to_noise(mean, each, len(difference))
 
 
 def _join_rollouts(trajectory: Trajectory) -> Trajectory:
@@ -287,11 +262,9 @@ def _join_rollouts(trajectory: Trajectory) -> Trajectory:
         joined = jnp.moveaxis(x, 0, 1)
         return joined.reshape(joined.shape[0], -1, *joined.shape[3:])
 
-    return Trajectory(
-        observation=join(trajectory.observation),
-        action=join(trajectory.action),
-        reward=join(trajectory.reward),
-        mask=join(trajectory.mask),
+    names = "observation", "action", "reward", "mask"
+    return trajectory.replace(
+        **{name: join(getattr(trajectory, name)) for name in names},
         nonfinite=trajectory.nonfinite.reshape(-1),
         simulated=jnp.sum(trajectory.simulated),
     )
@@ -309,15 +282,56 @@ def _zero_policy(env: Environment, size: int) -> Policy:
     return policy._replace(init=init)
 
 
-def _check_numbers(
-    num_directions: int, top: int, step_size: object, noise_std: object, update: str
-) -> None:
-    """Raises ValueError for numbers that make no sense; traced ones are taken on trust."""
-    if not 1 <= top <= num_directions:
-        raise ValueError(f"top_directions must lie in [1, {num_directions}], got {top}")
-    for name, value in (("step_size", step_size), ("noise_std", noise_std)):
-        check_number(name, value, positive=True)
-    if update not in ("paper", "document"):
-        raise ValueError(f"update must be 'paper' or 'document', got {update!r}")
-    if update == "document" and top != num_directions:
-        raise ValueError("update='document' uses all directions: leave top_directions out")
+def paper_increment(directions: Params, returns: jax.Array, top: int) -> Any:
+    """Returns the sum in the module's formula over b sigma; zero where sigma is.
+
+    Args:
+      directions: like the params, with a leading axis [D].
+      returns: [2, D] forwards and backwards.
+      top: b.
+    """
+    best = jnp.argsort(-jnp.max(returns, axis=0))[:top]
+    gain = _over_std(returns[0, best] - returns[1, best], returns[:, best]) / top
+    return jax.tree.map(lambda d: _weighted_sum(gain, d[best]), directions)
+
+
+def document_increment(directions: Params, returns: jax.Array, noise_std: ArrayLike) -> Any:
+    """Returns the increment of a published notebook, mistakes included, for reproducing it.
+
+    Its ``np.sum`` without an axis adds up the entries of the direction too, so all parameters move
+    by the same number; it does not divide by how many directions there are, and multiplies by
+    ``noise_std``. The bias is overwritten besides, see ``overwrite_bias``. Not reproduced: where
+    all returns are equal it divides 0 by 0, and its parameters are NaN for good.
+    """
+    totals = sum(jnp.sum(d.reshape(len(d), -1), axis=1) for d in jax.tree.leaves(directions))
+    increment = noise_std * jnp.sum(_over_std(returns[0] - returns[1], returns) * totals)
+    return jax.tree.map(lambda d: jnp.full(d.shape[1:], increment, d.dtype), directions)
+
+
+def overwrite_bias(params: Any) -> Any:
+    """Returns a linear policy's params with the first A weights in place of the bias [A].
+
+    The notebook writes the same first entries of its flat vector into every parameter.
+    """
+    layer = params["network"]["params"]["Dense_0"]
+    # PyTorch stores weights as [A, O], flax as [O, A].
+    bias = layer["kernel"].T.reshape(-1)[: layer["bias"].size]
+    return params | {"network": {"params": {"Dense_0": layer | {"bias": bias}}}}
+
+
+def _check_linear(policy: Policy) -> None:
+    """Raises ValueError for a policy whose bias ``overwrite_bias`` does not find."""
+    params = jax.eval_shape(policy.init, jax.random.key(0))
+    if set(params) != {"network", "constants"} or set(params["network"]["params"]) != {"Dense_0"}:
+        raise ValueError("update='document' is for linear policies: pass one with hidden_sizes=()")
+
+
+def _over_std(x: jax.Array, returns: jax.Array) -> jax.Array:
+    """Returns ``x`` over the standard deviation of all returns, 0 if they are all equal."""
+    std = jnp.std(returns)
+    return jnp.where(std > 0, x / jnp.where(std > 0, std, 1.0), 0.0)
+
+
+def _weighted_sum(weight: jax.Array, x: jax.Array) -> jax.Array:
+    """Returns the sum over the first axis of ``x`` [D, ...] times ``weight`` [D]."""
+    return jnp.sum(weight.reshape(-1, *(1,) * (x.ndim - 1)) * x, axis=0)

@@ -58,7 +58,7 @@ def accumulate(function: Callable[[Any], Any], data: tuple[Any, ...]) -> Any:
         return index + 1, jax.tree.map(jnp.add, sums, function(_chunk(chunks, index)))
 
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), sums)
-    return while_any(_more(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
+    return while_any(while_needed(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
 
 
 def map_steps(function: Callable[[Any], jax.Array], data: tuple[Any, ...]) -> jax.Array:
@@ -78,7 +78,7 @@ def map_steps(function: Callable[[Any], jax.Array], data: tuple[Any, ...]) -> ja
 
     one = jax.eval_shape(function, _chunk(chunks, jnp.zeros((), jnp.int32)))
     zeros = jnp.zeros((needed.size, *one.shape), one.dtype)
-    values = while_any(_more(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
+    values = while_any(while_needed(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
     return values.reshape(data[-1].shape)
 
 
@@ -112,8 +112,8 @@ def _chunk(chunks: tuple[Any, ...], index: jax.Array) -> tuple[Any, ...]:
     return jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, index, keepdims=False), chunks)
 
 
-def _more(needed: jax.Array) -> Callable[[Any], jax.Array]:
-    """Returns the condition of a loop over chunks, whose carry begins with the next one's index."""
+def while_needed(needed: jax.Array) -> Callable[[Any], jax.Array]:
+    """Returns the condition of a loop over what is needed [C]; its carry begins with an index."""
 
     def more(carry):
         index = carry[0]

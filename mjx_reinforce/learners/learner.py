@@ -9,14 +9,14 @@ import jax.numpy as jnp
 from flax import struct
 from jax.flatten_util import ravel_pytree
 
-from mjx_reinforce.checks import check_kind, check_type
+from mjx_reinforce.checks import check_kind
 from mjx_reinforce.engines.choice import Engine
 from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.learners import counts
 from mjx_reinforce.learners.diagnostics import Metrics
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.policy import Policy
-from mjx_reinforce.types import Environment, PyTree, Trajectory
+from mjx_reinforce.types import PyTree, Trajectory
 
 
 class TrainState(struct.PyTreeNode, kw_only=True):
@@ -45,12 +45,12 @@ class TrainState(struct.PyTreeNode, kw_only=True):
     """
 
     key: jax.Array
-    num_updates: jax.Array
-    env_steps: jax.Array
-    progress: jax.Array
+    num_updates: jax.Array = struct.field(default_factory=counts.zero)
+    env_steps: jax.Array = struct.field(default_factory=counts.zero)
+    progress: jax.Array = struct.field(default_factory=lambda: jnp.zeros(()))
     actor: Actor
-    opt_state: Any
-    estimator_state: Any
+    opt_state: Any = ()
+    estimator_state: Any = ()
     start_key: jax.Array | None = None
 
     def __repr__(self) -> str:
@@ -79,17 +79,17 @@ class Guests(NamedTuple):
 class Host:
     """A ``Learner.play`` that can take guests.
 
-    alone: as ``Learner.play``
-    with_guests: (TrainState, key, active, ``Guests``) -> what ``alone`` returns, and the
+    with_guests: (TrainState, key, active, ``Guests`` or None) -> what is played, and the
       ``Trajectory`` of the guests
     """
 
-    alone: Callable[[TrainState, jax.Array, Any], Any]
-    with_guests: Callable[[TrainState, jax.Array, Any, Guests], tuple[Any, Trajectory]]
+    with_guests: Callable[..., tuple[Any, Any]]
 
-    def __call__(self, state: TrainState, key: jax.Array, active: bool | jax.Array = True) -> Any:
+    def alone(self, state: TrainState, key: jax.Array, active: bool | jax.Array = True) -> Any:
         """Plays without guests."""
-        return self.alone(state, key, active)
+        return self.with_guests(state, key, active, None)[0]
+
+    __call__ = alone
 
 
 class Learner(NamedTuple):
@@ -134,8 +134,7 @@ class Learner(NamedTuple):
           state: from ``init`` or the step before.
           active: [] where False nothing is played and the state stays.
         """
-        after, metrics, _ = self.step_with(state, active, None)
-        return after, metrics
+        return self.step_with(state, active, None)[:2]
 
     def step_with(
         self, state: TrainState, active: bool | jax.Array, guests: Guests | None
@@ -201,17 +200,6 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
     """
     check_kind("state", state, TrainState, "learner.init(jax.random.key(0))")
     return _step(learner, state)
-
-
-def check_horizon(env: Environment, horizon: int | None) -> int:
-    """Returns the time limit in steps, or raises ValueError."""
-    horizon = getattr(env, "max_episode_steps", None) if horizon is None else horizon
-    if horizon is None:
-        raise ValueError("this environment declares no max_episode_steps: give a horizon")
-    check_type("horizon", horizon, int)
-    if horizon < 1:
-        raise ValueError(f"the horizon must be at least one step, got {horizon}")
-    return horizon
 
 
 def keep_finite(learned: PyTree, before: PyTree) -> tuple[Any, jax.Array]:

@@ -1,7 +1,6 @@
 """REINFORCE (Williams 1992): ``reinforce`` has the formula."""
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -17,14 +16,7 @@ from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.contract import check_environment
 from mjx_reinforce.engines.episode import check_shapes, episode_keys
 from mjx_reinforce.fused import any_lane
-from mjx_reinforce.learners import counts
-from mjx_reinforce.learners.contract import check_estimator, check_optimizer, check_update
-from mjx_reinforce.learners.diagnostics import (
-    nan_unless,
-    policy_metrics,
-    visited_steps,
-    within_kl,
-)
+from mjx_reinforce.learners import contract, counts, diagnostics
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.learners.learner import (
     Guests,
@@ -32,7 +24,6 @@ from mjx_reinforce.learners.learner import (
     Learner,
     Metrics,
     TrainState,
-    check_horizon,
     episode_metrics,
     keep_finite,
 )
@@ -41,19 +32,10 @@ from mjx_reinforce.learners.updates import Problem, Update, full_batch, make_opt
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.arguments import check_count, check_key, check_number
-from mjx_reinforce.policies.contract import check_policy
 from mjx_reinforce.policies.distributions.categorical import categorical
-from mjx_reinforce.policies.distributions.distribution import Distribution
-from mjx_reinforce.policies.distributions.normal import normal
+from mjx_reinforce.policies.distributions.gaussian import normal
 from mjx_reinforce.policies.policy import Policy, mlp_policy
-from mjx_reinforce.types import (
-    Box,
-    Discrete,
-    Environment,
-    Trajectory,
-    action_space,
-    observation_size,
-)
+from mjx_reinforce.types import Discrete, Environment, Trajectory, action_space, observation_size
 
 #: Where functions are that make estimators, and are no schedules of them.
 _ESTIMATORS = tuple(f"mjx_reinforce.learners.{name}" for name in ("estimators", "value_baseline"))
@@ -69,11 +51,6 @@ _specs: Any = Trajectory
 _EPISODES = _specs(
     observation=SECOND, action=SECOND, reward=SECOND, mask=SECOND, nonfinite=RUNS, simulated=NONE
 )
-
-
-def default_distribution(space: Box | Discrete) -> Distribution:
-    """Returns a Normal with a trained std, or a categorical distribution if discrete."""
-    return categorical(space) if isinstance(space, Discrete) else normal(space)
 
 
 def reinforce(
@@ -110,7 +87,8 @@ def reinforce(
 
     Args:
       env: what is played; any brax-style environment.
-      policy: by default an MLP of 32 and 32 tanh units with ``default_distribution``.
+      policy: by default an MLP of 32 and 32 tanh units with ``normal``, or ``categorical`` where
+        actions are discrete.
       estimator: by default leave-one-out on the return to go (discount 0.99), divided by its
         standard deviation plus 10. Or a function from ``TrainState.progress`` [] to one, where
         its numbers change as the budget is used.
@@ -155,49 +133,7 @@ def reinforce(
       >>> metrics["episodes"].item(), metrics["episode_return"].shape
       (4, ())
     """
-    check_environment(env)
-    size = observation_size(env)
-    if policy is None:
-        policy = mlp_policy(size, default_distribution(action_space(env)))
-    if optimizer is None:
-        optimizer = make_optimizer()
-    update = full_batch() if update is None else update
-    check_update(update)
-    check_count("num_episodes", num_episodes)
-    check_count("num_seeds", num_seeds)
-    if cut is not None:
-        check_cut(cut)
-    check_number("entropy_cost", entropy_cost)
-    check_number("normalize_steps", normalize_steps, finite=False)
-    check_number("normalize_min_std", normalize_min_std)
-    if max_kl is not None:
-        check_number("max_kl", max_kl, positive=True, finite=False)
-    check_type("one_start", one_start, bool)
-    check_policy(policy, env, size, likelihood=True)
-    check_optimizer("optimizer", optimizer)
-    if estimator is None:
-        estimator = standardize(leave_one_out(), floor=10.0)
-    estimator_at = _at(estimator)
-    check_estimator(estimator_at(jnp.zeros(())), env, size, num_episodes)
-    return _Reinforce(
-        env=env,
-        policy=policy,
-        estimator=estimator_at,
-        optimizer=optimizer,
-        update=update,
-        num_episodes=num_episodes,
-        horizon=check_horizon(env, horizon),
-        cut=cut,
-        entropy_cost=entropy_cost,
-        loss_per=loss_per,
-        max_kl=max_kl,
-        normalize_steps=normalize_steps,
-        normalize_min_std=normalize_min_std,
-        one_start=one_start,
-        num_seeds=num_seeds,
-        devices=devices,
-        observation_size=size,
-    ).learner(engine)
+    return _Reinforce(**locals()).learner()
 
 
 def _at(
@@ -211,13 +147,13 @@ def _at(
     return lambda progress: unchanging
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+@dataclasses.dataclass(kw_only=True, eq=False)
 class _Reinforce:
-    """The arguments of ``reinforce``, and what it does with them; ``observation_size`` is O."""
+    """The arguments of ``reinforce``, checked and completed, and what it does with them."""
 
     env: Environment
     policy: Policy
-    estimator: Callable[[jax.Array], Estimator]
+    estimator: Any
     optimizer: optax.GradientTransformation
     update: Update
     num_episodes: int
@@ -230,24 +166,57 @@ class _Reinforce:
     normalize_min_std: float | jax.Array
     one_start: bool
     num_seeds: int
+    engine: str
     devices: Devices | None
-    observation_size: int
+    observation_size: int = dataclasses.field(init=False)
+    plays: Engine = dataclasses.field(init=False)
 
     def __post_init__(self):
+        check_environment(self.env)
+        self.observation_size = size = observation_size(self.env)
+        self._check_numbers()
+        self.horizon = contract.check_horizon(self.env, self.horizon)
+        if self.policy is None:
+            space = action_space(self.env)
+            family = categorical if isinstance(space, Discrete) else normal
+            self.policy = mlp_policy(size, family(space))
+        contract.check_policy(self.policy, self.env, size, likelihood=True)
+        if self.optimizer is None:
+            self.optimizer = make_optimizer()
+        contract.check_optimizer("optimizer", self.optimizer)
+        if self.update is None:
+            self.update = full_batch()
+        contract.check_update(self.update)
+        if self.estimator is None:
+            self.estimator = standardize(leave_one_out(), floor=10.0)
+        self.estimator = _at(self.estimator)
+        first = self.estimator(jnp.zeros(()))
+        contract.check_estimator(first, self.env, size, self.num_episodes)
+        actor = jax.eval_shape(self._first_actor, jax.random.key(0))
+        player = choice.ActingPolicy(self._act, actor, self.policy.distribution)
+        self.plays = choice.choose(self.engine, self.env, player, self.horizon)
+
+    def _check_numbers(self):
+        check_count("num_episodes", self.num_episodes)
+        check_count("num_seeds", self.num_seeds)
+        if self.cut is not None:
+            check_cut(self.cut)
+        check_number("entropy_cost", self.entropy_cost)
+        check_number("normalize_steps", self.normalize_steps, finite=False)
+        check_number("normalize_min_std", self.normalize_min_std)
+        if self.max_kl is not None:
+            check_number("max_kl", self.max_kl, positive=True, finite=False)
+        check_type("one_start", self.one_start, bool)
         if self.loss_per not in ("episode", "step"):
             raise ValueError(f"loss_per must be 'episode' or 'step', got {self.loss_per!r}")
 
-    def learner(self, engine: str) -> Learner:
-        """Returns the learner, whose episodes are played by the engine of that name."""
-        actor = jax.eval_shape(self._first_actor, jax.random.key(0))
-        player = choice.ActingPolicy(self._act, actor, self.policy.distribution)
-        chosen = choice.choose(engine, self.env, player, self.horizon)
-        play: Any = functools.partial(self._play, chosen)
-        with_guests: Any = functools.partial(self._play_all, chosen)
-        if chosen.name == "native" and not self.one_start:
-            # Elsewhere an episode that is not played still takes its place.
-            play = Host(play, with_guests)
-        return Learner(self._init, play, self._learn, self.policy, chosen)
+    def learner(self) -> Learner:
+        """Returns the learner."""
+        host = Host(self._play)
+        # Elsewhere an episode that is not played still takes its place.
+        takes_guests = self.plays.name == "native" and not self.one_start
+        play = host if takes_guests else host.alone
+        return Learner(self._init, play, self._learn, self.policy, self.plays)
 
     def _act(self, actor: Actor, observation: jax.Array) -> jax.Array:
         return act(self.policy, actor, observation)
@@ -262,71 +231,49 @@ class _Reinforce:
         start_key = None
         if self.one_start:
             key, start_key = jax.random.split(key)
-        actor = self._first_actor(policy_key)
+        actor, estimator = self._first_actor(policy_key), self.estimator(jnp.zeros(()))
         return TrainState(
             key=key,
-            num_updates=counts.zero(),
-            env_steps=counts.zero(),
-            progress=jnp.zeros(()),
             actor=actor,
             opt_state=self.optimizer.init(actor.params),
-            estimator_state=self.estimator(jnp.zeros(())).init(
-                estimator_key, self.observation_size
-            ),
+            estimator_state=estimator.init(estimator_key, self.observation_size),
             start_key=start_key,
         )
 
     def _play(
-        self, engine: Engine, state: TrainState, key: jax.Array, active: bool | jax.Array = True
-    ) -> Trajectory:
-        return self._play_all(engine, state, key, active, None)[0]
-
-    def _play_all(
-        self,
-        engine: Engine,
-        state: TrainState,
-        key: jax.Array,
-        active: bool | jax.Array,
-        guests: Guests | None,
+        self, state: TrainState, key: jax.Array, active: bool | jax.Array, guests: Guests | None
     ) -> tuple[Trajectory, Trajectory | None]:
         """Plays the episodes of an update, with guests before them if there are any."""
-        play = functools.partial(self._play_part, engine)
-        visitors = None if guests is None else (guests.keys, guests.deterministic(), guests.active)
         check_shapes((), (self.num_episodes,), active=active)
+        visitors = None if guests is None else (guests.keys, guests.deterministic(), guests.active)
         chosen = jnp.broadcast_to(active, self.num_episodes)
         keys = episode_keys(key, self.num_episodes)
         limit = None if self.cut is None else self.cut.limit(state.progress, self.horizon)
-        given = state.actor, state.start_key, visitors, limit, keys, chosen
-        if self.devices is None:
-            return play(*given)
-        specs = _EPISODES, None if guests is None else _EPISODES
-        divided = self.devices.map(
-            functools.partial(_part, self.devices, play),
-            (NONE, NONE, NONE, NONE, RUNS, RUNS),
-            specs,
-        )
-        own, looked = divided(*given)
-        # Those of the first device; the others played none.
-        return own, None if guests is None else looked.episodes(slice(len(guests.keys)))
+        play: Any = self._play_part
+        if self.devices is not None:
+            given = NONE, NONE, NONE, NONE, RUNS, RUNS
+            of_guests = None if guests is None else _EPISODES
+            play = self.devices.map(play, given, (_EPISODES, of_guests))
+        own, looked = play(state.actor, state.start_key, visitors, limit, keys, chosen)
+        if self.devices is not None and guests is not None:
+            # Those of the first device; the others played none.
+            looked = looked.episodes(slice(len(guests.keys)))
+        return own, looked
 
     def _play_part(
-        self,
-        engine: Engine,
-        actor: Actor,
-        start_key: Any,
-        visitors: Any,
-        limit: jax.Array | None,
-        keys: Any,
-        chosen: Any,
+        self, actor: Actor, start_key: Any, visitors: Any, limit: Any, keys: Any, chosen: Any
     ) -> tuple[Trajectory, Trajectory | None]:
         """Plays episodes of these keys, as far as they are chosen, with guests before them.
 
         They have ``limit`` [] steps at most, guests those of the horizon. ``visitors`` are the keys
         of the guests, whether each takes the mode, and whether they are played; None without any.
+        Of several devices each plays a part of the episodes, and the first one the guests.
         """
         count, modes = 0, False
         if visitors is not None:
             guest_keys, guest_modes, guest_active = visitors
+            if self.devices is not None:
+                guest_active = guest_active & (self.devices.number() == 0)
             count = len(guest_keys)
             modes = jnp.concatenate([guest_modes, jnp.zeros(len(keys), bool)])
             chosen = jnp.concatenate([jnp.broadcast_to(guest_active, count), chosen])
@@ -334,7 +281,7 @@ class _Reinforce:
                 own = jnp.broadcast_to(limit, len(keys))
                 limit = jnp.concatenate([jnp.full(count, self.horizon), own])
             keys = jnp.concatenate([guest_keys, keys])
-        played = engine.rollout(
+        played = self.plays.rollout(
             self.env if start_key is None else _OneStart(self.env, start_key),
             self._act,
             actor,
@@ -346,6 +293,8 @@ class _Reinforce:
             active=chosen,
             limit=limit,
         )
+        if self.devices is not None:
+            played = dataclasses.replace(played, simulated=self.devices.sum(played.simulated))
         if visitors is None:
             return played, None
         return played.episodes(slice(count, None)), played.episodes(slice(count))
@@ -371,55 +320,31 @@ class _Reinforce:
         seen = dataclasses.replace(trajectory, observation=scaled)
         estimator = self.estimator(state.progress)
         weight, estimator_state, metrics = estimator.update(state.estimator_state, seen)
+        divisor = self.num_episodes if self.loss_per == "episode" else jnp.maximum(jnp.sum(mask), 1)
         problem = Problem(
             surrogate=_surrogate(self.policy, self.entropy_cost),
             optimizer=self.optimizer,
             samples=(scaled, trajectory.action, weight, mask),
-            divisor=self._divisor(trajectory),
+            divisor=divisor,
             clock=Clock(state.progress, counts.as_float(state.env_steps)),
         )
         params, opt_state, update_metrics = self.update(problem, key, actor.params, state.opt_state)
-        visited = visited_steps(trajectory)
+        visited = diagnostics.visited_steps(trajectory)
         if self.max_kl is not None:
-            params = within_kl(self.policy, actor, params, visited, self.max_kl)
-        normalizer = normalize.update(
-            actor.normalizer,
-            trajectory.observation,
-            mask & ~trajectory.nonfinite,
-            self.normalize_steps,
-            self.normalize_min_std,
-        )
+            params = diagnostics.within_kl(self.policy, actor, params, visited, self.max_kl)
+        counted = mask & ~trajectory.nonfinite
+        limits = self.normalize_steps, self.normalize_min_std
+        normalizer = normalize.update(actor.normalizer, trajectory.observation, counted, *limits)
         learned = Actor(params=params, normalizer=normalizer), opt_state, estimator_state
         before = actor, state.opt_state, state.estimator_state
         (actor, opt_state, estimator_state), skipped = keep_finite(learned, before)
         state = dataclasses.replace(
             state, actor=actor, opt_state=opt_state, estimator_state=estimator_state
         )
-        change = policy_metrics(self.policy, before[0], actor, visited)
+        change = diagnostics.policy_metrics(self.policy, before[0], actor, visited)
         sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
-        diagnostics = nan_unless(sound, metrics | update_metrics | change)
-        return state, episode_metrics(trajectory) | diagnostics | {"skipped_update": skipped}
-
-    def _divisor(self, trajectory: Trajectory) -> int | jax.Array:
-        """Returns what the sum over all steps is divided by."""
-        if self.loss_per == "step":
-            return jnp.maximum(jnp.sum(trajectory.mask), 1)
-        return self.num_episodes
-
-
-def _part(devices: Devices, play: Callable[..., Any], *given: Any) -> tuple[Any, Any]:
-    """Returns what ``_play_part`` plays of one device's part, guests on the first device alone."""
-    actor, start_key, visitors, limit, keys, chosen = given
-    if visitors is not None:
-        *others, active = visitors
-        visitors = *others, active & (devices.number() == 0)
-    played = play(actor, start_key, visitors, limit, keys, chosen)
-    simulated = devices.sum(played[0].simulated)
-    return jax.tree.map(
-        lambda x: dataclasses.replace(x, simulated=simulated),
-        played,
-        is_leaf=lambda x: isinstance(x, Trajectory),
-    )
+        measured = diagnostics.nan_unless(sound, metrics | update_metrics | change)
+        return state, episode_metrics(trajectory) | measured | {"skipped_update": skipped}
 
 
 class _OneStart:

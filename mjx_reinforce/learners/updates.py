@@ -17,7 +17,7 @@ from optax import Params
 
 from mjx_reinforce.engines.chunks import while_any
 from mjx_reinforce.learners.diagnostics import signal_to_noise
-from mjx_reinforce.learners.gradients import accumulate_gradient, draw_steps
+from mjx_reinforce.learners.gradients import accumulate_gradient, draw_steps, while_needed
 from mjx_reinforce.learners.schedules import Clock
 from mjx_reinforce.policies.arguments import check_count, check_number
 from mjx_reinforce.registry import check_name
@@ -176,8 +176,7 @@ def each_step() -> Update:
     def update(problem, key, params, opt_state):
         del key
         mask = problem.samples[-1]
-        alive = jnp.any(mask, axis=1)
-        horizon = alive.size
+        more = while_needed(jnp.any(mask, axis=1))
 
         def one(t, params, opt_state):
             now = jax.tree.map(
@@ -186,10 +185,6 @@ def each_step() -> Update:
             grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, now)
             params, opt_state, step = _descend(problem, grads, problem.divisor, params, opt_state)
             return params, opt_state, step | sums
-
-        def more(carry):
-            t = carry[0]
-            return (t < horizon) & alive[jnp.minimum(t, horizon - 1)]
 
         def body(carry):
             t, params, opt_state, sums = carry
@@ -293,10 +288,9 @@ def make_optimizer(
         check_number("learning_rate", rate)
     check_number("weight_decay", weight_decay)
     check_number("momentum", momentum)
-    if max_grad_norm is not None:
-        check_number("max_grad_norm", max_grad_norm, positive=True, finite=False)
     parts = []
     if max_grad_norm is not None:
+        check_number("max_grad_norm", max_grad_norm, positive=True, finite=False)
         parts.append(clip_by_norm(max_grad_norm))
     if name == "adamw":
         return optax.chain(*parts, optax.adamw(learning_rate, momentum, weight_decay=weight_decay))

@@ -15,7 +15,7 @@ from jax import lax
 from mjx_reinforce.learners.estimators import Estimator, explained_variance, reward_to_go
 from mjx_reinforce.learners.gradients import accumulate_gradient, draw_steps, map_steps
 from mjx_reinforce.policies.arguments import check_count
-from mjx_reinforce.policies.networks import MLP
+from mjx_reinforce.policies.policy import MLP
 
 #: The share that an update has in the running mean and variance of the returns.
 _UPDATE_SHARE = 0.1

@@ -42,7 +42,7 @@ def build(
     """
     from mjx_reinforce.engines.contract import check_environment
     from mjx_reinforce.export.policy_files import build_policy
-    from mjx_reinforce.learners.learner import check_horizon
+    from mjx_reinforce.learners.contract import check_horizon
 
     check_environment(env)
     if config.stop_when_solved and getattr(env, "reward_threshold", None) is None:
@@ -194,7 +194,7 @@ def _build_value_baseline(
     import optax
 
     from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
-    from mjx_reinforce.policies.networks import MLP
+    from mjx_reinforce.policies.policy import MLP
 
     shared = {
         "network": MLP(config.value_hidden_sizes, 1, initializer=config.initializer),

@@ -10,9 +10,13 @@ import mjx_reinforce as m
 from mjx_reinforce import Box, Discrete
 from mjx_reinforce.checks import BadEnvironmentError
 from mjx_reinforce.engines.contract import check_environment
-from mjx_reinforce.learners.contract import check_estimator, check_optimizer, check_update
+from mjx_reinforce.learners.contract import (
+    check_estimator,
+    check_optimizer,
+    check_policy,
+    check_update,
+)
 from mjx_reinforce.learners.estimators import Estimator
-from mjx_reinforce.policies.contract import check_policy
 
 
 def toy(**parts):

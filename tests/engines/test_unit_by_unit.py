@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.engines.unit_by_unit import unit_by_unit
-from mjx_reinforce.policies.networks import MLP
+from mjx_reinforce.policies.policy import MLP
 
 
 def both(sizes, x, outputs=2):

@@ -1,6 +1,5 @@
-"""Action distributions, a family a file.
+"""Action distributions: ``categorical``; ``gaussian``; ``bounded``, which keep to a range.
 
-``distribution`` is the interface of all. ``action_range`` has the checks of the action space,
-``gaussian`` what the Gaussian families share, ``normal_integrals`` their tails in numbers.
-``registry.DISTRIBUTIONS`` has their names.
+``distribution`` is the interface of all, with the checks of the action space. ``normal_integrals``
+are the tails of a Normal in numbers. ``registry.DISTRIBUTIONS`` has the families by name.
 """

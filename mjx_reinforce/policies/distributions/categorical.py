@@ -3,8 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.policies.distributions.action_range import check_space
-from mjx_reinforce.policies.distributions.distribution import Distribution
+from mjx_reinforce.policies.distributions.distribution import Distribution, check_space
 from mjx_reinforce.types import Box, Discrete
 
 

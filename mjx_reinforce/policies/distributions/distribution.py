@@ -7,16 +7,19 @@ depend on the observation. Sampling has two steps, ``noise`` and ``sample``: the
 depends on the key alone, so an engine can draw it in advance, and every engine gets
 the same actions from the same key.
 
-Every family is one function in a file of its own in this folder. It takes the action
-space, ``initial_std`` (the standard deviation before training, in the action's unit)
-and ``rescale`` (whether the network's output is scaled to the action's range). It
-raises ValueError for a space that it does not support.
+Every family is one function. It takes the action space, ``initial_std`` (the standard
+deviation before training, in the action's unit) and ``rescale`` (whether the network's
+output is scaled to the action's range). It raises ValueError for a space that it does
+not support; the checks are here.
 """
 
 from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
+import numpy as np
+
+from mjx_reinforce.types import Box, Discrete
 
 
 class Distribution(NamedTuple):
@@ -63,3 +66,47 @@ class Distribution(NamedTuple):
 
     def __repr__(self) -> str:
         return f"Distribution({self.num_outputs} outputs, {len(self.constants)} constants)"
+
+
+def check_space(name: str, space: Box | Discrete) -> None:
+    """Raises ValueError for what is no action space."""
+    if not isinstance(space, Box | Discrete):
+        raise ValueError(
+            f"{name} needs an action space, such as env.action_space, or mjx_reinforce.Box(low, "
+            f"high) with arrays [A], got a {type(space).__name__}"
+        )
+
+
+def continuous_box(name: str, space: Box | Discrete, *, bounded: bool = False) -> Box:
+    """Returns the action space if it is continuous.
+
+    Args:
+      name: the family's name, for the message.
+      space: the action space.
+      bounded: whether all its bounds must be finite.
+
+    Raises:
+      ValueError: the space is discrete, or an entry is unbounded.
+    """
+    check_space(name, space)
+    if not isinstance(space, Box):
+        raise ValueError(
+            f"{name} needs a continuous action space, this one is discrete; choose categorical"
+        )
+    if bounded and not np.all(np.isfinite(space.low) & np.isfinite(space.high)):
+        raise ValueError(
+            f"{name} needs finite action bounds, got {space}; "
+            "choose normal, or declare bounds in the environment's action_space"
+        )
+    return space
+
+
+def middle_and_half_range(space: Box) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the centre and half the width of each entry's range, [A] each.
+
+    They are 0 and 1 for an entry that is not bounded on both sides.
+    """
+    low, high = np.asarray(space.low, np.float32), np.asarray(space.high, np.float32)
+    bounded = np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    return (low + high) / 2, (high - low) / 2

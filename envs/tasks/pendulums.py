@@ -1,14 +1,50 @@
-"""InvertedDoublePendulum: keep two poles, one on the other, upright on a cart."""
+"""A pole on a cart, and two poles, one on the other, that are to be kept upright."""
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.envs.base import MujocoEnv
+from mjx_reinforce.envs.base import NearPose
+
+_MAX_ANGLE = 0.2
 
 
-class InvertedDoublePendulum(MujocoEnv):
+class InvertedPendulum(NearPose):
+    """Gymnasium's InvertedPendulum (gymnasium/envs/mujoco/inverted_pendulum_v5.py).
+
+    Observation, O = 4: cart position (m), pole angle (rad), cart velocity (m/s),
+    pole angular velocity (rad/s). Action, A = 1: force on the cart in [-3, 3],
+    times a gear of 100 (N).
+
+    Reward: 1 each step the pole stays up. The step on which it falls earns 0 in
+    v5 and 1 in v4. Start: every position and velocity uniform within
+    ``reset_noise_scale``. Terminates when the angle leaves [-0.2, 0.2] rad or the
+    observation is not finite. Solved at a return of 950; at most 1000 steps of
+    0.04 s.
+    """
+
+    @dataclasses.dataclass(frozen=True, kw_only=True)
+    class Settings(NearPose.Settings):
+        """Arguments of InvertedPendulum."""
+
+        xml_file: str = "inverted_pendulum.xml"
+        frame_skip: int = 2
+        reward_threshold: float | None = 950.0
+        reset_noise_scale: float = 0.01
+        reward_at_fall: float = 0.0
+        """The reward of the step that ends the episode: 0 is v5, 1 is v4."""
+
+    settings: Settings
+
+    def outcome(self, before, data, action):
+        """Returns 1 while the pole is up, and whether it fell."""
+        finite = jnp.all(jnp.isfinite(data.qpos)) & jnp.all(jnp.isfinite(data.qvel))
+        terminated = ~finite | (jnp.abs(data.qpos[1]) > _MAX_ANGLE)
+        reward = jnp.where(terminated, self.settings.reward_at_fall, 1.0)
+        return reward, terminated, {"reward_survive": reward}
+
+
+class InvertedDoublePendulum(NearPose):
     """Gymnasium's InvertedDoublePendulum (gymnasium/envs/mujoco/inverted_double_pendulum_v5.py).
 
     Observation, O = 9: cart position (m); sine of the lower pole's angle and of the upper's
@@ -24,29 +60,19 @@ class InvertedDoublePendulum(MujocoEnv):
     """
 
     @dataclasses.dataclass(frozen=True, kw_only=True)
-    class Settings(MujocoEnv.Settings):
+    class Settings(NearPose.Settings):
         """Arguments of InvertedDoublePendulum."""
 
         xml_file: str = "inverted_double_pendulum.xml"
         """The model; its first site is the tip."""
         frame_skip: int = 5
-        max_episode_steps: int = 1000
         reward_threshold: float | None = 9100.0
         healthy_reward: float = 10.0
         """The reward of a step that does not end the episode."""
         reset_noise_scale: float = 0.1
-        """Half the width of the start positions (m, rad) and the standard deviation of the start
-        velocities (m/s, rad/s)."""
 
     settings: Settings
-
-    def initial(self, rng):
-        """Draws qpos [3] uniformly and qvel [3] normally around upright rest."""
-        qpos_key, qvel_key = jax.random.split(rng)
-        noise = self.settings.reset_noise_scale
-        qpos = jax.random.uniform(qpos_key, (3,), minval=-noise, maxval=noise)
-        qvel = noise * jax.random.normal(qvel_key, (3,))
-        return jnp.asarray(self.mj_model.qpos0, qpos.dtype) + qpos, qvel
+    normal_velocity = True
 
     def observe(self, data):
         """Returns the observation [9]."""
