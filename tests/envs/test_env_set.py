@@ -39,7 +39,7 @@ def test_texts_are_read_by_their_type():
 
 
 @pytest.mark.parametrize(
-    ("word", "said"),
+    ("words", "said"),
     [
         ("weigth=1", "unknown setting of Task 'weigth'. Did you mean 'weight'.*Known: bounds"),
         ("weight=heavy", "weight of Task must be a number, got 'heavy'"),
@@ -48,16 +48,12 @@ def test_texts_are_read_by_their_type():
         ("max_episode_steps=1.5", "whole number"),
         ("weight", "takes NAME=VALUE"),
         ("weight=", "takes NAME=VALUE"),
+        ("weight=1 weight=2", "weight twice: 1 and 2"),
     ],
 )
-def test_what_is_no_setting_is_refused(word, said):
+def test_what_is_no_setting_is_refused(words, said):
     with pytest.raises(ValueError, match=said):
-        read_settings(Task, [word])
-
-
-def test_a_name_that_stands_twice_is_refused():
-    with pytest.raises(ValueError, match="weight twice: 1 and 2"):
-        read_settings(Task, ["weight=1", "weight=2"])
+        read_settings(Task, words.split())
 
 
 def test_what_has_no_settings_is_refused():
@@ -98,6 +94,7 @@ QUICK = (
 )
 
 
+@pytest.mark.slow
 def test_a_run_keeps_the_settings_of_its_environment(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ("max_episode_steps=7", "sutton_barto_reward=true")

@@ -26,17 +26,15 @@ IDS = envs.names()
 #: Arguments of Gymnasium's tasks that are about pictures.
 PICTURES = {"render_mode", "default_camera_config"}
 #: What compiles for half a minute and more is traced here, and compared with Gymnasium's in
-#: test_parity.py; every other task, a new one too, is also run.
+#: test_parity.py, in double precision; every other task, a new one too, is also run.
 HEAVY = {
     *("Pusher-v5", "Swimmer-v5", "HalfCheetah-v5", "Hopper-v5"),
     *("Walker2d-v5", "Ant-v5", "Humanoid-v5", "HumanoidStandup-v5"),
 }
+#: Tasks of the same classes as others, with other numbers.
+OLDER = {"InvertedPendulum-v4", "CartPole-v0"}
 LIGHT = sorted(set(IDS) - HEAVY)
-
-
-@pytest.fixture(scope="module", params=IDS)
-def env(request):
-    return envs.make(request.param)
+made = functools.cache(envs.make)
 
 
 def shapes(tree):
@@ -44,75 +42,81 @@ def shapes(tree):
     return jax.tree.map(lambda x: (x.shape, x.dtype, x.weak_type), tree)
 
 
-@pytest.mark.parametrize("x64", [False, True])
-def test_shapes_and_dtypes_stay(env, x64, request):
-    if x64 and request.node.callspec.params["env"] in HEAVY:
-        pytest.skip("test_parity.py steps it in double precision")
-    with jax.enable_x64(x64):
-        start = jax.eval_shape(env.reset, jax.random.key(0))
-        dtype = jnp.float64 if x64 else jnp.float32
-        action = jnp.asarray(null_action(env))
-        action = action.astype(dtype) if action.ndim else action
-        after = jax.eval_shape(env.step, start, action)
-        assert shapes(start) == shapes(after)
-        assert start.obs.shape == (env.observation_size,) == (observation_size(env),)
-        assert start.reward.shape == start.done.shape == ()
-        assert start.obs.dtype == start.reward.dtype == start.done.dtype == dtype
-        assert isinstance(env, Environment)
+@pytest.mark.parametrize("id", sorted(set(IDS) - OLDER))
+def test_a_step_keeps_shapes_and_dtypes_and_its_argument(id):
+    """The argument's structure and its leaves, dictionaries inside included."""
+    env = made(id)
+    assert isinstance(env, Environment)
+
+    def play(key, action):
+        state = env.reset(key)
+        leaves, structure = jax.tree.flatten(state)
+        after = env.step(state, action)
+        later, kept = jax.tree.flatten(state)
+        assert structure == kept
+        assert all(x is y for x, y in zip(leaves, later, strict=True))
+        return state, after
+
+    for x64 in (False, True) if id in LIGHT else (False,):
+        with jax.enable_x64(x64):
+            dtype = jnp.float64 if x64 else jnp.float32
+            action = jnp.asarray(null_action(env))
+            action = action.astype(dtype) if action.ndim else action
+            start, after = jax.eval_shape(play, jax.random.key(0), action)
+            assert shapes(start) == shapes(after)
+            assert start.obs.shape == (env.observation_size,) == (observation_size(env),)
+            assert start.reward.shape == start.done.shape == ()
+            assert start.obs.dtype == start.reward.dtype == start.done.dtype == dtype
 
 
-def test_the_plan_of_a_run_knows_its_sizes(env, request):
-    task = TASKS.get(request.node.callspec.params["env"])
-    if task is None:
-        pytest.skip("it was not measured")
-    entries = 1 if isinstance(action_space(env), Discrete) else env.action_size
-    sizes = (env.observation_size, entries, env.max_episode_steps)
-    assert (task.observation, task.action, task.horizon) == sizes
+def test_sizes_bounds_and_limits():
+    """They are those that the plan of a run knows, of what was measured."""
+    for id in IDS:
+        env, space = made(id), action_space(made(id))
+        if isinstance(space, Discrete):
+            assert env.action_size == space.num_actions > 1, id
+        else:
+            assert space.low.shape == space.high.shape == (env.action_size,), id
+            assert np.all(space.low < space.high), id
+        assert min(env.max_episode_steps, env.dt) > 0, id
+        entries = 1 if isinstance(space, Discrete) else env.action_size
+        sizes = (env.observation_size, entries, env.max_episode_steps)
+        if task := TASKS.get(id):
+            assert (task.observation, task.action, task.horizon) == sizes, id
 
 
-def test_bounds_and_limits(env):
-    space = action_space(env)
-    if isinstance(space, Discrete):
-        assert env.action_size == space.num_actions > 1
-    else:
-        assert space.low.shape == space.high.shape == (env.action_size,)
-        assert np.all(space.low < space.high)
-    assert env.max_episode_steps > 0
-    assert env.dt > 0
-
-
-def test_settings_are_frozen(env):
-    assert isinstance(env.settings, EpisodeSettings)
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        env.settings.max_episode_steps = 1
-    limits = env.settings.max_episode_steps, env.settings.reward_threshold
-    assert limits == (env.max_episode_steps, env.reward_threshold)
-
-
-def test_defaults_are_gymnasiums(env, request):
+def test_settings_are_frozen_and_gymnasiums():
     """Every argument of Gymnasium's class is here under its name, with its default."""
-    id = request.node.callspec.params["env"]
-    if id not in gymnasium.registry:
-        pytest.skip("Gymnasium has no such task")
-    theirs = gymnasium.spec(id)
-    parameters = inspect.signature(load_env_creator(theirs.entry_point)).parameters.values()
-    expected = {
-        parameter.name: parameter.default
-        for parameter in parameters
-        if parameter.kind != parameter.VAR_KEYWORD and parameter.name not in PICTURES
-    }
-    expected |= {
-        "max_episode_steps": theirs.max_episode_steps,
-        "reward_threshold": theirs.reward_threshold,
-    }
-    ours = dataclasses.asdict(env.settings)
-    assert expected.pop("xml_file", "").endswith(".xml") == ("xml_file" in ours and "v4" not in id)
-    assert {name: ours[name] for name in expected} == expected
+    for id in IDS:
+        env = made(id)
+        assert isinstance(env.settings, EpisodeSettings)
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            env.settings.max_episode_steps = 1
+        limits = env.settings.max_episode_steps, env.settings.reward_threshold
+        assert limits == (env.max_episode_steps, env.reward_threshold)
+        if id not in gymnasium.registry:
+            continue
+        theirs = gymnasium.spec(id)
+        parameters = inspect.signature(load_env_creator(theirs.entry_point)).parameters.values()
+        expected = {
+            parameter.name: parameter.default
+            for parameter in parameters
+            if parameter.kind != parameter.VAR_KEYWORD and parameter.name not in PICTURES
+        }
+        expected |= {
+            "max_episode_steps": theirs.max_episode_steps,
+            "reward_threshold": theirs.reward_threshold,
+        }
+        ours = dataclasses.asdict(env.settings)
+        own_file = "xml_file" in ours and "v4" not in id
+        assert expected.pop("xml_file", "").endswith(".xml") == own_file, id
+        assert {name: ours[name] for name in expected} == expected, id
 
 
 @pytest.mark.parametrize(
     ("id", "wrong", "message"),
     [
+        ("InvertedPendulm-v5", {}, "Did you mean 'InvertedPendulum-v5'"),
         ("Hopper-v5", {"helthy_reward": 1}, "of Hopper 'helthy_reward'.*'healthy_reward'.*Known"),
         ("CartPole-v1", {"sutton": True}, "of CartPole 'sutton'.*'sutton_barto_reward'"),
         ("InvertedPendulum-v5", {"solver": "mjxx"}, "unknown solver 'mjxx'"),
@@ -162,24 +166,12 @@ def test_the_start_is_of_the_solver(tmp_path, solver, is_mjx):
     assert (ours == theirs) == is_mjx
 
 
-def test_step_does_not_modify_its_argument(env):
-    """Neither the state's structure nor a leaf, dictionaries inside included."""
-
-    def compare(key, action):
-        state = env.reset(key)
-        leaves, structure = jax.tree.flatten(state)
-        env.step(state, action)
-        later, after = jax.tree.flatten(state)
-        assert structure == after
-        assert all(x is y for x, y in zip(leaves, later, strict=True))
-
-    jax.eval_shape(compare, jax.random.key(0), null_action(env))
-
-
-def test_it_runs_under_brax(env, request):
+@pytest.mark.parametrize("id", ["InvertedPendulum-v5", "CartPole-v1"])
+def test_it_runs_under_brax(id):
     """Their wrappers and rollout, on ours, with the raw keys they need."""
     from brax.training import acting
 
+    env = envs.make(id)
     wrapped = wrappers.training.wrap(env, episode_length=5, action_repeat=1)
     action = null_action(env)
 
@@ -188,50 +180,37 @@ def test_it_runs_under_brax(env, request):
             return jax.random.uniform(key, (*observation.shape[:-1], env.action_size)), {}
         return jax.random.randint(key, observation.shape[:-1], 0, env.action_size), {}
 
+    @jax.jit
     def play(keys, key):
         states = wrapped.reset(keys)
         return acting.generate_unroll(wrapped, states, policy, key, unroll_length=12)
 
-    args = jax.random.split(jax.random.PRNGKey(0), 4), jax.random.PRNGKey(1)
-    if request.node.callspec.params["env"] not in LIGHT:
-        last, data = jax.eval_shape(play, *args)
-        assert data.observation.shape == (12, 4, env.observation_size)
-        return
-    last, data = jax.jit(play)(*args)
+    last, data = play(jax.random.split(jax.random.PRNGKey(0), 4), jax.random.PRNGKey(1))
     assert data.observation.shape == (12, 4, env.observation_size)
     assert np.all(np.isfinite(data.observation))
     assert np.all(np.isfinite(data.reward))
     assert np.all(last.info["steps"] <= 5)
 
 
-@pytest.mark.parametrize("id", LIGHT)
+@pytest.mark.parametrize("id", ["CartPole-v1", "InvertedPendulum-v5", "Reacher-v5"])
 def test_the_same_key_is_the_same_episode(id):
-    env = envs.make(id)
+    """Compiled once, for a first step and for those that follow it."""
+    env = made(id)
     reset, step = jax.jit(env.reset), jax.jit(env.step)
     first, second, other = (reset(jax.random.key(seed)) for seed in (3, 3, 4))
     equal(first, second)
     assert np.any(first.obs != other.obs)
     action = null_action(env)
-    equal(step(first, action), step(second, action))
+    after = step(first, action)
+    equal(after, step(second, action))
+    assert np.all(np.isfinite(step(after, action).obs))
+    assert step._cache_size() == 1
     physics = first.pipeline_state
     equal(jax.jit(env.set_state)(physics.qpos, physics.qvel), first)
 
 
 def equal(x, y):
     jax.tree.map(np.testing.assert_array_equal, x, y)
-
-
-def test_step_is_compiled_once():
-    env = envs.make("InvertedPendulum-v5")
-    step, state = jax.jit(env.step), env.reset(jax.random.key(0))
-    for _ in range(3):
-        state = step(state, jnp.zeros(1))
-    assert step._cache_size() == 1
-
-
-def test_unknown_names_are_explained():
-    with pytest.raises(ValueError, match="Did you mean 'InvertedPendulum-v5'"):
-        envs.make("InvertedPendulm-v5")
 
 
 def test_register_once():
@@ -260,7 +239,7 @@ def look():
         seen.add(sys.stdout)
 watcher = threading.Thread(target=look)
 watcher.start()
-names = ["InvertedPendulum-v5", "CartPole-v1", "Reacher-v5"] * 2
+names = ["InvertedPendulum-v5", "CartPole-v1"] * 2
 makers = [threading.Thread(target=envs.make, args=(name,)) for name in names]
 for thread in makers:
     thread.start()
@@ -272,6 +251,7 @@ print(seen == {stdout}, sys.stdout is stdout)
 """
 
 
+@pytest.mark.slow
 def test_threads_that_make_environments_leave_standard_output_alone():
     """Nor do they print: what MJX says of its Warp backend is not heard."""
     done = subprocess.run(

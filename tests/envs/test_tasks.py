@@ -139,7 +139,10 @@ def test_formulas_are_gymnasiums(id, settings):
     assert ends == ({True, False} if falls and "terminate_when_unhealthy" not in settings else {0})
 
 
-@pytest.mark.parametrize("id", CASES)
+@pytest.mark.parametrize(
+    "id",
+    [pytest.param(id, marks=pytest.mark.slow) if id == "Pusher-v5" else id for id in CASES],
+)
 def test_starts_are_spread_as_gymnasiums(id):
     """So wide in each entry, and uniform or normal."""
     env, peer = envs.make(id), peer_of(id)
@@ -159,6 +162,7 @@ def test_starts_are_spread_as_gymnasiums(id):
     np.testing.assert_array_equal(is_normal[0], is_normal[1])
 
 
+@pytest.mark.slow
 def test_a_cylinder_starts_beside_the_goal_as_gymnasium_draws_it():
     """Quarters of what is drawn lie between those that rejection finds."""
     env, rng = envs.make("Pusher-v5"), np.random.default_rng(0)

@@ -9,6 +9,7 @@ from brax import envs as brax_envs
 from mjx_reinforce import reinforce, train_step
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Brax System")
 def test_a_brax_environment_trains():
     env = brax_envs.get_environment("inverted_pendulum", backend="generalized")

@@ -1,7 +1,6 @@
 """Diagnostics against closed forms, enumerated episodes, and updates made to be so."""
 
 import dataclasses
-import itertools
 
 import jax
 import jax.numpy as jnp
@@ -10,14 +9,15 @@ import optax
 import pytest
 from jax.flatten_util import ravel_pytree
 from problems import MASK, PARAMS, make_problem
-from scipy import integrate, stats
-from toys import Chain, Survive, Target, categorical, tabular_policy
+from scipy import stats
+from toys import Survive, Target, categorical
 
 from mjx_reinforce import Box, Discrete, Trajectory, mlp_policy, normal, reinforce, train_step
-from mjx_reinforce.learners import diagnostics, estimators, updates
+from mjx_reinforce.learners import diagnostics, updates
 from mjx_reinforce.learners.ars import ars
+from mjx_reinforce.policies import normalize
+from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.policies.distributions.categorical import categorical as softmax
-from mjx_reinforce.policies.distributions.truncated_normal import truncated_normal
 
 BOX = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))
 
@@ -64,10 +64,10 @@ def test_no_more_steps_than_promised_are_visited(num_episodes):
     assert np.all(np.isfinite(visited.observation))
 
 
+@pytest.mark.slow
 def test_nothing_after_the_end_is_visited():
-    policy = mlp_policy(1, normal(Target.action_space))
-    learner = reinforce(Target(), policy=policy)
-    actor = jax.jit(learner.init)(jax.random.key(0)).actor
+    policy = mlp_policy(1, normal(Target.action_space), ())
+    actor = Actor(params=policy.init(jax.random.key(0)), normalizer=normalize.init(1))
     moved = actor.replace(params=jax.tree.map(lambda x: x + 0.1, actor.params))
     clean, poisoned = (
         diagnostics.policy_metrics(
@@ -80,34 +80,11 @@ def test_nothing_after_the_end_is_visited():
     assert clean["kl"] > 0
 
 
-def test_the_kl_of_normals_is_the_integral():
-    family = normal(BOX, std="softplus")
-    old, new = jnp.array([0.3, -0.2, 0.1, -0.5]), jnp.array([0.1, 0.4, -0.2, 0.3])
-
-    def moments(outputs):
-        return np.asarray(family.mode(outputs)), np.asarray(family.std(outputs))
-
-    expected = 0.0
-    for mean, std, other_mean, other_std in zip(*moments(old), *moments(new), strict=True):
-        p, q = stats.norm(mean, std), stats.norm(other_mean, other_std)
-        expected += integrate.quad(
-            lambda x, p=p, q=q: p.pdf(x) * (p.logpdf(x) - q.logpdf(x)), mean - 9, mean + 9
-        )[0]
-    assert float(family.kl(old, new)) == pytest.approx(expected, rel=1e-5)
-
-
 @pytest.mark.cpu  # GPUs divide within 2 units in the last place
 def test_the_kl_of_normals_to_themselves_is_0():
     family = normal(BOX, std="softplus")
     outputs = jnp.array([0.3, -0.2, 0.1, -0.5])
     assert float(family.kl(outputs, outputs)) == 0.0
-
-
-def test_a_tiny_kl_of_normals_does_not_cancel():
-    """It is d^2 / 2 + s^2 for means d standard deviations apart and log-stds that differ by s."""
-    family = normal(Box(np.array([-1.0]), np.array([1.0])), initial_std=1.0)
-    kl = family.kl(jnp.array([0.0, 0.0]), jnp.array([2e-4, 1e-4]))
-    assert float(kl) == pytest.approx(2e-8 + 1e-8, rel=1e-3)
 
 
 def test_the_kl_of_categoricals_is_the_sum():
@@ -127,23 +104,6 @@ def test_the_estimated_kl_is_unbiased_and_never_negative():
     assert np.all(np.asarray(each) > 0)
 
 
-def test_a_family_without_a_closed_form_is_estimated():
-    """Of 20,000 samples, within five standard errors of the integral."""
-    family = truncated_normal(Box(np.array([-1.0]), np.array([1.0])))
-    old, new = jnp.array([0.2, -0.3]), jnp.array([0.5, -0.1])
-    action = family.sample(
-        jnp.broadcast_to(old, (20_000, 2)), family.noise(jax.random.key(0), (20_000,))
-    )
-    each = np.asarray(diagnostics.kl_divergence(family, old, new, action))
-
-    def integrand(x):
-        p, q = (float(family.log_prob(outputs, jnp.array([x]))) for outputs in (old, new))
-        return np.exp(p) * (p - q)
-
-    expected = integrate.quad(integrand, -1, 1)[0]
-    assert abs(each.mean() - expected) < 5 * each.std() / np.sqrt(each.size)
-
-
 def test_the_noise_of_all_episodes_is_the_sample_variance_of_their_mean():
     each = np.random.default_rng(0).normal(size=(6, 3)) + 1
     mean = each.mean(axis=0)
@@ -152,48 +112,21 @@ def test_the_noise_of_all_episodes_is_the_sample_variance_of_their_mean():
     assert float(got) == pytest.approx((np.sum(mean**2) - noise) / noise, rel=1e-4)
 
 
-def chain_moments():
-    """The exact mean and variance of an episode's gradient of Chain, by its six episodes."""
-    logits = tabular_policy().init(None)
-    gradients, probabilities = [], []
-    arms = [(a, 0) for a in (0, 1)] + list(itertools.product((0, 1), (1,), (0, 1)))
-    for episode in arms:
-        returns = np.cumsum([Chain.rewards[t, a] for t, a in enumerate(episode)][::-1])[::-1]
+def test_the_noise_is_that_of_some_episodes_beside_the_mean_of_all():
+    """Of 65 episodes that of two; see ``diagnostics.signal_to_noise``."""
+    mask = np.arange(5)[:, None] < np.random.default_rng(1).integers(1, 6, 65)
+    problem = make_problem(optax.sgd(0.1), mask=mask)
+    _, _, metrics = updates.full_batch()(problem, None, PARAMS, problem.optimizer.init(PARAMS))
 
-        def weighted(logits, episode=episode, returns=returns):
-            log_probs = jax.nn.log_softmax(logits)
-            return sum(g * log_probs[t, a] for t, (a, g) in enumerate(zip(episode, returns)))  # noqa: B905
+    def gradient(part):
+        samples = tuple(x[:, part] for x in problem.samples)
+        grads = jax.grad(lambda p: problem.surrogate(p, samples)[0])(PARAMS)
+        return np.array(jax.tree.leaves(grads))
 
-        gradients.append(np.asarray(jax.grad(weighted)(logits)).ravel())
-        log_probs = np.asarray(jax.nn.log_softmax(logits))
-        probabilities.append(np.exp(sum(log_probs[t, a] for t, a in enumerate(episode))))
-    gradients, probabilities = np.array(gradients), np.array(probabilities)
-    assert probabilities.sum() == pytest.approx(1, rel=1e-5)
-    mean = probabilities @ gradients
-    return np.sum(mean**2), probabilities @ np.sum(gradients**2, axis=1) - np.sum(mean**2)
-
-
-def test_signal_and_noise_are_unbiased_on_a_bandit():
-    """Of updates of four episodes, of which one is looked at, against all six that there are."""
-    learner = reinforce(
-        Chain(),
-        policy=tabular_policy(),
-        estimator=estimators.reward_to_go(1.0),
-        num_episodes=4,
-        normalize_steps=0,
-    )
-
-    def measure(key):
-        metrics = train_step(learner, jax.jit(learner.init)(key))[1]
-        square = metrics["gradient_norm"] ** 2
-        return square, square / (1 + metrics["gradient_snr"])
-
-    keys = jax.random.split(jax.random.key(0), 30_000)
-    square, noise = map(np.asarray, jax.jit(jax.vmap(measure))(keys))
-    signal, variance = chain_moments()
-    for got, expected in ((noise, variance / 4), (square - noise, signal)):
-        assert abs(got.mean() - expected) < 4.5 * got.std() / np.sqrt(got.size)
-        assert got.std() / np.sqrt(got.size) < 0.05 * expected
+    mean = gradient(slice(None)) / 65
+    apart = [np.sum((gradient(slice(n, n + 1)) - mean) ** 2) for n in (0, 1)]
+    expected = np.sum(mean**2) / (np.mean(apart) / 64) - 1
+    assert float(metrics["gradient_snr"]) == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(("bound", "share"), [(1e-6, 1.0), (1e6, 0.0)])
@@ -226,9 +159,7 @@ def test_what_does_not_clip_has_no_share():
     assert "clipped_gradients" not in metrics
 
 
-NAMES = {"kl", "policy_std", "explained_variance", "gradient_snr", "clipped_gradients"}
-
-
+@pytest.mark.slow
 def test_an_update_goes_no_further_than_it_may():
     """From the second update on: the first also scales the observations, which counts, too."""
 
@@ -257,9 +188,10 @@ def test_an_update_goes_no_further_than_it_may():
     assert same_kl == free_kl
 
 
+@pytest.mark.slow
 def test_a_change_without_a_kl_is_kept_as_it_is():
     policy = mlp_policy(1, normal(Survive.action_space), ())
-    actor = reinforce(Survive(), policy=policy).init(jax.random.key(0)).actor
+    actor = Actor(params=policy.init(jax.random.key(0)), normalizer=normalize.init(1))
     visited = diagnostics.visited_steps(make_trajectory([4, 9], 20))
     same = diagnostics.within_kl(policy, actor, actor.params, visited, 0.01)
     assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, actor.params))
@@ -268,13 +200,7 @@ def test_a_change_without_a_kl_is_kept_as_it_is():
     assert all(np.isnan(x).all() for x in jax.tree.leaves(kept))  # for ``keep_finite`` to see
 
 
-def test_an_update_has_all_of_them():
-    learner = reinforce(Survive(), num_episodes=4)
-    metrics = train_step(learner, jax.jit(learner.init)(jax.random.key(0)))[1]
-    assert metrics.keys() >= NAMES
-    assert all(np.isfinite(metrics[name]) for name in NAMES)
-
-
+@pytest.mark.slow
 def test_a_search_has_the_noise_of_its_directions_alone():
     learner = ars(Target(), num_directions=5)
     state = jax.jit(learner.init)(jax.random.key(0))
@@ -288,4 +214,4 @@ def test_a_search_has_the_noise_of_its_directions_alone():
     metrics = train_step(learner, state)[1]
     expected = np.sum(each.mean(axis=0) ** 2) / noise - 1
     assert float(metrics["gradient_snr"]) == pytest.approx(expected, rel=1e-3)
-    assert metrics.keys() & NAMES == {"gradient_snr"}
+    assert not metrics.keys() & {"kl", "policy_std", "explained_variance", "clipped_gradients"}

@@ -16,7 +16,7 @@ from toys import Chain, tabular_policy
 from mjx_reinforce import Trajectory, reinforce
 from mjx_reinforce.learners import estimators as est
 from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
-from mjx_reinforce.policies.networks import MLP
+from mjx_reinforce.policies.policy import MLP
 
 #: How likely each state, or the end, follows a state and an action; and what these earn.
 NEXT = np.array(

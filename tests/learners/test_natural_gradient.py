@@ -16,11 +16,11 @@ from mjx_reinforce.learners import natural_gradient as module
 from mjx_reinforce.learners import schedules
 from mjx_reinforce.learners.reinforce import _surrogate
 from mjx_reinforce.learners.updates import Problem, full_batch
+from mjx_reinforce.policies.distributions.bounded import tanh_normal
 from mjx_reinforce.policies.distributions.categorical import categorical
-from mjx_reinforce.policies.distributions.normal import normal
-from mjx_reinforce.policies.distributions.tanh_normal import tanh_normal
+from mjx_reinforce.policies.distributions.gaussian import normal
 from mjx_reinforce.settings.config import Config, check
-from mjx_reinforce.store.build import build
+from mjx_reinforce.store.build import _build_optimizer, build
 from mjx_reinforce.types import Box, Discrete
 
 MASK = np.arange(6)[:, None] < np.array([6, 1, 0, 4])
@@ -28,7 +28,6 @@ BOX = Box(np.array([-1.0, 0.0]), np.array([1.0, 4.0]))
 FAMILIES = {
     "linear normal": (normal(BOX), ()),
     "normal": (normal(BOX), (3,)),
-    "softplus": (normal(BOX, std="softplus"), (3,)),
     "linear softplus": (normal(BOX, std="softplus"), ()),
     "categorical": (categorical(Discrete(3)), (3,)),
 }
@@ -68,35 +67,43 @@ def actions_and_probabilities(distribution, outputs):
 def dense_fisher(policy, params, observations):
     """The mean over observations of E[score score^T], [P, P]."""
     flat, unravel = ravel_pytree(params)
-    total = np.zeros((flat.size, flat.size))
-    for observation in observations:
-        outputs = policy.apply(params, observation)
-        actions, shares = actions_and_probabilities(policy.distribution, outputs)
 
-        def log_prob(flat, action, observation=observation):
+    def of_one(observation):
+        def log_prob(flat, action):
             return policy.distribution.log_prob(policy.apply(unravel(flat), observation), action)
 
-        scores = np.asarray(jax.vmap(jax.grad(log_prob), (None, 0))(flat, jnp.asarray(actions)))
-        total += (scores.T * np.asarray(shares)) @ scores
-    return total / len(observations)
+        outputs = policy.apply(params, observation)
+        actions, shares = actions_and_probabilities(policy.distribution, outputs)
+        scores = jax.vmap(jax.grad(log_prob), (None, 0))(flat, jnp.asarray(actions))
+        return (scores.T * jnp.asarray(shares)) @ scores
+
+    return np.mean(jax.jit(jax.vmap(of_one))(observations), axis=0)
 
 
-def step(update, policy, params, problem, key=None):
-    """Returns the change of the parameters in one vector, and the metrics."""
-    key = jax.random.key(7) if key is None else key
-    after, _, metrics = update(problem, key, params, problem.optimizer.init(params))
-    return np.asarray(ravel_pytree(after)[0] - ravel_pytree(params)[0]), metrics
+def stepper(update, params, problem):
+    """Returns a compiled function from samples to the change of the parameters, and metrics."""
+
+    @jax.jit
+    def step(samples, key=None):
+        key, start = jax.random.key(7) if key is None else key, problem.optimizer.init(params)
+        after, _, metrics = update(problem._replace(samples=samples), key, params, start)
+        return ravel_pytree(after)[0] - ravel_pytree(params)[0], metrics
+
+    return step
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILIES)
 def test_the_step_is_that_of_a_dense_fisher_matrix(name):
     with jax.enable_x64(True):
         policy, params, problem = make(name)
         iterations = 1 if name == "linear normal" else 60  # which is exact without
         update = natural_gradient(policy, MAX_KL, damping=DAMPING, iterations=iterations)
-        got, metrics = step(update, policy, params, problem)
+        got, metrics = stepper(update, params, problem)(problem.samples)
+        got = np.asarray(got)
         fisher = dense_fisher(policy, params, np.asarray(problem.samples[0])[MASK])
-        plain, plain_metrics = step(full_batch(), policy, params, problem)
+        plain, plain_metrics = stepper(full_batch(), params, problem)(problem.samples)
+        plain = np.asarray(plain)
         direction = np.linalg.solve(fisher + DAMPING * np.eye(len(fisher)), plain)
         expected = np.sqrt(2 * MAX_KL / (plain @ direction)) * direction
         np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-9)
@@ -106,6 +113,7 @@ def test_the_step_is_that_of_a_dense_fisher_matrix(name):
         assert metrics["gradient_norm"] == pytest.approx(plain_metrics["gradient_norm"])
 
 
+@pytest.mark.slow
 def test_single_precision_and_observations_that_never_change():
     """One entry is 0 and one repeats another: the Fisher matrix is singular."""
     for name in ("linear normal", "normal"):
@@ -114,7 +122,7 @@ def test_single_precision_and_observations_that_never_change():
         observation = observation.at[..., 1].set(0.0).at[..., 2].set(observation[..., 0])
         problem = problem._replace(samples=(observation, *others))
         update = natural_gradient(policy, MAX_KL, damping=1e-3, iterations=30)
-        got, _ = step(update, policy, params, problem)
+        got, _ = stepper(update, params, problem)(problem.samples)
         assert got.dtype == np.float32
         with jax.enable_x64(True):
             wide = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), params)
@@ -122,7 +130,8 @@ def test_single_precision_and_observations_that_never_change():
                 jnp.asarray(np.asarray(x), bool if x.dtype == bool else float)
                 for x in problem.samples
             )
-            expected, _ = step(update, policy, wide, problem._replace(samples=samples))
+            expected, _ = stepper(update, wide, problem)(samples)
+            expected = np.asarray(expected)
         scale = np.abs(expected).max()
         np.testing.assert_allclose(got, expected, rtol=0, atol=2e-3 * scale)
 
@@ -136,96 +145,72 @@ def test_the_fisher_matrix_of_a_normal_is_the_curvature_of_its_divergence():
     )
 
 
-@pytest.mark.parametrize("name", ["linear normal", "normal"])
-def test_no_gradient_is_no_step(name):
-    policy, params, problem = make(name)
-    observation, action, weight, mask = problem.samples
-    problem = problem._replace(samples=(observation, action, 0 * weight, mask))
-    got, _ = step(natural_gradient(policy, MAX_KL), policy, params, problem)
-    assert np.all(got == 0.0)
-
-
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["linear normal", "categorical"])
-def test_the_scale_of_the_weights_does_not_matter(name):
+def test_the_scale_of_the_weights_does_not_matter_and_no_gradient_is_no_step(name):
     policy, params, problem = make(name)
-    update = natural_gradient(policy, MAX_KL)
-    expected, _ = step(update, policy, params, problem)
+    step = stepper(natural_gradient(policy, MAX_KL), params, problem)
+    expected, _ = step(problem.samples)
     observation, action, weight, mask = problem.samples
     for scale in (2.0**-50, 2.0**20):  # of which float32 rounds none
-        scaled = problem._replace(samples=(observation, action, scale * weight, mask))
-        got, _ = step(update, policy, params, scaled)
+        got, _ = step((observation, action, scale * weight, mask))
         np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-6)
+    assert np.all(step((observation, action, 0 * weight, mask))[0] == 0.0)
 
 
+@pytest.mark.slow
 def test_steps_are_drawn_where_there_are_many(monkeypatch):
     """From inside the mask; the direction is about that of all."""
     policy, params, problem = make("normal")
-    observation, *others = problem.samples
+    observation, *_ = problem.samples
     poisoned = jnp.where(MASK[..., None], observation, jnp.nan)
     update = natural_gradient(policy, MAX_KL, damping=0.1)
-    every, _ = step(update, policy, params, problem)
+    every = np.asarray(stepper(update, params, problem)(problem.samples)[0])
     monkeypatch.setattr(module, "MAX_FISHER_STEPS", 20)
     keys = jax.random.split(jax.random.key(0), 20)
-
-    def draw(key, observation=observation):
-        samples = (observation, *others)
-        after, *_ = update(problem._replace(samples=samples), key, params, optax.sgd(1.0).init({}))
-        return ravel_pytree(after)[0] - ravel_pytree(params)[0]
-
-    drawn = np.asarray(jax.vmap(draw)(keys))
+    step = stepper(update, params, problem)
+    drawn = np.asarray(jax.vmap(lambda key: step(problem.samples, key)[0])(keys))
     cosines = drawn @ every / np.linalg.norm(drawn, axis=1) / np.linalg.norm(every)
-    assert len(np.unique(cosines)) == len(keys)
+    assert len(np.unique(cosines)) == len(drawn)
     assert cosines.mean() > 0.8
     found = jax.vmap(lambda key: module.draw_steps(key, jnp.asarray(MASK), (20,)))(keys)
     assert np.all(np.isfinite(poisoned.reshape(-1, 3)[found]))
 
 
-def learn(update, policy, optimizer=None, progress=0.0, **settings):
-    learner = reinforce(
-        Drift(),
-        policy=policy,
-        update=update,
-        optimizer=optax.sgd(1.0) if optimizer is None else optimizer,
-        num_episodes=3,
-        normalize_steps=0,
-        engine="vmap",
-        **settings,
-    )
-    state = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(3), 4))
-    state = dataclasses.replace(state, progress=jnp.full(4, progress))
-    return jax.jit(jax.vmap(learner.step))(state)[1]
-
-
-@pytest.mark.parametrize("hidden_sizes", [(), (8,)])
-def test_a_step_moves_the_policy_by_about_the_divergence(hidden_sizes):
-    """Of four seeds side by side; a factor on the step counts by its square."""
-    policy = mlp_policy(1, normal(Drift.action_space), hidden_sizes)
-    update = natural_gradient(policy, 1e-3, damping=1e-3, iterations=20)
-    metrics = learn(update, policy)
-    assert np.all(metrics["skipped_update"] == 0)
-    np.testing.assert_allclose(metrics["kl"], 1e-3, rtol=0.1)
-    np.testing.assert_allclose(learn(update, policy, optax.sgd(0.5))["kl"], 2.5e-4, rtol=0.1)
-    shrinking = optax.chain(optax.sgd(0.0), schedules.shrink_std(0.5))
-    assert np.all(learn(update, policy, shrinking, progress=0.1)["kl"] > 1e-4)
-
-
-def test_seeds_side_by_side_are_the_seeds_alone():
+@pytest.mark.slow
+def test_a_step_moves_the_policy_by_about_the_divergence():
+    """Of seeds side by side, as of one alone; a factor on the step counts by its square."""
     policy = mlp_policy(1, normal(Drift.action_space), (8,))
-    settings = {"num_episodes": 4, "optimizer": optax.sgd(1.0), "engine": "vmap"}
-    learner = reinforce(
-        Drift(), policy=policy, update=natural_gradient(policy, 1e-2), max_kl=1e-2, **settings
-    )
-    states = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 3))
-    together, _ = jax.jit(jax.vmap(learner.step))(states)
-    for seed in range(3):
-        state = jax.tree.map(lambda x, seed=seed: x[seed], states)
-        alone, _ = train_step(learner, state)
-        for got, expected in zip(
-            jax.tree.leaves(together.actor.params), jax.tree.leaves(alone.actor.params), strict=True
-        ):
-            np.testing.assert_allclose(got[seed], expected, rtol=1e-3, atol=1e-5)
+    update = natural_gradient(policy, 1e-3, damping=1e-3, iterations=20)
+
+    def learn(key, rate, shrinking=1.0):
+        optimizer = optax.chain(optax.sgd(rate), schedules.shrink_std(shrinking))
+        learner = reinforce(
+            Drift(),
+            policy=policy,
+            update=update,
+            optimizer=optimizer,
+            num_episodes=3,
+            normalize_steps=0,
+            engine="vmap",
+        )
+        state = dataclasses.replace(learner.init(key), progress=jnp.float32(0.1))
+        after, metrics = learner.step(state)
+        return ravel_pytree(after.actor.params)[0], metrics
+
+    keys = jax.random.split(jax.random.key(3), 4)
+    rates = jnp.repeat(jnp.array([1.0, 0.5, 0.0]), 4)
+    shrinking = jnp.repeat(jnp.array([1.0, 1.0, 0.5]), 4)
+    together, metrics = jax.jit(jax.vmap(learn))(jnp.tile(keys, 3), rates, shrinking)
+    assert np.all(metrics["skipped_update"] == 0)
+    np.testing.assert_allclose(metrics["kl"][:4], 1e-3, rtol=0.1)
+    np.testing.assert_allclose(metrics["kl"][4:8], 2.5e-4, rtol=0.1)
+    assert np.all(metrics["kl"][8:] > 1e-4)
+    alone, _ = jax.jit(learn)(keys[2], 1.0)
+    np.testing.assert_allclose(together[2], alone, rtol=1e-3, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_settings_become_the_update():
     """The learning rate leaves a share of the step, relative to its first value."""
     natural = Config(
@@ -236,22 +221,19 @@ def test_settings_become_the_update():
         normalize_steps=0,
         num_episodes=64,
         engine="vmap",
+        decay_steps=None,
     )
     check(natural)
-
-    def moved(**settings):
-        config = dataclasses.replace(natural, **settings)
-        learner, _ = build(SignedTarget(), config)
-        state = jax.jit(learner.init)(jax.random.key(0))
-        first, _ = train_step(learner, state)
-        second, metrics = train_step(learner, first)
-        return float(metrics["kl"]), second
-
-    constant, _ = moved(decay_steps=None)
-    assert constant == pytest.approx(0.01, rel=0.25)
-    assert moved(decay_steps=None, learning_rate=1e-3)[0] == pytest.approx(constant, rel=1e-3)
-    decayed, _ = moved(decay_steps=1)  # to a tenth of the step, a hundredth of the divergence
-    assert decayed == pytest.approx(1e-4, rel=0.25)
+    learner, _ = build(SignedTarget(), natural)
+    _, metrics = train_step(learner, jax.jit(learner.init)(jax.random.key(0)))
+    assert float(metrics["kl"]) == pytest.approx(0.01, rel=0.25)
+    for settings, last in (({}, 1.0), ({"learning_rate": 1e-3}, 1.0), ({"decay_steps": 8}, 0.1)):
+        optimizer = _build_optimizer(dataclasses.replace(natural, **settings))
+        state = optimizer.init(jnp.ones(2))
+        for played, share in ((0.0, 1.0), (8.0, last)):
+            clock = schedules.Clock(jnp.zeros(()), jnp.asarray(played))
+            change, _ = optimizer.update(jnp.ones(2), state, jnp.ones(2), clock=clock)
+            np.testing.assert_allclose(change, -share, rtol=1e-5)
 
 
 def test_nonsense_is_refused():

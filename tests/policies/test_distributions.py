@@ -11,7 +11,7 @@ from scipy import integrate, special, stats
 
 from mjx_reinforce import Box, fused
 from mjx_reinforce.policies.distributions import normal_integrals
-from mjx_reinforce.policies.distributions.normal import normal
+from mjx_reinforce.policies.distributions.gaussian import normal
 from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
 from mjx_reinforce.types import Discrete
 
@@ -41,8 +41,6 @@ def supporting(space):
 DISCRETE = list(supporting(ARMS))
 CONTINUOUS = [name for name in supporting(SPACE) if name != "deterministic"]
 BOUNDED = sorted(set(CONTINUOUS) - set(supporting(UNBOUNDED)))
-#: The bounded families whose outputs are the mean and the log of the standard deviation.
-BOUNDED_NORMALS = ["clipped-normal", "tanh-normal", "truncated-normal"]
 #: Actions of positive probability; and the interval where there is a density, if it is not all of
 #: the action's range.
 ATOMS = {"clipped-normal": [LOW, HIGH], "tanh-normal": -1.0 + 2.0 * np.tanh([-6.0, 6.0])}
@@ -159,7 +157,10 @@ def test_the_fused_engine_writes_out_sample_and_mode(name):
     np.testing.assert_allclose(written, jax.vmap(distribution.mode, -1, -1)(outputs), rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", BOUNDED_NORMALS)
+@pytest.mark.parametrize(
+    "name",
+    ["clipped-normal", "tanh-normal", pytest.param("truncated-normal", marks=pytest.mark.slow)],
+)
 def test_far_out_samples_stay_inside_and_gradients_finite(name):
     """At means up to 10,000 standard deviations beyond either bound."""
     distribution = build(name)
@@ -221,7 +222,7 @@ def test_truncated_normal_against_scipy(std, distance):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("distance", [-1e6, -1e4, 1e4])
+@pytest.mark.parametrize("distance", [pytest.param(-1e6, marks=pytest.mark.slow), 1e4])
 def test_truncated_normal_far_out_is_exponential(distance, dtype):
     """With rate c / std from the nearer bound, up to a relative 1 / c^2."""
     with jax.enable_x64(dtype == np.float64):
@@ -310,11 +311,10 @@ def test_tanh_normal_density():
     np.testing.assert_allclose(distribution.log_prob(outputs, actions), expected, atol=5e-3)
 
 
-@pytest.mark.parametrize("name", DISCRETE)
-def test_discrete_probabilities(name):
-    """Entropy, mode, score and the frequencies of samples follow from the probabilities."""
-    distribution = build(name, ARMS)
-    outputs = some_outputs(distribution)
+def test_the_probabilities_of_a_categorical():
+    """Entropy, mode, score and the frequencies of samples follow from them: a softmax."""
+    distribution = build("categorical", ARMS)
+    outputs = jnp.array([0.3, -1.0, 2.0, 0.0])
     log_probs = distribution.log_prob(outputs, jnp.arange(4))
     probabilities = np.exp(np.asarray(log_probs, float))
     assert np.sum(probabilities) == pytest.approx(1.0, rel=1e-6)
@@ -327,14 +327,8 @@ def test_discrete_probabilities(name):
     assert stats.chisquare(counts, NUM_SAMPLES * probabilities / probabilities.sum()).pvalue > 1e-4
     scores = jax.vmap(jax.grad(distribution.log_prob), (None, 0))(outputs, jnp.arange(4))
     np.testing.assert_allclose(probabilities @ np.asarray(scores), 0.0, atol=1e-6)
-
-
-def test_categorical_is_a_softmax():
-    distribution = build("categorical", ARMS)
-    logits = jnp.array([0.3, -1.0, 2.0, 0.0])
-    got = jnp.exp(distribution.log_prob(logits, jnp.arange(4)))
-    np.testing.assert_allclose(got, special.softmax(np.asarray(logits, float)), rtol=1e-6)
-    assert int(distribution.mode(logits)) == 2
+    softmax = special.softmax(np.asarray(outputs, float))
+    np.testing.assert_allclose(probabilities, softmax, rtol=1e-6)
 
 
 def test_deterministic_has_no_density():
@@ -348,29 +342,16 @@ def test_deterministic_has_no_density():
 
 
 def test_nonsense_is_refused():
-    with pytest.raises(ValueError, match="initial_std must be positive"):
-        normal(SPACE, initial_std=-1.0)
-    with pytest.raises(ValueError, match="'parameter', 'softplus' or 'sigmoid'"):
-        normal(SPACE, std="exp")
-    with pytest.raises(ValueError, match="stays below 1"):
-        normal(SPACE, std="sigmoid", initial_std=1.0)
     with pytest.raises(ValueError, match="categorical needs a discrete action space"):
         build("categorical")
-
-
-@pytest.mark.parametrize("name", [*CONTINUOUS, "deterministic"])
-def test_a_discrete_space_is_refused(name):
-    with pytest.raises(ValueError, match=r"continuous action space.*choose categorical"):
-        build(name, ARMS)
-
-
-@pytest.mark.parametrize("name", BOUNDED)
-def test_unbounded_actions_are_refused(name):
-    with pytest.raises(ValueError, match=r"finite action bounds.*choose normal"):
-        build(name, UNBOUNDED)
+    for name in [*CONTINUOUS, "deterministic"]:
+        with pytest.raises(ValueError, match=r"continuous action space.*choose categorical"):
+            build(name, ARMS)
+    for name in BOUNDED:
+        with pytest.raises(ValueError, match=r"finite action bounds.*choose normal"):
+            build(name, UNBOUNDED)
 
 
 def test_every_family_is_tested():
     """The lists above leave out a family that cannot be built."""
     assert {*CONTINUOUS, *DISCRETE, "deterministic"} == set(DISTRIBUTIONS)
-    assert set(BOUNDED) >= set(BOUNDED_NORMALS)
