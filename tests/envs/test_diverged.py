@@ -81,7 +81,7 @@ def test_a_step_in_which_c_resets_earns_no_number(case, in_a_folder):
     np.testing.assert_allclose(found, [*speeds[2::3][: len(found) - 1], np.nan], rtol=1e-4)
 
 
-@pytest.mark.parametrize("engine", ["vmap", "native"])
+@pytest.mark.parametrize("engine", [pytest.param("vmap", marks=pytest.mark.slow), "native"])
 def test_every_engine_ends_the_episode(engine):
     env = Slider()
     policy, params = still(env)
@@ -93,6 +93,7 @@ def test_every_engine_ends_the_episode(engine):
     assert 1e7 < episode.reward.max() < 1e8
 
 
+@pytest.mark.slow
 def test_many_at_once_are_told():
     vec = make_vec(Slider(), 2)
     state, step = vec.reset(jax.random.key(0)), jax.jit(vec.step)
@@ -103,6 +104,7 @@ def test_many_at_once_are_told():
     assert state.reward[0] == 0
 
 
+@pytest.mark.slow
 def test_episodes_to_look_at_end_there(in_a_folder):
     """In each simulation that ``watch`` knows."""
     (in_a_folder / "slider.xml").write_text(MODEL.format(kp=1e5))

@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from mjx_reinforce import reinforce
+from mjx_reinforce import mlp_policy, normal, reinforce
+from mjx_reinforce.engines.episode import episode_keys
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
 from mjx_reinforce.envs.in_mujoco import InMujoco
@@ -202,19 +203,22 @@ def test_fields_of_the_model_are_those_of_mujoco_with_the_same_fields(reach):
 
 
 @pytest.mark.slow
-def test_machine_code_plays_what_was_drawn():
-    """The same episodes as ``vmap``: with other goals, frictions and masses they would differ."""
-    floor = '<geom name="floor" type="plane" size="5 5 1"/>'  # contacts take long to compile
-    spec = mujoco.MjSpec.from_string(SOURCE.replace(floor, ""))  # pyright: ignore
-    env = Reach(xml_file=spec)
-    learner = reinforce(env, num_episodes=4, horizon=8, engine="native")
-    like = reinforce(env, num_episodes=4, horizon=8, engine="vmap")
-    key, state = jax.random.key(2), learner.init(jax.random.key(0))
-    played, expected = (jax.jit(x.play)(state, key) for x in (learner, like))
-    np.testing.assert_allclose(played.observation, expected.observation, rtol=2e-3, atol=2e-3)
-    np.testing.assert_allclose(played.reward, expected.reward, rtol=2e-3, atol=2e-3)
-    goals = np.asarray(played.observation[0, :, -2])
-    assert len(set(goals.tolist())) == 4
+def test_machine_code_plays_what_was_drawn(reach):
+    """As ``step`` does: with other goals, frictions and masses the episodes would differ."""
+    env, reset, step = reach
+    policy = mlp_policy(env.observation_size, normal(env.action_space), ())
+    learner = reinforce(env, policy=policy, num_episodes=4, horizon=8, engine="native")
+    key, start = jax.random.key(2), learner.init(jax.random.key(0))
+    played = jax.jit(learner.play)(start, key)
+    for n, own in enumerate(episode_keys(key, 4)):
+        state = reset(jax.random.split(own)[0])
+        for seen, action, reward in zip(
+            *(x[:, n] for x in (played.observation, played.action, played.reward)), strict=True
+        ):
+            np.testing.assert_allclose(seen, state.obs, rtol=2e-3, atol=2e-3)
+            state = step(state, action)
+            np.testing.assert_allclose(reward, state.reward, rtol=2e-3, atol=2e-3)
+    assert len(set(np.asarray(played.observation[0, :, -2]).tolist())) == 4
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,7 @@ def test_probe_2_the_best_action_depends_on_the_observation():
     np.testing.assert_allclose(mode[:, 0], [-0.5, 0.5], atol=0.15)
 
 
+@pytest.mark.slow
 def test_update_is_the_gradient_of_the_surrogate():
     """SGD at rate 1 moves the parameters by minus the gradient of the formula in reinforce()."""
     with jax.enable_x64(True):
@@ -180,6 +181,7 @@ class Breaks(Survive):
         return after.replace(obs=jnp.where(self.broken, jnp.nan, after.obs))
 
 
+@pytest.mark.slow
 def test_a_broken_simulation_is_counted_and_stays_in_its_seed():
     @jax.jit
     @jax.vmap

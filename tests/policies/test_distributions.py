@@ -64,7 +64,12 @@ def draw(distribution, outputs):
     return jax.jit(distribution.sample)(copies, noise)
 
 
-@pytest.fixture(params=CONTINUOUS)
+@pytest.fixture(
+    params=[
+        pytest.param(name, marks=pytest.mark.slow) if name == "truncated-normal" else name
+        for name in CONTINUOUS
+    ]
+)
 def name(request):
     return request.param
 
