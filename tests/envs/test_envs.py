@@ -39,6 +39,9 @@ LIGHT = sorted(set(IDS) - HEAVY)
 #: Tasks that take seconds to trace or to compile.
 SECONDS = HEAVY - {"Swimmer-v5"} | {"Reacher-v5", "InvertedDoublePendulum-v5"}
 made = functools.cache(envs.make)
+all_in_turn = pytest.mark.parametrize(
+    "ids", [LIGHT, pytest.param(sorted(HEAVY), marks=pytest.mark.slow)], ids=["light", "heavy"]
+)
 
 
 def shapes(tree):
@@ -79,9 +82,10 @@ def test_a_step_keeps_shapes_and_dtypes_and_its_argument(id):
             assert start.obs.dtype == start.reward.dtype == start.done.dtype == dtype
 
 
-def test_sizes_bounds_and_limits():
+@all_in_turn
+def test_sizes_bounds_and_limits(ids):
     """They are those that the plan of a run knows, of what was measured."""
-    for id in IDS:
+    for id in ids:
         env, space = made(id), action_space(made(id))
         if isinstance(space, Discrete):
             assert env.action_size == space.num_actions > 1, id
@@ -95,9 +99,10 @@ def test_sizes_bounds_and_limits():
             assert (task.observation, task.action, task.horizon) == sizes, id
 
 
-def test_settings_are_frozen_and_gymnasiums():
+@all_in_turn
+def test_settings_are_frozen_and_gymnasiums(ids):
     """Every argument of Gymnasium's class is here under its name, with its default."""
-    for id in IDS:
+    for id in ids:
         env = made(id)
         assert isinstance(env.settings, EpisodeSettings)
         with pytest.raises(dataclasses.FrozenInstanceError):
