@@ -42,7 +42,7 @@ from mjx_reinforce.reports.statistics.survival import kaplan_meier, log_rank
 from mjx_reinforce.runs.run import RunResults, run
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import of_task
-from mjx_reinforce.sweeps.run import SweepResults, sweep
+from mjx_reinforce.sweeps.perform import SweepResults, sweep
 from mjx_reinforce.training.driver import Evaluation
 from mjx_reinforce.training.evaluation import evaluate
 from mjx_reinforce.types import Box, Discrete, Environment, Trajectory

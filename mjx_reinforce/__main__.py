@@ -41,18 +41,12 @@ def _command(arguments: list[str]) -> tuple[str, list[str]]:
     if first in ("-V", "--version", "version"):
         print(SCRIPT, ours)
         sys.exit(0)
-    from mjx_reinforce.registry import nearest
-    from mjx_reinforce.settings.hints import about_word
-    from mjx_reinforce.settings.presets import PRESETS
+    from mjx_reinforce.settings.flags import about_word
+    from mjx_reinforce.settings.tables import PRESETS
 
     if first.startswith("-") or first in PRESETS:
         return "train", arguments
-    said = about_word(first, trains=True, prog=SCRIPT)
-    if said is None:
-        near = nearest(first, PRESETS)
-        hint = f" Did you mean {near!r}?" if near else ""
-        said = f"unknown command {first!r}.{hint} Commands: {', '.join(COMMANDS)}."
-    say_error(said)
+    say_error(about_word(first))
     sys.exit(2)
 
 

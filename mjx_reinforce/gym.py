@@ -11,7 +11,7 @@ those of ``vector.for_gymnasium.make``.
 import gymnasium
 
 from mjx_reinforce import envs
-from mjx_reinforce.settings.measured import TASKS
+from mjx_reinforce.settings.tables import TASKS
 
 for _id in envs.names():
     gymnasium.register(

@@ -21,10 +21,10 @@ from mjx_reinforce.reports.page import columns, document, tables, words
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.figures import Figure, figures
 from mjx_reinforce.reports.page.vega import ONE, render_chart
+from mjx_reinforce.settings.config import as_words
 from mjx_reinforce.settings.defaults import check_task, of_task
 from mjx_reinforce.settings.flags import read_command_line
 from mjx_reinforce.settings.own_code import env_flag
-from mjx_reinforce.settings.relevance import as_words
 from mjx_reinforce.store.provenance import version
 from mjx_reinforce.training.resume import recordable
 

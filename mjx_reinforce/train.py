@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mjx_reinforce import envs
-from mjx_reinforce.console.heartbeat import heartbeat, to_screen
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.console.streams import accept_everything, silence_alarms
+from mjx_reinforce.console.streams import accept_everything, heartbeat, silence_alarms, to_screen
 from mjx_reinforce.runs.command_line import parse, refuse, refuse_full, start
 from mjx_reinforce.runs.directory import (
     check_writable,
@@ -26,7 +25,7 @@ from mjx_reinforce.runs.directory import (
     make_directory,
     remove_empty,
 )
-from mjx_reinforce.runs.plan import Plan, make_plan
+from mjx_reinforce.runs.plan import make_plan
 from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.memory import check_memory
@@ -70,7 +69,7 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
             # A module of the user's is imported before JAX starts, which it may set up.
             env = None if envs.is_ours(config.env) else envs.make_set(config.env, config.env_set)
             configure_jax()
-            with heartbeat(to_screen, None, "writing the simulation out"):
+            with heartbeat(to_screen, "writing the simulation out"):
                 default = start(arguments, "train")[0]
                 ready, found = _start(env, config, default)
             if config.init_from is not None and found is None:
@@ -138,7 +137,7 @@ def train(
     ready: "Ready",
     found: "Checkpoint | None",
     config: Config,
-    plan: Plan,
+    plan: str,
     directory: Path,
     interrupt: Interrupt,
 ) -> int:
@@ -160,12 +159,11 @@ def train(
 
     with Display() as display:
         interrupt.restore_screen(display.console.show_cursor)
-        display.say(plan.text)
-        with display.compiling(plan.compiling), _collection_paused():
+        display.say(plan)
+        with display.compiling(), _collection_paused():
             from mjx_reinforce.reports.curves import load_libraries
-            from mjx_reinforce.runs.log import RunLog
-            from mjx_reinforce.runs.observers import RunFiles, Screen
-            from mjx_reinforce.runs.training import compile_driver, draw, summary_of
+            from mjx_reinforce.runs.observers import RunFiles, RunLog, Screen
+            from mjx_reinforce.runs.run import compile_driver, draw, summary_of
 
             loading = threading.Thread(target=load_libraries, daemon=True)
             driver, seconds = compile_driver(ready, config, found, display.say, loading.start)
@@ -173,7 +171,7 @@ def train(
         interrupt.defer(display.say)
         files = RunFiles(RunLog(directory), ready.policy, display.say)
         files.begin(driver, found)
-        driver.observers += [files, Screen(display, plan.correction)]
+        driver.observers += [files, Screen(display)]
         display.start(seconds)
         driver.drive(lambda: interrupt.number is not None)
     files.end(driver)

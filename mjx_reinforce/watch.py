@@ -15,9 +15,8 @@ from rich.progress import track
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.heartbeat import heartbeat
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.console.streams import accept_everything, say_error, silence_alarms
+from mjx_reinforce.console.streams import accept_everything, heartbeat, say_error, silence_alarms
 from mjx_reinforce.export.films import (
     Renderer,
     import_gymnasium,
@@ -180,7 +179,7 @@ def _check_env(settings: WatchSettings, source: PolicySource) -> None:
 def _waiting(what: str) -> AbstractContextManager[Any]:
     """Returns a ``with`` block that shows on the screen that its contents are still running."""
     console = Console(stderr=True)
-    return console.status(what) if console.is_terminal else heartbeat(console.print, None, what)
+    return console.status(what) if console.is_terminal else heartbeat(console.print, what)
 
 
 def compare(settings: WatchSettings, simulators: Mapping[str, Any]) -> str:

@@ -159,7 +159,7 @@ def test_import_is_light():
     assert loaded.strip() == "[]"
 
 
-@pytest.mark.parametrize("command", ["train", "sweeps.designs.grid", "export.__main__", "new"])
+@pytest.mark.parametrize("command", ["train", "sweeps.grid", "export.__main__", "new"])
 def test_what_reads_a_command_line_is_light(command):
     """So that --help, and what is refused, take no second."""
     loaded = run(f"import sys, mjx_reinforce.{command}\nprint('jax' in sys.modules)")

@@ -1,13 +1,8 @@
 """How this program's commands set up JAX."""
 
-import contextlib
 import functools
-import glob
 import os
-import re
 import sys
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 from mjx_reinforce.engines.native.ownership import distrust, distrust_contents, make_folder
@@ -20,15 +15,10 @@ _REFUSED = {
 }
 #: Values of these with which the commands can work.
 _HARMLESS = (False, None, "allow", "log", "log_explicit")
-#: What JAX says of a program in its cache: what it was doing, the function's name, and the error.
-_CACHE_ERROR = r"Error (reading|writing) persistent compilation cache entry for '([^']+)': (.*)"
 
 
 def configure_jax() -> None:
     """Turns on exact float32 products and the compilation cache, unless the user chose.
-
-    A program in the cache that cannot be read is removed, because JAX replaces no file; then JAX
-    writes it again.
 
     Raises:
       ValueError: JAX finds no device, such as where JAX_PLATFORMS names one that is not here, or is
@@ -42,8 +32,6 @@ def configure_jax() -> None:
             raise ValueError(f"{name} is set, but {what}; unset it")
     if settings["jax_enable_compilation_cache"]:
         _choose_cache()
-    if getattr(warnings.showwarning, "func", None) is not _forget_unreadable:
-        warnings.showwarning = functools.partial(_forget_unreadable, warnings.showwarning)
     if settings["jax_default_matmul_precision"] is None:
         jax.config.update("jax_default_matmul_precision", "highest")
     try:
@@ -91,32 +79,6 @@ def _unusable(folder: Path) -> str | None:
     except OSError as error:
         return f"{type(error).__name__}: {error.strerror}"
     return distrust(folder) or distrust_contents(folder)
-
-
-def _forget_unreadable(
-    show: Callable[..., None], message: object, *where: object, **options: object
-) -> None:
-    """Shows a warning; one about the cache in a line, and removes a program that cannot be read.
-
-    JAX names the function that was compiled, not the file: all programs of that function go.
-    """
-    import jax
-
-    found = re.search(_CACHE_ERROR, str(message), re.DOTALL)
-    if found is None:
-        show(message, *where, **options)
-        return
-    (doing, name, cause), folder = found.groups(), jax.config.values["jax_compilation_cache_dir"]
-    removed = []
-    for path in Path(folder).glob(f"{glob.escape(name)}-*") if doing == "reading" else ():
-        with contextlib.suppress(OSError):
-            path.unlink()
-            removed.append(path)
-    if removed:
-        _warn(f"{name} in {folder} could not be read; it is compiled anew")
-    else:
-        kind = cause.partition(": '")[0]  # without the file
-        _warn(f"the cache {folder} does not work ({kind}), so the next start compiles again")
 
 
 @functools.cache

@@ -8,11 +8,10 @@ import numpy as np
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.runs import plan
-from mjx_reinforce.settings import measured
-from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.defaults import of_task
-from mjx_reinforce.settings.relevance import as_flag, changed, is_read
+from mjx_reinforce.runs.plan import said_time
+from mjx_reinforce.settings import tables
+from mjx_reinforce.settings.config import Config, as_flag, changed, is_read
+from mjx_reinforce.settings.defaults import expected_seconds, of_task
 from mjx_reinforce.types import Environment
 
 if TYPE_CHECKING:
@@ -41,7 +40,7 @@ def _sizes(id: str, env: "MujocoEnv") -> str:
     """Returns the sizes of a task, a line each."""
     from mjx_reinforce.types import observation_size
 
-    known = measured.TASKS.get(id)
+    known = tables.TASKS.get(id)
     observation = observation_size(env) if known is None else known.observation
     limit = getattr(env, "max_episode_steps", None)
     threshold = getattr(env, "reward_threshold", None)
@@ -89,7 +88,7 @@ def _how_to_train(config: Config) -> list[str]:
     said = [
         f"To train {config.num_seeds} seeds for {config.env_steps:,} env steps each:",
         f"  {command('train')} --env {config.env}",
-        _time_here(config),
+        f"{said_time(expected_seconds(config))}. --minutes M sets a time.",
     ]
     differing = (name for name in changed(config, Config()) if name not in _SAID)
     names = [name for name in differing if is_read(name, config)]
@@ -97,14 +96,3 @@ def _how_to_train(config: Config) -> list[str]:
         flags = "\n".join(f"  {as_flag(name, getattr(config, name))}" for name in names)
         said.append(f"Its default settings, where other tasks have others:\n{flags}")
     return said
-
-
-def _time_here(config: Config) -> str:
-    """Returns how long a run takes on this machine, as the run itself says."""
-    machine = plan.this_hardware()
-    task, speed = measured.TASKS.get(config.env), machine.speeds.get(config.env)
-    if task is None or speed is None:
-        return f"How long that takes on {machine.name} is not known; --minutes M sets a time."
-    seconds, bounded = plan.run_seconds(config, task, machine, speed)
-    said = plan.said_time(speed.compiling, seconds, bounded)
-    return f"On {machine.name}: {said[0].lower()}{said[1:]}."

@@ -11,16 +11,13 @@ from typing import Any, NoReturn
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import say_error
-from mjx_reinforce.registry import check_name
 from mjx_reinforce.runs.directory import remove_empty
-from mjx_reinforce.settings.config import Config, read_seeds
+from mjx_reinforce.settings.config import Config, changed, check_read, is_read, read_seeds
 from mjx_reinforce.settings.defaults import flag_value, for_arguments, named_code
-from mjx_reinforce.settings.flags import asks_brief_help, read_command_line
+from mjx_reinforce.settings.flags import about_word, asks_brief_help, read_command_line
 from mjx_reinforce.settings.groups import GROUPS, MAIN, UNUSUAL
-from mjx_reinforce.settings.hints import about_word
 from mjx_reinforce.settings.own_code import check_named
-from mjx_reinforce.settings.presets import PRESETS
-from mjx_reinforce.settings.relevance import changed, check_read, is_read
+from mjx_reinforce.settings.tables import PRESETS
 from mjx_reinforce.training import resume
 
 #: What a run leaves in its directory.
@@ -106,9 +103,8 @@ def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequ
     if not arguments or arguments[0].startswith("-"):
         return _default(arguments), None, arguments, f"{prog} [PRESET]"
     preset, *flags = arguments
-    if preset not in PRESETS and (said := about_word(preset, trains=True, prog=prog)):
-        raise ValueError(said)
-    check_name("preset", preset, PRESETS)
+    if preset not in PRESETS:
+        raise ValueError(about_word(preset))
     return PRESETS[preset][1], preset, flags, f"{prog} {preset}"
 
 

@@ -17,9 +17,8 @@ from rich.table import Table
 from rich.text import Text
 
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.heartbeat import heartbeat
+from mjx_reinforce.console.streams import heartbeat
 from mjx_reinforce.reports.statistics import enough, iqm
-from mjx_reinforce.runs.plan import duration
 from mjx_reinforce.settings.own_code import env_flag
 from mjx_reinforce.training import progress
 
@@ -86,17 +85,9 @@ class Display:
         with suppress(OSError):
             print_commands(self.console, commands)
 
-    def compiling(self, expected: float | None) -> AbstractContextManager[None]:
-        """Returns a ``with`` block that shows that its contents are still running.
-
-        Args:
-          expected: how long they take (s), or None if that is not known.
-        """
-        if not self.console.is_terminal:
-            return heartbeat(self.say, expected)
-        if expected is not None:
-            self._bar.update(self._task, description=f"compiling, about {duration(expected)}")
-        return nullcontext()
+    def compiling(self) -> AbstractContextManager[None]:
+        """Returns a ``with`` block that shows that its contents are still running."""
+        return nullcontext() if self.console.is_terminal else heartbeat(self.say)
 
     def start(self, compile_seconds: float) -> None:
         """Marks the end of compilation, from where the time left is counted."""

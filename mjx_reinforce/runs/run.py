@@ -2,11 +2,13 @@
 
 import contextlib
 import dataclasses
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce import envs
@@ -15,21 +17,126 @@ from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.export.player import Player
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.export.run_files import Which
+from mjx_reinforce.learners import counts
 from mjx_reinforce.policies.actor import Actor
 from mjx_reinforce.policies.policy import Policy
+from mjx_reinforce.reports.curves import draw_learning_curve
 from mjx_reinforce.reports.statistics import worst_if_not_finite
 from mjx_reinforce.runs.directory import locked, make_directory, remove_empty
 from mjx_reinforce.runs.display import Display
-from mjx_reinforce.runs.log import RunLog
-from mjx_reinforce.runs.observers import Callbacks, RunFiles, Screen
+from mjx_reinforce.runs.observers import Callbacks, RunFiles, RunLog, Screen
 from mjx_reinforce.runs.plan import make_plan
 from mjx_reinforce.runs.sinks import check_installed
-from mjx_reinforce.runs.training import compile_driver, draw, summary_of
-from mjx_reinforce.settings.config import Config, check
+from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.store.ready import get_ready
-from mjx_reinforce.training.driver import Driver, Evaluation
-from mjx_reinforce.training.state import last_actors
+from mjx_reinforce.training.driver import Driver, Evaluation, first_best
+from mjx_reinforce.training.programs import RunPrograms, compile_run
+from mjx_reinforce.training.progress import HOPELESS
+from mjx_reinforce.training.record import RunRecord
+from mjx_reinforce.training.state import Budget, RunState, begin_with, last_actors
+
+if TYPE_CHECKING:
+    from mjx_reinforce.store.ready import Ready
+    from mjx_reinforce.training.checkpoint import Checkpoint
+
+
+def compile_driver(
+    ready: "Ready",
+    config: Config,
+    found: "Checkpoint | None" = None,
+    say: Callable[[str], None] = lambda text: None,
+    meanwhile: Callable[[], object] = lambda: None,
+) -> tuple[Driver, float]:
+    """Returns a run before its first update, and how long it took to compile, in seconds.
+
+    Args:
+      ready: the run.
+      config: its settings.
+      found: the checkpoint from which it will go on, if any.
+      say: shows a line to the user.
+      meanwhile: begins other work in Python; called once the rest of the time is XLA's.
+    """
+    started = time.perf_counter()
+    state, programs = compile_run(ready.programs, config, meanwhile)
+    seconds = ready.engine_seconds + time.perf_counter() - started
+    if config.init_from is not None and found is None:
+        state = begin_with(state, last_actors(config, ready.policy))
+    if config.minutes is not None:
+        first = state if found is None else found.state[0]
+        env_steps = env_steps_in(60 * config.minutes, programs, first, config.max_updates)
+        say(f"{config.minutes:g} min are about {env_steps:,} env steps of a seed in all here")
+        config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
+    record, best = RunRecord(config, ready.threshold), first_best(state.train_states)
+    known = dataclasses.replace(config, horizon=ready.horizon)
+    return Driver(known, programs, record, state, best), seconds
+
+
+def summary_of(
+    driver: Driver, engine: str, compile_seconds: float, test: dict[str, Any]
+) -> dict[str, Any]:
+    """Returns the contents of summary.json.
+
+    Args:
+      driver: of the run, at its end.
+      engine: the name of the engine that played.
+      compile_seconds: wall time of compiling.
+      test: from ``Driver.test``, empty if the run was interrupted.
+    """
+    record, seconds = driver.record, driver.seconds()
+    end = {"status": "stopped", "reason": HOPELESS} if record.hopeless() else {"status": "finished"}
+    return {
+        **(end if test else {"status": "interrupted"}),
+        **record.summary(engine, compile_seconds, seconds),
+        "best_updates": counts.to_int(driver.best.num_updates).tolist(),
+        **test,
+    }
+
+
+def draw(driver: Driver) -> bytes:
+    """Returns the contents of learning_curve.png."""
+    config, record = driver.config, driver.record
+    axis = "episodes" if config.env_steps is None else "env_steps"
+    history, training = record.history(), record.training()
+    return draw_learning_curve(history, training, config.env, record.threshold, axis)
+
+
+#: The part of the time in which its speed is measured; what is trained in it is trained again.
+_PART = 0.03
+
+
+def env_steps_in(
+    seconds: float, programs: RunPrograms, state: RunState, max_updates: int | None
+) -> int:
+    """Returns the env steps that a mean seed will have played in all after a time.
+
+    A copy of the state is trained, and evaluated, for a small part of that time. The speed of the
+    second half of that part counts: the first updates also have what a device does once, and the
+    shortest episodes.
+
+    Args:
+      seconds: the time.
+      programs: of the run.
+      state: from which it goes on.
+      max_updates: of the run, if any.
+    """
+    budget = Budget.of(None, max_updates)
+    copy = jax.tree.map(jnp.copy, state)
+    began, past = time.perf_counter(), [(0.0, _played(state))]
+    going = True
+    while going and past[-1][0] < _PART * seconds:
+        copy, metrics, _ = programs.advance(copy, True, budget)
+        past.append((time.perf_counter() - began, _played(copy)))
+        going = bool(metrics["active"].any())
+    end, played = past[-1]
+    half, before = next((x for x in past[1:-1] if x[0] >= end / 2), past[-2])
+    speed = (played - before) / (end - half)
+    return min(max(1, round(past[0][1] + speed * max(seconds - end, 0.0))), MAX_COUNT)
+
+
+def _played(state: RunState) -> float:
+    """Returns the env steps of the mean seed."""
+    return float(counts.to_int(state.train_states.env_steps).mean())
 
 
 class RunResults(NamedTuple):
@@ -156,15 +263,15 @@ def run(
         display = Display()
         display.console.quiet = quiet
         held.enter_context(display)
-        display.say(plan.text)
-        with display.compiling(plan.compiling):
+        display.say(plan)
+        with display.compiling():
             driver, seconds = compile_driver(ready, config, say=display.say)
         files = None
         if config.output is not None:
             files = RunFiles(RunLog(config.output), ready.policy, display.say)
             files.begin(driver, None)
             driver.observers.append(files)
-        driver.observers += [Screen(display, plan.correction), Callbacks(observers)]
+        driver.observers += [Screen(display), Callbacks(observers)]
         display.start(seconds)
         driver.drive(lambda: False)
         if files is not None:

@@ -1,12 +1,28 @@
-"""What a sink is, which ones a run has, and that of JSON lines."""
+"""Where the rows of evaluations go besides metrics.csv: JSON lines, and charts of many seeds.
 
+Charts show statistics over the seeds, and a few seeds one by one. RUN/tensorboard has events,
+written here and not by tensorboardX's ``SummaryWriter``, whose thread dies on a full disk and then
+keeps the program from ending. RUN/wandb has a run of Weights & Biases, offline unless WANDB_MODE
+says otherwise.
+"""
+
+import contextlib
 import csv
+import importlib
 import importlib.util
 import json
+import os
+import socket
+import struct
+import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
-from mjx_reinforce.files import append, finite, write_bytes
+import numpy as np
+
+from mjx_reinforce.files import append, finite, read_json, write_bytes, write_json
+from mjx_reinforce.reports.statistics import iqm, iqm_interval
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.rows import Cells, parse_cell
 
@@ -75,30 +91,24 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Que
     Raises:
       OSError: one of them cannot be written.
     """
-    from mjx_reinforce.runs import charts
-
     sinks = []
     if config.jsonl:
         sinks.append(Queue("metrics.jsonl", JsonLines(directory)))
     if config.tensorboard:
-        sinks.append(Queue("tensorboard/", charts.TensorBoard(directory, updates)))
+        sinks.append(Queue("tensorboard/", TensorBoard(directory, updates)))
     if config.wandb:
-        sinks.append(Queue("to W&B", charts.WeightsAndBiases(directory)))
+        sinks.append(Queue("to W&B", WeightsAndBiases(directory)))
     return sinks
 
 
 def files(directory: Path) -> list[Path]:
     """Returns the files that sinks replace at once."""
-    from mjx_reinforce.runs import charts
-
-    return [directory / NAME, directory / charts.WANDB_RUN]
+    return [directory / NAME, directory / WANDB_RUN]
 
 
 def remove_outputs(directory: Path) -> None:
     """Removes what the sinks of an older run left; W&B keeps its runs apart itself."""
-    from mjx_reinforce.runs import charts
-
-    events = (directory / charts.TENSORBOARD).glob(charts.EVENTS)
+    events = (directory / TENSORBOARD).glob(EVENTS)
     for path in (*files(directory), *events):
         path.unlink(missing_ok=True)
 
@@ -133,3 +143,182 @@ def _as_json_lines(rows: Cells) -> bytes:
     numbers = zip(*(map(parse_cell, cells) for cells in rows.values()), strict=True)
     objects = (finite(dict(zip(rows, row, strict=True))) for row in numbers)
     return "".join(json.dumps(each, allow_nan=False) + "\n" for each in objects).encode()
+
+
+#: Seeds that are shown one by one, the first ones: each is a curve for every column.
+MAX_SINGLE_SEEDS = 16
+#: Columns that say when an evaluation was; what is shown is their mean.
+_PROGRESS = ("env_steps", "episodes", "wall_seconds")
+_QUANTILES = (5, 25, 50, 75, 95)
+#: The interval is drawn from thousands of resamples, so the returns that matter alone have it.
+_WITH_INTERVAL = ("eval_return",)
+
+
+def chart_step(rows: Cells) -> int:
+    """Returns the place of an evaluation on the axis of charts: the most updates of a seed."""
+    return max(map(int, rows["update"]))
+
+
+def measured(rows: Cells) -> dict[str, np.ndarray]:
+    """Returns the columns [S] of one evaluation that were measured."""
+    apart = ("seed", "update", *_PROGRESS)
+    names = [name for name, cells in rows.items() if name not in apart and cells[0]]
+    return {name: np.array(rows[name], float) for name in names}
+
+
+def scalars(rows: Cells) -> dict[str, float]:
+    """Returns the numbers that are shown, by name, such as ``eval_return/iqm``.
+
+    For each column: ``iqm``, ``lowest`` (of returns, the worst seed), ``highest`` and quantiles;
+    for the evaluation's return also ``iqm_low`` and ``iqm_high``, its 95 % interval; and
+    ``seed_0`` and so on, of the first ``MAX_SINGLE_SEEDS``. A value that is not finite counts as
+    less than any other; what it reaches is NaN.
+
+    Args:
+      rows: of one evaluation.
+    """
+    shown = {f"progress/{name}": float(np.array(rows[name], float).mean()) for name in _PROGRESS}
+    for name, values in measured(rows).items():
+        numbers = _summary(values)
+        if name in _WITH_INTERVAL:
+            low, high = iqm_interval(values)
+            numbers |= {"iqm_low": float(low), "iqm_high": float(high)}
+        numbers |= {f"seed_{i}": float(x) for i, x in enumerate(values[:MAX_SINGLE_SEEDS])}
+        shown |= {f"{name}/{key}": x for key, x in numbers.items()}
+    return shown
+
+
+def _summary(values: np.ndarray) -> dict[str, float]:
+    """Returns statistics over the seeds of values [S]."""
+    failed_last = np.where(np.isfinite(values), values, -np.inf)
+    # Not interpolated: between a failed seed and another there is no number.
+    found = np.percentile(failed_last, (0, *_QUANTILES, 100), method="inverted_cdf")
+    names = ("lowest", *(f"quantile_{q:02}" for q in _QUANTILES), "highest")
+    quantiles = np.where(np.isfinite(found), found, np.nan)
+    return {"iqm": float(iqm(values))} | dict(zip(names, quantiles.tolist(), strict=True))
+
+
+TENSORBOARD = "tensorboard"
+EVENTS = "events.out.tfevents.*"
+
+
+class TensorBoard:
+    """Writes events whose step is the number of updates."""
+
+    def __init__(self, directory: Path, updates: int | None):
+        """Begins a file of events beside those that are there.
+
+        Args:
+          directory: of the run.
+          updates: after how many a resumed run goes on: TensorBoard drops what older files have
+            of later ones. None drops everything.
+        """
+        folder = directory / TENSORBOARD
+        folder.mkdir(exist_ok=True)
+        # Readers sort the files by name.
+        place = f"{int(time.time()):010}.{socket.gethostname()}"
+        count = len(list(folder.glob(EVENTS)))
+        self._path = folder / f"events.out.tfevents.{place}.{count:04}"
+        first = 0 if updates is None else updates + 1
+        start = _message("event", "SessionLog")(status="START")
+        event, now = _message("event", "Event"), time.time()
+        header = event(wall_time=now, file_version="brain.Event:2")
+        purge = event(wall_time=now, step=first, session_log=start)
+        append(self._path, _record(header) + _record(purge))
+
+    def write(self, rows: Cells) -> None:
+        """Adds an event, or raises OSError and adds none."""
+        event, summary = _message("event", "Event"), _message("summary", "Summary")
+        # Not by ``summary.scalar``, which prints a line for every NaN.
+        shown = [summary.Value(tag=tag, simple_value=x) for tag, x in scalars(rows).items()]
+        step, now = chart_step(rows), time.time()
+        append(self._path, _record(event(wall_time=now, step=step, summary=summary(value=shown))))
+
+    def close(self) -> None:
+        """Does nothing: every event is written."""
+
+
+def _message(file: str, name: str) -> Any:
+    """Returns a class of tensorboardX's protocol; type checkers do not see what is in its files."""
+    return getattr(importlib.import_module(f"tensorboardX.proto.{file}_pb2"), name)
+
+
+def _record(event: Any) -> bytes:
+    """Returns an event in TensorFlow's record format: length, its checksum, event, checksum."""
+    from tensorboardX.record_writer import masked_crc32c
+
+    data = event.SerializeToString()
+    length = struct.pack("<Q", len(data))
+    checksums = [struct.pack("<I", masked_crc32c(part)) for part in (length, data)]
+    return length + checksums[0] + data + checksums[1]
+
+
+#: Which run it is, and up to which update it has rows.
+WANDB_RUN = "wandb/mjx_reinforce.json"
+_TO_BE_ONLINE = "; run wandb login, or unset WANDB_MODE and send the run later by wandb sync"
+
+
+class WeightsAndBiases:
+    """Logs the statistics over seeds, and the first seeds; the step is the number of updates.
+
+    A resumed run goes on under the same id. Rows that it has already are not logged again: they
+    are the same.
+    """
+
+    def __init__(self, directory: Path):
+        """Begins the run, or goes on with it.
+
+        Args:
+          directory: of ours.
+
+        Raises:
+          OSError: W&B cannot be started.
+        """
+        import wandb
+
+        self._path = directory / WANDB_RUN
+        self._path.parent.mkdir(exist_ok=True)  # without it W&B writes elsewhere
+        known = read_json(self._path) if self._path.exists() else {}
+        self._logged = int(known.get("updates", -1))
+        mode: Any = os.environ.get("WANDB_MODE", "offline")
+        with _errors_as_os_errors(_TO_BE_ONLINE if mode == "online" else ""):
+            self._run = wandb.init(
+                project=os.environ.get("WANDB_PROJECT", "mjx_reinforce"),
+                name=os.environ.get("WANDB_NAME", directory.resolve().name),
+                id=known.get("id"),
+                resume="allow" if known and mode == "online" else None,
+                config=read_json(directory / "config.json"),
+                dir=directory,
+                mode=mode,
+                settings=wandb.Settings(silent=True, console="off", x_disable_stats=True),
+            )
+        self._save()
+
+    def write(self, rows: Cells) -> None:
+        """Logs the rows of one evaluation, or raises OSError."""
+        step = chart_step(rows)
+        if step <= self._logged:
+            return
+        with _errors_as_os_errors():
+            self._run.log(scalars(rows), step=step)
+        self._logged = step
+        self._save()
+
+    def close(self) -> None:
+        """Ends the run, once all of it is written or sent."""
+        with _errors_as_os_errors():
+            self._run.finish()
+
+    def _save(self) -> None:
+        write_json(self._path, {"id": self._run.id, "updates": self._logged})
+
+
+@contextlib.contextmanager
+def _errors_as_os_errors(remedy: str = "") -> Iterator[None]:
+    """Raises W&B's own errors as OSError: a run warns of an OSError and continues."""
+    import wandb
+
+    try:
+        yield
+    except wandb.Error as error:
+        raise OSError(str(error).rstrip(".") + remedy) from error

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 from mjx_reinforce import envs
 from mjx_reinforce.checks import whole_number
-from mjx_reinforce.settings import measured, tuned
+from mjx_reinforce.settings import tables
 from mjx_reinforce.settings.config import Config, spoken
-from mjx_reinforce.settings.memory import cpu_factor, has_gpu
+from mjx_reinforce.settings.memory import cpu_factor, has_gpu, num_parameters
 from mjx_reinforce.settings.own_code import CODE
 
 #: Where a budget is large, it has about so many evaluations.
@@ -47,18 +47,19 @@ def of_task(
       >>> dataclasses.replace(config, num_seeds=8).num_seeds, config.env_steps
       (8, 20000)
     """
-    few = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **tuned.OF_TASKS.get(env, {}))
-    if env_steps is None and seconds is None and (env in tuned.SOLVED or env not in tuned.OF_TASKS):
+    known = tables.OF_TASKS.get(env)
+    few = dataclasses.replace(Config(env=env, num_seeds=num_seeds), **(known or {}))
+    if env_steps is None and seconds is None and (env in tables.SOLVED or known is None):
         return few
     rows = [(0, few)]
-    for least, settings in tuned.OF_BUDGETS.get(env, ()):
+    for least, settings in tables.OF_BUDGETS.get(env, ()):
         rows.append((least, dataclasses.replace(few, **settings)))
     if env_steps is not None:
         chosen = next(config for least, config in reversed(rows) if env_steps >= least)
         return _with_budget(chosen, env_steps)
     given, chosen = _in_time(seconds or _DEFAULT_SECONDS, rows)
     if seconds is None:
-        given = min(given, tuned.ENOUGH.get(env, given))
+        given = min(given, tables.ENOUGH.get(env, given))
     return _with_budget(chosen, max(given, 1 if seconds else few.env_steps or 0))
 
 
@@ -88,9 +89,9 @@ def _with_budget(config: Config, env_steps: int) -> Config:
     config = dataclasses.replace(config, env_steps=env_steps)
     if isinstance(config.decay_steps, int) and config.decay_steps < env_steps:
         config = dataclasses.replace(config, decay_steps="budget")
-    if config.env not in measured.TASKS:
+    if config.env not in tables.TASKS:
         return config
-    horizon = config.training_horizon(measured.TASKS[config.env].horizon)
+    horizon = config.training_horizon(tables.TASKS[config.env].horizon)
     played = config.episodes_per_update * horizon
     usual = dataclasses.replace(config, num_seeds=Config.num_seeds)
     every = min(env_steps // _EVALUATIONS, expected_env_steps(_BETWEEN, usual)) // played
@@ -102,15 +103,35 @@ def expected_env_steps(seconds: float, config: Config) -> int:
 
     A task that was not measured has those of its default budget.
     """
-    machine = measured.GPU if has_gpu() else measured.CPU
+    steps = _steps_in(seconds, config)
+    return (config.env_steps or 0) if steps is None else int(float(f"{steps:.2g}"))
+
+
+def expected_seconds(config: Config) -> float | None:
+    """Returns about how long this machine trains a run (s), without compiling and evaluations.
+
+    None where that is not known: of a task or an engine that was not measured, of a value network
+    or a policy larger than the task's own, and of a run that its number of updates ends.
+    """
+    steps = _steps_in(1.0, config)
+    other = config.engine == "vmap" or config.estimator == "value-baseline"
+    if steps is None or other or config.env_steps is None:
+        return None
+    task, own = tables.TASKS[config.env], of_task(config.env, env_steps=1)
+    larger = num_parameters(config, task) > num_parameters(own, task)
+    return None if larger else config.env_steps / steps
+
+
+def _steps_in(seconds: float, config: Config) -> float | None:
+    """Returns about how many env steps of a seed a time gives; None of an unmeasured task."""
+    machine = tables.GPU if has_gpu() else tables.CPU
     if config.env not in machine:
-        return config.env_steps or 0
-    speed, task = machine[config.env], measured.TASKS[config.env]
+        return None
+    speed, task = machine[config.env], tables.TASKS[config.env]
     useful = 1.0 if speed.engine == "native" else task.useful
     episodes = config.num_seeds * config.episodes_per_update
     each = speed.seconds(config.num_seeds, episodes)  # an env step of every seed
-    steps = useful * seconds * (1.0 if has_gpu() else cpu_factor()) / each
-    return int(float(f"{steps:.2g}"))
+    return useful * seconds * (1.0 if has_gpu() else cpu_factor()) / each
 
 
 def check_task(env: str) -> None:

@@ -9,37 +9,38 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TextIO, TypeVar, get_type_hints
+from typing import Annotated, Any, TextIO, TypeVar, get_args, get_type_hints
 
 import docstring_parser
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from mjx_reinforce import envs
 from mjx_reinforce.checks import whole_number
+from mjx_reinforce.console.commands import COMMANDS, command
 from mjx_reinforce.console.streams import columns_of, say_error, wrapped
-from mjx_reinforce.settings.hints import about_unknown, known, required, unknown_flags
+from mjx_reinforce.registry import is_own, nearest
+from mjx_reinforce.settings.config import flag, spoken
+from mjx_reinforce.settings.tables import PRESETS
 
 Form = TypeVar("Form")
 
 #: Columns that --help is written for at least: of 20 columns tyro makes thousands of lines.
 _LEAST_WIDTH = 60
-#: What tyro says of a value -> what we say.
+#: What tyro says of a value -> what we say, of its first paragraph.
 _OUR_WORDS = {
     r"Error parsing (PATH|\[.*\]): .*": "'' is no path",  # without a flag
     r"Missing value for argument '(\S+)'.*": r"\1 needs a value after it",
     r"Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]": (
-        r"\1 takes whole numbers with spaces between them, such as 32 32, got \2"
+        r"\1 takes numbers with spaces between them, such as 32 32, got \2"
+    ),
+    r"Error parsing (\S+): no type matching (.+?) could be instantiated from \[(.*?)\]\..*": (
+        r"\1 takes \2, got \3"
+    ),
+    r"invalid choice (\S+) for argument '(\S+)'\. Expected one of (\(.*\))\.": (
+        r"\2 takes one of \3, got \1"
     ),
     r"Error parsing (\S+): (takes .*)": r"\1 \2",
-}
-#: Of a value that is of none of several types.
-_NO_TYPE = r"Error parsing (\S+): no type matching (.+?) could be instantiated from \[(.*?)\]\..*"
-#: Of a value that is none of some names.
-_NO_CHOICE = r"invalid choice (\S+) for argument '(\S+)'\. Expected one of \((.*)\)"
-_TYPES = {
-    "INT": "a whole number, such as 4 or 2e6,",
-    "FLOAT": "a number, such as 0.5,",
-    "PATH": "a path",
 }
 #: How numbers and paths are read, everywhere.
 _READERS = ConstructorRegistry()
@@ -110,13 +111,16 @@ def read_command_line(
         if not stop.code:
             print(_with_description(page.getvalue(), description), end="")
             if brief:
-                print(f"\n--help all shows all {len(known(form))} settings.")
+                print(f"\n--help all shows all {len(_names(form))} settings.")
             raise
-        if wrong := unknown_flags(arguments, form):
-            raise ValueError(about_unknown(wrong, arguments, form, prog)) from stop
-        raise ValueError(f"{_in_our_words(box.getvalue(), form, prog)} (see --help)") from stop
+        text = _first_section(box.getvalue())
+        if text.startswith("Missing from"):
+            text = f"{prog} needs {_required(form)}"
+        for pattern, replacement in _OUR_WORDS.items():
+            text = re.sub(pattern, replacement, text)
+        raise ValueError(f"{text} (see --help)") from stop
     if unknown:
-        raise ValueError(about_unknown(unknown, arguments, form, prog))
+        raise ValueError(_about_unknown(unknown[0], form))
     return _as_form(form, parsed)
 
 
@@ -209,27 +213,6 @@ def _with_description(page: str, description: str) -> str:
     return "\n\n".join([usage, wrapped(description, columns), rest])
 
 
-def _in_our_words(box: str, form: type, prog: str) -> str:
-    """Returns a message of tyro's in our words."""
-    text = _first_section(box)
-    if text.startswith("Missing from"):
-        return f"{prog} needs {' and '.join(required(form))}"
-    if found := re.match(_NO_TYPE, text):
-        flag, kinds, value = found.groups()
-        kinds = kinds.replace(" ", "").split("|")  # tyro's box breaks long lines
-        spoken = [_TYPES.get(kind) or kind.strip("{}").split(",") for kind in kinds]
-        numbers = [each for each in spoken if isinstance(each, str)]
-        names = [name for each in spoken if isinstance(each, list) for name in each]
-        return f"{flag} takes {' or '.join([*numbers, *names])}, got {value}"
-    if found := re.match(_NO_CHOICE, text):
-        value, flag, choices = found.groups()
-        names = sorted(set(re.findall(r"'(.*?)'", choices)) - {"None"})
-        return f"{flag} takes {' or '.join(names)}, got {value}"
-    for pattern, replacement in _OUR_WORDS.items():
-        text = re.sub(pattern, replacement, text)
-    return text
-
-
 def _first_section(box: str) -> str:
     """Returns the first paragraph of a message of tyro's, without its frame and title."""
     lines = [line.strip("│ ") for line in box.splitlines()[1:]]
@@ -241,6 +224,49 @@ def _first_section(box: str) -> str:
         else:
             said.append(line)
     return " ".join(said)
+
+
+def _names(form: type) -> list[str]:
+    """Returns the settings of a dataclass, and of the dataclasses in it."""
+    hints, names = get_type_hints(form), []
+    for field in dataclasses.fields(form):
+        kind = hints[field.name]
+        inside = isinstance(kind, type) and dataclasses.is_dataclass(kind)
+        names += _names(kind) if inside else [field.name]
+    return names
+
+
+def _required(form: type) -> str:
+    """Returns what a command line must have, as --help calls it."""
+    hints = get_type_hints(form, include_extras=True)
+    needed = (f.name for f in dataclasses.fields(form) if f.default is dataclasses.MISSING)
+    alone = {name for name, kind in hints.items() if tyro.conf.Positional in get_args(kind)}
+    return " and ".join(name.upper() if name in alone else flag(name) for name in needed)
+
+
+def _about_unknown(word: str, form: type) -> str:
+    """Returns the message about a word that a form does not take."""
+    if not word.startswith("-"):
+        return about_word(word)
+    name, known = word.partition("=")[0], [*map(spoken, _names(form))]
+    if name.removeprefix("--") in known:
+        return f"{name} stands after --, which ends the flags: leave -- out"
+    near = nearest(spoken(name.lstrip("-")), known)
+    hint = f" Did you mean '--{near}'?" if near else ""
+    return f"unknown flag {name!r}.{hint} (See --help.)"
+
+
+def about_word(word: str) -> str:
+    """Returns the message about a word that is neither a flag nor its value, with the remedy."""
+    if word in envs.names() or is_own(word):
+        return f"{word!r} is a task: write {command('train')} --env {word}"
+    if word in COMMANDS:
+        return f"{word!r} is a command of its own, {command(word)}, and comes before all flags"
+    if word in PRESETS:
+        return f"{word!r} is a preset, and a preset comes before all flags (see --help)"
+    near = nearest(word, [*envs.names(), *PRESETS, *COMMANDS])
+    hint = f" Did you mean {near!r}?" if near else ""
+    return f"no flag or command takes {word!r}.{hint} (See --help.)"
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""What a run needs, from its settings alone: memory, whether that is there, and arithmetic.
+"""What a run needs, from its settings alone: memory, and whether that is there.
 
 The factors were read off XLA's own account of its programs (``memory_analysis``), for 100 seeds of
 toys with 4 and 300 observations and 1,000 seeds of InvertedPendulum.
@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, flag, marked
 from mjx_reinforce.settings.declare import Range
-from mjx_reinforce.settings.measured import TASKS, Task
+from mjx_reinforce.settings.tables import TASKS, Task
 
 _FLOAT = 4  # bytes
 #: Copies of the episodes that a gradient needs: as played, scaled, and by time.
@@ -186,37 +186,3 @@ def _may_have_accelerator() -> bool:
     if os.environ.get("JAX_PLATFORMS") == "cpu":
         return False
     return importlib.util.find_spec("jax_plugins") is not None
-
-
-_FORWARDS, _BACKWARDS = 2, 4
-#: Steps that each of the natural gradient's iterations passes over at most, forwards and backwards.
-_FISHER_STEPS = 4096
-
-
-def operations_per_step(config: Config, task: Task) -> float:
-    """Returns the operations for each env step that a run plays and trains on.
-
-    The policy plays and measures how far it moved, and learns from each step once, or from what
-    minibatches draw; the natural gradient passes over some of them again and again. The value
-    network gives each step its value, and is fitted ``value_fits`` times, on all of them or on
-    minibatches.
-
-    Args:
-      config: the settings.
-      task: the sizes of the task; ``config`` may have another time limit.
-    """
-    policy = num_parameters(config, task)
-    if config.algorithm == "ars":
-        return _FORWARDS * policy
-    steps = config.episodes_per_update * config.training_horizon(task.horizon)
-    learned = 1.0
-    if config.update == "minibatches":
-        learned = config.minibatch_updates * config.minibatch_size / steps
-    elif config.update == "natural-gradient" and config.hidden_sizes:
-        learned += config.natural_iterations * min(1, _FISHER_STEPS / steps)
-    fitted = config.value_fits
-    if config.value_fit == "minibatches":
-        fitted *= config.value_batch_size / steps
-    once = _FORWARDS + _BACKWARDS
-    value = critic_parameters(config, task) * (_FORWARDS + once * fitted)
-    return (2 * _FORWARDS + once * learned) * policy + value

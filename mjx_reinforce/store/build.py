@@ -90,7 +90,7 @@ def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
 
 
 def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
-    from mjx_reinforce.console.heartbeat import to_screen
+    from mjx_reinforce.console.streams import to_screen
     from mjx_reinforce.engines.native import outlook
     from mjx_reinforce.learners.reinforce import reinforce
     from mjx_reinforce.learners.schedules import Cut

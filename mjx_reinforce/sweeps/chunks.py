@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.sweeps.designs.groups import Group
 from mjx_reinforce.sweeps.history import History, Measured
 from mjx_reinforce.sweeps.layout import StateRows
+from mjx_reinforce.sweeps.plan import Group
 from mjx_reinforce.sweeps.programs import SlotPrograms
 from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.checkpoint import Attempts, Checkpoint, SaveDue

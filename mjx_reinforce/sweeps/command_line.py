@@ -18,11 +18,10 @@ from mjx_reinforce.runs.command_line import (
     start,
 )
 from mjx_reinforce.runs.directory import remove_empty
-from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.config import Config, changed
 from mjx_reinforce.settings.groups import GROUPS
-from mjx_reinforce.settings.relevance import changed
-from mjx_reinforce.sweeps.designs import grid
-from mjx_reinforce.sweeps.designs.design import Design, SweepSettings, read_design
+from mjx_reinforce.sweeps import grid
+from mjx_reinforce.sweeps.design import Design, SweepSettings, read_design
 from mjx_reinforce.sweeps.perform import perform
 
 _ABOUT_SWEEPS = (

@@ -11,22 +11,23 @@ import numpy as np
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.reports.experiment import counted, say, setting_in_words
 from mjx_reinforce.runs.display import Display
-from mjx_reinforce.runs.plan import duration, is_wrong
 from mjx_reinforce.settings.config import MAX_COUNT
 from mjx_reinforce.sweeps import chunks
-from mjx_reinforce.sweeps.ahead import Stopwatch, one_ahead
 from mjx_reinforce.sweeps.chunks import Runs, Saver
-from mjx_reinforce.sweeps.designs.design import Design
-from mjx_reinforce.sweeps.designs.groups import Group, learner_builder
-from mjx_reinforce.sweeps.designs.plan import GroupPlan, Prepared, divide, group_seconds
+from mjx_reinforce.sweeps.design import Design
 from mjx_reinforce.sweeps.history import History
-from mjx_reinforce.sweeps.programs import SlotPrograms, compile_programs
+from mjx_reinforce.sweeps.plan import (
+    Group,
+    GroupPlan,
+    Prepared,
+    divide,
+    learner_builder,
+)
+from mjx_reinforce.sweeps.programs import SlotPrograms, Stopwatch, compile_programs, one_ahead
 from mjx_reinforce.sweeps.results import SweepFiles
 from mjx_reinforce.training.driver import drive
 from mjx_reinforce.training.progress import Progress
 
-#: More than this share of a sweep is all of it, up to rounding.
-_ALL = 1 - 1e-6
 #: So many values of a setting are named in a line.
 _NAMED = 6
 
@@ -47,6 +48,11 @@ class Stage(NamedTuple):
     def num_runs(self) -> int:
         """How many runs there are in its chunks."""
         return sum(len(runs.seed) for runs in self.chunks)
+
+    @property
+    def cost(self) -> int:
+        """What a run of it counts for in the progress of the sweep: its budget."""
+        return self.group.config.env_steps or 1
 
 
 class Conductor:
@@ -82,9 +88,7 @@ class Conductor:
     def conduct(self) -> bool:
         """Trains all groups; returns whether they ended, or were interrupted."""
         stages = self._stages()
-        said = {stage.number: self._seconds(stage) for stage in stages}
-        each = {number: 1.0 if seconds is None else seconds for number, seconds in said.items()}
-        self._total = sum(each[stage.number] * stage.num_runs for stage in stages)
+        self._total = sum(stage.cost * stage.num_runs for stage in stages)
         programs = one_ahead([functools.partial(self._compile, stage) for stage in stages])
         for stage in stages:
             began = time.perf_counter()
@@ -92,16 +96,14 @@ class Conductor:
             seconds = time.perf_counter() - began
             self.clock.compiling += seconds
             self._begin_files(seconds)
-            before = self.clock.running
             for runs in stage.chunks:
                 began, waited = time.perf_counter(), self.clock.compiling
-                ended = self._train(stage, compiled, runs, each[stage.number])
+                ended = self._train(stage, compiled, runs)
                 waited = self.clock.compiling - waited
                 self.clock.running += time.perf_counter() - began - waited
                 if not ended:
                     return False
-                self._done += each[stage.number] * len(runs.seed)
-            self._correct(said[stage.number], stage.num_runs, self.clock.running - before)
+                self._done += stage.cost * len(runs.seed)
         self._begin_files(0.0)  # where nothing was left to do
         return True
 
@@ -110,31 +112,6 @@ class Conductor:
         ready, self._ready = self._ready, None
         if ready is not None:
             ready(seconds)
-
-    def _seconds(self, stage: Stage) -> float | None:
-        """Returns about how long a run of a stage takes (s), None where that is not known."""
-        prepared, group = self._prepared, stage.group
-        env = prepared.envs[stage.number]
-        seconds = group_seconds(
-            env, prepared.horizons[stage.number], prepared.engine, group, prepared.devices.count
-        )
-        runs = len(group.members) * group.config.num_seeds
-        return None if seconds is None else seconds / runs
-
-    def _correct(self, said: float | None, num_runs: int, took: float) -> None:
-        """Says what the rest takes, if the runs that ended took quite another time than was said.
-
-        A sweep that goes on may have trained a part of them before.
-        """
-        done, resumed = self._part_done(), self._design.resume is not None
-        if said is None or resumed or done > _ALL or not is_wrong(said * num_runs, took):
-            return
-        left = duration(self.clock.running * (1 - done) / done)
-        self._display.say(
-            f"{num_runs:,} runs took {duration(took)}, not about {duration(said * num_runs)} as "
-            f"was said: the rest takes about {left}",
-            "yellow",
-        )
 
     def _stages(self) -> list[Stage]:
         """Returns the runs that are still to be trained."""
@@ -165,11 +142,8 @@ class Conductor:
             self.clock,
         )
 
-    def _train(self, stage: Stage, programs: SlotPrograms, runs: Runs, each: float) -> bool:
-        """Trains a chunk, from its last checkpoint if there is one; returns whether it ended.
-
-        ``each`` is what a run of it takes, as ``_part_done`` counts.
-        """
+    def _train(self, stage: Stage, programs: SlotPrograms, runs: Runs) -> bool:
+        """Trains a chunk, from its last checkpoint if there is one; returns whether it ended."""
         config = dataclasses.replace(stage.group.config, num_seeds=len(runs.seed))
         history, layout = History(config), programs.layout
         saver = Saver(self._files.checkpoints(runs.name), config, layout, self._display.say)
@@ -179,7 +153,7 @@ class Conductor:
         self._display.say(self._heading(runs))
 
         def show() -> None:
-            self._display.show_progress(self._progress(history, each))
+            self._display.show_progress(self._progress(history, stage.cost))
 
         observers = [show, lambda: saver.save_if_due(states, history)]
         most = (config.checkpoint_every or MAX_COUNT) // config.eval_every
@@ -211,18 +185,17 @@ class Conductor:
     def _part_done(self, more: float = 0.0) -> float:
         """Returns the part of the whole sweep that is done.
 
-        It counts the budgets of all runs by the time that they were said to take, or alike where
-        that is not known: those that lie aside cost nothing.
+        It counts the budgets of all runs: those that lie aside cost nothing.
 
         Args:
           more: what of the present chunk is done.
         """
         return (self._done + more) / self._total if self._total else 0.0
 
-    def _progress(self, history: History, each: float) -> Progress:
+    def _progress(self, history: History, cost: int) -> Progress:
         """Returns how far the chunk is, or the whole sweep where that differs."""
         now = history.progress()
-        done = self._part_done(each * now.num_seeds * now.fraction)
+        done = self._part_done(cost * now.num_seeds * now.fraction)
         passed = self.clock.running + history.seconds
         left = passed * (1 - done) / done if done > 0 else float("nan")
         return now._replace(fraction=done, seconds_left=left)

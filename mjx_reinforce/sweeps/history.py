@@ -10,8 +10,7 @@ import numpy as np
 
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.budget import used
-from mjx_reinforce.training.progress import Progress, measure_progress
+from mjx_reinforce.training.progress import Progress, measure_progress, used
 from mjx_reinforce.training.record import GrowingTable
 
 #: What is kept of every evaluation, and the name of its latest.

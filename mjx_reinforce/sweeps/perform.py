@@ -1,24 +1,31 @@
 """A sweep from its design to its files."""
 
 import contextlib
+import dataclasses
 import shlex
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
+from mjx_reinforce.checks import check_kind
 from mjx_reinforce.console.commands import command, typed
-from mjx_reinforce.console.heartbeat import heartbeat, to_screen
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.files import read_json, write_json
+from mjx_reinforce.console.streams import heartbeat, to_screen
+from mjx_reinforce.files import read_arrays, read_json, write_json
 from mjx_reinforce.runs.directory import choose_directory, locked, make_directory
+from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.own_code import code_flags
-from mjx_reinforce.sweeps.designs.design import Design, as_record, check_design
+from mjx_reinforce.sweeps.design import Design, as_record, check_design
 from mjx_reinforce.training.resume import check_same_program
 
 if TYPE_CHECKING:
     from mjx_reinforce.report import WrittenReport
-    from mjx_reinforce.sweeps.designs.plan import Prepared
+    from mjx_reinforce.runs.display import Display
+    from mjx_reinforce.sweeps.plan import Prepared
     from mjx_reinforce.sweeps.results import SweepFiles
 
 #: Not every terminal has the page's quotation marks.
@@ -85,10 +92,10 @@ def _perform(
     """Does what ``perform`` says, in a directory that is ours; ``known`` is its sweep.json."""
     from mjx_reinforce.runs.display import Display
     from mjx_reinforce.sweeps.conduct import Conductor
-    from mjx_reinforce.sweeps.designs.plan import prepare_sweep
+    from mjx_reinforce.sweeps.plan import prepare_sweep
     from mjx_reinforce.sweeps.results import SweepFiles
 
-    with heartbeat((lambda text: None) if quiet else to_screen, None, "writing the simulation out"):
+    with heartbeat((lambda text: None) if quiet else to_screen, "writing the simulation out"):
         prepared = prepare_sweep(design, known.get("chunk_runs"))
     contents = _contents(design, prepared, known)
     if known:
@@ -98,7 +105,7 @@ def _perform(
     with Display() as display, contextlib.ExitStack() as compiling:
         display.console.quiet = quiet
         display.say(prepared.plan)
-        compiling.enter_context(display.compiling(None))
+        compiling.enter_context(display.compiling())
 
         def ready(seconds: float) -> None:
             """Begins the files; not before there is a program, see ``train``."""
@@ -111,26 +118,34 @@ def _perform(
         if interrupt is not None:
             interrupt.restore_screen(display.console.show_cursor)
         conductor = Conductor(prepared, design, files, display, interrupt, ready)
-        conductor.clock.compiling += prepared.engine_seconds
         ended = conductor.conduct()
-        contents |= {
-            "status": "finished" if ended else "interrupted",
-            "compile_seconds": contents["compile_seconds"] + conductor.clock.compiling,
-            "run_seconds": contents["run_seconds"] + conductor.clock.running,
-        }
+        contents["status"] = "finished" if ended else "interrupted"
+        contents["compile_seconds"] += prepared.engine_seconds + conductor.clock.compiling
+        contents["run_seconds"] += conductor.clock.running
         _finish(design, prepared, files, contents)
-        written = None
-        if ended and report:
-            display.say("writing the report")
-            written = _report(directory)
-            contents["statistics_seconds"] = written.seconds
-            files.write(contents)
-            for sentence in written.answer:
-                display.say(sentence.translate(_PLAIN_QUOTES))
-        display.say(_last_line(directory, contents))
-        if written is not None:
-            display.show_commands(_watch(directory, written.best, vars(design.base)))
+        _say_end(design, files, contents, display, report=ended and report)
     return ended
+
+
+def _say_end(
+    design: Design,
+    files: "SweepFiles",
+    contents: dict[str, Any],
+    display: "Display",
+    *,
+    report: bool,
+) -> None:
+    """Writes the report, if that is asked for, and says what a sweep found and where it is."""
+    if not report:
+        display.say(_last_line(files.directory, contents))
+        return
+    display.say("writing the report")
+    written = _report(files.directory)
+    contents["statistics_seconds"] = written.seconds
+    files.write(contents)
+    for sentence in (*written.answer, _last_line(files.directory, contents)):
+        display.say(sentence.translate(_PLAIN_QUOTES))
+    display.show_commands(_watch(files.directory, written.best, vars(design.base)))
 
 
 def _finish(
@@ -138,7 +153,7 @@ def _finish(
 ) -> None:
     """Writes the last files of a sweep, or those of one that was interrupted."""
     from mjx_reinforce.store.build import policy_settings
-    from mjx_reinforce.sweeps.designs.grid import configure
+    from mjx_reinforce.sweeps.grid import configure
 
     def settings(number: int) -> tuple[dict[str, Any], dict[str, Any]]:
         [config] = configure(design.base, [prepared.configurations[number]])
@@ -219,3 +234,96 @@ def _last_line(directory: Path, contents: Mapping[str, Any]) -> str:
     if (seconds := contents["statistics_seconds"]) is None:
         return f"{took}. Files in {directory}"
     return f"{took}, statistics and report {seconds:.1f} s. Files in {directory}, first report.html"
+
+
+class SweepResults(NamedTuple):
+    """What a sweep measured, of R runs in E evaluations.
+
+    Attributes:
+      directory: of its files, None where none were asked for
+      configurations: the values of what was swept, in each
+      configuration: [R] the number of each run's
+      seed: [R]
+      eval_return: [E, R] mean return of the policy's mode; NaN where it was not finite
+      env_steps: [E, R] trained until then
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = dataclasses.replace(
+      ...     mr.of_task("CartPole-v1", env_steps=200), num_seeds=2, eval_episodes=2
+      ... )
+      >>> swept = mr.sweep(config, over={"discount": [0.98, 0.99]}, quiet=True)
+      >>> swept.configurations, swept.configuration.tolist()
+      ([{'discount': 0.98}, {'discount': 0.99}], [0, 0, 1, 1])
+    """
+
+    directory: Path | None
+    configurations: list[dict[str, Any]]
+    configuration: np.ndarray
+    seed: np.ndarray
+    eval_return: np.ndarray
+    env_steps: np.ndarray
+
+
+def sweep(
+    base: Config,
+    over: Mapping[str, Sequence[Any]],
+    *,
+    output: Path | str | None = None,
+    exact: bool = False,
+    chunk_runs: int | None = None,
+    report: bool = True,
+    quiet: bool = False,
+) -> SweepResults:
+    """Trains many configurations, ``base.num_seeds`` of each, as the command line does.
+
+    Args:
+      base: the settings that are not swept, such as ``mjx_reinforce.of_task("Hopper-v5")``.
+      over: names of settings and the values of each; all combinations are trained.
+      output: the directory of the sweep's files. None, with ``base.output`` None too, leaves none.
+      exact: move every run by itself, so that no result depends in any bit on the others.
+      chunk_runs: runs that are under way at once at most; as many as memory holds by default.
+      report: write report.html among the files.
+      quiet: show no progress.
+
+    Returns:
+      What was measured; the same is in the files of the directory.
+
+    Raises:
+      ValueError: a setting makes no sense, or the directory is not empty.
+      OSError: a file cannot be written.
+
+    Examples:
+      >>> import dataclasses
+      >>> import mjx_reinforce as mr
+      >>> config = dataclasses.replace(
+      ...     mr.of_task("CartPole-v1", env_steps=200), num_seeds=2, eval_episodes=2
+      ... )
+      >>> swept = mr.sweep(config, over={"discount": [0.98, 0.99]}, quiet=True)
+      >>> swept.configurations, swept.configuration.tolist()
+      ([{'discount': 0.98}, {'discount': 0.99}], [0, 0, 1, 1])
+    """
+    check_kind("base", base, Config, 'mjx_reinforce.of_task("Hopper-v5")')
+    with contextlib.ExitStack() as held:
+        asked = base.output if output is None else Path(output)
+        place = asked
+        if place is None:
+            place = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="sweep-")))
+        base = dataclasses.replace(base, output=place)
+        design = Design(base=base, over=over, exact=exact, chunk_runs=chunk_runs)
+        perform(design, None, [], report=report and asked is not None, quiet=quiet)
+        return read_results(place)._replace(directory=asked)
+
+
+def read_results(directory: Path) -> SweepResults:
+    """Returns what a finished sweep measured, or raises ValueError."""
+    record = read_json(directory / "sweep.json")
+    if not (directory / "curves.npz").exists():
+        raise ValueError(
+            f"{directory} has no results yet: the sweep is {record.get('status', 'unfinished')}; "
+            f"go on with it by --resume {directory}"
+        )
+    listed = record["configurations"]
+    values = [{k: x for k, x in one.items() if k != "configuration"} for one in listed]
+    return SweepResults(directory, values, **read_arrays(directory / "curves.npz"))

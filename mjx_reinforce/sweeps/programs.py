@@ -3,7 +3,8 @@
 import dataclasses
 import functools
 import threading
-from collections.abc import Callable, Collection, Sequence
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -16,13 +17,59 @@ from mjx_reinforce.files import Arrays
 from mjx_reinforce.learners import counts
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.settings.memory import num_cores
-from mjx_reinforce.sweeps.ahead import Stopwatch, started
 from mjx_reinforce.sweeps.history import Measured
 from mjx_reinforce.sweeps.layout import StateRows, pack_slots
 from mjx_reinforce.training.block import BuildLearner
 from mjx_reinforce.training.programs import Programs, compiling, programs_of
 from mjx_reinforce.training.state import Budget, RunState, Seed, budget_of
 from mjx_reinforce.types import Environment, PyTree
+
+
+@dataclasses.dataclass
+class Stopwatch:
+    """Where the time of a sweep goes (s).
+
+    compiling: with nothing trained beside it
+    running: training and evaluating
+    """
+
+    compiling: float = 0.0
+    running: float = 0.0
+
+    def wait(self, compiled: Future) -> Any:
+        """Returns a program, once it is compiled."""
+        began = time.perf_counter()
+        program = compiled.result()
+        self.compiling += time.perf_counter() - began
+        return program
+
+
+def one_ahead(tasks: Sequence[Callable[[], Any]]) -> Iterator[Any]:
+    """Yields the results of tasks in order; each begins when the one before is handed out."""
+    waiting = [started(tasks[0])] if tasks else []
+    for following in (*tasks[1:], None):
+        result = waiting.pop().result()
+        if following is not None:
+            waiting.append(started(following))
+        yield result
+
+
+def started(task: Callable[[], Any]) -> Future:
+    """Returns the result to come of a task, which begins in a thread of its own.
+
+    Python waits for it before it exits: a compiler that is cut off there ends the process.
+    """
+    future: Future = Future()
+
+    def work() -> None:
+        try:
+            future.set_result(task())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=work).start()
+    return future
+
 
 #: What ``history.Measured`` has of a run's counts since the start.
 _COUNTS = ("updates", "env_steps")

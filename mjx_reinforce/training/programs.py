@@ -163,12 +163,9 @@ def compile_run(
     place, view = division.place, functools.partial(division.view, num_seeds=num_seeds)
     like = division.shapes(programs.like, num_seeds)
 
-    def present(states: RunState) -> tuple[Actor, jax.Array]:
-        return states.train_states.actor, states.train_states.num_updates
-
     def advance(before: RunState, budget: Budget, look: jax.Array) -> Any:
         after, block = programs.advance(before, budget, look)
-        return after, block.made[None], block.metrics, (present(before), block.looked)
+        return after, block.made[None], block.metrics, (_present(before), block.looked)
 
     beginning = division.jit(programs.begin, (NONE, NONE, RUNS, NONE), (RUNS, SECOND))
     evaluating = division.jit(programs.evaluate, (RUNS, RUNS), RUNS)
@@ -200,16 +197,13 @@ def compile_run(
         made, metrics = jax.device_get((made, metrics))
         metrics = {name: x[: made.max(), :num_seeds] for name, x in metrics.items()}
         if look and programs.rides:
-            looked = on_host(*seen)
+            looked = _on_host(num_seeds, *seen)
         return view(after), metrics, looked
 
     def evaluated(states: RunState) -> Looked:
         states = place(states)
-        return on_host(present(states), evaluating(states.train_states.actor, states.eval_keys))
-
-    def on_host(policies: tuple[Actor, jax.Array], measured: dict[str, jax.Array]) -> Looked:
-        seen = jax.tree.map(lambda x: x[:num_seeds], jax.device_get((*policies, measured)))
-        return Looked(*seen)
+        measured = evaluating(states.train_states.actor, states.eval_keys)
+        return _on_host(num_seeds, _present(states), measured)
 
     def tested(actor: Actor) -> Arrays:
         placed = place(actor)
@@ -228,3 +222,16 @@ def _joined(evaluations: Sequence[Arrays]) -> Arrays:
         )
         for name in evaluations[0]
     }
+
+
+def _present(states: RunState) -> tuple[Actor, jax.Array]:
+    """Returns the present policies, and how many updates made them."""
+    return states.train_states.actor, states.train_states.num_updates
+
+
+def _on_host(
+    num_seeds: int, policies: tuple[Actor, jax.Array], measured: dict[str, jax.Array]
+) -> Looked:
+    """Returns an evaluation without what stands where there is no seed."""
+    seen = jax.tree.map(lambda x: x[:num_seeds], jax.device_get((*policies, measured)))
+    return Looked(*seen)

@@ -13,8 +13,7 @@ from mjx_reinforce.files import Arrays
 from mjx_reinforce.reports.statistics import summarize
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import progress, rows
-from mjx_reinforce.training.budget import used
-from mjx_reinforce.training.progress import BLOCKS, Progress, measure_progress
+from mjx_reinforce.training.progress import BLOCKS, Progress, measure_progress, used
 
 
 class GrowingTable:

@@ -31,11 +31,18 @@ from mjx_reinforce.console import jax_setup
 from mjx_reinforce.registry import ESTIMATORS
 from mjx_reinforce.runs import display
 from mjx_reinforce.runs.command_line import parse
-from mjx_reinforce.settings.config import Config, check, marked
+from mjx_reinforce.settings.config import (
+    Config,
+    as_words,
+    changed,
+    check,
+    check_read,
+    is_read,
+    marked,
+)
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.groups import Reader
-from mjx_reinforce.settings.presets import PRESETS
-from mjx_reinforce.settings.relevance import as_words, changed, check_read, is_read
+from mjx_reinforce.settings.tables import PRESETS
 from mjx_reinforce.store.build import build
 
 # Settings that make no sense.

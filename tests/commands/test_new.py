@@ -24,7 +24,7 @@ SENSED = """<mujoco><option timestep="0.002"/><worldbody>
 @pytest.mark.slow
 def test_the_arm_learns_to_reach(tmp_path):
     command = [sys.executable, "-m", "mjx_reinforce.train", "--env", "my_arm:Arm"]
-    options = ["--num-episodes", "64", "--env-steps", "300_000", "--num-seeds", "2"]
+    options = ["--num-episodes", "64", "--env-steps", "200_000", "--num-seeds", "1"]
     output = ["--output", str(tmp_path / "arm")]
     subprocess.run([*command, *options, *output], check=True, capture_output=True, cwd=EXAMPLES)
     with (tmp_path / "arm" / "metrics.csv").open() as file:
@@ -117,7 +117,6 @@ WRONG = {
     "still.xml": "has no actuators",
     "broken.xml": "MuJoCo cannot compile",
     "pgs.xml": 'set <option solver="Newton"/>',
-    "arm.xml --outptu a.py": "Did you mean '--output'?",
 }
 
 

@@ -19,7 +19,7 @@ from mujoco import mjx
 from mjx_reinforce import Environment, envs
 from mjx_reinforce.envs.settings import EpisodeSettings
 from mjx_reinforce.physics.mjx_internals import fenced
-from mjx_reinforce.settings.measured import TASKS
+from mjx_reinforce.settings.tables import TASKS
 from mjx_reinforce.types import Discrete, action_space, null_action, observation_size
 
 IDS = envs.names()

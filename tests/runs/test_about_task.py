@@ -64,8 +64,7 @@ def test_a_page_has_sizes_rules_settings_and_how_to_train(register):
     config = Config()
     assert train == f"To train {config.num_seeds} seeds for {config.env_steps:,} env steps each:"
     assert command.endswith(" --env Told-v0")
-    assert time.startswith("How long that takes on ")
-    assert time.endswith("is not known; --minutes M sets a time.")
+    assert time == "How long this takes here is not known. --minutes M sets a time."
 
 
 def test_what_a_task_does_not_say(register):
@@ -102,5 +101,4 @@ def test_settings_that_differ_are_flags():
 def test_a_measured_task_has_a_time():
     page = about_task.about_task("CartPole-v1")
     assert "one of 2" in page
-    assert "How long that takes" not in page
-    assert page.rpartition("\n\nOn ")[2].partition(": ")[2][:1].islower()
+    assert "\n\nTraining takes about " in page

@@ -1,6 +1,8 @@
 """``mjx_reinforce.run``: a run from Python, its results, files and observers."""
 
+import contextlib
 import dataclasses
+import io
 
 import numpy as np
 import pytest
@@ -21,11 +23,22 @@ CONFIG = dataclasses.replace(
 
 
 @pytest.fixture(scope="module")
-def results():
-    return mjx_reinforce.run(CONFIG, quiet=True)
+def made(tmp_path_factory):
+    """A quiet run without files: what it returned, and what an observer saw."""
+    seen, folder = [], tmp_path_factory.mktemp("nothing")
+    with contextlib.chdir(folder), contextlib.redirect_stdout(io.StringIO()) as said:
+        results = mjx_reinforce.run(CONFIG, observers=[seen.append], quiet=True)
+    assert said.getvalue() == ""
+    assert [*folder.iterdir()] == []
+    return results, seen
 
 
-def test_what_it_returns(results, tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def results(made):
+    return made[0]
+
+
+def test_what_it_returns(results):
     assert results.eval_return.shape == results.env_steps.shape == (4, 2)
     assert results.training["episode_return"].shape == (6, 2)
     assert results.test_returns.shape == results.best_test_returns.shape == (2,)
@@ -35,11 +48,13 @@ def test_what_it_returns(results, tmp_path, monkeypatch):
     assert repr(results).startswith("RunResults(ContinuousCartPole-v0, 2 seeds, return ")
 
 
-def test_files_are_written_only_where_asked_and_say_the_same(results, tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_files_and_a_screen_say_the_same(results, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    mjx_reinforce.run(CONFIG, quiet=True)
-    assert [*tmp_path.iterdir()] == []
-    written = mjx_reinforce.run(CONFIG, output="here", quiet=True)
+    written = mjx_reinforce.run(CONFIG, output="here")
+    said = capsys.readouterr().out
+    assert said.startswith("Training 2 seeds of ContinuousCartPole-v0")
+    assert "update     6" in said
     np.testing.assert_array_equal(written.eval_return, results.eval_return)
     saved = read_policy(tmp_path / "here" / "policy", 1)
     np.testing.assert_array_equal(
@@ -50,29 +65,13 @@ def test_files_are_written_only_where_asked_and_say_the_same(results, tmp_path, 
         mjx_reinforce.run(CONFIG, output="here", quiet=True)
 
 
-def test_observers_see_every_evaluation(results):
-    seen = []
-    mjx_reinforce.run(CONFIG, observers=[seen.append], quiet=True)
+def test_observers_see_every_evaluation(made):
+    results, seen = made
     assert [one.updates.tolist() for one in seen] == [[0, 0], [2, 2], [4, 4], [6, 6]]
     np.testing.assert_array_equal([x.measured["eval_return"] for x in seen], results.eval_return)
     np.testing.assert_array_equal([x.env_steps for x in seen], results.env_steps)
     last = seen[-1].actor.normalizer.mean
     np.testing.assert_array_equal(last, results.actor.normalizer.mean)
-
-
-def test_an_observer_ends_a_run():
-    ended = mjx_reinforce.run(CONFIG, observers=[lambda one: one.updates.max() >= 2], quiet=True)
-    assert ended.summary["status"] == "finished"
-    assert len(ended.training["episode_return"]) == 4
-
-
-def test_quiet_is_quiet_and_the_rest_shows_progress(capsys):
-    mjx_reinforce.run(CONFIG, quiet=True)
-    assert capsys.readouterr().out == ""
-    mjx_reinforce.run(CONFIG)
-    said = capsys.readouterr().out
-    assert said.startswith("Training 2 seeds of ContinuousCartPole-v0")
-    assert "update     6" in said
 
 
 def test_players_of_seeds(results):
@@ -101,12 +100,3 @@ def test_a_run_to_begin_from_is_looked_for_before_anything_is_compiled(tmp_path,
     with pytest.raises(ValueError, match="is no run directory"):
         mjx_reinforce.run(wanted, output=tmp_path / "new", quiet=True)
     assert [*tmp_path.iterdir()] == []
-
-
-def test_a_sweep_leaves_files_only_where_asked(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    swept = mjx_reinforce.sweep(CONFIG, {"discount": [0.9, 0.99]}, quiet=True)
-    assert [*tmp_path.iterdir()] == []
-    assert swept.directory is None
-    assert swept.eval_return.shape[1] == 4
-    assert capsys.readouterr().out == ""

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from mjx_reinforce import files
 from mjx_reinforce import train as train_module
 from mjx_reinforce.reports.statistics import iqm, iqm_interval
-from mjx_reinforce.runs import charts, sinks
-from mjx_reinforce.runs.log import RunLog
+from mjx_reinforce.runs import sinks
+from mjx_reinforce.runs.observers import RunLog
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import rows
 
@@ -65,7 +65,7 @@ def events(folder):
     from tensorboardX.proto.event_pb2 import Event
     from tensorboardX.record_writer import masked_crc32c
 
-    for path in sorted(folder.glob(charts.EVENTS)):
+    for path in sorted(folder.glob(sinks.EVENTS)):
         content = path.read_bytes()
         while content:
             length, of_length = struct.unpack("<QI", content[:12])
@@ -84,16 +84,13 @@ def events_of(folder):
             shown = {step: x for step, x in shown.items() if step < event.step}
         elif event.HasField("summary"):
             assert event.step not in shown
-            shown[event.step] = {
-                value.tag: value.simple_value if value.HasField("simple_value") else value.histo
-                for value in event.summary.value
-            }
+            shown[event.step] = {value.tag: value.simple_value for value in event.summary.value}
     return shown
 
 
 def test_statistics_are_over_all_seeds_and_a_few_seeds_are_single():
-    shown = charts.scalars(evaluation(10))
-    values = charts.measured(evaluation(10))["eval_return"]
+    shown = sinks.scalars(evaluation(10))
+    values = sinks.measured(evaluation(10))["eval_return"]
     low, high = iqm_interval(values)
     assert shown["eval_return/iqm"] == float(iqm(values))
     assert (shown["eval_return/iqm_low"], shown["eval_return/iqm_high"]) == (low, high)
@@ -109,7 +106,7 @@ def test_statistics_are_over_all_seeds_and_a_few_seeds_are_single():
 
 
 def test_before_the_first_update_its_columns_are_not_shown():
-    shown = charts.scalars(evaluation(0, first=True))
+    shown = sinks.scalars(evaluation(0, first=True))
     assert {name.partition("/")[0] for name in shown} == {
         *("progress", "eval_return", "eval_return_stochastic", "eval_length")
     }
@@ -163,30 +160,16 @@ def test_what_a_kill_left_of_writing_a_file_is_removed_and_what_is_not_ours_stay
     assert (directory / "mine.txt").read_text() == "mine"
 
 
-def test_tensorboard_has_the_numbers_and_the_histograms(directory):
+def test_tensorboard_has_the_numbers(directory):
     [charted] = sinks.open_sinks(Config(tensorboard=True), directory, None)
     for update in (0, 5):
         charted.write(evaluation(update))
     charted.close()
     shown = events_of(directory / "tensorboard")
     assert list(shown) == [0, 5]
-    expected = charts.scalars(evaluation(5))
+    expected = sinks.scalars(evaluation(5))
     for name, value in expected.items():
         np.testing.assert_allclose(shown[5][name], value, rtol=1e-6, err_msg=name)
-    histogram = shown[5]["eval_return/seeds"]
-    assert histogram.num == 19
-    assert sum(histogram.bucket) == 19
-
-
-def test_a_histogram_of_equal_values_is_one_bin(directory):
-    levels = (0.0, 1000.0, -3e38)
-    [charted] = sinks.open_sinks(Config(tensorboard=True), directory, None)
-    for update, level in enumerate(levels):
-        charted.write(evaluation(update) | {"eval_return": 20 * [str(level)]})
-    shown = events_of(directory / "tensorboard")
-    for update in range(len(levels)):
-        histogram = shown[update]["eval_return/seeds"]
-        assert [count for count in histogram.bucket if count] == [20]
 
 
 def resumed_charts(directory):
@@ -230,20 +213,19 @@ def test_a_run_that_starts_again_drops_everything(directory):
 def test_a_full_disk_delays_rows_and_loses_none(directory, monkeypatch, name):
     config = Config(**{name: True})
     [slow] = sinks.open_sinks(config, directory, None)
-    module = f"mjx_reinforce.runs.{'sinks' if name == 'jsonl' else 'charts'}"
 
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     slow.write(evaluation(0))
     with monkeypatch.context() as patch:
-        patch.setattr(f"{module}.append", full)
+        patch.setattr("mjx_reinforce.runs.sinks.append", full)
         for update in (5, 10):
             with pytest.raises(OSError, match="No space left"):
                 slow.write(evaluation(update))
     slow.write(evaluation(15))
     with monkeypatch.context() as patch:
-        patch.setattr(f"{module}.append", full)
+        patch.setattr("mjx_reinforce.runs.sinks.append", full)
         with pytest.raises(OSError, match="No space left"):
             slow.write(evaluation(20))
     slow.close()
@@ -286,7 +268,7 @@ def wandb_rows(directory):
 
 WANDB_PROGRAM = """
 import json, pathlib, sys
-from mjx_reinforce.runs.charts import WeightsAndBiases
+from mjx_reinforce.runs.sinks import WeightsAndBiases
 sink = WeightsAndBiases(pathlib.Path("."))
 for rows in json.load(sys.stdin):
     sink.write(rows)
@@ -305,7 +287,7 @@ def test_wandb_is_offline_and_goes_on(directory, monkeypatch):
         subprocess.run(command, input=given, check=True, cwd=directory, text=True)
     found, ids = wandb_rows(directory)
     assert [row["_step"] for row in found] == [0, 5, 10]
-    assert found[1]["eval_return/iqm"] == charts.scalars(evaluation(5))["eval_return/iqm"]
+    assert found[1]["eval_return/iqm"] == sinks.scalars(evaluation(5))["eval_return/iqm"]
     assert len(ids) == 1
     assert {path.name for path in directory.iterdir()} == {"metrics.csv", "config.json", "wandb"}
 

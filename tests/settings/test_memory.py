@@ -6,7 +6,7 @@ import pytest
 
 from mjx_reinforce.settings import memory
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.measured import Task
+from mjx_reinforce.settings.tables import Task
 
 TASK = Task(3, 2, 100, 1.0, 0.0)
 CONFIG = Config(num_seeds=2, hidden_sizes=(4,), num_episodes=8)

@@ -18,10 +18,9 @@ from mjx_reinforce import envs
 from mjx_reinforce import train as train_module
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.runs import command_line
-from mjx_reinforce.settings.config import check
+from mjx_reinforce.settings.config import check, check_read_by_policy
 from mjx_reinforce.settings.defaults import of_task
-from mjx_reinforce.settings.presets import PRESETS
-from mjx_reinforce.settings.relevance import check_read_by_policy
+from mjx_reinforce.settings.tables import PRESETS
 from mjx_reinforce.store.build import build, policy_settings
 
 TINY = ["--num-seeds", "2", "--max-updates", "2", "--horizon", "8"]
@@ -34,19 +33,11 @@ def toys(register, run):
         register(name, Survive)
 
 
-@pytest.mark.parametrize("name", PRESETS)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["gymnasium-tutorial", "continuous-cartpole-ars"])
 def test_a_preset_trains(name, run, tmp_path):
-    ars = PRESETS[name][1].algorithm == "ars"
-    arguments = [
-        name,
-        *TINY,
-        "--output",
-        "out",
-        "--num-directions" if ars else "--num-episodes",
-        "2",
-    ]
-    if PRESETS[name][1].update == "minibatches":
-        arguments += ["--minibatch-updates", "3"]
+    episodes = "--num-directions" if PRESETS[name][1].algorithm == "ars" else "--num-episodes"
+    arguments = [name, *TINY, "--output", "out", episodes, "2"]
     assert run(*arguments) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     config = json.loads((tmp_path / "out" / "config.json").read_text())
@@ -60,13 +51,19 @@ def test_a_preset_trains(name, run, tmp_path):
         assert config[setting] == getattr(PRESETS[name][1], setting)
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_makes_sense(name):
-    line, config = PRESETS[name]
-    check(config)
-    assert 20 < len(line) < 100
-    assert command_line.parse([name]) == config
-    assert command_line.parse([name, "--horizon", "7"]).horizon == 7
+def test_every_preset_makes_sense():
+    """Its update is traced, not compiled."""
+    for name, (line, config) in PRESETS.items():
+        check(config)
+        assert 20 < len(line) < 100
+        assert command_line.parse([name, "--horizon", "7"]) == dataclasses.replace(
+            config, horizon=7
+        )
+        small = dataclasses.replace(config, num_seeds=1, horizon=7, engine="vmap")
+        learner, _ = build(envs.make(config.env), small)
+        before = jax.eval_shape(learner.init, jax.random.key(0))
+        after, _ = jax.eval_shape(learner.step, before)
+        assert jax.tree.structure(after) == jax.tree.structure(before), name
 
 
 def test_no_preset_is_the_default():
@@ -94,7 +91,7 @@ def test_network_outputs_mean_what_they_do_in_the_program(name, std):
         assert float(moved[0]) == pytest.approx(0.3 + 2 * std(-0.7), rel=1e-5)
 
 
-@pytest.mark.parametrize("name", sorted(PRESETS))
+@pytest.mark.parametrize("name", ["baseline-truncated-normal", "gymnasium-tutorial"])
 def test_first_weights_are_pytorchs(name):
     """Uniform within 1 / sqrt(fan-in), biases too; the critic's as well."""
     config = PRESETS[name][1]
@@ -109,18 +106,6 @@ def test_first_weights_are_pytorchs(name):
             assert 0.8 * bound < float(jnp.max(jnp.abs(x))) <= bound
 
 
-@pytest.mark.parametrize("name", ["auto", "vmap", "native"])
-def test_engines_have_names(name):
-    assert command_line.parse(["--engine", name]).engine == name
-    with pytest.raises(ValueError, match="or vmap, got 'mjx'"):
-        command_line.parse(["--engine", "mjx"])
-
-
-def test_an_unknown_preset_is_explained(run, capsys):
-    assert run("gymnasium-tutorail") == 2
-    assert "Did you mean 'gymnasium-tutorial'" in capsys.readouterr().err
-
-
 def test_help_lists_presets_and_groups_without_jax():
     code = (
         "import sys\nfrom mjx_reinforce.runs import command_line\n"
@@ -133,7 +118,7 @@ def test_help_lists_presets_and_groups_without_jax():
         assert text in done.stdout
 
 
-@pytest.mark.parametrize("id", ["InvertedPendulum-v5", "Hopper-v5", "CartPole-v1"])
+@pytest.mark.parametrize("id", ["Hopper-v5", "CartPole-v1"])
 @pytest.mark.parametrize("words", [["--algorithm", "ars"], []])
 def test_defaults_that_a_policy_does_not_read_are_not_the_users(id, words):
     """Only what the command line itself says may be refused for doing nothing."""

@@ -3,9 +3,9 @@
 import contextlib
 import dataclasses
 import os
+import shutil
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import jax
@@ -23,14 +23,12 @@ from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.gpu import ptx
 from mjx_reinforce.engines.native.gpu import seam as gpu
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.store import kept, ready
 from mjx_reinforce.training.programs import compile_run
 from mjx_reinforce.training.state import budget_of
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
 SETTINGS = {
-    "plain": {},
     "all else": {
         "estimator": "value-baseline",
         "optimizer": "adamw",
@@ -46,6 +44,23 @@ SETTINGS = {
 def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory):
+    """A folder with the programs of ``CONFIG``, and the numbers that they compute."""
+    made = tmp_path_factory.mktemp("kept")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(objects, "folder", lambda: made)
+        patch.setattr(machine, "_LOADED", {})  # as in a process that has loaded nothing
+        return made, numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+
+
+@pytest.fixture
+def expected(filled, folder):
+    """The numbers; the test's own folder has the programs."""
+    shutil.copytree(filled[0], folder, dirs_exist_ok=True, copy_function=shutil.copy2)
+    return filled[1]
 
 
 def numbers(prepared, config):
@@ -66,6 +81,7 @@ def numbers(prepared, config):
     return [measured, leaves]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETTINGS)
 def test_a_second_start_traces_nothing_and_gives_the_same(name, monkeypatch):
     config = dataclasses.replace(CONFIG, **SETTINGS[name])
@@ -77,6 +93,10 @@ def test_a_second_start_traces_nothing_and_gives_the_same(name, monkeypatch):
         second = ready.get_ready(config, config)
         assert second.engine_seconds == 0
         assert jax.tree.structure(second.programs.like) == jax.tree.structure(plain.programs.like)
+        shapes = [
+            [(x.shape, x.dtype) for x in jax.tree.leaves(y.programs.like)] for y in (second, plain)
+        ]
+        assert shapes[0] == shapes[1]
         for prepared in (first, second):
             assert prepared[:5] == plain[:5]
         jax.tree.map(np.testing.assert_array_equal, numbers(second, config), expected)
@@ -95,14 +115,15 @@ def test_seeds_and_budgets_are_inputs_and_all_else_is_not():
     assert len({key, *others}) == 1 + len(changes)
 
 
-@pytest.mark.parametrize(
-    ("owner", "name"),
-    [(objects, "source_digest"), (kept, "provenance"), (kept, "made_for"), (kept, "version")],
-)
-def test_programs_depend_on_sources_versions_and_the_machine(owner, name, monkeypatch):
-    key = kept.key_of(CONFIG)
-    monkeypatch.setattr(owner, name, lambda *_: {"git_commit": "", "python": "another"})
-    assert kept.key_of(CONFIG) != key
+def test_programs_depend_on_sources_versions_the_machine_and_its_devices(monkeypatch):
+    key, another = kept.key_of(CONFIG), {"git_commit": "", "python": "another"}
+    for owner, name, value in (
+        *((objects, "source_digest", another), (kept, "provenance", another)),
+        *((kept, "made_for", another), (kept, "version", another), (jax, "device_count", 8)),
+    ):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, lambda *_, value=value: value)
+            assert kept.key_of(CONFIG) != key, name
 
 
 def test_programs_depend_on_what_jax_is_told(monkeypatch):
@@ -115,12 +136,6 @@ def test_programs_depend_on_what_jax_is_told(monkeypatch):
     keys.add(kept.key_of(CONFIG))
     assert len(keys) == 4
     assert None in keys
-
-
-def test_programs_depend_on_the_number_of_devices(monkeypatch):
-    key = kept.key_of(CONFIG)
-    monkeypatch.setattr(jax, "device_count", lambda: 8)
-    assert kept.key_of(CONFIG) != key
 
 
 def test_a_program_that_launches_a_gpus_kernel_is_kept(monkeypatch):
@@ -148,92 +163,83 @@ def test_a_commit_that_changes_no_source_changes_nothing(monkeypatch):
     assert kept.key_of(CONFIG) == key
 
 
-def test_a_resumed_run_finds_its_programs(monkeypatch):
-    """Its config.json has the time limit, which the command line had left out."""
-    numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+@pytest.mark.slow
+def test_resumed_runs_and_other_seeds_find_their_programs(expected, monkeypatch):
+    """A config.json has the time limit, which the command line had left out."""
     monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
     resumed = dataclasses.replace(CONFIG, horizon=500, resume=Path("run"), env_steps=999)
     assert ready.get_ready(resumed, CONFIG).horizon == 500
     with pytest.raises(pytest.fail.Exception, match="was built"):
         ready.get_ready(dataclasses.replace(resumed, horizon=400), CONFIG)
-
-
-def test_another_seed_finds_the_programs_and_differs(monkeypatch):
-    first = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
-    monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("the environment was built"))
     other = dataclasses.replace(CONFIG, seed=1)
-    assert not np.array_equal(numbers(ready.get_ready(other, other), other)[1][0], first[1][0])
+    found = numbers(ready.get_ready(other, other), other)
+    assert not np.array_equal(found[1][0], expected[1][0])
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["facts", "advance", pytest.param("", id="machine code", marks=pytest.mark.cpu)],
-)
-def test_what_is_damaged_is_made_again(name, folder, monkeypatch):
-    monkeypatch.setattr(machine, "_LOADED", {})  # as in a process that has loaded nothing
-    expected = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
-    (path,) = (path for path in folder.iterdir() if path.stem.partition("-")[2] == name)
-    path.write_bytes(path.read_bytes()[:-1])
-    monkeypatch.setattr(machine, "_LOADED", {})
-    assert kept.read_programs(kept.key_of(CONFIG)) is None
+@pytest.mark.slow
+@pytest.mark.cpu
+def test_what_is_damaged_is_made_again(expected, folder, monkeypatch):
+    whole = {path: path.read_bytes() for path in folder.iterdir()}
+    for name in ("facts", "advance", ""):  # the last is the machine code
+        monkeypatch.setattr(machine, "_LOADED", {})
+        for path, content in whole.items():
+            path.write_bytes(content)
+        assert kept.read_programs(kept.key_of(CONFIG)) is not None
+        monkeypatch.setattr(machine, "_LOADED", {})
+        (path,) = (path for path in whole if path.stem.partition("-")[2] == name)
+        path.write_bytes(whole[path][:-1])
+        assert kept.read_programs(kept.key_of(CONFIG)) is None, name
     again = numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
     jax.tree.map(np.testing.assert_array_equal, again, expected)
     assert kept.read_programs(kept.key_of(CONFIG)) is not None
 
 
-def test_bad_input_is_refused_of_what_is_kept_too():
-    numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+@pytest.mark.slow
+def test_bad_input_is_refused_of_what_is_kept_too(expected):
     many = dataclasses.replace(CONFIG, env_steps=None, max_updates=10**14)
     with pytest.raises(ValueError, match="more than the 2\\^53"):
         ready.get_ready(many, CONFIG)
     idle = dataclasses.replace(CONFIG, initial_std=2.0)
-    for _ in range(2):
-        with pytest.raises(ValueError, match=r"--initial-std 2\.0 would do nothing"):
-            ready.get_ready(idle, CONFIG)
+    with pytest.raises(ValueError, match=r"--initial-std 2\.0 would do nothing"):
+        ready.get_ready(idle, CONFIG)
 
 
-def test_programs_need_no_code_of_others(monkeypatch):
+@pytest.mark.slow
+def test_programs_need_no_code_of_others(folder, monkeypatch):
     """A process that plays other tasks has their code in memory too."""
     own = kept.seam.targets
     monkeypatch.setattr(kept.seam, "targets", lambda: [*own(), "mjx_reinforce_" + 64 * "0"])
-    numbers(ready.get_ready(CONFIG, CONFIG), CONFIG)
+    prepared = ready.get_ready(CONFIG, CONFIG)
+    compile_run(prepared.programs, CONFIG)
     assert kept.read_programs(kept.key_of(CONFIG)) is not None
 
 
-def test_nothing_is_kept_of_an_environment_of_the_users(register):
+def test_nothing_is_kept_of_code_of_the_users_or_where_kernels_are_looked_at(monkeypatch):
+    assert kept.key_of(CONFIG) is not None
     for name in ("Survive-v0", "toys:Survive"):
         assert kept.key_of(Config(env=name)) is None
-
-
-def test_nothing_is_kept_where_kernels_are_described(monkeypatch):
-    assert kept.key_of(CONFIG) is not None
-    monkeypatch.setenv(look.DEBUG, "1")
-    assert kept.key_of(CONFIG) is None
-
-
-@pytest.mark.parametrize("looks", ["jax_debug_nans", "jax_debug_infs"])
-def test_nothing_is_kept_where_jax_is_to_look_for_nans(looks):
-    jax.config.update(looks, True)
-    try:
-        assert kept.key_of(CONFIG) is None
-    finally:
-        jax.config.update(looks, False)
+    for looks in ("jax_debug_nans", "jax_debug_infs"):
+        jax.config.update(looks, True)
+        try:
+            assert kept.key_of(CONFIG) is None
+        finally:
+            jax.config.update(looks, False)
+    for owner, name, value in ((look, "level", lambda: 1), (objects, "folder", lambda: None)):
+        with monkeypatch.context() as patch:
+            patch.setattr(owner, name, value)
+            assert kept.key_of(CONFIG) is None
 
 
 @contextlib.contextmanager
 def cache_of_jax(folder):
-    """Lets JAX keep programs in a folder, and its warnings be shown as the commands show them."""
+    """Lets JAX keep programs in a folder, as the commands do."""
     before = jax.config.values["jax_compilation_cache_dir"]
-    show = warnings.showwarning
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("always")
-            jax.config.update("jax_compilation_cache_dir", str(folder))
-            compilation_cache.reset_cache()
-            configure_jax()
-            yield
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        compilation_cache.reset_cache()
+        configure_jax()
+        yield
     finally:
-        warnings.showwarning = show
         jax.config.update("jax_compilation_cache_dir", before)
         compilation_cache.reset_cache()
 
@@ -243,19 +249,6 @@ def compile_and_run():
         return jnp.sin(x) + 2
 
     return float(jax.jit(shifted_sine)(1.0))
-
-
-def test_a_damaged_program_in_the_cache_of_jax_is_replaced(tmp_path, capsys):
-    """JAX itself would leave it there, and compile at every start."""
-    with cache_of_jax(tmp_path):
-        value = compile_and_run()
-        [program] = tmp_path.glob("jit_shifted_sine-*-cache")
-        os.truncate(program, 100)
-        assert compile_and_run() == value
-        assert "jit_shifted_sine in" in capsys.readouterr().err
-        assert program.stat().st_size > 100
-        assert compile_and_run() == value
-        assert capsys.readouterr().err == ""
 
 
 @pytest.mark.parametrize("where", ["", "native/key.o"])
@@ -283,11 +276,6 @@ def test_a_cache_of_jax_that_does_not_work_is_named_once(tmp_path, capsys):
     assert said.startswith(f"warning: the cache {file} is not used (FileExistsError")
 
 
-def test_nothing_is_kept_where_jax_keeps_nothing(monkeypatch):
-    monkeypatch.setattr(objects, "folder", lambda: None)
-    assert kept.key_of(CONFIG) is None
-
-
 def test_a_program_that_calls_python_is_not_kept(folder):
     def calls_python():
         return jax.pure_callback(lambda: np.float32(3), jax.ShapeDtypeStruct((), "f4"))
@@ -295,16 +283,6 @@ def test_a_program_that_calls_python_is_not_kept(folder):
     program = kept._export("key", "evaluate", calls_python, ())
     assert float(jax.jit(program)()) == 3
     assert not list(folder.iterdir())
-
-
-@pytest.mark.parametrize("env", ["InvertedPendulum-v5", "CartPole-v1"])
-def test_a_tree_of_states_is_described_and_rebuilt(env):
-    config = of_task(env)
-    like = ready.made(envs.make(env), config).programs.like
-    again = kept.rebuild(kept.describe_tree(like))
-    assert jax.tree.structure(again) == jax.tree.structure(like)
-    for new, old in zip(jax.tree.leaves(again), jax.tree.leaves(like), strict=True):
-        assert (new.shape, new.dtype) == (old.shape, old.dtype)
 
 
 def test_a_tree_of_other_classes_is_neither_described_nor_rebuilt():
@@ -340,6 +318,7 @@ print("mujoco" in sys.modules)
 """
 
 
+@pytest.mark.slow
 def test_a_second_process_loads_the_machine_code_and_no_simulator(tmp_path):
     def run(which):
         environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from mjx_reinforce.sweeps import command_line
-from mjx_reinforce.sweeps.designs.design import Design
+from mjx_reinforce.sweeps.design import Design
 
 FLAGS = ["--env", "CartPole-v1", "--over", "learning-rate", "0.1", "0.2", "--discount", "0.5"]
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.sweeps import chunks
-from mjx_reinforce.sweeps.designs import design, grid, plan
-from mjx_reinforce.sweeps.designs.groups import Group, make_groups
+from mjx_reinforce.sweeps import chunks, design, grid, plan
+from mjx_reinforce.sweeps.plan import Group, make_groups
 
 CONFIG = Config(env_steps=1000, max_updates=7, num_seeds=3, num_episodes=16)
 

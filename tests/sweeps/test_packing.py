@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.sweeps.ahead import Stopwatch, started
 from mjx_reinforce.sweeps.layout import StateRows, pack_slots
+from mjx_reinforce.sweeps.programs import Stopwatch, started
 
 
 @pytest.mark.parametrize("num_devices", [1, 2, 8])

@@ -3,8 +3,8 @@
 import pytest
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.sweeps.designs.design import Design
-from mjx_reinforce.sweeps.designs.plan import prepare_sweep
+from mjx_reinforce.sweeps.design import Design
+from mjx_reinforce.sweeps.plan import prepare_sweep
 
 BASE = Config(
     env="ContinuousCartPole-v0", num_seeds=3, env_steps=None, max_updates=2, engine="vmap"

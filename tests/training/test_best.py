@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 
-from mjx_reinforce.training.best import first_best, keep_best, shape_of_best
+from mjx_reinforce.training.driver import first_best, keep_best, shape_of_best
 from mjx_reinforce.training.programs import Looked
 
 STATES = SimpleNamespace(

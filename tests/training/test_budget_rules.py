@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training import budget, checkpoint
+from mjx_reinforce.training import checkpoint, progress
 
 
 def test_the_budget_that_is_nearer_to_its_end_counts():
     steps, updates = np.array([[50, 200], [0, 0]]), np.array([[9, 1], [5, 0]])
-    both = budget.used(Config(env_steps=100, max_updates=10), steps, updates)
+    both = progress.used(Config(env_steps=100, max_updates=10), steps, updates)
     np.testing.assert_allclose(both, [[0.9, 2.0], [0.5, 0.0]])
-    alone = budget.used(Config(env_steps=None, max_updates=10), steps, updates)
+    alone = progress.used(Config(env_steps=None, max_updates=10), steps, updates)
     np.testing.assert_allclose(alone, [[0.9, 0.1], [0.5, 0.0]])
-    np.testing.assert_allclose(budget.used(Config(env_steps=100), steps, updates), steps / 100)
+    np.testing.assert_allclose(progress.used(Config(env_steps=100), steps, updates), steps / 100)
 
 
 def test_a_checkpoint_is_due_after_so_many_updates():

@@ -7,8 +7,7 @@ import pytest
 
 from mjx_reinforce.learners import counts
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.best import Best
-from mjx_reinforce.training.driver import Driver, drive
+from mjx_reinforce.training.driver import Best, Driver, drive
 from mjx_reinforce.training.programs import Looked, RunPrograms
 from mjx_reinforce.training.record import RunRecord
 

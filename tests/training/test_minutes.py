@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.learners import counts
+from mjx_reinforce.runs.run import env_steps_in
 from mjx_reinforce.settings.config import MAX_COUNT
-from mjx_reinforce.training.budget import env_steps_in
 
 
 def state_of(env_steps):

@@ -1,6 +1,7 @@
 """The compiled programs of a run."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,6 @@ from toys import Toy
 
 from mjx_reinforce import envs
 from mjx_reinforce.learners import counts
-from mjx_reinforce.reports.statistics.aggregates import interval
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store import ready
 from mjx_reinforce.training.programs import compile_run
@@ -18,6 +18,12 @@ from mjx_reinforce.training.state import budget_of, seed_keys
 from mjx_reinforce.types import plain, with_keys
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    """A run of CartPole that is ready."""
+    return ready.made(envs.make(CONFIG.env), CONFIG)
 
 
 def test_the_keys_of_seeds_are_those_of_a_split():
@@ -28,9 +34,10 @@ def test_the_keys_of_seeds_are_those_of_a_split():
     np.testing.assert_array_equal(jax.random.key_data(keys), split[np.array([2, 8])])
 
 
-def test_they_have_run_once_without_an_update():
+@pytest.mark.slow
+def test_they_have_run_once_without_an_update(prepared):
     """A GPU's driver translates kernels when they first run: that is compiling too."""
-    prepared, made = ready.made(envs.make(CONFIG.env), CONFIG), []
+    made = []
 
     def advance(*arguments):
         state, block = prepared.programs.advance(*arguments)
@@ -46,9 +53,9 @@ def test_they_have_run_once_without_an_update():
     assert made[1] > 0
 
 
-def test_evaluations_ride_with_the_updates_that_follow():
+@pytest.mark.slow
+def test_evaluations_ride_with_the_updates_that_follow(prepared):
     """They measure the policies before these, and leave what is trained as it is, to the bit."""
-    prepared = ready.made(envs.make(CONFIG.env), CONFIG)
     assert prepared.engine == "native"
     assert prepared.programs.rides
     first, programs = compile_run(prepared.programs, CONFIG)
@@ -73,28 +80,13 @@ def test_evaluations_ride_with_the_updates_that_follow():
 
 def test_a_seed_begins_alike_whichever_begin_with_it():
     """So do the seeds that a process has, and those of a slot."""
-    config = dataclasses.replace(CONFIG, num_seeds=4, test_episodes=6)
-    begin = jax.jit(ready.made(envs.make(config.env), config).programs.begin)
+    config = dataclasses.replace(LUCK, num_seeds=4, test_episodes=6)
+    begin = jax.jit(ready.made(Luck(), config).programs.begin)
     every, all_keys = plain(begin(3, 5, np.arange(4, dtype=np.uint32), {}))
     some, keys = plain(begin(3, 5, np.array([2, 0], np.uint32), {}))
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y[jnp.array([2, 0])]), some, every)
     assert keys.shape == (3, 2, 2)
     assert np.array_equal(keys, all_keys[:, [2, 0]])
-
-
-def test_runs_count_beyond_32_bits():
-    """A budget that ends two updates beyond 2^32 env steps, and half of its schedules."""
-    config = dataclasses.replace(CONFIG, env_steps=2**32 + 200, eval_every=50)
-    state, programs = compile_run(ready.made(envs.make(config.env), config).programs, config)
-    played = jnp.tile(jnp.asarray(counts.from_int(2**32 - 50)), (2, 1))
-    train_states = dataclasses.replace(state.train_states, env_steps=played)
-    state = dataclasses.replace(state, train_states=train_states)
-    state, metrics, _ = programs.advance(state, True, budget_of(config))
-    total = 2**32 - 50 + metrics["env_steps"].sum(axis=0)
-    assert counts.to_int(state.train_states.env_steps).tolist() == total.tolist()
-    last = metrics["env_steps"][metrics["active"].sum(axis=0) - 1, [0, 1]]
-    assert np.all((total >= 2**32 + 200) & (total - last < 2**32 + 200))
-    np.testing.assert_allclose(state.train_states.progress, 1, atol=1e-6)
 
 
 class Luck(Toy):
@@ -110,64 +102,39 @@ class Luck(Toy):
 LUCK = Config(env="Luck-v0", num_seeds=3, hidden_sizes=(), eval_episodes=2, test_episodes=5)
 
 
-@pytest.fixture
-def measure(register):
+@functools.cache
+def measure(**changes):
     """Returns what settings evaluate to before and after an update, and what they test to."""
-    register("Luck-v0", Luck)
-
-    def measure(**changes):
-        config = dataclasses.replace(LUCK, **changes)
-        state, programs = compile_run(ready.made(envs.make(config.env), config).programs, config)
-        state, _, first = programs.advance(state, True, budget_of(config))
-        later = programs.evaluate(state).measured
-        return first.measured, later, programs.test(state.train_states.actor)
-
-    return measure
+    config = dataclasses.replace(LUCK, **changes)
+    state, programs = compile_run(ready.made(Luck(), config).programs, config)
+    state, _, first = programs.advance(state, True, budget_of(config))
+    later = programs.evaluate(state).measured
+    return first.measured, later, programs.test(state.train_states.actor)
 
 
-def test_each_seed_is_evaluated_and_tested_on_starts_of_its_own(measure):
+@pytest.mark.slow
+def test_each_seed_is_evaluated_and_tested_on_starts_of_its_own_whatever_is_trained():
     first, second, test = (result["eval_return"] for result in measure())
     assert len({*first.tolist(), *test.tolist()}) == 6
     assert np.array_equal(first, second)  # the same at every evaluation
-
-
-@pytest.mark.parametrize(
-    "changes", [{"num_seeds": 5}, {"seed": 7, "learning_rate": 0.5, "hidden_sizes": (3,)}]
-)
-def test_a_seed_keeps_its_starts_whatever_is_trained(measure, changes):
-    for one, other in zip(measure(), measure(**changes), strict=True):
+    changed = measure(num_seeds=5, seed=7, learning_rate=0.5, hidden_sizes=(3,))
+    for one, other in zip(measure(), changed, strict=True):
         assert np.array_equal(one["eval_return"], other["eval_return"][:3])
-    other = measure(eval_seed=1)
-    assert not np.isin(one["eval_return"], other[2]["eval_return"]).any()
+    assert not np.isin(test, measure(eval_seed=1)[2]["eval_return"]).any()
 
 
-def test_a_test_plays_whole_evaluations_from_starts_of_their_own(measure):
-    tests = [measure(test_episodes=episodes)[2] for episodes in (None, 2, 5, 6)]
-    assert [int(test["eval_steps"][0]) for test in tests] == [2 * n for n in (2, 2, 6, 6)]
+@pytest.mark.slow
+def test_a_test_plays_whole_evaluations_from_starts_of_their_own():
+    tests = [
+        measure(**changes)[2] for changes in ({"test_episodes": None}, {}, {"test_episodes": 6})
+    ]
+    assert [int(test["eval_steps"][0]) for test in tests] == [2 * n for n in (2, 6, 6)]
     for name in ("eval_return", "eval_return_stochastic", "eval_length"):
-        assert np.array_equal(tests[0][name], tests[1][name])
-        assert np.array_equal(tests[2][name], tests[3][name])
+        assert np.array_equal(tests[1][name], tests[2][name])
     assert not np.isin(tests[0]["eval_return"], tests[2]["eval_return"]).any()
 
 
-def test_an_interval_over_seeds_covers_the_mean_over_starts():
-    """With starts shared by the seeds of a run it never would: all returns would be one number."""
-    config = dataclasses.replace(LUCK, num_seeds=20, test_episodes=4)
-    programs = ready.made(Luck(), config).programs
-
-    @jax.jit
-    def tested(eval_seed):
-        state, keys = programs.begin(0, eval_seed, np.arange(20, dtype=np.uint32), {})
-        actor = state.train_states.actor
-        return jnp.mean(jnp.stack([programs.evaluate(actor, x)["eval_return"] for x in keys]), 0)
-
-    covered = []
-    for eval_seed in range(100):
-        found = interval("mean", np.asarray(tested(np.uint32(eval_seed))))
-        covered.append(found.low <= 0 <= found.high)
-    assert 0.88 <= np.mean(covered) <= 1  # 95 %, with a standard error of 2.2
-
-
+@pytest.mark.slow
 def test_training_is_cut_and_evaluations_are_whole():
     """The updates are those of episodes that short; evaluations play to the time limit."""
     env = envs.make(CONFIG.env)
@@ -187,6 +154,7 @@ def test_training_is_cut_and_evaluations_are_whole():
     assert np.all(looked.measured["eval_length"] > 6)
 
 
+@pytest.mark.slow
 def test_training_is_cut_for_a_share_of_the_budget():
     """Guests, who play whole episodes, ride from the start."""
     config = dataclasses.replace(

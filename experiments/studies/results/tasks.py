@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import of_task
-from mjx_reinforce.settings.measured import TASKS as MEASURED
+from mjx_reinforce.settings.tables import TASKS as MEASURED
 
 #: Roots of all randomness of the results. No tuning used them. The second and the third are of
 #: tasks whose settings were chosen again after a run with the first.

@@ -13,7 +13,7 @@ from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.files import read_arrays, read_json, write_arrays
 from mjx_reinforce.reports.statistics.survival import time_to_threshold
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.sweeps.designs.design import Design, read_design
+from mjx_reinforce.sweeps.design import Design, read_design
 from mjx_reinforce.sweeps.perform import perform
 
 #: Root of all randomness of the study; no figure elsewhere in this repository uses it.

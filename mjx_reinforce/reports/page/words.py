@@ -17,7 +17,7 @@ from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.learning import fastest
 from mjx_reinforce.reports.statistics import Estimate, enough
 from mjx_reinforce.reports.statistics.comparisons import Comparison
-from mjx_reinforce.settings.tuned import OF_TASKS
+from mjx_reinforce.settings.tables import OF_TASKS
 
 #: What counts as a difference after Holm's correction.
 LEVEL = 0.05

@@ -10,10 +10,8 @@ from typing import Any, Literal
 from mjx_reinforce.checks import alternatives, read_as
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.registry import check_name, nearest
-from mjx_reinforce.settings.config import Config, check, flag, spoken
+from mjx_reinforce.settings.config import Config, check, check_read, flag, spoken
 from mjx_reinforce.settings.groups import LogSettings
-from mjx_reinforce.settings.hints import other_names
-from mjx_reinforce.settings.relevance import check_read
 
 _FIELDS = {field.name: field for field in dataclasses.fields(Config)}
 #: What comes before the name of a setting of the environment, such as env_set.frame_skip.
@@ -56,9 +54,7 @@ def _of_env(name: str) -> str | None:
 
 def _unknown(word: str) -> str:
     """Returns the message about a word that is no setting."""
-    meant = [x[2:] for x in other_names(flag(word))]
-    known = [spoken(name) for name in _FIELDS]
-    near = next((each for each in meant if each in known), None) or nearest(word, known)
+    near = nearest(word, [spoken(name) for name in _FIELDS])
     hint = f" Did you mean {near!r}?" if near else ""
     return f"unknown setting {word!r} after --over.{hint} (--help all lists the settings.)"
 

@@ -5,19 +5,104 @@ that means for people.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from mjx_reinforce import envs
 from mjx_reinforce.devices import Devices
+from mjx_reinforce.registry import is_own
 from mjx_reinforce.reports.experiment import counted
-from mjx_reinforce.runs.plan import duration, idle, run_seconds, task_of, this_hardware
+from mjx_reinforce.runs.plan import idle, said_time, task_of, this_hardware
+from mjx_reinforce.settings.config import Config, marked
+from mjx_reinforce.settings.declare import Mark
+from mjx_reinforce.settings.defaults import expected_seconds
+from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.settings.memory import gigabytes, needed, num_cores
 from mjx_reinforce.store.build import build, policy_settings
-from mjx_reinforce.sweeps.designs.design import Design
-from mjx_reinforce.sweeps.designs.grid import configure
-from mjx_reinforce.sweeps.designs.groups import Group, make_groups
+from mjx_reinforce.sweeps.design import Design
+from mjx_reinforce.sweeps.grid import configure
 from mjx_reinforce.types import Environment
+
+
+class Group(NamedTuple):
+    """C configurations that share their programs.
+
+    config: the settings of the first
+    members: [C] their numbers in the sweep
+    settings: [C] each, the numbers that are traced
+    """
+
+    config: Config
+    members: np.ndarray
+    settings: dict[str, np.ndarray]
+
+
+def make_groups(configs: Sequence[Config], swept: Collection[str], *, exact: bool) -> list[Group]:
+    """Returns the configurations of a sweep in groups, in the order of their first members.
+
+    Args:
+      configs: of the sweep.
+      swept: the settings in which they differ.
+      exact: trace every number that may be, so that what is swept beside it changes no program.
+    """
+    members: dict[Any, list[int]] = {}
+    traced = [_traced(config, swept, exact) for config in configs]
+    for number, (config, settings) in enumerate(zip(configs, traced, strict=True)):
+        compiled = dataclasses.replace(config, **dict.fromkeys(settings, None))
+        members.setdefault((dataclasses.astuple(compiled), tuple(settings)), []).append(number)
+    return [
+        Group(
+            configs[numbers[0]],
+            np.array(numbers),
+            {name: np.array([traced[i][name] for i in numbers]) for name in traced[numbers[0]]},
+        )
+        for numbers in members.values()
+    ]
+
+
+def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, float]:
+    """Returns the numbers of a configuration that its programs take as arguments."""
+    if is_own(config.algorithm):
+        return {}
+    other = Reader.ARS if config.algorithm == "reinforce" else Reader.REINFORCE
+    names = set(marked(Mark.TRACED)).difference(marked(other))
+    if not (Reader.REINFORCE.holds(config) and Reader.FREE_STD.holds(config)):
+        # Others have ``initial_std`` in their actions, which an engine may compile.
+        names.discard("initial_std")
+    settings = {name: getattr(config, name) for name in sorted(names) if exact or name in swept}
+    if not Reader.DECAY.holds(config):
+        settings.pop("final_learning_rate", None)
+    elif "learning_rate" in settings and config.final_learning_rate is None:
+        settings["final_learning_rate"] = config.learning_rate / 10
+    return {
+        name: float(value)
+        for name, value in settings.items()
+        if not (value is None or isinstance(value, str))
+    }
+
+
+def learner_builder(env: Environment, config: Config) -> Callable[[dict[str, Any]], Any]:
+    """Returns the function from the traced settings of a run to its learner.
+
+    Args:
+      env: what it learns on.
+      config: the other settings.
+    """
+    from mjx_reinforce.store.build import build
+
+    if config.algorithm != "reinforce":
+        return lambda settings: build(env, dataclasses.replace(config, **settings))[0]
+    plain = build(env, config)[0]
+
+    def build_learner(settings: dict[str, Any]) -> Any:
+        # How REINFORCE plays depends on no traced number, and takes a second to write out.
+        traced = build(env, dataclasses.replace(config, engine="vmap", **settings))[0]
+        return plain._replace(init=traced.init, learn=traced.learn)
+
+    return build_learner
+
 
 #: Chunks take up to this part of the memory that is there.
 _MEMORY = 0.6
@@ -134,7 +219,7 @@ def describe_plan(
         f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
         f"of {first.env}, on {where}, with the engine {learners[0].engine.name}: "
         f"{counted(len(groups), 'compiled program')}, {counted(chunks, 'chunk')} of up to {side:,} "
-        f"runs. {_time(envs, horizons, learners, groups, num_devices)}. "
+        f"runs. {_time(groups, num_devices)}. "
         f"It needs about {gigabytes(memory)} of memory beside the programs."
         f"{_idle_devices(side, num_devices)}"
     )
@@ -151,44 +236,21 @@ def _idle_devices(side: int, num_devices: int) -> str:
     return idle(min(side, num_devices), few if side < num_devices else "--exact computes on one")
 
 
-def _time(
-    envs: Sequence[Environment],
-    horizons: Sequence[int],
-    learners: Sequence[Any],
-    groups: Sequence[Group],
-    num_devices: int,
-) -> str:
+def _time(groups: Sequence[Group], num_devices: int) -> str:
     """Returns about how long the training takes, where that is known."""
-    total = 0.0
-    for env, horizon, learner, group in zip(envs, horizons, learners, groups, strict=True):
-        seconds = group_seconds(env, horizon, learner.engine.name, group, num_devices)
+    total, faster = 0.0, 1 if this_hardware().shared else num_devices
+    for group in groups:
+        seconds = expected_seconds(_together(group))
         if seconds is None:
-            return "How long this takes here is not known"
-        total += seconds
-    compiling = duration(this_hardware().speeds[groups[0].config.env].compiling)
-    return f"Compiling takes about {compiling} each, training about {duration(total)}"
+            return said_time(None)
+        total += seconds / faster
+    return said_time(total)
 
 
-def group_seconds(
-    env: Environment, horizon: int, engine: str, group: Group, num_devices: int
-) -> float | None:
-    """Returns about how long all runs of a group train (s), None where that is not known.
-
-    Args:
-      env: what is trained on.
-      horizon: the time limit of an episode in steps.
-      engine: the name of what plays.
-      group: of configurations, with their budget.
-      num_devices: on which they are.
-    """
-    machine, num_seeds = this_hardware(), len(group.members) * group.config.num_seeds
-    config = dataclasses.replace(group.config, num_seeds=num_seeds)
-    speed = machine.speeds.get(config.env)
-    if speed is None or engine != speed.engine:
-        return None
-    task = task_of(policy_settings(env, config), horizon, config)
-    seconds, _ = run_seconds(config, task, machine, speed)
-    return seconds / (1 if machine.shared else num_devices)
+def _together(group: Group) -> Config:
+    """Returns the settings of all runs of a group, as if they were seeds of one run."""
+    num_seeds = len(group.members) * group.config.num_seeds
+    return dataclasses.replace(group.config, num_seeds=num_seeds)
 
 
 class Prepared(NamedTuple):

@@ -13,7 +13,7 @@ from mjx_reinforce.files import read_json
 from mjx_reinforce.settings.config import Config, check_each, flag, marked, spoken
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.memory import check_memory, gigabytes, host_memory
-from mjx_reinforce.sweeps.designs.grid import check_over, configure, grid
+from mjx_reinforce.sweeps.grid import check_over, configure, grid
 from mjx_reinforce.training.resume import PLACES, as_config
 
 #: What writing results.csv and curves.npz needs for a run with two evaluations (bytes).

@@ -1,1 +1,0 @@
-"""What a sweep is to do: configurations, searches, groups, and their division into chunks."""
