@@ -83,18 +83,13 @@ def rows(folder):
 
 @pytest.mark.slow
 @pytest.mark.cpu
-def test_a_run_goes_on_on_fewer_devices_and_its_programs_are_kept(run, tmp_path, capsys):
-    """Checkpoints are those of any number; a second start trains to the bit what the first did."""
-    command = "--env CartPole-v1 --num-episodes 8 --eval-episodes 2 --hidden-sizes 4 --num-seeds 1"
+def test_a_run_goes_on_on_fewer_devices(run, tmp_path, capsys):
+    """Its checkpoints are those of any number."""
+    command = "--env toys:Drift --num-episodes 8 --eval-episodes 2 --hidden-sizes 4 --num-seeds 1"
     command += " --env-steps None --eval-every 2 --checkpoint-every 2 --learning-rate 1e-4"
-    for name in ("first", "out"):
-        line = f"-m mjx_reinforce.train {command} --max-updates 4 --output {name}"
-        said = on_devices(2, tmp_path, *line.split())
-        assert "which share the episodes of an update" in said
-    for ours, theirs in zip(rows(tmp_path / "first"), rows(tmp_path / "out"), strict=True):
-        del ours["wall_seconds"], theirs["wall_seconds"]
-        assert ours == theirs
-    assert run("--resume", "out", "--max-updates", "8") == 0
+    line = f"-m mjx_reinforce.train {command} --max-updates 4 --output out"
+    assert "which share the episodes of an update" in on_devices(2, tmp_path, *line.split())
+    assert run("--resume", "out", "--env", "toys:Drift", "--max-updates", "8") == 0
     assert "going on after 4 updates" in capsys.readouterr().out
     assert run(*command.split(), "--max-updates", "8", "--output", "one") == 0
     one, other = rows(tmp_path / "one"), rows(tmp_path / "out")
@@ -105,6 +100,19 @@ def test_a_run_goes_on_on_fewer_devices_and_its_programs_are_kept(run, tmp_path,
         for name in ("train_return", "eval_return", "gradient_norm"):
             values = [float(row[name] or 0) for row in (ours, theirs)]
             np.testing.assert_allclose(*values, rtol=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.cpu
+def test_programs_of_several_devices_are_kept(tmp_path):
+    """The second start reads them, and trains to the bit what the first did."""
+    command = "-m mjx_reinforce.train --env CartPole-v1 --num-episodes 8 --eval-episodes 2"
+    command += " --num-seeds 1 --env-steps None --max-updates 2 --output"
+    for name in ("first", "second"):
+        on_devices(2, tmp_path, *command.split(), name)
+    for ours, theirs in zip(rows(tmp_path / "first"), rows(tmp_path / "second"), strict=True):
+        del ours["wall_seconds"], theirs["wall_seconds"]
+        assert ours == theirs
 
 
 def test_flags_of_xla_but_the_number_of_devices_keep_a_run_from_going_on(tmp_path):
