@@ -17,10 +17,10 @@ from mjx_reinforce.files import check_folder, write_bytes
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment, relabel
 from mjx_reinforce.reports.findings import Findings, compute_findings
-from mjx_reinforce.reports.page import columns, document, tables, words
+from mjx_reinforce.reports.page import columns, document, words
 from mjx_reinforce.reports.page.document import Watch, encoded
-from mjx_reinforce.reports.page.figures import Figure, figures
-from mjx_reinforce.reports.page.vega import ONE, render_chart
+from mjx_reinforce.reports.page.over_time import worst_seeds
+from mjx_reinforce.reports.page.vega import render_chart
 from mjx_reinforce.settings.config import as_words
 from mjx_reinforce.settings.defaults import check_task, of_task
 from mjx_reinforce.settings.flags import read_command_line
@@ -135,17 +135,18 @@ def write_report(chosen: Sequence[Path], output: Path) -> WrittenReport:
 def _write(experiment: Experiment, output: Path) -> WrittenReport:
     started = time.perf_counter()
     findings = compute_findings(experiment)
-    drawn, data = figures(findings), tables.chart_tables(findings)
-    results, beside, labels = columns.results_csv(findings), _beside(output), findings.labels
+    drawn, labels, beside = document.charts(findings), findings.labels, _beside(output)
     beside.mkdir(exist_ok=True)
-    texts = {f"{name}.csv": columns.table_csv(table, labels) for name, table in data.items()}
-    for name, content in {**texts, "results.csv": results}.items():
-        write_bytes(beside / name, encoded(content))
-    for figure in drawn:
-        _write_figure(figure, data, labels, experiment.title, beside)
+    results = columns.results_csv(findings)
+    write_bytes(beside / "results.csv", encoded(results))
+    for chart in drawn:
+        for name, table in chart.data.items():
+            write_bytes(beside / f"{name}.csv", encoded(columns.table_csv(table, labels)))
+        for ending, picture in render_chart(chart, labels, experiment.title).items():
+            write_bytes(beside / f"{chart.name}.{ending}", picture)
     seconds = time.perf_counter() - started
     watch, ours = how_to_watch(experiment, findings), version("mjx-reinforce") or "not installed"
-    text = document.render(findings, drawn, data, results, watch, ours, seconds)
+    text = document.render(findings, drawn, results, watch, ours, seconds)
     write_bytes(output, encoded(text))
     return WrittenReport(time.perf_counter() - started, words.headline(findings), findings.order[0])
 
@@ -155,43 +156,23 @@ def _beside(output: Path) -> Path:
     return output.with_suffix("")
 
 
-def _write_figure(
-    figure: Figure,
-    data: Mapping[str, columns.Table],
-    labels: Sequence[str],
-    title: str,
-    folder: Path,
-) -> None:
-    """Writes a figure as PNG and SVG."""
-    names = [*figure.tables, *figure.hidden, *ONE]
-    needed = {name: columns.rows({**data, **ONE}[name], labels) for name in names}
-    for ending, picture in render_chart(figure.spec, needed, title).items():
-        write_bytes(folder / f"{figure.name}.{ending}", picture)
-
-
 def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
     """Returns how to see the worst seed of the best configuration.
 
     By its run, by the policy that its sweep kept, or, where that is an older one, trained again.
     """
     best = findings.results[0]
-    worst = tables.worst_seeds(best)[0]
-    seed, directory = int(best.configuration.seed[worst]), best.configuration.where[worst]
-    if (directory / "config.json").is_file():
-        return Watch(
-            f"To watch the worst, seed {seed}:",
-            f"python -m mjx_reinforce.watch {shlex.quote(str(directory))} --seed {seed}"
-            + env_flag(experiment.env),
-        )
-    first = experiment.directories[findings.order[0]]
-    number = findings.order[0] - experiment.directories.index(first)
-    place = directory / "policies" / f"{number:03d}"
-    if seed in seeds_in(place):
-        return Watch(
-            f"To watch the worst, seed {seed}, whose policy the sweep kept:",
-            f"python -m mjx_reinforce.watch {shlex.quote(str(place))} --seed {seed}"
-            + env_flag(experiment.env),
-        )
+    worst, own = worst_seeds(best)[0], env_flag(experiment.env)
+    seed, place = int(best.configuration.seed[worst]), best.configuration.where[worst]
+    said, kept = f"To watch the worst, seed {seed}:", (place / "config.json").is_file()
+    if not kept:
+        first = experiment.directories[findings.order[0]]
+        number = findings.order[0] - experiment.directories.index(first)
+        place = place / "policies" / f"{number:03d}"
+        said, kept = f"{said[:-1]}, whose policy the sweep kept:", seed in seeds_in(place)
+    if kept:
+        command = f"python -m mjx_reinforce.watch {shlex.quote(str(place))} --seed {seed}{own}"
+        return Watch(said, command)
     try:
         check_task(experiment.env)
     except ValueError as error:
@@ -201,7 +182,7 @@ def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
         f"The sweep has not kept the policy of the worst, seed {seed}. Trained again it begins "
         "alike, but rounds in another way, which makes another run of it on chaotic tasks:",
         f"python -m mjx_reinforce.train {flags} --num-seeds {seed + 1} --output again\n"
-        f"python -m mjx_reinforce.watch again --seed {seed}{env_flag(experiment.env)}",
+        f"python -m mjx_reinforce.watch again --seed {seed}{own}",
     )
 
 

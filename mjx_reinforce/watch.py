@@ -1,14 +1,11 @@
 """``python -m mjx_reinforce.watch RUN`` plays a trained policy and makes a film of it."""
 
 import dataclasses
-import os
 import sys
-from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import track
@@ -19,34 +16,32 @@ from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import accept_everything, heartbeat, say_error, silence_alarms
 from mjx_reinforce.export.films import (
     Renderer,
-    import_gymnasium,
     import_mujoco,
     mediapy_with_ffmpeg,
+    with_sky,
     write_film,
 )
-from mjx_reinforce.export.run_files import SeedChoice, Which
-from mjx_reinforce.files import check_folder
-from mjx_reinforce.playing.cast import (
-    RUNS,
-    PolicySource,
-    Role,
-    cast,
-    choose_run,
-    main_seed,
-    read_source,
+from mjx_reinforce.export.run_files import (
+    Run,
+    SeedChoice,
+    Which,
+    choose_seed,
+    is_pretrained,
+    provenance_of,
+    read_run,
 )
+from mjx_reinforce.files import check_folder
 from mjx_reinforce.settings.flags import read_command_line
 from mjx_reinforce.settings.own_code import check_named
 
 if TYPE_CHECKING:
-    from mjx_reinforce.envs.base import MujocoEnv
-    from mjx_reinforce.types import MjModel
+    from mjx_reinforce.export.player import Player
+    from mjx_reinforce.types import Environment
 
+#: Where runs are put that name no other place, see ``runs.directory.choose_directory``.
+RUNS = Path("runs")
 #: Settings that are whole numbers, with the least and the greatest that is accepted.
-_RANGES = (
-    *(("width", 1, 4096), ("height", 1, 4096)),
-    *(("episode", 0, 2**31 - 1), ("episodes", 1, 10_000)),
-)
+_RANGES = (("width", 1, 4096), ("height", 1, 4096), ("episode", 0, 2**31 - 1))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,23 +64,16 @@ class WatchSettings:
     beside: Literal["untrained"] | SeedChoice | None = None
     """A second policy, on the left, from the same start: untrained (before and after), or another
     seed of the run, such as worst."""
-    live: bool = False
-    """Show episode after episode in MuJoCo's viewer, in place of a film; the mouse pulls at bodies
-    (a double click selects, Ctrl and a drag pulls). Needs a screen."""
-    backend: Literal["mjx", "mujoco", "gymnasium"] | None = None
-    """Which simulation is filmed: "mjx", as in training; "mujoco", C MuJoCo, which starts at once;
-    "gymnasium", the installed Gymnasium, and then the returns of --episodes in it and in mjx are
-    printed. By default mjx for a run, mujoco with --live and for a policy of the package."""
-    episodes: int = 16
-    """With --backend gymnasium: how many episodes are compared."""
+    backend: Literal["mjx", "mujoco"] | None = None
+    """Which simulation is filmed: "mjx", as in training, or "mujoco", C MuJoCo, which starts at
+    once. By default mjx for a run, mujoco for a policy of the package."""
     episode: int = 0
     """Number of the start state; the same number, the same start."""
     noise: bool = False
     """Draw actions from the policy, as training does, instead of taking its mode."""
     output: Path | None = None
     """The film, .gif or, after pip install mediapy imageio-ffmpeg, .mp4.
-    By default RUN/seed-NUMBER.gif, or RUN/seed-NUMBER-gymnasium.gif; for a policy of the package
-    TASK.gif."""
+    By default RUN/seed-NUMBER.gif; for a policy of the package TASK.gif."""
     seconds: float = 20.0
     """Length of the film at most, in simulated seconds; the episode is played to its end."""
     width: int = 480
@@ -112,6 +100,19 @@ def main() -> None:
         sys.exit(130)
 
 
+class Role(NamedTuple):
+    """A policy that plays.
+
+    label: what a picture says of it
+    name: what a message says of it
+    player: the policy
+    """
+
+    label: str
+    name: str
+    player: "Player"
+
+
 def film(settings: WatchSettings) -> None:
     """Plays the episode, says what it returned, and writes the film.
 
@@ -119,29 +120,32 @@ def film(settings: WatchSettings) -> None:
       ValueError: a setting is out of range, or the run is damaged, or nothing can be drawn here.
       OSError: a file cannot be read or written.
     """
-    source = read_source(settings.run)
-    _check_env(settings, source)
-    output = film_path(settings, source)
-    if settings.backend == "gymnasium":
-        import_gymnasium()
+    run = None if is_pretrained(settings.run) else read_run(settings.run)
+    env_id = run.env if run else str(settings.run)
+    horizon = run.horizon if run else provenance_of(env_id)["horizon"]
+    if settings.env not in (None, env_id):
+        raise ValueError(f"--env is {settings.env}, but {settings.run} was trained on {env_id}")
+    check_named({"env": env_id}, {"env": settings.env}, settings.run)
+    output = film_path(settings, run)
     import_mujoco()
     configure_jax()
-    from mjx_reinforce.playing.mujoco_playing import check_observations
+    from mjx_reinforce.export.takes import Take, side_by_side
 
-    roles = cast(settings, source)
-    env = envs.make_set(source.env, source.run.env_set if source.run else ())
-    check_observations(env, roles[-1].player, source)
-    if settings.live:
-        from mjx_reinforce.playing.mujoco_playing import live
-
-        live(env, scene(env), roles[-1].player, source.horizon, settings)
-        return
+    roles = cast(settings, run)
+    env = envs.make_set(env_id, run.env_set if run else ())
+    if run:
+        _check_observations(env, roles[-1].player, run)
     model = scene(env)
     size = settings.width, settings.height
     renderer = Renderer(model, *size)  # raises before anything is compiled
-    from mjx_reinforce.export.takes import side_by_side
-
-    takes = [_take(settings, source, env, model, role) for role in roles]
+    takes = []
+    for role in roles:
+        name, play = _simulator(settings.backend, env, role.player, horizon, packaged=run is None)
+        with _waiting("compiling and playing"):
+            episode = play(settings.episode, settings.noise)
+        steps = f"{len(episode.rewards)} steps in {name}"
+        print(f"{env_id}, {role.name}: return {episode.total:.1f} in {steps}")
+        takes.append(Take(role.label, model, _within(env, "dt").dt, *episode))
     shown = side_by_side(takes, *size, seconds=settings.seconds, renderer=renderer)
     samples = [*map(shown.draw, shown.samples)]
     frames = map(shown.draw, track(range(shown.length), "drawing", transient=True))
@@ -151,49 +155,31 @@ def film(settings: WatchSettings) -> None:
     print(f"{shown.length} frames in {output}{cut * (settings.seconds < lasting)}")
 
 
-def _take(
-    settings: WatchSettings, source: PolicySource, env: "MujocoEnv", model: "MjModel", role: Role
-) -> Any:
-    """Returns the episode of one policy, and says what it earned."""
-    from mjx_reinforce.export.takes import Take
-    from mjx_reinforce.playing.mujoco_playing import simulators
+def choose_run(directory: Path) -> Path:
+    """Returns a directory, or of a folder of runs the one whose policies were written last.
 
-    by_name = simulators(settings.backend, env, role.player, source)
-    name, play = list(by_name.items())[-1]
-    with _waiting("compiling and playing"):
-        episode = play(settings.episode, settings.noise)
-        steps = f"{len(episode.rewards)} steps in {name}"
-        print(f"{source.env}, {role.name}: return {episode.total:.1f} in {steps}")
-        if len(by_name) > 1:
-            print(compare(settings, by_name))
-    return Take(role.label, model, _within(env, "dt").dt, episode.qpos, episode.rewards)
-
-
-def _check_env(settings: WatchSettings, source: PolicySource) -> None:
-    """Raises ValueError for another environment than the run's, or where one must be named."""
-    if settings.env not in (None, source.env):
-        raise ValueError(f"--env is {settings.env}, but {settings.run} was trained on {source.env}")
-    check_named({"env": source.env}, {"env": settings.env}, settings.run)
+    Raises:
+      ValueError: the directory is ``RUNS``, and has no run that has policies.
+    """
+    if (directory / "config.json").exists():
+        return directory
+    policies = [x for x in directory.glob("*/policy") if (x.parent / "config.json").exists()]
+    if policies:
+        return max(policies, key=lambda policy: policy.stat().st_mtime).parent
+    if directory == RUNS:
+        raise ValueError(
+            f"no run was named, and the folder {directory} has none: {command('train')} trains "
+            f"one; one elsewhere is named as in {command('watch')} DIRECTORY"
+        )
+    return directory
 
 
-def _waiting(what: str) -> AbstractContextManager[Any]:
-    """Returns a ``with`` block that shows on the screen that its contents are still running."""
-    console = Console(stderr=True)
-    return console.status(what) if console.is_terminal else heartbeat(console.print, what)
-
-
-def compare(settings: WatchSettings, simulators: Mapping[str, Any]) -> str:
-    """Returns the mean and range of the returns in each simulation, side by side."""
-    said = []
-    for name, play in simulators.items():
-        totals = [play(i, settings.noise).total for i in range(settings.episodes)]
-        worst, best = np.min(totals), np.max(totals)
-        said.append(f"{name} {np.mean(totals):.1f} ({worst:.1f} to {best:.1f})")
-    return f"mean return of {settings.episodes} episodes: {', '.join(said)}"
-
-
-def film_path(settings: WatchSettings, source: PolicySource) -> Path:
+def film_path(settings: WatchSettings, run: Run | None) -> Path:
     """Returns the film's path.
+
+    Args:
+      settings: of the film.
+      run: whose policy plays; None for a policy of the package.
 
     Raises:
       ValueError: a setting is out of range, the run has no such seed, or the film exists or cannot
@@ -205,14 +191,17 @@ def film_path(settings: WatchSettings, source: PolicySource) -> Path:
         value = getattr(settings, name)
         if not least <= value <= most:
             raise ValueError(f"--{name} must be in [{least}, {most}], got {value}")
-    _check_together(settings)
-    number = main_seed(settings, source)
-    suffix = "-gymnasium" * (settings.backend == "gymnasium")
-    name = f"seed-{number}" if source.run else source.env
-    folder = source.run.directory if source.run else Path()
-    output = settings.output or folder / f"{name}{suffix}.gif"
-    if settings.live:
-        return output
+    if run:
+        by_default = run.directory / f"seed-{choose_seed(run, settings.seed, settings.which)}.gif"
+    else:
+        beside = settings.beside not in (None, "untrained")
+        if settings.seed != "best" or settings.which != "last" or beside:
+            raise ValueError(
+                f"the package has one policy for {settings.run}; leave --seed, --which and "
+                "--beside out (but for --beside untrained), or give a run directory"
+            )
+        by_default = Path(f"{settings.run}.gif")
+    output = settings.output or by_default
     if output.suffix.lower() not in (".gif", ".mp4"):
         raise ValueError(f"{output} is no film; end --output in .gif or .mp4")
     check_folder(output.parent)
@@ -223,24 +212,77 @@ def film_path(settings: WatchSettings, source: PolicySource) -> Path:
     return output
 
 
-def _check_together(settings: WatchSettings) -> None:
-    """Raises ValueError for settings that exclude each other, or where --live has no screen."""
-    if settings.live and settings.backend not in (None, "mujoco"):
+def cast(settings: WatchSettings, run: Run | None) -> list[Role]:
+    """Returns the policies that play, from left to right; the last is the one asked for.
+
+    Args:
+      settings: of the film.
+      run: that of the settings; None for a policy of the package.
+
+    Raises:
+      ValueError: the run has no such seed, or a file is damaged.
+    """
+    from mjx_reinforce.export.player import load
+
+    def role(seed: SeedChoice) -> Role:
+        player = load(settings.run, seed, which=settings.which, policy=settings.policy)
+        rank = f" ({seed})" if isinstance(seed, str) else ""
+        name = f"seed {player.seed}" if run else "the package's policy"
+        return Role(f"seed {player.seed}{rank}", name, player)
+
+    main = role(settings.seed)
+    if settings.beside is None:
+        return [main._replace(label=main.player.env)]
+    if settings.beside == "untrained":
+        before = Role("before training", "untrained", untrained(main.player))
+        return [before, main._replace(label="after training")]
+    return [role(settings.beside), main]
+
+
+def untrained(player: "Player") -> "Player":
+    """Returns a player whose policy has random parameters, as training begins with."""
+    import jax
+
+    from mjx_reinforce.policies import normalize
+    from mjx_reinforce.policies.actor import Actor
+
+    params = player.policy.init(jax.random.key(player.seed))
+    actor = Actor(params=params, normalizer=normalize.init(player.observation_size))
+    return player._replace(actor=actor)
+
+
+def _check_observations(env: "Environment", player: "Player", run: Run) -> None:
+    """Raises ValueError for a policy of a run whose observations are not the environment's."""
+    from mjx_reinforce.types import observation_size
+
+    if (size := observation_size(env)) != player.observation_size:
         raise ValueError(
-            f"--live needs C MuJoCo, and --backend is {settings.backend}; leave one out"
-        )
-    if settings.live and settings.beside is not None:
-        raise ValueError("--live shows one policy; leave --beside out")
-    screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    if settings.live and sys.platform == "linux" and not screen:
-        raise ValueError(
-            "--live needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set; "
-            "leave --live out to write a film"
+            f"the policy in {run.directory} takes observations of {player.observation_size} "
+            f"entries, {run.env} has {size}: config.json and policy/ are of different runs"
         )
 
 
-def scene(env: "MujocoEnv") -> Any:
-    """Returns the MuJoCo model that an environment's ``qpos`` moves, with a floor and a sky.
+def _simulator(
+    backend: str | None, env: "Environment", player: "Player", horizon: int, *, packaged: bool
+) -> tuple[str, Any]:
+    """Returns the name of the simulation that plays, and a ``playing.Simulator``."""
+    from mjx_reinforce import playing
+    from mjx_reinforce.envs.base import MujocoEnv
+
+    if backend is None:
+        backend = "mujoco" if packaged and isinstance(env, MujocoEnv) else "mjx"
+    play = playing.mujoco_simulator if backend == "mujoco" else playing.simulator
+    return backend, play(env, player, horizon)
+
+
+def _waiting(what: str) -> AbstractContextManager[Any]:
+    """Returns a ``with`` block that shows on the screen that its contents are still running."""
+    console = Console(stderr=True)
+    return console.status(what) if console.is_terminal else heartbeat(console.print, what)
+
+
+def scene(env: Any) -> Any:
+    """Returns the MuJoCo model that an environment's ``qpos`` moves, with a sky.
 
     Raises:
       ValueError: it has none.
@@ -250,9 +292,8 @@ def scene(env: "MujocoEnv") -> Any:
     xml_file = getattr(env, "scene", None) or getattr(settings, "xml_file", None)
     if xml_file is not None and not hasattr(xml_file, "nbody"):  # no compiled model
         from mjx_reinforce.envs import models
-        from mjx_reinforce.export.scenery import dress
 
-        return dress(models.spec(xml_file), replace=not models.is_own(xml_file))
+        return with_sky(models.spec(xml_file))
     if hasattr(env, "mj_model"):
         return env.mj_model
     raise ValueError(

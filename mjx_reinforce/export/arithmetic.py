@@ -179,28 +179,38 @@ def onnx_model(plain: Arithmetic, env: str, seed: int) -> bytes:
       seed: the number of the seed, for the description too.
     """
     onnx = import_onnx()
-    helper, float32, int64 = onnx.helper, onnx.TensorProto.FLOAT, onnx.TensorProto.INT64
+    helper, float32 = onnx.helper, onnx.TensorProto.FLOAT
     size, out = plain.sizes
+    nodes: list[Any] = []
+
+    def add(operation: str, *inputs: str, name: str = "", **attributes: int) -> str:
+        """Adds an operation, and returns the name of what comes out of it."""
+        name = name or f"{operation.lower()}_{len(nodes)}"
+        nodes.append(helper.make_node(operation, inputs, [name], **attributes))
+        return name
+
+    x = "observation"
+    if plain.normalized:
+        x = add("Clip", add("Div", add("Sub", x, "mean"), "std"), "least", "greatest")
+    for i in range(plain.num_layers):
+        x = add("Gemm", add("Tanh", x) if i else x, f"weight_{i}", f"bias_{i}")
+    if plain.head == "clip":
+        x = add("Min", add("Max", x, "low"), "high")
+    elif plain.head == "tanh":
+        x = add("Add", add("Mul", add("Tanh", x), "half"), "middle")
+    elif plain.head == "argmax":
+        x = add("ArgMax", x, axis=1, keepdims=0)
+    add("Identity", x, name="action")
+    clips = {"least": np.float32(-plain.clip), "greatest": np.float32(plain.clip)}
+    constants = plain.arrays | (clips if plain.normalized else {})
     discrete = plain.head == "argmax"
-    constants = plain.arrays | {
-        "least": np.float32(-plain.clip),
-        "greatest": np.float32(plain.clip),
-    }
-    nodes = [
-        helper.make_node(operation, inputs, [output], **attributes)
-        for operation, inputs, output, attributes in _nodes(plain)
-    ]
-    used = {name for node in nodes for name in node.input}
+    kind, shape = (onnx.TensorProto.INT64, ["N"]) if discrete else (float32, ["N", out])
     graph = helper.make_graph(
         nodes,
         "policy",
         [helper.make_tensor_value_info("observation", float32, ["N", size])],
-        [
-            helper.make_tensor_value_info("action", int64, ["N"])
-            if discrete
-            else helper.make_tensor_value_info("action", float32, ["N", out])
-        ],
-        [onnx.numpy_helper.from_array(x, n) for n, x in sorted(constants.items()) if n in used],
+        [helper.make_tensor_value_info("action", kind, shape)],
+        [onnx.numpy_helper.from_array(x, name) for name, x in sorted(constants.items())],
         doc_string=f"The deterministic action of a trained policy for {env}, seed {seed}.",
     )
     model = helper.make_model(
@@ -211,35 +221,3 @@ def onnx_model(plain: Arithmetic, env: str, seed: int) -> bytes:
     )
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()
-
-
-def _nodes(plain: Arithmetic) -> list[tuple[str, list[str], str, dict[str, Any]]]:
-    """Returns operations in order: its name, inputs, output and attributes."""
-    nodes: list[tuple[str, list[str], str, dict[str, Any]]] = []
-    x = "observation"
-    if plain.normalized:
-        nodes += [
-            ("Sub", [x, "mean"], "centred", {}),
-            ("Div", ["centred", "std"], "scaled", {}),
-            ("Clip", ["scaled", "least", "greatest"], "clipped", {}),
-        ]
-        x = "clipped"
-    for i in range(plain.num_layers):
-        nodes.append(("Gemm", [x, f"weight_{i}", f"bias_{i}"], f"layer_{i}", {}))
-        x = f"layer_{i}"
-        if i < plain.num_layers - 1:
-            nodes.append(("Tanh", [x], f"units_{i}", {}))
-            x = f"units_{i}"
-    return (
-        nodes
-        + {
-            "mean": [("Identity", [x], "action", {})],
-            "clip": [("Max", [x, "low"], "above", {}), ("Min", ["above", "high"], "action", {})],
-            "tanh": [
-                ("Tanh", [x], "squashed", {}),
-                ("Mul", ["squashed", "half"], "spread", {}),
-                ("Add", ["spread", "middle"], "action", {}),
-            ],
-            "argmax": [("ArgMax", [x], "action", {"axis": 1, "keepdims": 0})],
-        }[plain.head]
-    )

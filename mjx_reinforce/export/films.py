@@ -15,7 +15,7 @@ import numpy as np
 from mjx_reinforce.files import write_bytes
 
 if TYPE_CHECKING:
-    from mjx_reinforce.types import MjModel
+    from mjx_reinforce.types import MjModel, MjSpec
 
 #: Colours of a .gif, beside the one that is transparent.
 _COLORS = 255
@@ -88,15 +88,17 @@ def _camera(model: "MjModel") -> tuple[Any, int | None]:
     return camera, int(first) if ways[model.jnt_bodyid == first].any() else None
 
 
-def import_gymnasium() -> Any:
-    """Returns the module, or raises ValueError with a remedy."""
-    try:
-        import gymnasium
-    except ImportError as error:
-        raise ValueError(
-            f"--backend gymnasium needs Gymnasium ({error}); pip install 'gymnasium[mujoco]'"
-        ) from error
-    return gymnasium
+def with_sky(spec: "MjSpec") -> Any:
+    """Compiles a model to be drawn, with a sky if it has none: MuJoCo's picture would be black."""
+    mujoco = import_mujoco()
+    sky = mujoco.mjtTexture.mjTEXTURE_SKYBOX
+    if not any(texture.type == sky for texture in spec.textures):
+        gradient = {"builtin": mujoco.mjtBuiltin.mjBUILTIN_GRADIENT, "width": 64, "height": 384}
+        overhead, horizon = (0.30, 0.50, 0.72), (0.86, 0.91, 0.95)
+        name = "mjx_reinforce_sky"
+        spec.add_texture(name=name, type=sky, rgb1=overhead, rgb2=horizon, **gradient)
+    with warnings.catch_warnings(action="ignore"):  # what MuJoCo deprecates in a model
+        return spec.compile()
 
 
 def import_mujoco() -> Any:

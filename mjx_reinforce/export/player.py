@@ -118,15 +118,9 @@ def load_saved(
 ) -> tuple[Player, SavedPolicy]:
     """Loads a policy, as ``load``, with what its files say."""
     check_type("run", run, str | Path)
-    if is_pretrained(run):
-        return load_pretrained(str(run), seed, which)
-    return load_seed(read_run(run), seed, which, policy)
-
-
-def load_pretrained(
-    name: str, seed: SeedChoice = "best", which: Which = "last"
-) -> tuple[Player, SavedPolicy]:
-    """Loads the policy for a task that comes with the package, as ``load_saved``."""
+    if not is_pretrained(run):
+        return load_seed(read_run(run), seed, which, policy)
+    name = str(run)
     if (seed, which) != ("best", "last"):
         raise ValueError(
             f"the package has one policy for {name}, of the best seed; leave seed and which out, "

@@ -54,7 +54,6 @@ def side_by_side(
     height: int,
     *,
     seconds: float,
-    columns: int | None = None,
     max_rate: float = MAX_RATE,
     renderer: Renderer | None = None,
 ) -> Film:
@@ -65,7 +64,6 @@ def side_by_side(
       width: of each take (pixels).
       height: of each take (pixels).
       seconds: length at most (simulated s); it ends with the longest take.
-      columns: takes in a row; by default all.
       max_rate: frames a second at most.
       renderer: of the last take's model, where it is open already.
 
@@ -74,7 +72,6 @@ def side_by_side(
     """
     if not takes:
         raise ValueError("a film needs at least one take")
-    columns = columns or len(takes)
     dt = max(take.dt for take in takes)
     interval = dt * max(1, math.ceil(1 / (dt * max_rate) - 1e-9))
     lasting = max(min(len(take.qpos) * take.dt, seconds) for take in takes)
@@ -86,10 +83,7 @@ def side_by_side(
             _picture(take, renderer, frame * interval)
             for take, renderer in zip(takes, renderers, strict=True)
         ]
-        blank = np.full_like(pictures[0], _PAPER)
-        pictures += [blank] * (-len(pictures) % columns)
-        rows = [pictures[i : i + columns] for i in range(0, len(pictures), columns)]
-        return np.concatenate([np.concatenate(row, axis=1) for row in rows])
+        return np.concatenate(pictures, axis=1)
 
     length = max(1, math.ceil(lasting / interval - 1e-6))
     samples = [*range(0, length, -(-length // SAMPLES))]

@@ -1,5 +1,6 @@
 """The figures of a report: what an experiment's numbers say, best configuration first."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -15,13 +16,13 @@ from mjx_reinforce.reports.experiment import (
     Solving,
     shared_seeds,
 )
-from mjx_reinforce.reports.learning import Learning, compare_learning
 from mjx_reinforce.reports.statistics import Estimate, iqm, iqm_interval
 from mjx_reinforce.reports.statistics.aggregates import interval, wilson
-from mjx_reinforce.reports.statistics.comparisons import Comparison, compare_all
+from mjx_reinforce.reports.statistics.comparisons import Comparison, compare_all, holm
 from mjx_reinforce.reports.statistics.power import seeds_needed, wrong_winner
 from mjx_reinforce.reports.statistics.survival import (
     collapses,
+    log_rank,
     mean_while_training,
     median_steps,
     restricted_mean,
@@ -45,6 +46,32 @@ class Few(NamedTuple):
 
     wrong: dict[int, float]
     needed: int | None
+
+
+class SpeedTest(NamedTuple):
+    """The log-rank test of two results, ``first`` and ``second`` being their places.
+
+    p_value: that both solve the task equally soon
+    adjusted: the same after Holm's correction for all pairs
+    """
+
+    first: int
+    second: int
+    p_value: float
+    adjusted: float
+
+
+class Learning(NamedTuple):
+    """How fast the results learn.
+
+    until: env steps at which the areas end and the mean env steps to solve are cut off
+    speeds: of all pairs of the best results; empty where the task has no threshold
+    areas: the same pairs by the mean return over the training
+    """
+
+    until: int
+    speeds: list[SpeedTest]
+    areas: list[Comparison]
 
 
 class Findings(NamedTuple):
@@ -85,16 +112,20 @@ def compute_findings(experiment: Experiment) -> Findings:
     finals = np.concatenate([part.eval_return[-1] for part in parts])
     worst = min(finals[np.isfinite(finals)], default=math.nan)
     results = [
-        _result(part, band, seeds, worst, min(ends))._replace(
-            solving=_solving_of(part, experiment, min(ends))
-        )
+        _result(part, band, seeds, worst, _solving_of(part, experiment, min(ends)), min(ends))
         for part, band, seeds in zip(parts, bands, curves, strict=True)
     ]
     order = sorted(range(len(results)), key=lambda i: _rank(results[i]))
     ranked = [results[i] for i in order]
-    comparisons = _compare_pairs(ranked[:COMPARED])
-    learning = compare_learning(ranked, min(ends))
-    return Findings(experiment, ranked, order, grid, comparisons, _ask_few(ranked), learning)
+    return Findings(
+        experiment,
+        results=ranked,
+        order=order,
+        grid=grid,
+        comparisons=_compare_pairs(ranked[:COMPARED], "scores"),
+        few=_ask_few(ranked),
+        learning=compare_learning(ranked, min(ends)),
+    )
 
 
 def _curve_steps(parts: Sequence[Configuration], end: int) -> np.ndarray:
@@ -121,7 +152,12 @@ def _bands(curves: Sequence[np.ndarray]) -> list[Estimate]:
 
 
 def _result(
-    part: Configuration, band: Estimate, seeds: np.ndarray, worst: float, until: int
+    part: Configuration,
+    band: Estimate,
+    seeds: np.ndarray,
+    worst: float,
+    solving: Solving | None,
+    until: int,
 ) -> Result:
     final = part.eval_return[-1]
     scores = np.where(np.isfinite(final), final, worst)
@@ -139,7 +175,7 @@ def _result(
         seeds=seeds,
         areas=areas,
         area=interval("mean", areas),
-        solving=None,
+        solving=solving,
     )
 
 
@@ -168,12 +204,14 @@ def _rank(result: Result) -> tuple[float, float]:
     return math.inf if math.isnan(mean) else -mean, math.inf if math.isnan(speed) else speed
 
 
-def _compare_pairs(results: Sequence[Result]) -> list[Comparison]:
-    """Compares all pairs on the seeds that all of them have."""
+def _compare_pairs(results: Sequence[Result], field: str) -> list[Comparison]:
+    """Compares all pairs by a field [S] of theirs, on the seeds that all of them have."""
     shared = shared_seeds(results)
     if len(results) < 2 or len(shared) < 2:
         return []
-    return compare_all([each.scores[np.isin(each.configuration.seed, shared)] for each in results])
+    return compare_all(
+        [getattr(each, field)[np.isin(each.configuration.seed, shared)] for each in results]
+    )
 
 
 def _ask_few(results: Sequence[Result]) -> Few | None:
@@ -184,6 +222,31 @@ def _ask_few(results: Sequence[Result]) -> Few | None:
     enough = [number for number in FEW if 10 * number <= min(len(best), len(second))]
     wrong = {number: wrong_winner(best, second, number) for number in enough}
     return Few(wrong, seeds_needed(best, second))
+
+
+def compare_learning(results: Sequence[Result], until: int) -> Learning:
+    """Compares how fast results learn; see ``Learning``."""
+    best = results[:COMPARED]
+    return Learning(until, _speeds(best), _compare_pairs(best, "areas"))
+
+
+def fastest(results: Sequence[Result]) -> int:
+    """Returns the place of the result with the fewest mean env steps to solve."""
+    means = [float(each.solving.mean.value) if each.solving else np.inf for each in results]
+    return int(np.argmin(means))
+
+
+def _speeds(results: Sequence[Result]) -> list[SpeedTest]:
+    solving = [each.solving for each in results if each.solving is not None]
+    pairs = list(itertools.combinations(range(len(solving)), 2))
+    found = [
+        log_rank(solving[i].steps, solving[i].solved, solving[j].steps, solving[j].solved).p_value
+        for i, j in pairs
+    ]
+    return [
+        SpeedTest(i, j, p_value, float(adjusted))
+        for (i, j), p_value, adjusted in zip(pairs, found, holm(found), strict=True)
+    ]
 
 
 def swept(findings: Findings) -> list[str]:

@@ -14,10 +14,10 @@ from mjx_reinforce import envs, registry
 from mjx_reinforce.checks import whole_number
 from mjx_reinforce.console import commands, streams
 from mjx_reinforce.envs.__main__ import main as envs_main
-from mjx_reinforce.playing.cast import choose_run
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.settings.groups import MAIN
+from mjx_reinforce.watch import choose_run
 
 
 @pytest.fixture

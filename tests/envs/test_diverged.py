@@ -2,18 +2,16 @@
 
 import functools
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
-from mjx_reinforce import make_vec, mlp_policy, normal, rollout
+from mjx_reinforce import make_vec, mlp_policy, normal, playing, rollout
 from mjx_reinforce.envs.base import MujocoEnv
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export.player import Player
-from mjx_reinforce.playing import mjx_playing, mujoco_playing
 from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor
 
@@ -104,24 +102,13 @@ def test_many_at_once_are_told():
     assert state.reward[0] == 0
 
 
-@pytest.mark.slow
-def test_episodes_to_look_at_end_there(in_a_folder):
+def test_episodes_to_look_at_end_there():
     """In each simulation that ``watch`` knows."""
-    (in_a_folder / "slider.xml").write_text(MODEL.format(kp=1e5))
-    gymnasium.register(
-        "Diverging-v0",
-        "gymnasium.envs.mujoco.half_cheetah_v5:HalfCheetahEnv",
-        kwargs={"xml_file": str(in_a_folder / "slider.xml"), "frame_skip": 1},
-    )
     env = Slider()
     policy, params = still(env)
     actor = Actor(params=params, normalizer=normalize.init(1))
     player = Player("Diverging-v0", 0, policy, actor)
-    for play in (
-        mjx_playing.simulator(env, player, 20),
-        mujoco_playing.mujoco_simulator(env, player, 20),
-        mjx_playing.gymnasium_simulator(player, 20)[1],
-    ):
-        episode = play(0, False)
+    for simulator in (playing.simulator, playing.mujoco_simulator):
+        episode = simulator(env, player, 20)(0, False)
         assert np.isnan(episode.rewards).tolist() == [False] * (len(episode.rewards) - 1) + [True]
         assert 4 < len(episode.rewards) == len(episode.qpos) < 10

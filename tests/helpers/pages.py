@@ -6,10 +6,28 @@ import re
 import subprocess
 import sys
 
+import numpy as np
+
+from mjx_reinforce.reports.findings import compute_findings
+from mjx_reinforce.reports.sources import read_experiment
+
 #: Tables that are wider than their place, which cuts columns or hides them behind a scroll bar.
 CUT = """[...document.querySelectorAll('.scroll, .numbers')].filter((place) =>
   !place.clientWidth || place.scrollWidth > place.clientWidth || place.innerText.length < 20
 ).map((place) => place.getAttribute('aria-label'))"""
+
+
+def findings_of(*directories):
+    return compute_findings(read_experiment(directories))
+
+
+def change_curves(directory, change):
+    """Changes the arrays of a sweep's curves: change(arrays) in place."""
+    with np.load(directory / "curves.npz") as archive:
+        arrays = dict(archive)
+    change(arrays)
+    np.savez(directory / "curves.npz", **arrays)
+    return arrays
 
 
 def content(page):

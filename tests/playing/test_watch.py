@@ -1,26 +1,24 @@
 """Films of trained policies."""
 
 import functools
-import math
 import subprocess
 import sys
 import time
+from pathlib import Path
 
-import gymnasium
 import imageio_ffmpeg
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import struct
+from bad_envs import Pole
 from PIL import Image
 from saved_runs import change, change_arrays, make_run
-from toys import Survive, ToyState
+from toys import Survive
 
-from mjx_reinforce import act, envs, load, load_policy, watch
+from mjx_reinforce import act, envs, load_policy, playing, watch
 from mjx_reinforce.engines.rollouts import rollout
 from mjx_reinforce.export import takes
-from mjx_reinforce.playing import mjx_playing as playing
+from mjx_reinforce.export.run_files import read_run
 
 
 def watch_run(monkeypatch, *arguments):
@@ -28,11 +26,68 @@ def watch_run(monkeypatch, *arguments):
     watch.main()
 
 
-@pytest.mark.parametrize("env_id", ["InvertedPendulum-v5", "CartPole-v1"])
-def test_the_film_is_the_episode(tmp_path, env_id):
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Returns of seeds 0, 1, 2 are 2, 7, 5."""
+    return read_run(make_run(tmp_path_factory.mktemp("run")))
+
+
+def roles(run, **settings):
+    place = run.directory if run else Path("Hopper-v5")
+    return watch.cast(watch.WatchSettings(place, **settings), run)
+
+
+def test_who_plays_is_named_where_there_are_two(run):
+    (alone,) = roles(run, seed=2)
+    assert (alone.label, alone.name, alone.player.seed) == ("CartPole-v1", "seed 2", 2)
+    (alone,) = roles(None)
+    assert (alone.label, alone.name) == ("Hopper-v5", "the package's policy")
+    both = roles(run, beside="worst")
+    assert [x.label for x in both] == ["seed 0 (worst)", "seed 1 (best)"]
+    assert [x.name for x in both] == ["seed 0", "seed 1"]
+    assert [x.label for x in roles(run, seed=2, beside=0)] == ["seed 0", "seed 2"]
+
+
+def test_before_training_the_parameters_are_random_and_nothing_is_scaled(run):
+    before, after = roles(run, beside="untrained")
+    assert (before.label, before.name) == ("before training", "untrained")
+    assert (after.label, after.name) == ("after training", "seed 1")
+    first, last = before.player.actor, after.player.actor
+    assert float(first.normalizer.count) == 0 < float(last.normalizer.count)
+    drawn = after.player.policy.init(jax.random.key(1))
+    jax.tree.map(np.testing.assert_array_equal, first.params, drawn)
+    same = jax.tree.map(lambda x, y: bool(np.all(x == y)), first.params, last.params)
+    assert not all(jax.tree.leaves(same))
+
+
+def test_the_package_has_one_policy_of_a_task(monkeypatch, capsys):
+    monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("an environment was built"))
+    for options in (["--seed", "worst"], ["--which", "best"], ["--beside", "2"]):
+        with pytest.raises(SystemExit, match="2"):
+            watch_run(monkeypatch, "HalfCheetah-v5", *options)
+        assert "the package has one policy for HalfCheetah-v5" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("asked", [None, "mjx", "mujoco"])
+def test_which_simulation_plays(monkeypatch, asked):
+    """Where nothing is asked, C MuJoCo if it knows the task: it is the package's policy."""
+    monkeypatch.setattr(playing, "mujoco_simulator", lambda *_: "C")
+    monkeypatch.setattr(playing, "simulator", lambda *_: "MJX")
+    plays = {"mjx": ("mjx", "MJX"), "mujoco": ("mujoco", "C")}
+    for env, packaged, unasked in (
+        (Survive(), True, "mjx"),
+        (Pole(), True, "mujoco"),
+        (Pole(), False, "mjx"),
+    ):
+        found = watch._simulator(asked, env, None, 9, packaged=packaged)  # pyright: ignore
+        assert found == plays[asked or unasked]
+
+
+@pytest.mark.slow
+def test_the_film_is_the_episode(tmp_path):
     """In a process of its own: the way MuJoCo draws is settled when it is imported."""
-    env = envs.make(env_id)
-    make_run(tmp_path, env_id)
+    env = envs.make("CartPole-v1")
+    make_run(tmp_path)
     options = ["--width", "96", "--height", "64"]
     command = [sys.executable, "-m", "mjx_reinforce.watch", str(tmp_path), *options]
     said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
@@ -50,41 +105,16 @@ def test_the_film_is_the_episode(tmp_path, env_id):
     )
     length = int(played.mask.sum())
     assert f"return {float(played.reward.sum()):.1f} in {length} steps" in said
-    skip = {"InvertedPendulum-v5": 1, "CartPole-v1": 2}[env_id]
     with Image.open(tmp_path / "seed-1.gif") as film:
         assert film.size == (96, 64 + 12)
         pictures = []
         for i in range(film.n_frames):
             film.seek(i)
             pictures.append(np.asarray(film.convert("RGB"), float))
-            assert film.info["duration"] == pytest.approx(1000 * env.dt * skip)
-    assert len(pictures) == -(-(length + 1) // skip)
+            assert film.info["duration"] == pytest.approx(1000 * 2 * env.dt)  # every second step
+    assert len(pictures) == -(-(length + 1) // 2)
     assert np.abs(pictures[0] - pictures[-1]).max() > 50  # something moves
     assert np.ptp(pictures[0]) > 100  # and is to be seen
-
-
-def test_noise_and_other_starts_differ(tmp_path):
-    player = load(make_run(tmp_path))
-    play = playing.simulator(envs.make("CartPole-v1"), player, 60)
-    plain, other, noisy = play(0, False), play(1, False), play(0, True)
-    lengths = [[len(play(i, noise).rewards) for i in range(8)] for noise in (False, True)]
-    assert np.any(plain.qpos[0] != other.qpos[0])
-    np.testing.assert_array_equal(plain.qpos[0], noisy.qpos[0])
-    assert lengths[0] != lengths[1]
-    assert len(plain.qpos) == len(plain.rewards) + 1
-
-
-def test_seeds_and_starts_share_a_program(tmp_path):
-    """So that the compilation cache serves every later start."""
-    env, events = envs.make("CartPole-v1"), []
-    make_run(tmp_path)
-    playing.simulator(env, load(tmp_path, 0), 30)(0, False)
-    jax.monitoring.register_event_listener(lambda event, **_: events.append(event))
-    player = load(tmp_path, 2)
-    del events[:]
-    playing.simulator(env, player, 30)(5, True)
-    assert "/jax/compilation_cache/cache_hits" in events
-    assert "/jax/compilation_cache/cache_misses" not in events
 
 
 def test_the_compilation_cache_is_that_of_training(tmp_path):
@@ -103,110 +133,13 @@ def test_the_compilation_cache_is_that_of_training(tmp_path):
     assert ran.stdout.split() == ["here/mjx_reinforce", "highest"]
 
 
-@struct.dataclass
-class Moving(ToyState):
-    qpos: jax.Array | None = None
-
-    @property
-    def pipeline_state(self):
-        return self
-
-
-class Breaking(Survive):
-    """Leaves the finite numbers in its third step."""
-
-    def reset(self, rng):
-        del rng
-        return Moving(jnp.zeros(1), jnp.zeros(()), jnp.zeros(()), qpos=jnp.zeros(1))
-
-    def step(self, state, action):
-        del action
-        obs = state.obs + 1.0
-        obs = jnp.where(obs > 2.5, jnp.nan, obs)
-        return state.replace(obs=obs, reward=jnp.ones(()), qpos=obs)
-
-
-def test_a_return_that_is_not_finite_is_nan(tmp_path):
-    run = make_run(tmp_path, "InvertedPendulum-v5", observation_size=1)
-    episode = playing.simulator(Breaking(), load(run), 20)(0, False)
-    np.testing.assert_array_equal(episode.rewards, [1.0, 1.0, np.nan])
-    np.testing.assert_array_equal(episode.qpos, [[0.0], [1.0], [2.0]])
-    assert math.isnan(episode.total)
-    said = watch.compare(watch.WatchSettings(run, episodes=2), {"mjx": lambda *_: episode})
-    assert said == "mean return of 2 episodes: mjx nan (nan to nan)"
-
-
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "InvertedPendulum-v5"])
-def test_gymnasium_plays_the_same_policy(tmp_path, env_id):
-    make_run(tmp_path, env_id)
-    # Its noise is far greater than the range of the actions.
-    wide = {"params__constants": lambda log_std: np.full_like(log_std, 6.0)}
-    change_arrays(tmp_path / "policy" / "actor.npz", checksum=None, **wide)
-    player = load(tmp_path)
-    version, play = playing.gymnasium_simulator(player, 15)
-    assert version == gymnasium.__version__
-    episode = play(3, False)
-    env = gymnasium.make(env_id)
-    observation, _ = env.reset(seed=3)
-    for i, reward in enumerate(episode.rewards):
-        seen = observation[::2] if env_id == "CartPole-v1" else observation[:2]
-        np.testing.assert_allclose(episode.qpos[i], seen, rtol=1e-6)
-        observation, expected, terminated, _, _ = env.step(player.act(observation))
-        assert reward == expected
-    assert terminated or len(episode.rewards) == 15
-    assert len(episode.qpos) == len(episode.rewards) + 1
-    noisy = [play(start, True).qpos for start in range(8)]
-    np.testing.assert_array_equal(noisy[3], play(3, True).qpos)
-    plain = [play(start, False).qpos for start in range(8)]
-    assert any(x.shape != y.shape or np.any(x != y) for x, y in zip(noisy, plain, strict=True))
-
-
-def test_both_simulations_are_said_side_by_side(tmp_path, monkeypatch, capsys):
-    """The film is of the last one; nothing is drawn here."""
-
-    class Blank:
-        def __init__(self, *_):
-            self.draw = lambda qpos, *_: np.full((8, 8, 3), len(qpos), np.uint8)
-
-    monkeypatch.setattr(watch, "Renderer", Blank)
-    monkeypatch.setattr(takes, "Renderer", Blank)
-    run = make_run(tmp_path)
-    watch_run(monkeypatch, run, "--backend", "gymnasium", "--episodes", 2)
-    said = capsys.readouterr().out.splitlines()
-    player = load(run)
-    name, theirs = playing.gymnasium_simulator(player, 60)
-    ours = playing.simulator(envs.make("CartPole-v1"), player, 60)
-    episode = theirs(0, False)
-    returned = f"return {episode.total:.1f} in {len(episode.rewards)} steps"
-    assert said[0] == f"CartPole-v1, seed 1: {returned} in gymnasium {name}"
-    for label, play in (("mjx", ours), (f"gymnasium {name}", theirs)):
-        totals = [play(i, False).total for i in range(2)]
-        words = f"{label} {sum(totals) / 2:.1f} ({min(totals):.1f} to {max(totals):.1f})"
-        assert words in said[1]
-    assert (run / "seed-1-gymnasium.gif").exists()
-
-
-def test_a_simulator_that_is_not_there_is_named(tmp_path, monkeypatch):
-    player = load(make_run(tmp_path))
-    for env_id in ("ContinuousCartPole-v0", "os:path"):
-        with pytest.raises(ValueError, match="leave --backend gymnasium out"):
-            playing.gymnasium_simulator(player._replace(env=env_id), 9)
-    with pytest.raises(ValueError, match=r"of 4 entries, the installed Gymnasium's .* \(10,\)"):
-        playing.gymnasium_simulator(player._replace(env="Reacher-v5"), 9)
-    monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(ValueError, match=r"pip install 'gymnasium\[mujoco\]'"):
-        playing.gymnasium_simulator(player, 9)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--backend", "gymnasium"], "pip install 'gymnasium[mujoco]'"),
         (["--sed", 3], "error: unknown flag '--sed'. Did you mean '--seed'?"),
         (["--width", "wide"], "--width takes a whole number, such as 4 or 2e6, got 'wide'"),
         (["--seed", 3], "has no seed 3: its seeds are 0 to 2"),
         (["--which", "best"], "has no policy/best"),
-        (["--episodes", 0], "--episodes must be in [1, 10000], got 0"),
         (["--seconds", 0], "--seconds must be positive and finite, got 0"),
         (["--width", 5000], "--width must be in [1, 4096], got 5000"),
         (["--episode", -1], "--episode must be in [0, 2147483647], got -1"),
@@ -216,19 +149,13 @@ def test_a_simulator_that_is_not_there_is_named(tmp_path, monkeypatch):
         (["--output", "policy.gif", "--overwrite"], "policy.gif exists"),
         (["--output", "config.json", "--overwrite"], "config.json is no film"),
         (["--output", "film.mp4"], "pip install mediapy imageio-ffmpeg"),
-        (["--live"], "--live needs a screen, and neither DISPLAY nor WAYLAND_DISPLAY is set"),
-        (["--live", "--backend", "mjx"], "--live needs C MuJoCo, and --backend is mjx"),
-        (["--live", "--beside", "worst"], "--live shows one policy; leave --beside out"),
     ],
 )
 def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
     make_run(tmp_path)
     (tmp_path / "policy.gif").mkdir()
     monkeypatch.chdir(tmp_path)
-    for variable in ("DISPLAY", "WAYLAND_DISPLAY"):
-        monkeypatch.delenv(variable, raising=False)
-    for package in ("mediapy", "gymnasium"):
-        monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.setitem(sys.modules, "mediapy", None)
     monkeypatch.setattr(envs, "make", lambda *_: pytest.fail("an environment was built"))
     with pytest.raises(SystemExit, match="2"):
         watch_run(monkeypatch, tmp_path, *arguments)
@@ -248,9 +175,8 @@ def test_a_policy_of_another_environment_is_named(tmp_path, monkeypatch, capsys)
     assert "takes observations of 4 entries, Reacher-v5 has 10" in error
 
 
-@pytest.mark.parametrize("width", [48, 33])
-def test_an_mp4_is_what_was_drawn(tmp_path, width):
-    frames = np.zeros((5, 32, width, 3), np.uint8)
+def test_an_mp4_is_what_was_drawn(tmp_path):
+    frames = np.zeros((5, 32, 33, 3), np.uint8)  # a width that is odd
     frames[:, :16, :, 0] = 40 * np.arange(1, 6)[:, None, None]
     watch.write_film(tmp_path / "film.mp4", iter(frames), 25.0, [*frames[:1]])
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", tmp_path / "film.mp4"]
@@ -320,22 +246,37 @@ class OfBrax(Wrapper):
 """
 
 
-def test_wrapped_environments_are_filmed(tmp_path):
+class Blank:
+    """Draws pictures of one shade, each another."""
+
+    def __init__(self, model, width, height):
+        self.shape, self.drawn = (height, width, 3), 0
+
+    def draw(self, qpos):
+        self.drawn += 1
+        return np.full(self.shape, self.drawn, np.uint8)
+
+
+def test_wrapped_environments_are_filmed(tmp_path, monkeypatch):
     """By a wrapper of brax's, which hands on all attributes, and by one's own, which has few."""
     (tmp_path / "wraps.py").write_text(WRAPPERS)
+    monkeypatch.syspath_prepend(tmp_path)
+    for module in (watch, takes):
+        monkeypatch.setattr(module, "Renderer", Blank)
     run = make_run(tmp_path)
     change_arrays(run / "policy" / "actor.npz", checksum=None)
     frames = {}
     for name in ("CartPole-v1", "wraps:Plain", "wraps:OfBrax", "wraps:Twice"):
         for file in ("config.json", "policy/policy.json"):
             change(run / file, env=name)
-        command = [sys.executable, "-m", "mjx_reinforce.watch", ".", "--env", name, "--overwrite"]
-        options = ["--width", "96", "--height", "64"]
-        subprocess.run([*command, *options], check=True, capture_output=True, cwd=run)
+        size = ["--width", "48", "--height", "32"]
+        watch_run(monkeypatch, run, "--env", name, "--overwrite", *size)
         with Image.open(run / "seed-1.gif") as film:
             frames[name] = film.n_frames, film.info["duration"]
     assert frames["CartPole-v1"] == frames["wraps:Plain"] == frames["wraps:OfBrax"]
-    assert frames["wraps:Twice"][1] == 1000 * 2 * envs.make("CartPole-v1").dt
+    # Every second step of the one, every step of the other.
+    assert frames["CartPole-v1"][1] == 1000 * 2 * envs.make("CartPole-v1").dt
+    assert frames["wraps:Twice"][1] == frames["CartPole-v1"][1]
 
 
 def test_an_environment_without_a_model_is_refused(register, tmp_path, monkeypatch, capsys):

@@ -12,7 +12,6 @@ from mjx_reinforce.reports.statistics.aggregates import (
     cvar,
     interval,
     median_interval,
-    optimality_gap,
     wilson,
 )
 
@@ -67,7 +66,9 @@ def test_strata_are_resampled_apart():
 
 def test_values_by_hand():
     values = np.array([4.0, 1.0, 3.0, 10.0, 2.0])
-    assert optimality_gap(values, 3.0) == pytest.approx((0 + 2 + 0 + 0 + 1) / 5)
+    assert interval("optimality-gap", values, target=3.0).value == pytest.approx(
+        (0 + 2 + 0 + 0 + 1) / 5
+    )
     assert interval("median", values).value == 3.0
     assert interval("mean", values).value == 4.0
     assert interval("iqm", values).value == 3.0

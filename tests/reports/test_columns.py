@@ -31,8 +31,10 @@ def test_numbers_have_a_few_digits_and_what_is_not_finite_is_none():
     assert [type(x) for x in columns.short([2.0, 2.5])] == [int, float]
 
 
-def test_tables_are_joined_row_after_row():
-    assert columns.join_tables([TABLE, TABLE])["configuration"] == [1, 0, 1, 0]
+def test_tables_stand_below_each_other():
+    """What is no list is the same in all rows of its table."""
+    table = columns.stacked([TABLE, {"configuration": 3, "value": [4, 5]}])
+    assert table == {"configuration": [1, 0, 3, 3], "value": [2.5, None, 4, 5]}
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import types
 
 import numpy as np
 
-from mjx_reinforce.reports import learning
+from mjx_reinforce.reports import findings
 from mjx_reinforce.reports.statistics.comparisons import holm
 from mjx_reinforce.reports.statistics.survival import log_rank
 
@@ -34,7 +34,7 @@ QUICK, SLOW = np.arange(100, 160, 10), np.arange(400, 1000, 100)
 def test_speeds_are_log_rank_tests_of_all_pairs():
     solved = [True, True, False, True, True, True]
     results = [result(9, steps=QUICK), result(8, steps=SLOW, solved=solved), result(7, steps=SLOW)]
-    speeds = learning.compare_learning(results, UNTIL).speeds
+    speeds = findings.compare_learning(results, UNTIL).speeds
     assert [(x.first, x.second) for x in speeds] == [(0, 1), (0, 2), (1, 2)]
     exact = [
         log_rank(*(x for k in pair for x in (results[k].solving.steps, results[k].solving.solved)))
@@ -47,17 +47,17 @@ def test_speeds_are_log_rank_tests_of_all_pairs():
 
 def test_areas_are_compared_on_the_seeds_that_all_have():
     results = [result(9), result(5, seed=[5, 4, 3, 2, 7, 8]), result(7, seed=[2, 3, 4, 5])]
-    found = learning.compare_learning(results, UNTIL)
+    found = findings.compare_learning(results, UNTIL)
     assert (found.until, found.speeds, len(found.areas)) == (UNTIL, [], 3)
-    alone = learning.compare_learning([result(9), result(8, seed=[5, 6, 7, 8, 9, 10])], UNTIL)
+    alone = findings.compare_learning([result(9), result(8, seed=[5, 6, 7, 8, 9, 10])], UNTIL)
     assert alone.areas == []
-    assert learning.compare_learning([result(9)], UNTIL).areas == []
+    assert findings.compare_learning([result(9)], UNTIL).areas == []
 
 
 def test_no_more_than_the_best_are_compared(monkeypatch):
-    monkeypatch.setattr(learning, "COMPARED", 2)
+    monkeypatch.setattr(findings, "COMPARED", 2)
     results = [result(k, steps=QUICK) for k in (9, 8, 7)]
-    found = learning.compare_learning(results, UNTIL)
+    found = findings.compare_learning(results, UNTIL)
     assert (len(found.speeds), len(found.areas)) == (1, 1)
 
 
@@ -68,5 +68,5 @@ def test_the_fastest_has_the_fewest_mean_steps():
         result(7, steps=SLOW, mean=1),
         result(6, steps=QUICK),
     ]
-    assert learning.fastest(steps) == 2
-    assert learning.fastest([result(9), result(8)]) == 0
+    assert findings.fastest(steps) == 2
+    assert findings.fastest([result(9), result(8)]) == 0

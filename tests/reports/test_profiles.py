@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from rliable import library
 from scipy import stats
 
-from mjx_reinforce.reports.statistics.profiles import performance_profile
+from mjx_reinforce.reports.statistics.aggregates import performance_profile
 
 
 def test_profile_is_that_of_rliable():

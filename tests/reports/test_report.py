@@ -11,13 +11,20 @@ import pytest
 from browser import CHROMIUM, opened_browser
 from fake_sweeps import GRID, make_sweep
 from measured_runs import ONE, make_measured_run
-from pages import CUT, content, run_report, visible
+from pages import CUT, change_curves, content, findings_of, run_report, visible
 
 from mjx_reinforce import report
 from mjx_reinforce.reports import findings, sources
-from mjx_reinforce.reports.page import distributions, tables, words
+from mjx_reinforce.reports.page import document, vega, words
+from mjx_reinforce.reports.page.over_time import worst_seeds
 
 HOSTILE = "x</script><script>alert(1)</script>\"'&"
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Leaves out the files beside the page that take the most time."""
+    monkeypatch.setattr(report, "render_chart", lambda *_: {})
 
 
 @pytest.fixture(scope="module")
@@ -77,9 +84,14 @@ def test_the_figures_are_those_of_the_curves(found):
     assert len(found.comparisons) == 16 * 15 / 2
 
 
+def tables_of(found):
+    """The data of all charts."""
+    return {name: table for each in document.charts(found) for name, table in each.data.items()}
+
+
 def test_a_histogram_has_every_seed(found):
-    data = tables.chart_tables(found)["histogram"]
-    last = len(distributions.slider_stops(found)) - 1
+    data = tables_of(found)["histogram"]
+    last = len(vega.slider_stops(found)) - 1
     for place, result in enumerate(found.results):
         rows = zip(data["configuration"], data["moment"], data["share"], strict=True)
         share = sum(share for c, m, share in rows if (c, m) == (place, last))
@@ -88,7 +100,7 @@ def test_a_histogram_has_every_seed(found):
 
 
 def test_solved_share_rises_to_those_who_ever_did(found):
-    data = tables.chart_tables(found)["solved"]
+    data = tables_of(found)["solved"]
     for place, result in enumerate(found.results):
         shares = [
             s for c, s in zip(data["configuration"], data["share"], strict=True) if c == place
@@ -99,20 +111,23 @@ def test_solved_share_rises_to_those_who_ever_did(found):
 
 def solve_at_the_end(directory, runs, threshold):
     """Lets some runs of a sweep reach the threshold at their last evaluation, not before."""
-    with np.load(directory / "curves.npz") as archive:
-        arrays = dict(archive)
-    arrays["eval_return"][:-1, runs] = np.minimum(arrays["eval_return"][:-1, runs], threshold / 2)
-    arrays["eval_return"][-1, runs] = threshold + 10
-    np.savez(directory / "curves.npz", **arrays)
+
+    def change(arrays):
+        before, last = arrays["eval_return"][:-1], arrays["eval_return"][-1]
+        before[:, runs] = np.minimum(before[:, runs], threshold / 2)
+        last[runs] = threshold + 10
+
+    change_curves(directory, change)
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_tables_and_figures_agree_on_who_solved(tmp_path):
     """Seeds end at different env steps; the figures' last place is the end of each, as table 1."""
     directory = make_sweep(tmp_path / "sweep", num_seeds=40, over=ONE)
     solve_at_the_end(directory, [1, 5, 9, 42, 77], 950)
     report.write_report([directory], directory / "report.html")
-    shown = findings.compute_findings(sources.read_experiment([directory]))
-    data, said = tables.chart_tables(shown), visible(directory / "report.html")
+    shown = findings_of(directory)
+    data, said = tables_of(shown), visible(directory / "report.html")
     for place, result in enumerate(shown.results):
         at_end = int((result.configuration.eval_return[-1] >= 950).sum())
         ever = int((result.configuration.eval_return >= 950).any(axis=0).sum())
@@ -153,6 +168,7 @@ def is_number(text):
 FORMULAS = ("=HYPERLINK(1)", "@SUM(1+1)", "+A1", "-A1", "\tA1")
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_names_are_no_formulas_in_spreadsheets(tmp_path):
     """A spreadsheet computes what begins like a formula: numbers may, names may not."""
     runs = [make_measured_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
@@ -182,11 +198,12 @@ def test_a_thousand_seeds_make_no_larger_charts(tmp_path):
     sizes = []
     for seeds in (50, 200):
         directory = make_sweep(tmp_path / str(seeds), num_seeds=seeds, over=ONE)
-        figures = findings.compute_findings(sources.read_experiment([directory]))
-        sizes.append(len(json.dumps(tables.chart_tables(figures))))
+        figures = findings_of(directory)
+        sizes.append(len(json.dumps(tables_of(figures))))
     assert sizes[1] < 1.2 * sizes[0]
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_run_alone_and_names_that_are_markup(tmp_path):
     directory = make_measured_run(tmp_path / "<b>run", env=HOSTILE, note=HOSTILE)
     page = tmp_path / "page.html"
@@ -210,7 +227,7 @@ def test_the_worst_seed_is_watched_by_the_policy_that_its_sweep_kept(tmp_path):
     experiment = sources.read_experiment([directory])
     figures = findings.compute_findings(experiment)
     number, best = figures.order[0], figures.results[0]
-    seed = int(best.configuration.seed[tables.worst_seeds(best)[0]])
+    seed = int(best.configuration.seed[worst_seeds(best)[0]])
     place = directory / "policies" / f"{number:03d}"
     (place / "policy").mkdir(parents=True)
     known = {"env": "InvertedPendulum-v5", "horizon": 1000, "seeds": [seed, 99]}
@@ -232,6 +249,7 @@ def test_a_command_on_the_page_runs_nothing_else(tmp_path):
     assert "unknown environment" in command_of(refused).said
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_a_path_that_the_locale_cannot_read_is_escaped(tmp_path):
     """Where Python reads the file system as ASCII, a path's other bytes are surrogates."""
     directory = make_measured_run(tmp_path / "run\udce6")
@@ -239,36 +257,30 @@ def test_a_path_that_the_locale_cannot_read_is_escaped(tmp_path):
     assert r"run\udce6" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_seeds_that_all_failed_are_no_answer(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=5, over=ONE)
-    with np.load(directory / "curves.npz") as archive:
-        arrays = dict(archive)
-    arrays["eval_return"][2:] = np.nan
-    np.savez(directory / "curves.npz", **arrays)
+    change_curves(directory, lambda arrays: arrays["eval_return"][2:].fill(np.nan))
     report.write_report([directory], directory / "report.html")
     assert "There is no answer" in visible(directory / "report.html")
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path):
-    """It writes into the run, and replaces what exists when it is asked to, or says one line."""
+    """It writes into the run."""
     run = make_measured_run(tmp_path / "run")
     page = run / "report.html"
     done = run_report(run)
     assert done.returncode == 0, done.stderr
     assert str(page) in done.stdout
     assert (run / "report" / "results.csv").is_file()
-    page.write_text("mine")
-    refused = run_report(run)
-    assert refused.returncode == 2
-    assert refused.stderr == f"error: {page} exists; pass --overwrite or another --output\n"
-    assert page.read_text() == "mine"
-    assert run_report(run, "--overwrite").returncode == 0
     assert "<!doctype html>" in page.read_text()
+    assert (run / "report" / "curves.png").is_file()
 
 
 def said_by_main(monkeypatch, capsys, *arguments):
     """What the command says, or how it refuses; nothing is drawn."""
-    monkeypatch.setattr(report, "figures", lambda findings: [])
+    monkeypatch.setattr(report.document, "charts", lambda findings: [])
     monkeypatch.setattr(report.document, "render", lambda *arguments: "a page")
     monkeypatch.setattr(sys, "argv", ["report", *map(str, arguments)])
     status = 0
@@ -291,7 +303,8 @@ def test_pages_go_where_they_belong(tmp_path, monkeypatch, capsys):
         assert said_by_main(monkeypatch, capsys, *chosen)[0] == 0
         assert page.read_text() == "a page"
         status, said = said_by_main(monkeypatch, capsys, *chosen)
-        assert (status, "exists; pass --overwrite" in said) == (2, True)
+        assert status == 2
+        assert said.endswith("report.html exists; pass --overwrite or another --output\n")
         page.unlink()
         status, said = said_by_main(monkeypatch, capsys, *chosen)
         assert (status, "report exists; pass --overwrite" in said) == (2, True)
@@ -322,11 +335,8 @@ def test_outputs_that_cannot_be_are_refused(tmp_path, name):
 def test_ties_are_said_as_ties(tmp_path, seeds, why, none):
     """Equal means are not "0.0 above", and p = 1 is not "or more"; no interval has no width."""
     directory = make_sweep(tmp_path / "sweep", num_seeds=seeds, over=ONE)
-    with np.load(directory / "curves.npz") as archive:
-        arrays = dict(archive)
-    arrays["eval_return"][-1] = 1000.0
-    np.savez(directory / "curves.npz", **arrays)
-    said = " ".join(words.headline(findings.compute_findings(sources.read_experiment([directory]))))
+    change_curves(directory, lambda arrays: arrays["eval_return"][-1].fill(1000.0))
+    said = " ".join(words.headline(findings_of(directory)))
     assert "The mean equals that of the next" in said
     assert f"1,000.0 (no interval: {none})." in said
     assert why in said
@@ -336,14 +346,15 @@ def test_ties_are_said_as_ties(tmp_path, seeds, why, none):
 def test_a_configuration_that_ended_earlier_stays_at_its_end(tmp_path):
     """At the slider's last stop its histogram is of its final returns, and says so."""
     directory = make_sweep(tmp_path / "sweep", num_seeds=40, over=ONE)
-    with np.load(directory / "curves.npz") as archive:
-        arrays = dict(archive)
-    arrays["env_steps"][:, arrays["configuration"] == 0] //= 2
-    np.savez(directory / "curves.npz", **arrays)
-    shown = findings.compute_findings(sources.read_experiment([directory]))
+
+    def change(arrays):
+        arrays["env_steps"][:, arrays["configuration"] == 0] //= 2
+
+    arrays = change_curves(directory, change)
+    shown = findings_of(directory)
     place = shown.order.index(0)
-    drawn = distributions.distributions(shown)
-    last = len(distributions.slider_stops(shown)) - 1
+    drawn = tables_of(shown)
+    last = len(vega.slider_stops(shown)) - 1
     said = drawn["moments"]["said"][place * (last + 1) : (place + 1) * (last + 1)]
     assert "its end: " in said[last]
     assert "its end: " not in said[0]
@@ -357,8 +368,8 @@ def test_a_configuration_that_ended_earlier_stays_at_its_end(tmp_path):
 @pytest.mark.parametrize(("seeds", "worst"), [(1, 1), (4, 1), (8, 2), (200, 10)])
 def test_the_worst_are_a_quarter_at_most(tmp_path, seeds, worst):
     directory = make_sweep(tmp_path / "sweep", num_seeds=seeds, over=ONE)
-    best = findings.compute_findings(sources.read_experiment([directory])).results[0]
-    places = tables.worst_seeds(best)
+    best = findings_of(directory).results[0]
+    places = worst_seeds(best)
     assert len(places) == worst
     assert best.scores[places].max() <= np.delete(best.scores, places).min(initial=np.inf)
 
@@ -371,6 +382,8 @@ OVERFLOW = """[...document.querySelectorAll('.chart')].filter((chart) => {
 }).map((chart) => chart.id)"""
 
 
+@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
 def test_charts_are_whole_at_any_width_and_on_paper(tmp_path):
     directory = make_sweep(
@@ -399,15 +412,14 @@ HIDDEN = """[...document.querySelectorAll('.results td, .results tbody th')].fil
 }).map((cell) => cell.textContent)"""
 
 
+@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
 @pytest.mark.parametrize("over", [ONE, GRID], ids=["two", "sixteen"])
 def test_no_column_is_cut_at_any_width(tmp_path, over):
     """From a phone to a wide screen, also where returns have seven digits."""
     directory = make_sweep(tmp_path / "sweep", num_seeds=8, over=over)
-    with np.load(directory / "curves.npz") as archive:
-        arrays = dict(archive)
-    arrays["eval_return"] = -1234.5678 * arrays["eval_return"]
-    np.savez(directory / "curves.npz", **arrays)
+    change_curves(directory, lambda x: x.update(eval_return=-1234.5678 * x["eval_return"]))
     page = directory / "report.html"
     report.write_report([directory], page)
     with opened_browser() as browser:
@@ -423,6 +435,8 @@ def test_no_column_is_cut_at_any_width(tmp_path, over):
         assert browser.errors == []
 
 
+@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
 def test_tables_of_a_figure_are_no_formulas_either(tmp_path):
     """What the page itself writes when a button is pressed."""
@@ -446,6 +460,7 @@ def test_tables_of_a_figure_are_no_formulas_either(tmp_path):
     assert [text for text in begun if not is_number(text)] == []
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
 def test_in_a_browser(written):
     """No error, no request, nothing wider than a phone; the keyboard moves the slider."""

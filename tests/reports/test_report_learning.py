@@ -6,32 +6,24 @@ import numpy as np
 import pytest
 from fake_sweeps import make_sweep
 from measured_runs import make_measured_run
-from pages import content, run_report, visible
+from pages import change_curves, content, findings_of, visible
 from places import ROOT
 
 from mjx_reinforce import report
-from mjx_reinforce.reports import findings, sources
 from mjx_reinforce.reports.page import listings, words
 from mjx_reinforce.reports.page.document import AUTHORS, TITLE, bibtex
 
 RATES = {"learning_rate": [1e-3, 3e-3, 1e-2]}
 
 
-def change_curves(directory, change):
-    """Changes the curves [E, R] of a sweep: change(eval_return, configuration) in place."""
-    with np.load(directory / "curves.npz") as archive:
-        arrays = dict(archive)
-    change(arrays["eval_return"], arrays["configuration"])
-    np.savez(directory / "curves.npz", **arrays)
-
-
 def all_solve(directory, first):
     """Lets all seeds end alike, those of configuration i having solved it at ``first[i]``."""
 
-    def change(returns, configuration):
+    def change(arrays):
+        returns = arrays["eval_return"]
         returns[:] = 20.0
         for i, evaluation in enumerate(first):
-            returns[evaluation:, configuration == i] = 1000.0
+            returns[evaluation:, arrays["configuration"] == i] = 1000.0
 
     change_curves(directory, change)
 
@@ -45,13 +37,13 @@ def crossed(tmp_path_factory):
         over={"learning_rate": [1e-3, 3e-3], "discount": [0.98, 0.99, 0.995]},
     )
     report.write_report([directory], directory / "report.html")
-    return directory, findings.compute_findings(sources.read_experiment([directory]))
+    return directory, findings_of(directory)
 
 
 def test_seeds_that_all_solve_are_told_apart_by_their_speed(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=24, over=RATES)
     all_solve(directory, [6, 2, 9])
-    found = findings.compute_findings(sources.read_experiment([directory]))
+    found = findings_of(directory)
     said = words.headline(found)
     assert said[0] == "Fastest is learning rate 0.003; the returns at the end are a tie."
     rows = listings.listings(found)["speed"]["rows"]
@@ -63,7 +55,7 @@ def test_seeds_that_all_solve_are_told_apart_by_their_speed(tmp_path):
 def test_equal_speeds_are_not_told_apart(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=24, over=RATES)
     all_solve(directory, [4, 4, 4])
-    found = findings.compute_findings(sources.read_experiment([directory]))
+    found = findings_of(directory)
     assert not re.search("faster|Fastest", " ".join(words.headline(found)))
     assert {each.adjusted for each in found.learning.speeds} == {1.0}
 
@@ -71,15 +63,15 @@ def test_equal_speeds_are_not_told_apart(tmp_path):
 def test_what_is_surely_slower_is_named_where_two_are_equally_fast(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=24, over=RATES)
     all_solve(directory, [6, 2, 2])
-    said = words.headline(findings.compute_findings(sources.read_experiment([directory])))
+    said = words.headline(findings_of(directory))
     slower = "faster than “learning rate 0.001”"
     assert said[0] == f"learning rate 0.01 is surely {slower}; the returns at the end are a tie."
 
 
 def test_nobody_solves_it_is_no_race(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=12, over=RATES)
-    change_curves(directory, lambda returns, configuration: np.minimum(returns, 500, out=returns))
-    said = " ".join(words.headline(findings.compute_findings(sources.read_experiment([directory]))))
+    change_curves(directory, lambda x: np.minimum(x["eval_return"], 500, out=x["eval_return"]))
+    said = " ".join(words.headline(findings_of(directory)))
     assert not re.search("faster|Fastest", said)
 
 
@@ -94,10 +86,12 @@ def test_every_figure_is_a_vector_and_every_table_has_a_number(crossed):
     assert numbers == ["1", "2", "3", "4", "5"]
 
 
-def test_configurations_have_the_names_that_are_asked_for(tmp_path):
+def test_configurations_have_the_names_that_are_asked_for(tmp_path, monkeypatch):
     directory = make_sweep(tmp_path / "sweep", num_seeds=8, over=RATES)
-    done = run_report(directory, "--labels", "learning rate 0.01=fast", "learning rate 0.001=slow")
-    assert done.returncode == 0, done.stderr
+    names = ["learning rate 0.01=fast", "learning rate 0.001=slow"]
+    monkeypatch.setattr("sys.argv", ["report", str(directory), "--labels", *names])
+    monkeypatch.setattr(report, "render_chart", lambda *_: {})
+    report.main()
     page = directory / "report.html"
     assert set(content(page)["labels"]) == {"fast", "slow", "learning rate 0.003"}
     assert "learning rate 0.01" not in (directory / "report" / "curves.csv").read_text()
@@ -122,7 +116,7 @@ def test_names_that_cannot_be_are_refused(tmp_path, monkeypatch, capsys, label, 
 
 def test_a_run_is_told_in_plain_words(tmp_path):
     directory = make_measured_run(tmp_path / "run", num_seeds=3, offset=150.0)
-    said = words.headline(findings.compute_findings(sources.read_experiment([directory])))
+    said = words.headline(findings_of(directory))
     assert said[0].startswith("2 of 3 seeds learned to solve CartPole-v1. The return went from ")
 
 

@@ -64,7 +64,7 @@ def write_small_gif(path: Path, frames: Sequence[np.ndarray], rate: float, most_
 
 def _take(player: Player, label: str, episode: int = 0) -> Take:
     """Returns an episode of a policy without noise."""
-    from mjx_reinforce.playing.mujoco_playing import mujoco_simulator
+    from mjx_reinforce.playing import mujoco_simulator
 
     env = envs.make(player.env)
     played = mujoco_simulator(env, player, env.max_episode_steps)(episode, False)

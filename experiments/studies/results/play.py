@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from experiments.studies.results.films import save
@@ -94,14 +95,13 @@ def _play(
 ) -> list[dict[str, Any]]:
     """Plays one policy, films it if so wished, and returns a row for each episode."""
     from mjx_reinforce.export.player import load_seed
-    from mjx_reinforce.playing.mjx_playing import gymnasium_simulator
 
     player, _ = load_seed(run, policy)
-    version, simulate = gymnasium_simulator(player, run.horizon)
-    episodes = [simulate(number, False) for number in range(num_episodes)]
+    env = gymnasium.make(run.env, max_episode_steps=run.horizon)
+    episodes = [_play_in_gymnasium(env, player, number) for number in range(num_episodes)]
     returns = {
         "ours": np.asarray(ours(player.actor, ROOT + 1), float).tolist(),
-        f"gymnasium {version}": [episode.total for episode in episodes],
+        f"gymnasium {gymnasium.__version__}": [episode.total for episode in episodes],
     }
     for name, values in returns.items():
         print(f"{policy}, seed {player.seed}: mean return {np.mean(values):.1f} in {name}")
@@ -118,6 +118,25 @@ def _play(
         for name, values in returns.items()
         for number, value in enumerate(values)
     ]
+
+
+def _play_in_gymnasium(env: gymnasium.Env, player: Player, episode: int) -> Any:
+    """Returns the episode of a policy without noise from the start of a number."""
+    from mjx_reinforce.playing import Episode
+
+    task: Any = env.unwrapped
+
+    def positions() -> np.ndarray:
+        return np.array(task.data.qpos if hasattr(task, "data") else task.state[::2])
+
+    observation, _ = env.reset(seed=episode)
+    qpos, rewards, ended = [positions()], [], False
+    while not ended:
+        observation, reward, terminated, truncated, _ = env.step(player.act(observation))
+        qpos.append(positions())
+        rewards.append(reward)
+        ended = terminated or truncated
+    return Episode(np.stack(qpos), np.array(rewards, float))
 
 
 def _film(path: Path, env_id: str, label: str, episodes: Sequence[Any]) -> None:

@@ -3,7 +3,7 @@
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -38,9 +38,16 @@ def _integer(value: float) -> float | int:
     return int(value) if value.is_integer() else value
 
 
-def join_tables(tables: Sequence[Table]) -> Table:
-    """Returns the rows of all tables."""
-    return {name: [x for table in tables for x in table[name]] for name in tables[0]}
+def stacked(parts: Iterable[Mapping[str, Any]]) -> Table:
+    """Returns tables below each other; what is no list in one is the same in all of its rows."""
+    table: Table = {}
+    for part in parts:
+        length = next(len(x) for x in part.values() if isinstance(x, list))
+        for name, values in part.items():
+            table.setdefault(name, []).extend(
+                values if isinstance(values, list) else [values] * length
+            )
+    return table
 
 
 def results_csv(findings: Findings) -> str:

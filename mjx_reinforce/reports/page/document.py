@@ -12,37 +12,13 @@ from markupsafe import Markup
 
 from mjx_reinforce.reports.experiment import COMPARED, Experiment, counted, say, setting_in_words
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.page import charts, vega, words
-from mjx_reinforce.reports.page.columns import Table, short
-from mjx_reinforce.reports.page.distributions import slider_stops
-from mjx_reinforce.reports.page.figures import SHOWN, Figure
+from mjx_reinforce.reports.page import at_the_end, over_time, vega, words
+from mjx_reinforce.reports.page.columns import short
 from mjx_reinforce.reports.page.listings import Listing, key_figures, listings
 from mjx_reinforce.reports.page.listings import matrix as pairs_matrix
 from mjx_reinforce.reports.page.words import steps
 
 _TEMPLATES = resources.files("mjx_reinforce.reports.page") / "files"
-_METHODS = (
-    "Configurations are ordered by the mean of their seeds' final returns; where means are equal, "
-    "by the env steps to solve.",
-    "Intervals are of 95 %, over seeds, and each holds alone, not all at once: of means and "
-    "interquartile means by the expanded percentile bootstrap (Hesterberg 2015), of the worst "
-    "tenth by the bootstrap t, of shares after Wilson.",
-    "The interquartile mean leaves out the worst and the best quarter of the seeds (Agarwal et "
-    "al. 2021, arXiv:2108.13264); a seed that is not finite is worse than every other.",
-    "Env steps to solve are those of the first evaluation at or above the threshold; a seed that "
-    "never got there is censored, not left out (Kaplan and Meier 1958).",
-    "The times to solve are compared by the log-rank test on those curves (Mantel 1966). It takes "
-    "configurations for independent; where they have the same seeds, p is a little too large.",
-    "The return while training is the area under a seed's learning curve, by its width in env "
-    "steps.",
-    f"The best configurations, at most {COMPARED}, are compared in pairs: their returns seed by "
-    "seed, on the seeds that all have. The p values of each table are corrected for the number of "
-    "pairs (Holm 1979).",
-    "A return is the mean of an evaluation's episodes, without exploration. A seed has the same "
-    "starts at every evaluation.",
-    "Curves are read off, by linear interpolation, at the same env steps for all seeds, up to the "
-    "end of the shortest.",
-)
 
 
 class Watch(NamedTuple):
@@ -52,10 +28,21 @@ class Watch(NamedTuple):
     command: str
 
 
+def charts(findings: Findings) -> list[vega.Chart]:
+    """Returns the charts in the order of the page, numbered; those of all settings as one."""
+    made: list[vega.Chart] = []
+    for build in (
+        *(at_the_end.final, over_time.curves, over_time.solved, at_the_end.distribution),
+        *(at_the_end.profile, at_the_end.sensitivity, over_time.worst),
+    ):
+        place = made[-1].number + 1 if made else 1
+        made += [each._replace(number=place) for each in build(findings)]
+    return made
+
+
 def render(
     findings: Findings,
-    drawn: list[Figure],
-    chart_tables: Mapping[str, Table],
+    drawn: list[vega.Chart],
     results: str,
     watch: Watch,
     version: str,
@@ -65,8 +52,7 @@ def render(
 
     Args:
       findings: the figures.
-      drawn: the charts.
-      chart_tables: their data, by name.
+      drawn: its ``charts``.
       results: ``results.csv``.
       watch: how to see the worst seed.
       version: of this program.
@@ -74,14 +60,14 @@ def render(
     """
     import vl_convert
 
-    stops = short(findings.grid[slider_stops(findings)], 7)
+    stops = short(findings.grid[vega.slider_stops(findings)], 7)
     content = {
         "labels": findings.labels,
         "specs": {figure.name: figure.spec for figure in drawn},
-        "tables": {**chart_tables, **vega.ONE},
+        "tables": {name: x for each in drawn for name, x in each.data.items()} | vega.ONE,
         "moments": stops,
         "results": results,
-        "row": charts.ROW,
+        "row": at_the_end.ROW,
         "light": vega.LIGHT,
     }
     loader = jinja2.Environment(
@@ -102,10 +88,9 @@ def render(
         size=_size_in_words(results),
         version=version,
         seconds=f"{seconds:.1f} s",
-        light=vega.LIGHT,
-        dark=vega.DARK,
-        colour=vega.colour,
-        dash=vega.dash,
+        findings=findings,
+        vega=vega,
+        words=words,
         css=Markup(_read_template("page.css")),
         script=Markup(_read_template("page.js")),
         vega_bundle=Markup(vl_convert.javascript_bundle("window.vegaEmbed = vegaEmbed;")),
@@ -142,41 +127,26 @@ def _size_in_words(text: str) -> str:
     return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(1, round(size / 1e3))} kB"
 
 
-def _text(findings: Findings, drawn: list[Figure]) -> dict[str, Any]:
+def _text(findings: Findings, drawn: list[vega.Chart]) -> dict[str, Any]:
     """Returns the text of the page, without the provenance of its numbers."""
     figures = {figure.name: figure for figure in drawn}
     sensitivity = [figure for figure in drawn if figure.name.startswith("sensitivity-")]
     listed, matrix = listings(findings), pairs_matrix(findings)
-    contents = [
-        *(("answer", "Answer"), ("distrust", "What to distrust"), ("results", "Results")),
-        *([("curves", "Learning curves")]),
-        *([("speed", "Who learns faster")] if "speed" in listed else []),
-        *([("distribution", "All seeds")]),
-        *([("pairs", "Pair by pair")] if matrix else []),
-        *([("settings", "Each setting")] if sensitivity else []),
-        *(("worst", "The worst seeds"), ("source", "Where this comes from"), ("data", "Data")),
-    ]
     names = ("final", "curves", "solved", "distribution", "profile", "worst")
     failures = any(not math.isfinite(x) for each in findings.results for x in each.final)
     return {
-        "title": findings.experiment.title,
-        "asked": findings.experiment.asked,
-        "contents": contents,
         "answer": words.headline(findings),
         "key_figures": key_figures(findings),
         "distrust": list(words.caveats(findings)),
         "figures": {name: figures.get(name) for name in names},
         "failures": failures,
-        "labels": findings.labels,
-        "first_shown": SHOWN,
         "matrix": matrix,
         "pairs": counted(len(findings.comparisons), "pair"),
-        "level": words.LEVEL,
         "listed": listed,
         "until": steps(findings.learning.until),
         "numbers": _table_numbers(listed),
         "sensitivity": sensitivity,
-        "methods": _METHODS,
+        "compared": COMPARED,
     }
 
 

@@ -1,14 +1,18 @@
 """The report's tables, as the page shows them."""
 
 import math
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from mjx_reinforce.reports.experiment import COMPARED, Result, counted
-from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.page import tables, words
+from mjx_reinforce.reports.findings import Findings, SpeedTest
+from mjx_reinforce.reports.page import words
+from mjx_reinforce.reports.page.over_time import worst_seeds
 from mjx_reinforce.reports.page.words import interval_in_words, number, percent, short_p, steps
+from mjx_reinforce.reports.statistics import Estimate
+from mjx_reinforce.reports.statistics.comparisons import Comparison
 
 #: A table: its ``header``, and ``rows`` of a ``label`` and ``cells``, pairs of a value and what
 #: stands below it. Where the header has a column more, the first is the rank of the row.
@@ -26,12 +30,13 @@ def listings(findings: Findings) -> dict[str, Listing]:
     return {name: listing for name, listing in found.items() if listing}
 
 
-def _worst(findings: Findings) -> Listing:
-    """Returns the fates of the best configuration's worst seeds and of the others' worst one."""
-    best, *others = findings.results
-    rows = [_fate(findings, best, s) for s in tables.worst_seeds(best).tolist()]
-    rows += [_fate(findings, each, tables.worst_seeds(each)[0]) for each in others[: COMPARED - 1]]
-    return {"header": ["configuration", "seed", "return at the end", "what happened"], "rows": rows}
+def _row(result: Result, cells: Sequence[tuple[str, str]]) -> dict[str, Any]:
+    return {"label": result.configuration.label, "cells": cells}
+
+
+def _cell(estimate: Estimate, form: Callable[[float], str] = number) -> tuple[str, str]:
+    """Returns an estimate in words, and its interval below it."""
+    return form(float(estimate.value)), interval_in_words(estimate, form)
 
 
 def key_figures(findings: Findings) -> list[tuple[str, str, str]]:
@@ -39,74 +44,57 @@ def key_figures(findings: Findings) -> list[tuple[str, str, str]]:
     best = findings.results[0]
     seeds = sum(len(each.final) for each in findings.results)
     ends = max(int(each.configuration.env_steps[-1].max()) for each in findings.results)
-    found = [
-        ("seeds trained", f"{seeds:,}", counted(len(findings.results), "configuration")),
-        (
-            "return of the best" if findings.comparisons else "mean return",
-            number(best.mean.value),
-            interval_in_words(best.mean),
-        ),
-    ]
+    configurations = counted(len(findings.results), "configuration")
+    mean = "return of the best" if findings.comparisons else "mean return"
+    found = [("seeds trained", f"{seeds:,}", configurations), (mean, *_cell(best.mean))]
     if (solving := best.solving) is not None:
         said = f"of {len(best.final):,}; {interval_in_words(solving.rate, percent)}"
         found.append(("seeds that solve it", f"{solving.at_end:,}", said))
-        until = steps(solving.median.value)
-        found.append(("env steps until half", until, interval_in_words(solving.median, steps)))
+        found.append(("env steps until half", *_cell(solving.median, steps)))
     else:
-        found.append(("worst tenth", number(best.tail.value), interval_in_words(best.tail)))
-    found.append(("env steps a seed", f"{ends:,}", "at most"))
-    return found
+        found.append(("worst tenth", *_cell(best.tail)))
+    return [*found, ("env steps a seed", f"{ends:,}", "at most")]
 
 
-def _results_table(findings: Findings) -> dict[str, Any]:
+def _results_table(findings: Findings) -> Listing:
     """Returns the table of all configurations."""
     header = ["", "configuration", "seeds", "mean", "interquartile mean", "worst tenth"]
-    solving = findings.experiment.threshold is not None
-    if solving:
+    if findings.experiment.threshold is not None:
         header += ["solved at the end", "steps until half solved", "fell back"]
-    header += ["not finite"]
-    listed = []
+    rows = []
     for each in findings.results:
-        cells = [(f"{len(each.final):,}", "")]
-        for estimate in (each.mean, each.iqm, each.tail):
-            cells.append((number(float(estimate.value)), interval_in_words(estimate)))
-        if each.solving is not None:
-            share = f"{each.solving.at_end:,} of {len(each.final):,}"
-            median = each.solving.median
-            cells.append((share, interval_in_words(each.solving.rate, percent)))
-            cells.append((steps(median.value), interval_in_words(median, steps)))
-            cells.append((f"{int(each.solving.fell.sum()):,}", ""))
-        cells.append((f"{sum(not math.isfinite(x) for x in each.final):,}", ""))
-        listed.append({"label": each.configuration.label, "cells": cells})
-    return {"header": header, "rows": listed}
+        seeds = len(each.final)
+        cells = [(f"{seeds:,}", ""), *map(_cell, (each.mean, each.iqm, each.tail))]
+        if (solving := each.solving) is not None:
+            share = f"{solving.at_end:,} of {seeds:,}"
+            cells.append((share, interval_in_words(solving.rate, percent)))
+            cells.append(_cell(solving.median, steps))
+            cells.append((f"{int(solving.fell.sum()):,}", ""))
+        cells.append((f"{int(np.sum(~np.isfinite(each.final))):,}", ""))
+        rows.append(_row(each, cells))
+    return {"header": [*header, "not finite"], "rows": rows}
 
 
-def _speed_table(findings: Findings) -> dict[str, Any]:
+def _speed_table(findings: Findings) -> Listing:
     """Returns the table of who learns faster: the fastest first."""
     compared = findings.results[:COMPARED]
     if len(compared) < 2:
         return {}
-    solving = findings.experiment.threshold is not None
     header = ["", "configuration"]
-    if solving:
+    if findings.experiment.threshold is not None:
         header += ["steps until half solved", "mean steps to solve", "log-rank p, Holm"]
-    header += ["return while training", "p of it, Holm"]
     best_area = max(range(len(compared)), key=lambda i: float(compared[i].area.value))
     order = sorted(range(len(compared)), key=lambda i: _slowness(compared[i]))
-    speeds = {frozenset((e.first, e.second)): e.adjusted for e in findings.learning.speeds}
-    areas = {frozenset((e.first, e.second)): e.adjusted for e in findings.learning.areas}
-    listed = []
+    rows = []
     for i in order:
         each, cells = compared[i], []
-        if each.solving is not None:
-            median, mean = each.solving.median, each.solving.mean
-            cells.append((steps(median.value), interval_in_words(median, steps)))
-            cells.append((steps(float(mean.value)), interval_in_words(mean, steps)))
-            cells.append((_p_against(speeds, i, order[0], "fastest"), ""))
-        cells.append((number(float(each.area.value)), interval_in_words(each.area)))
-        cells.append((_p_against(areas, i, best_area, "greatest"), ""))
-        listed.append({"label": each.configuration.label, "cells": cells})
-    return {"header": header, "rows": listed}
+        if (solving := each.solving) is not None:
+            cells += [_cell(solving.median, steps), _cell(solving.mean, steps)]
+            cells.append((_p_against(findings.learning.speeds, i, order[0], "fastest"), ""))
+        cells.append(_cell(each.area))
+        cells.append((_p_against(findings.learning.areas, i, best_area, "greatest"), ""))
+        rows.append(_row(each, cells))
+    return {"header": [*header, "return while training", "p of it, Holm"], "rows": rows}
 
 
 def _slowness(result: Result) -> float:
@@ -114,12 +102,10 @@ def _slowness(result: Result) -> float:
     return float(result.solving.mean.value if result.solving else -result.area.value)
 
 
-def _p_against(adjusted: dict[frozenset[int], float], i: int, best: int, said: str) -> str:
+def _p_against(tests: Sequence[SpeedTest | Comparison], i: int, best: int, said: str) -> str:
     """Returns the p value of a result against the best, or what the best is."""
-    if i == best:
-        return said
-    pair = frozenset((i, best))
-    return short_p(adjusted[pair]) if pair in adjusted else "none"
+    found = [each.adjusted for each in tests if {each.first, each.second} == {i, best}]
+    return said if i == best else short_p(found[0]) if found else "none"
 
 
 def matrix(findings: Findings) -> list[dict[str, Any]]:
@@ -147,35 +133,27 @@ def matrix(findings: Findings) -> list[dict[str, Any]]:
 
 def _against(findings: Findings) -> Listing:
     """Returns the comparisons of the best configuration with each other one."""
-    if not findings.comparisons:
-        return {}
-    listed = [
-        {
-            "label": findings.results[pair.second].configuration.label,
-            "cells": [
-                (number(float(pair.difference.value)), interval_in_words(pair.difference)),
-                (
-                    percent(float(pair.improvement.value)),
-                    interval_in_words(pair.improvement, percent),
-                ),
-                (short_p(pair.p_value), ""),
-                (short_p(pair.adjusted), ""),
-            ],
-        }
-        for pair in words.of_best(findings)
-    ]
+    rows = []
+    for pair in words.of_best(findings):
+        cells = [_cell(pair.difference), _cell(pair.improvement, percent)]
+        cells += [(short_p(pair.p_value), ""), (short_p(pair.adjusted), "")]
+        rows.append(_row(findings.results[pair.second], cells))
     header = ["against", "difference", "best is better", "p", "p, Holm"]
-    return {"header": header, "rows": listed}
+    return {"header": header, "rows": rows} if rows else {}
 
 
-def _fate(findings: Findings, result: Result, s: int) -> dict[str, Any]:
-    final = float(result.final[s])
-    cells = [
-        (str(int(result.configuration.seed[s])), ""),
-        (number(final) if math.isfinite(final) else "not finite", ""),
-        (_how_it_ended(findings, result, s), ""),
-    ]
-    return {"label": result.configuration.label, "cells": cells}
+def _worst(findings: Findings) -> Listing:
+    """Returns the fates of the best configuration's worst seeds and of the others' worst one."""
+    best, *others = findings.results
+    seeds = [(best, s) for s in worst_seeds(best)]
+    seeds += [(each, worst_seeds(each)[0]) for each in others[: COMPARED - 1]]
+    rows = []
+    for each, s in seeds:
+        final = float(each.final[s])
+        said = number(final) if math.isfinite(final) else "not finite"
+        ended = str(int(each.configuration.seed[s])), said, _how_it_ended(findings, each, s)
+        rows.append(_row(each, [(cell, "") for cell in ended]))
+    return {"header": ["configuration", "seed", "return at the end", "what happened"], "rows": rows}
 
 
 def _how_it_ended(findings: Findings, result: Result, s: int) -> str:

@@ -1,14 +1,26 @@
-"""What the report's charts share: their look, their scales, and how they are drawn.
+"""What a chart of the report is, and what all share: their look, their scales, how they are drawn.
 
-Charts name a colour as a CSS variable, so that one drawing fits both grounds and print.
+Charts are in Vega-Lite, through Altair. They show the configurations whose labels are in the
+parameter ``shown``; the page's check boxes set it. ``at`` is the env step, and ``moment`` its
+number, that the page's slider sets. They name a colour as a CSS variable, so that one drawing fits
+both grounds and print.
 """
 
 import json
 import re
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import altair as alt
+import numpy as np
+
+from mjx_reinforce.reports.findings import Findings
+from mjx_reinforce.reports.page.columns import Table, rows
+
+#: So many configurations are shown at first, the best.
+SHOWN = 4
+#: Moments that the page's slider stops at, at most.
+_MOMENTS = 30
 
 #: Okabe and Ito's colours, told apart by colour-blind people (https://jfly.uni-koeln.de/color/);
 #: without their yellow, which is lost on white.
@@ -43,8 +55,13 @@ def in_light(text: str) -> str:
 
 #: A data set of one row, of what is drawn once.
 ONE = {"one": {"row": [0]}}
-#: Layers over one another.
-Chart = alt.LayerChart | alt.FacetChart
+#: The env steps of a seed, along the bottom.
+STEPS = alt.X(
+    "env_steps:Q",
+    title="env steps of a seed",
+    axis=alt.Axis(labelExpr="datum.value ? format(datum.value, '~s') : '0'"),
+    scale=alt.Scale(nice=False),
+)
 #: Pixels of a configuration's name in a legend, at most.
 _LABEL_LIMIT = 420
 _IS_SHOWN = "indexof(shown, datum.configuration) >= 0"
@@ -56,67 +73,93 @@ def config() -> dict[str, Any]:
     text = {"labelColor": "var(--ink)", "titleColor": "var(--soft)", "titleFontWeight": "normal"}
     sizes = {"labelFontSize": 12, "titleFontSize": 12}
     axis = {"gridColor": "var(--line)", "domainColor": "var(--soft)", "tickColor": "var(--soft)"}
+    above = {"titleAlign": "left", "titleAngle": 0, "titleAnchor": "start"}
+    above |= {"titleX": 0, "titleY": -12}
+    symbols = {"symbolStrokeWidth": 2.5, "symbolSize": 300}
     return {
         "font": _FONT,
         "background": None,
         "view": {"stroke": None},
         "axis": {**text, **sizes, **axis, "gridOpacity": 0.7, "labelOverlap": True},
         "axisX": {"grid": False, "tickCount": 6},
-        "axisY": {
-            "domain": False,
-            "ticks": False,
-            "tickCount": 5,
-            "titleAlign": "left",
-            "titleAngle": 0,
-            "titleAnchor": "start",
-            "titleY": -12,
-            "titleX": 0,
-        },
-        "legend": {
-            **text,
-            **sizes,
-            "symbolStrokeWidth": 2.5,
-            "symbolSize": 300,
-            "labelLimit": _LABEL_LIMIT,
-        },
+        "axisY": {"domain": False, "ticks": False, "tickCount": 5, **above},
+        "legend": {**text, **sizes, **symbols, "labelLimit": _LABEL_LIMIT},
         "text": {"color": "var(--ink)", "fontSize": 12},
         "rule": {"color": "var(--soft)"},
     }
 
 
-def specification(
-    chart: Chart, labels: Sequence[str], shown: Sequence[str], end: float, moment: int
-) -> dict[str, Any]:
-    """Returns a chart as a Vega-Lite specification without its data.
+class Chart(NamedTuple):
+    """A chart, what is said of it, and what it is drawn from.
+
+    name: of its file
+    number: on the page
+    alt: for who cannot see it
+    spec: in Vega-Lite, without data
+    data: tables by name
+    hidden: the names of those that can be found elsewhere, and not be downloaded here
+    listed: the name of the table that the page can show, if any
+    """
+
+    name: str
+    title: str
+    caption: str
+    alt: str
+    spec: dict[str, Any]
+    data: dict[str, Table]
+    hidden: tuple[str, ...] = ()
+    listed: str | None = None
+    number: int = 0
+
+    @property
+    def tables(self) -> list[str]:
+        """The names of the tables that can be downloaded."""
+        return [name for name in self.data if name not in self.hidden]
+
+
+def make_chart(findings: Findings, layers: Sequence[Any], height: int, **fields: Any) -> Chart:
+    """Returns a chart of layers over one another.
 
     Args:
-      chart: from ``charts``.
-      labels: of all configurations.
-      shown: of those that are shown at first.
-      end: the env step, and
-      moment: its number, at which the slider stands at first.
+      findings: what it is of.
+      layers: Altair's charts, the lowest first.
+      height: in pixels.
+      **fields: of ``Chart``, but for ``spec``.
     """
-    params = [
-        alt.param(name="shown", value=list(shown)),
-        alt.param(name="at", value=end),
-        alt.param(name="moment", value=moment),
-        alt.param(name="logarithmic", value=False),
-    ]
-    spec = chart.add_params(*params).properties(width="container").to_dict()
-    return spec | {"config": config(), "autosize": {"type": "fit-x", "contains": "padding"}}
+    at_first = {
+        "shown": findings.labels[:SHOWN],
+        "at": float(findings.grid[-1]),
+        "moment": len(slider_stops(findings)) - 1,
+        "logarithmic": False,
+    }
+    params = [alt.param(name=name, value=value) for name, value in at_first.items()]
+    chart = alt.layer(*layers, height=height).add_params(*params).properties(width="container")
+    spec = chart.to_dict() | {"config": config(), "description": fields["alt"]}
+    spec["autosize"] = {"type": "fit-x", "contains": "padding"}
+    return Chart(spec=spec, **fields)
 
 
-def render_chart(spec: dict[str, Any], datasets: dict[str, Any], title: str) -> dict[str, bytes]:
-    """Returns a specification and its data as pictures, by the endings of their files."""
+def render_chart(chart: Chart, labels: Sequence[str], title: str) -> dict[str, bytes]:
+    """Returns a chart of configurations with these labels as pictures, by their files' endings."""
     import vl_convert
 
-    whole = spec | {"datasets": datasets, "width": 720, "background": "var(--paper)"}
+    datasets = {name: rows(table, labels) for name, table in (chart.data | ONE).items()}
+    whole = chart.spec | {"datasets": datasets, "width": 720, "background": "var(--paper)"}
     whole["title"] = {"text": title, "anchor": "start", "color": "var(--ink)", "offset": 14}
     svg = vl_convert.vegalite_to_svg(json.loads(in_light(json.dumps(whole))))
-    return {
-        "png": vl_convert.svg_to_png(svg, scale=2),
-        "svg": svg.encode(),
-    }
+    return {"png": vl_convert.svg_to_png(svg, scale=2), "svg": svg.encode()}
+
+
+def slider_stops(findings: Findings) -> list[int]:
+    """Returns the points of the grid that the slider stops at."""
+    last = len(findings.grid) - 1
+    return np.unique(np.linspace(0, last, min(_MOMENTS, last + 1)).round().astype(int)).tolist()
+
+
+def tooltips(**fields: tuple[str, str]) -> list[alt.Tooltip]:
+    """Returns what is said of fields where one points: each one's name and its format."""
+    said = fields.items()
+    return [alt.Tooltip(f"{x}:Q", title=name, format=form) for x, (name, form) in said]
 
 
 def shown_rows(data: str) -> alt.Chart:
@@ -162,8 +205,30 @@ def _legend(labels: Sequence[str]) -> alt.Legend:
     )
 
 
-def moment_line(end: float) -> alt.Chart:
+def share_layers(
+    findings: Findings, data: str, x: alt.X, *, title: str, tips: list[alt.Tooltip], **line: Any
+) -> list[alt.Chart]:
+    """Returns the band and the line of a share of the seeds; ``line`` says how they are drawn."""
+    chart, axis, scale = shown_rows(data), alt.Axis(format=".0%"), alt.Scale(domain=[0, 1])
+    colours = series(findings.labels)
+    tips = [*tips, *tooltips(low=("95 % from", ".1%"), high=("to", ".1%"))]
+    return [
+        chart.mark_area(opacity=0.18, **line).encode(
+            x=x, y=alt.Y("low:Q", title=title), y2="high:Q", color=colours
+        ),
+        chart.mark_line(strokeWidth=2.2, **line).encode(
+            x=x,
+            y=alt.Y("share:Q", title=title, scale=scale, axis=axis),
+            color=colours,
+            strokeDash=dashes(findings.labels),
+            tooltip=["configuration:N", *tips],
+        ),
+    ]
+
+
+def moment_line(findings: Findings) -> alt.Chart:
     """Returns a line at the slider's env step, without one at the end of the axis."""
+    end = float(findings.grid[-1])
     return (
         alt.Chart(alt.NamedData("one"))
         .transform_calculate(env_steps="at")
@@ -173,8 +238,19 @@ def moment_line(end: float) -> alt.Chart:
     )
 
 
-def threshold_line(threshold: float | None, axis: str) -> list[alt.Chart]:
+def drawn_threshold(findings: Findings) -> float | None:
+    """Returns the return that counts as solved, None where it would squeeze all that is drawn."""
+    threshold = findings.experiment.threshold
+    returns = np.concatenate([each.configuration.eval_return.ravel() for each in findings.results])
+    known = returns[np.isfinite(returns)]
+    if threshold is None or not known.size or threshold - known.max() > 0.5 * np.ptp(known):
+        return None
+    return threshold
+
+
+def threshold_line(findings: Findings, axis: str) -> list[alt.Chart]:
     """Returns the line at the return that counts as solved, and its name."""
+    threshold = drawn_threshold(findings)
     if threshold is None:
         return []
     ground = alt.Chart(alt.NamedData("one"))

@@ -13,8 +13,7 @@ from mjx_reinforce.reports.experiment import (
     setting_in_words,
     shared_seeds,
 )
-from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.learning import fastest
+from mjx_reinforce.reports.findings import Findings, fastest
 from mjx_reinforce.reports.statistics import Estimate, enough
 from mjx_reinforce.reports.statistics.comparisons import Comparison
 from mjx_reinforce.settings.tables import OF_TASKS

@@ -20,15 +20,6 @@ from mjx_reinforce.reports.statistics import (
 from mjx_reinforce.reports.statistics.tails import cvar, cvar_interval
 
 
-def optimality_gap(values: ArrayLike, target: float = 1.0) -> np.ndarray:
-    """Returns how far the values [..., S] fall short of a target on average, [...].
-
-    It is the mean of ``max(target - value, 0)`` (Agarwal et al. 2021, arXiv:2108.13264, section
-    4.3): values above the target count as the target. NaN where a seed failed.
-    """
-    return target - finite_or_nan(np.mean(_clipped(values, target), axis=-1))
-
-
 def interval(
     statistic: str,
     values: ArrayLike,
@@ -187,3 +178,21 @@ def _median(values: np.ndarray, axis: int = -1) -> np.ndarray:
 
 def _clipped(values: ArrayLike, target: float) -> np.ndarray:
     return np.minimum(worst_if_not_finite(values), target)
+
+
+def performance_profile(
+    values: ArrayLike, thresholds: ArrayLike, confidence: float = 0.95
+) -> Estimate:
+    """Returns the share of seeds above each threshold (Agarwal et al. 2021, section 4.2).
+
+    Args:
+      values: [S] a return a seed; one that is not finite is above nothing.
+      thresholds: [K] returns.
+      confidence: the level of the band, which holds at each threshold alone: Wilson's interval.
+
+    Returns:
+      Arrays [K].
+    """
+    ordered = np.sort(worst_if_not_finite(values))
+    above = len(ordered) - np.searchsorted(ordered, thresholds, side="right")
+    return wilson(above, len(ordered), confidence)

@@ -1,0 +1,198 @@
+"""Reading the directory of a run or a sweep: what is whole is read, what is damaged is named."""
+
+import json
+
+import numpy as np
+import pytest
+
+from mjx_reinforce.reports.directories import read_metrics, read_run, read_sweep
+
+HEADER = "seed,env_steps,eval_return,entropy\n"
+ROWS = ["0,10,1.5,2\n", "1,12,-0.5,2\n", "0,20,nan,2\n", "1,22,3.0,2\n"]
+
+
+@pytest.fixture
+def run(tmp_path):
+    (tmp_path / "metrics.csv").write_text(HEADER + "".join(ROWS))
+    config = {"env": "Hopper-v5", "learning_rate": 0.01, "device": "cpu", "engine": "auto"}
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    return tmp_path
+
+
+def test_a_run_that_goes_on(run):
+    source = read_run(run)
+    [part] = source.configurations
+    assert (source.env, source.status, source.threshold) == ("Hopper-v5", "running", None)
+    assert source.settings == {"env": "Hopper-v5", "learning_rate": 0.01, "engine": "auto"}
+    assert source.provenance == {"device": "cpu", "engine": "auto"}
+    np.testing.assert_array_equal(part.eval_return, [[1.5, -0.5], [np.nan, 3.0]])
+    assert part.env_steps.tolist() == [[10, 12], [20, 22]]
+    assert part.nonfinite.tolist() == [0, 0]
+
+
+def test_a_run_that_ended(run):
+    summary = {
+        "status": "finished",
+        "threshold": 3000,
+        "engine": "native",
+        "nonfinite": [{"seed": 1}, {"seed": 1}],
+        "run_seconds": 2.5,
+        "compile_seconds": None,
+    }
+    (run / "summary.json").write_text(json.dumps(summary))
+    source = read_run(run)
+    assert (source.status, source.threshold) == ("finished", 3000.0)
+    assert source.provenance["engine"] == "native"
+    assert source.timings == {"run_seconds": 2.5}
+    assert source.configurations[0].nonfinite.tolist() == [0, 2]
+
+
+@pytest.mark.parametrize("end", ["0,30,1", "0,30,1.0,2\n", "0,30,1.0,2\n1,32,4"])
+def test_a_last_evaluation_that_is_not_whole_is_left_out(run, end):
+    with (run / "metrics.csv").open("a") as file:
+        file.write(end)
+    assert read_metrics(run / "metrics.csv")["env_steps"].tolist() == [[10, 12], [20, 22]]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (HEADER, "has no evaluation yet"),
+        ("seed,env_steps\n0,1\n", "has no column eval_return"),
+        (HEADER + "0,10,high,2\n", "eval_return in line 2 is 'high'"),
+        (HEADER + ROWS[0] + "1,12\n", "line 3 has 2 entries, not 4"),
+        (HEADER + "".join(ROWS[i] for i in (0, 1, 3, 2)), "line 4 is not of seed 0"),
+        (HEADER + ROWS[1], "line 2 is not of seed 0"),
+    ],
+)
+def test_a_damaged_table_is_named_with_its_line(run, text, message):
+    (run / "metrics.csv").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_metrics(run / "metrics.csv")
+
+
+def test_a_table_that_cannot_be_read(run):
+    (run / "metrics.csv").write_bytes(b"seed\xff\n")
+    with pytest.raises(ValueError, match="cannot read"):
+        read_metrics(run / "metrics.csv")
+    (run / "metrics.csv").unlink()
+    with pytest.raises(ValueError, match="No such file"):
+        read_metrics(run / "metrics.csv")
+
+
+def test_a_run_without_a_task(run):
+    (run / "config.json").write_text("{}")
+    with pytest.raises(ValueError, match=r"config.json is damaged: env is None"):
+        read_run(run)
+
+
+@pytest.mark.parametrize("events", [3, [3], [{}], [{"seed": "one"}]])
+def test_damaged_events(run, events):
+    (run / "summary.json").write_text(json.dumps({"nonfinite": events}))
+    with pytest.raises(ValueError, match="nonfinite is no list of updates"):
+        read_run(run)
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ({"threshold": True}, "threshold is True, not a number"),
+        ({"threshold": "2"}, "threshold is '2', not a number"),
+        ({"run_seconds": "long"}, "run_seconds is 'long', not a number"),
+    ],
+)
+def test_entries_are_numbers_or_none(run, entry, said):
+    (run / "summary.json").write_text(json.dumps(entry))
+    with pytest.raises(ValueError, match=f"summary.json is damaged: {said}"):
+        read_run(run)
+
+
+CONTENT = {
+    "status": "interrupted",
+    "env": "Hopper-v5",
+    "threshold": 3000.0,
+    "settings": {"discount": 0.9},
+    "configurations": [
+        {"configuration": 0, "learning_rate": 0.1},
+        {"configuration": 1, "learning_rate": 0.2},
+    ],
+    "device": "cpu",
+    "run_seconds": 3,
+}
+ARRAYS = {
+    "configuration": np.array([1, 0, 1]),
+    "seed": np.array([0, 0, 1]),
+    "eval_return": np.arange(6, dtype=np.float32).reshape(2, 3),
+    "env_steps": 10 * np.arange(6).reshape(2, 3),
+}
+RESULTS = "configuration,seed,nonfinite\n0,0,3\n1,0,4\n1,1,5\n"
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    """Returns a function that writes a sweep, with other parts."""
+
+    def write(results=RESULTS, content=CONTENT, **arrays):
+        (tmp_path / "sweep.json").write_text(json.dumps(content))
+        (tmp_path / "results.csv").write_text(results)
+        whole = {k: x for k, x in (ARRAYS | arrays).items() if x is not None}
+        np.savez(tmp_path / "curves.npz", **whole)
+        return tmp_path
+
+    return write
+
+
+def test_a_sweep_that_was_interrupted(sweep):
+    source = read_sweep(sweep())
+    first, second = source.configurations
+    assert (source.env, source.threshold, source.status) == ("Hopper-v5", 3000.0, "interrupted")
+    assert (first.label, second.label) == ("learning rate 0.1", "learning rate 0.2")
+    assert (first.seed.tolist(), second.seed.tolist()) == ([0], [0, 1])
+    assert second.eval_return.tolist() == [[0, 2], [3, 5]]
+    assert second.env_steps.tolist() == [[0, 20], [30, 50]]
+    assert (first.nonfinite.tolist(), second.nonfinite.tolist()) == ([3], [4, 5])
+    assert source.settings == {"discount": 0.9}
+    assert source.provenance == {"device": "cpu"}
+    assert source.timings == {"run_seconds": 3.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"env": None}, "env is None"),
+        ({"configurations": {}}, "does not name configuration 0"),
+        ({"configurations": [3]}, "configurations is no list of settings"),
+        ({"configurations": CONTENT["configurations"][:1]}, "does not name configuration 1"),
+        ({"threshold": "high"}, "threshold is 'high', not a number"),
+    ],
+)
+def test_a_damaged_sweep_json_is_named(sweep, change, message):
+    with pytest.raises(ValueError, match=message):
+        read_sweep(sweep(content=CONTENT | change))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"seed": None}, "it has no array seed"),
+        ({"extra": np.zeros(3)}, "'extra' is not an array of a sweep"),
+        ({"seed": np.array(["0", "1", "2"])}, "seed holds no numbers"),
+        ({"seed": np.zeros(2, int)}, r"seed has the shape \(2,\), not \(3,\)"),
+        ({"env_steps": np.zeros((1, 3))}, r"env_steps has the shape \(1, 3\), not \(2, 3\)"),
+        ({"eval_return": np.zeros(3)}, "has the shape"),
+    ],
+)
+def test_damaged_curves_are_named(sweep, arrays, message):
+    with pytest.raises(ValueError, match=f"curves.npz is damaged: .*{message}"):
+        read_sweep(sweep(**arrays))
+
+
+def test_a_curve_without_its_row_is_named(sweep):
+    with pytest.raises(ValueError, match="no row of configuration 1, seed 1"):
+        read_sweep(sweep(results=RESULTS.removesuffix("1,1,5\n")))
+
+
+def test_a_sweep_without_results(sweep):
+    nothing = {name: x[..., :0] for name, x in ARRAYS.items()}
+    with pytest.raises(ValueError, match="has no results yet"):
+        read_sweep(sweep(**nothing))
