@@ -18,29 +18,28 @@ if TYPE_CHECKING:
 
 silence_mjx()  # before any environment imports it
 
-_CART_POLE = "mjx_reinforce.envs.tasks.cart_pole:CartPole"
-_INVERTED_PENDULUM = "mjx_reinforce.envs.tasks.pendulums:InvertedPendulum"
+_TASKS = "mjx_reinforce.envs.tasks"
 
 #: id -> ("module:Class" or a callable, constructor arguments). One line a task.
 _TABLE: dict[str, tuple[str | Callable[..., Any], dict[str, Any]]] = {
-    "InvertedPendulum-v5": (_INVERTED_PENDULUM, {}),
-    "InvertedPendulum-v4": (_INVERTED_PENDULUM, {"reward_at_fall": 1.0}),
-    "InvertedDoublePendulum-v5": (
-        "mjx_reinforce.envs.tasks.pendulums:InvertedDoublePendulum",
-        {},
+    "InvertedPendulum-v5": (f"{_TASKS}.pendulums:InvertedPendulum", {}),
+    "InvertedPendulum-v4": (f"{_TASKS}.pendulums:InvertedPendulum", {"reward_at_fall": 1.0}),
+    "InvertedDoublePendulum-v5": (f"{_TASKS}.pendulums:InvertedDoublePendulum", {}),
+    "Reacher-v5": (f"{_TASKS}.arms:Reacher", {}),
+    "Pusher-v5": (f"{_TASKS}.arms:Pusher", {}),
+    "Swimmer-v5": (f"{_TASKS}.planar:Swimmer", {}),
+    "HalfCheetah-v5": (f"{_TASKS}.planar:HalfCheetah", {}),
+    "Hopper-v5": (f"{_TASKS}.planar:Hopper", {}),
+    "Walker2d-v5": (f"{_TASKS}.planar:Walker2d", {}),
+    "Ant-v5": (f"{_TASKS}.ant:Ant", {}),
+    "Humanoid-v5": (f"{_TASKS}.humanoids:Humanoid", {}),
+    "HumanoidStandup-v5": (f"{_TASKS}.humanoids:HumanoidStandup", {}),
+    "CartPole-v1": (f"{_TASKS}.cart_pole:CartPole", {}),
+    "CartPole-v0": (
+        f"{_TASKS}.cart_pole:CartPole",
+        {"max_episode_steps": 200, "reward_threshold": 195.0},
     ),
-    "Reacher-v5": ("mjx_reinforce.envs.tasks.arms:Reacher", {}),
-    "Pusher-v5": ("mjx_reinforce.envs.tasks.arms:Pusher", {}),
-    "Swimmer-v5": ("mjx_reinforce.envs.tasks.planar:Swimmer", {}),
-    "HalfCheetah-v5": ("mjx_reinforce.envs.tasks.planar:HalfCheetah", {}),
-    "Hopper-v5": ("mjx_reinforce.envs.tasks.planar:Hopper", {}),
-    "Walker2d-v5": ("mjx_reinforce.envs.tasks.planar:Walker2d", {}),
-    "Ant-v5": ("mjx_reinforce.envs.tasks.ant:Ant", {}),
-    "Humanoid-v5": ("mjx_reinforce.envs.tasks.humanoids:Humanoid", {}),
-    "HumanoidStandup-v5": ("mjx_reinforce.envs.tasks.humanoids:HumanoidStandup", {}),
-    "CartPole-v1": (_CART_POLE, {}),
-    "CartPole-v0": (_CART_POLE, {"max_episode_steps": 200, "reward_threshold": 195.0}),
-    "ContinuousCartPole-v0": ("mjx_reinforce.envs.tasks.cart_pole:ContinuousCartPole", {}),
+    "ContinuousCartPole-v0": (f"{_TASKS}.cart_pole:ContinuousCartPole", {}),
 }
 
 

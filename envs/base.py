@@ -239,7 +239,7 @@ class MujocoEnv(Env):
         state, view = self._physics(data, episode), View(data, self.mj_model, episode)
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
-        terms = self._checked_outcome(self._before(state, start), view, action)[2]
+        terms = self._outcome(state, start, view, action)[2]
         return State(cast(Any, state), self.observe(view), zero, zero, dict.fromkeys(terms, zero))
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -263,7 +263,7 @@ class MujocoEnv(Env):
             fields = {k: v for k, v in before.episode.items() if k in models.RANDOM}
             data = mjx.rne_postconstraint(self.model.replace(**fields), data)
         view = View(data, self.mj_model, before.episode)
-        reward, terminated, terms = self._checked_outcome(self._before(before, start), view, action)
+        reward, terminated, terms = self._outcome(before, start, view, action)
         dtype = state.reward.dtype
         return dataclasses.replace(
             state,
@@ -274,15 +274,12 @@ class MujocoEnv(Env):
             metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
         )
 
-    def _checked_outcome(self, before: Before, data: View, action: jax.Array) -> Any:
+    def _outcome(self, state: Physics, start: mjx.Data, data: View, action: jax.Array) -> Any:
         """Returns what ``outcome`` returns, or raises ValueError where it is no outcome."""
-        return check_outcome(type(self).__name__, self.outcome(before, data, action))
-
-    def _before(self, state: Physics, start: mjx.Data) -> Before:
-        """Returns the start of an env step as ``outcome`` may read it."""
         constant = {name: getattr(start, name) for name in models.CONSTANT}
         known = constant | state.carried | _carried(state)
-        return Before(known, self.mj_model, state.episode)
+        before = Before(known, self.mj_model, state.episode)
+        return check_outcome(type(self).__name__, self.outcome(before, data, action))
 
     def _physics(self, data: mjx.Data, episode: dict[str, jax.Array]) -> Physics:
         """Returns what the next env step needs to know of a simulation."""

@@ -36,8 +36,6 @@ class HalfCheetah(Runner):
         ctrl_cost_weight: float = 0.1
         reset_noise_scale: float = 0.1
 
-    settings: Settings
-
 
 class Swimmer(Runner):
     """Gymnasium's Swimmer (gymnasium/envs/mujoco/swimmer_v5.py).
@@ -62,8 +60,6 @@ class Swimmer(Runner):
         reward_threshold: float | None = 360.0
         ctrl_cost_weight: float = 1e-4
         reset_noise_scale: float = 0.1
-
-    settings: Settings
 
 
 class PlanarWalker(Healthy):
@@ -157,5 +153,3 @@ class Walker2d(PlanarWalker):
         healthy_z_range: Interval = (0.8, 2.0)
         healthy_angle_range: Interval = (-1.0, 1.0)
         reset_noise_scale: float = 5e-3
-
-    settings: Settings

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import importlib.resources
 import inspect
 import subprocess
 import sys
@@ -239,13 +238,6 @@ def test_register_once():
             envs.register("Again-v0", envs.make)
     finally:
         del envs._TABLE["Again-v0"]
-
-
-def test_own_model_by_path(tmp_path):
-    asset = importlib.resources.files("mjx_reinforce.envs") / "assets" / "inverted_pendulum.xml"
-    (tmp_path / "mine.xml").write_text(asset.read_text())
-    mine = envs.make("InvertedPendulum-v5", xml_file=str(tmp_path / "mine.xml"), frame_skip=1)
-    assert mine.dt == pytest.approx(0.02)
 
 
 _THREADS = """

@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from toys import Drifting, Late, SignedTarget, Survive, Target
+from brax import envs as brax_envs
+from toys import Drifting, Late, SignedTarget, Survive
 
 from mjx_reinforce import Cut, mlp_policy, normal, reinforce, rollout, train_step
 from mjx_reinforce.engines.native import available
@@ -136,18 +137,6 @@ def test_no_key_is_used_twice():
         state = jax.jit(learner.init)(jax.random.key(0))
         state, _ = train_step(learner, state)
         train_step(learner, state)
-
-
-@pytest.mark.slow
-def test_hyperparameters_vmap():
-    def step(learning_rate):
-        learner = reinforce(Target(), optimizer=optax.sgd(learning_rate), num_episodes=4)
-        state = learner.init(jax.random.key(0))
-        after, _ = learner.step(state)
-        return after.actor.params["constants"] - state.actor.params["constants"]
-
-    moves = jax.jit(jax.vmap(step))(jnp.array([0.1, 0.2]))
-    np.testing.assert_allclose(2 * moves[0], moves[1], rtol=1e-4)
 
 
 class Scattered(Survive):
@@ -294,3 +283,22 @@ def test_episodes_are_cut_until_a_share_of_the_budget_is_used(engine, short_apar
 def test_nonsense_is_refused(settings, said):
     with pytest.raises(ValueError, match=said):
         reinforce(Survive(), **settings)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Brax System")
+def test_a_brax_environment_trains():
+    """Ours under brax's tools are in test_envs.py."""
+    env = brax_envs.get_environment("inverted_pendulum", backend="generalized")
+    played = []
+    for engine in ("vmap", "auto"):
+        learner = reinforce(env, num_episodes=8, horizon=30, engine=engine)
+        state = learner.init(jax.random.key(0))
+        after, metrics = train_step(learner, state)
+        assert int(metrics["skipped_update"]) == 0
+        before, later = (jax.flatten_util.ravel_pytree(s.actor.params)[0] for s in (state, after))
+        assert np.all(np.isfinite(later))
+        assert np.any(before != later)
+        played.append(int(metrics["env_steps"]))
+    assert learner.engine.name == "native"
+    assert played[0] == played[1] > 8

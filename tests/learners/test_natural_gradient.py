@@ -136,15 +136,6 @@ def test_single_precision_and_observations_that_never_change():
         np.testing.assert_allclose(got, expected, rtol=0, atol=2e-3 * scale)
 
 
-def test_the_fisher_matrix_of_a_normal_is_the_curvature_of_its_divergence():
-    distribution = normal(BOX)
-    outputs = jnp.array([0.3, -0.2, np.log(0.5), np.log(2.0)])
-    curvature = jax.hessian(distribution.kl, argnums=1)(outputs, outputs)
-    np.testing.assert_allclose(
-        np.diag(distribution.fisher(outputs[2:])), curvature, rtol=1e-5, atol=1e-6
-    )
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["linear normal", "categorical"])
 def test_the_scale_of_the_weights_does_not_matter_and_no_gradient_is_no_step(name):

@@ -185,13 +185,6 @@ def test_far_out_samples_stay_inside_and_gradients_finite(name):
         assert all(np.all(np.isfinite(x)) for x in jax.tree.leaves(values)), (std, distance)
 
 
-def test_normal_against_scipy():
-    outputs, action = jnp.array([0.25, np.log(0.7)]), jnp.array([0.4])
-    expected = stats.norm(-1.0 + 2.0 * 0.25, 0.7)
-    assert float(build("normal").log_prob(outputs, action)) == pytest.approx(expected.logpdf(0.4))
-    assert float(build("normal").entropy(outputs)) == pytest.approx(expected.entropy())
-
-
 def test_standard_deviations():
     """A sigmoid's at initial_std 0.5 is sigmoid(o); without rescaling the mean is the output."""
     distribution = normal(SPACE, std="sigmoid", rescale=False)

@@ -7,12 +7,11 @@ import numpy as np
 from mjx_reinforce.policies.distributions import normal_integrals
 from mjx_reinforce.policies.distributions.distribution import Distribution, middle_and_half_range
 from mjx_reinforce.policies.distributions.gaussian import (
-    LOG_SQRT_2PI,
     gaussian_outputs,
     normal_entropy,
     normal_log_density,
 )
-from mjx_reinforce.policies.distributions.normal_integrals import log_tail
+from mjx_reinforce.policies.distributions.normal_integrals import LOG_SQRT_2PI, log_tail
 from mjx_reinforce.types import Box, Discrete
 
 # float32 cannot recover a z much beyond the first number from tanh(z). Samples beyond it are all

@@ -20,9 +20,9 @@ from mjx_reinforce.policies.distributions.distribution import (
     continuous_box,
     middle_and_half_range,
 )
+from mjx_reinforce.policies.distributions.normal_integrals import LOG_SQRT_2PI
 from mjx_reinforce.types import Box, Discrete
 
-LOG_SQRT_2PI = 0.5 * float(np.log(2.0 * np.pi))
 _MIN_STD = 1e-6
 
 

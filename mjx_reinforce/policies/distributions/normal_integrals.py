@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.polynomial import legendre
 
-_LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
+LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 _PIVOT = 4.0
 # A bound farther away, in standard deviations, is treated as this far: it cuts off nothing either
 # way, and the square stays finite in float32.
@@ -99,7 +99,7 @@ def log_tail(x: jax.Array) -> jax.Array:
     """Returns the log-probability [...] that a standard Normal exceeds ``x`` [...]."""
     upper = x >= 0
     distance = jnp.where(upper, x, -x)
-    log_small = -0.5 * distance**2 + jnp.log(half_line(0, distance)) - _LOG_SQRT_2PI
+    log_small = -0.5 * distance**2 + jnp.log(half_line(0, distance)) - LOG_SQRT_2PI
     return jnp.where(upper, log_small, jnp.log1p(-jnp.exp(log_small)))
 
 
