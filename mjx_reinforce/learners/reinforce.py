@@ -33,9 +33,17 @@ from mjx_reinforce.policies import normalize
 from mjx_reinforce.policies.actor import Actor, act
 from mjx_reinforce.policies.arguments import check_count, check_key, check_number
 from mjx_reinforce.policies.distributions.categorical import categorical
+from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.policies.distributions.gaussian import normal
 from mjx_reinforce.policies.policy import Policy, mlp_policy
-from mjx_reinforce.types import Discrete, Environment, Trajectory, action_space, observation_size
+from mjx_reinforce.types import (
+    Box,
+    Discrete,
+    Environment,
+    Trajectory,
+    action_space,
+    observation_size,
+)
 
 #: Where functions are that make estimators, and are no schedules of them.
 _ESTIMATORS = tuple(f"mjx_reinforce.learners.{name}" for name in ("estimators", "value_baseline"))
@@ -51,6 +59,11 @@ _specs: Any = Trajectory
 _EPISODES = _specs(
     observation=SECOND, action=SECOND, reward=SECOND, mask=SECOND, nonfinite=RUNS, simulated=NONE
 )
+
+
+def default_distribution(space: Box | Discrete) -> Distribution:
+    """Returns a Normal with a trained std, or a categorical distribution if discrete."""
+    return categorical(space) if isinstance(space, Discrete) else normal(space)
 
 
 def reinforce(
@@ -87,8 +100,7 @@ def reinforce(
 
     Args:
       env: what is played; any brax-style environment.
-      policy: by default an MLP of 32 and 32 tanh units with ``normal``, or ``categorical`` where
-        actions are discrete.
+      policy: by default an MLP of 32 and 32 tanh units with ``default_distribution``.
       estimator: by default leave-one-out on the return to go (discount 0.99), divided by its
         standard deviation plus 10. Or a function from ``TrainState.progress`` [] to one, where
         its numbers change as the budget is used.
@@ -177,9 +189,7 @@ class _Reinforce:
         self._check_numbers()
         self.horizon = contract.check_horizon(self.env, self.horizon)
         if self.policy is None:
-            space = action_space(self.env)
-            family = categorical if isinstance(space, Discrete) else normal
-            self.policy = mlp_policy(size, family(space))
+            self.policy = mlp_policy(size, default_distribution(action_space(self.env)))
         contract.check_policy(self.policy, self.env, size, likelihood=True)
         if self.optimizer is None:
             self.optimizer = make_optimizer()
