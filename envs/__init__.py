@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.checks import BadEnvironmentError, check_parts, explain
-from mjx_reinforce.physics.quiet import silence_mjx
+from mjx_reinforce.physics import silence_mjx
 from mjx_reinforce.registry import check_name, load_definition, load_ours, load_own
 
 if TYPE_CHECKING:

@@ -34,9 +34,9 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 import jax
 import pytest
 from command_lines import added_environments, run_command
+from verify import verify
 
 from mjx_reinforce.fused import scalarized
-from mjx_reinforce.fused.passes.verify import verify
 
 SLOW = Path(__file__).with_name("slow.txt")
 _STALE = pytest.StashKey[list[str]]()

@@ -38,12 +38,10 @@ All exceptions of floating-point arithmetic, where 0 and the exponent are consta
 So ``(x - x) == 0`` is true for every x; ``jnp.isfinite`` is what tells whether x is finite.
 """
 
-from mjx_reinforce.fused.by_engine import by_engine
-from mjx_reinforce.fused.errors import TooLarge, UnsupportedPrimitive, refusal
-from mjx_reinforce.fused.jaxprs import prune
-from mjx_reinforce.fused.lanes import any_lane
-from mjx_reinforce.fused.scalarized import Scalarized, scalarize
-from mjx_reinforce.fused.skippable import skippable
+from mjx_reinforce.fused.jaxprs import UnsupportedPrimitive, prune
+from mjx_reinforce.fused.primitives import any_lane, by_engine, skippable
+from mjx_reinforce.fused.scalarized import Scalarized, refusal, scalarize
+from mjx_reinforce.fused.size import TooLarge
 from mjx_reinforce.fused.vmap import vmap
 
 __all__ = [

@@ -48,11 +48,6 @@ def together(arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
     return [lift(array) for array in arrays]
 
 
-def take(array: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Returns the elements at these row-major positions, in the positions' shape."""
-    return array.reshape(-1)[positions.reshape(-1)].reshape(positions.shape)
-
-
 def zeros(aval: Any) -> np.ndarray:
     """Returns zeros of an abstract value's shape and dtype."""
     return np.zeros(aval.shape, aval.dtype)

@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.fused import arrays, jaxprs
-from mjx_reinforce.fused.errors import no_rule
 from mjx_reinforce.fused.graph import Graph
 from mjx_reinforce.fused.rules import (
     branches,
@@ -83,7 +82,8 @@ def _apply(
     if name in _ARRAY_RULES:
         if name not in _KEYS_TO_WORDS and any(is_key(atom.aval) for atom in eqn.invars):
             return _word_by_word(graph, eqn, operands)
-        return _settled(eqn, _ARRAY_RULES[name](graph, eqn, *operands))
+        results = zip(_ARRAY_RULES[name](graph, eqn, *operands), eqn.outvars, strict=True)
+        return [arrays.settle(result, out.aval.dtype) for result, out in results]
     program = jaxprs.callee(eqn)
     if program is not None:
         with graph.evaluating(eqn):
@@ -91,7 +91,7 @@ def _apply(
     makes_keys = any(is_key(out.aval) for out in eqn.outvars)
     if all(map(arrays.is_numeric, operands)) and not makes_keys:
         return jaxprs.compute_constants(eqn.primitive.bind, eqn.params, operands)
-    raise no_rule(name, graph.source(eqn))
+    raise jaxprs.no_rule(name, graph.source(eqn))
 
 
 def _word_by_word(graph: Graph, eqn: jaxprs.Equation, operands: list[np.ndarray]) -> list:
@@ -103,11 +103,3 @@ def _word_by_word(graph: Graph, eqn: jaxprs.Equation, operands: list[np.ndarray]
         plane = [x[..., k] if key else x for x, key in zip(operands, keys, strict=True)]
         planes.append(rule(graph, one, *plane))
     return [np.stack(arrays.together(words), -1) for words in zip(*planes, strict=True)]
-
-
-def _settled(eqn: jaxprs.Equation, results: list[np.ndarray]) -> list[np.ndarray]:
-    """Turns results that became constants into numeric arrays."""
-    return [
-        arrays.settle(result, out.aval.dtype)
-        for result, out in zip(results, eqn.outvars, strict=True)
-    ]

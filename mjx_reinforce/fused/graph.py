@@ -5,18 +5,17 @@ are shared. A node that needs nothing of a loop's body is placed before the loop
 out of a branch, because then it would run also where the branch is skipped.
 """
 
-import contextlib
 from collections.abc import Hashable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike
 
 from mjx_reinforce.fused import arrays, jaxprs, ops
-from mjx_reinforce.fused.errors import TooLarge
-from mjx_reinforce.fused.nodes import BOOL, Captured, Gate, Loop, Node, Scalar, Scope, identity
-from mjx_reinforce.fused.passes import folding, simplify
-from mjx_reinforce.fused.size import MAX_SCALARS
+from mjx_reinforce.fused.nodes import BOOL, Captured, Node, Scalar, Scope, identity
+from mjx_reinforce.fused.passes import simplify
+from mjx_reinforce.fused.size import MAX_SCALARS, TooLarge
 
 
 class Limits(NamedTuple):
@@ -25,13 +24,11 @@ class Limits(NamedTuple):
     Constants fold iteration by iteration in a scan that is written out, and a loop is shorter. A
     scan whose own ``unroll`` is its whole length is always written out, as JAX does.
 
-    plain: of a scan that reads and makes no arrays.
-    arrays: of one that reads or makes arrays, which a loop keeps in memory.
-    unrollable: of one for which ``by_engine`` says that it may be, instead of the other two.
+    scans: of any scan.
+    unrollable: of one for which ``by_engine`` says that it may be, instead of the former.
     """
 
-    plain: int = 4
-    arrays: int = 4
+    scans: int = 4
     unrollable: int = 4
 
 
@@ -49,6 +46,7 @@ class Graph:
     path: the equations that are being evaluated, from the outermost one, by their ids.
     learned: what was found out on a path. The body of a loop is evaluated again and again, each
       time with less assumed of what never changes, and what was found out inside still holds.
+    captured: the arrays that the program closes over and whose values are not known yet, by id.
     certain: predicates of the branches and loops around the present scope. Its code runs only
       if each of them is true for at least one element of the batch.
     """
@@ -63,19 +61,14 @@ class Graph:
         self.certain: set[Node] = set()
         self._scopes = [Scope(depth=0, floor=0)]
         self._count = self._applied = 0
-        self._captured: dict[int, tuple[Captured, np.ndarray]] = {}
+        self.captured: dict[int, tuple[Captured, np.ndarray]] = {}
 
     @property
     def scope(self) -> Scope:
         """The innermost scope."""
         return self._scopes[-1]
 
-    @property
-    def captures(self) -> bool:
-        """Whether the program closes over an array whose value is not known yet."""
-        return bool(self._captured)
-
-    @contextlib.contextmanager
+    @contextmanager
     def evaluating(self, eqn: jaxprs.Equation) -> Iterator[None]:
         """Lengthens the path by an equation."""
         self._evaluated[id(eqn)] = eqn
@@ -93,19 +86,15 @@ class Graph:
         around = [eqn, *(self._evaluated[number] for number in reversed(self.path))]
         return next(filter(None, map(jaxprs.source, around)), "an unknown line")
 
-    @contextlib.contextmanager
-    def loop_body(self) -> Iterator[Scope]:
+    def loop_body(self) -> AbstractContextManager[Scope]:
         """Opens the scope of a loop's body; nodes that do not depend on it are placed outside."""
-        with self._open(self.scope.floor) as scope:
-            yield scope
+        return self._open(self.scope.floor)
 
-    @contextlib.contextmanager
-    def branch(self) -> Iterator[Scope]:
+    def branch(self) -> AbstractContextManager[Scope]:
         """Opens the scope of a branch; everything made in it stays in it."""
-        with self._open(self.scope.depth + 1) as scope:
-            yield scope
+        return self._open(self.scope.depth + 1)
 
-    @contextlib.contextmanager
+    @contextmanager
     def _open(self, floor: int) -> Iterator[Scope]:
         scope = Scope(depth=self.scope.depth + 1, floor=floor)
         self._scopes.append(scope)
@@ -116,7 +105,7 @@ class Graph:
             self.scope.cost += scope.cost
             self.scope.has_loop |= scope.has_loop
 
-    @contextlib.contextmanager
+    @contextmanager
     def again(self, scope: Scope) -> Iterator[None]:
         """Opens the scope of a branch once more; it is still the innermost's child."""
         before = scope.cost
@@ -127,7 +116,7 @@ class Graph:
             self._scopes.pop()
             self.scope.cost += scope.cost - before
 
-    @contextlib.contextmanager
+    @contextmanager
     def assuming(self, predicate: Scalar) -> Iterator[None]:
         """Assumes in a block that a predicate is true for at least one element of the batch."""
         before = set(self.certain)
@@ -139,11 +128,7 @@ class Graph:
             self.certain = before
 
     def leaf(
-        self,
-        dtype: DTypeLike,
-        varying: bool,
-        owner: Loop | Gate | None = None,
-        position: Any = None,
+        self, dtype: DTypeLike, varying: bool, owner: Any = None, position: Any = None
     ) -> Node:
         """Makes a node that nothing computes: an input, a loop's carry, a gate's result."""
         index = self.number()
@@ -154,14 +139,14 @@ class Graph:
         known = jaxprs.as_numpy(value)
         if known is not None:
             return known
-        if id(value) not in self._captured:
+        if id(value) not in self.captured:
             source = Captured(value)
             leaves = [
                 Node(value.dtype, False, self._scopes[0], self.number(), owner=source, position=i)
                 for i in range(value.size)
             ]
-            self._captured[id(value)] = (source, arrays.pack(leaves, value.shape, value.dtype))
-        return self._captured[id(value)][1]
+            self.captured[id(value)] = (source, arrays.pack(leaves, value.shape, value.dtype))
+        return self.captured[id(value)][1]
 
     def number(self) -> int:
         """Returns the next index."""
@@ -186,7 +171,7 @@ class Graph:
         """Applies an operation: a constant, an existing node, a simpler one or a new one."""
         nodes = [arg for arg in args if isinstance(arg, Node)]
         if not nodes:
-            return folding.fold(op, args, dtype)
+            return simplify.fold(op, args, dtype)
         self._applied += 1
         if self._applied > _MOST:
             raise TooLarge(f"written out it is more than {_MOST:,} scalar operations")

@@ -19,12 +19,36 @@ from jax import lax
 from jax.extend import core
 from jax.interpreters import partial_eval
 
-from mjx_reinforce.fused.errors import no_keys
 from mjx_reinforce.fused.ops import FACTS
 from mjx_reinforce.types import PyTree, is_key
 
 # The parameter under which a call-like primitive keeps the jaxpr that it calls.
 _CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+
+
+class UnsupportedPrimitive(NotImplementedError):  # noqa: N818 (reads as what it is)
+    """A JAX primitive that cannot be written out, or not for a backend."""
+
+
+def no_keys() -> UnsupportedPrimitive:
+    """Returns the error for typed PRNG keys."""
+    return UnsupportedPrimitive(
+        "typed PRNG keys (jax.random.key) cannot be written out; draw the random numbers outside "
+        "and pass them, or use jax.vmap for this function"
+    )
+
+
+def no_rule(name: str, source: str) -> UnsupportedPrimitive:
+    """Returns the error for a primitive without a rule.
+
+    Args:
+      name: the primitive's.
+      source: the line of the user's code that it came from.
+    """
+    return UnsupportedPrimitive(
+        f"there is no rule for the primitive {name!r}, used at {source}; use jax.vmap for this "
+        "function, or add a rule in mjx_reinforce/fused/rules"
+    )
 
 
 class Program(NamedTuple):
@@ -66,17 +90,6 @@ class Equation(Protocol):
     invars: list[Atom]
     outvars: list[Atom]
     source_info: Any
-
-
-class ScanParts(NamedTuple):
-    """How the operands and results of a ``scan`` equation divide.
-
-    num_consts: the leading operands, the same in every iteration.
-    num_carry: the operands after them, and the leading results; the rest are xs and ys.
-    """
-
-    num_consts: int
-    num_carry: int
 
 
 def trace(fn: Callable, *examples: PyTree) -> tuple[Program, Any]:
@@ -167,25 +180,17 @@ def _implementation(key: Atom) -> Any:
     return dtype._impl
 
 
-def _random_bits(eqn: Equation) -> Callable[..., Any]:
-    bits, width = _implementation(eqn.invars[0]).random_bits, eqn.params["bit_width"]
-    return lambda key: bits(key, width, eqn.params["shape"])
-
-
-def _random_split(eqn: Equation) -> Callable[..., Any]:
-    split = _implementation(eqn.invars[0]).split
-    return lambda key: split(key, eqn.params["shape"])
-
-
-def _random_fold_in(eqn: Equation) -> Callable[..., Any]:
-    return _implementation(eqn.invars[0]).fold_in
-
-
-#: What is done to keys, as functions of their words.
-_OF_KEYS = {
-    "random_bits": _random_bits,
-    "random_split": _random_split,
-    "random_fold_in": _random_fold_in,
+#: What is done to keys, as functions of their words: equation -> function.
+_OF_KEYS: dict[str, Callable[[Equation], Callable[..., Any]]] = {
+    "random_bits": lambda eqn: (
+        lambda key: _implementation(eqn.invars[0]).random_bits(
+            key, eqn.params["bit_width"], eqn.params["shape"]
+        )
+    ),
+    "random_split": lambda eqn: (
+        lambda key: _implementation(eqn.invars[0]).split(key, eqn.params["shape"])
+    ),
+    "random_fold_in": lambda eqn: _implementation(eqn.invars[0]).fold_in,
 }
 
 
@@ -209,21 +214,26 @@ def depends(closed: Any, given: Iterable[bool]) -> list[bool]:
     jaxpr = program(closed).jaxpr
     found = {variable for variable, is_given in zip(jaxpr.invars, given, strict=True) if is_given}
     for eqn in jaxpr.eqns:
-        if any(_is_variable(atom) and atom in found for atom in eqn.invars):
+        if any(not is_literal(atom) and atom in found for atom in eqn.invars):
             found.update(eqn.outvars)
-    return [_is_variable(out) and out in found for out in jaxpr.outvars]
+    return [not is_literal(out) and out in found for out in jaxpr.outvars]
 
 
-def scan_parts(eqn: Equation) -> ScanParts:
-    """Returns how a ``scan`` equation's operands divide."""
+def scan_parts(eqn: Equation) -> tuple[int, int]:
+    """Returns how the operands and results of a ``scan`` equation divide.
+
+    Returns:
+      How many leading operands are the same in every iteration; and how many operands after them,
+      and leading results, are the carry. The rest are xs and ys.
+    """
     if "num_consts" in eqn.params:  # JAX 0.10
-        return ScanParts(eqn.params["num_consts"], eqn.params["num_carry"])
+        return eqn.params["num_consts"], eqn.params["num_carry"]
     consts, carry, _ = eqn.params["ft_in"].update(list(eqn.invars)).unpack()
-    return ScanParts(len(list(consts)), len(list(carry)))
+    return len(list(consts)), len(list(carry))
 
 
 def is_literal(atom: Any) -> bool:
-    """Returns whether an operand is a literal."""
+    """Returns whether an operand is a literal, which is not hashable in every release."""
     return isinstance(atom, core.Literal)
 
 
@@ -267,13 +277,13 @@ def live_equations(jaxpr: core.Jaxpr, used: Iterable[bool]) -> list[Any]:
     when nothing reads it.
     """
     needed = {
-        out for out, use in zip(jaxpr.outvars, used, strict=True) if use and _is_variable(out)
+        out for out, use in zip(jaxpr.outvars, used, strict=True) if use and not is_literal(out)
     }
     kept = []
     for eqn in reversed(jaxpr.eqns):
         if any(out in needed for out in eqn.outvars):
             kept.append((eqn, [out in needed for out in eqn.outvars]))
-            needed.update(atom for atom in eqn.invars if _is_variable(atom))
+            needed.update(atom for atom in eqn.invars if not is_literal(atom))
     return kept[::-1]
 
 
@@ -305,8 +315,3 @@ def compute_constants(
         results = function(*arrays, **params)
         results = results if isinstance(results, (list, tuple)) else [results]
         return [np.asarray(result) for result in results]
-
-
-def _is_variable(atom: Any) -> bool:
-    """Returns whether an atom is a variable (literals are not hashable in every release)."""
-    return not is_literal(atom)

@@ -8,13 +8,12 @@ from typing import Any
 import jax
 import numpy as np
 
+from mjx_reinforce.checks import explain
 from mjx_reinforce.fused import arrays, evaluate, jaxprs, size
-from mjx_reinforce.fused.backends import BACKENDS
-from mjx_reinforce.fused.errors import no_keys
+from mjx_reinforce.fused.backends.backend import Backend
 from mjx_reinforce.fused.graph import Graph, Limits
 from mjx_reinforce.fused.nodes import Scalar
 from mjx_reinforce.fused.passes import liveness
-from mjx_reinforce.registry import check_name, load_definition
 from mjx_reinforce.types import PyTree, is_key
 
 #: Looks at every program that was written out. The tests set it to ``verify``; users leave it.
@@ -40,20 +39,14 @@ class Scalarized:
     schedule: liveness.Schedule
     captures: bool
 
-    def compile(self, backend: str, **settings: Any) -> Any:
-        """Returns what a backend makes of the function.
-
-        Args:
-          backend: a name of ``backends.BACKENDS``.
-          **settings: what the backend takes.
-        """
-        check_name("backend", backend, BACKENDS)
-        return load_definition(BACKENDS[backend])(**settings).compile(self.schedule, self.outputs)
+    def compile(self, backend: Backend) -> Any:
+        """Returns what a backend makes of the function."""
+        return backend.compile(self.schedule, self.outputs)
 
     @property
-    def operations(self) -> Counter:
+    def operations(self) -> Counter[str]:
         """How many scalar operations it takes, by name; a loop's body counts once."""
-        return self.compile("count")
+        return Counter(node.op.name for node in liveness.nodes(self.schedule) if node.op)
 
 
 def scalarize(fn: Callable, *examples: PyTree, branch_cost: int = 400) -> Scalarized:
@@ -90,7 +83,7 @@ def build(
     """
     program, out_shape = jaxprs.trace(fn, *examples)
     if any(is_key(variable.aval) for variable in program.jaxpr.invars):
-        raise no_keys()
+        raise jaxprs.no_keys()
     size.check_size(program)
     graph = Graph(branch_cost, limits)
     inputs = [
@@ -107,7 +100,7 @@ def build(
         out_avals=out_avals,
         outputs=outputs,
         schedule=liveness.schedule(graph.scope, (x for leaf in outputs for x in leaf)),
-        captures=graph.captures,
+        captures=bool(graph.captured),
     )
     if inspect is not None:
         inspect(written)
@@ -115,6 +108,13 @@ def build(
 
 
 def _input_array(graph: Graph, number: int, aval: Any, varying: bool) -> np.ndarray:
-    size = int(np.prod(aval.shape, dtype=int))
-    leaves = [graph.leaf(aval.dtype, varying, position=(number, k)) for k in range(size)]
+    places = [(number, k) for k in range(int(np.prod(aval.shape, dtype=int)))]
+    leaves = [graph.leaf(aval.dtype, varying, position=place) for place in places]
     return arrays.pack(leaves, aval.shape, aval.dtype)
+
+
+def refusal(error: Exception) -> str:
+    """Returns in one line why a function cannot be written out, from what was raised."""
+    if isinstance(error, (size.TooLarge, jaxprs.UnsupportedPrimitive)):
+        return " ".join(str(error).split())
+    return f"it cannot be written out ({explain(error)})"

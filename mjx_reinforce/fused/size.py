@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from mjx_reinforce.fused import jaxprs, ops
-from mjx_reinforce.fused.errors import TooLarge
 
 #: What is larger takes minutes to write, and longer to compile.
 MAX_SCALARS = 4_000_000
@@ -18,6 +17,10 @@ _LOOP = 2
 #: The program that is written out of a primitive of ours, among its parameters.
 _CARRIES = {"by_engine": "one", "skippable": "computation"}
 _ELEMENTWISE = {*ops.FACTS, "integer_pow", "square", "add_any", "clamp"}
+
+
+class TooLarge(NotImplementedError):  # noqa: N818 (reads as what it is)
+    """A function that is too large to be written out."""
 
 
 def check_size(program: jaxprs.Program) -> None:
@@ -54,7 +57,9 @@ def _equation_size(eqn: Any, default: Mapping[Any, int | None]) -> int:
         return _LOOP * sum(num_scalars(jaxprs.program(body)) for body in bodies)
     if name == "scan":
         return min(_LOOP, params["length"]) * num_scalars(jaxprs.program(params["jaxpr"]))
-    made, read = (sum(map(_elements, atoms)) for atoms in (eqn.outvars, eqn.invars))
+    made, read = (
+        sum(math.prod(atom.aval.shape) for atom in atoms) for atoms in (eqn.outvars, eqn.invars)
+    )
     if name == "dot_general":
         (contracted, _), _ = params["dimension_numbers"]
         return 2 * made * math.prod(eqn.invars[0].aval.shape[axis] for axis in contracted)
@@ -66,8 +71,3 @@ def _equation_size(eqn: Any, default: Mapping[Any, int | None]) -> int:
         return read
     program = jaxprs.callee(eqn)
     return 0 if program is None else num_scalars(program)
-
-
-def _elements(atom: Any) -> int:
-    """Returns how many entries an operand or a result has."""
-    return math.prod(atom.aval.shape)

@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.fused import jaxprs, scalarized
+from mjx_reinforce.fused.backends.xla import XLA
 from mjx_reinforce.types import PyTree
 
 #: XLA takes minutes to compile more operations, and what it makes of them is slow.
@@ -71,7 +72,11 @@ class Mapped:
         leaves = jax.tree.leaves((args, kwargs))
         batch = _batch_size(leaves, axes)
         rows = [_rows(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
-        values = written.compile("xla", read=lambda place: _row(rows, *place), batch_shape=(batch,))
+
+        def read(place: tuple[int, int]) -> jax.Array:
+            return lax.index_in_dim(rows[place[0]], place[1], keepdims=False)
+
+        values = written.compile(XLA(read, (batch,)))
         out_tree = written.out_tree
         target = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
         ends = _axes(self._out_axes, target)
@@ -112,10 +117,6 @@ class Mapped:
         return written, axes
 
 
-def _is_none(x: object) -> bool:
-    return x is None
-
-
 def _axes(prefix: PyTree, tree: PyTree) -> list[Any]:
     """Returns the axis of each leaf of the tree, as a pytree prefix says."""
     if isinstance(prefix, list) and isinstance(tree, tuple):
@@ -125,7 +126,7 @@ def _axes(prefix: PyTree, tree: PyTree) -> list[Any]:
     def note(axis: Any, subtree: PyTree) -> None:
         axes.extend([axis] * len(jax.tree.leaves(subtree)))
 
-    jax.tree.map(note, prefix, tree, is_leaf=_is_none)
+    jax.tree.map(note, prefix, tree, is_leaf=lambda x: x is None)
     return axes
 
 
@@ -156,10 +157,6 @@ def _rows(x: jax.Array, axis: int | None) -> jax.Array:
     if axis is None:
         return x.reshape(-1)
     return jnp.moveaxis(x, axis, -1).reshape(-1, x.shape[axis])
-
-
-def _row(rows: list[jax.Array], number: int, position: int) -> jax.Array:
-    return lax.index_in_dim(rows[number], position, keepdims=False)
 
 
 def _assemble(scalars: list[Any], aval: jaxprs.Shape, axis: int | None, batch: int) -> jax.Array:

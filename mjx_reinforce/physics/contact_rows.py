@@ -22,6 +22,8 @@ from mujoco import mjx
 from mjx_reinforce.fused import by_engine, skippable
 from mjx_reinforce.physics.mjx_internals import geom_groups
 
+Pair = tuple[jax.Array, jax.Array]
+
 
 class Group(NamedTuple):
     """Contacts with equally many rows.
@@ -146,7 +148,7 @@ def with_bases(division: Blocks, rows: jax.Array, touching: jax.Array) -> Jacobi
 
 def weighted(
     division: Blocks, start: jax.Array, jacobian: Jacobian, mass: jax.Array, force: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+) -> Pair:
     """Returns start [nv, nv] + J' diag(mass) J, and J' force [nv].
 
     Args:
@@ -157,24 +159,15 @@ def weighted(
       force: [rows]
     """
 
-    def whole(
-        start: jax.Array, jacobian: Jacobian, mass: jax.Array, force: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def whole(start: jax.Array, jacobian: Jacobian, mass: jax.Array, force: jax.Array) -> Pair:
         rows = jacobian.rows
         return start + (rows.T * mass) @ rows, rows.T @ force
 
-    def by_contact(
-        start: jax.Array, jacobian: Jacobian, mass: jax.Array, force: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    def by_contact(start: jax.Array, jacobian: Jacobian, mass: jax.Array, force: jax.Array) -> Pair:
         others = slice(division.others)
         sums = whole(start, Jacobian(jacobian.rows[others], []), mass[others], force[others])
-        for group, basis, *each in zip(
-            division.groups,
-            jacobian.bases,
-            by_group(division, mass),
-            by_group(division, force),
-            strict=True,
-        ):
+        parts = by_group(division, mass), by_group(division, force)
+        for group, basis, *each in zip(division.groups, jacobian.bases, *parts, strict=True):
             pyramid = jnp.asarray(group.pyramid, start.dtype)
 
             def add(

@@ -273,14 +273,10 @@ UNLIKE_C = {
     (mjx.GeomType.ELLIPSOID, mjx.GeomType.CYLINDER),
     (mjx.GeomType.CYLINDER, mjx.GeomType.CYLINDER),
 }
-_ROUND_GEOMS = (
-    mjx.GeomType.SPHERE,
-    mjx.GeomType.CAPSULE,
-    mjx.GeomType.CYLINDER,
-)
+_ROUND_GEOMS = {mjx.GeomType.SPHERE, mjx.GeomType.CAPSULE, mjx.GeomType.CYLINDER}
 _collision = collision_with(
     lambda table: {
-        pair: one_by_one(function) if set(pair) <= set(_ROUND_GEOMS) else function
+        pair: one_by_one(function) if set(pair) <= _ROUND_GEOMS else function
         for pair, function in (table | _OURS).items()
     }
 )

@@ -17,7 +17,7 @@ from mjx_reinforce.physics.mjx_internals import (
     jax_fields,
     muscle_gain,
     solve_m,
-    with_inertia,
+    with_fields,
 )
 
 
@@ -30,7 +30,7 @@ def tendon_armature(model: mjx.Model, data: mjx.Data) -> mjx.Data:
     matrix = jax_fields(data).M
     if matrix.ndim == 1 or not model.ntendon:  # a sparse one has no place for it
         return data
-    return with_inertia(data, jnp.where(_coupled(model), matrix, 0))
+    return with_fields(data, M=jnp.where(_coupled(model), matrix, 0))
 
 
 def _coupled(model: mjx.Model) -> np.ndarray:
@@ -137,7 +137,7 @@ def _clamped(model: mjx.Model, data: mjx.Data) -> jax.Array:
     """
 
     def at_an_end(
-        force: jax.Array, limited: np.ndarray, ends: jax.Array, slack: float
+        force: jax.Array, limited: np.ndarray, ends: jax.Array, slack: float = 0
     ) -> jax.Array:
         low, high = ends.T
         beyond = (force <= low + slack * jnp.abs(low)) | (force >= high - slack * jnp.abs(high))
@@ -150,16 +150,11 @@ def _clamped(model: mjx.Model, data: mjx.Data) -> jax.Array:
     joint = data.qfrc_actuator[model.jnt_dofadr]
     # A tendon's forces are scaled to its limit, and their sum is rounded.
     rounding = max(1e-10, 10 * float(jnp.finfo(force.dtype).eps))
-    return (
-        at_an_end(force, model.actuator_forcelimited, model.actuator_forcerange, 0)
-        | (of_joint & at_an_end(joint, model.jnt_actfrclimited, model.jnt_actfrcrange, 0)).any(1)
-        | (
-            of_tendon
-            & at_an_end(
-                force @ of_tendon, model.tendon_actfrclimited, model.tendon_actfrcrange, rounding
-            )
-        ).any(1)
-    )
+    own = at_an_end(force, model.actuator_forcelimited, model.actuator_forcerange)
+    at_joint = at_an_end(joint, model.jnt_actfrclimited, model.jnt_actfrcrange)
+    tendon = force @ of_tendon, model.tendon_actfrclimited, model.tendon_actfrcrange
+    at_tendon = of_tendon & at_an_end(*tendon, rounding)
+    return own | (of_joint & at_joint).any(1) | at_tendon.any(1)
 
 
 def _free_bodies(model: mjx.Model) -> list[int]:

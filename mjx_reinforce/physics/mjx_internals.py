@@ -3,8 +3,8 @@
 No other file imports MJX's private modules or reads the private part of its data. Three kinds:
 
 - Names that MJX keeps private, here without underscore: the imports, and ``advance``.
-- Fields of ``mjx.Data`` that only MJX's JAX implementation has: ``jax_fields``, ``with_solution``,
-  ``rows_of``, ``with_rows``, ``with_contact``, ``with_inertia``, ``Simulation``, ``num_contacts``.
+- Fields of ``mjx.Data`` that only MJX's JAX implementation has: ``jax_fields``, ``with_fields``,
+  ``rows_of``, ``with_rows``, ``with_contact``, ``Simulation``, ``num_contacts``.
 - Functions of MJX in which a name is given another meaning: ``collision_with`` and ``fenced``. They
   would do nothing, silently, if MJX stopped looking that name up; ``check_lookup`` raises then.
 
@@ -17,51 +17,35 @@ each entry of the child: time grows exponentially with depth. Pusher's arm, ten 
 second a state; with a fence between levels, 50 us.
 """
 
-import contextlib
-import dis
 import functools
 import inspect
 import threading
 import types
 from collections.abc import Callable, Iterator
-from importlib import metadata
 from typing import Any, cast
 
 import jax
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import collision_driver, scan
-from mujoco.mjx._src.collision_driver import geom_pairs
-from mujoco.mjx._src.collision_primitive import collider
-from mujoco.mjx._src.collision_types import Collision, GeomInfo
-from mujoco.mjx._src.forward import _advance as advance
-from mujoco.mjx._src.math import make_frame, quat_mul_axis
-from mujoco.mjx._src.smooth import solve_m
-from mujoco.mjx._src.support import muscle_gain
+from mujoco.mjx._src import (
+    collision_driver,
+    collision_primitive,
+    collision_types,
+    forward,
+    math,
+    scan,
+    smooth,
+    support,
+)
 
-__all__ = [
-    "Collision",
-    "GeomInfo",
-    "Simulation",
-    "advance",
-    "check_lookup",
-    "collider",
-    "collision_with",
-    "fenced",
-    "geom_groups",
-    "geom_pairs",
-    "jax_fields",
-    "make_frame",
-    "muscle_gain",
-    "num_contacts",
-    "quat_mul_axis",
-    "rows_of",
-    "solve_m",
-    "with_contact",
-    "with_inertia",
-    "with_rows",
-    "with_solution",
-]
+advance = forward._advance
+collider = collision_primitive.collider
+geom_pairs = collision_driver.geom_pairs
+make_frame, quat_mul_axis = math.make_frame, math.quat_mul_axis
+muscle_gain = support.muscle_gain
+solve_m = smooth.solve_m
+Collision = collision_types.Collision
+GeomInfo = collision_types.GeomInfo
 
 #: What this package was tested with; ``pyproject.toml`` bounds the versions at the same.
 TESTED_VERSIONS = {"mujoco": "4.0", "mujoco-mjx": "3.17"}
@@ -70,47 +54,23 @@ TESTED_VERSIONS = {"mujoco": "4.0", "mujoco-mjx": "3.17"}
 # ---------------------------------------------------------------------------- names in MJX's code
 
 
-def check_lookup(module: types.ModuleType, function: str, name: str) -> None:
+def check_lookup(function: Callable[..., Any], name: str) -> None:
     """Checks that a function of MJX looks up a global name, so that it sees another meaning.
 
-    Args:
-      module: the module of MJX that has the function and the name.
-      function: the function's name.
-      name: the global name that this package gives another meaning.
-
     Raises:
-      RuntimeError: if the function is gone, or does not look the name up in this module.
+      RuntimeError: it does not.
     """
-    found = inspect.unwrap(getattr(module, function, None))  # type: ignore
-    if (
-        isinstance(found, types.FunctionType)
-        and found.__globals__ is vars(module)
-        and name in _looked_up(found.__code__)
-    ):
-        return
-    versions = ", ".join(
-        f"{package} {metadata.version(package)} (tested: {tested}.*)"
-        for package, tested in TESTED_VERSIONS.items()
-    )
-    raise RuntimeError(
-        f"{module.__name__}.{function} does not look up {name}, which mjx_reinforce replaces. "
-        f"Installed: {versions}. Install the tested versions, or adapt {__name__}"
-    )
+    if name not in inspect.unwrap(function).__code__.co_names:
+        tested = " and ".join(f"{package}=={it}.*" for package, it in TESTED_VERSIONS.items())
+        raise RuntimeError(
+            f"{function.__module__}.{function.__name__} does not look up {name}, which "
+            f"mjx_reinforce replaces: install {tested}, or adapt {__name__}"
+        )
 
 
-def _looked_up(code: types.CodeType) -> set[str]:
-    """Returns the global names that a function's code looks up, also in functions inside it."""
-    names = {step.argval for step in dis.get_instructions(code) if step.opname == "LOAD_GLOBAL"}
-    inner = (_looked_up(const) for const in code.co_consts if isinstance(const, types.CodeType))
-    return names.union(*inner)
-
-
-for _function, _module, _name in (
-    ("collision", collision_driver, "_COLLISION_FUNC"),
-    ("flat", scan, "_nvmap"),
-    ("body_tree", scan, "_nvmap"),
-):
-    check_lookup(_module, _function, _name)
+check_lookup(mjx.collision, "_COLLISION_FUNC")
+check_lookup(scan.flat, "_nvmap")
+check_lookup(scan.body_tree, "_nvmap")
 
 
 def geom_groups(model: mjx.Model) -> Iterator[tuple[int, int, int]]:
@@ -149,8 +109,12 @@ def fenced(fn: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(fn)
     def traced(*args: Any) -> Any:
-        with _lock, _swapped(scan, "_nvmap", _fenced_level):
-            return fn(*args)
+        with _lock:
+            before, scan._nvmap = scan._nvmap, _fenced_level
+            try:
+                return fn(*args)
+            finally:
+                scan._nvmap = before
 
     return traced
 
@@ -158,17 +122,6 @@ def fenced(fn: Callable[..., Any]) -> Callable[..., Any]:
 def _fenced_level(*inputs: Any) -> Any:
     """Computes one level of bodies, and lets nothing of it be computed again."""
     return jax.lax.optimization_barrier(_level(*inputs))
-
-
-@contextlib.contextmanager
-def _swapped(module: types.ModuleType, name: str, value: object) -> Iterator[None]:
-    """Gives a module's name another meaning for a while."""
-    before = getattr(module, name)
-    setattr(module, name, value)
-    try:
-        yield
-    finally:
-        setattr(module, name, before)
 
 
 # --------------------------------------------------------------------------- fields of MJX's data
@@ -179,21 +132,9 @@ def jax_fields(data: mjx.Data) -> mjx.DataJAX:
     return cast(mjx.DataJAX, data._impl)
 
 
-def with_solution(
-    data: mjx.Data, qacc: jax.Array, qfrc_constraint: jax.Array, efc_force: jax.Array
-) -> mjx.Data:
-    """Returns the data with what a constraint solver found.
-
-    Args:
-      data: an MJX simulation.
-      qacc: [nv] the acceleration.
-      qfrc_constraint: [nv] the constraints' joint forces.
-      efc_force: [rows] the constraint rows' forces.
-    """
-    solved = data.tree_replace(
-        {"qacc": qacc, "qfrc_constraint": qfrc_constraint, "_impl.efc_force": efc_force}
-    )
-    return cast(mjx.Data, solved)  # flax types it as any PyTreeNode
+def with_fields(data: mjx.Data, **fields: Any) -> mjx.Data:
+    """Returns the data with other values of fields that only MJX's JAX implementation has."""
+    return cast(mjx.Data, data.tree_replace({f"_impl.{name}": x for name, x in fields.items()}))
 
 
 _ROW_FIELDS = ("efc_J", "efc_D", "efc_aref", "efc_pos", "efc_margin", "efc_frictionloss")
@@ -206,18 +147,12 @@ def rows_of(data: mjx.Data) -> list[jax.Array]:
 
 def with_rows(data: mjx.Data, rows: list[jax.Array]) -> mjx.Data:
     """Returns the data with rows as ``rows_of`` lists them."""
-    names = (f"_impl.{name}" for name in _ROW_FIELDS)
-    return cast(mjx.Data, data.tree_replace(dict(zip(names, rows, strict=True))))
+    return with_fields(data, **dict(zip(_ROW_FIELDS, rows, strict=True)))
 
 
 def with_contact(data: mjx.Data, contact: Any, dim: np.ndarray) -> mjx.Data:
     """Returns the data with other contacts, of these dimensions."""
-    return cast(mjx.Data, data.tree_replace({"_impl.contact": contact.replace(dim=dim)}))
-
-
-def with_inertia(data: mjx.Data, matrix: jax.Array) -> mjx.Data:
-    """Returns the data with another inertia matrix, [nv, nv]."""
-    return cast(mjx.Data, data.tree_replace({"_impl.M": matrix}))
+    return with_fields(data, contact=contact.replace(dim=dim))
 
 
 class Simulation:

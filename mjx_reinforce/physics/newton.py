@@ -16,7 +16,7 @@ done; here a round evaluates one point, and the search ends when no row changes 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,8 +30,8 @@ from mjx_reinforce.physics.mjx_internals import jax_fields
 _MIN_TRACE = 1e-15
 
 
-class _Rows(NamedTuple):
-    """The constraints.
+class Rows(NamedTuple):
+    """Constraint rows.
 
     jacobian: J
     reference: [rows] r
@@ -39,10 +39,18 @@ class _Rows(NamedTuple):
     equality: [rows] whether a row is active on both sides
     """
 
-    jacobian: contact_rows.Jacobian
+    jacobian: Any
     reference: jax.Array
     constraint_mass: jax.Array
     equality: jax.Array
+
+    def active(self, residual: jax.Array) -> jax.Array:
+        """Returns which rows push at residuals [rows]; a NaN pushes, so that it is not lost."""
+        return self.equality | ~(residual >= 0)
+
+    def force(self, residual: jax.Array) -> jax.Array:
+        """Returns the rows' forces, [rows]."""
+        return jnp.where(self.active(residual), -self.constraint_mass * residual, 0)
 
 
 class _Point(NamedTuple):
@@ -58,15 +66,15 @@ class _Point(NamedTuple):
     residual: jax.Array
 
 
-class _Search(NamedTuple):
+class Search(NamedTuple):
     """The state of Newton's method.
 
-    point: the acceleration reached
+    point: the acceleration reached, and what the next step needs of it
     steps: [] how many were made
     settled: [] whether the last step led to the minimum
     """
 
-    point: _Point
+    point: Any
     steps: jax.Array
     settled: jax.Array
 
@@ -134,7 +142,7 @@ def solve_newton(
     # A NaN counts as touching, so that it gets to the acceleration.
     touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
     jacobian = contact_rows.with_bases(division, fields.efc_J, touching)
-    rows = _Rows(jacobian, fields.efc_aref, fields.efc_D, equality)
+    rows = Rows(jacobian, fields.efc_aref, fields.efc_D, equality)
     inertia = mjx.full_m(model, data)
 
     def along(direction: jax.Array) -> jax.Array:
@@ -142,21 +150,22 @@ def solve_newton(
 
     smallest = smallest_decrement(model, inertia)
 
-    def improve(search: _Search) -> _Search:
+    def improve(search: Search) -> Search:
         before = search.point
         direction, decrement = _newton_direction(division, inertia, rows, before)
         change, change_of_imbalance = along(direction), inertia @ direction
-        slope = jnp.dot(direction, before.imbalance)
-        curvature = jnp.dot(direction, change_of_imbalance)
-        length = _line_search(rows, before, change, slope, curvature, model.opt.ls_iterations)
+        without_rows = Line(
+            jnp.dot(direction, before.imbalance), jnp.dot(direction, change_of_imbalance)
+        )
+        length = _line_search(rows, before, change, without_rows, model.opt.ls_iterations)
         after = _Point(
             before.qacc + length * direction,
             before.imbalance + length * change_of_imbalance,
             before.residual + length * change,
         )
-        same = jnp.all(_active(rows, after.residual) == _active(rows, before.residual))
+        same = jnp.all(rows.active(after.residual) == rows.active(before.residual))
         settled = same | (decrement < smallest)
-        return _Search(after, search.steps + 1, settled)
+        return Search(after, search.steps + 1, settled)
 
     def begin(qacc: jax.Array) -> _Point:
         imbalance = inertia @ qacc - data.qfrc_smooth
@@ -167,14 +176,19 @@ def solve_newton(
         warm = begin(data.qacc_warmstart)
         better = _cost(rows, data, warm) < _cost(rows, data, start)
         start = jax.tree.map(lambda w, s: jnp.where(better, w, s), warm, start)
-    end = jax.lax.while_loop(
-        lambda search: ~search.settled & (search.steps < model.opt.iterations),
-        improve,
-        _Search(start, jnp.int32(0), jnp.array(False)),
-    ).point
-    force = _force(rows, end)
+    end = descend(model, improve, start)
+    force = rows.force(end.residual)
     joint_force = contact_rows.weighted(division, inertia, rows.jacobian, force, force)[1]
     return end.qacc, joint_force, force
+
+
+def descend(model: mjx.Model, improve: Callable[[Search], Search], start: Any) -> Any:
+    """Returns the point that Newton's method reaches from a start."""
+    return jax.lax.while_loop(
+        lambda search: ~search.settled & (search.steps < model.opt.iterations),
+        improve,
+        Search(start, jnp.int32(0), jnp.array(False)),
+    ).point
 
 
 def smallest_decrement(model: mjx.Model, inertia: jax.Array) -> jax.Array:
@@ -182,26 +196,15 @@ def smallest_decrement(model: mjx.Model, inertia: jax.Array) -> jax.Array:
     return model.opt.tolerance * jnp.maximum(jnp.trace(inertia), _MIN_TRACE)
 
 
-def _active(rows: _Rows, residual: jax.Array) -> jax.Array:
-    """Returns which rows push at residuals [rows]; a NaN pushes, so that it is not lost."""
-    return rows.equality | ~(residual >= 0)
-
-
-def _cost(rows: _Rows, data: mjx.Data, point: _Point) -> jax.Array:
+def _cost(rows: Rows, data: mjx.Data, point: _Point) -> jax.Array:
     """Returns what is minimised, []."""
-    active = _active(rows, point.residual)
+    active = rows.active(point.residual)
     penalty = jnp.sum(jnp.where(active, rows.constraint_mass * point.residual**2, 0))
     return (jnp.dot(point.imbalance, point.qacc - data.qacc_smooth) + penalty) / 2
 
 
-def _force(rows: _Rows, point: _Point) -> jax.Array:
-    """Returns the rows' forces, [rows]."""
-    active = _active(rows, point.residual)
-    return jnp.where(active, -rows.constraint_mass * point.residual, 0)
-
-
 def _newton_direction(
-    division: contact_rows.Blocks, inertia: jax.Array, rows: _Rows, point: _Point
+    division: contact_rows.Blocks, inertia: jax.Array, rows: Rows, point: _Point
 ) -> tuple[jax.Array, jax.Array]:
     """Returns Newton's step [nv].
 
@@ -209,9 +212,9 @@ def _newton_direction(
     half the product of gradient and step, up to the sign; it keeps its digits near the minimum,
     where the difference of two costs would be rounding error.
     """
-    active_mass = jnp.where(_active(rows, point.residual), rows.constraint_mass, 0)
+    active_mass = jnp.where(rows.active(point.residual), rows.constraint_mass, 0)
     hessian, joint_force = contact_rows.weighted(
-        division, inertia, rows.jacobian, active_mass, _force(rows, point)
+        division, inertia, rows.jacobian, active_mass, rows.force(point.residual)
     )
     gradient = point.imbalance - joint_force
     direction = -solve(hessian, gradient)
@@ -219,12 +222,7 @@ def _newton_direction(
 
 
 def _line_search(
-    rows: _Rows,
-    point: _Point,
-    change: jax.Array,
-    slope: jax.Array,
-    curvature: jax.Array,
-    max_rounds: int,
+    rows: Rows, point: _Point, change: jax.Array, without_rows: Line, max_rounds: int
 ) -> jax.Array:
     """Returns the length of the step that leads to the least cost, [].
 
@@ -232,8 +230,7 @@ def _line_search(
       rows: the constraints.
       point: where the step starts.
       change: [rows] how the residual changes along it.
-      slope: [] the derivative there, without rows.
-      curvature: [] how that derivative changes along the step.
+      without_rows: the derivative along it that has no rows.
       max_rounds: lengths to evaluate at most.
     """
     row_slope = rows.constraint_mass * change * point.residual
@@ -241,14 +238,14 @@ def _line_search(
 
     def line(active: jax.Array) -> Line:
         return Line(
-            slope + jnp.sum(jnp.where(active, row_slope, 0)),
-            curvature + jnp.sum(jnp.where(active, row_curvature, 0)),
+            without_rows.at_zero + jnp.sum(jnp.where(active, row_slope, 0)),
+            without_rows.rate + jnp.sum(jnp.where(active, row_curvature, 0)),
         )
 
     def at(length: jax.Array) -> Line:
         return line(rows.equality | (point.residual + length * change < 0))
 
-    return root(line(_active(rows, point.residual)), at, max_rounds)
+    return root(line(rows.active(point.residual)), at, max_rounds)
 
 
 def root(first: Line, at: Callable[[jax.Array], Line], max_rounds: int) -> jax.Array:

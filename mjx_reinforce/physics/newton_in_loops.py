@@ -7,7 +7,7 @@ computed again in each step, where ``newton`` carries them on: less code, and mo
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,36 +17,7 @@ from mujoco import mjx
 from mjx_reinforce.fused import skippable
 from mjx_reinforce.physics import contact_rows, newton
 from mjx_reinforce.physics.mjx_internals import jax_fields
-
-
-class _Rows(NamedTuple):
-    """The rows of contacts of one dimension; those of no contact as if of one.
-
-    jacobian: [contacts, rows of a contact, nv] J
-    reference: [contacts, rows of a contact] r
-    constraint_mass: [contacts, rows of a contact] D
-    equality: [contacts, rows of a contact] whether a row is active on both sides
-    """
-
-    jacobian: jax.Array
-    reference: jax.Array
-    constraint_mass: jax.Array
-    equality: jax.Array
-
-
-class _Search(NamedTuple):
-    """The state of Newton's method.
-
-    qacc: [nv] the acceleration reached
-    imbalance: [nv] M a minus the unconstrained forces
-    steps: [] how many were made
-    settled: [] whether the last step led to the minimum
-    """
-
-    qacc: jax.Array
-    imbalance: jax.Array
-    steps: jax.Array
-    settled: jax.Array
+from mjx_reinforce.physics.newton import Line, Rows, Search
 
 
 def solve_in_loops(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -54,20 +25,19 @@ def solve_in_loops(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Arr
     groups, inertia = _groups(model, data), mjx.full_m(model, data)
     smallest = newton.smallest_decrement(model, inertia)
 
-    def improve(search: _Search) -> _Search:
-        direction, decrement, residuals = _newton_direction(groups, inertia, search)
+    def improve(search: Search) -> Search:
+        qacc, imbalance = search.point
+        direction, decrement, residuals = _newton_direction(groups, inertia, *search.point)
         change_of_imbalance = inertia @ direction
-        without_rows = newton.Line(
-            jnp.dot(direction, search.imbalance), jnp.dot(direction, change_of_imbalance)
-        )
+        without_rows = Line(jnp.dot(direction, imbalance), jnp.dot(direction, change_of_imbalance))
         _, changes = _fold(lambda _, rows: (None, rows.jacobian @ direction), None, groups)
 
-        def line(length: jax.Array) -> newton.Line:
-            def add(line: newton.Line, one: tuple) -> tuple[newton.Line, None]:
+        def line(length: jax.Array) -> Line:
+            def add(line: Line, one: tuple) -> tuple[Line, None]:
                 rows, residual, change = one
-                active = _active(rows, residual + length * change)
+                active = rows.active(residual + length * change)
                 weighted = jnp.where(active, rows.constraint_mass * change, 0)
-                return newton.Line(
+                return Line(
                     line.at_zero + jnp.dot(weighted, residual),
                     line.rate + jnp.dot(weighted, change),
                 ), None
@@ -78,47 +48,37 @@ def solve_in_loops(model: mjx.Model, data: mjx.Data) -> tuple[jax.Array, jax.Arr
 
         def compare(same: jax.Array, one: tuple) -> tuple[jax.Array, None]:
             rows, residual, change = one
-            after = _active(rows, residual + length * change)
-            return same & jnp.all(after == _active(rows, residual)), None
+            after = rows.active(residual + length * change)
+            return same & jnp.all(after == rows.active(residual)), None
 
         same, _ = _fold(compare, jnp.array(True), groups, residuals, changes)
-        return _Search(
-            search.qacc + length * direction,
-            search.imbalance + length * change_of_imbalance,
-            search.steps + 1,
-            same | (decrement < smallest),
-        )
+        after = qacc + length * direction, imbalance + length * change_of_imbalance
+        return Search(after, search.steps + 1, same | (decrement < smallest))
 
-    start = data.qacc_smooth, jnp.zeros_like(data.qacc_smooth), jnp.int32(0), jnp.array(False)
-    qacc = lax.while_loop(
-        lambda search: ~search.settled & (search.steps < model.opt.iterations),
-        improve,
-        _Search(*start),
-    ).qacc
+    start = data.qacc_smooth, jnp.zeros_like(data.qacc_smooth)
+    qacc, _ = newton.descend(model, improve, start)
 
-    def push(joint_force: jax.Array, rows: _Rows) -> tuple[jax.Array, jax.Array]:
+    def push(joint_force: jax.Array, rows: Rows) -> tuple[jax.Array, jax.Array]:
         residual = rows.jacobian @ qacc - rows.reference
-        force = jnp.where(_active(rows, residual), -rows.constraint_mass * residual, 0)
+        force = rows.force(residual)
         return joint_force + rows.jacobian.T @ force, force
 
     joint_force, forces = _fold(push, jnp.zeros_like(qacc), groups)
     return qacc, joint_force, jnp.concatenate([force.reshape(-1) for force in forces])
 
 
-def _groups(model: mjx.Model, data: mjx.Data) -> list[_Rows]:
-    """Divides the rows into those of no contact and those of the contacts of each dimension."""
+def _groups(model: mjx.Model, data: mjx.Data) -> list[Rows]:
+    """Divides the rows into those of no contact and those of the contacts of each dimension.
+
+    The arrays are [contacts, rows of a contact, ...]; the rows of no contact are as if of one.
+    """
     fields = jax_fields(data)
     others = fields.ne + fields.nf + fields.nl
     division = contact_rows.blocks(others, fields.contact.dim, contact_rows.couplings(model))
     equality = jnp.arange(fields.efc_D.size) < fields.ne
     rows = fields.efc_J, fields.efc_aref, fields.efc_D, equality
     contacts = zip(*(contact_rows.by_group(division, x) for x in rows), strict=True)
-    return [_Rows(*(x[None, :others] for x in rows)), *(_Rows(*each) for each in contacts)]
-
-
-def _active(rows: _Rows, residual: jax.Array) -> jax.Array:
-    """Returns which of a contact's rows push; a NaN pushes, so that it is not lost."""
-    return rows.equality | ~(residual >= 0)
+    return [Rows(*(x[None, :others] for x in rows)), *(Rows(*each) for each in contacts)]
 
 
 def _fold(step: Callable, start: Any, *groups: Sequence) -> tuple[Any, list]:
@@ -140,13 +100,13 @@ def _fold(step: Callable, start: Any, *groups: Sequence) -> tuple[Any, list]:
 
 
 def _newton_direction(
-    groups: list[_Rows], inertia: jax.Array, search: _Search
+    groups: list[Rows], inertia: jax.Array, qacc: jax.Array, imbalance: jax.Array
 ) -> tuple[jax.Array, jax.Array, list[jax.Array]]:
     """Returns the step [nv], by how much the cost would fall [], see ``newton``, and residuals."""
 
-    def add(sums: tuple, rows: _Rows) -> tuple[tuple, jax.Array]:
-        residual = rows.jacobian @ search.qacc - rows.reference
-        mass = jnp.where(_active(rows, residual), rows.constraint_mass, 0)
+    def add(sums: tuple, rows: Rows) -> tuple[tuple, jax.Array]:
+        residual = rows.jacobian @ qacc - rows.reference
+        mass = jnp.where(rows.active(residual), rows.constraint_mass, 0)
 
         def pushed() -> tuple:
             hessian, gradient = sums
@@ -155,7 +115,7 @@ def _newton_direction(
 
         return skippable(jnp.any(mass != 0), pushed, sums), residual
 
-    (hessian, gradient), residuals = _fold(add, (inertia, search.imbalance), groups)
+    (hessian, gradient), residuals = _fold(add, (inertia, imbalance), groups)
     direction = -_inverse_times(hessian, gradient)
     return direction, -jnp.dot(gradient, direction) / 2, residuals
 

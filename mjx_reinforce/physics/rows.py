@@ -40,9 +40,6 @@ def make_constraint(model: mjx.Model, data: mjx.Data, may_unroll: bool = True) -
     if model.opt.disableflags & mjx.DisableBit.CONSTRAINT or not contact.dim.size:
         return _with_changes(model, mjx.make_constraint(model, data))
 
-    def whole() -> list[jax.Array]:
-        return rows_of(mjx.make_constraint(model, data))
-
     def in_turn() -> list[jax.Array]:
         parts = [rows_of(mjx.make_constraint(model, with_contact(data, contact, np.zeros(0, int))))]
         for dim in (1, 3, 4, 6):
@@ -51,6 +48,7 @@ def make_constraint(model: mjx.Model, data: mjx.Data, may_unroll: bool = True) -
                 parts.append(_contact_rows(model, data, int(dim), chosen))
         return [jnp.concatenate(part) for part in zip(*parts, strict=True)]
 
+    whole = lambda: rows_of(mjx.make_constraint(model, data))  # noqa: E731
     rows = by_engine(in_turn, whole, may_unroll=may_unroll)
     return _with_changes(model, with_rows(data, rows))
 

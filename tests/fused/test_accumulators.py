@@ -113,6 +113,7 @@ def loops_of(function):
 FUNCTIONS = [added_up, twice, start_read_again, begun_again, never_read, ends_early]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("few", [True, False], ids=["in registers", "in place"])
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_machine_code_gives_the_results_of_vmap(function, few, monkeypatch):

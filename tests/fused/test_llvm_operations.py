@@ -5,9 +5,9 @@ import pytest
 from jax import lax
 from lane_code import call, engine
 
+from mjx_reinforce.fused.backends.llvm_lanes import Lanes
 from mjx_reinforce.fused.backends.llvm_operations import OPERATIONS
-from mjx_reinforce.fused.backends.llvm_text import Text
-from mjx_reinforce.fused.errors import UnsupportedPrimitive
+from mjx_reinforce.fused.jaxprs import UnsupportedPrimitive
 from mjx_reinforce.fused.ops import Op
 
 pytest.importorskip("llvmlite", reason="machine code is written by llvmlite")
@@ -31,7 +31,11 @@ def run(name, *operands, dtype=None, **params):
     kinds = [x.dtype for x in operands]
     dtype = np.dtype(dtype or kinds[-1])
     op = Op(name, tuple(sorted(params.items())))
-    write = lambda text, names: OPERATIONS[name](text, op, dtype, kinds, names)  # noqa: E731
+
+    def write(text, names):
+        lanes = [Lanes(text, kind, each) for kind, each in zip(kinds, names, strict=True)]
+        return OPERATIONS[name](op, dtype, *lanes).name
+
     return call(engine(write, kinds, dtype, LANES), operands, np.zeros(LANES, dtype))
 
 
@@ -185,5 +189,5 @@ def test_bits_stay():
 
 
 def test_what_has_no_instruction_is_refused():
-    with pytest.raises(UnsupportedPrimitive, match="no instruction for 'zeta'"):
-        OPERATIONS["zeta"](Text(LANES), Op("zeta"), np.dtype("f4"), [], [])
+    with pytest.raises(UnsupportedPrimitive, match="no instruction for 'nextafter'"):
+        OPERATIONS["nextafter"](Op("nextafter"), np.dtype("f4"))

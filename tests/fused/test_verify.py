@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
+from verify import verify
 
 from mjx_reinforce import fused
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.fused.nodes import Node
 from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
-from mjx_reinforce.fused.passes.verify import verify
 
 
 def program(x):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.physics import constraints, limits, newton
+from mjx_reinforce.physics import limits, newton, step
 
 SMOOTH = np.float32([3.0, 4.0])
 
@@ -20,7 +20,10 @@ def data_of(rows=((0.0, 0.0), (0.0, 0.0)), dist=(0.1,), margin=(0.0,), ne=0, nf=
         efc_J=jnp.float32(rows), efc_force=jnp.ones(2), ne=ne, nf=nf, nl=nl, contact=contact
     )
     return types.SimpleNamespace(
-        _impl=fields, qacc_smooth=jnp.asarray(SMOOTH), qfrc_constraint=jnp.ones(2)
+        _impl=fields,
+        qacc_smooth=jnp.asarray(SMOOTH),
+        qfrc_constraint=jnp.ones(2),
+        replace=lambda **changed: changed.values(),
     )
 
 
@@ -37,13 +40,14 @@ def solve(monkeypatch):
         monkeypatch.setattr(limits, "solve_limits", lambda *_: solution(1.0))
         monkeypatch.setattr(newton, "supports", lambda *_: ours)
         monkeypatch.setattr(newton, "solve_newton", None)
-        monkeypatch.setattr(constraints.touching, "solve_touching", lambda *_: solution(2.0))
+        monkeypatch.setattr(step.touching, "solve_touching", lambda *_: solution(2.0))
         named = dict(zip(("qacc", "qfrc_constraint", "force"), solution(3.0), strict=True))
         force = types.SimpleNamespace(efc_force=named.pop("force"))
         theirs = types.SimpleNamespace(**named, _impl=force)
-        monkeypatch.setattr(constraints.mjx, "solve", lambda *_: theirs)
-        monkeypatch.setattr(constraints, "with_solution", lambda data, *found: found)
-        return [np.asarray(x).tolist() for x in constraints.solve(None, data)]  # pyright: ignore
+        monkeypatch.setattr(step.mjx, "solve", lambda *_: theirs)
+        with_force = lambda found, efc_force: [*found, efc_force]  # noqa: E731
+        monkeypatch.setattr(step, "with_fields", with_force)
+        return [np.asarray(x).tolist() for x in step.solve_constraints(None, data)]  # pyright: ignore
 
     return of
 

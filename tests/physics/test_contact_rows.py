@@ -65,7 +65,7 @@ def test_rows_of_a_contact_are_two_for_each_direction_of_friction():
     np.testing.assert_array_equal(group.pyramid, [[1, 1, 0], [1, -1, 0], [1, 0, 1], [1, 0, -1]])
 
 
-@pytest.mark.parametrize("pushing", [[], [0], [2, 3, 5], range(6)])
+@pytest.mark.parametrize("pushing", [[], [2, 3, 5], range(6)])
 def test_weighted(division, pushing):
     rows, mass, force = problem(division, [*pushing])
     start = np.eye(NV) + 1
@@ -77,7 +77,7 @@ def test_weighted(division, pushing):
     np.testing.assert_allclose(made[1], rows.T @ force, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("touching", [[], [1], [0, 2, 4], [3, 5], range(6)])
+@pytest.mark.parametrize("touching", [[], [0, 2, 4], range(6)])
 def test_along(division, touching):
     """Rows of contacts that do not touch are zero."""
     rows, direction = jacobian_of(division), np.arange(1.0, NV + 1)
@@ -99,7 +99,7 @@ def test_a_contact_that_does_not_touch_costs_no_product(monkeypatch):
     np.testing.assert_array_equal(made, [NV] * 4 + [0] * 4)
 
 
-@pytest.mark.parametrize("env_id", ["Ant-v5", "HalfCheetah-v5", "Humanoid-v5", "Hopper-v5"])
+@pytest.mark.parametrize("env_id", ["Ant-v5", pytest.param("Humanoid-v5", marks=pytest.mark.slow)])
 def test_what_no_contact_couples_is_zero_in_every_jacobian(env_id):
     """Against MJX's rows with all contacts touching, at random poses."""
     env = envs.make(env_id)

@@ -1,10 +1,13 @@
 """Contacts of every pair of types of geoms that is right, in five poses, against C MuJoCo."""
 
+import types
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from mujoco import mjx
 from scipy.spatial.transform import Rotation
 
 from mjx_reinforce.envs import models
@@ -78,51 +81,69 @@ RIGHT = [
 ]
 
 
-@pytest.mark.parametrize("pair", RIGHT, ids="-".join)
-def test_contacts_are_those_of_mujoco(pair):
-    model, qpos = compiled(*pair), poses(*pair)
-    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+@pytest.fixture(scope="module")
+def all_pairs():
+    """A model of all pairs, each of which meets only within itself, and MJX's contacts of poses."""
+    bodies = "".join(
+        f'<geom type="{GEOMS[first]}" contype="{1 << k}" conaffinity="{1 << k}"/><body><freejoint/>'
+        f'<geom type="{GEOMS[second]}" contype="{1 << k}" conaffinity="{1 << k}"/></body>'
+        for k, (first, second) in enumerate(RIGHT)
+    )
+    text = f"<mujoco><worldbody>{bodies}</worldbody></mujoco>"
+    model = mujoco.MjModel.from_xml_string(text)  # pyright: ignore[reportAttributeAccessIssue]
+    qpos = np.concatenate([poses(*pair) for pair in RIGHT], axis=1)
     with jax.enable_x64(True):
-        mx = models.to_mjx(model, "pair")
-        start = models.make_data(mx)
+        mx = mjx.put_model(model, impl="jax")
+        start = mjx.make_data(model, impl="jax")
 
         def collide(place):
-            found = contacts.fwd_position(mx, start.replace(qpos=jnp.append(place, 0.0)))
-            return jax_fields(found).contact
+            return jax_fields(contacts.fwd_position(mx, start.replace(qpos=place))).contact
 
-        unoptimized = {"xla_backend_optimization_level": 0}
-        found = jax.jit(jax.vmap(collide), compiler_options=unoptimized)(qpos)
-        found = jax.tree.map(np.asarray, found)
-    touching = 0
-    for i, place in enumerate(qpos):
-        data.qpos[:7] = place
-        mujoco.mj_forward(model, data)  # pyright: ignore[reportAttributeAccessIssue]
-        touches = np.flatnonzero(found.dist[i] < 0)
+        lowered = jax.jit(jax.vmap(collide)).lower(jnp.asarray(qpos))
+        found = lowered.compile()(jnp.asarray(qpos))
+    found = jax.tree.map(np.asarray, found)
+    return types.SimpleNamespace(model=model, qpos=qpos, found=found, text=lowered.as_text())
+
+
+@pytest.fixture(scope="module")
+def theirs(all_pairs):
+    """C's contacts: of each pose, rows of a pair's number, distance, place and frame."""
+    data, rows = mujoco.MjData(all_pairs.model), []  # pyright: ignore[reportAttributeAccessIssue]
+    for place in all_pairs.qpos:
+        data.qpos[:] = place
+        mujoco.mj_forward(all_pairs.model, data)  # pyright: ignore[reportAttributeAccessIssue]
+        parts = ((c.geom1 % len(RIGHT), [c.dist], c.pos, c.frame) for c in data.contact)
+        rows.append([(number, np.concatenate(row)) for number, *row in parts])
+    return rows
+
+
+@pytest.mark.parametrize("pair", RIGHT, ids="-".join)
+def test_contacts_are_those_of_mujoco(all_pairs, theirs, pair):
+    number, found, touching = RIGHT.index(pair), all_pairs.found, 0
+    for i, rows in enumerate(theirs):
+        touches = np.flatnonzero((found.dist[i] < 0) & (found.geom[i, :, 0] % len(RIGHT) == number))
         ours = [
             np.concatenate([found.dist[i, k, None], found.pos[i, k], found.frame[i, k].ravel()])
             for k in touches
         ]
-        theirs = [np.concatenate([[c.dist], c.pos, c.frame]) for c in data.contact]
-        assert len(ours) == len(theirs), (i, ours, theirs)
+        exact = [row for of, row in rows if of == number]
+        assert len(ours) == len(exact), (i, ours, exact)
         touching += bool(ours)
         key = lambda row: tuple(np.round(row[:4], 4) + 0.0)  # noqa: E731
-        for mine, exact in zip(sorted(ours, key=key), sorted(theirs, key=key), strict=True):
-            np.testing.assert_allclose(mine, exact, rtol=0, atol=TOLERANCE.get(pair, 1e-12))
+        for mine, row in zip(sorted(ours, key=key), sorted(exact, key=key), strict=True):
+            np.testing.assert_allclose(mine, row, rtol=0, atol=TOLERANCE.get(pair, 1e-12))
     assert touching >= 4
 
 
-def test_the_search_along_a_capsule_is_written_out():
+def test_the_search_along_a_capsule_is_written_out(all_pairs):
     """A loop in XLA stalls jaxlib 0.10.2."""
-    mx = models.to_mjx(compiled("cylinder", "capsule"), "pair")
-    program = jax.jit(lambda data: contacts.fwd_position(mx, data)).lower(models.make_data(mx))
-    assert "stablehlo.while" not in program.as_text()
+    assert "stablehlo.while" not in all_pairs.text
 
 
-@pytest.mark.parametrize("pair", contacts.UNLIKE_C)
-def test_pairs_that_mjx_gets_wrong_are_refused_if_they_can_meet(pair):
-    names = [kind.name.lower() for kind in pair]
-    model = compiled(*names)
-    with pytest.raises(ValueError, match="which MJX gets wrong; keep that pair apart"):
+def test_pairs_that_mjx_gets_wrong_are_refused_if_they_can_meet():
+    for pair in contacts.UNLIKE_C:
+        model = compiled(*(kind.name.lower() for kind in pair))
+        with pytest.raises(ValueError, match="which MJX gets wrong; keep that pair apart"):
+            models.to_mjx(model, "pair")
+        model.geom_contype[0] = model.geom_conaffinity[0] = 0
         models.to_mjx(model, "pair")
-    model.geom_contype[0] = model.geom_conaffinity[0] = 0
-    models.to_mjx(model, "pair")

@@ -1,5 +1,7 @@
 """The constraint solver of contact tasks against MJX's own, taken to the optimum."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -10,7 +12,7 @@ from mujoco import mjx
 from mjx_reinforce import envs
 from mjx_reinforce.physics import contact_rows, newton, newton_in_loops
 from mjx_reinforce.physics import step as physics
-from mjx_reinforce.physics.mjx_internals import jax_fields
+from mjx_reinforce.physics.mjx_internals import jax_fields, with_fields
 
 SCENE = """
 <mujoco>
@@ -50,57 +52,79 @@ def random_states(model, count):
     return jnp.asarray(qpos), jnp.asarray(qvel), jnp.asarray(warmstart)
 
 
-def test_finds_the_optimum_that_mjx_finds():
-    """Contacts, a limit and an equality constraint together, from good and bad starts."""
-    with jax.enable_x64(True):
-        model, data = scene()
-        states = random_states(model, 64)
-
-        def both(*state):
-            ready = rows_at(model, data, *state)
-            theirs = mjx.solve(model, ready)
-            expected = theirs.qacc, theirs.qfrc_constraint, jax_fields(theirs).efc_force
-            return newton.solve_newton(model, ready), expected
-
-        actual, expected = jax.jit(jax.vmap(both))(*states)
-    assert (np.asarray(expected[2]) != 0).mean() > 0.1
-    for ours, theirs in zip(actual, expected, strict=True):
-        scale = 1 + np.abs(theirs).max(axis=1, keepdims=True)
-        assert np.max(np.abs(ours - theirs) / scale) < 1e-9
-
-
-def test_in_loops_it_finds_the_same():
-    """As for more contacts than there is room for; of two dimensions."""
+@pytest.fixture(scope="module")
+def problems():
+    """A model and 64 problems: contacts of two dimensions, a limit and an equality together."""
     with jax.enable_x64(True):
         model, data = scene(geom='condim="1"')
+        assert {1, 3} == {*jax_fields(data).contact.dim}
+        make = jax.jit(jax.vmap(functools.partial(rows_at, model, data)))
+        return model, make(*random_states(model, 64))
 
-        def both(*state):
-            ready = rows_at(model, data, *state)
-            return newton_in_loops.solve_in_loops(model, ready), newton.solve_newton(model, ready)
 
-        actual, expected = jax.jit(jax.vmap(both))(*random_states(model, 64))
-    assert {1, 3} == {*jax_fields(data).contact.dim}
-    for ours, theirs in zip(actual, expected, strict=True):
+@pytest.fixture(scope="module")
+def solve(problems):
+    """Solves problems within a number of steps, and as many of each line search."""
+    models = {np.dtype(np.float64): problems[0], np.dtype(np.float32): in_single(problems[0])}
+
+    @jax.jit
+    def within(ready, cap):
+        model = models[ready.qpos.dtype]
+        model = model.replace(opt=model.opt.replace(iterations=cap, ls_iterations=cap))
+        return jax.vmap(functools.partial(newton.solve_newton, model))(ready)
+
+    def solved(ready, cap=100):
+        with jax.enable_x64(ready.qpos.dtype == np.float64):
+            return [np.asarray(x) for x in within(ready, cap)]
+
+    return solved
+
+
+def in_single(tree):
+    def single(x):
+        is_double = getattr(x, "dtype", None) == np.float64
+        return np.asarray(x).astype(np.float32) if is_double else x
+
+    return jax.tree.map(single, tree)
+
+
+def assert_same_solutions(actual, expected, tolerance):
+    for pair in zip(actual, expected, strict=True):
+        ours, theirs = map(np.asarray, pair)
         scale = 1 + np.abs(theirs).max(axis=1, keepdims=True)
-        assert np.max(np.abs(ours - theirs) / scale) < 1e-11
+        assert np.max(np.abs(ours - theirs) / scale) < tolerance
 
 
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_ends_where_the_gradient_vanishes(dtype):
+def test_finds_the_optimum_that_mjx_finds(problems, solve):
+    """From good and bad starts."""
+    model, ready = problems
+    with jax.enable_x64(True):
+        end = jax.jit(jax.vmap(functools.partial(mjx.solve, model)))(ready)
+    expected = end.qacc, end.qfrc_constraint, jax_fields(end).efc_force
+    assert (np.asarray(expected[2]) != 0).mean() > 0.1
+    assert_same_solutions(solve(ready), expected, 1e-9)
+
+
+def test_in_loops_it_finds_the_same(problems, solve):
+    """As for more contacts than there is room for."""
+    model, ready = problems
+    with jax.enable_x64(True):
+        found = jax.jit(jax.vmap(functools.partial(newton_in_loops.solve_in_loops, model)))(ready)
+    assert_same_solutions(found, solve(ready), 1e-11)
+
+
+@pytest.mark.parametrize("double", [True, False])
+def test_ends_where_the_gradient_vanishes(problems, solve, double):
     """No reference: the acceleration balances all forces."""
-    with jax.enable_x64(dtype == "float64"):
-        model, data = scene()
-
-        def imbalance(*state):
-            ready = rows_at(model, data, *state)
-            qacc, joint_force, _ = newton.solve_newton(model, ready)
-            forces = ready.qfrc_smooth + joint_force
-            return mjx.mul_m(model, ready, qacc) - forces, forces
-
-        left, forces = jax.jit(jax.vmap(imbalance))(*random_states(model, 64))
+    model, ready = problems
+    qacc, joint_force, _ = solve(ready if double else in_single(ready))
+    with jax.enable_x64(True):
+        inertia = np.asarray(jax.vmap(functools.partial(mjx.full_m, model))(ready))
+    forces = np.asarray(ready.qfrc_smooth) + joint_force
+    left = np.einsum("bij,bj->bi", inertia, qacc) - forces
     scale = 1 + np.abs(forces).max(axis=1, keepdims=True)
-    assert left.dtype == dtype
-    assert np.max(np.abs(left) / scale) < (1e-10 if dtype == "float64" else 1e-4)
+    assert qacc.dtype == (np.float64 if double else np.float32)
+    assert np.max(np.abs(left) / scale) < (1e-10 if double else 1e-4)
 
 
 def test_the_line_search_finds_the_root_among_kinks():
@@ -110,7 +134,7 @@ def test_the_line_search_finds_the_root_among_kinks():
         residual, change = random.standard_normal((2, 12))
         mass = 10 ** random.uniform(-1, 3, 12)
         none = contact_rows.Jacobian(jnp.zeros((12, 1)), [])
-        rows = newton._Rows(none, jnp.zeros(12), jnp.asarray(mass), jnp.array(False))
+        rows = newton.Rows(none, jnp.zeros(12), jnp.asarray(mass), jnp.array(False))
         active = residual < 0
         curvature = random.uniform(0.1, 1)
         row_slope, row_curvature = mass * change * residual, mass * change**2
@@ -118,9 +142,8 @@ def test_the_line_search_finds_the_root_among_kinks():
         slope = -(curvature + (row_slope + row_curvature)[active].sum())
         zero = jnp.zeros(())
         start = newton._Point(zero, zero, jnp.asarray(residual))
-        found = newton._line_search(
-            rows, start, jnp.asarray(change), jnp.asarray(slope), jnp.asarray(curvature), 50
-        )
+        without_rows = newton.Line(jnp.asarray(slope), jnp.asarray(curvature))
+        found = newton._line_search(rows, start, jnp.asarray(change), without_rows, 50)
 
         def cost(length, args=(residual, change, mass, slope, curvature)):
             residual, change, mass, slope, curvature = args
@@ -132,17 +155,14 @@ def test_the_line_search_finds_the_root_among_kinks():
         assert cost(np.float64(found)) <= cost(grid).min() + 1e-4 * abs(cost(grid).min())
 
 
-def test_a_nan_ends_the_search():
+def test_a_nan_ends_the_search(problems, solve):
     """It reaches the acceleration, and does not keep the other episodes waiting."""
-    model, data = scene()
-    qpos, qvel, warmstart = random_states(model, 4)
-    solve = jax.jit(
-        jax.vmap(lambda *state: newton.solve_newton(model, rows_at(model, data, *state))[0])
-    )
-    clean = solve(qpos, qvel, warmstart)
-    dirty = solve(qpos, qvel.at[2].set(jnp.nan), warmstart)
-    assert np.isnan(dirty[2]).all()
-    np.testing.assert_array_equal(np.delete(dirty, 2, 0), np.delete(clean, 2, 0))
+    ready = in_single(problems[1])
+    fields = jax_fields(ready)
+    dirty = with_fields(ready, efc_aref=jnp.asarray(fields.efc_aref).at[2].set(jnp.nan))
+    clean, broken = solve(ready)[0], solve(dirty)[0]
+    assert np.isnan(broken[2]).all()
+    np.testing.assert_array_equal(np.delete(broken, 2, 0), np.delete(clean, 2, 0))
 
 
 def test_an_optimum_is_left_as_it_is():
@@ -158,43 +178,35 @@ def test_an_optimum_is_left_as_it_is():
     np.testing.assert_allclose(qacc, [0, 0, -9.81, 0, 0, 0], atol=1e-6)
 
 
-@pytest.mark.parametrize("cap", [1, 2])
-def test_caps_leave_no_more_cost_than_the_start(cap):
+def test_caps_leave_no_more_cost_than_the_start(problems, solve):
+    model, ready = problems
+    fields = jax.tree.map(np.asarray, jax_fields(ready))
     with jax.enable_x64(True):
-        model, data = scene()
-        opt = model.opt.replace(iterations=cap, ls_iterations=cap)
-        capped = model.replace(opt=opt)
+        inertia = np.asarray(jax.vmap(functools.partial(mjx.full_m, model))(ready))
 
-        def costs(*state):
-            ready = rows_at(model, data, *state)
-            fields = jax_fields(ready)
+    def cost(qacc):
+        residual = np.einsum("brj,bj->br", fields.efc_J, qacc) - fields.efc_aref
+        equality = np.arange(residual.shape[1]) < fields.ne
+        pushed = np.where(equality | (residual < 0), residual, 0)
+        offset = qacc - np.asarray(ready.qacc_smooth)
+        inertial = np.einsum("bi,bij,bj->b", offset, inertia, offset)
+        return (inertial + (fields.efc_D * pushed**2).sum(axis=1)) / 2
 
-            def cost(qacc):
-                residual = fields.efc_J @ qacc - fields.efc_aref
-                equality = jnp.arange(residual.size) < fields.ne
-                pushed = jnp.where(equality | (residual < 0), residual, 0)
-                offset = qacc - ready.qacc_smooth
-                inertial = offset @ mjx.mul_m(model, ready, offset)
-                return (inertial + jnp.sum(fields.efc_D * pushed**2)) / 2
-
-            return cost(newton.solve_newton(capped, ready)[0]), cost(ready.qacc_smooth)
-
-        after, before = jax.jit(jax.vmap(costs))(*random_states(model, 64))
-    assert np.all(np.asarray(after) <= np.asarray(before))
-    assert np.median(np.asarray(after) / np.asarray(before)) < 0.5
+    before = cost(np.asarray(ready.qacc_smooth))
+    for cap in (1, 2):
+        after = cost(solve(ready, cap)[0])
+        assert np.all(after <= before)
+        assert np.median(after / before) < 0.5
 
 
-@pytest.mark.parametrize(
-    ("options", "ours"),
-    [
+def test_other_models_go_to_mjx():
+    for options, ours in (
         ({}, True),
         ({"cone": "elliptic"}, False),
         ({"solver": "CG"}, False),
         ({"joint": 'frictionloss="1"'}, False),
-    ],
-)
-def test_other_models_go_to_mjx(options, ours):
-    assert newton.supports(*scene(**options)) == ours
+    ):
+        assert newton.supports(*scene(**options)) == ours, options
 
 
 def test_every_task_with_contacts_is_solved_here():

@@ -116,8 +116,13 @@ def test_connects_and_welds_ask_for_what_c_asks():
     mujoco.mj_forward(model, data)  # pyright: ignore
     with jax.enable_x64(True):
         ours, start = mjx.put_model(model, impl="jax"), mjx.put_data(model, data, impl="jax")
-        found = jax.jit(lambda data: jax_fields(rows.make_constraint(ours, data)).efc_aref)(start)
-        plain = jax_fields(mjx.make_constraint(ours, start)).efc_aref
+
+        @jax.jit
+        def both(data):
+            made = rows.make_constraint(ours, data), mjx.make_constraint(ours, data)
+            return [jax_fields(each).efc_aref for each in made]
+
+        found, plain = both(start)
     connect_first = [*range(6, 9), *range(6), *range(9, 15)]
     theirs = data.efc_aref[connect_first]
     np.testing.assert_allclose(found[:15], theirs, rtol=1e-10, atol=1e-10)

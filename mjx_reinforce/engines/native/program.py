@@ -23,7 +23,7 @@ from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Environment, PyTree
 
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
-LOOPS = Limits(plain=1, arrays=1, unrollable=1)
+LOOPS = Limits(scans=1, unrollable=1)
 #: On GPUs a loop over few contacts is written out: an array that a loop reads is in memory there.
 GPU_LOOPS = LOOPS._replace(unrollable=scratch.WRITTEN_OUT)
 #: The folders whose files decide what is written for a step.

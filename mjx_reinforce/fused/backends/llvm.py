@@ -1,6 +1,5 @@
 """Turns the scalar graph into LLVM IR: one instruction on a lane vector for each node."""
 
-import dataclasses
 import itertools
 import math
 from collections import Counter
@@ -10,40 +9,32 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from mjx_reinforce.fused.backends.backend import Backend
+from mjx_reinforce.fused.backends.llvm_lanes import Lanes
 from mjx_reinforce.fused.backends.llvm_operations import OPERATIONS
 from mjx_reinforce.fused.backends.llvm_text import Text, literal
-from mjx_reinforce.fused.errors import UnsupportedPrimitive
+from mjx_reinforce.fused.jaxprs import UnsupportedPrimitive
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
 from mjx_reinforce.fused.ops import Op
 from mjx_reinforce.fused.passes.accumulators import accumulators, reads, unread
 from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop, Schedule
 
 
-class Input(NamedTuple):
-    """An argument: lane vectors, one after the other, that stay as they are until the end.
-
-    pointer: where the first lies.
-    dtype: of their entries.
-    align: bytes of which the pointer is known to be a multiple; 1 leaves it to the dtype.
-    """
-
-    pointer: str
-    dtype: np.dtype
-    align: int = 1
-
-
-@dataclasses.dataclass(frozen=True)
-class Memory:
+class Memory(NamedTuple):
     """A value that stays in memory and is loaded wherever it is used: registers are few.
 
-    pointer: where its lane vector lies.
-    dtype: of its entries.
-    align: as of ``Input``. Neighbours that are known to be aligned are loaded together.
+    pointer: where its lane vector lies; the first one of an input, which stays until the end.
+    dtype: of the entries.
+    align: bytes of which the pointer is known to be a multiple; 1 leaves it to the dtype.
+      Neighbours that are known to be aligned are loaded together.
     """
 
     pointer: str
     dtype: np.dtype
     align: int = 1
+
+
+#: An argument: lane vectors, one after the other.
+Input = Memory
 
 
 class Places(NamedTuple):
@@ -113,8 +104,9 @@ class LLVM(Backend[Value]):
     def node(self, node: Node, operands: list[Value]) -> Value:
         """Writes one operation."""
         op = cast(Op, node.op)  # leaves are not scheduled
-        kinds = [np.dtype(arg.dtype) for arg in node.args]
-        made = OPERATIONS[op.name](self._text, op, node.dtype, kinds, cast(list[str], operands))
+        named = zip(node.args, cast(list[str], operands), strict=True)
+        lanes = [Lanes(self._text, np.dtype(arg.dtype), name) for arg, name in named]
+        made = OPERATIONS[op.name](op, node.dtype, *lanes).name
         if node in self._stored:
             self._text.store(made, self._stored[node].pointer, node.dtype)
         return made
@@ -169,7 +161,7 @@ class LLVM(Backend[Value]):
         carries = [carry for carry in loop.carries if carry.leaf not in idle]
         inits = [self.value(carry.init, values) for carry in carries]
         readers = [self._reader(e.leaf, e.values, values) for e in loop.elements]
-        kept = [self.reserve(_dtype(r.value), loop.length or 0) for r in loop.records]
+        kept = [self.reserve(r.value.dtype, loop.length or 0) for r in loop.records]
         before, head, after = text.block, text.label(), text.label()
         text.line(f"br label %{head}")
         text.start(head)
@@ -186,7 +178,7 @@ class LLVM(Backend[Value]):
             known[element.leaf] = reader(count)
         inner = self.inside(loop.body, values, known)
         for record, array in zip(loop.records, kept, strict=True):
-            dtype = _dtype(record.value)
+            dtype = record.value.dtype
             text.store(self.value(record.value, inner), self._text.at(array, dtype, count), dtype)
         nexts = [self.value(carry.next, inner) for carry in carries]
         kinds = [text.type(carry.leaf.dtype) for carry in carries]
@@ -209,7 +201,7 @@ class LLVM(Backend[Value]):
         ]
         return ends, [
             [
-                Memory(self._text.at(array, _dtype(r.value), t), _dtype(r.value))
+                Memory(self._text.at(array, r.value.dtype, t), r.value.dtype)
                 for t in range(len(r.outs))
             ]
             for r, array in zip(loop.records, kept, strict=True)
@@ -305,10 +297,6 @@ class LLVM(Backend[Value]):
         index = self._text.let(f"add i64 {step}, {place.start}")
         align = math.gcd(align, dtype.itemsize * place.stride, dtype.itemsize * place.start)
         return Memory(self._text.at(pointer, dtype, index), dtype, align)
-
-
-def _dtype(scalar: Any) -> np.dtype:
-    return np.dtype(scalar.dtype)
 
 
 def _evenly_spaced(row: Sequence[Scalar]) -> Places | None:

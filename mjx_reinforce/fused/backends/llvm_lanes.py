@@ -1,6 +1,7 @@
 """Lane vectors under Python's operators, so that formulas written in LLVM IR read as formulas."""
 
-from typing import NamedTuple
+import dataclasses
+from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -13,15 +14,23 @@ INFINITY = float("inf")
 ROUND = 1.5 * 2.0**23
 
 _BITS = {"float32": np.int32, "float64": np.int64, "int32": np.float32, "int64": np.float64}
-#: Instructions on floats, and on integers.
-_INSTRUCTIONS = {
-    "+": ("fadd contract", "add"),
-    "-": ("fsub contract", "sub"),
-    "*": ("fmul contract", "mul"),
-}
 
 
-class Lanes(NamedTuple):
+def _writes(on_floats: str, on_integers: str = "") -> Any:
+    """Returns an operator: an instruction on floats, and one on integers where it is another."""
+
+    def operator(x: "Lanes", y: "Lanes | float") -> "Lanes":
+        return x.write(on_floats if x.dtype.kind == "f" else on_integers or on_floats, y)
+
+    return operator
+
+
+def _compares(predicate: str) -> Any:
+    return lambda x, y: x.compare(predicate, y)
+
+
+@dataclasses.dataclass(eq=False, slots=True)
+class Lanes:
     """A lane vector and where it is written; a Python number beside it stands in every lane.
 
     A product that a sum takes may become one fused operation, rounded once, where the machine
@@ -40,8 +49,7 @@ class Lanes(NamedTuple):
         """Returns a number as a lane vector of this dtype."""
         if isinstance(number, Lanes):
             return number
-        scalar = np.asarray(number, self.dtype)
-        return Lanes(self.text, self.dtype, self.text.constant(scalar))
+        return self.named(self.text.constant(np.asarray(number, self.dtype)))
 
     def write(
         self, operation: str, *operands: "Lanes | float", dtype: DTypeLike | None = None
@@ -51,23 +59,13 @@ class Lanes(NamedTuple):
         names = ", ".join([self.name, *(self.like(x).name for x in operands)])
         return Lanes(self.text, np.dtype(dtype or self.dtype), self.text.let(operation + names))
 
-    def _arithmetic(self, sign: str, other: "Lanes | float") -> "Lanes":
-        return self.write(_INSTRUCTIONS[sign][self.dtype.kind != "f"], other)
-
-    def __add__(self, other):
-        return self._arithmetic("+", other)
-
-    def __sub__(self, other):
-        return self._arithmetic("-", other)
-
-    def __mul__(self, other):
-        return self._arithmetic("*", other)
-
-    def __truediv__(self, other):
-        return self.write("fdiv contract", other)
-
-    __radd__ = __add__
-    __rmul__ = __mul__
+    __add__ = __radd__ = _writes("fadd contract", "add")
+    __sub__ = _writes("fsub contract", "sub")
+    __mul__ = __rmul__ = _writes("fmul contract", "mul")
+    __truediv__ = _writes("fdiv contract")
+    __and__, __or__, __xor__ = map(_writes, ("and", "or", "xor"))
+    __lshift__, __rshift__ = map(_writes, ("shl", "ashr"))
+    __lt__, __le__, __gt__, __ge__ = map(_compares, ("lt", "le", "gt", "ge"))
 
     def __rsub__(self, other):
         return self.like(other) - self
@@ -78,41 +76,14 @@ class Lanes(NamedTuple):
     def __neg__(self):
         return self.write("fneg")
 
-    def __and__(self, other):
-        return self.write("and", other)
-
-    def __or__(self, other):
-        return self.write("or", other)
-
-    def __xor__(self, other):
-        return self.write("xor", other)
-
-    def __lshift__(self, other):
-        return self.write("shl", other)
-
-    def __rshift__(self, other):
-        return self.write("ashr", other)
-
-    def __lt__(self, other):  # pyright: ignore[reportIncompatibleMethodOverride] (lanes)
-        return self.compare("lt", other)
-
-    def __le__(self, other):  # pyright: ignore[reportIncompatibleMethodOverride] (lanes)
-        return self.compare("le", other)
-
-    def __gt__(self, other):  # pyright: ignore[reportIncompatibleMethodOverride] (lanes)
-        return self.compare("gt", other)
-
-    def __ge__(self, other):  # pyright: ignore[reportIncompatibleMethodOverride] (lanes)
-        return self.compare("ge", other)
-
     def compare(self, predicate: str, other: "Lanes | float") -> "Lanes":
         """Returns a mask: "eq", "ne", "lt", "le", "gt" or "ge"; with NaN only "ne" is true."""
         if self.dtype.kind == "f":
-            return self.write(
-                f"fcmp {'u' if predicate == 'ne' else 'o'}{predicate}", other, dtype=bool
-            )
-        signed = "" if predicate in ("eq", "ne") else "s"
-        return self.write(f"icmp {signed}{predicate}", other, dtype=bool)
+            instruction = f"fcmp {'u' if predicate == 'ne' else 'o'}{predicate}"
+        else:
+            sign = "" if predicate in ("eq", "ne") else "s" if self.dtype.kind == "i" else "u"
+            instruction = f"icmp {sign}{predicate}"
+        return self.write(instruction, other, dtype=bool)
 
     def where(self, yes: "Lanes | float", no: "Lanes | float") -> "Lanes":
         """Returns one value where this mask is set and the other where it is not."""
@@ -121,14 +92,16 @@ class Lanes(NamedTuple):
         kind = self.text.type(of.dtype)
         yes, no = of.like(yes), of.like(no)
         mask = f"{self.text.type(bool)} {self.name}"
-        name = self.text.let(f"select {mask}, {kind} {yes.name}, {kind} {no.name}")
-        return Lanes(self.text, of.dtype, name)
+        return of.named(self.text.let(f"select {mask}, {kind} {yes.name}, {kind} {no.name}"))
+
+    def named(self, name: str) -> "Lanes":
+        """Returns another operand of this dtype."""
+        return Lanes(self.text, self.dtype, name)
 
     def call(self, function: str, *operands: "Lanes | float") -> "Lanes":
         """Calls an intrinsic, such as "fabs", whose operands and result have this dtype."""
         names = [self.like(x).name for x in operands]
-        name = self.text.call(f"llvm.{function}", self.dtype, self.name, *names)
-        return Lanes(self.text, self.dtype, name)
+        return self.named(self.text.call(f"llvm.{function}", self.dtype, self.name, *names))
 
     def __abs__(self):
         return self.call("fabs")

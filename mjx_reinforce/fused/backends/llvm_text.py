@@ -119,12 +119,14 @@ class Text:
 
     def call(self, function: str, dtype: DTypeLike, *operands: str) -> str:
         """Calls an intrinsic such as "llvm.sqrt" on lane vectors of one dtype."""
-        kind = self.type(dtype)
-        scalar = {"float": "f32", "double": "f64"}.get(scalar_type(dtype), scalar_type(dtype))
-        suffix = scalar if self.lanes == 1 else f"v{self.lanes}{scalar}"
-        name = f"@{function}.{suffix}"
+        kind, name = self.type(dtype), f"@{function}.{self._suffix(dtype)}"
         self.declared.add(f"declare {kind} {name}({', '.join([kind] * len(operands))})")
         return self.let(f"call {kind} {name}({', '.join(f'{kind} {x}' for x in operands)})")
+
+    def _suffix(self, dtype: DTypeLike) -> str:
+        """Returns how intrinsics' names end for lane vectors, such as "v8f32"."""
+        scalar = {"float": "f32", "double": "f64"}.get(scalar_type(dtype), scalar_type(dtype))
+        return scalar if self.lanes == 1 else f"v{self.lanes}{scalar}"
 
     def label(self) -> str:
         """Returns the name of a basic block to come."""
@@ -229,14 +231,11 @@ class Text:
 
     def gather(self, base: str, index: str, dtype: DTypeLike) -> str:
         """Loads for each lane the entry at its own index of an array."""
-        scalar, kind, lanes = scalar_type(dtype), self.type(dtype), self.lanes
+        places, kind, lanes = self._places(base, index, dtype), self.type(dtype), self.lanes
         if lanes == 1:
-            place = self.let(f"getelementptr inbounds {scalar}, ptr {base}, i64 {index}")
-            return self.let(f"load {scalar}, ptr {place}")
-        places = self.let(f"getelementptr inbounds {scalar}, ptr {base}, <{lanes} x i64> {index}")
-        bits = {"float": "f32", "double": "f64"}.get(scalar, scalar)
-        name = f"@llvm.masked.gather.v{lanes}{bits}.v{lanes}p0"
-        pointers, bools = f"<{lanes} x ptr>", f"<{lanes} x i1>"
+            return self.let(f"load {kind}, ptr {places}")
+        name = f"@llvm.masked.gather.{self._suffix(dtype)}.v{lanes}p0"
+        pointers, bools = f"<{lanes} x ptr>", self.type(bool)
         self.declared.add(f"declare {kind} {name}({pointers}, i32, {bools}, {kind})")
         align, all_lanes = np.dtype(dtype).itemsize, self.constant(np.True_)
         operands = f"{pointers} {places}, i32 {align}, {bools} {all_lanes}, {kind} poison"
@@ -244,21 +243,22 @@ class Text:
 
     def scatter(self, value: str, base: str, index: str, mask: str, dtype: DTypeLike) -> None:
         """Stores each lane's value at its own index of an array, where the mask is set."""
-        scalar, kind, lanes = scalar_type(dtype), self.type(dtype), self.lanes
+        kind, lanes = self.type(dtype), self.lanes
         if lanes == 1:
             with self.when(mask):
-                place = self.let(f"getelementptr inbounds {scalar}, ptr {base}, i64 {index}")
-                self.line(f"store {scalar} {value}, ptr {place}")
+                self.line(f"store {kind} {value}, ptr {self._places(base, index, dtype)}")
             return
-        places = self.let(f"getelementptr inbounds {scalar}, ptr {base}, <{lanes} x i64> {index}")
-        bits = {"float": "f32", "double": "f64"}.get(scalar, scalar)
-        name = f"@llvm.masked.scatter.v{lanes}{bits}.v{lanes}p0"
-        pointers, bools = f"<{lanes} x ptr>", f"<{lanes} x i1>"
+        places, align = self._places(base, index, dtype), np.dtype(dtype).itemsize
+        name = f"@llvm.masked.scatter.{self._suffix(dtype)}.v{lanes}p0"
+        pointers, bools = f"<{lanes} x ptr>", self.type(bool)
         self.declared.add(f"declare void {name}({kind}, {pointers}, i32, {bools})")
-        align = np.dtype(dtype).itemsize
-        self.line(
-            f"call void {name}({kind} {value}, {pointers} {places}, i32 {align}, {bools} {mask})"
-        )
+        operands = f"{kind} {value}, {pointers} {places}, i32 {align}, {bools} {mask}"
+        self.line(f"call void {name}({operands})")
+
+    def _places(self, base: str, index: str, dtype: DTypeLike) -> str:
+        """Returns the pointer to each lane's entry of an array."""
+        scalar, indices = scalar_type(dtype), self.type(np.int64)
+        return self.let(f"getelementptr inbounds {scalar}, ptr {base}, {indices} {index}")
 
     def mask(self, flags: str) -> str:
         """Returns a vector of bools as an integer of as many bits."""
@@ -277,8 +277,6 @@ class Text:
         """Converts a float to the nearest integer that there is, and NaN to 0."""
         sign = "s" if np.dtype(dtype).kind == "i" else "u"
         new, old = self.type(dtype), self.type(before)
-        lanes = "" if self.lanes == 1 else f"v{self.lanes}"
-        bits = {"float": "f32", "double": "f64"}[scalar_type(before)]
-        name = f"@llvm.fpto{sign}i.sat.{lanes}{scalar_type(dtype)}.{lanes}{bits}"
+        name = f"@llvm.fpto{sign}i.sat.{self._suffix(dtype)}.{self._suffix(before)}"
         self.declared.add(f"declare {new} {name}({old})")
         return self.let(f"call {new} {name}({old} {value})")

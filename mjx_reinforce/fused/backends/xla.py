@@ -10,10 +10,10 @@ from jax import lax
 
 from mjx_reinforce.fused.backends.backend import Backend
 from mjx_reinforce.fused.jaxprs import operation
-from mjx_reinforce.fused.lanes import any_lane
 from mjx_reinforce.fused.nodes import Captured, Node, Scalar, is_constant
 from mjx_reinforce.fused.ops import Op
 from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
+from mjx_reinforce.fused.primitives import any_lane
 
 Values = dict[Node, Any]
 
@@ -71,7 +71,10 @@ class XLA(Backend[Any]):
         init = [self._materialize(c.init, c.out.varying, values) for c in loop.carries]
         body = functools.partial(self._iteration, loop, values)
         if loop.records or loop.elements:
-            rows = [self._stack(e.values, e.leaf.varying, values) for e in loop.elements]
+            rows = [
+                jax.numpy.stack([self._materialize(x, e.leaf.varying, values) for x in e.values])
+                for e in loop.elements
+            ]
             final, stacked = lax.scan(body, init, rows, length=loop.length)
             return final, [
                 [kept[t] for t in range(len(record.outs))]
@@ -119,6 +122,3 @@ class XLA(Backend[Any]):
 
     def _materialize(self, scalar: Scalar, varying: bool, values: Values) -> Any:
         return self._spread(self.value(scalar, values), varying)
-
-    def _stack(self, row: list[Scalar], varying: bool, values: Values) -> jax.Array:
-        return jax.numpy.stack([self._materialize(x, varying, values) for x in row])

@@ -1,6 +1,6 @@
 """Passes: what a compiler does to the scalar graph besides writing it.
 
-``folding`` and ``simplify`` look at a node as it is made: what of constants is computed at once,
-and what need not be computed. ``liveness`` looks at the whole graph before a backend does: what the
-results need, and in which order. ``verify`` looks whether the result is well formed.
+``simplify`` looks at a node as it is made: what of constants is computed at once, and what need not
+be computed. ``liveness`` looks at the whole graph before a backend does: what the results need, and
+in which order. ``accumulators`` finds what may change in place.
 """

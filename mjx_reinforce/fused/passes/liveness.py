@@ -6,7 +6,7 @@ of their own, and keep only the values that something reads.
 
 import dataclasses
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from mjx_reinforce.fused.nodes import Gate, Loop, Node, Scalar, Scope
@@ -98,6 +98,12 @@ class LiveLoop:
 
 
 Schedule = list[Node | LiveGate | LiveLoop]
+
+
+def nodes(body: Schedule) -> Iterator[Node]:
+    """Yields the nodes of a schedule, also inside of its loops and gates."""
+    for step in body:
+        yield from [step] if isinstance(step, Node) else nodes(step.body)
 
 
 def schedule(root: Scope, results: Iterable[Scalar]) -> Schedule:

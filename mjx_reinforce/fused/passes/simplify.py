@@ -1,4 +1,4 @@
-"""Algebra on scalars: what need not be computed.
+"""What need not be computed: constants are folded, and algebra makes scalars simpler.
 
 Results are those of IEEE arithmetic, with the exceptions that the package's docstring lists:
 
@@ -10,14 +10,14 @@ Results are those of IEEE arithmetic, with the exceptions that the package's doc
 A division by a constant becomes a product only where the reciprocal is exact.
 """
 
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import numpy as np
 
-from mjx_reinforce.fused.nodes import Node, Scalar, is_constant
-from mjx_reinforce.fused.ops import Op
-from mjx_reinforce.fused.passes import folding
+from mjx_reinforce.fused import jaxprs
+from mjx_reinforce.fused.nodes import Node, Scalar, is_constant, same
+from mjx_reinforce.fused.ops import FACTS, Op
 
 # Greater powers are not faster as products than as ``pow``.
 _LARGEST_POWER = 8
@@ -28,11 +28,78 @@ class Builder(Protocol):
 
     def call(self, name: str, *args: Scalar) -> Scalar:
         """Applies one of the named operations to scalars."""
-        ...
 
     def select(self, predicate: Scalar, on_true: Scalar, on_false: Scalar) -> Scalar:
         """Returns on_true where the predicate holds, else on_false."""
-        ...
+
+
+def fold(op: Op, operands: Sequence[Any], dtype: np.dtype) -> Any:
+    """Applies an operation to constants, scalars or arrays.
+
+    Args:
+      op: the operation.
+      operands: NumPy scalars or arrays of one shape.
+      dtype: that of the result.
+
+    Returns:
+      A NumPy array, or a NumPy scalar where the operands are scalars.
+    """
+    name = op.name
+    if name == "convert_element_type":
+        result = np.asarray(operands[0]).astype(dtype)
+    elif name == "bitcast_convert_type":
+        result = np.asarray(operands[0]).view(dtype)
+    elif (by_numpy := _EXCEPTIONS.get(name, FACTS[name].in_numpy)) is not None:
+        result = by_numpy(*operands)
+    else:
+        result = jaxprs.compute_constants(jaxprs.operation(name), dict(op.params), operands)[0]
+    return np.asarray(result, dtype)[()]
+
+
+def _divide(x: np.ndarray, y: np.ndarray) -> Any:
+    """Division as XLA does it: integers round towards zero, and by zero it is -1."""
+    if not _are_integers(x):
+        return np.true_divide(x, y)
+    ones = ~np.zeros_like(y)  # -1, in an unsigned integer the greatest
+    return np.where(y == 0, ones, (x - _remainder(x, y)) // np.where(y == 0, 1, y))
+
+
+def _remainder(x: np.ndarray, y: np.ndarray) -> Any:
+    """The rest of that division: an integer divided by zero is what remains."""
+    if not _are_integers(x):
+        return np.fmod(x, y)
+    return np.where(y == 0, x, np.fmod(x, np.where(y == 0, 1, y)))
+
+
+def _are_integers(x: np.ndarray) -> bool:
+    return np.issubdtype(np.asarray(x).dtype, np.integer)
+
+
+def _choose_case(predicate: np.ndarray, *cases: np.ndarray) -> Any:
+    """Picks the case that the predicate numbers."""
+    return np.choose(np.asarray(predicate, int), cases)
+
+
+def _logistic(x: np.ndarray) -> Any:
+    """1 / (1 + exp(-x)) in x's dtype."""
+    one = np.asarray(x).dtype.type(1)
+    return one / (one + np.exp(-x))
+
+
+def _rsqrt(x: np.ndarray) -> Any:
+    """1 / sqrt(x) in x's dtype."""
+    return np.asarray(x).dtype.type(1) / np.sqrt(x)
+
+
+#: What one function of NumPy does not compute. Rare operations that NumPy does not have at all JAX
+#: computes at once, in about 1 ms.
+_EXCEPTIONS: dict[str, Callable[..., Any]] = {
+    "select_n": _choose_case,
+    "div": _divide,
+    "rem": _remainder,
+    "rsqrt": _rsqrt,
+    "logistic": _logistic,
+}
 
 
 def simplify(graph: Builder, op: Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar | None:
@@ -155,26 +222,10 @@ def _abs(graph: Builder, x: Scalar) -> Scalar | None:
     return graph.call("abs", _negated(x)) if _negated(x) is not None else None
 
 
-def _max(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
-    return _extreme(x, y, -np.inf)
-
-
-def _min(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
-    return _extreme(x, y, np.inf)
-
-
 def _extreme(x: Scalar, y: Scalar, neutral: float) -> Scalar | None:
     if x is y or _is(y, neutral):
         return x
     return y if _is(x, neutral) else None
-
-
-def _and(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
-    return _bitwise(x, y, absorbing=False)
-
-
-def _or(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
-    return _bitwise(x, y, absorbing=True)
 
 
 def _bitwise(x: Scalar, y: Scalar, absorbing: bool) -> Scalar | None:
@@ -198,7 +249,7 @@ def _select(graph: Builder, predicate: Scalar, *cases: Scalar) -> Scalar | None:
     on_false, on_true = cases
     if is_constant(predicate):
         return on_true if predicate else on_false
-    if on_true is on_false or _equal_constants(on_true, on_false):
+    if same(on_true, on_false):
         return on_true
     inverse = _args(predicate, "not")
     if inverse:
@@ -208,11 +259,6 @@ def _select(graph: Builder, predicate: Scalar, *cases: Scalar) -> Scalar | None:
         if simpler is not None:
             return simpler
     return _select_again(graph, predicate, on_true, on_false)
-
-
-def _equal_constants(x: Scalar, y: Scalar) -> bool:
-    both = is_constant(x) and is_constant(y)
-    return both and x.tobytes() == y.tobytes()
 
 
 def _select_bool(
@@ -259,7 +305,7 @@ def _through_select(
     cases = []
     for case in (1, 2):
         chosen = [arg if is_constant(arg) else arg.args[case] for arg in args]
-        cases.append(folding.fold(op, chosen, dtype))
+        cases.append(fold(op, chosen, dtype))
     return graph.select(nodes[0].args[0], cases[1], cases[0])
 
 
@@ -271,10 +317,10 @@ _RULES: dict[str, Callable[..., Scalar | None]] = {
     "pow": _pow,
     "neg": _neg,
     "abs": _abs,
-    "max": _max,
-    "min": _min,
-    "and": _and,
-    "or": _or,
+    "max": lambda _, x, y: _extreme(x, y, -np.inf),
+    "min": lambda _, x, y: _extreme(x, y, np.inf),
+    "and": lambda _, x, y: _bitwise(x, y, absorbing=False),
+    "or": lambda _, x, y: _bitwise(x, y, absorbing=True),
     "not": _not,
     "select_n": _select,
 }

@@ -25,12 +25,7 @@ class _Body(NamedTuple):
 
 
 def cond_rule(
-    graph: Graph,
-    run: Callable,
-    eqn: jaxprs.Equation,
-    used: list[bool],
-    index: np.ndarray,
-    *operands: np.ndarray,
+    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: list[bool], *operands: np.ndarray
 ) -> list[np.ndarray]:
     """Evaluates the branches that lanes may take and picks each lane's own.
 
@@ -39,33 +34,28 @@ def cond_rule(
       run: (program, arguments, which results are used) -> results.
       eqn: the equation.
       used: which of its results are used.
-      index: [] which branch is taken.
-      *operands: the arguments of every branch.
+      *operands: [] which branch is taken, and the arguments of every branch.
     """
+    index, *arguments = operands
     programs = [jaxprs.program(branch) for branch in eqn.params["branches"]]
     (choice,) = arrays.elements(index)
     if is_constant(choice):
         taken = programs[min(max(int(choice), 0), len(programs) - 1)]
-        return run(taken, list(operands), used)
+        return run(taken, arguments, used)
     layout = arrays.Layout([out.aval for out in eqn.outvars])
 
     def branch(program: jaxprs.Program) -> Branch:
-        return lambda: layout.unpack(run(program, list(operands), used))
+        return lambda: layout.unpack(run(program, arguments, used))
 
     return layout.pack(_choose_among(graph, [branch(program) for program in programs], choice))
 
 
 def skippable_rule(
-    graph: Graph,
-    run: Callable,
-    eqn: jaxprs.Equation,
-    used: list[bool],
-    needed: np.ndarray,
-    *operands: np.ndarray,
+    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: list[bool], *operands: np.ndarray
 ) -> list[np.ndarray]:
     """Skips a computation that no lane needs, if it is expensive; see ``skippable``."""
-    count = eqn.params["num_results"]
-    otherwise, consts = list(operands[:count]), list(operands[count:])
+    count, (needed, *others) = eqn.params["num_results"], operands
+    otherwise, consts = others[:count], others[count:]
     layout = arrays.Layout([out.aval for out in eqn.outvars])
 
     def compute() -> list[Scalar]:

@@ -1,13 +1,12 @@
 """Rules for the primitives that work on each element alone."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from mjx_reinforce.fused import arrays, jaxprs, ops
-from mjx_reinforce.fused.errors import no_rule
 from mjx_reinforce.fused.graph import Graph
-from mjx_reinforce.fused.passes import folding, simplify
+from mjx_reinforce.fused.passes import simplify
 
 
 def _elementwise(graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray) -> list[np.ndarray]:
@@ -21,7 +20,7 @@ def _map_op(
     graph: Graph, op: ops.Op, aval: jaxprs.Shape, operands: Sequence[np.ndarray]
 ) -> np.ndarray:
     if all(map(arrays.is_numeric, operands)):
-        return np.asarray(folding.fold(op, operands, aval.dtype))
+        return np.asarray(simplify.fold(op, operands, aval.dtype))
     apply, dtype = graph.apply, np.dtype(aval.dtype)
     return arrays.map_elements(lambda *args: apply(op, args, dtype), aval.shape, dtype, *operands)
 
@@ -35,16 +34,13 @@ def _convert(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarr
 
 def _bitcast(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
     if x.shape != eqn.outvars[0].aval.shape:
-        raise no_rule("bitcast_convert_type to another size", graph.source(eqn))
+        raise jaxprs.no_rule("bitcast_convert_type to another size", graph.source(eqn))
     return _elementwise(graph, eqn, x)
 
 
-def _add_any(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
-    return [_map_op(graph, ops.Op("add"), eqn.outvars[0].aval, (x, y))]
-
-
-def _square(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
-    return [_map_op(graph, ops.Op("mul"), eqn.outvars[0].aval, (x, x))]
+def _as(name: str) -> Callable[..., list[np.ndarray]]:
+    """Returns the rule of an operation under another name."""
+    return lambda graph, eqn, *xs: [_map_op(graph, ops.Op(name), eqn.outvars[0].aval, xs)]
 
 
 def _clamp(
@@ -74,8 +70,10 @@ RULES = {
     **dict.fromkeys(ops.FACTS, _elementwise),
     "convert_element_type": _convert,
     "bitcast_convert_type": _bitcast,
-    "add_any": _add_any,
-    "square": _square,
+    "add_any": lambda graph, eqn, x, y: [
+        _map_op(graph, ops.Op("add"), eqn.outvars[0].aval, (x, y))
+    ],
+    "square": lambda graph, eqn, x: [_map_op(graph, ops.Op("mul"), eqn.outvars[0].aval, (x, x))],
     "clamp": _clamp,
     "integer_pow": _integer_pow,
     "pow": _pow_rule,

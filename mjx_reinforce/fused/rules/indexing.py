@@ -66,7 +66,7 @@ def _read_window(
 ) -> np.ndarray:
     """Reads a window; an unknown start outside counts as the nearest inside."""
     if not unknowns:
-        return arrays.lift(arrays.take(flat, positions))
+        return arrays.lift(flat[positions.reshape(-1)].reshape(positions.shape))
     (index, stride, count), *rest = unknowns
     values = _read_window(graph, flat, positions, rest)
     for k in range(1, count):
@@ -159,14 +159,9 @@ def _default_fill(dtype: np.dtype) -> Any:
 
 
 def _scatter(
-    graph: Graph,
-    eqn: jaxprs.Equation,
-    operand: np.ndarray,
-    indices: np.ndarray,
-    updates: np.ndarray,
-    *,
-    combine: Callable,
+    graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray, combine: Callable
 ) -> list[np.ndarray]:
+    operand, indices, updates = operands
     dims = eqn.params["dimension_numbers"]
     hidden = {*dims.inserted_window_dims, *dims.operand_batching_dims}
     window_axes = list(dims.update_window_dims)
@@ -230,14 +225,6 @@ RULES = {
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
     "scatter": functools.partial(_scatter, combine=_replace),
-    "scatter-add": _combining("add"),
-    "scatter_add": _combining("add"),
-    "scatter-sub": _combining("sub"),
-    "scatter_sub": _combining("sub"),
-    "scatter_mul": _combining("mul"),
-    "scatter-mul": _combining("mul"),
-    "scatter_min": _combining("min"),
-    "scatter-min": _combining("min"),
-    "scatter_max": _combining("max"),
-    "scatter-max": _combining("max"),
+    **{f"scatter-{name}": _combining(name) for name in ("add", "sub", "mul", "min", "max")},
+    **{f"scatter_{name}": _combining(name) for name in ("add", "sub", "mul", "min", "max")},
 }

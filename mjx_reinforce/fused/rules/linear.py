@@ -1,5 +1,6 @@
 """Rules for small linear algebra, written out in scalars."""
 
+import functools
 import itertools
 from typing import Any
 
@@ -42,14 +43,8 @@ def _as_matrices(x: np.ndarray, batch: tuple, contracted: tuple) -> np.ndarray:
 
 def _dot(graph: Graph, left: list, right: list, dtype: DTypeLike) -> Any:
     terms = [graph.call("mul", a, b) for a, b in zip(left, right, strict=True)]
-    return _sum_terms(graph, terms, dtype)
-
-
-def _sum_terms(graph: Graph, terms: list, dtype: DTypeLike) -> Any:
-    total = np.dtype(dtype).type(0)
-    for term in terms:
-        total = graph.call("add", total, term)
-    return total
+    add = functools.partial(graph.call, "add")
+    return functools.reduce(add, terms, np.dtype(dtype).type(0))
 
 
 def _minus_dot(graph: Graph, start: Any, left: list, right: list) -> Any:

@@ -5,10 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.fused import arrays, carries, jaxprs
+from mjx_reinforce.fused import arrays, jaxprs
 from mjx_reinforce.fused.graph import Graph
 from mjx_reinforce.fused.nodes import Gate, Loop, Node, Scalar, is_constant, same
-from mjx_reinforce.fused.rules.iterate import Assumption, Iteration, iterate, varies
+from mjx_reinforce.fused.rules import iterate
+from mjx_reinforce.fused.rules.iterate import Assumption, Iteration, varies
 
 
 def while_rule(
@@ -36,8 +37,8 @@ def while_rule(
     if is_constant(active) and not active:
         return carry.pack(start)
     foreseen = None
-    if carries.has_loops(body) or carries.has_loops(cond):
-        kept = carries.keeps(body, num_body, len(eqn.outvars))
+    if iterate.has_loops(body) or iterate.has_loops(cond):
+        kept = iterate.keeps(body, num_body, len(eqn.outvars))
         outside, inside = _varying(cond_consts), _varying(body_consts)
 
         def after(varying: list[bool]) -> list[bool]:
@@ -45,11 +46,11 @@ def while_rule(
             new = [n or (varying[0] and not k) for n, k in zip(new, kept, strict=True)]
             return [*jaxprs.depends(cond, [*outside, *new]), *new]
 
-        of_goes_on, *of_carry = carries.spread(
+        of_goes_on, *of_carry = iterate.spread(
             after, [varies(active), *_varying(operands[num_cond + num_body :])]
         )
         foreseen = Assumption([False, *carry.repeat(kept)], [of_goes_on, *carry.repeat(of_carry)])
-    loop = iterate(graph, step, [active, *start], active=0, foreseen=foreseen)
+    loop = iterate.iterate(graph, step, [active, *start], active=0, foreseen=foreseen)
     return carry.pack(loop.results()[0][1:])
 
 
@@ -57,53 +58,46 @@ def scan_rule(
     graph: Graph, run: Callable, eqn: jaxprs.Equation, used: Any, *operands: np.ndarray
 ) -> list:
     """Writes a short scan out; makes a loop of a longer one, which may end early."""
-    length, parts = eqn.params["length"], jaxprs.scan_parts(eqn)
+    length, (num_consts, num_carry) = eqn.params["length"], jaxprs.scan_parts(eqn)
     body = jaxprs.program(eqn.params["jaxpr"])
-    split = parts.num_consts + parts.num_carry
-    consts, init = list(operands[: parts.num_consts]), operands[parts.num_consts : split]
-    carry = arrays.Layout([out.aval for out in eqn.outvars[: parts.num_carry]])
-    outs = arrays.Layout([out.aval for out in body.jaxpr.outvars[parts.num_carry :]])
+    split = num_consts + num_carry
+    consts, init = list(operands[:num_consts]), operands[num_consts:split]
+    carry = arrays.Layout([out.aval for out in eqn.outvars[:num_carry]])
+    outs = arrays.Layout([out.aval for out in body.jaxpr.outvars[num_carry:]])
     ins = arrays.Layout([var.aval for var in body.jaxpr.invars[split:]])
     order = range(length)[::-1] if eqn.params["reverse"] else range(length)
 
     def step(state: list[Scalar], row: list[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
         results = run(body, [*consts, *carry.pack(state), *ins.pack(row)])
-        return carry.unpack(results[: parts.num_carry]), outs.unpack(results[parts.num_carry :])
+        return carry.unpack(results[:num_carry]), outs.unpack(results[num_carry:])
 
     rows = [ins.unpack([x[t : t + 1] for x in operands[split:]]) for t in order]
-    has_arrays = len(operands) > split or len(eqn.outvars) > parts.num_carry
-    if length <= max(_limit(graph, has_arrays), eqn.params["unroll"]):
+    limit = graph.limits.unrollable if graph.may_unroll else graph.limits.scans
+    if length <= max(limit, eqn.params["unroll"]):
         final, table = _unroll(step, carry.unpack(init), rows)
     else:
         foreseen = None
-        if carries.has_loops(body):
-            kept = carries.keeps(body, parts.num_consts, parts.num_carry)
+        if iterate.has_loops(body):
+            kept = iterate.keeps(body, num_consts, num_carry)
             before, beside = _varying(consts), _varying(operands[split:])
 
             def after(varying: list[bool]) -> list[bool]:
-                return jaxprs.depends(body, [*before, *varying, *beside])[: parts.num_carry]
+                return jaxprs.depends(body, [*before, *varying, *beside])[:num_carry]
 
-            varying = carries.spread(after, _varying(init))
+            varying = iterate.spread(after, _varying(init))
             foreseen = Assumption(carry.repeat(kept), carry.repeat(varying))
         final, table = _as_loop(graph, step, carry.unpack(init), rows, length, foreseen)
     table = [table[k] for k in np.argsort(order)] if length else []
     stacked = [outs.pack(row) for row in table]
     ys = [np.stack(arrays.together(column)) for column in zip(*stacked, strict=True)]
     if not table:
-        ys = [arrays.zeros(out.aval) for out in eqn.outvars[parts.num_carry :]]
+        ys = [arrays.zeros(out.aval) for out in eqn.outvars[num_carry:]]
     return [*carry.pack(final), *ys]
 
 
 def _varying(operands: Sequence[np.ndarray]) -> list[bool]:
     """Returns which arrays have elements that differ from lane to lane."""
     return [any(map(varies, operand.flat)) for operand in operands]
-
-
-def _limit(graph: Graph, has_arrays: bool) -> int:
-    """Returns up to which length a scan is written out."""
-    if graph.may_unroll:
-        return graph.limits.unrollable
-    return graph.limits.arrays if has_arrays else graph.limits.plain
 
 
 def _unroll(step: Iteration, state: list[Scalar], rows: list[list[Scalar]]) -> tuple[list, list]:
@@ -125,10 +119,10 @@ def _as_loop(
 ) -> tuple[list, list]:
     """Builds a scan's loop; returns the final carry and the ys of each iteration."""
     xs = [list(column) for column in zip(*rows, strict=True)]
-    loop = iterate(graph, step, inits, length=length, xs=xs, foreseen=foreseen)
+    loop = iterate.iterate(graph, step, inits, length=length, xs=xs, foreseen=foreseen)
     switch = None if xs or loop.ys else _switch(loop)
     if switch is not None:
-        loop = iterate(graph, step, inits, length=length, active=switch, foreseen=foreseen)
+        loop = iterate.iterate(graph, step, inits, length=length, active=switch, foreseen=foreseen)
     final, columns = loop.results()
     return final, [list(row) for row in zip(*columns, strict=True)] or [[]] * length
 

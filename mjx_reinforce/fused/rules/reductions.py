@@ -24,29 +24,15 @@ def _reduce(
     return [arrays.pack(reduced, aval.shape, aval.dtype)]
 
 
-def _cumulate(
-    graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, *, combine: Callable
-) -> list[np.ndarray]:
+def _cumulate(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, *, combine: str) -> list:
     """Combines each element with all before it (after it, if reversed)."""
     step = -1 if eqn.params["reverse"] else 1
     lines = np.moveaxis(arrays.lift(x), eqn.params["axis"], -1)[..., ::step].copy()
     for line in lines.reshape(-1, lines.shape[-1]):
         for i in range(1, line.size):
-            line[i] = combine(graph, line[i - 1], line[i])
+            line[i] = graph.call(combine, line[i - 1], line[i])
     lines = np.moveaxis(lines[..., ::step], -1, eqn.params["axis"])
     return [arrays.settle(lines, eqn.outvars[0].aval.dtype)]
-
-
-def _named(name: str) -> Callable:
-    return lambda graph, x, y: graph.call(name, x, y)
-
-
-def _logaddexp(graph: Graph, x: Any, y: Any) -> Any:
-    """The sum of equal infinities, and of NaN, is found without their difference."""
-    delta = graph.call("sub", x, y)
-    correction = graph.call("log1p", graph.call("exp", graph.call("neg", graph.call("abs", delta))))
-    total = graph.call("add", graph.call("max", x, y), correction)
-    return graph.select(graph.call("ne", delta, delta), graph.call("add", x, y), total)
 
 
 def _arg_extreme(
@@ -164,11 +150,10 @@ RULES = {
     "reduce_and": _reducer("and", True),
     "reduce_or": _reducer("or", False),
     "reduce_xor": _reducer("xor", False),
-    "cumsum": functools.partial(_cumulate, combine=_named("add")),
-    "cumprod": functools.partial(_cumulate, combine=_named("mul")),
-    "cummax": functools.partial(_cumulate, combine=_named("max")),
-    "cummin": functools.partial(_cumulate, combine=_named("min")),
-    "cumlogsumexp": functools.partial(_cumulate, combine=_logaddexp),
+    "cumsum": functools.partial(_cumulate, combine="add"),
+    "cumprod": functools.partial(_cumulate, combine="mul"),
+    "cummax": functools.partial(_cumulate, combine="max"),
+    "cummin": functools.partial(_cumulate, combine="min"),
     "argmax": functools.partial(_arg_extreme, better="gt"),
     "argmin": functools.partial(_arg_extreme, better="lt"),
     "sort": _sort,

@@ -1,9 +1,10 @@
 """Rules that move elements about without computing anything."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from mjx_reinforce.fused import arrays, jaxprs
-from mjx_reinforce.fused.errors import no_rule
 from mjx_reinforce.fused.graph import Graph
 
 
@@ -14,36 +15,12 @@ def _slice(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray
     return [x[tuple(slice(*bound) for bound in bounds)]]
 
 
-def _reshape(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
-    return [x.reshape(eqn.outvars[0].aval.shape)]
-
-
 def _broadcast_in_dim(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
     shape = eqn.params["shape"]
     aligned = [1] * len(shape)
     for axis, target in enumerate(eqn.params["broadcast_dimensions"]):
         aligned[target] = x.shape[axis]
     return [np.broadcast_to(x.reshape(aligned), shape)]
-
-
-def _transpose(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
-    return [x.transpose(eqn.params["permutation"])]
-
-
-def _rev(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
-    return [np.flip(x, eqn.params["dimensions"])]
-
-
-def _tile(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
-    return [np.tile(x, eqn.params["reps"])]
-
-
-def _concatenate(graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray) -> list[np.ndarray]:
-    return [np.concatenate(arrays.together(operands), eqn.params["dimension"])]
-
-
-def _stack(graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray) -> list[np.ndarray]:
-    return [np.stack(arrays.together(operands), eqn.params["axis"])]
 
 
 def _unstack(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
@@ -79,47 +56,40 @@ def _iota(graph: Graph, eqn: jaxprs.Equation) -> list[np.ndarray]:
     return [np.broadcast_to(line.reshape(aligned), aval.shape)]
 
 
-def _empty(graph: Graph, eqn: jaxprs.Equation) -> list[np.ndarray]:
-    return [arrays.zeros(eqn.outvars[0].aval)]
-
-
 def _platform_index(graph: Graph, eqn: jaxprs.Equation) -> list[np.ndarray]:
     default = jaxprs.default_platform(eqn)
     if default is None:
-        raise no_rule("platform_dependent without a default", graph.source(eqn))
+        raise jaxprs.no_rule("platform_dependent without a default", graph.source(eqn))
     return [np.asarray(default, eqn.outvars[0].aval.dtype)]
 
 
-def _identity(graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray) -> list[np.ndarray]:
-    return list(operands)
+def _moved(move: Callable[..., np.ndarray]) -> Callable[..., list[np.ndarray]]:
+    """Returns a rule: (parameters, shape of the result, operands) -> the result."""
+    return lambda graph, eqn, *operands: [move(eqn.params, eqn.outvars[0].aval, *operands)]
 
 
+_IDENTITIES = (
+    *("copy", "copy_p", "device_put", "name", "optimization_barrier", "pvary", "random_wrap"),
+    *("random_unwrap", "reshard", "sharding_constraint", "stop_gradient"),
+)
 RULES = {
+    **dict.fromkeys(_IDENTITIES, lambda graph, eqn, *operands: list(operands)),
+    **dict.fromkeys(
+        ("reshape", "squeeze", "expand_dims"), _moved(lambda _, aval, x: x.reshape(aval.shape))
+    ),
     "slice": _slice,
-    "reshape": _reshape,
-    "squeeze": _reshape,
-    "expand_dims": _reshape,
     "broadcast_in_dim": _broadcast_in_dim,
-    "transpose": _transpose,
-    "rev": _rev,
-    "tile": _tile,
-    "concatenate": _concatenate,
-    "stack": _stack,
+    "transpose": _moved(lambda params, _, x: x.transpose(params["permutation"])),
+    "rev": _moved(lambda params, _, x: np.flip(x, params["dimensions"])),
+    "tile": _moved(lambda params, _, x: np.tile(x, params["reps"])),
+    "concatenate": _moved(
+        lambda params, _, *xs: np.concatenate(arrays.together(xs), params["dimension"])
+    ),
+    "stack": _moved(lambda params, _, *xs: np.stack(arrays.together(xs), params["axis"])),
     "unstack": _unstack,
     "split": _split,
     "pad": _pad,
     "iota": _iota,
-    "empty": _empty,
+    "empty": _moved(lambda _, aval: arrays.zeros(aval)),
     "platform_index": _platform_index,
-    "copy": _identity,
-    "copy_p": _identity,
-    "device_put": _identity,
-    "name": _identity,
-    "optimization_barrier": _identity,
-    "pvary": _identity,
-    "random_wrap": _identity,
-    "random_unwrap": _identity,
-    "reshard": _identity,
-    "sharding_constraint": _identity,
-    "stop_gradient": _identity,
 }

@@ -1,8 +1,13 @@
-"""``by_engine``: one result computed in two ways, for an engine that writes out and for XLA.
+"""What a function says to be written out as: ``by_engine``, ``skippable``, ``any_lane``.
 
-The choice is a primitive of our own, ``by_engine``, which carries both programs. XLA compiles
-``many`` and never sees ``one``; ``fused`` writes ``one`` out. No other code chooses between the
-two.
+``by_engine`` has one result computed in two ways. The choice is a primitive of our own, which
+carries both programs. XLA compiles ``many`` and never sees ``one``; ``fused`` writes ``one`` out.
+No other code chooses between the two.
+
+``skippable`` is a computation that changes nothing where it is not needed. ``fused`` writes it out
+as a branch that is skipped if no lane needs it. Of ``jax.lax.cond`` it also selects each lane's own
+result, which costs an operation for each number; a skippable computation gives the same where a
+lane does not need it.
 """
 
 import functools
@@ -11,6 +16,7 @@ from typing import Any
 
 import jax
 import jax.core
+import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 from jax.interpreters import ad, batching, mlir
@@ -134,3 +140,66 @@ _CHOICE.def_abstract_eval(lambda *_, many, **__: many.out_avals)
 batching.primitive_batchers[_CHOICE] = _batched
 ad.primitive_jvps[_CHOICE] = _derivative
 mlir.register_lowering(_CHOICE, mlir.lower_fun(_many, multiple_results=True))
+
+
+#: Its operands are the predicate, the leaves of ``otherwise``, and what the computation reads.
+_SKIPPABLE = core.Primitive("skippable")
+_SKIPPABLE.multiple_results = True
+
+
+def skippable(needed: jax.Array, compute: Callable[[], PyTree], otherwise: PyTree) -> Any:
+    """Returns what ``compute`` does; it need not run where ``needed`` is False.
+
+    Args:
+      needed: [] bool. Where it is False, ``compute()`` equals ``otherwise``.
+      compute: no arguments -> a result of the structure, shapes and dtypes of ``otherwise``.
+      otherwise: the result where it is not needed.
+    """
+    leaves, tree = jax.tree.flatten(otherwise)
+    program, _ = jaxprs.trace(lambda: jax.tree.leaves(compute()))
+    computation = jax.make_jaxpr(lambda *xs: jax.core.eval_jaxpr(program.jaxpr, xs))(
+        *program.consts
+    )
+    results = _SKIPPABLE.bind(
+        needed, *leaves, *program.consts, computation=computation, num_results=len(leaves)
+    )
+    return tree.unflatten(results)
+
+
+def _plain_skippable(needed: Any, *operands: Any, computation: Any, num_results: int) -> list[Any]:
+    otherwise, consts = list(operands[:num_results]), operands[num_results:]
+    return jax.lax.cond(needed, lambda: core.jaxpr_as_fun(computation)(*consts), lambda: otherwise)
+
+
+def _batched_skippable(operands: Sequence[Any], axes: Sequence[int | None], **params: Any) -> tuple:
+    results = jax.vmap(functools.partial(_plain_skippable, **params), tuple(axes))(*operands)
+    return results, [0] * len(results)
+
+
+_SKIPPABLE.def_impl(_plain_skippable)
+_SKIPPABLE.def_abstract_eval(lambda *_, computation, **__: computation.out_avals)
+batching.primitive_batchers[_SKIPPABLE] = _batched_skippable
+mlir.register_lowering(_SKIPPABLE, mlir.lower_fun(_plain_skippable, multiple_results=True))
+
+
+@jax.custom_batching.custom_vmap
+def any_lane(predicate: jax.Array) -> jax.Array:
+    """Returns whether a predicate holds in any lane, of this batch or of one mapped over it.
+
+    A loop's or a branch's predicate that ``jax.vmap`` batches turns the loop into one that computes
+    every lane, and the branch into a selection. This one is never batched: under an outer
+    ``jax.vmap`` (say over seeds) it reduces over that axis too, so loops stay loops.
+
+    Args:
+      predicate: bools of any shape.
+
+    Returns:
+      One bool, the same for every lane of every mapped axis.
+    """
+    return jnp.any(predicate)
+
+
+@any_lane.def_vmap
+def _reduce_outer_axis(axis_size: int, in_batched: list[bool], predicate: jax.Array) -> Any:
+    del axis_size, in_batched
+    return any_lane(predicate), False

@@ -1,6 +1,4 @@
-"""The choice by engine: XLA computes one program, and the other is what is written out."""
-
-import importlib
+"""What a function says to be written out as: the choice by engine, and what may be skipped."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +7,7 @@ import pytest
 from jax import lax
 
 from mjx_reinforce import fused
-from mjx_reinforce.fused import jaxprs, scalarized, size
+from mjx_reinforce.fused import jaxprs, primitives, scalarized, size
 from mjx_reinforce.fused.graph import Limits
 
 
@@ -49,8 +47,7 @@ def test_one_is_written_out():
 def test_xla_does_not_read_what_is_written_out(monkeypatch):
     """To map it takes as long as to map what XLA compiles."""
     read = property(lambda _: pytest.fail("the program was read"))
-    module = importlib.import_module("mjx_reinforce.fused.by_engine")  # hidden by the function
-    monkeypatch.setattr(module._Mapped, "_traced", read)
+    monkeypatch.setattr(primitives._Mapped, "_traced", read)
     twice = jax.jit(jax.vmap(jax.vmap(choice)))
     np.testing.assert_array_equal(twice(jnp.ones((2, 3))), 2 * jnp.ones((2, 3)))
     with pytest.raises(pytest.fail.Exception, match="was read"):
@@ -131,7 +128,7 @@ def total(x, **options):
 
 
 def sines(fn, unrollable, length=7):
-    limits = Limits(plain=1, arrays=1, unrollable=unrollable)
+    limits = Limits(1, unrollable)
     return scalarized.build(fn, (jnp.ones(length),), [True], 400, limits).operations["sin"]
 
 
@@ -172,5 +169,61 @@ def test_platform_dependent_without_a_default_is_refused_by_name():
     def fn(x):
         return lax.platform_dependent(x, cpu=lambda x: x + 1, cuda=jnp.sin)
 
-    with pytest.raises(fused.UnsupportedPrimitive, match=r"without a default.*test_by_engine\.py"):
+    with pytest.raises(fused.UnsupportedPrimitive, match=r"without a default.*test_primitives\.py"):
         fused.vmap(fn)(X)
+
+
+def plus_sine(x):
+    """Adds the sine, of which that of 0 changes nothing."""
+    return fused.skippable(x != 0, lambda: {"y": x + jnp.sin(x)}, {"y": x})["y"]
+
+
+NUMBERS = jnp.array([0.0, 1.0, -2.0])
+
+
+def test_results():
+    """By JAX, and written out with a branch and without one; of one example too."""
+    for transformed in (
+        jax.vmap(plus_sine),
+        jax.jit(jax.vmap(plus_sine)),
+        fused.vmap(plus_sine, branch_cost=0),
+        fused.vmap(plus_sine, branch_cost=10_000),
+    ):
+        np.testing.assert_allclose(transformed(NUMBERS), NUMBERS + jnp.sin(NUMBERS), rtol=1e-6)
+    assert plus_sine(jnp.float32(2)) == 2 + jnp.sin(jnp.float32(2))
+    assert jax.jit(plus_sine)(jnp.float32(0)) == 0
+
+
+def test_where_it_is_known_whether_it_is_needed():
+    for needed in (True, False):
+        both = fused.vmap(lambda x, n=needed: fused.skippable(jnp.array(n), lambda: x * 2, x))
+        np.testing.assert_array_equal(both(jnp.ones(3)), [1.0 + needed] * 3)
+
+
+def test_nothing_is_selected():
+    """Of ``lax.cond`` each lane's own result is."""
+
+    def sines(x):
+        return sum(jnp.sin(x * k) for k in range(1, 9))
+
+    def skipping(x):
+        return fused.skippable(x != 0, lambda: sines(x), jnp.zeros(()))
+
+    def choosing(x):
+        return jax.lax.cond(x != 0, lambda: sines(x), lambda: jnp.zeros(()))
+
+    written = [fused.scalarize(f, jnp.ones(()), branch_cost=3) for f in (skipping, choosing)]
+    assert [x.operations["select_n"] for x in written] == [0, 1]
+    results = [jax.jit(fused.vmap(f, branch_cost=3))(NUMBERS) for f in (skipping, choosing)]
+    np.testing.assert_array_equal(*results)
+
+
+def test_results_must_be_of_the_structure_of_what_is_skipped_to():
+    with pytest.raises((TypeError, ValueError)):
+        fused.skippable(jnp.array(True), lambda: (NUMBERS, NUMBERS), NUMBERS)
+
+
+def test_its_size_is_that_of_the_computation():
+    traced = jaxprs.trace(plus_sine, jnp.ones(()))[0]
+    alone = jaxprs.trace(lambda x: x + jnp.sin(x), jnp.ones(()))[0]
+    assert size.num_scalars(traced) == size.num_scalars(alone) + 1  # and the comparison
