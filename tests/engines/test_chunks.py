@@ -52,17 +52,11 @@ def played(lives, seed=0):
     return play_chunks(play, NOISY, keys, begun, jnp.zeros((HORIZON, len(lives))))
 
 
-@pytest.mark.parametrize(
-    ("number", "at_most", "expected"),
-    [(1000, 50, 50), (12, 5, 4), (7, 6, 1), (7, 7, 7), (7, 100, 7), (1, 1, 1)],
-)
-def test_the_largest_divisor(number, at_most, expected):
-    assert largest_divisor(number, at_most) == expected
-
-
-@pytest.mark.parametrize(("horizon", "length"), [(1000, 50), (37, 37), (53, 1), (200, 50)])
-def test_a_chunk_divides_the_horizon(horizon, length):
-    assert chunk_length(horizon) == length
+def test_the_largest_divisor_and_a_chunk_divides_the_horizon():
+    cases = (1000, 50, 50), (12, 5, 4), (7, 6, 1), (7, 7, 7), (7, 100, 7), (1, 1, 1)
+    for number, at_most, expected in cases:
+        assert largest_divisor(number, at_most) == expected
+    assert [chunk_length(horizon) for horizon in (1000, 37, 53, 200)] == [50, 37, 1, 50]
 
 
 @pytest.mark.parametrize(("lives", "chunks"), [([0, 0], 0), ([3, 50], 1), ([1, 51], 2), ([999], 3)])

@@ -30,15 +30,6 @@ def text():
     return lambda lanes, flush: kernel.player_text(built, num_actor, lanes, flush)
 
 
-@pytest.mark.parametrize("lanes", [1, 4])
-def test_every_lane_begins_ends_and_is_settled(text, lanes):
-    work = text(lanes, denormals.Flush()).partition("@work(")[2]
-    for name in ("begin", "finish", "settle"):
-        calls = re.findall(rf"call void @{name}\(ptr %job, ptr \S+, i64 (\d+)", work)
-        assert calls == [str(lane) for lane in range(lanes)]
-    assert f"<{lanes} x float>" in work or lanes == 1
-
-
 def test_what_it_takes_it_frees_and_what_it_flushes_it_undoes(text):
     work = text(2, denormals.flush("x86_64-unknown-linux-gnu")).partition("@work(")[2]
     assert work.count("call ptr @malloc") == work.count("call void @free") == 1

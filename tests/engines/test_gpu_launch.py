@@ -129,29 +129,27 @@ def test_what_the_driver_does_not_launch_is_an_error(driver):
         launched("is_an_error", 2)
 
 
-@pytest.mark.parametrize(
-    ("assemblers", "kernel"),
-    [
-        ((by("new", b"new"), by("old", b"old")), 1),
-        ((by("new", b"of another GPU"), by("old", b"old")), 1),
-        ((by("new", None), by("old", b"old")), 1),
-        ((by("new", None), by("old", None)), None),
-    ],
-)
-def test_the_next_assembler_is_tried(assemblers, kernel, driver, monkeypatch, capfd):
+def test_the_next_assembler_is_tried(driver, monkeypatch, capfd):
     """Where none can, the driver is asked to launch nothing, which it refuses."""
     driver.refused = (b"of another GPU",)
     monkeypatch.setenv(look.DEBUG, "1")
     slot = POINTER()
-    launcher.fill(ctypes.addressof(slot), KERNEL, assemblers, None)
-    launch, found = (POINTER * 2).from_address(slot.value)
-    assert launch == ctypes.cast(driver.cuLaunchKernel, POINTER).value
-    assert found == kernel
-    said = capfd.readouterr().err
-    if assemblers[0].name == "new" and driver.images != [b"new"]:
-        assert f"kernel {KERNEL.key}: not by new: " in said
-    else:
-        assert f"kernel {KERNEL.key}: registers of a thread: 8\n" in said
+    for new, old, kernel in (
+        (b"new", b"old", 1),
+        (b"of another GPU", b"old", 1),
+        (None, b"old", 1),
+        (None, None, None),
+    ):
+        driver.images.clear()
+        launcher.fill(ctypes.addressof(slot), KERNEL, (by("new", new), by("old", old)), None)
+        launch, found = (POINTER * 2).from_address(slot.value)
+        assert launch == ctypes.cast(driver.cuLaunchKernel, POINTER).value
+        assert found == kernel
+        said = capfd.readouterr().err
+        if driver.images == [b"new"]:
+            assert f"kernel {KERNEL.key}: registers of a thread: 8\n" in said
+        else:
+            assert f"kernel {KERNEL.key}: not by new: " in said
 
 
 def test_machine_code_is_kept_for_what_assembled_it(driver, tmp_path):
@@ -199,24 +197,19 @@ def test_pips_assembler_comes_first(tmp_path, monkeypatch):
     assert "ptxas, home" not in [x.name for x in assembler.assemblers("9.0")]
 
 
-def test_there_is_none_without_a_driver(tmp_path, monkeypatch):
+def test_there_is_none_without_a_driver_and_one_that_fails_says_why(tmp_path, monkeypatch):
+    program(tmp_path / "nvidia" / "cu13" / "bin" / "ptxas", "1", "echo no such GPU >&2; exit 3")
+    monkeypatch.syspath_prepend(tmp_path)
+    driver = SimpleNamespace(cuDriverGetVersion=id)
+    monkeypatch.setattr(assembler.ctypes, "CDLL", lambda name: driver)
+    with pytest.raises(RuntimeError, match="ptxas returned 3: no such GPU"):
+        assembler.assemblers("99.0")[0].assemble("text")
+
     def lost(name):
         raise OSError(f"{name}: cannot open")
 
-    program(tmp_path / "nvidia" / "cu13" / "bin" / "ptxas", "1", "cat")
-    monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(assembler.ctypes, "CDLL", lost)
     assert assembler.assemblers("9.0") == ()
-
-
-def test_an_assembler_that_fails_says_why(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        assembler.ctypes, "CDLL", lambda name: SimpleNamespace(cuDriverGetVersion=id)
-    )
-    program(tmp_path / "nvidia" / "cu13" / "bin" / "ptxas", "1", "echo no such GPU >&2; exit 3")
-    monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(RuntimeError, match="ptxas returned 3: no such GPU"):
-        assembler.assemblers("99.0")[0].assemble("text")
 
 
 def test_the_first_that_works_is_taken(monkeypatch):

@@ -40,22 +40,25 @@ def nothing_in_memory(monkeypatch):
     monkeypatch.delenv(look.DEBUG, raising=False)
 
 
-@pytest.mark.parametrize("value", ["yes", "3", "-1", "1.0", " 1"])
-def test_another_value_is_named_with_the_remedy(value, monkeypatch):
-    monkeypatch.setenv(look.DEBUG, value)
-    with pytest.raises(ValueError, match=f"MJX_REINFORCE_DEBUG is '{value}'; set it to 1 .* unset"):
-        available.unavailable()
-
-
-@pytest.mark.parametrize("value", [None, "", "0"])
-def test_nothing_is_said_unless_asked(value, monkeypatch, tmp_path, capfd):
-    if value is not None:
+def test_another_value_is_named_with_the_remedy(monkeypatch):
+    for value in ("yes", "3", "-1", "1.0", " 1"):
         monkeypatch.setenv(look.DEBUG, value)
-    key = items.load(tmp_path).key
-    assert capfd.readouterr() == ("", "")
-    assert [path.name for path in tmp_path.iterdir()] == [f"{key}.o"]
-    machine._LOADED.clear()
-    assert not items.load(tmp_path).compiled
+        words = f"MJX_REINFORCE_DEBUG is '{value}'; set it to 1 .* unset"
+        with pytest.raises(ValueError, match=words):
+            available.unavailable()
+
+
+def test_nothing_is_said_unless_asked(monkeypatch, tmp_path, capfd):
+    for number, value in enumerate((None, "", "0")):
+        if value is not None:
+            monkeypatch.setenv(look.DEBUG, value)
+        folder = tmp_path / str(number)
+        machine._LOADED.clear()
+        key = items.load(folder).key
+        assert capfd.readouterr() == ("", "")
+        assert [path.name for path in folder.iterdir()] == [f"{key}.o"]
+        machine._LOADED.clear()
+        assert not items.load(folder).compiled
 
 
 @pytest.mark.cpu
@@ -85,16 +88,15 @@ def test_the_texts_are_left_beside_the_objects(monkeypatch, tmp_path, capfd):
         assert f"  text, {ending}: {folder / key}.{ending}\n" in said
 
 
-@pytest.mark.parametrize("folder", ["none", "a file"])
-def test_a_folder_that_takes_no_texts_breaks_nothing(folder, monkeypatch, tmp_path, capfd):
+def test_a_folder_that_takes_no_texts_breaks_nothing(monkeypatch, tmp_path, capfd):
     (tmp_path / "file").touch()
     monkeypatch.setenv(look.DEBUG, "2")
-    code = items.load(None if folder == "none" else tmp_path / "file" / "native")
-    assert "handler" in code.addresses
-    said = capfd.readouterr().err
-    assert "  machine code: " in said
-    error = "OSError: no folder" if folder == "none" else "FileExistsError"
-    assert said.count(f"  no texts: {error}") == 1
+    for folder, error in ((None, "OSError: no folder"), (tmp_path / "file/native", "FileExistsE")):
+        machine._LOADED.clear()
+        assert "handler" in items.load(folder).addresses
+        said = capfd.readouterr().err
+        assert "  machine code: " in said
+        assert said.count(f"  no texts: {error}") == 1
 
 
 def test_the_stack_is_that_of_the_assembly(monkeypatch, tmp_path, capfd):
@@ -165,7 +167,8 @@ def test_what_is_played_and_mapped_is_named(monkeypatch, capfd):
     monkeypatch.setenv(look.DEBUG, "1")
     for env, name in ((Drifting(), "Drifting"), (Wrapper(), "Wrapper of Drifting")):
         machine._LOADED.clear()
-        program.build_program(env, *_act_and_actor(env), 20)
+        actor, act, distribution = actor_and_act(env, (4,))
+        program.build_program(env, act, actor, distribution, 20)
         said = capfd.readouterr().err
         assert re.search(rf"^kernel \w{{64}}: {name}, [\d,]+ scalar operations$", said, re.M)
 
@@ -174,8 +177,3 @@ def test_what_is_played_and_mapped_is_named(monkeypatch, capfd):
 
     assert not isinstance(machine_code(Wrapper(), doubled, jnp.float32(0)), str)
     assert ": doubled of Wrapper of Drifting, 1 scalar operations\n" in capfd.readouterr().err
-
-
-def _act_and_actor(env):
-    actor, act, distribution = actor_and_act(env, (4,))
-    return act, actor, distribution

@@ -35,15 +35,15 @@ def mapped():
     return jax.jit(machine_map(function, *jax.tree.map(lambda x: x[0], batch(1))))
 
 
-@pytest.mark.parametrize("size", [1, 16, 37])
-def test_results_are_those_of_vmap(mapped, size):
+def test_results_are_those_of_vmap(mapped):
     """The last lanes have no example where the size is no multiple of theirs."""
-    got, want = mapped(*batch(size)), jax.vmap(function)(*batch(size))
-    assert jax.tree.structure(got) == jax.tree.structure(want)
-    for x, exact in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
-        assert (x.shape, x.dtype) == (exact.shape, exact.dtype)
-        np.testing.assert_allclose(x, exact, rtol=1e-6)
-    assert size % this_machine().lanes or size == 16
+    for size in (1, 16, 37):
+        got, want = mapped(*batch(size)), jax.vmap(function)(*batch(size))
+        assert jax.tree.structure(got) == jax.tree.structure(want)
+        for x, exact in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+            assert (x.shape, x.dtype) == (exact.shape, exact.dtype)
+            np.testing.assert_allclose(x, exact, rtol=1e-6)
+        assert size % this_machine().lanes or size == 16
 
 
 def test_a_loop_reads_what_one_before_it_has_kept():
@@ -58,6 +58,15 @@ def test_a_loop_reads_what_one_before_it_has_kept():
     x, *_ = batch(37)
     got = jax.jit(machine_map(sums, x[0]))(x)
     np.testing.assert_allclose(got, jax.vmap(sums)(x), rtol=1e-5, atol=1e-6)
+
+
+def test_integers_divide_as_everywhere():
+    """By zero, and the least one by -1, for both of which a processor stops the program."""
+    edges = jnp.int32([-(2**31), -7, -1, 0, 1, 5, 2**31 - 1])
+    x, y = (x.ravel() for x in jnp.meshgrid(edges, edges))
+    for function in (jax.lax.div, jax.lax.rem):
+        got = jax.jit(machine_map(function, x[0], y[0]))(x, y)
+        np.testing.assert_array_equal(got, jax.vmap(function)(x, y))
 
 
 def test_a_long_text_takes_less_effort_and_gives_the_same_bits(mapped, monkeypatch):

@@ -6,12 +6,14 @@ import re
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
-from players import actor_and_act, assert_same_episodes, both, played
-from toys import Bytes, Drifting, categorical
+from players import actor_and_act, assert_same_episodes, both, only_active, played
+from scenes import SCENE
+from toys import Bytes, Drifting
 
-from mjx_reinforce import Box, envs, fused, reinforce
+from mjx_reinforce import Box
 from mjx_reinforce.engines import choice, rollouts
 from mjx_reinforce.engines.native import available, objects, outlook, program, rollout
 from mjx_reinforce.engines.native.cpu import lanes, machine
@@ -41,21 +43,6 @@ def test_every_distribution_draws_the_same_noise(name):
     assert np.all(got.action[~got.mask] == 0)
 
 
-def in_scalars(env):
-    """Plays as ``vmap``, with the step written out."""
-    step = fused.vmap(env.step, in_axes=-1, out_axes=-1)
-    return functools.partial(rollouts.rollout, env_step=step)
-
-
-@pytest.mark.parametrize("hidden_sizes", [(), (7, 5, 6), (8, 6, 5)])
-def test_the_pendulum(hidden_sizes):
-    env = envs.make("InvertedPendulum-v5")
-    options = {"horizon": 50, "num_episodes": 20}
-    got, want = both(env, actor_and_act(env, hidden_sizes), in_scalars(env), **options)
-    assert not want.mask[:, -1].all()
-    assert_same_episodes(got, want, rounding=2e-5)
-
-
 def test_a_limit_for_each_episode():
     """Also one beyond the horizon, and one of no step; some take the mode."""
     env = Drifting()
@@ -70,15 +57,6 @@ def test_a_limit_for_each_episode():
     np.testing.assert_array_equal(got.reward, np.where(got.mask, whole.reward, 0))
 
 
-@pytest.mark.parametrize("id", ["CartPole-v1", "Reacher-v5"])
-def test_tasks_without_contacts(id):
-    env = envs.make(id)
-    distribution = categorical(env.action_space.num_actions) if id == "CartPole-v1" else None
-    player = actor_and_act(env, (4,), distribution=distribution)
-    got, want = both(env, player, in_scalars(env), horizon=20, num_seeds=2)
-    assert_same_episodes(got, want, rounding=1e-4)
-
-
 @pytest.mark.cpu
 def test_no_lane_waits():
     """Lengths from 4 to 84, a lane's next episode of any seed: nearly all that is played counts."""
@@ -90,56 +68,27 @@ def test_no_lane_waits():
     assert np.all(got.simulated > 0)
 
 
-def test_a_seed_that_stands_still_plays_nothing():
-    env = Drifting()
-    actor, act, distribution = actor_and_act(env, ())
-
-    @jax.jit
-    def play(active):
-        def one(active, key):
-            size = {"num_episodes": 4, "horizon": 60}
-            return rollout.rollout(env, act, actor, distribution, key, active=active, **size)
-
-        return jax.vmap(one)(active, jax.random.split(jax.random.key(1), 3))
-
-    every, some, none = (play(jnp.array(x)) for x in ([1, 1, 1], [1, 0, 1], [0, 0, 0]))
-    for leaf, whole in zip(jax.tree.leaves(some), jax.tree.leaves(every), strict=True):
-        assert not np.any(leaf[1])
-        if leaf.ndim > 1:
-            np.testing.assert_array_equal(leaf[::2], whole[::2])
-    assert not any(np.any(x) for x in jax.tree.leaves(none))
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_only_active_episodes_are_played(threads):
-    """They are, to the bit, what the same episodes are alone, by their own keys; some are modes."""
-    env = Drifting()
-    actor, act, distribution = actor_and_act(env, (5,))
-    keys = jax.random.split(jax.random.key(1), (3, 40))
+def test_only_active_episodes_are_played():
+    """Of each seed as many as it has, some of which are modes."""
     chosen = np.arange(120).reshape(3, 40) % 3 == 1
     chosen[1] = False
-    modes = np.arange(40) % 2 == 0
+    options = {"horizon": 60, "deterministic": np.arange(40) % 2 == 0}
+    some = only_active(
+        rollout.rollout, Drifting(), actor_and_act(Drifting(), (5,)), chosen, **options
+    )
+    assert (some.simulated > 0).tolist() == [True, False, True]
 
-    def one(keys, active, modes):
-        options = {"horizon": 60, "active": active, "deterministic": modes, "threads": threads}
-        size = {"num_episodes": len(keys)}
-        return rollout.rollout(env, act, actor, distribution, keys, **size, **options)
 
-    some = jax.jit(jax.vmap(one, in_axes=(0, 0, None)))(keys, jnp.array(chosen), modes)
-    assert some.mask.any()
-    for s in range(3):
-        got = jax.tree.map(lambda x, s=s: np.asarray(x)[s], some)
-        rest = got.replace(
-            observation=got.observation[:, ~chosen[s]], action=got.action[:, ~chosen[s]]
-        )
-        assert not any(x.any() for x in (rest.observation, rest.action, got.mask[:, ~chosen[s]]))
-        assert not got.reward[:, ~chosen[s]].any()
-        assert bool(got.simulated) == chosen[s].any()
-        if chosen[s].any():
-            alone = jax.jit(one)(keys[s][chosen[s]], True, modes[chosen[s]])
-            for name in ("observation", "action", "reward", "mask"):
-                part = getattr(got, name)[:, chosen[s]]
-                np.testing.assert_array_equal(part, getattr(alone, name), err_msg=name)
+def test_episodes_have_keys_of_their_own():
+    env, keys = Drifting(), jax.random.split(jax.random.key(1), 9)
+    actor, act, distribution = actor_and_act(env, (5,))
+    size = {"num_episodes": 9, "horizon": 60}
+    whole = rollout.rollout(env, act, actor, distribution, keys, **size)
+    size["num_episodes"] = 4
+    some = rollout.rollout(env, act, actor, distribution, keys[::-2][:4], **size)
+    for name in ("observation", "action", "reward", "mask"):
+        want = getattr(whole, name)[:, ::-2][:, :4]
+        np.testing.assert_array_equal(getattr(some, name), want, err_msg=name)
 
 
 @pytest.mark.cpu
@@ -155,141 +104,75 @@ def test_steps_are_counted_for_the_seed_that_a_lane_played():
     assert np.all(many.simulated >= many.mask.sum((1, 2)))
 
 
-def assert_identical(got, want):
-    for name in ("observation", "action", "reward", "mask", "nonfinite"):
-        np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_the_number_of_threads_changes_nothing(threads):
-    env = Drifting()
-    player = actor_and_act(env, (5,))
+def test_the_number_of_threads_changes_nothing():
+    player = actor_and_act(Drifting(), (5,))
     options = {"num_episodes": 40, "horizon": 60}
-    want = played(rollout.rollout, env, player, **options)
-    some = played(functools.partial(rollout.rollout, threads=threads), env, player, **options)
-    assert_identical(some, want)
-    assert_identical(played(rollout.rollout, env, player, **options), want)
-
-
-@pytest.mark.cpu
-@pytest.mark.parametrize("level", ["x86-64", "x86-64-v3"])
-def test_older_cpus(level, monkeypatch):
-    """Fewer lanes, no fused products: the same episodes up to rounding."""
-    env = Drifting()
-    player = actor_and_act(env, (5,))
-    want = played(rollout.rollout, env, player, horizon=30)
-    monkeypatch.setenv(machine.VARIABLE, level)
-    try:
-        machine.this_machine()
-    except ValueError as error:
-        pytest.skip(str(error))
-    jax.clear_caches()
-    assert_same_episodes(played(rollout.rollout, env, player, horizon=30), want, rounding=2e-5)
-
-
-def test_an_end_that_is_nan_is_no_end():
-    class Lost(Drifting):
-        def step(self, state, action):
-            after = super().step(state, action)
-            return after.replace(done=jnp.where(after.obs[0] > 0.75, jnp.nan, after.done))
-
-    env = Lost()
-    got, want = both(env, actor_and_act(env, (4,)), num_episodes=20)
-    assert 0 < want.nonfinite.mean() < 1
-    assert_same_episodes(got, want, rounding=2e-5)
+    want = played(rollout.rollout, Drifting(), player, **options)
+    for threads in (1, 2, 0):
+        play = functools.partial(rollout.rollout, threads=threads)
+        got = played(play, Drifting(), player, **options)
+        for name in ("observation", "action", "reward", "mask", "nonfinite"):
+            np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
 
 
 def test_a_nan_stays_in_its_lane():
+    """As an observation and as ``done``; the other episodes are as without it."""
+
     class Breaking(Drifting):
         def step(self, state, action):
             after = super().step(state, action)
-            broken = after.obs[0] > 0.75
-            return after.replace(obs=jnp.where(broken, jnp.nan, after.obs))
+            x = after.obs[0]
+            return after.replace(
+                obs=jnp.where(x > 0.75, jnp.nan, after.obs),
+                done=jnp.where(x < -0.75, jnp.nan, after.done),
+            )
 
-    calm, env = Drifting(), Breaking()
-    player = actor_and_act(env, (4,))
-    got, want = both(env, player, num_episodes=20)
-    assert 0 < want.nonfinite.mean() < 1
+    player = actor_and_act(Breaking(), (4,))
+    got, want = both(Breaking(), player, num_episodes=20)
     assert_same_episodes(got, want, rounding=2e-5)
-    sound = ~got.nonfinite
-    alone = played(rollout.rollout, calm, player, num_episodes=20)
-    kept = sound & (alone.observation[..., 0].max(axis=1) < 0.75)
+    alone = played(rollout.rollout, Drifting(), player, num_episodes=20)
+    reached = alone.observation[:, 1:, :, 0]
+    high, low = (reached > 0.75).any(axis=1), (reached < -0.75).any(axis=1)
+    assert (low & ~high).any()
+    assert high.any()
+    assert got.nonfinite[low | high].all()
+    kept = ~got.nonfinite
     assert kept.any()
     for name in ("observation", "action", "reward"):
         one, other = (np.moveaxis(getattr(x, name), 1, 2)[kept] for x in (got, alone))
         np.testing.assert_array_equal(one, other)
 
 
-def test_integers_divide_as_everywhere():
-    """By zero, and the least one by -1, for both of which a processor stops the program."""
-    edges = jnp.int32([-(2**31), -7, -1, 0, 1, 5, 2**31 - 1])
-
-    class Divides(Drifting):
-        def reset(self, rng):
-            state = super().reset(rng)
-            numbers = jax.random.choice(rng, edges, (2,))
-            return state.replace(info=(*state.info, numbers))
-
-        def step(self, state, action):
-            *info, (x, y) = state.info
-            after = super().step(state.replace(info=tuple(info)), action)
-            parts = jnp.float32([jax.lax.div(x, y), jax.lax.rem(x, y)])
-            info = (*after.info, jnp.stack([x, y]))
-            return after.replace(info=info, reward=parts[0] + 3 * parts[1])
-
-    env = Divides()
-    got, want = both(env, actor_and_act(env, ()), num_episodes=100, horizon=1)
-    np.testing.assert_array_equal(got.reward, want.reward)
-    assert len(np.unique(want.reward)) > 20
-
-
-@pytest.mark.parametrize("count", [1, 4, 8, 16])
-def test_vectors_begin_at_multiples_of_their_size(count):
+def test_vectors_begin_at_multiples_of_their_size():
     """As LLVM takes for granted, also of 16 numbers of 8 bytes."""
     leaves = [jax.ShapeDtypeStruct((3,), x) for x in (np.float32, np.float64, np.int32, np.int64)]
-    places = lanes.layout(leaves, 1, 1, count)
-    fields = [*places.inputs, places.broken, places.seed, places.episode]
-    for field, after in itertools.pairwise(fields):
-        assert after.offset >= field.offset + field.count * field.dtype.itemsize * count
-    for field in fields:
-        vector = field.dtype.itemsize * count
-        assert field.offset % vector == lanes.ALIGNMENT % vector == 0
+    for count in (1, 4, 8, 16):
+        places = lanes.layout(leaves, 1, 1, count)
+        fields = [*places.inputs, places.broken, places.seed, places.episode]
+        for field, after in itertools.pairwise(fields):
+            assert after.offset >= field.offset + field.count * field.dtype.itemsize * count
+        for field in fields:
+            vector = field.dtype.itemsize * count
+            assert field.offset % vector == lanes.ALIGNMENT % vector == 0
 
 
 @pytest.mark.cpu
 def test_double_precision():
+    """Networks have float32 parameters, whatever jax_enable_x64 says."""
     with jax.enable_x64(True):
         env = Drifting()
-        got, want = both(env, actor_and_act(env, (4, 3)), num_episodes=20)
+        player = actor_and_act(env, (4, 3))
+        assert np.dtype(np.float32) in {x.dtype for x in jax.tree.leaves(player[0].params)}
+        got, want = both(env, player, num_episodes=20)
         assert got.observation.dtype == np.float64
         assert_same_episodes(got, want, rounding=1e-12)
     jax.clear_caches()
 
 
-@pytest.mark.cpu
-def test_a_policy_in_single_precision_plays_in_double_precision():
-    """Networks have float32 parameters, whatever jax_enable_x64 says."""
-    with jax.enable_x64(True):
-        learners = [
-            reinforce(Drifting(), num_episodes=4, horizon=20, engine=engine)
-            for engine in ("native", "vmap")
-        ]
-        returns = []
-        for learner in learners:
-            state = learner.init(jax.random.key(0))
-            trajectory = jax.jit(learner.play)(state, jax.random.key(1))
-            returns.append(np.asarray(trajectory.reward))
-    assert returns[0].dtype == np.float64
-    np.testing.assert_allclose(*returns, rtol=1e-6, atol=1e-6)
-    jax.clear_caches()
-
-
 def test_no_code_is_made_twice(tmp_path, monkeypatch):
     """Not in a process, and not in the next, which reads it from the disk."""
-    env = envs.make("CartPole-v1")
-    actor, act, distribution = actor_and_act(
-        env, (), distribution=categorical(env.action_space.num_actions)
-    )
+    env = Drifting()
+    actor, act, distribution = actor_and_act(env, ())
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
     first = program.build_program(env, act, actor, distribution, 17)
     assert first.code.compiled
@@ -317,10 +200,8 @@ def test_constants_are_part_of_the_code():
 
 
 def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
-    env = envs.make("CartPole-v1")
-    actor, act, distribution = actor_and_act(
-        env, (), distribution=categorical(env.action_space.num_actions)
-    )
+    env = Drifting()
+    actor, act, distribution = actor_and_act(env, ())
     player = choice.ActingPolicy(act, actor, distribution)
     assert choice.choose("auto", env, player, 500).name == "native"
     assert choice.choose("auto", env).name == "vmap"
@@ -350,22 +231,21 @@ def test_lanes_have_no_numbers_of_8_bits():
     assert "machine code cannot play this: its state has numbers of int8" in chosen.why
 
 
-@pytest.mark.parametrize("implementation", ["rbg", "unsafe_rbg"])
-def test_keys_of_another_generator(implementation):
+def test_keys_of_another_generator():
     """Their noise is not drawn here; auto plays them as ``vmap`` does, and says so."""
     env = Drifting()
     actor, act, distribution = actor_and_act(env, (4,))
-    key = jax.random.key(1, impl=implementation)
+    key = jax.random.key(1, impl="rbg")
     engine = choice.choose("auto", env, choice.ActingPolicy(act, actor, distribution), 20)
     assert engine.name == "native"
 
     def play(engine):
         return engine(env, act, actor, distribution, key, num_episodes=6, horizon=20)
 
-    with pytest.warns(UserWarning, match=f"the key is of {implementation}; vmap plays it"):
+    with pytest.warns(UserWarning, match="the key is of rbg; vmap plays it"):
         got = play(engine.rollout)
     assert_same_episodes(got, play(rollouts.rollout), rounding=0)
-    with pytest.raises(ValueError, match=rf'of {implementation}; make .*impl="threefry2x32"'):
+    with pytest.raises(ValueError, match=r'of rbg; make .*impl="threefry2x32"'):
         play(rollout.rollout)
 
 
@@ -375,26 +255,19 @@ def chosen(env, name="auto"):
 
 
 @pytest.mark.cpu
-@pytest.mark.parametrize(
-    "error", [KeyError("lost"), ValueError("cannot reshape"), RecursionError("deep")]
-)
-def test_auto_falls_back_whatever_the_writer_raises(error, monkeypatch):
+def test_auto_falls_back_whatever_the_writer_raises(monkeypatch):
     def write(*_):
         raise error
 
     monkeypatch.setattr(program, "_write_cpu", write)
+    monkeypatch.setattr(machine, "_LOADED", {})
     monkeypatch.setattr(objects, "folder", lambda: None)
-
-    class Unseen(Drifting):
-        def step(self, state, action):
-            after = super().step(state, action)
-            return after.replace(reward=after.reward + len(type(error).__name__))
-
-    engine = chosen(Unseen())
-    assert engine.name == "vmap"
-    assert f"it cannot be written out ({type(error).__name__}" in engine.why
-    with pytest.raises(ValueError, match="native engine cannot play this: it cannot be written"):
-        chosen(Unseen(), "native")
+    for error in (KeyError("lost"), ValueError("cannot reshape"), RecursionError("deep")):
+        engine = chosen(Drifting())
+        assert engine.name == "vmap"
+        assert f"it cannot be written out ({type(error).__name__}" in engine.why
+        with pytest.raises(ValueError, match="native engine cannot play this: it cannot be writ"):
+            chosen(Drifting(), "native")
 
 
 class Panorama(Drifting):
@@ -411,7 +284,6 @@ class Panorama(Drifting):
 def test_wide_observations_are_not_for_machine_code():
     engine = chosen(Panorama())
     assert engine.name == "vmap"
-    assert "because of an observation of 2,000 entries" in engine.why
     assert "109 s, more than 80 s, because of an observation of 2,000 entries" in engine.why
     assert outlook.announcement(Panorama()) is None
     assert outlook.announcement(Drifting()) is None
@@ -420,13 +292,15 @@ def test_wide_observations_are_not_for_machine_code():
 @pytest.mark.cpu
 def test_large_models_are_not_for_machine_code(monkeypatch):
     """The reason says which bodies meet most, and people who wait are told of it beforehand."""
-    env = envs.make("Walker2d-v5")
-    assert outlook.seconds(env) == pytest.approx(5, abs=3)
-    monkeypatch.setattr(outlook, "_WORTH_SAYING", 1)
+    env = Drifting()
+    env.mj_model = mujoco.MjModel.from_xml_string(SCENE)  # pyright: ignore
+    env.num_contacts = 14
     monkeypatch.setattr(objects, "folder", lambda: None)
+    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(outlook, "_WORTH_SAYING", 0)
     assert "with up to 14 contacts, and compiling" in str(outlook.announcement(env))
-    monkeypatch.setattr(outlook, "MAX_SECONDS", 1)
+    monkeypatch.setattr(outlook, "MAX_SECONDS", 1e-9)
     engine = chosen(env)
     assert engine.name == "vmap"
-    assert "more than 1 s, because of its size; its geoms can meet in" in engine.why
+    assert "more than 1e-09 s, because of its size; its geoms can meet in" in engine.why
     assert re.search(r"bodies 'world' \(\d+\), .* the feet alone, by contype", engine.why)

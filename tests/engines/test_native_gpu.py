@@ -9,150 +9,133 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from players import actor_and_act, assert_same_episodes, both, played
-from scenes import MANY_FEET, Scene
+from jax import lax
+from players import actor_and_act, assert_same_episodes, only_active, played
+from scenes import THREE_FEET, Scene
 from toys import Bytes, Chain, Drifting, categorical
 
-from mjx_reinforce import envs, fused
-from mjx_reinforce.engines import choice
+from mjx_reinforce import fused
+from mjx_reinforce.engines import rollouts
 from mjx_reinforce.engines.native import available, objects, program, rollout, step
 from mjx_reinforce.engines.native.gpu import kernel as kernels
 from mjx_reinforce.engines.native.gpu import lockstep, ptx, scratch, seam
 from mjx_reinforce.fused import scalarized
+from mjx_reinforce.physics import touching
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
 
 
+class Busy(Drifting):
+    """Its step has loops that keep and read arrays, one that ends by its lane, and a branch."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        x, y = after.obs
+        kept = lax.scan(lambda c, w: (jnp.sin(c + w), c * w), x, jnp.linspace(0.1, 1, 9))[1]
+        total = lax.scan(lambda c, row: (0.9 * c + row, None), y, kept[::-1])[0]
+        grown = lax.while_loop(lambda z: z < 1.5, lambda z: z + 0.1 + y**2, jnp.abs(total))
+        often = lambda: lax.fori_loop(0, 9, lambda _, z: jnp.cos(z) + jnp.sin(z * x), y)  # noqa: E731
+        extra = lax.cond(x > 0.2, often, lambda: 0.0)
+        return after.replace(reward=after.reward + total + grown + extra)
+
+
 @pytest.fixture(scope="module")
-def pendulum():
-    env = envs.make("InvertedPendulum-v5")
+def busy():
+    env = Busy()
     return env, actor_and_act(env, (5, 6))
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-def test_the_same_episodes_as_everywhere(pendulum, monkeypatch, threads):
-    """Of a task, and of toys whose state has a counter, a flag, a limit and a number of 8 bits."""
-    gpu_on_cpu.emulate(monkeypatch, threads)
-    toys = ((env, actor_and_act(env, (4,))) for env in (Drifting(), Bytes()))
-    for env, who in (pendulum, *toys):
-        limit = jnp.array([200, 7, 100, 1, 63])
-        got, want = both(env, who, deterministic=jnp.arange(5) < 2, horizon=100, limit=limit)
+def assert_identical(got, want):
+    for name in ("observation", "action", "reward", "mask", "nonfinite"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("env", "distribution"),
+    [
+        pytest.param(Busy(), None, id="loops", marks=pytest.mark.slow),
+        pytest.param(Bytes(), None, id="8 bits"),
+        pytest.param(Chain(), categorical(2), id="integer actions", marks=pytest.mark.slow),
+    ],
+)
+def test_the_same_episodes_as_everywhere(env, distribution, monkeypatch):
+    """Of toys whose state has a counter, a flag, a limit and a number of 8 bits."""
+    who = actor_and_act(env, (4,), distribution=distribution)
+    options = {"deterministic": jnp.arange(5) < 2, "horizon": 100}
+    options["limit"] = jnp.array([200, 7, 100, 1, 63])
+    want = None
+    for threads in (1, 3):
+        gpu_on_cpu.emulate(monkeypatch, threads)
+        got = played(rollout.rollout, env, who, **options)
+        want = want or played(rollouts.rollout, env, who, **options)
+        assert got.action.dtype == want.action.dtype
         assert got.mask[:, 0].all()
         assert not got.mask[:, -1].all()
         assert_same_episodes(got, want, rounding=2e-5)
+        if threads == 1:
+            np.testing.assert_array_equal(got.simulated, got.mask.sum((1, 2)))
 
 
-def test_actions_may_be_integers(monkeypatch):
-    gpu_on_cpu.emulate(monkeypatch)
-    env = Chain()
-    got, want = both(env, actor_and_act(env, (4,), distribution=categorical(2)))
-    assert got.action.dtype == want.action.dtype
-    assert_same_episodes(got, want, rounding=1e-6)
-
-
-def test_steps_are_counted_for_the_seed_that_played_them(pendulum, monkeypatch):
-    gpu_on_cpu.emulate(monkeypatch)
-    result = played(rollout.rollout, *pendulum, num_episodes=7, horizon=100)
-    np.testing.assert_array_equal(result.simulated, result.mask.sum((1, 2)))
-
-
-def test_seeds_that_are_not_active_are_not_played(pendulum, monkeypatch):
-    gpu_on_cpu.emulate(monkeypatch)
-    env, (actor, act, distribution) = pendulum
-
-    def one(key, active):
-        size = {"num_episodes": 5, "horizon": 20}
-        return rollout.rollout(env, act, actor, distribution, key, active=active, **size)
-
-    keys = jax.random.split(jax.random.key(0), 4)
-    all_seeds, some = (
-        jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(keys, jnp.array(active)))
-        for active in ([True] * 4, [False, True, False, True])
-    )
-    assert all_seeds.mask[:, 0].all()
-    for got, want in zip(jax.tree.leaves(some), jax.tree.leaves(all_seeds), strict=True):
-        assert not got[[0, 2]].any()
-        np.testing.assert_array_equal(got[[1, 3]], want[[1, 3]])
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_episodes_that_are_not_active_are_not_played(pendulum, monkeypatch, threads):
+@pytest.mark.slow
+def test_episodes_that_are_not_active_are_not_played(busy, monkeypatch):
     """Also in step with others: a thread that never had an episode counts no steps."""
-    block = gpu_on_cpu.Block(threads)
-    gpu_on_cpu.emulate(monkeypatch, block=block)
     monkeypatch.setattr(lockstep, "LONG", 0)
-    env, (actor, act, distribution) = pendulum
-
-    def one(key, active):
-        size = {"num_episodes": 5, "horizon": 20, "deterministic": jnp.arange(5) % 2 == 1}
-        return rollout.rollout(env, act, actor, distribution, key, active=active, **size)
-
-    keys = jax.random.split(jax.random.key(0), 3)
     chosen = np.array([[0] * 5, [0, 1, 0, 0, 1], [0] * 5]).astype(bool)
-    play = jax.jit(jax.vmap(one))
-    some, every = (
-        jax.tree.map(np.asarray, play(keys, x)) for x in (jnp.array(chosen), jnp.ones((3, 5), bool))
-    )
-    assert block.apart is None
-    np.testing.assert_array_equal(some.mask, every.mask & chosen[:, None])
-    for name in ("observation", "action", "reward"):
-        played = some.mask.reshape(some.mask.shape + (1,) * (getattr(some, name).ndim - 3))
-        np.testing.assert_array_equal(getattr(some, name), played * getattr(every, name))
-    assert not some.simulated[[0, 2]].any()
-    lengths = some.mask[1].sum(axis=0)
-    assert some.simulated[1] == (lengths.sum() if threads == 1 else 2 * lengths.max())
+    options = {"horizon": 20, "deterministic": jnp.arange(5) % 2 == 1}
+    for threads in (1, 3):
+        block = gpu_on_cpu.Block(threads)
+        gpu_on_cpu.emulate(monkeypatch, block=block)
+        some = only_active(rollout.rollout, *busy, chosen, **options)
+        assert block.apart is None
+        assert not some.simulated[[0, 2]].any()
+        lengths = some.mask[1].sum(axis=0)
+        assert some.simulated[1] == (lengths.sum() if threads == 1 else 2 * lengths.max())
 
 
-def test_in_step_or_apart_an_episode_is_the_same(monkeypatch):
-    """Hopper's loops and branches, entered by all threads together or by each alone.
+@pytest.mark.slow
+def test_in_step_or_apart_and_with_long_arrays_in_a_buffer_an_episode_is_the_same(
+    busy, monkeypatch
+):
+    """Loops and branches are entered by all threads together or by each alone.
 
     Threads of a block meet at one place, also where their episodes have ended.
     """
-    env = envs.make("Hopper-v5")
-    who = actor_and_act(env, (4,))
     gpu_on_cpu.emulate(monkeypatch)
-    want = played(rollout.rollout, env, who, horizon=30)
-    meetings = []
-    for long in (10**9, 3_000, 0):
+    want = played(rollout.rollout, *busy, horizon=30)
+    made, meetings = [], []
+    for long, longest in ((10**9, 25), (4, 25), (0, 4)):
         block = gpu_on_cpu.Block(3)
         gpu_on_cpu.emulate(monkeypatch, block=block)
+        load = ptx.load_kernel
+        monkeypatch.setattr(
+            ptx, "load_kernel", lambda *x, load=load: made.append(load(*x)) or made[-1]
+        )
         monkeypatch.setattr(lockstep, "LONG", long)
-        got = played(rollout.rollout, env, who, horizon=30)
+        monkeypatch.setattr(scratch, "WRITTEN_OUT", longest)
+        got = played(rollout.rollout, *busy, horizon=30)
         assert block.apart is None
         meetings.append(block.meetings)
-        for name in ("observation", "action", "reward", "mask", "nonfinite"):
-            np.testing.assert_array_equal(getattr(got, name), getattr(want, name))
+        assert_identical(got, want)
+    assert [kernel.scratch > 0 for kernel in made] == [False, False, True]
     assert 0 < meetings[0] < meetings[1] < meetings[2]
 
 
+@pytest.mark.slow
 def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
-    env = Scene(MANY_FEET)
+    monkeypatch.setattr(touching, "_room", lambda model: 1)
+    env = Scene(THREE_FEET)
     who = actor_and_act(env, ())
     size = {"num_episodes": 12, "horizon": 2}
     gpu_on_cpu.emulate(monkeypatch)
     want = played(rollout.rollout, env, who, **size)
+    touch = want.observation[:, 1, :, -3:].sum(axis=-1)
+    assert {0, 1, 2} <= {*touch.ravel().astype(int)}
     block = gpu_on_cpu.Block(3)
     gpu_on_cpu.emulate(monkeypatch, block=block)
     monkeypatch.setattr(lockstep, "LONG", 0)
-    got = played(rollout.rollout, env, who, **size)
+    assert_identical(played(rollout.rollout, env, who, **size), want)
     assert block.apart is None
-    for name in ("observation", "action", "reward", "mask"):
-        np.testing.assert_array_equal(getattr(got, name), getattr(want, name))
-
-
-def test_long_arrays_are_in_a_buffer(monkeypatch):
-    env = envs.make("Hopper-v5")
-    who = actor_and_act(env, (4,))
-    gpu_on_cpu.emulate(monkeypatch)
-    want = played(rollout.rollout, env, who, horizon=30)
-    monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
-    made, load = [], ptx.load_kernel
-    monkeypatch.setattr(ptx, "load_kernel", lambda *x: made.append(load(*x)) or made[-1])
-    got = played(rollout.rollout, env, who, horizon=30)
-    assert made[0].scratch > 100
-    for name in ("observation", "action", "reward", "mask"):
-        np.testing.assert_array_equal(getattr(got, name), getattr(want, name))
 
 
 def test_each_thread_has_words_of_its_own():
@@ -176,8 +159,7 @@ def test_each_thread_has_words_of_its_own():
     np.testing.assert_array_equal(buffer, 100 * threads + entries[:, None])
 
 
-def kernel_text(env, sizes):
-    actor, act, distribution = actor_and_act(env, sizes)
+def kernel_text(env, actor, act, distribution):
     examples = step.examples(env, actor)[:-1]
     function = step.step_function(env, act, distribution, 50)
     written = scalarized.build(
@@ -198,38 +180,39 @@ def test_a_division_that_llvm_spells_otherwise_is_not_left():
         ptx._with_xla_divisions("div.rn.f32 %f1, %f2, %f3;")
 
 
-@pytest.mark.parametrize(
-    ("name", "threads", "blocks"), [("InvertedPendulum-v5", 32, 16), ("Hopper-v5", 256, 1)]
-)
-@pytest.mark.parametrize("capability", ["7.5", "9.0"])
-def test_ptx(name, threads, blocks, capability, tmp_path, monkeypatch):
+@pytest.mark.parametrize("long", [False, True])
+def test_ptx(busy, long, tmp_path, monkeypatch):
     """It is one kernel that calls nothing; NVIDIA's assembler takes it, where there is one."""
-    monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
-    text = kernel_text(envs.make(name), (4,))
-    made = ptx.load_kernel(text, lambda: text, capability, tmp_path)
-    assert made.compiled
-    assert (made.threads, made.blocks) == (threads, blocks)
-    assert (made.scratch > 0) == (name == "Hopper-v5")
-    assert made.text.count(".entry play(") == 1
-    assert f".target sm_{capability.replace('.', '')}" in made.text
-    assert "call" not in made.text
-    assert '.pragma "nounroll";' in made.text  # the assembler leaves our loops as they are
-    meetings = re.findall(r"(bar.warp.sync 0xffffffff; )?bar(?:rier)?\.(?:sync|red)", made.text)
-    assert meetings
-    assert all(meetings)  # a warp comes together before each: an H200 waited forever without
-    ptx._LOADED.clear()
-    again = ptx.load_kernel(text, lambda: pytest.fail("it is on disk"), capability, tmp_path)
-    assert again == made._replace(compiled=False)
-    if shutil.which("ptxas"):
-        source = tmp_path / "play.ptx"
-        source.write_text(made.text)
-        architecture = f"-arch=sm_{capability.replace('.', '')}"
-        subprocess.run(["ptxas", "-O0", architecture, source, "-o", "/dev/null"], check=True)
+    env, player = busy
+    if long:
+        monkeypatch.setattr(kernels, "LONG", 10)
+        monkeypatch.setattr(lockstep, "LONG", 4)
+        monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
+    text = kernel_text(env, *player)
+    for capability in ("7.5", "9.0"):
+        made = ptx.load_kernel(text, lambda: text, capability, tmp_path)
+        assert made.compiled
+        assert (made.threads, made.blocks) == ((256, 1) if long else (32, 16))
+        assert (made.scratch > 0) == long
+        assert made.text.count(".entry play(") == 1
+        assert f".target sm_{capability.replace('.', '')}" in made.text
+        assert "call" not in made.text
+        assert '.pragma "nounroll";' in made.text  # the assembler leaves our loops as they are
+        meetings = re.findall(r"(bar.warp.sync 0xffffffff; )?bar(?:rier)?\.(?:sync|red)", made.text)
+        assert meetings
+        assert all(meetings)  # a warp comes together before each: an H200 waited forever without
+        ptx._LOADED.clear()
+        again = ptx.load_kernel(text, lambda: pytest.fail("it is on disk"), capability, tmp_path)
+        assert again == made._replace(compiled=False)
+        if shutil.which("ptxas"):
+            source = tmp_path / "play.ptx"
+            source.write_text(made.text)
+            architecture = f"-arch=sm_{capability.replace('.', '')}"
+            subprocess.run(["ptxas", "-O0", architecture, source, "-o", "/dev/null"], check=True)
 
 
-def test_the_buffer_has_room_for_the_threads_of_all_blocks(monkeypatch, tmp_path):
-    env = envs.make("Hopper-v5")
-    actor, act, distribution = actor_and_act(env, (4,))
+def test_the_buffer_has_room_for_the_threads_of_all_blocks(busy, monkeypatch, tmp_path):
+    env, (actor, act, distribution) = busy
     monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
     monkeypatch.setattr(ptx, "_LOADED", {})
@@ -257,9 +240,9 @@ def test_what_no_kernel_computes_is_refused():
         ptx._compile("declare double @cosh(double)\n", "9.0")
 
 
-def test_one_launch_for_all_seeds_in_loops(pendulum, monkeypatch):
+def test_one_launch_for_all_seeds_in_loops(busy, monkeypatch):
     """Vmapped twice, in a scan, it is one custom call that writes over zeros."""
-    env, (actor, act, distribution) = pendulum
+    env, (actor, act, distribution) = busy
 
     def one(key):
         return rollout.rollout(env, act, actor, distribution, key, num_episodes=8, horizon=50)
@@ -274,7 +257,7 @@ def test_one_launch_for_all_seeds_in_loops(pendulum, monkeypatch):
     text = gpu_on_cpu.lowered(monkeypatch, repeated, jax.random.split(jax.random.key(0), (2, 3)))
     calls = [line for line in text.splitlines() if "@mjx_reinforce_gpu_" in line]
     assert len(calls) == 1
-    assert "tensor<6x50x4x8xf32>" in calls[0]
+    assert "tensor<6x50x2x8xf32>" in calls[0]
     assert calls[0].count("operand_index") == len(kernels.RESULTS)
     assert "blocks = 2 : i32" in calls[0]
     assert "threads = 32 : i32" in calls[0]
@@ -291,19 +274,8 @@ def test_it_says_why_there_are_no_kernels(monkeypatch):
     with jax.enable_x64(True):
         assert "float32 alone" in (seam.kernels_unavailable() or "")
     assert "libcuda.so.1, is not found" in (seam.kernels_unavailable() or "")
-
-
-@pytest.mark.cpu
-def test_another_engine_plays_where_kernels_are_not_launched(pendulum, monkeypatch):
     monkeypatch.setattr(available, "platform", lambda: "gpu")
-    monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
-    env, (actor, act, distribution) = pendulum
-    who = choice.ActingPolicy(act, actor, distribution)
-    chosen = choice.choose("auto", env, who, 50)
-    assert chosen.name == "vmap"
-    assert "libcuda.so.1, is not found" in chosen.why
-    with pytest.raises(ValueError, match=r"libcuda.so.1, is not found"):
-        choice.choose("native", env, who, 50)
+    assert "libcuda.so.1, is not found" in (available.unavailable() or "")
 
 
 def test_few_episodes_are_spread_over_all_multiprocessors(monkeypatch):

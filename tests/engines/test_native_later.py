@@ -132,10 +132,11 @@ play(jnp.ones((2000, 2000)), jnp.array([1, 0, 1]))
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("end", "status"),
-    [("", 0), ("sys.exit(7)", 7), ("os.kill(os.getpid(), signal.SIGINT)", -2), (WAITING, 0)],
-    ids=["end", "exit", "interrupt", "waiting program"],
+    [("sys.exit(7)", 7), ("os.kill(os.getpid(), signal.SIGINT)", -2), (WAITING, 0)],
+    ids=["exit", "interrupt", "waiting program"],
 )
 def test_who_ends_does_not_wait(end, status, tmp_path):
     """And leaves no process behind."""

@@ -37,11 +37,11 @@ def code(request, monkeypatch):
     return code
 
 
-@pytest.mark.parametrize("active", [ACTIVE, [0, 0], [1], 1, [[1, 0, 1], [0, 0, 1]]])
-def test_results_under_jit(code, active):
+def test_results_under_jit(code):
     play = jax.jit(lambda active: items.play(code, active))
-    for _ in range(2):
-        items.check(play(jnp.array(active)), active)
+    for active in (ACTIVE, [0, 0], [1], 1, [[1, 0, 1], [0, 0, 1]]):
+        for _ in range(2):
+            items.check(play(jnp.array(active)), active)
 
 
 def test_in_a_scan_and_a_while_loop(code):
@@ -93,21 +93,7 @@ def run(program, **environment):
     return done.stdout.split()
 
 
-def test_as_many_threads_as_asked():
-    """Of a pool of 4; and no thread for lanes that would be empty."""
-    run(
-        """
-code = items.load()
-for most, threads in ((0, 4), (1, 1), (2, 2), (3, 3), (9, 4)) * 5:
-    items.check(items.play(code, [1, 0, 1, 1], most, threads), [1, 0, 1, 1], threads)
-items.check(items.play(items.load(lanes=4), [1, 0, 1, 1], 0, 3), [1, 0, 1, 1], 3)
-items.check(items.play(items.load(lanes=16), [1, 0, 1, 1], 0, 1), [1, 0, 1, 1], 1)
-""",
-        NPROC="4",
-    )
-
-
-@pytest.mark.parametrize("pool", ["1", "4"])
+@pytest.mark.parametrize("pool", ["1", pytest.param("4", marks=pytest.mark.slow)])
 def test_on_eight_devices_at_once(pool):
     run(
         """
@@ -127,6 +113,7 @@ for device in range(8):
     )
 
 
+@pytest.mark.slow
 def test_no_memory_is_lost():
     """10,000 jobs of 4 kB on a pool of 4; tasks that come late free what they hold."""
     before, after = run(
@@ -175,51 +162,60 @@ def test_results_are_zeroed_by_all_threads():
     np.testing.assert_array_equal(simulated, [3, 0])
 
 
-LOAD = """
-from pathlib import Path
+@pytest.mark.slow
+def test_a_second_process_compiles_nothing(tmp_path):
+    """Neither LLVM nor XLA."""
+    program = """
 from mjx_reinforce.engines.native import objects
+events = []
+jax.monitoring.register_event_listener(lambda e, **_: events.append(e))
 code = items.load(objects.folder())
 items.check(jax.jit(lambda a: items.play(code, a))(jax.numpy.array([1, 0, 1])), [1, 0, 1])
-print(code.compiled)
+print(code.compiled, *(e.rsplit('/')[-1] for e in events if 'cache_' in e))
 """
-
-
-def test_a_second_process_compiles_nothing(tmp_path):
-    """Neither LLVM nor XLA; an object that was damaged is made again."""
-    hits = (
-        "events = []\njax.monitoring.register_event_listener(lambda e, **_: events.append(e))\n"
-        f"{LOAD}\nprint(*(e.rsplit('/')[-1] for e in events if 'cache_' in e))"
-    )
     where = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
-    assert run(hits, **where)[0] == "True"
-    compiled, *events = run(hits, **where)
+    assert run(program, **where)[0] == "True"
+    compiled, *events = run(program, **where)
     assert compiled == "False"
     assert "cache_hits" in events
     assert "cache_misses" not in events
-    (stored,) = (tmp_path / "native").iterdir()
-    whole = stored.read_bytes()
-    stored.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
-    assert run(LOAD, **where) == ["True"]
-    assert stored.read_bytes() == whole
 
 
-@pytest.mark.parametrize("place", ["", "native", "native/OBJECT"])
-def test_code_that_others_may_have_written_is_not_loaded(tmp_path, place):
-    where = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path)}
-    assert run(LOAD, **where) == ["True"]
-    (stored,) = (tmp_path / "native").iterdir()
-    (tmp_path / place.replace("OBJECT", stored.name)).chmod(0o777)
-    assert run(LOAD, **where) == ["True"]
-    stored.chmod(0o600)
-    assert run(LOAD, **where) == ["True" if place in ("", "native") else "False"]
+@pytest.fixture
+def cache(tmp_path):
+    """Where JAX keeps programs, for the test."""
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", before)
 
 
-@pytest.mark.parametrize("damage", [b"", b"short", bytes(2000)])
-def test_a_damaged_object_is_none(tmp_path, damage):
+def test_code_that_others_may_have_written_is_not_loaded(cache, monkeypatch):
+    def compiled():
+        monkeypatch.setattr(machine, "_LOADED", {})
+        return items.load(objects.folder()).compiled
+
+    assert compiled()
+    assert not compiled()
+    (stored,) = (cache / "native").iterdir()
+    for place in (cache, cache / "native"):
+        before = place.stat().st_mode
+        place.chmod(0o777)
+        with pytest.warns(UserWarning, match="others may write to .* no machine code is kept"):
+            assert compiled()
+        place.chmod(before)
+    stored.chmod(0o666)
+    assert compiled()
+    assert not compiled()
+
+
+def test_a_damaged_object_is_none(tmp_path):
     objects.write_object(tmp_path, "key", b"data")
     assert objects.read_object(tmp_path, "key") == b"data"
-    (tmp_path / "key.o").write_bytes(damage)
-    assert objects.read_object(tmp_path, "key") is None
+    whole = (tmp_path / "key.o").read_bytes()
+    for damage in (b"", b"short", bytes(2000), whole[:-1] + bytes([whole[-1] ^ 1])):
+        (tmp_path / "key.o").write_bytes(damage)
+        assert objects.read_object(tmp_path, "key") is None
 
 
 def test_the_cache_forgets_what_was_used_longest_ago(tmp_path):
@@ -238,15 +234,11 @@ def test_a_cache_that_cannot_be_written_is_none(tmp_path):
     assert objects.read_object(tmp_path / "file" / "cache", "key") is None
 
 
-def test_objects_are_kept_where_jax_keeps_programs():
-    before = jax.config.values["jax_compilation_cache_dir"]
-    assert objects.folder() == Path(before) / "native"
-    try:
-        for folder in (None, "gs://bucket/cache"):
-            jax.config.update("jax_compilation_cache_dir", folder)
-            assert objects.folder() is None
-    finally:
-        jax.config.update("jax_compilation_cache_dir", before)
+def test_objects_are_kept_where_jax_keeps_programs(cache):
+    assert objects.folder() == cache / "native"
+    for folder in (None, "gs://bucket/cache"):
+        jax.config.update("jax_compilation_cache_dir", folder)
+        assert objects.folder() is None
 
 
 class Frame:
@@ -326,34 +318,31 @@ class Frame:
         return self.keep(parts)
 
 
-@pytest.mark.parametrize(
-    ("settings", "scheduled", "destroyed"),
-    [
+def test_the_caller_plays_what_the_pool_does_not():
+    for settings, scheduled, destroyed in (
         ({"api_bytes": 144}, 0, 0),  # an API without a pool
         ({"count_refused": True}, 0, 1),  # a caller without one
         ({"schedules": 0}, 1, 1),
         ({"schedules": 1}, 2, 1),
         ({"schedules": 2}, 2, 0),
-    ],
-)
-def test_the_caller_plays_what_the_pool_does_not(settings, scheduled, destroyed):
-    frame = Frame(**settings)
-    seam._function(items.load(), "handler", 1, 0)(frame.address)
-    items.check(frame.results, [1, 1])
-    assert frame.scheduled == scheduled
-    assert frame.destroyed == [1234] * destroyed
+    ):
+        frame = Frame(**settings)
+        seam._function(items.load(), "handler", 1, 0)(frame.address)
+        items.check(frame.results, [1, 1])
+        assert frame.scheduled == scheduled, settings
+        assert frame.destroyed == [1234] * destroyed, settings
 
 
-@pytest.mark.parametrize(
-    ("lanes", "limit", "helpers"),
-    [(1, 0, 2), (2, 0, 2), (3, 0, 1), (5, 0, 1), (6, 0, 0), (1, 1, 0), (1, 2, 1), (1, 9, 2)],
-)
-def test_threads_for_six_items_on_a_pool_of_three(lanes, limit, helpers):
-    frame = Frame(limit=limit, late=True)
-    seam._function(items.load(lanes=lanes), "handler", 1, 0)(frame.address)
-    assert frame.scheduled == helpers
-    for _ in range(helpers):
-        frame.run_task()
+def test_threads_for_six_items_on_a_pool_of_three():
+    for lanes, limit, helpers in (
+        *((1, 0, 2), (2, 0, 2), (3, 0, 1), (5, 0, 1), (6, 0, 0)),
+        *((1, 1, 0), (1, 2, 1), (1, 9, 2)),
+    ):
+        frame = Frame(limit=limit, late=True)
+        seam._function(items.load(lanes=lanes), "handler", 1, 0)(frame.address)
+        assert frame.scheduled == helpers, (lanes, limit)
+        for _ in range(helpers):
+            frame.run_task()
 
 
 def test_a_task_that_comes_late_touches_only_the_job():
@@ -393,6 +382,9 @@ def test_code_for_older_cpus(level, monkeypatch):
     """The registers are those of the level, and the numbers the same."""
     import llvmlite.binding as llvm
 
+    monkeypatch.setenv(machine.VARIABLE, "pentium")
+    with pytest.raises(ValueError, match="pentium"):
+        machine.this_machine()
     lanes, features = machine.LEVELS[level]
     monkeypatch.setenv(machine.VARIABLE, level)
     if not all(llvm.get_host_cpu_features().get(feature) for feature in features):
@@ -422,12 +414,6 @@ def test_this_cpu_has_the_lanes_of_its_vectors():
             break
 
 
-def test_an_unknown_level_is_named(monkeypatch):
-    monkeypatch.setenv(machine.VARIABLE, "pentium")
-    with pytest.raises(ValueError, match="pentium"):
-        machine.this_machine()
-
-
 def test_it_says_why_it_is_unavailable(monkeypatch):
     assert available.unavailable() is None
     with monkeypatch.context() as patch:
@@ -444,7 +430,7 @@ def test_it_says_why_it_is_unavailable(monkeypatch):
 
 
 def test_the_engine_is_imported_without_llvmlite():
-    names = (
+    names = [
         "available",
         "objects",
         "cpu.machine",
@@ -452,7 +438,7 @@ def test_the_engine_is_imported_without_llvmlite():
         "cpu.seam",
         "gpu.ptx",
         "gpu.seam",
-    )
+    ]
     program = "".join(f"import mjx_reinforce.engines.native.{name}\n" for name in names)
     assert run(f"{program}print('llvmlite' in sys.modules)") == ["False"]
 

@@ -1,4 +1,4 @@
-"""One whole update of the pendulum by each engine, as kept in tests/engines/golden.
+"""One whole update of a toy by each engine, as kept in tests/engines/golden.
 
 ``JAX_PLATFORMS=cpu PYTHONPATH=. python tests/helpers/golden.py`` writes these files again: where
 the mathematics is changed on purpose, which the commit says.
@@ -9,8 +9,9 @@ import numpy as np
 import optax
 from jax.flatten_util import ravel_pytree
 from places import ROOT
+from toys import Drifting
 
-from mjx_reinforce import envs, reinforce, train_step
+from mjx_reinforce import reinforce, train_step
 
 FOLDER = ROOT / "tests" / "engines" / "golden"
 ENGINES = ("vmap", "native")
@@ -23,7 +24,7 @@ def updated(engine):
     first steps would have the gradient's sign alone.
     """
     learner = reinforce(
-        envs.make("InvertedPendulum-v5"),
+        Drifting(),
         num_episodes=4,
         horizon=20,
         optimizer=optax.sgd(0.01),

@@ -55,3 +55,22 @@ def played(play, env, player, num_seeds=3, num_episodes=5, **options):
 def both(env, player, other=rollouts.rollout, **options):
     got = played(rollout.rollout, env, player, **options)
     return got, played(other, env, player, **options)
+
+
+def only_active(play, env, player, chosen, **options):
+    """Plays chosen episodes [S, N] of several seeds: zeros stand for all others. The result."""
+    actor, act, distribution = player
+    options["num_episodes"] = chosen.shape[1]
+
+    def one(key, active):
+        return play(env, act, actor, distribution, key, active=active, **options)
+
+    keys, each = jax.random.split(jax.random.key(0), len(chosen)), jax.jit(jax.vmap(one))
+    some, every = (jax.tree.map(np.asarray, each(keys, x)) for x in (chosen, chosen | True))
+    assert every.mask[:, 0].all()
+    np.testing.assert_array_equal(some.mask, every.mask & chosen[:, None])
+    for name in ("observation", "action", "reward"):
+        shown = some.mask.reshape(some.mask.shape + (1,) * (getattr(some, name).ndim - 3))
+        np.testing.assert_array_equal(getattr(some, name), shown * getattr(every, name))
+    assert not some.nonfinite.any()
+    return some

@@ -21,16 +21,26 @@ SCENE = """
 </worldbody></mujoco>"""
 
 
-#: Of its 16 contacts three of each kind have room in `touching`.
-MANY_FEET = """
-<mujoco><worldbody><geom type="plane" size="5 5 1"/>
-  <body pos="0 0 0.1"><freejoint/><inertial pos="0 0 0" mass="1" diaginertia="0.1 0.2 0.3"/>
-    {}</body>
-</worldbody></mujoco>""".format(
-    "".join(
-        f'<geom type="sphere" size="0.1" pos="{x} {y} 0" condim="{dim}" priority="1"/>'
-        for x, y, dim in [(x, y, 1 if x == y else 3) for x in range(4) for y in range(4)]
+def _feet(dims, beside=""):
+    """A body on feet, three of each of some dimensions, with a limit, and what is beside it."""
+    feet = "".join(
+        f'<geom type="sphere" size="0.1" pos="{0.3 * x} {0.3 * y} 0" condim="{dim}" priority="1"/>'
+        for x in range(3)
+        for y, dim in enumerate(dims)
     )
+    return f"""
+<mujoco><worldbody><geom type="plane" size="5 5 1" contype="3" conaffinity="3"/>
+  <body pos="0 0 0.1"><inertial pos="0 0 0" mass="1" diaginertia="0.1 0.2 0.3"/>
+    <joint type="slide" axis="0 0 1"/><joint axis="1 0 0"/>
+    <joint axis="0 1 0" range="-0.2 0.2" limited="true"/>{feet}</body>{beside}
+</worldbody></mujoco>"""
+
+
+THREE_FEET = _feet([1])
+FEET = _feet(
+    (1, 3, 4, 6),
+    """<body pos="0.5 0.4 0.2"><joint type="slide" axis="1 0 0"/>
+    <geom type="capsule" size="0.1 0.2" condim="1"/></body>""",
 )
 
 
@@ -54,10 +64,9 @@ class Scene(Survive):
     def step(self, state, action):
         return state.replace(obs=self.forward(state.info))
 
-    def forward(self, info, moved=0.0):
-        """Returns what the physics makes of a state, or of one with slightly greater positions."""
+    def forward(self, info):
+        """Returns what the physics makes of a state."""
         qpos, qvel, warmstart = info
-        qpos = qpos * (1 + moved)
         data = self.data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
         data = physics.forward(self.model, data)
         contact = jax_fields(data).contact

@@ -12,6 +12,7 @@ from mjx_reinforce import Box, Discrete, envs
 from mjx_reinforce.vector import for_brax
 
 
+@pytest.mark.slow
 def test_brax_sees_the_environments_as_its_wrappers_show_them():
     """The same starts and actions: its rewards, ends and observations, until an episode ends."""
     ours = for_brax.make("InvertedPendulum-v5", 4, max_episode_steps=9)
@@ -41,6 +42,7 @@ def test_brax_sees_the_environments_as_its_wrappers_show_them():
     assert 0 < cut < 4
 
 
+@pytest.mark.slow
 def test_a_new_episode_has_a_new_start():
     env = for_brax.make("InvertedPendulum-v5", 3, max_episode_steps=2)
     state = env.reset(jax.random.key(0))
@@ -58,6 +60,7 @@ def test_actions_have_bounds():
             for_brax.make(Drifting(space), 2)
 
 
+@pytest.mark.slow
 def test_its_ppo_trains(monkeypatch):
     """With the function that brax 0.14.2 calls and JAX 0.10 has no more (docs/vector.md)."""
     monkeypatch.setattr(

@@ -20,13 +20,13 @@ SPACE = Box(np.array([-3.0]), np.array([1.0]))
 
 
 def test_spaces_shapes_and_types_are_those_of_gymnasium():
-    ours = for_stable_baselines3.make("Hopper-v5", 3)
-    theirs = make_vec_env("Hopper-v5", 3)
+    ours = for_stable_baselines3.make("InvertedPendulum-v5", 3)
+    theirs = make_vec_env("InvertedPendulum-v5", 3)
     assert ours.action_space == theirs.action_space
     assert ours.observation_space.shape == theirs.observation_space.shape
     assert ours.reset().shape == theirs.reset().shape
     for mine, other in zip(
-        ours.step(np.zeros((3, 3), np.float32)), theirs.step(np.zeros((3, 3))), strict=True
+        ours.step(np.zeros((3, 1), np.float32)), theirs.step(np.zeros((3, 1))), strict=True
     ):
         assert type(mine) is type(other)
         assert np.shape(mine) == np.shape(other)
@@ -107,8 +107,8 @@ def test_a_broken_simulation_leaves_numbers():
 
 
 def test_attributes_methods_and_wrappers():
-    env = for_stable_baselines3.make("Hopper-v5", 3)
-    assert env.get_attr("dt") == [pytest.approx(0.008)] * 3
+    env = for_stable_baselines3.make("InvertedPendulum-v5", 3)
+    assert env.get_attr("dt") == [pytest.approx(0.04)] * 3
     assert env.get_attr("render_mode", [0, 2]) == [None, None]
     assert env.has_attr("dt")
     assert not env.has_attr("nothing")
@@ -117,10 +117,10 @@ def test_attributes_methods_and_wrappers():
     with pytest.raises(NotImplementedError, match="dt cannot be set"):
         env.set_attr("dt", 1)
     with pytest.raises(TypeError, match="autoreset"):
-        for_stable_baselines3.make("Hopper-v5", 3, autoreset="next_step")
+        for_stable_baselines3.make("InvertedPendulum-v5", 3, autoreset="next_step")
     env.reset()
     with pytest.raises(ValueError, match="must be finite numbers"):
-        env.step(np.full((3, 3), np.nan))
+        env.step(np.full((3, 1), np.nan))
 
 
 def test_closed_twice():

@@ -28,9 +28,11 @@ def play(env, steps=25, num=5, engine="native"):
     return jax.tree.map(lambda *x: np.stack(x), *found)
 
 
-@pytest.mark.parametrize("threads", [1, 3, 8])
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    "env", [TOY, "InvertedPendulum-v5", "CartPole-v1"], ids=["toy", "pendulum", "cart"]
+    ("env", "threads"),
+    [(TOY, 8), ("InvertedPendulum-v5", 3), ("CartPole-v1", 1)],
+    ids=["toy", "pendulum", "cart"],
 )
 def test_the_same_steps_as_on_a_cpu(monkeypatch, env, threads):
     """Also where threads have several environments each, or none."""
@@ -42,18 +44,19 @@ def test_the_same_steps_as_on_a_cpu(monkeypatch, env, threads):
         np.testing.assert_allclose(x, y, rtol=2e-5, atol=2e-5)
 
 
-@pytest.mark.parametrize("long", [10**9, 0])
-def test_threads_of_a_block_meet(monkeypatch, long):
+@pytest.mark.slow
+def test_threads_of_a_block_meet(monkeypatch):
     """In loops and branches that all of them go through together, also those that have no more."""
     env = envs.make("Hopper-v5")
     want = play(env, steps=6)
-    block = gpu_on_cpu.Block(3)
-    gpu_on_cpu.emulate(monkeypatch, block=block)
-    monkeypatch.setattr(lockstep, "LONG", long)
-    got = play(env, steps=6)
-    assert block.apart is None
-    assert block.meetings > 6
-    np.testing.assert_allclose(got.obs, want.obs, rtol=1e-3, atol=1e-3)
+    for long in (10**9, 0):
+        block = gpu_on_cpu.Block(3)
+        gpu_on_cpu.emulate(monkeypatch, block=block)
+        monkeypatch.setattr(lockstep, "LONG", long)
+        got = play(env, steps=6)
+        assert block.apart is None
+        assert block.meetings > 6
+        np.testing.assert_allclose(got.obs, want.obs, rtol=1e-3, atol=1e-3)
 
 
 def test_mapped_over_it_remains_one_launch(monkeypatch):
@@ -77,6 +80,7 @@ def test_machine_code_for_a_gpu_is_chosen_where_a_step_is_large(monkeypatch):
     assert make_vec(TOY, 4).engine.name == "native"
 
 
+@pytest.mark.slow
 def test_llvm_makes_ptx_of_it(monkeypatch):
     """For the real target, where this LLVM has it."""
     kept = {}
