@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import altair as alt
 import numpy as np
@@ -75,7 +76,7 @@ def curves(findings: Findings) -> Iterator[vega.Chart]:
 
 
 def _bands(findings: Findings) -> Table:
-    def part(place: int, result: Result) -> Table:
+    def part(place: int, result: Result) -> dict[str, Any]:
         known = np.isfinite(result.band.value)
         return {
             "configuration": place,
@@ -90,7 +91,7 @@ def _seeds(findings: Findings) -> Table:
     """Returns some curves of each configuration: from the worst seed to the best, evenly."""
     most = max(5, min(_DRAWN_OF_ONE, _DRAWN_OF_ALL // len(findings.results)))
 
-    def parts() -> Iterator[Table]:
+    def parts() -> Iterator[dict[str, Any]]:
         for place, result in enumerate(findings.results):
             ranked = _from_the_worst(result)
             chosen = np.unique(np.linspace(0, len(ranked) - 1, min(most, len(ranked))).round())
@@ -140,7 +141,7 @@ def _solved_shares(findings: Findings) -> Table:
     who ever did.
     """
 
-    def part(place: int, result: Result) -> Table:
+    def part(place: int, result: Result) -> dict[str, Any]:
         steps = findings.grid[findings.grid <= result.configuration.env_steps[-1].min()]
         assert result.solving is not None
         curve = kaplan_meier(np.minimum(result.solving.steps, steps[-1]), result.solving.solved)
@@ -190,7 +191,7 @@ def worst(findings: Findings) -> Iterator[vega.Chart]:
     )
 
 
-def _worst_curve(result: Result, s: int) -> Table:
+def _worst_curve(result: Result, s: int) -> dict[str, Any]:
     part = result.configuration
     returns = part.eval_return[:, s]
     keep = np.unique(np.linspace(0, len(returns) - 1, min(len(returns), _MOST_POINTS)).round())
