@@ -92,15 +92,6 @@ def test_a_result_of_nothing_mapped_stays_one():
     np.testing.assert_array_equal(out[1], 3.0)
 
 
-def test_what_xla_compiles_has_nothing_of_one():
-    def fn(x):
-        return fused.by_engine(lambda y: jnp.tanh(y), lambda y: jnp.cos(y), x)
-
-    text = jax.jit(jax.vmap(fn)).lower(X).as_text()
-    assert "cosine" in text
-    assert "tanh" not in text
-
-
 def test_the_size_is_that_of_one():
     traced, _ = jaxprs.trace(
         lambda x: fused.by_engine(lambda x: x + 1, lambda x: jnp.sin(jnp.cos(x)), x), X

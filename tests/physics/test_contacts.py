@@ -1,4 +1,4 @@
-"""Contacts of every pair of types of geoms that is right, in five poses, against C MuJoCo."""
+"""Contacts of every pair of types of geoms that is right, in many poses, against C MuJoCo."""
 
 import types
 
@@ -46,7 +46,7 @@ TOLERANCE = {("cylinder", "capsule"): 1e-5}
 
 
 def poses(first, second):
-    """Flat, on edge, nearly flat and deep, the same and shallow, and side by side: [5, 7]."""
+    """Flat, on edge, nearly flat and deep, shallow, and side by side; then ``others``: [65, 7]."""
     up = np.eye(3)[2]
     across = up if first == "plane" else np.eye(3)[0]
     lying = Rotation.from_euler("y", 90 if second == "capsule" else 0, degrees=True)
@@ -65,7 +65,31 @@ def poses(first, second):
         meets = turn.apply(FARTHEST[second](turn.inv().apply(-along)))
         place = FARTHEST[first](along) - depth * along - meets + [0.01, 0.02, 0] * (1 - along)
         rows.append([*place, *turn.as_quat(scalar_first=True)])
-    return np.array(rows)
+    return np.concatenate([rows, others(first, second)])
+
+
+#: Pairs whose contacts are those of C also where the geoms are apart: they have a margin of 10 m,
+#: and their planes are tilted.
+ROUND = [
+    *(("plane", x) for x in ("sphere", "capsule")),
+    *(("sphere", x) for x in ("sphere", "capsule")),
+    ("capsule", "capsule"),
+]
+
+
+def others(first, second):
+    """Random poses of round geoms, for capsules also chosen ones, [60, 7]; far away for others."""
+    rng = np.random.default_rng(0)
+    rows = np.concatenate([0.4 * rng.normal(size=(60, 3)), rng.normal(size=(60, 4))], axis=1)
+    if (first, second) not in ROUND:
+        rows[:, 2] = 50
+    elif second == "capsule":
+        rows[10:20, 3:] = [1, 0, 0, 0] + 0.01 * rows[10:20, 3:]  # nearly parallel, and on end
+        lying = [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
+        # Crossing, with no distance between the axes, and end-on.
+        rows[:3] = [[0.15, 0, 0, *lying], [0, 0, 0, *lying], [0, 0.3, 0.5, *lying]]
+    rows[:, 3:] /= np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
+    return rows
 
 
 def compiled(first, second):
@@ -84,11 +108,12 @@ RIGHT = [
 @pytest.fixture(scope="module")
 def all_pairs():
     """A model of all pairs, each of which meets only within itself, and MJX's contacts of poses."""
-    bodies = "".join(
-        f'<geom type="{GEOMS[first]}" contype="{1 << k}" conaffinity="{1 << k}"/><body><freejoint/>'
-        f'<geom type="{GEOMS[second]}" contype="{1 << k}" conaffinity="{1 << k}"/></body>'
-        for k, (first, second) in enumerate(RIGHT)
-    )
+    bodies = ""
+    for k, pair in enumerate(RIGHT):
+        options = f'contype="{1 << k}" conaffinity="{1 << k}" margin="{10 * (pair in ROUND)}"'
+        tilt = 'euler="20 30 0"' if pair in ROUND and pair[0] == "plane" else ""
+        one, other = f'<geom type="{GEOMS[pair[0]]}" {options} {tilt}/>', GEOMS[pair[1]]
+        bodies += f'{one}<body><freejoint/><geom type="{other}" {options}/></body>'
     text = f"<mujoco><worldbody>{bodies}</worldbody></mujoco>"
     model = mujoco.MjModel.from_xml_string(text)  # pyright: ignore[reportAttributeAccessIssue]
     qpos = np.concatenate([poses(*pair) for pair in RIGHT], axis=1)
@@ -117,11 +142,14 @@ def theirs(all_pairs):
     return rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pair", RIGHT, ids="-".join)
 def test_contacts_are_those_of_mujoco(all_pairs, theirs, pair):
     number, found, touching = RIGHT.index(pair), all_pairs.found, 0
     for i, rows in enumerate(theirs):
-        touches = np.flatnonzero((found.dist[i] < 0) & (found.geom[i, :, 0] % len(RIGHT) == number))
+        near = np.inf if pair in ROUND else 0
+        own = found.geom[i, :, 0] % len(RIGHT) == number
+        touches = np.flatnonzero((found.dist[i] < near) & own)
         ours = [
             np.concatenate([found.dist[i, k, None], found.pos[i, k], found.frame[i, k].ravel()])
             for k in touches
@@ -135,6 +163,25 @@ def test_contacts_are_those_of_mujoco(all_pairs, theirs, pair):
     assert touching >= 4
 
 
+def test_parallel_capsules_meet_at_the_middle_of_where_they_do_in_c():
+    """C has contacts at both ends of their overlap."""
+    model = compiled("capsule", "capsule")
+    data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
+    data.qpos[:7] = [0.1, 0, 0.3, 1, 0, 0, 0]
+    mujoco.mj_forward(model, data)  # pyright: ignore[reportAttributeAccessIssue]
+    first, second = data.contact
+    with jax.enable_x64(True):
+        place = types.SimpleNamespace(
+            geom_xpos=jnp.array(data.geom_xpos[:2]),
+            geom_xmat=jnp.array(data.geom_xmat[:2].reshape(2, 3, 3)),
+        )
+        shape = types.SimpleNamespace(geom_size=jnp.array(model.geom_size[:2]))
+        dist, pos, _ = contacts.capsule_capsule(shape, place, None, np.array([[0, 1]]))
+    np.testing.assert_allclose(dist, first.dist, atol=1e-12)
+    np.testing.assert_allclose(pos[0], (first.pos + second.pos) / 2, atol=1e-12)
+
+
+@pytest.mark.slow
 def test_the_search_along_a_capsule_is_written_out(all_pairs):
     """A loop in XLA stalls jaxlib 0.10.2."""
     assert "stablehlo.while" not in all_pairs.text

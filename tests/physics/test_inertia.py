@@ -70,6 +70,7 @@ def test_it_is_what_c_solves():
         np.testing.assert_allclose(smooth, data.qacc_smooth, rtol=0, atol=1e-12 * scale)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", ["", 'jacobian="sparse"'])
 def test_a_step_of_euler_is_that_of_mjx(option):
     """With damping, which is part of the matrix, in both of MJX's layouts."""

@@ -57,6 +57,7 @@ def path(tmp_path):
     return str(path)
 
 
+@pytest.mark.slow
 def test_before_is_what_was(path):
     env = Watched(path)
     step, state = jax.jit(env.step), env.reset(jax.random.key(0))

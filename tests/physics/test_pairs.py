@@ -81,16 +81,6 @@ def test_a_nan_reaches_the_contacts():
     )
 
 
-def test_engines_that_collide_all_at_once_have_the_function_as_it_is(monkeypatch):
-    def at_once(one, many, *rows, may_unroll):
-        return many(*rows)
-
-    monkeypatch.setattr(pairs, "by_engine", at_once)
-    model, data = model_of(), data_of()
-    got = pairs.one_by_one(collide)(model, data, None, GEOMS)
-    jax.tree.map(np.testing.assert_array_equal, got, collide(model, data, None, GEOMS))
-
-
 def test_pairs_with_margins_of_their_own_go_to_mjx(monkeypatch):
     monkeypatch.setattr(pairs, "by_engine", lambda *_, **__: pytest.fail("one after the other"))
     model, data = model_of(num_pairs=1), data_of()

@@ -226,38 +226,12 @@ TUMBLERS = """
 </mujoco>
 """
 
-# A margin of 10 m, so that every pair of geoms is in contact.
-TOUCHING = """
-<mujoco>
-  <default><geom margin="10"/></default>
-  <worldbody>
-    <geom type="plane" size="0 0 1" euler="20 30 0"/>
-    <body><freejoint/><geom type="capsule" size="0.07 0.5"/></body>
-    <body><freejoint/><geom type="capsule" size="0.1 0.3"/></body>
-    <body><freejoint/><geom type="sphere" size="0.2"/></body>
-  </worldbody>
-</mujoco>
-"""
-
-UPRIGHT, LYING = [1, 0, 0, 0], [np.sqrt(0.5), np.sqrt(0.5), 0, 0]
-TILTED, STEEP = (  # as the plane, and 29 degrees from it: MJX's frames do not follow it there
-    Rotation.from_euler("XYZ", (20, angle, 0), degrees=True).as_quat(scalar_first=True).tolist()
-    for angle in (30, 59)
-)
-
 
 def compiled(xml):
     """Returns C MuJoCo's model and data, and MJX's."""
     model = mujoco.MjModel.from_xml_string(xml)  # pyright: ignore[reportAttributeAccessIssue]
     data = mujoco.MjData(model)  # pyright: ignore[reportAttributeAccessIssue]
     return model, data, mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
-
-
-def mj_contact(model, data, qpos):
-    """Returns C MuJoCo's contacts."""
-    data.qpos[:] = qpos
-    mujoco.mj_forward(model, data)  # pyright: ignore[reportAttributeAccessIssue]
-    return data.contact
 
 
 @pytest.mark.slow
@@ -301,56 +275,6 @@ def test_rotation_rate_at_every_angle():
             )
             found = jax.jit(rate)(jnp.array(angles))
         np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)
-
-
-def poses():
-    """Random poses of two capsules and a sphere, then chosen ones of the capsules, [N, 3, 7]."""
-    rng = np.random.default_rng(0)
-    position = rng.normal(size=(64, 3, 3)) * 0.4
-    turn = rng.normal(size=(64, 3, 4))
-    turn[16:32, 1] = turn[16:32, 0] + rng.normal(size=(16, 4)) * 0.01
-    turn /= np.linalg.norm(turn, axis=2, keepdims=True)
-    chosen = [
-        (TILTED, [0, 0, 1], UPRIGHT),  # on end on the plane
-        (STEEP, [1, 0, 1], LYING),
-        (UPRIGHT, [0.15, 0, 1], LYING),  # crossing
-        (UPRIGHT, [0, 0, 1], LYING),  # crossing, with no distance between the axes
-        (UPRIGHT, [0, 0.3, 1.5], LYING),  # end-on
-        (LYING, [0.1, 0.9, 1.3], UPRIGHT),
-    ]
-    for row, (first, place, second) in enumerate(chosen):
-        position[row, :2], turn[row, :2] = ([0, 0, 1], place), (first, second)
-    return np.concatenate([position, turn], axis=2)
-
-
-def contacts_in_order(contact):
-    """Returns geoms, distances, places and frames, by pair of geoms."""
-    order = np.argsort(np.asarray(contact.geom) @ [10, 1], stable=True)
-    frame = np.reshape(contact.frame, (-1, 3, 3))
-    return [np.asarray(x)[order] for x in (contact.geom, contact.dist, contact.pos, frame)]
-
-
-def test_contacts_are_those_of_mujoco():
-    parallel = np.array([[0, 0, 1, *TILTED], [0.1, 0, 1.4, *TILTED], [1, 1, 1, *UPRIGHT]])
-    qpos = np.concatenate([poses(), parallel[None]]).reshape(-1, 21)
-    with jax.enable_x64(True):
-        model, data, mx, start = compiled(TOUCHING)
-
-        def collide(qpos):
-            return jax_fields(contacts.fwd_position(mx, start.replace(qpos=qpos))).contact
-
-        found = jax.jit(jax.vmap(collide), compiler_options=UNOPTIMIZED)(qpos)
-        ours = [contacts_in_order(jax.tree.map(lambda x, i=i: x[i], found)) for i in range(65)]
-    for actual, place in zip(ours[:-1], qpos, strict=False):
-        theirs = contacts_in_order(mj_contact(model, data, place))
-        for quantity, exact in zip(actual, theirs, strict=True):
-            np.testing.assert_allclose(quantity, exact, rtol=0, atol=1e-12)
-    # Parallel capsules: C has contacts at both ends of their overlap, ours is at its middle.
-    (_, dist, pos, _), theirs = ours[-1], contacts_in_order(mj_contact(model, data, qpos[-1]))
-    ends, middle = (np.all(x[0] == [1, 2], axis=1) for x in (theirs, ours[-1]))
-    assert (ends.sum(), middle.sum()) == (2, 1)
-    np.testing.assert_allclose(theirs[1][ends], dist[middle][0], atol=1e-12)
-    np.testing.assert_allclose(theirs[2][ends].mean(axis=0), pos[middle][0], atol=1e-12)
 
 
 def test_axes_that_cross_push_across_also_in_single_precision():

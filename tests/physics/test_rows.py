@@ -107,6 +107,7 @@ HELD = """
 """
 
 
+@pytest.mark.slow
 def test_connects_and_welds_ask_for_what_c_asks():
     """With the change of the Jacobian, which MJX leaves out."""
     model = mujoco.MjModel.from_xml_string(HELD)  # pyright: ignore
