@@ -16,13 +16,7 @@ from mjx_reinforce.sweeps import chunks
 from mjx_reinforce.sweeps.chunks import Runs, Saver
 from mjx_reinforce.sweeps.design import Design
 from mjx_reinforce.sweeps.history import History
-from mjx_reinforce.sweeps.plan import (
-    Group,
-    GroupPlan,
-    Prepared,
-    divide,
-    learner_builder,
-)
+from mjx_reinforce.sweeps.plan import GroupPlan, Part, Prepared, divide, learner_builder
 from mjx_reinforce.sweeps.programs import SlotPrograms, Stopwatch, compile_programs, one_ahead
 from mjx_reinforce.sweeps.results import SweepFiles
 from mjx_reinforce.training.driver import drive
@@ -33,15 +27,15 @@ _NAMED = 6
 
 
 class Stage(NamedTuple):
-    """The runs of one group.
+    """The runs of one group that are still to be trained.
 
-    number: of the group in the sweep
-    group: its configurations
+    part: the group
+    plan: how all its runs are divided
     chunks: its runs
     """
 
-    number: int
-    group: Group
+    part: Part
+    plan: GroupPlan
     chunks: list[Runs]
 
     @property
@@ -52,7 +46,7 @@ class Stage(NamedTuple):
     @property
     def cost(self) -> int:
         """What a run of it counts for in the progress of the sweep: its budget."""
-        return self.group.config.env_steps or 1
+        return self.part.group.config.env_steps or 1
 
 
 class Conductor:
@@ -115,41 +109,36 @@ class Conductor:
 
     def _stages(self) -> list[Stage]:
         """Returns the runs that are still to be trained."""
-        made = []
-        for number, group in enumerate(self._prepared.groups):
-            parts = chunks.split_runs(group, f"{number:03d}", self._divide(number).num_chunks)
-            left = [runs for runs in parts if not self._files.has(runs.name)]
-            made.append(Stage(number, group, left))
+        made, devices = [], self._prepared.devices.count
+        for number, part in enumerate(self._prepared.parts):
+            plan = divide(part.group, part.limit, devices, exact=self._design.exact)
+            every = chunks.split_runs(part.group, f"{number:03d}", plan.num_chunks)
+            left = [runs for runs in every if not self._files.has(runs.name)]
+            made.append(Stage(part, plan, left))
         return [stage for stage in made if stage.chunks]
-
-    def _divide(self, number: int) -> GroupPlan:
-        """Returns how the runs of a group are divided."""
-        prepared = self._prepared
-        group, limit, devices = prepared.groups[number], prepared.limits[number], prepared.devices
-        return divide(group, limit, devices.count, exact=self._design.exact)
 
     def _compile(self, stage: Stage) -> SlotPrograms:
         """Returns the programs of a group."""
-        env, config = self._prepared.envs[stage.number], stage.group.config
+        group, env, horizon, _ = stage.part
         return compile_programs(
             env,
-            learner_builder(env, config),
-            self._prepared.horizons[stage.number],
-            config,
-            tuple(stage.group.settings),
-            self._divide(stage.number).widths,
+            learner_builder(env, group.config),
+            horizon,
+            group.config,
+            tuple(group.settings),
+            stage.plan.widths,
             self._prepared.devices,
             self.clock,
         )
 
     def _train(self, stage: Stage, programs: SlotPrograms, runs: Runs) -> bool:
         """Trains a chunk, from its last checkpoint if there is one; returns whether it ended."""
-        config = dataclasses.replace(stage.group.config, num_seeds=len(runs.seed))
+        config = dataclasses.replace(stage.part.group.config, num_seeds=len(runs.seed))
         history, layout = History(config), programs.layout
         saver = Saver(self._files.checkpoints(runs.name), config, layout, self._display.say)
         states = saver.find(layout.shapes(len(runs.seed)), history)
         if states is None:
-            states = chunks.initial_states(programs, stage.group, runs)
+            states = chunks.initial_states(programs, stage.part.group, runs)
         self._display.say(self._heading(runs))
 
         def show() -> None:

@@ -157,11 +157,11 @@ def _finish(
 
     def settings(number: int) -> tuple[dict[str, Any], dict[str, Any]]:
         [config] = configure(design.base, [prepared.configurations[number]])
-        group = next(i for i, each in enumerate(prepared.groups) if number in each.members)
-        run = {"env": config.env, "horizon": prepared.horizons[group]}
+        part = next(each for each in prepared.parts if number in each.group.members)
+        run = {"env": config.env, "horizon": part.horizon}
         if config.env_set:
             run["env_set"] = list(config.env_set)
-        return policy_settings(prepared.envs[group], config), run
+        return policy_settings(part.env, config), run
 
     files.finish()
     if contents["status"] == "finished":
@@ -186,14 +186,14 @@ def _contents(design: Design, prepared: "Prepared", known: Mapping[str, Any]) ->
     return {
         "status": "running",
         "env": design.base.env,
-        "threshold": getattr(prepared.envs[0], "reward_threshold", None),
+        "threshold": getattr(prepared.parts[0].env, "reward_threshold", None),
         **as_record(design),
         "num_seeds": design.base.num_seeds,
         "configurations": [
             {"configuration": number, **values}
             for number, values in enumerate(prepared.configurations)
         ],
-        "chunk_runs": prepared.limits,
+        "chunk_runs": [part.limit for part in prepared.parts],
         "local_devices": prepared.devices.count,
         "engine": prepared.engine,
         "compile_seconds": known.get("compile_seconds", 0.0),

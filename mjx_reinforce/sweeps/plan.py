@@ -20,6 +20,7 @@ from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.defaults import expected_seconds
 from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.settings.memory import gigabytes, needed, num_cores
+from mjx_reinforce.settings.tables import Task
 from mjx_reinforce.store.build import build, policy_settings
 from mjx_reinforce.sweeps.design import Design
 from mjx_reinforce.sweeps.grid import configure
@@ -37,6 +38,26 @@ class Group(NamedTuple):
     config: Config
     members: np.ndarray
     settings: dict[str, np.ndarray]
+
+    @property
+    def num_runs(self) -> int:
+        """How many runs it has: each configuration has as many seeds."""
+        return len(self.members) * self.config.num_seeds
+
+
+class Part(NamedTuple):
+    """A group that is ready to be trained.
+
+    group: its configurations
+    env: what they train on
+    horizon: the time limit of an episode in steps
+    limit: how many of its runs a chunk may have
+    """
+
+    group: Group
+    env: Environment
+    horizon: int
+    limit: int
 
 
 def make_groups(configs: Sequence[Config], swept: Collection[str], *, exact: bool) -> list[Group]:
@@ -90,8 +111,6 @@ def learner_builder(env: Environment, config: Config) -> Callable[[dict[str, Any
       env: what it learns on.
       config: the other settings.
     """
-    from mjx_reinforce.store.build import build
-
     if config.algorithm != "reinforce":
         return lambda settings: build(env, dataclasses.replace(config, **settings))[0]
     plain = build(env, config)[0]
@@ -133,7 +152,7 @@ def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> GroupP
       num_devices: among which a chunk is divided.
       exact: one run a slot.
     """
-    total = len(group.members) * group.config.num_seeds
+    total = group.num_runs
     num_chunks = -(-total // limit)
     if exact:
         return GroupPlan(num_chunks, (num_devices,))
@@ -143,34 +162,13 @@ def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> GroupP
     return GroupPlan(num_chunks, tuple(num_devices * width for width in sorted(each, reverse=True)))
 
 
-def chunk_limit(
-    env: Environment,
-    horizon: int,
-    group: Group,
-    asked: int | None,
-    num_devices: int,
-) -> int:
-    """Returns how many runs of a group a chunk may have.
-
-    Args:
-      env: what is trained on.
-      horizon: the time limit of an episode in steps.
-      group: whose runs are divided.
-      asked: what the user said, or None for what memory holds.
-      num_devices: among which a chunk is divided.
+def _capacity(group: Group, task: Task, num_devices: int) -> int:
+    """Returns how many runs of a group memory holds side by side.
 
     Raises:
       ValueError: not even one run for each device fits into memory.
     """
-    total = len(group.members) * group.config.num_seeds
-    limit = _capacity(env, horizon, group, num_devices) if asked is None else asked
-    return min(limit, total)
-
-
-def _capacity(env: Environment, horizon: int, group: Group, num_devices: int) -> int:
-    """Returns how many runs memory holds side by side."""
-    one = dataclasses.replace(group.config, num_seeds=1)
-    task, machine = task_of(policy_settings(env, one), horizon, one), this_hardware()
+    one, machine = dataclasses.replace(group.config, num_seeds=1), this_hardware()
     memory = machine.memory - task.base_memory if machine.shared else machine.memory * num_devices
     capacity = int(_MEMORY * memory / needed(one, task))
     if capacity < num_devices:
@@ -181,43 +179,35 @@ def _capacity(env: Environment, horizon: int, group: Group, num_devices: int) ->
     return capacity
 
 
-def describe_plan(
-    envs: Sequence[Environment],
-    horizons: Sequence[int],
-    learners: Sequence[Any],
-    groups: Sequence[Group],
-    parts: Sequence[GroupPlan],
-    num_devices: int,
-) -> str:
+def _task(env: Environment, horizon: int, config: Config) -> Task:
+    return task_of(policy_settings(env, config), horizon, config)
+
+
+def _describe(parts: Sequence[Part], engine: str, num_devices: int, *, exact: bool) -> str:
     """Returns a paragraph on what a sweep will do.
 
     Args:
-      envs: what each group trains on.
-      horizons: the time limit of an episode in steps, of each group.
-      learners: one of each group.
-      groups: of configurations.
-      parts: how the runs of each are divided.
+      parts: its groups.
+      engine: the name of what plays the episodes.
       num_devices: on which they are.
+      exact: one run a slot.
     """
-    first, machine = groups[0].config, this_hardware()
+    groups, machine = [part.group for part in parts], this_hardware()
+    first, at_once = groups[0].config, num_cores() if machine.shared else 1  # slots
+    plans = [divide(part.group, part.limit, num_devices, exact=exact) for part in parts]
     configurations = sum(len(group.members) for group in groups)
-    runs, chunks = configurations * first.num_seeds, sum(part.num_chunks for part in parts)
-    at_once = num_cores() if machine.shared else 1  # slots
-    side = max(
-        -(-len(group.members) * group.config.num_seeds // part.num_chunks)
-        for group, part in zip(groups, parts, strict=True)
-    )
-    memory = max(
-        needed(dataclasses.replace(group.config, num_seeds=at_once * part.widths[0]), task)
-        for env, horizon, group, part in zip(envs, horizons, groups, parts, strict=True)
-        for task in (task_of(policy_settings(env, group.config), horizon, group.config),)
-    )
+    runs, chunks = sum(group.num_runs for group in groups), sum(plan.num_chunks for plan in plans)
+    side, memory = 0, 0.0
+    for (group, env, horizon, _), plan in zip(parts, plans, strict=True):
+        side = max(side, -(-group.num_runs // plan.num_chunks))
+        together = dataclasses.replace(group.config, num_seeds=at_once * plan.widths[0])
+        memory = max(memory, needed(together, _task(env, horizon, group.config)))
     where = machine.name
     if num_devices > 1:
         where = f"{num_devices} devices" + (f" ({where} each)" if not machine.shared else "")
     return (
         f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
-        f"of {first.env}, on {where}, with the engine {learners[0].engine.name}: "
+        f"of {first.env}, on {where}, with the engine {engine}: "
         f"{counted(len(groups), 'compiled program')}, {counted(chunks, 'chunk')} of up to {side:,} "
         f"runs. {_time(groups, num_devices)}. "
         f"It needs about {gigabytes(memory)} of memory beside the programs."
@@ -240,39 +230,27 @@ def _time(groups: Sequence[Group], num_devices: int) -> str:
     """Returns about how long the training takes, where that is known."""
     total, faster = 0.0, 1 if this_hardware().shared else num_devices
     for group in groups:
-        seconds = expected_seconds(_together(group))
+        seconds = expected_seconds(dataclasses.replace(group.config, num_seeds=group.num_runs))
         if seconds is None:
             return said_time(None)
         total += seconds / faster
     return said_time(total)
 
 
-def _together(group: Group) -> Config:
-    """Returns the settings of all runs of a group, as if they were seeds of one run."""
-    num_seeds = len(group.members) * group.config.num_seeds
-    return dataclasses.replace(group.config, num_seeds=num_seeds)
-
-
 class Prepared(NamedTuple):
     """All that a sweep is made of.
 
-    envs: what each group trains on
-    horizons: the time limit of an episode in steps, of each group
+    parts: its groups
     devices: where
     configurations: the values of what is swept, in each
-    groups: of configurations
-    limits: how many runs of each group a chunk may have
     engine: the name of what plays the episodes
     engine_seconds: wall time that making it took, for all groups
     plan: a paragraph for people
     """
 
-    envs: list[Any]
-    horizons: list[int]
+    parts: list[Part]
     devices: Devices
     configurations: list[dict[str, Any]]
-    groups: list[Group]
-    limits: list[int]
     engine: str
     engine_seconds: float
     plan: str
@@ -292,19 +270,17 @@ def prepare_sweep(design: Design, limits: Sequence[int] | None) -> Prepared:
     configs = configure(design.base, configurations)
     # A program for several devices need not round as the one for a single device does.
     devices = Devices(1 if design.exact else None)
-    groups = make_groups(configs, tuple(design.over), exact=design.exact)
-    made = [envs.make_set(group.config.env, group.config.env_set) for group in groups]
-    built = [build(env, group.config) for env, group in zip(made, groups, strict=True)]
-    learners, horizons = [list(x) for x in zip(*built, strict=True)]
-    if limits is None:
-        limits = [
-            chunk_limit(env, horizon, group, design.chunk_runs, devices.count)
-            for env, horizon, group in zip(made, horizons, groups, strict=True)
-        ]
-    parts = [
-        divide(group, limit, devices.count, exact=design.exact)
-        for group, limit in zip(groups, limits, strict=True)
-    ]
-    plan = describe_plan(made, horizons, learners, groups, parts, devices.count)
-    engine = learners[0].engine.name, sum(learner.engine.seconds for learner in learners)
-    return Prepared(made, horizons, devices, configurations, groups, list(limits), *engine, plan)
+    parts, engines = [], []
+    for number, group in enumerate(make_groups(configs, tuple(design.over), exact=design.exact)):
+        env = envs.make_set(group.config.env, group.config.env_set)
+        learner, horizon = build(env, group.config)
+        engines.append(learner.engine)
+        limit = design.chunk_runs if limits is None else limits[number]
+        if limit is None:
+            limit = _capacity(group, _task(env, horizon, group.config), devices.count)
+        if limits is None:
+            limit = min(limit, group.num_runs)
+        parts.append(Part(group, env, horizon, limit))
+    engine, seconds = engines[0].name, sum(each.seconds for each in engines)
+    plan = _describe(parts, engine, devices.count, exact=design.exact)
+    return Prepared(parts, devices, configurations, engine, seconds, plan)
