@@ -17,7 +17,7 @@ from mjx_reinforce.training.division import ALONE, Division, divide_run
 
 #: Settings, and how their runs are divided.
 VARIANTS = {
-    "plain": ({}, [{"episodes": 2}, {"episodes": 8}, {"seeds": 2}, {"seeds": 3}]),
+    "plain": ({}, [{"episodes": 8}, {"seeds": 3}]),
     "value": (
         {"estimator": "value-baseline", "update": "natural-gradient", "max_kl": 0.01},
         [{"episodes": 8}],
