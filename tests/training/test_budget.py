@@ -1,16 +1,24 @@
 """Budgets: those of the defaults, in time, and of runs that begin where others ended."""
 
 import dataclasses
+import errno
+import itertools
 import json
 import math
+import time
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from experiments.kit.trainings import results
+from mjx_reinforce.learners import counts
 from mjx_reinforce.runs.command_line import parse
+from mjx_reinforce.runs.run import env_steps_in
 from mjx_reinforce.settings import defaults, tables
-from mjx_reinforce.settings.config import Config, check
+from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.training import checkpoint, progress
 
 SMALL = [
     "--env",
@@ -99,3 +107,105 @@ def test_a_budget_chooses_the_settings():
         words = ["--env", "Hopper-v5", "--env-steps", str(config.env_steps)]
         assert parse(words) == config
     assert parse(["--env=Hopper-v5", "--env-steps=1000000", "--num-seeds=9"]).num_seeds == 9
+
+
+# A budget in time: the env steps that a machine trains in it, from the speed at the start.
+
+
+def state_of(env_steps):
+    each = np.stack([np.asarray(counts.from_int(env_steps))] * 2)
+    return SimpleNamespace(train_states=SimpleNamespace(env_steps=each))
+
+
+@pytest.fixture
+def machine(monkeypatch):
+    """Programs that play so many env steps in each second; the clock goes a second a question."""
+    clock = itertools.count()
+    monkeypatch.setattr(time, "perf_counter", lambda: float(next(clock)))
+    monkeypatch.setattr("jax.tree.map", lambda function, tree: tree)
+
+    def made(played, blocks=10**6):
+        steps = itertools.accumulate(itertools.islice(played, blocks))
+        left = itertools.count(blocks - 1, -1)
+
+        def advance(state, look, budget):
+            assert look  # as training does, so that evaluations are in the time
+            going = np.array([[next(left) > 0, False]])
+            return state_of(next(steps)), {"active": going}, None
+
+        return SimpleNamespace(advance=advance)
+
+    return made
+
+
+def test_what_is_trained_in_a_time_at_an_even_speed(machine):
+    # Ten blocks are 3 % of the time; the steps of the trial are trained again.
+    programs = machine(itertools.repeat(50))
+    assert env_steps_in(300.0, programs, state_of(0), None) == 50 * (300 - 10 + 1)
+
+
+def test_the_second_half_of_the_trial_counts(machine):
+    programs = machine(itertools.chain([1000] * 4, itertools.repeat(10)))
+    found = env_steps_in(300.0, programs, state_of(0), None)
+    assert found == 10 * 291
+
+
+def test_a_run_that_ends_by_itself_is_tried_no_longer(machine):
+    programs = machine(itertools.repeat(7), blocks=3)
+    assert env_steps_in(1e6, programs, state_of(0), 3) == 7 * (10**6 - 3)
+
+
+def test_a_budget_is_a_count(machine):
+    assert (
+        env_steps_in(1e12, machine(itertools.repeat(10**9), blocks=4), state_of(0), None)
+        == MAX_COUNT
+    )
+
+
+# How much of a budget is used, and when a checkpoint is due.
+
+
+def test_the_budget_that_is_nearer_to_its_end_counts():
+    steps, updates = np.array([[50, 200], [0, 0]]), np.array([[9, 1], [5, 0]])
+    both = progress.used(Config(env_steps=100, max_updates=10), steps, updates)
+    np.testing.assert_allclose(both, [[0.9, 2.0], [0.5, 0.0]])
+    alone = progress.used(Config(env_steps=None, max_updates=10), steps, updates)
+    np.testing.assert_allclose(alone, [[0.9, 0.1], [0.5, 0.0]])
+    np.testing.assert_allclose(progress.used(Config(env_steps=100), steps, updates), steps / 100)
+
+
+def test_a_checkpoint_is_due_after_so_many_updates():
+    due = checkpoint.SaveDue(5)
+    assert [due.is_due(n) for n in (0, 4, 5, 6)] == [False, False, True, True]
+    due.saved(6)
+    assert [due.is_due(n) for n in (6, 10, 11)] == [False, False, True]
+
+
+def test_a_checkpoint_is_due_after_a_minute(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(checkpoint.time, "perf_counter", lambda: now[0])
+    due = checkpoint.SaveDue(None)
+    now[0] += 59.0
+    assert not due.is_due(10**9)
+    now[0] += 1.0
+    assert due.is_due(0)
+    due.saved(0)
+    assert not due.is_due(0)
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [(OSError(errno.ENOSPC, "No space left on device"), "No space"), (OSError("gone"), "gone")],
+)
+def test_the_first_failure_in_a_row_is_a_warning(error, said):
+    heard, fails = [], [True, True, False, True]
+    attempts = checkpoint.Attempts(heard.append)
+
+    def write():
+        if fails.pop(0):
+            raise error
+
+    written = [attempts.attempt("metrics.csv", write) for _ in range(4)]
+    assert written == [False, False, True, False]
+    assert len(heard) == 2
+    assert heard[0].startswith(f"warning: cannot write metrics.csv ({said}")
