@@ -5,7 +5,7 @@ import os
 import sys
 from pathlib import Path
 
-from mjx_reinforce.engines.native.ownership import distrust, distrust_contents, make_folder
+from mjx_reinforce.engines.native.objects import distrust, make_folder
 
 #: Settings of JAX's that the commands cannot work with, and why.
 _REFUSED = {
@@ -78,7 +78,7 @@ def _unusable(folder: Path) -> str | None:
         make_folder(folder)
     except OSError as error:
         return f"{type(error).__name__}: {error.strerror}"
-    return distrust(folder) or distrust_contents(folder)
+    return distrust(folder)
 
 
 @functools.cache

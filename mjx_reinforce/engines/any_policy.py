@@ -11,7 +11,6 @@ import numpy as np
 from mjx_reinforce.checks import check_kind, check_parts
 from mjx_reinforce.engines import choice, rollouts
 from mjx_reinforce.engines.episode import Act
-from mjx_reinforce.engines.mapping import machine_code
 from mjx_reinforce.engines.native import available
 from mjx_reinforce.policies.arguments import check_count, check_key
 from mjx_reinforce.policies.distributions.distribution import Distribution
@@ -133,7 +132,7 @@ def _player(
     large = sum(np.size(x) for x in jax.tree.leaves(params)) > _MOST_PARAMETERS
     if engine == "auto" and large and available.platform() == "cpu":
         examples = jax.eval_shape(env.reset, jax.random.key(0)), null_action(env)
-        step = machine_code(env, env.step, *examples)
+        step = choice.machine_code(env, env.step, *examples)
         if not isinstance(step, str):
             return functools.partial(rollouts.rollout, env_step=_episodes_last(step))
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
@@ -145,9 +144,8 @@ def _of_any_batch(act: Act) -> Act:
     """Returns a policy of one observation [O] as one of [O] or [N, O]."""
 
     def batched(params: PyTree, observation: jax.Array) -> jax.Array:
-        if observation.ndim == 1:
-            return act(params, observation)
-        return jax.vmap(act, (None, 0))(params, observation)
+        mapped = act if observation.ndim == 1 else jax.vmap(act, (None, 0))
+        return mapped(params, observation)
 
     return batched
 

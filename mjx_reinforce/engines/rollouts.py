@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jax import lax
 
 from mjx_reinforce.engines import episode
-from mjx_reinforce.engines.chunks import play_chunks
 from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Environment, PyTree, Trajectory
 
@@ -84,7 +83,7 @@ def rollout(
     alive = none | active if left is None else active & (left > 0)
     progress = _Progress(state, alive, none, left)
     records = _empty_records(step, progress, distribution, horizon)
-    progress, (observation, action, reward, mask), simulated = play_chunks(
+    progress, (observation, action, reward, mask), simulated = episode.play_chunks(
         lambda noise, progress: lax.scan(step, progress, noise),
         distribution,
         noise_keys,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from optax import Params
 
-from mjx_reinforce.engines.chunks import largest_divisor, while_any
+from mjx_reinforce.engines.episode import largest_divisor, while_any
 
 #: Samples whose activations are held at once; 2**18 of them take 64 MB a 64-unit layer.
 MAX_SAMPLES = 2**18

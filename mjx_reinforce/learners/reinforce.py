@@ -12,9 +12,8 @@ from mjx_reinforce.checks import check_type
 from mjx_reinforce.devices import NONE, RUNS, SECOND, Devices
 from mjx_reinforce.engines import choice
 from mjx_reinforce.engines.choice import Engine
-from mjx_reinforce.engines.chunks import CHUNK_STEPS
 from mjx_reinforce.engines.contract import check_environment
-from mjx_reinforce.engines.episode import check_shapes, episode_keys
+from mjx_reinforce.engines.episode import CHUNK_STEPS, check_shapes, episode_keys
 from mjx_reinforce.fused import any_lane
 from mjx_reinforce.learners import contract, counts, diagnostics
 from mjx_reinforce.learners.estimators import Estimator, leave_one_out, standardize

@@ -15,7 +15,7 @@ import optax
 from jax import lax
 from optax import Params
 
-from mjx_reinforce.engines.chunks import while_any
+from mjx_reinforce.engines.episode import while_any
 from mjx_reinforce.learners.diagnostics import signal_to_noise
 from mjx_reinforce.learners.gradients import accumulate_gradient, draw_steps, while_needed
 from mjx_reinforce.learners.schedules import Clock

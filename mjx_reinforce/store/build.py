@@ -91,11 +91,11 @@ def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
 
 def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
     from mjx_reinforce.console.streams import to_screen
-    from mjx_reinforce.engines.native import outlook
+    from mjx_reinforce.engines.native import available
     from mjx_reinforce.learners.reinforce import reinforce
     from mjx_reinforce.learners.schedules import Cut
 
-    if config.engine in ("auto", "native") and (said := outlook.announcement(env)):
+    if config.engine in ("auto", "native") and (said := available.announcement(env)):
         to_screen(said)
     cut = None
     if config.train_horizon is not None and config.whole_after < 1:

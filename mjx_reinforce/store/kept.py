@@ -19,7 +19,7 @@ import numpy as np
 from jax import export
 
 from mjx_reinforce import envs
-from mjx_reinforce.engines.native import look, objects
+from mjx_reinforce.engines.native import objects
 from mjx_reinforce.engines.native.available import made_for, platform
 from mjx_reinforce.engines.native.cpu import seam
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
@@ -48,7 +48,7 @@ def key_of(config: Config) -> str | None:
     """
     looks = any(jax.config.values[name] for name in ("jax_debug_nans", "jax_debug_infs"))
     own = not envs.is_ours(config.env) or any(is_own(getattr(config, name)) for name in CODE)
-    if looks or look.level() or objects.folder() is None or own:
+    if looks or objects.is_described() or objects.folder() is None or own:
         return None
     if "xml_file" in split_words(config.env_set):  # the file may change
         return None

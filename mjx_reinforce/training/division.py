@@ -16,7 +16,7 @@ import numpy as np
 from jax.sharding import PartitionSpec
 
 from mjx_reinforce.devices import NONE, RUNS, Devices
-from mjx_reinforce.engines.chunks import largest_divisor
+from mjx_reinforce.engines.episode import largest_divisor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.state import RunState, shape_of_all
 from mjx_reinforce.types import PyTree

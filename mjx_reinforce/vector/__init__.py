@@ -3,6 +3,5 @@
 ``environment`` is the environment in JAX, whose step is one call of machine code where that is
 possible; ``episodes`` says what one of them does: how episodes begin, end and follow each other.
 ``for_gymnasium`` puts it under ``gymnasium.vector.VectorEnv``, whose ids ``mjx_reinforce.gym``
-tells to Gymnasium, ``for_stable_baselines3`` under that library's ``VecEnv``, and ``for_brax``
-under brax's ``Env``.
+tells to Gymnasium, and ``for_brax`` under brax's ``Env``.
 """

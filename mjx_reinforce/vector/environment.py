@@ -10,8 +10,8 @@ from jax.typing import ArrayLike
 from mjx_reinforce import envs
 from mjx_reinforce.checks import check_parts, check_type
 from mjx_reinforce.engines import episode
+from mjx_reinforce.engines.choice import MapEngine, map_function
 from mjx_reinforce.engines.contract import check_environment
-from mjx_reinforce.engines.mapping import MapEngine, map_function
 from mjx_reinforce.engines.native.available import GENERATOR
 from mjx_reinforce.policies.arguments import check_count, check_key
 from mjx_reinforce.registry import check_name, nearest
@@ -189,10 +189,7 @@ class VectorEnv:
 
     def _check_memory(self) -> None:
         """Raises ValueError for more environments than there is memory for."""
-        each = sum(
-            int(np.prod(x.shape, dtype=int)) * np.dtype(x.dtype).itemsize
-            for x in jax.tree.leaves(self._blank)
-        )
+        each = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(self._blank))
         needed, there = _COPIES * each * self.num_envs, _memory()
         if needed > there:
             raise ValueError(

@@ -97,20 +97,14 @@ def advance_function(env: Environment, limit: int | None, autoreset: str) -> Cal
       autoreset: one of ``AUTORESETS``.
     """
 
-    def play(state: VectorState, action: PyTree) -> VectorState:
-        return _play(env, limit, state, action)
-
-    def restart(state: VectorState) -> VectorState:
-        return _begin(env, state)
-
     def advance(state: VectorState, action: PyTree, begins: jax.Array) -> VectorState:
         if autoreset == "same_step":
-            after = play(state, action)
-            start = lax.cond(begins | after.done, lambda: restart(state), lambda: after)
+            after = _play(env, limit, state, action)
+            start = lax.cond(begins | after.done, lambda: _begin(env, state), lambda: after)
             kept = after.replace(simulation=start.simulation, keys=start.keys)  # pyright: ignore
             return jax.tree.map(lambda x, y: jnp.where(begins, x, y), start, kept)
         over = begins | (state.done if autoreset == "next_step" else False)
-        return lax.cond(over, lambda: restart(state), lambda: play(state, action))
+        return lax.cond(over, lambda: _begin(env, state), lambda: _play(env, limit, state, action))
 
     return advance
 

@@ -16,15 +16,23 @@ from mjx_reinforce.types import Discrete, Environment, PyTree
 from mjx_reinforce.vector.environment import VectorEnv, make_vec
 from mjx_reinforce.vector.episodes import VectorState
 
-_MODES = {
-    "next_step": AutoresetMode.NEXT_STEP,
-    "same_step": AutoresetMode.SAME_STEP,
-    "disabled": AutoresetMode.DISABLED,
-}
 #: A seed of all environments, or one for each.
 Seeds: TypeAlias = int | Sequence[int | None] | None
-#: How arrays are handed out, by name; "torch" and "jax" stay on the device.
-_KINDS_OF_ARRAYS = ("numpy", "jax", "torch")
+
+
+def _to_torch(x: jax.Array) -> Any:
+    import torch  # pyright: ignore[reportMissingImports] (whoever asks for it has it)
+
+    return torch.from_dlpack(x)
+
+
+#: How arrays are handed out, by name: copied, for the next step writes into the state's memory, or
+#: as they are on the device.
+_HAND_OUT: dict[str, Callable[[jax.Array], Any]] = {
+    "numpy": np.array,
+    "jax": lambda x: x,
+    "torch": _to_torch,
+}
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
@@ -45,7 +53,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
           ValueError: an argument has no such value, or there is nothing to render.
         """
-        check_name("arrays", arrays, dict.fromkeys(_KINDS_OF_ARRAYS))
+        check_name("arrays", arrays, _HAND_OUT)
         if render_mode not in (None, "rgb_array"):
             raise ValueError(f"render_mode must be rgb_array or None, got {render_mode!r}")
         if render_mode and not hasattr(vec.env, "mj_model"):
@@ -54,7 +62,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.state: VectorState | None = None
         dt = getattr(vec.env, "dt", None)
         self.metadata = {
-            "autoreset_mode": _MODES[vec.autoreset],
+            "autoreset_mode": AutoresetMode[vec.autoreset.upper()],
             "render_modes": ["rgb_array"],
             **({"render_fps": round(1 / dt)} if dt else {}),
         }
@@ -66,17 +74,14 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self.observation_space = batch(self.single_observation_space, self.num_envs)
         self.action_space = batch(self.single_action_space, self.num_envs)
         self._arrays, self._process = arrays, os.getpid()
-        self._out = _converter(arrays)
+        self._out = _HAND_OUT[arrays]
         self._reset, self._restart = jax.jit(vec.reset), jax.jit(vec.restart)
         # What is handed out without a copy must outlive the next step.
-        self._step = jax.jit(vec.step, donate_argnums=() if arrays in ("jax", "torch") else 0)
+        self._step = jax.jit(vec.step, donate_argnums=0 if arrays == "numpy" else ())
         self._renderer: Any = None
 
     def reset(
-        self,
-        *,
-        seed: Seeds = None,
-        options: dict[str, Any] | None = None,
+        self, *, seed: Seeds = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
         """Begins new episodes.
 
@@ -296,14 +301,3 @@ def _space(vec: VectorEnv) -> gymnasium.Space:
         return gymnasium.spaces.Discrete(space.num_actions)
     low, high = np.asarray(space.low, np.float32), np.asarray(space.high, np.float32)
     return gymnasium.spaces.Box(low, high, dtype=np.float32)
-
-
-def _converter(arrays: str) -> Callable[[jax.Array], Any]:
-    """Returns what hands an array out."""
-    if arrays == "numpy":
-        return np.array  # a copy: the next step writes into the state's memory
-    if arrays == "jax":
-        return lambda x: x
-    import torch  # pyright: ignore[reportMissingImports] (whoever asks for it has it)
-
-    return torch.from_dlpack

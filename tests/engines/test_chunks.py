@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce import Distribution
-from mjx_reinforce.engines.chunks import (
+from mjx_reinforce.engines.episode import (
     CHUNK_STEPS,
     chunk_length,
     largest_divisor,

@@ -9,7 +9,7 @@ from players import actor_and_act, played
 from toys import Drifting
 
 from mjx_reinforce.engines.native import available, program, rollout, step
-from mjx_reinforce.engines.native.cpu import denormals, kernel, machine
+from mjx_reinforce.engines.native.cpu import handler, kernel, machine
 from mjx_reinforce.fused import scalarized
 
 if reason := available.unavailable():
@@ -31,7 +31,7 @@ def text():
 
 
 def test_what_it_takes_it_frees_and_what_it_flushes_it_undoes(text):
-    work = text(2, denormals.flush("x86_64-unknown-linux-gnu")).partition("@work(")[2]
+    work = text(2, handler.flush("x86_64-unknown-linux-gnu")).partition("@work(")[2]
     assert work.count("call ptr @malloc") == work.count("call void @free") == 1
     set_at, undone_at = (found.start() for found in re.finditer("call void @llvm.x86.sse.ld", work))
     assert set_at < work.index("phi i64 [0, ") < undone_at < work.index("call void @free")

@@ -20,7 +20,7 @@ NUMBERS = itertools.count(20)
 def code(tmp_path, monkeypatch):
     """Code that is on disk, of which this process forgets how it is called."""
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
-    monkeypatch.setattr(seam, "_WAYS", {})
+    monkeypatch.setattr(seam, "_KNOWN", set())
     monkeypatch.setattr(machine, "_LOADED", {})
     return items.load(tmp_path, lanes=next(NUMBERS))
 
@@ -52,14 +52,8 @@ def test_code_that_is_gone_is_not_restored(code, tmp_path, monkeypatch):
     assert not seam.restore(seam._target(code.key).encode())
 
 
-def test_what_xla_does_not_take_is_not_restored(code, monkeypatch):
-    monkeypatch.setattr(seam, "_register", lambda code: False)
-    assert seam.way(code) == "callback"
-    assert not seam.restore(seam._target(code.key).encode())
-
-
-def test_a_way_is_found_once(code, monkeypatch):
-    assert seam.way(code) == "ffi"
-    monkeypatch.setattr(seam, "_register", pytest.fail)
-    assert seam.way(code) == "ffi"
+def test_xla_is_told_once(code, monkeypatch):
+    seam.register(code)
+    monkeypatch.setattr(seam.jax.ffi, "register_ffi_target", pytest.fail)
+    seam.register(code)
     assert [x.shape for x in items.play(code, [1, 1])][:2] == [(2, T, N, 2), (2, T, N, 1)]

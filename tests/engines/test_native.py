@@ -15,7 +15,7 @@ from toys import Bytes, Drifting
 
 from mjx_reinforce import Box
 from mjx_reinforce.engines import choice, rollouts
-from mjx_reinforce.engines.native import available, objects, outlook, program, rollout
+from mjx_reinforce.engines.native import available, objects, program, rollout
 from mjx_reinforce.engines.native.cpu import lanes, machine
 from mjx_reinforce.engines.native.gpu import ptx
 from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
@@ -145,12 +145,13 @@ def test_a_nan_stays_in_its_lane():
 
 def test_vectors_begin_at_multiples_of_their_size():
     """As LLVM takes for granted, also of 16 numbers of 8 bytes."""
-    leaves = [jax.ShapeDtypeStruct((3,), x) for x in (np.float32, np.float64, np.int32, np.int64)]
+    kinds = np.float32, np.float64, np.int32, np.int64
+    leaves = [jax.ShapeDtypeStruct((3,), x) for x in (*kinds, *kinds)]
     for count in (1, 4, 8, 16):
-        places = lanes.layout(leaves, 1, 1, count)
+        places = lanes.layout(leaves, 1, count)
         fields = [*places.inputs, places.broken, places.seed, places.episode]
         for field, after in itertools.pairwise(fields):
-            assert after.offset >= field.offset + field.count * field.dtype.itemsize * count
+            assert after.offset >= field.offset + field.entries * field.dtype.itemsize * count
         for field in fields:
             vector = field.dtype.itemsize * count
             assert field.offset % vector == lanes.ALIGNMENT % vector == 0
@@ -259,7 +260,7 @@ def test_auto_falls_back_whatever_the_writer_raises(monkeypatch):
     def write(*_):
         raise error
 
-    monkeypatch.setattr(program, "_write_cpu", write)
+    monkeypatch.setattr(program.kernel, "player_text", write)
     monkeypatch.setattr(machine, "_LOADED", {})
     monkeypatch.setattr(objects, "folder", lambda: None)
     for error in (KeyError("lost"), ValueError("cannot reshape"), RecursionError("deep")):
@@ -285,8 +286,8 @@ def test_wide_observations_are_not_for_machine_code():
     engine = chosen(Panorama())
     assert engine.name == "vmap"
     assert "109 s, more than 80 s, because of an observation of 2,000 entries" in engine.why
-    assert outlook.announcement(Panorama()) is None
-    assert outlook.announcement(Drifting()) is None
+    assert available.announcement(Panorama()) is None
+    assert available.announcement(Drifting()) is None
 
 
 @pytest.mark.cpu
@@ -297,9 +298,9 @@ def test_large_models_are_not_for_machine_code(monkeypatch):
     env.num_contacts = 14
     monkeypatch.setattr(objects, "folder", lambda: None)
     monkeypatch.setattr(machine, "_LOADED", {})
-    monkeypatch.setattr(outlook, "_WORTH_SAYING", 0)
-    assert "with up to 14 contacts, and compiling" in str(outlook.announcement(env))
-    monkeypatch.setattr(outlook, "MAX_SECONDS", 1e-9)
+    monkeypatch.setattr(available, "_WORTH_SAYING", 0)
+    assert "with up to 14 contacts, and compiling" in str(available.announcement(env))
+    monkeypatch.setattr(available, "MAX_SECONDS", 1e-9)
     engine = chosen(env)
     assert engine.name == "vmap"
     assert "more than 1e-09 s, because of its size; its geoms can meet in" in engine.why

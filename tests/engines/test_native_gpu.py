@@ -9,35 +9,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax import lax
 from players import actor_and_act, assert_same_episodes, only_active, played
 from scenes import THREE_FEET, Scene
-from toys import Bytes, Chain, Drifting, categorical
+from toys import Busy, Bytes, Chain, categorical
 
 from mjx_reinforce import fused
 from mjx_reinforce.engines import rollouts
 from mjx_reinforce.engines.native import available, objects, program, rollout, step
 from mjx_reinforce.engines.native.gpu import kernel as kernels
-from mjx_reinforce.engines.native.gpu import lockstep, ptx, scratch, seam
+from mjx_reinforce.engines.native.gpu import lockstep, ptx, seam
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.physics import touching
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)
-
-
-class Busy(Drifting):
-    """Its step has loops that keep and read arrays, one that ends by its lane, and a branch."""
-
-    def step(self, state, action):
-        after = super().step(state, action)
-        x, y = after.obs
-        kept = lax.scan(lambda c, w: (jnp.sin(c + w), c * w), x, jnp.linspace(0.1, 1, 9))[1]
-        total = lax.scan(lambda c, row: (0.9 * c + row, None), y, kept[::-1])[0]
-        grown = lax.while_loop(lambda z: z < 1.5, lambda z: z + 0.1 + y**2, jnp.abs(total))
-        often = lambda: lax.fori_loop(0, 9, lambda _, z: jnp.cos(z) + jnp.sin(z * x), y)  # noqa: E731
-        extra = lax.cond(x > 0.2, often, lambda: 0.0)
-        return after.replace(reward=after.reward + total + grown + extra)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +97,7 @@ def test_in_step_or_apart_and_with_long_arrays_in_a_buffer_an_episode_is_the_sam
             ptx, "load_kernel", lambda *x, load=load: made.append(load(*x)) or made[-1]
         )
         monkeypatch.setattr(lockstep, "LONG", long)
-        monkeypatch.setattr(scratch, "WRITTEN_OUT", longest)
+        monkeypatch.setattr(lockstep, "WRITTEN_OUT", longest)
         got = played(rollout.rollout, *busy, horizon=30)
         assert block.apart is None
         meetings.append(block.meetings)
@@ -140,7 +125,7 @@ def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
 
 def test_each_thread_has_words_of_its_own():
     """Those of the threads of a warp are side by side."""
-    text = scratch.ScratchText()
+    text = lockstep.ScratchText()
     arrays = [text.reserve_long(np.int32, count) for count in (30, 40)]
     block, lane = (
         text.let(f"call i32 @llvm.nvvm.read.ptx.sreg.{x}()") for x in ("ctaid.x", "tid.x")
@@ -187,7 +172,7 @@ def test_ptx(busy, long, tmp_path, monkeypatch):
     if long:
         monkeypatch.setattr(kernels, "LONG", 10)
         monkeypatch.setattr(lockstep, "LONG", 4)
-        monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
+        monkeypatch.setattr(lockstep, "WRITTEN_OUT", 4)
     text = kernel_text(env, *player)
     for capability in ("7.5", "9.0"):
         made = ptx.load_kernel(text, lambda: text, capability, tmp_path)
@@ -213,7 +198,7 @@ def test_ptx(busy, long, tmp_path, monkeypatch):
 
 def test_the_buffer_has_room_for_the_threads_of_all_blocks(busy, monkeypatch, tmp_path):
     env, (actor, act, distribution) = busy
-    monkeypatch.setattr(scratch, "WRITTEN_OUT", 4)
+    monkeypatch.setattr(lockstep, "WRITTEN_OUT", 4)
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
     monkeypatch.setattr(ptx, "_LOADED", {})
 

@@ -48,7 +48,7 @@ def slow(monkeypatch):
 def test_what_xla_compiled_meanwhile_waits_for_it(slow, tmp_path):
     go_on, _ = slow
     code = items.load(tmp_path)
-    assert seam.way(code) == "ffi"
+    seam.register(code)
     play = jax.jit(lambda active: items.play(code, active)).lower(jnp.array(ACTIVE)).compile()
     assert not code.made.done()
     assert not list(tmp_path.iterdir())
@@ -61,19 +61,11 @@ def test_what_xla_compiled_meanwhile_waits_for_it(slow, tmp_path):
     assert not items.load(tmp_path).compiled  # it is on disk
 
 
-def test_a_way_without_xla_waits_too(slow, monkeypatch):
-    go_on, _ = slow
-    code = items.load()
-    monkeypatch.setattr(seam, "_WAYS", {code.key: "callback"})
-    threading.Timer(0.2, go_on.set).start()
-    items.check(jax.jit(lambda active: items.play(code, active))(jnp.array(ACTIVE)), ACTIVE)
-
-
 def test_what_is_not_compiled_is_an_error_of_the_program(slow):
     go_on, errors = slow
     errors.append(RuntimeError("no memory is left"))
     code = items.load()
-    assert seam.way(code) == "ffi"
+    seam.register(code)
     play = jax.jit(lambda active: items.play(code, active)).lower(jnp.array(ACTIVE)).compile()
     go_on.set()
     with pytest.raises(Exception, match=r"LLVM did not compile .* --engine vmap needs none"):

@@ -1,4 +1,4 @@
-"""Machine code made at run time, called from compiled JAX: by whatever way, on whatever threads."""
+"""Machine code made at run time, called from compiled JAX on whatever threads."""
 
 import ctypes
 import os
@@ -22,19 +22,10 @@ pytestmark = pytest.mark.cpu
 ACTIVE = [1, 0, 1, 1, 0, 7]
 
 
-@pytest.fixture(params=["ffi", "callback"])
-def code(request, monkeypatch):
-    """The test player, called by each way."""
-    code = items.load()
-    monkeypatch.setattr(seam, "_WAYS", {})
-    if request.param == "callback":
-
-        def refuse(*args, **kwargs):
-            raise RuntimeError("the handler's API version is incompatible")
-
-        monkeypatch.setattr(jax.ffi, "register_ffi_target", refuse)
-    assert seam.way(code) == request.param
-    return code
+@pytest.fixture
+def code():
+    """The test player."""
+    return items.load()
 
 
 def test_results_under_jit(code):
@@ -45,7 +36,7 @@ def test_results_under_jit(code):
 
 
 def test_in_a_scan_and_a_while_loop(code):
-    """Each call gets what the last one gave, without going back to Python for `ffi`."""
+    """Each call gets what the last one gave, without going back to Python."""
 
     def turn(active):
         return (items.play(code, active)[3][:, 0] % 2).astype(jnp.int32)
@@ -139,20 +130,12 @@ print(resident())
 
 def test_results_are_zeroed_by_all_threads():
     """Buffers of several parts, of sizes that divide into none, with bounds around them."""
-    code, seeds, horizon = items.load(), 2, 200_001
+    seeds, horizon = 2, 200_001
     given = [np.ones((seeds, items.N), np.int32), np.zeros(seeds, np.int32)]
     given += [np.zeros((seeds, items.N, 2), np.uint32), np.zeros(seeds, np.int32)]
     sizes = [seeds * n for n in (horizon * 6, horizon * 3, horizon * 3, items.N, items.N, 1)]
     made = [np.full(size + 2, 7, np.int32) for size in sizes]
-    data = [*(x.ctypes.data for x in given), *(x[1:].ctypes.data for x in made)]
-    buffers = (ctypes.c_void_p * len(data))(*data)
-    job = seam._function(code, "open", 2, 3)(
-        buffers, (ctypes.c_int64 * 6)(*(4 * size for size in sizes)), seeds, items.N, horizon
-    )
-    share = seam._function(code, "share", 1, 0)
-    with seam.ThreadPoolExecutor(3) as pool:
-        list(pool.map(share, [job] * 3))
-    seam._function(code, "close", 1, 0)(job)
+    items.by_hand(items.text(), given, [x[1:-1] for x in made], (seeds, items.N, horizon))
     assert all(x[0] == x[-1] == 7 for x in made)
     observation, action, reward, length, broken, simulated = (x[1:-1] for x in made)
     assert not any(x.any() for x in (observation, action, broken))
@@ -198,12 +181,10 @@ def test_code_that_others_may_have_written_is_not_loaded(cache, monkeypatch):
     assert compiled()
     assert not compiled()
     (stored,) = (cache / "native").iterdir()
-    for place in (cache, cache / "native"):
-        before = place.stat().st_mode
-        place.chmod(0o777)
-        with pytest.warns(UserWarning, match="others may write to .* no machine code is kept"):
-            assert compiled()
-        place.chmod(before)
+    (cache / "native").chmod(0o777)
+    with pytest.warns(UserWarning, match="others may write to .* no machine code is kept"):
+        assert compiled()
+    (cache / "native").chmod(0o700)
     stored.chmod(0o666)
     assert compiled()
     assert not compiled()
@@ -327,7 +308,7 @@ def test_the_caller_plays_what_the_pool_does_not():
         ({"schedules": 2}, 2, 0),
     ):
         frame = Frame(**settings)
-        seam._function(items.load(), "handler", 1, 0)(frame.address)
+        items.function(items.load(), "handler", 1)(frame.address)
         items.check(frame.results, [1, 1])
         assert frame.scheduled == scheduled, settings
         assert frame.destroyed == [1234] * destroyed, settings
@@ -339,7 +320,7 @@ def test_threads_for_six_items_on_a_pool_of_three():
         *((1, 1, 0), (1, 2, 1), (1, 9, 2)),
     ):
         frame = Frame(limit=limit, late=True)
-        seam._function(items.load(lanes=lanes), "handler", 1, 0)(frame.address)
+        items.function(items.load(lanes=lanes), "handler", 1)(frame.address)
         assert frame.scheduled == helpers, (lanes, limit)
         for _ in range(helpers):
             frame.run_task()
@@ -348,7 +329,7 @@ def test_threads_for_six_items_on_a_pool_of_three():
 def test_a_task_that_comes_late_touches_only_the_job():
     """The job outlives the call until the last task has let go of it."""
     frame = Frame(late=True)
-    seam._function(items.load(), "handler", 1, 0)(frame.address)
+    items.function(items.load(), "handler", 1)(frame.address)
     job = (ctypes.c_int64 * len(handler.FIELDS)).from_address(frame.tasks[0][1])
     before = dict(zip(handler.FIELDS, job, strict=True))
     frame.run_task()
@@ -361,7 +342,7 @@ def test_a_task_that_comes_late_touches_only_the_job():
 
 def test_a_task_that_the_pool_refuses_holds_nothing():
     frame = Frame(late=True, schedules=1)
-    seam._function(items.load(), "handler", 1, 0)(frame.address)
+    items.function(items.load(), "handler", 1)(frame.address)
     job = (ctypes.c_int64 * len(handler.FIELDS)).from_address(frame.tasks[0][1])
     assert job[handler.FIELDS.index("refs")] == 1
     frame.run_task()

@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engines.unit_by_unit import unit_by_unit
+from mjx_reinforce.engines.native.step import unit_by_unit
 from mjx_reinforce.policies.policy import MLP
 
 

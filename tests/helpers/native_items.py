@@ -1,5 +1,8 @@
 """A player that plays nothing: each item says which it is. For tests of the way to it."""
 
+import ctypes
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -122,3 +125,24 @@ def check(results, active, threads=None):
     assert not simulated.ravel()[1:].any()
     if threads is not None:
         assert simulated.sum() == threads
+
+
+def function(code, name, num_pointers, num_integers=0):
+    """A function of machine code for Python to call; it returns a pointer."""
+    kinds = [ctypes.c_void_p] * num_pointers + [ctypes.c_int64] * num_integers
+    return ctypes.CFUNCTYPE(ctypes.c_void_p, *kinds)(code.addresses[name])
+
+
+def by_hand(text, given, made, sizes, threads=3):
+    """Fills arrays by the functions that a handler is made of, in threads that are not XLA's.
+
+    The sizes are those of a job: seeds, episodes and steps.
+    """
+    names, target = ("open", "share", "close"), machine.this_machine()
+    code = machine.load_module(text, lambda: text, names, target, None)
+    data = [x.ctypes.data for x in [*given, *made]]
+    bytes_ = (ctypes.c_int64 * len(made))(*(x.nbytes for x in made))
+    job = function(code, "open", 2, 3)((ctypes.c_void_p * len(data))(*data), bytes_, *sizes)
+    with ThreadPoolExecutor(threads) as pool:
+        list(pool.map(function(code, "share", 1), [job] * threads))
+    function(code, "close", 1)(job)

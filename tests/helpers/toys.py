@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
+from jax import lax
 
 from mjx_reinforce import Box, Discrete, Distribution, Policy
 
@@ -190,6 +191,20 @@ class Drifting(Survive):
         info = (count + 1, count % 7 == 3, limit)
         earned = jnp.mean(jnp.asarray(action, moved.dtype))
         return state.replace(obs=moved, reward=earned, done=done.astype(moved.dtype), info=info)
+
+
+class Busy(Drifting):
+    """Its step has loops that keep and read arrays, one that ends by its lane, and a branch."""
+
+    def step(self, state, action):
+        after = super().step(state, action)
+        x, y = after.obs
+        kept = lax.scan(lambda c, w: (jnp.sin(c + w), c * w), x, jnp.linspace(0.1, 1, 9))[1]
+        total = lax.scan(lambda c, row: (0.9 * c + row, None), y, kept[::-1])[0]
+        grown = lax.while_loop(lambda z: z < 1.5, lambda z: z + 0.1 + y**2, jnp.abs(total))
+        often = lambda: lax.fori_loop(0, 9, lambda _, z: jnp.cos(z) + jnp.sin(z * x), y)  # noqa: E731
+        extra = lax.cond(x > 0.2, often, lambda: 0.0)
+        return after.replace(reward=after.reward + total + grown + extra)
 
 
 class Bytes(Drifting):

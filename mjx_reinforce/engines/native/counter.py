@@ -7,6 +7,7 @@ Written for ``jax_threefry_partitionable``, JAX's default.
 
 import functools
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -94,26 +95,17 @@ def _refuse(*_: object) -> jax.Array:
 @functools.cache
 def _from_a_count() -> object:
     """Returns the generator of keys that skip numbers, which cannot be split."""
-    return random.define_prng_impl(
-        key_shape=(3,),
-        seed=_refuse,
-        split=_refuse,
-        random_bits=_bits,
-        fold_in=_refuse,
-        name="threefry2x32 from a count",
-        tag="count",
-    )
+    return _generator((3,), "threefry2x32 from a count", "count", _refuse, _refuse)
 
 
 @functools.cache
 def _written_out() -> object:
     """Returns JAX's generator, in operations that can be written out."""
-    return random.define_prng_impl(
-        key_shape=(2,),
-        seed=_refuse,
-        split=_split,
-        random_bits=_bits,
-        fold_in=_fold_in,
-        name="threefry2x32 written out",
-        tag="written",
-    )
+    return _generator((2,), "threefry2x32 written out", "written", _split, _fold_in)
+
+
+def _generator(
+    shape: tuple[int, ...], name: str, tag: str, split: Callable, fold_in: Callable
+) -> object:
+    made = {"key_shape": shape, "name": name, "tag": tag, "split": split, "fold_in": fold_in}
+    return random.define_prng_impl(seed=_refuse, random_bits=_bits, **made)

@@ -1,24 +1,19 @@
 """A function of one example over a batch, in machine code: ``jax.vmap`` for simulations."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engines.native import available, look, objects
+from mjx_reinforce.engines.native import program
 from mjx_reinforce.engines.native.cpu import handler, machine, seam
-from mjx_reinforce.engines.native.cpu.denormals import flush
 from mjx_reinforce.engines.native.cpu.mapping import POSITIONS, mapping_text
-from mjx_reinforce.engines.native.gpu import ptx
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
-from mjx_reinforce.engines.native.gpu.lockstep import operations
 from mjx_reinforce.engines.native.gpu.mapping import mapping_text as gpu_mapping_text
-from mjx_reinforce.engines.native.program import GPU_LOOPS, LOOPS, WRITERS
-from mjx_reinforce.engines.native.step import BRANCH_COST, stored
+from mjx_reinforce.engines.native.step import stored
 from mjx_reinforce.fused import jaxprs, scalarized
-from mjx_reinforce.fused.graph import Limits
 from mjx_reinforce.types import PyTree
 
 #: Raises TooLarge for a program that takes too long to write and compile.
@@ -28,7 +23,7 @@ SizeCheck: TypeAlias = Callable[[jaxprs.Program], None]
 def machine_map(
     function: Callable[..., Any],
     *examples: PyTree,
-    check: SizeCheck | None = None,
+    check: SizeCheck = lambda traced: None,
     name: str = "a function",
 ) -> Callable[..., Any]:
     """Returns a function of a batch, compiled unless memory or disk has it.
@@ -41,7 +36,7 @@ def machine_map(
       function: of one example; pytrees of numbers of 32 or 64 bits and bools, in and out.
       *examples: its arguments, or their shapes.
       check: raises TooLarge where writing it out and compiling it takes too long.
-      name: what ``look`` calls it.
+      name: of the function, for people.
 
     Raises:
       TooLarge: writing it out would take minutes.
@@ -61,7 +56,7 @@ def machine_map(
     for leaf in (*kept, *map(jax.eval_shape, [stored] * len(results), results)):
         if np.dtype(leaf.dtype).itemsize not in (4, 8):
             raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
-    code = _code(flat, kept, check, name)
+    code, _ = program.load("map", name, flat, kept, check, _write_cpu, gpu_mapping_text)
 
     def mapped(*args: PyTree) -> Any:
         values = jax.tree.leaves(args)
@@ -72,7 +67,10 @@ def machine_map(
             for x in results
             if x.size
         ]
-        made = iter(_run(code, shapes, rows))
+        if isinstance(code, machine.Code):
+            made = iter(seam.call(code, shapes, jnp.int32(0), *rows))
+        else:
+            made = iter(gpu_seam.launch_map(code, shapes, *rows))
         return out_tree.unflatten(
             next(made).reshape(num, *x.shape).astype(x.dtype)
             if x.size
@@ -83,43 +81,9 @@ def machine_map(
     return mapped
 
 
-def _run(
-    code: machine.Code | ptx.Kernel, shapes: list[jax.ShapeDtypeStruct], rows: list[jax.Array]
-) -> Sequence[jax.Array]:
-    """Runs the code on arrays [N, ...] and returns those of these shapes."""
-    if isinstance(code, machine.Code):
-        return seam.call(code, shapes, jnp.int32(0), *rows, positions=POSITIONS)
-    return gpu_seam.launch_map(code, shapes, *rows)
-
-
-def _code(
-    function: Callable[..., Any], examples: list[Any], check: SizeCheck | None, name: str
-) -> machine.Code | ptx.Kernel:
-    """Returns the machine code that maps a function of leaves."""
-    traced, _ = jaxprs.trace(function, *examples)
-    on_cpu = available.platform() == "cpu"
-    source = f"map {jaxprs.fingerprint(traced)} {objects.source_digest(*WRITERS)}"
-
-    def written(limits: Limits) -> scalarized.Scalarized:
-        if check is not None:
-            check(traced)
-        return scalarized.build(function, examples, [True] * len(examples), BRANCH_COST, limits)
-
-    def write_gpu() -> str:  # where memory or disk has no code
-        step = written(GPU_LOOPS)
-        return look.title(name, operations(step.schedule)) + gpu_mapping_text(step)
-
-    if not on_cpu:
-        capability = gpu_seam.compute_capability()
-        return ptx.load_kernel(source, write_gpu, capability, objects.folder())
-    target = machine.this_machine()
-
-    def write() -> str:
-        step = written(LOOPS)
-        title = look.title(name, operations(step.schedule))
-        num_args = 1 + sum(bool(np.prod(x.shape)) for x in step.in_avals)
-        sizes = [np.dtype(x.dtype).itemsize for x in step.out_avals if np.prod(x.shape)]
-        entry = handler.handler_text(num_args, sizes, target.lanes, POSITIONS, zeroed=False)
-        return title + entry + mapping_text(step, target.lanes, flush(target.triple))
-
-    return machine.load_module(source, write, handler.NAMES, target, objects.folder())
+def _write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
+    """Writes a function, and all around it, as LLVM IR."""
+    num_args = 1 + sum(bool(np.prod(x.shape)) for x in written.in_avals)
+    sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals if np.prod(x.shape)]
+    entry = handler.handler_text(num_args, sizes, target.lanes, POSITIONS, zeroed=False)
+    return entry + mapping_text(written, target.lanes, handler.flush(target.triple))

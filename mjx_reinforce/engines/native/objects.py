@@ -1,28 +1,39 @@
-"""Compiled objects on disk: written whole or not at all, checked when read, bounded in size.
+"""Compiled objects: made, described and kept on disk.
 
-They are code: only what nobody but this user and root may have written is read.
+They are written whole or not at all, checked when read, bounded in size. They are code: only what
+nobody but this user and root may have written is read.
+
+With the variable MJX_REINFORCE_DEBUG=1, for work on the compiler, each object is made even if the
+disk has it, described on stderr, and its LLVM IR is left beside it.
 """
 
 import contextlib
 import functools
 import hashlib
 import os
+import stat
+import sys
 import tempfile
+import time
 import warnings
+from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-import jax
-
-from mjx_reinforce.engines.native.ownership import distrust, is_trusted, make_folder
-
-if TYPE_CHECKING:
-    from importlib.abc import Traversable
-
+#: Asks for descriptions.
+DEBUG = "MJX_REINFORCE_DEBUG"
 #: Where a folder holds more bytes than this, what was used longest ago goes.
 LIMIT = 256 * 2**20
 _DIGEST = hashlib.sha256().digest_size
+
+
+def key_of(*parts: object) -> str:
+    """Returns the key of an object: a hash of all that it depends on, this LLVM besides."""
+    import llvmlite
+    import llvmlite.binding as llvm
+
+    made_by = "1", llvmlite.__version__, llvm.llvm_version_info
+    return hashlib.sha256("\n".join(map(str, (*made_by, *parts))).encode()).hexdigest()
 
 
 def read_object(folder: Path, key: str) -> bytes | None:
@@ -30,7 +41,8 @@ def read_object(folder: Path, key: str) -> bytes | None:
     path = folder / f"{key}.o"
     try:
         with open(path, "rb", opener=_open_no_link) as file:
-            if not is_trusted(os.fstat(file.fileno())):
+            status = os.fstat(file.fileno())
+            if not stat.S_ISREG(status.st_mode) or _stranger(path, status):
                 return None
             data = file.read()
     except OSError:
@@ -81,20 +93,12 @@ def source_digest(*packages: str) -> str:
     """Returns a hash of the files of packages that decide what is compiled."""
     digest = hashlib.sha256()
     for name in packages:
-        for file in _files(resources.files(name)):
-            digest.update(file.read_bytes())
+        with resources.as_file(resources.files(name)) as folder:
+            for place, _, names in sorted(os.walk(folder, followlinks=True)):
+                for file in sorted(names):
+                    if file.endswith((".py", ".ll", ".xml")):
+                        digest.update(Path(place, file).read_bytes())
     return digest.hexdigest()
-
-
-def _files(folder: "Traversable") -> list[Any]:
-    """Returns the files of a package that are part of the program, in order of their names."""
-    found = []
-    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
-        if entry.is_dir():
-            found += _files(entry)
-        elif entry.name.endswith((".py", ".ll", ".xml")):
-            found.append(entry)
-    return found
 
 
 def folder() -> Path | None:
@@ -102,6 +106,8 @@ def folder() -> Path | None:
 
     None if JAX keeps none, and where others may write, of which it warns.
     """
+    import jax  # here alone: commands that compute nothing do not wait for it
+
     chosen = jax.config.values["jax_compilation_cache_dir"]
     if not chosen or "://" in chosen or not jax.config.values["jax_enable_compilation_cache"]:
         return None
@@ -110,3 +116,76 @@ def folder() -> Path | None:
         warnings.warn(f"{why}, so no machine code is kept in {folder}", stacklevel=2)
         return None
     return folder
+
+
+def distrust(folder: Path) -> str | None:
+    """Returns why others may decide what is in a folder; None if only this user and root may.
+
+    What does not exist yet is no reason: ``make_folder`` makes it.
+    """
+    try:
+        status = folder.stat()
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        return f"{type(error).__name__}: {error.strerror}"
+    return _stranger(folder, status)
+
+
+def _stranger(place: Path, status: os.stat_result) -> str | None:
+    """Returns why another user may have made or changed a place, None if none may."""
+    if sys.platform == "win32":
+        return None
+    if status.st_uid not in (0, os.geteuid()):
+        return f"{place} belongs to another user ({status.st_uid})"
+    others = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return f"others may write to {place}" if others else None
+
+
+def make_folder(folder: Path) -> None:
+    """Makes a folder that only this user may enter, and those above it, where they are not there.
+
+    Raises:
+      OSError: it cannot be made, or is a file.
+    """
+    for place in (*reversed(folder.parents), folder):
+        if not place.is_dir():
+            place.mkdir(0o700, exist_ok=True)
+
+
+def is_described() -> bool:
+    """Returns whether objects are described, and therefore made even if the disk has them."""
+    return os.environ.get(DEBUG, "0") not in ("", "0")
+
+
+def describe(key: str, what: str) -> None:
+    """Says something of an object on stderr where that is asked for."""
+    if is_described():
+        print(f"kernel {key}: {' '.join(what.split())}", file=sys.stderr, flush=True)
+
+
+def kept(key: str, folder: Path | None) -> bytes | None:
+    """Returns an object that need not be made; None if there is none."""
+    return read_object(folder, key) if folder and not is_described() else None
+
+
+def make(key: str, folder: Path | None, text: str, compile: Callable[[str], bytes]) -> bytes:
+    """Returns what is compiled of a text, and keeps it.
+
+    Args:
+      key: of the object.
+      folder: where it is kept; None keeps none.
+      text: LLVM IR, whose first line says what it is.
+      compile: returns what is kept.
+    """
+    began = time.perf_counter()
+    made = compile(text)
+    seconds = time.perf_counter() - began
+    about = text.partition("\n")[0].removeprefix("; ")
+    describe(key, f"{about}; LLVM took {seconds:.2f} s for {len(made):,} bytes")
+    if folder:
+        write_object(folder, key, made)
+        if is_described():
+            with contextlib.suppress(OSError):
+                (folder / f"{key}.ll").write_text(text, encoding="utf-8")
+    return made

@@ -1,6 +1,7 @@
-"""From an environment and a policy to machine code, made once and kept on disk."""
+"""From a function written out, such as a step of an episode, to machine code, kept on disk."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,25 +10,23 @@ import numpy as np
 
 from mjx_reinforce import fused
 from mjx_reinforce.engines import episode
-from mjx_reinforce.engines.native import available, look, objects, outlook, step
-from mjx_reinforce.engines.native.cpu import handler, kernel, machine, queue
-from mjx_reinforce.engines.native.cpu.denormals import flush
+from mjx_reinforce.engines.native import available, objects, step
+from mjx_reinforce.engines.native.cpu import handler, kernel, lanes, machine
 from mjx_reinforce.engines.native.gpu import kernel as gpu_kernel
-from mjx_reinforce.engines.native.gpu import ptx, scratch
+from mjx_reinforce.engines.native.gpu import lockstep, ptx
 from mjx_reinforce.engines.native.gpu import seam as gpu_seam
-from mjx_reinforce.engines.native.gpu.lockstep import operations
 from mjx_reinforce.engines.native.step import StepResult
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.fused.graph import Limits
 from mjx_reinforce.policies.distributions.distribution import Distribution
-from mjx_reinforce.types import Environment, PyTree
+from mjx_reinforce.types import Environment, PyTree, observation_size
 
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
 LOOPS = Limits(scans=1, unrollable=1)
 #: On GPUs a loop over few contacts is written out: an array that a loop reads is in memory there.
-GPU_LOOPS = LOOPS._replace(unrollable=scratch.WRITTEN_OUT)
+GPU_LOOPS = LOOPS._replace(unrollable=lockstep.WRITTEN_OUT)
 #: The folders whose files decide what is written for a step.
-WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
+_WRITERS = ("mjx_reinforce.fused", "mjx_reinforce.engines")
 
 
 class NativeProgram(NamedTuple):
@@ -59,28 +58,70 @@ def build_program(
     """
     examples = step.examples(env, actor)
     function = step.step_function(env, act, distribution, length)
-    on_cpu = available.platform() == "cpu"
-    if not on_cpu:  # a thread without an episode does not play
+    if available.platform() != "cpu":  # a thread without an episode does not play
         function, examples = while_running(function), examples[:-1]
-    traced, shapes = jaxprs.trace(function, *examples)
-    source = f"{jaxprs.fingerprint(traced)} {objects.source_digest(*WRITERS)}"
-    folder = objects.folder()
-    target = machine.this_machine() if on_cpu else None
+    num_actor = len(jax.tree.leaves(actor))
+    check = functools.partial(available.check_seconds, env, entries=observation_size(env))
 
-    def write() -> str:  # not called where memory or disk has the code
-        outlook.check_seconds(env, traced, shapes.record[0].size)
-        limits, varying = LOOPS if on_cpu else GPU_LOOPS, [True] * len(jax.tree.leaves(examples))
-        written = scalarized.build(function, examples, varying, step.BRANCH_COST, limits)
-        title = look.title(look.name_of(env), operations(written.schedule))
-        if target is None:
-            return title + gpu_kernel.kernel_text(written, len(jax.tree.leaves(actor)))
-        return title + _write_cpu(written, examples, target)
+    def write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
+        buffers = [x for x in jax.tree.leaves((actor, examples[1].state)) if np.prod(x.shape)]
+        sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals[: lanes.NUM_RECORDS]]
+        num_args = lanes.NUM_CONTROLS + len(buffers)
+        entry = handler.handler_text(num_args, [*sizes, 4, 4, 4], target.lanes)
+        flush = handler.flush(target.triple)
+        return entry + kernel.player_text(written, num_actor, target.lanes, flush)
 
-    if target is None:
-        code = ptx.load_kernel(source, write, gpu_seam.compute_capability(), folder)
-    else:
-        code = machine.load_module(source, write, handler.NAMES, target, folder)
+    def write_gpu(written: scalarized.Scalarized) -> str:
+        return gpu_kernel.kernel_text(written, num_actor)
+
+    code, shapes = load("play", name_of(env), function, examples, check, write_cpu, write_gpu)
     return NativeProgram(code, shapes.record)
+
+
+def load(
+    use: str,
+    name: str,
+    function: Callable[..., Any],
+    examples: Sequence[PyTree],
+    check: Callable[[jaxprs.Program], None],
+    write_cpu: Callable[[scalarized.Scalarized, machine.Machine], str],
+    write_gpu: Callable[[scalarized.Scalarized], str],
+) -> tuple[machine.Code | ptx.Kernel, Any]:
+    """Returns the machine code of a function, compiled unless memory or disk has it, and shapes.
+
+    They are those of what the function returns.
+
+    Args:
+      use: what the writers write around the function.
+      name: of the function, for people.
+      function: what is written out.
+      examples: its arguments, or their shapes.
+      check: raises TooLarge for what takes too long to write and compile.
+      write_cpu: what is written out, and for which machine -> LLVM IR.
+      write_gpu: what is written out -> LLVM IR.
+    """
+    on_cpu = available.platform() == "cpu"
+    target = machine.this_machine() if on_cpu else None
+    traced, shapes = jaxprs.trace(function, *examples)
+    source = f"{use} {jaxprs.fingerprint(traced)} {objects.source_digest(*_WRITERS)}"
+
+    def write() -> str:
+        check(traced)
+        varying, limits = [True] * len(jax.tree.leaves(examples)), LOOPS if target else GPU_LOOPS
+        written = scalarized.build(function, examples, varying, step.BRANCH_COST, limits)
+        title = f"; {name}, {lockstep.operations(written.schedule):,} scalar operations\n"
+        return title + (write_cpu(written, target) if target else write_gpu(written))
+
+    if target:
+        return machine.load_module(source, write, handler.NAMES, target, objects.folder()), shapes
+    capability = gpu_seam.compute_capability()
+    return ptx.load_kernel(source, write, capability, objects.folder()), shapes
+
+
+def name_of(env: Any) -> str:
+    """Returns the class of an environment, and of those in it if it wraps one."""
+    inner = getattr(env, "env", None)
+    return type(env).__name__ + ("" if inner is None else f" of {name_of(inner)}")
 
 
 def refusal(error: Exception) -> str:
@@ -95,16 +136,3 @@ def refusal(error: Exception) -> str:
 def while_running(function: Callable[..., StepResult]) -> Any:
     """Returns a step of episodes that are running."""
     return lambda *args: function(*args, jnp.int32(1))
-
-
-def _write_cpu(
-    written: scalarized.Scalarized, examples: tuple[Any, ...], target: machine.Machine
-) -> str:
-    """Writes a step, and all around it, as LLVM IR."""
-    actor, carried, *_ = examples
-    num_actor = len(jax.tree.leaves(actor))
-    buffers = [x for x in jax.tree.leaves((actor, carried.state)) if np.prod(x.shape)]
-    records = [np.dtype(x.dtype).itemsize for x in written.out_avals[: queue.NUM_RECORDS]]
-    num_args, lanes = queue.NUM_CONTROLS + len(buffers), target.lanes
-    entry = handler.handler_text(num_args, [*records, 4, 4, 4], lanes)
-    return entry + kernel.player_text(written, num_actor, lanes, flush(target.triple))

@@ -13,14 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engines import episode
-from mjx_reinforce.engines.chunks import chunk_length
 from mjx_reinforce.engines.native import available
 from mjx_reinforce.engines.native.cpu import machine
 from mjx_reinforce.engines.native.cpu import seam as cpu
 from mjx_reinforce.engines.native.gpu import seam as gpu
-from mjx_reinforce.engines.native.plays import plays
 from mjx_reinforce.engines.native.program import NativeProgram, build_program, refusal
-from mjx_reinforce.engines.native.step import stored
+from mjx_reinforce.engines.native.step import plays, stored
 from mjx_reinforce.fused import TooLarge, UnsupportedPrimitive
 from mjx_reinforce.policies.distributions.distribution import Distribution
 from mjx_reinforce.types import Environment, PyTree, Trajectory
@@ -56,11 +54,10 @@ def rollout(
     flags = {"deterministic": deterministic, "active": active, "limit": steps}
     episode.check_shapes((), (num_episodes,), **flags)
     episode.check_shapes((), threads=threads)
-    against = against_key(key)
-    if against:
+    if against := against_key(key):
         raise ValueError(f"the native engine cannot play this: {against}; {_REMEDY}")
     try:
-        program = build_program(env, act, actor, distribution, chunk_length(horizon))
+        program = build_program(env, act, actor, distribution, episode.chunk_length(horizon))
     except (TooLarge, UnsupportedPrimitive) as error:
         raise ValueError(f"the native engine cannot play this: {error}") from error
     begin = functools.partial(episode.begin, env)
@@ -105,11 +102,10 @@ def unsupported(
     env: Environment, act: episode.Act, actor: PyTree, distribution: Distribution, horizon: int
 ) -> str | None:
     """Returns why machine code cannot play this here, or None; it is compiled if it can."""
-    reason = available.unavailable()
-    if reason:
+    if reason := available.unavailable():
         return reason
     try:
-        build_program(env, act, actor, distribution, chunk_length(horizon))
+        build_program(env, act, actor, distribution, episode.chunk_length(horizon))
     except Exception as error:  # whatever it is, another engine may play this
         return refusal(error)
     return None

@@ -16,8 +16,8 @@ from mjx_reinforce.fused.backends.llvm_text import Text
 _TEXT = Path(__file__).with_name("handler.ll")
 #: What every handler begins with.
 _ENTRY = Path(__file__).parents[1] / "entry.ll"
-#: The functions to be called from outside.
-NAMES = ("handler", "open", "share", "close")
+#: The functions to be called from outside; tests call others.
+NAMES = ("handler",)
 #: The fields of a job, %Job.
 FIELDS = (
     "refs",  # i64: who may still look at the job; the last one frees it
@@ -55,29 +55,20 @@ class Positions(NamedTuple):
 EPISODES = Positions(THREADS, KEYS, REWARD)
 #: Bytes from the start of a struct to a member, in xla/ffi/api/c_api.h of major version 0.
 OFFSETS = {
-    "XLA_FFI_CallFrame.extension_start": 8,
-    "XLA_FFI_CallFrame.api": 16,
-    "XLA_FFI_CallFrame.ctx": 24,
-    "XLA_FFI_CallFrame.args.size": 56,
-    "XLA_FFI_CallFrame.args.args": 72,
-    "XLA_FFI_CallFrame.rets.size": 96,
-    "XLA_FFI_CallFrame.rets.rets": 112,
-    "XLA_FFI_CallFrame.attrs.attrs": 160,
-    "XLA_FFI_Buffer.data": 24,
-    "XLA_FFI_Buffer.rank": 32,
-    "XLA_FFI_Buffer.dims": 40,
-    "XLA_FFI_Scalar.value": 8,
-    "XLA_FFI_Metadata_Extension.extension_base.type": 8,
-    "XLA_FFI_Metadata_Extension.metadata": 24,
-    "XLA_FFI_Metadata.api_version.major_version": 24,
-    "XLA_FFI_Metadata.api_version.minor_version": 28,
-    "XLA_FFI_Metadata.traits": 32,
-    "XLA_FFI_Api.api_version.minor_version": 36,
-    "XLA_FFI_Api.XLA_FFI_Error_Create": 48,
-    "XLA_FFI_Api.XLA_FFI_Error_Destroy": 64,
-    "XLA_FFI_Api.XLA_FFI_Stream_Get": 80,
-    "XLA_FFI_Api.XLA_FFI_ThreadPool_Schedule": 136,
-    "XLA_FFI_Api.XLA_FFI_ThreadPool_NumThreads": 144,
+    f"{struct}.{member.split()[0]}": int(member.split()[1])
+    for struct, members in (
+        ("XLA_FFI_CallFrame", "extension_start 8, api 16, ctx 24, args.size 56, args.args 72"),
+        ("XLA_FFI_CallFrame", "rets.size 96, rets.rets 112, attrs.attrs 160"),
+        ("XLA_FFI_Buffer", "data 24, rank 32, dims 40"),
+        ("XLA_FFI_Scalar", "value 8"),
+        ("XLA_FFI_Metadata_Extension", "extension_base.type 8, metadata 24"),
+        ("XLA_FFI_Metadata", "api_version.major_version 24, api_version.minor_version 28"),
+        ("XLA_FFI_Metadata", "traits 32"),
+        ("XLA_FFI_Api", "api_version.minor_version 36, XLA_FFI_Error_Create 48"),
+        ("XLA_FFI_Api", "XLA_FFI_Error_Destroy 64, XLA_FFI_Stream_Get 80"),
+        ("XLA_FFI_Api", "XLA_FFI_ThreadPool_Schedule 136, XLA_FFI_ThreadPool_NumThreads 144"),
+    )
+    for member in members.split(", ")
 }
 
 
@@ -90,8 +81,8 @@ def handler_text(
 ) -> str:
     """Returns the IR of all but ``@work``; it defines %Job.
 
-    ``@handler`` is for XLA. Others ``@open`` a job, ``@share`` it in any number of threads, and
-    ``@close`` it when these have returned.
+    ``@handler`` is what XLA calls. It opens a job by ``@open``, which any number of threads
+    ``@share``, and ends it by ``@close`` when these have returned.
 
     Args:
       num_args: the number of arguments: plays [*B, N] int32 (of ``native.plays``), threads [*B]
@@ -153,3 +144,51 @@ class JobText:
         """Returns one of several pointers, such as those to the job's data."""
         place = self.text.let(f"getelementptr inbounds ptr, ptr {pointers}, i64 {number}")
         return self.text.let(f"load ptr, ptr {place}")
+
+
+class Flush(NamedTuple):
+    """LLVM IR for one architecture, by which numbers too small for full precision count as zero.
+
+    XLA's own threads do so too. All threads of a job do the same, so that an episode is the same on
+    any of them.
+
+    declarations: the intrinsics
+    begin: what takes such numbers as zero from now on
+    end: what undoes it
+    """
+
+    declarations: str = ""
+    begin: str = ""
+    end: str = ""
+
+
+_FLUSHES = {
+    "x86_64": Flush(  # MXCSR: flush to zero, and denormals are zero
+        """declare void @llvm.x86.sse.stmxcsr(ptr)
+declare void @llvm.x86.sse.ldmxcsr(ptr)
+""",
+        """%control = alloca [2 x i32]
+  call void @llvm.x86.sse.stmxcsr(ptr %control)
+  %control.old = load i32, ptr %control
+  %control.new = or i32 %control.old, 32832
+  %control.at = getelementptr inbounds i32, ptr %control, i64 1
+  store i32 %control.new, ptr %control.at
+  call void @llvm.x86.sse.ldmxcsr(ptr %control.at)""",
+        "call void @llvm.x86.sse.ldmxcsr(ptr %control)",
+    ),
+    "aarch64": Flush(  # FPCR: flush to zero
+        """declare i64 @llvm.aarch64.get.fpcr()
+declare void @llvm.aarch64.set.fpcr(i64)
+""",
+        """%control.old = call i64 @llvm.aarch64.get.fpcr()
+  %control.new = or i64 %control.old, 16777216
+  call void @llvm.aarch64.set.fpcr(i64 %control.new)""",
+        "call void @llvm.aarch64.set.fpcr(i64 %control.old)",
+    ),
+}
+
+
+def flush(triple: str) -> Flush:
+    """Returns what flushes on a machine; nothing where that is not known."""
+    architecture = triple.partition("-")[0].replace("arm64", "aarch64")
+    return _FLUSHES.get(architecture, Flush())

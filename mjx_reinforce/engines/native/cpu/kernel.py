@@ -1,6 +1,6 @@
 """The program that every thread runs: it plays episodes in the lanes of vectors.
 
-A lane whose episode is over takes the next one (``queue``), so no lane waits for a longer episode
+A lane whose episode is over takes the next one (``lanes``), so no lane waits for a longer episode
 beside it, whatever the seeds do. What a lane computes depends on its own episode alone: results are
 the same for any number of lanes and threads.
 """
@@ -10,16 +10,21 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.engines.native.cpu import handler
-from mjx_reinforce.engines.native.cpu.denormals import Flush
-from mjx_reinforce.engines.native.cpu.lanes import ALIGNMENT, Field, VectorLayout, layout
-from mjx_reinforce.engines.native.cpu.queue import NUM_CONTROLS, NUM_RECORDS, queue_text
+from mjx_reinforce.engines.native.cpu.handler import Flush
+from mjx_reinforce.engines.native.cpu.lanes import (
+    ALIGNMENT,
+    NUM_CONTROLS,
+    NUM_RECORDS,
+    Field,
+    VectorLayout,
+    layout,
+    queue_text,
+)
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.fused.backends.llvm import LLVM, Input
 from mjx_reinforce.fused.backends.llvm_text import Text
 
 _INT, _LONG = np.dtype(np.int32), np.dtype(np.int64)
-#: The last arguments of a step: keys, t, deterministic, alive.
-_NUM_OTHERS = 4
 
 
 def player_text(step: scalarized.Scalarized, num_actor: int, lanes: int, flush: Flush) -> str:
@@ -31,27 +36,24 @@ def player_text(step: scalarized.Scalarized, num_actor: int, lanes: int, flush: 
       lanes: how many lanes a vector has.
       flush: what makes all threads round alike.
     """
-    num_state = len(step.in_avals) - num_actor - _NUM_OTHERS
-    places = layout(step.in_avals, num_actor, num_state, lanes)
-    work = _Work(Text(lanes), places).write(step, flush)
+    places = layout(step.in_avals, num_actor, lanes)
+    work = _Work(Text(lanes), places, num_actor).write(step, flush)
     return flush.declarations + queue_text(places, lanes) + work
 
 
 class _Work(handler.JobText):
     """Writes ``@work``; pointers are to the lane vectors of its memory."""
 
-    def __init__(self, text: Text, places: VectorLayout):
+    def __init__(self, text: Text, places: VectorLayout, num_actor: int):
         super().__init__(text)
-        self.places = places
+        self.places, self.num_actor = places, num_actor
         self.room, self.memory = self._allocate()
         self.inputs = [self._pointer(field) for field in places.inputs]
         self.seed, self.episode = self._pointer(places.seed), self._pointer(places.episode)
         self.step, self.broken = self._pointer(places.step), self._pointer(places.broken)
-        self.limit = self._pointer(places.limit)
-        self.alive = self._pointer(places.alive)
-        self.horizon = self.job("horizon", "i64")
-        self.episodes = self.job("episodes", "i64")
-        first = NUM_CONTROLS + len(places.actor_fields) + len(places.state_fields)
+        self.limit, self.alive = self._pointer(places.limit), self._pointer(places.alive)
+        self.horizon, self.episodes = self.job("horizon", "i64"), self.job("episodes", "i64")
+        first = NUM_CONTROLS + len(places.actor) + len(places.state)
         data = self.job("data", "ptr")
         self.records = [self.element(data, first + k) for k in range(NUM_RECORDS)]
 
@@ -89,7 +91,7 @@ class _Work(handler.JobText):
         values = emit.compile(step.schedule, step.outputs)
         self._record(values[:NUM_RECORDS], step.out_avals, alive)
         (goes_on,), (broken,), *carried = values[NUM_RECORDS:]
-        first = self.places.actor
+        first = self.num_actor
         for leaf, to, field in zip(carried, self.inputs[first:], fields[first:], strict=False):
             for k, value in enumerate(leaf):
                 text.store(value, text.at(to, field.dtype, k), field.dtype)

@@ -6,7 +6,6 @@ lays each object out in one piece, which that model asks for.
 """
 
 import functools
-import hashlib
 import itertools
 import os
 import sys
@@ -16,7 +15,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mjx_reinforce.engines.native import look, objects
+from mjx_reinforce.engines.native import objects
 from mjx_reinforce.engines.native.cpu import emit
 from mjx_reinforce.registry import check_name
 
@@ -139,40 +138,30 @@ def load_module(
       RuntimeError: the text is no LLVM IR, or it calls a function that is nowhere; a long text's
         ``addresses`` raise the latter.
     """
-    key = _key(source, names, machine)
+    key = objects.key_of(*machine, *names, source)
     with _LOCK:
         if key not in _LOADED:
-            found = objects.read_object(folder, key) if folder and not look.level() else None
-            if found:
+            if found := objects.kept(key, folder):
                 made = _done(_link(key, names, found))
             else:
-                made = _make(key, write, names, machine, folder)
+                made = _make(key, write(), names, machine, folder)
             _LOADED[key] = Code(key, made, compiled=not found)
         return _LOADED[key]
 
 
 def _make(
-    key: str,
-    write: Callable[[], str],
-    names: tuple[str, ...],
-    machine: Machine,
-    folder: Path | None,
+    key: str, text: str, names: tuple[str, ...], machine: Machine, folder: Path | None
 ) -> Future[dict[str, int]]:
-    """Returns where the functions of a module will be, of what ``write`` returns."""
+    """Returns where the functions of a module will be."""
 
-    def finish(data: bytes) -> dict[str, int]:
-        addresses = _link(key, names, data)
-        if folder:
-            objects.write_object(folder, key, data)
-        return addresses
+    def finish(compile: Callable[[str, Machine], bytes]) -> dict[str, int]:
+        data = objects.make(key, folder, text, lambda text: compile(text, machine))
+        return _link(key, names, data)
 
-    if look.level():
-        return _done(finish(_build(key, write, machine, folder)))
-    text = write()
     if len(text) <= _LONG_TEXT or not sys.executable:
-        return _done(finish(_compile(text, machine)))
+        return _done(finish(_compile))
     emit.parse(text, _target(machine))  # what is no LLVM IR is known at once
-    return emit.later(lambda: finish(_compile_elsewhere(text, machine)))
+    return emit.later(lambda: finish(_compile_elsewhere))
 
 
 def _done(addresses: dict[str, int]) -> Future[dict[str, int]]:
@@ -195,30 +184,6 @@ def loaded(key: str, names: tuple[str, ...], folder: Path) -> Code | None:
                 return None
             _LOADED[key] = Code(key, _done(_link(key, names, data)), compiled=False)
         return _LOADED[key]
-
-
-def _key(source: str, names: tuple[str, ...], machine: Machine) -> str:
-    """Returns a hash of all that an object depends on."""
-    import llvmlite
-    import llvmlite.binding as llvm
-
-    made_by = ("1", llvmlite.__version__, str(llvm.llvm_version_info))
-    return hashlib.sha256(
-        "\n".join((*made_by, *map(str, machine), *names, source)).encode()
-    ).hexdigest()
-
-
-def _build(key: str, write: Callable[[], str], machine: Machine, folder: Path | None) -> bytes:
-    """Returns object code of what ``write`` returns."""
-
-    def texts(text: str, _: bytes) -> dict[str, str]:
-        target = _target(machine, _effort(text))
-        return {"ll": text, "s": target.emit_assembly(emit.parse(text, target))}
-
-    def compile(text: str) -> bytes:
-        return _compile(text, machine)
-
-    return look.build(key, folder, write, compile, look.code_facts, texts)
 
 
 def _compile(text: str, machine: Machine) -> bytes:

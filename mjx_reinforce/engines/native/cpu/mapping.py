@@ -4,12 +4,10 @@ A thread takes as many examples at once as a vector has lanes. The lanes of the 
 no example compute the last one again, and leave nothing.
 """
 
-from typing import Any
-
 import numpy as np
 
 from mjx_reinforce.engines.native.cpu import handler
-from mjx_reinforce.engines.native.cpu.denormals import Flush
+from mjx_reinforce.engines.native.cpu.handler import Flush
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.fused.backends.llvm import LLVM, Input
 from mjx_reinforce.fused.backends.llvm_text import Text
@@ -38,7 +36,7 @@ class _Work(handler.JobText):
 
     def __init__(self, text: Text, written: scalarized.Scalarized):
         super().__init__(text)
-        self.written = written
+        self.written, self.inputs = written, written.in_avals
 
     def write(self, flush: Flush) -> str:
         """Returns the function."""
@@ -46,7 +44,7 @@ class _Work(handler.JobText):
         text.line(flush.begin)
         total, data = self.job("total", "i64"), self.job("data", "ptr")
         next_at = self.field("next")
-        given = [x for x in self.written.in_avals if _size(x)]
+        given = [x for x in self.inputs if _size(x)]
         made = [x for x in self.written.out_avals if _size(x)]
         buffers = [self.element(data, k) for k in range(1 + len(given) + len(made))]
         arguments, results = buffers[1 : 1 + len(given)], buffers[1 + len(given) :]
@@ -75,11 +73,6 @@ class _Work(handler.JobText):
         text.line(flush.end)
         text.line("ret void")
         return text.function("void @work(ptr %job)")
-
-    @property
-    def inputs(self) -> list[Any]:
-        """Shape and dtype of each leaf of the arguments."""
-        return self.written.in_avals
 
     def _items(self, first: str, total: str) -> tuple[str, str]:
         """Returns the example of each lane, and which lanes have one of their own."""

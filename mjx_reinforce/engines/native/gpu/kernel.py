@@ -15,11 +15,11 @@ from mjx_reinforce.engines.native.gpu.lockstep import (
     LONG,
     LOOP_FACTS,
     Lockstep,
+    ScratchText,
     operations,
     some_of_block,
 )
-from mjx_reinforce.engines.native.gpu.scratch import ScratchText
-from mjx_reinforce.engines.native.plays import NOT_PLAYED
+from mjx_reinforce.engines.native.step import NOT_PLAYED
 from mjx_reinforce.fused import scalarized
 from mjx_reinforce.fused.backends.llvm import Input
 
@@ -68,7 +68,7 @@ def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
     read; and the results, which are zero when it starts: observation [S, T, O, N], action
     [S, T, A, N], reward [S, T, N], length [S, N] int32, broken [S, N] int32, simulated [S] int32
     and next [1] int32, the item to be fetched next; and, if there are long arrays, the buffer of
-    ``scratch.ScratchText``. Item k is episode k % N of seed k / N. A thread counts the steps that
+    ``ScratchText``. Item k is episode k % N of seed k / N. A thread counts the steps that
     it waits for others in its block as simulated for the seed it played last, if there is one.
 
     Args:

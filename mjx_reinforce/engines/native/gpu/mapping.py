@@ -5,8 +5,7 @@ import math
 import numpy as np
 
 from mjx_reinforce.engines.native.gpu.kernel import entry_text
-from mjx_reinforce.engines.native.gpu.lockstep import Lockstep, some_of_block
-from mjx_reinforce.engines.native.gpu.scratch import ScratchText
+from mjx_reinforce.engines.native.gpu.lockstep import Lockstep, ScratchText, some_of_block
 from mjx_reinforce.fused import jaxprs, scalarized
 from mjx_reinforce.fused.backends.llvm import Input
 
@@ -19,7 +18,7 @@ def mapping_text(written: scalarized.Scalarized) -> str:
     Its arguments are pointers to: sizes [2] int32 (examples N, threads in all), the leaves [N, ...]
     of the function's arguments that are not empty; as many again as there are results, which it
     does not read; and the results, the leaves of the function's result that are not empty; and, if
-    there are long arrays, the buffer of ``scratch.ScratchText``. Thread k computes the examples k,
+    there are long arrays, the buffer of ``ScratchText``. Thread k computes the examples k,
     k + threads and so on.
 
     Args:
@@ -29,12 +28,7 @@ def mapping_text(written: scalarized.Scalarized) -> str:
     given = [k for k, leaf in enumerate(written.in_avals) if _size(leaf)]
     made = [k for k, leaf in enumerate(written.out_avals) if _size(leaf)]
     own = [text.reserve(x.dtype, _size(x)) if _size(x) else "null" for x in written.in_avals]
-    text.declared |= {
-        f"declare i32 @llvm.nvvm.read.ptx.sreg.{x}()" for x in ("tid.x", "ctaid.x", "ntid.x")
-    }
-    in_block, block, threads = (
-        text.let(f"call i32 @llvm.nvvm.read.ptx.sreg.{x}()") for x in ("tid.x", "ctaid.x", "ntid.x")
-    )
+    in_block, block, threads = (text.let(text.asked(x)) for x in ("tid", "ctaid", "ntid"))
     number = text.let(f"add i32 {text.let(f'mul i32 {block}, {threads}')}, {in_block}")
     total, stride = (text.load(text.at("%sizes", _INT, k), _INT) for k in range(2))
     before, head, body, end = text.block, text.label(), text.label(), text.label()

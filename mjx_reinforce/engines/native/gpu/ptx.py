@@ -1,6 +1,5 @@
 """From LLVM IR to PTX, the assembly language that NVIDIA's driver takes."""
 
-import hashlib
 import re
 import threading
 from collections.abc import Callable
@@ -8,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mjx_reinforce import fused
-from mjx_reinforce.engines.native import look, objects
+from mjx_reinforce.engines.native import objects
 
 #: LLVM's name of NVIDIA's GPUs.
 TRIPLE = "nvptx64-nvidia-cuda"
@@ -54,14 +53,16 @@ def load_kernel(
       UnsupportedPrimitive: the text calls the C library.
       RuntimeError: the text is no LLVM IR, or this LLVM has no code for such a GPU.
     """
-    key = _key(source, capability)
+    key = objects.key_of(capability, source)
+
+    def compile(text: str) -> bytes:
+        return _compile(text, capability).encode()
+
     with _LOCK:
         if key not in _LOADED:
-            found = objects.read_object(folder, key) if folder and not look.level() else None
-            text = found.decode() if found else _build(key, write, capability, folder)
-            _LOADED[key] = Kernel(key, text, *_facts(text), compiled=not found)
-            if folder and not found:
-                objects.write_object(folder, key, text.encode())
+            found = objects.kept(key, folder)
+            made = found or objects.make(key, folder, write(), compile)
+            _LOADED[key] = _kernel(key, made, compiled=not found)
         return _LOADED[key]
 
 
@@ -73,40 +74,15 @@ def in_memory() -> list[str]:
 def kept(key: str, folder: Path) -> Kernel | None:
     """Returns a kernel by its key; None if it is not on disk."""
     found = objects.read_object(folder, key)
-    return Kernel(key, found.decode(), *_facts(found.decode()), compiled=False) if found else None
+    return _kernel(key, found, compiled=False) if found else None
 
 
-def _build(key: str, write: Callable[[], str], capability: str, folder: Path | None) -> str:
-    """Returns PTX of what ``write`` returns."""
-
-    def facts(made: str) -> dict[str, str]:
-        threads, blocks, words = _facts(made)
-        return {
-            "threads of a multiprocessor": f"{blocks * threads:,}",
-            "long arrays of a thread": f"{4 * words:,} bytes",
-        }
-
-    def texts(text: str, made: str) -> dict[str, str]:
-        return {"ll": text, "ptx": made}
-
-    def compile(text: str) -> str:
-        return _compile(text, capability)
-
-    return look.build(key, folder, write, compile, facts, texts)
-
-
-def _facts(text: str) -> tuple[int, int, int]:
-    """Returns a kernel's threads, blocks and scratch."""
+def _kernel(key: str, data: bytes, *, compiled: bool) -> Kernel:
+    """Returns the kernel that is kept as ``data``."""
+    text = data.decode()
     threads, blocks = (int(re.findall(x, text)[0]) for x in _BOUNDS)
-    return threads, blocks, int((re.findall(_SCRATCH, text) or [0])[0])
-
-
-def _key(source: str, capability: str) -> str:
-    import llvmlite
-    import llvmlite.binding as llvm
-
-    made_by = ("1", llvmlite.__version__, str(llvm.llvm_version_info), capability)
-    return hashlib.sha256("\n".join((*made_by, source)).encode()).hexdigest()
+    scratch = int((re.findall(_SCRATCH, text) or [0])[0])
+    return Kernel(key, text, threads, blocks, scratch, compiled)
 
 
 def _compile(text: str, capability: str) -> str:

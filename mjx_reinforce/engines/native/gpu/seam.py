@@ -1,49 +1,28 @@
 """How JAX launches kernels on an NVIDIA GPU.
 
 A kernel is launched within compiled programs and loops without Python: a handler of JAX's foreign
-function interface launches machine code, which is assembled while XLA compiles. Each assembler is
-tried once in each process before it is relied on.
+function interface launches machine code, which is assembled while XLA compiles.
 """
 
 import ctypes
 import functools
-import hashlib
 import math
 import re
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 
 from mjx_reinforce.engines.native import objects
-from mjx_reinforce.engines.native.gpu import assembler, launcher, ptx
-from mjx_reinforce.engines.native.gpu.scratch import WARP
+from mjx_reinforce.engines.native.gpu import launcher, ptx
+from mjx_reinforce.engines.native.gpu.lockstep import WARP
 
 #: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
 _OLDEST = (22,)
-#: A kernel that adds 1 to the number that is its second argument and its result.
-_PROBE = """
-.version 7.0
-.target sm_70
-.address_size 64
-.visible .entry play(.param .u64 given, .param .u64 unread, .param .u64 written) {
-  .reg .b64 %p<3>;
-  .reg .b32 %x<3>;
-  ld.param.u64 %p1, [given];
-  ld.param.u64 %p2, [written];
-  ld.global.u32 %x1, [%p1];
-  ld.global.u32 %x2, [%p2];
-  add.s32 %x1, %x1, %x2;
-  st.global.u32 [%p2], %x1;
-  ret;
-}
-"""
 #: What may assemble a kernel, what is preferred first.
-Assemblers = tuple[assembler.Assembler, ...]
+Assemblers = tuple[launcher.Assembler, ...]
 #: XLA's names of the handlers that it knows.
 _HANDLERS: set[str] = set()
 _LOCK = threading.Lock()
@@ -70,35 +49,12 @@ def kernels_unavailable() -> str | None:
 
 @functools.cache
 def _assemblers() -> tuple[Assemblers, str | None]:
-    """Returns what assembles kernels, with what to try next where it fails; or why nothing does."""
+    """Returns what assembles kernels, what is preferred first; or why nothing does."""
     capabilities = {getattr(x, "compute_capability", "") for x in jax.local_devices()}
     if len(capabilities) > 1:
         return (), f"its kernels are for GPUs of one kind, not {' and '.join(sorted(capabilities))}"
-    found = assembler.assemblers(compute_capability())
-    why: str | None = "NVIDIA's driver, libcuda.so.1, is not found"
-    for k, each in enumerate(found):
-        why = _fails(each)
-        if why is None:
-            return found[k:], None
-    return (), why
-
-
-def _fails(each: assembler.Assembler) -> str | None:
-    """Returns why a kernel is not launched, None if it is: in a loop, into its own results."""
-    key = hashlib.sha256(f"probe {each.name}".encode()).hexdigest()
-    probe = ptx.Kernel(key, _PROBE, threads=1, blocks=1, scratch=0, compiled=True)
-
-    def add(_: Any, x: jax.Array) -> jax.Array:
-        return _call_by((each,), probe, (1, 1), [jnp.ones(1, jnp.int32)], [x])[0]
-
-    try:
-        with jax.ensure_compile_time_eval():
-            found = jax.jit(lambda x: lax.fori_loop(0, 3, add, x))(jnp.zeros(1, jnp.int32))
-            return (
-                None if int(found[0]) == 3 else f"XLA launched a kernel and gave {found[0]}, not 3"
-            )
-    except Exception as error:  # what XLA raises has no type of its own
-        return f"XLA does not launch its kernels: {' '.join(str(error).split())[:200]}"
+    found = launcher.assemblers(compute_capability())
+    return found, None if found else "NVIDIA's driver, libcuda.so.1, is not found"
 
 
 def targets() -> list[str]:
@@ -132,10 +88,10 @@ def _handler(kernel: ptx.Kernel, assemblers: Assemblers) -> str:
     name = _target(kernel.key)
     with _LOCK:
         if name not in _HANDLERS:
-            made = launcher.launcher(kernel.key)
-            address = jax.ffi.pycapsule(ctypes.c_void_p(made.handler))
+            handler, slot = launcher.launcher(kernel.key)
+            address = jax.ffi.pycapsule(ctypes.c_void_p(handler))
             jax.ffi.register_ffi_target(name, address, platform="CUDA")
-            given = (made.slot, kernel, assemblers, objects.folder())
+            given = (slot, kernel, assemblers, objects.folder())
             threading.Thread(target=launcher.fill, args=given, daemon=True).start()
             _HANDLERS.add(name)
     return name
@@ -195,16 +151,13 @@ def _launch(
 ) -> Sequence[jax.Array]:
     seeds, episodes = args[0].shape
     shape = jax.ShapeDtypeStruct
-    observation, action, reward = (
+    records = [
         shape((seeds, horizon, int(np.prod(x.shape, dtype=int)), episodes), x.dtype) for x in record
-    )
+    ]
     counts = [shape(x, jnp.int32) for x in ((seeds, episodes), (seeds, episodes), (seeds,), (1,))]
-    given = [jnp.array([seeds, episodes, horizon], jnp.int32), *args]
-    zeros = [jnp.zeros(x.shape, x.dtype) for x in (observation, action, reward, *counts)]
     grid = _grid(seeds * episodes, kernel.threads, kernel.blocks)
-    words = kernel.scratch * math.prod(grid)
-    scratch = [shape((words,), jnp.int32)] if words else []
-    return _call(kernel, grid, given, zeros, scratch)[: len(zeros) - 1]
+    sizes = jnp.array([seeds, episodes, horizon], jnp.int32)
+    return _fill(kernel, grid, [sizes, *args], [*records, *counts])[:-1]
 
 
 def launch_map(
@@ -221,13 +174,24 @@ def launch_map(
     def play(*args):
         examples = len(args[0])
         grid = _grid(examples, kernel.threads, kernel.blocks)
-        given = [jnp.array([examples, math.prod(grid)], jnp.int32), *args]
-        made = [jnp.zeros((examples, *x.shape[1:]), x.dtype) for x in results]
-        words = kernel.scratch * math.prod(grid)
-        scratch = [jax.ShapeDtypeStruct((words,), jnp.int32)] if words else []
-        return _call(kernel, grid, given, made, scratch)[: len(made)]
+        sizes = jnp.array([examples, math.prod(grid)], jnp.int32)
+        made = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in results]
+        return _fill(kernel, grid, [sizes, *args], made)
 
     return in_one_launch(play)(*args)
+
+
+def _fill(
+    kernel: ptx.Kernel,
+    grid: tuple[int, int],
+    given: Sequence[jax.Array],
+    results: Sequence[jax.ShapeDtypeStruct],
+) -> Sequence[jax.Array]:
+    """Returns what a kernel writes into zeros of these shapes."""
+    words = kernel.scratch * math.prod(grid)
+    scratch = [jax.ShapeDtypeStruct((words,), jnp.int32)] if words else []
+    zeros = [jnp.zeros(x.shape, x.dtype) for x in results]
+    return _call(kernel, grid, given, zeros, scratch)[: len(results)]
 
 
 def _call(
@@ -242,22 +206,10 @@ def _call(
     They also write into ``scratch``, a buffer that begins with any values. Returns ``written`` as
     they leave it, and then that buffer.
     """
-    return _call_by(_assemblers()[0], kernel, grid, given, written, scratch)
-
-
-def _call_by(
-    assemblers: Assemblers,
-    kernel: ptx.Kernel,
-    grid: tuple[int, int],
-    given: Sequence[jax.Array],
-    written: Sequence[jax.Array],
-    scratch: Sequence[jax.ShapeDtypeStruct] = (),
-) -> Sequence[jax.Array]:
-    """Launches a kernel that is assembled so."""
     results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
     aliases = {len(given) + k: k for k in range(len(results))}
     blocks, threads = map(np.int32, grid)
-    target = _handler(kernel, assemblers)
+    target = _handler(kernel, _assemblers()[0])
     call = jax.ffi.ffi_call(target, [*results, *scratch], input_output_aliases=aliases)
     return call(*given, *written, blocks=blocks, threads=threads)
 
