@@ -153,7 +153,6 @@ def test_a_policy_of_the_package_can_be_exported(tmp_path, monkeypatch):
         (["numpy", "--output", "nowhere/policy.npz"], "cannot write to nowhere"),
         (["numpy", "--output", "mine.py/policy.npz"], "cannot write to mine.py"),
         (["numpy", "--output", "/proc/policy.npz"], "cannot write to /proc; choose another"),
-        (["torch"], "--to takes numpy or onnx, got 'torch'"),
         (["numpy", "--sede", "1"], "unknown flag '--sede'. Did you mean '--seed'?"),
         (["numpy", "--seed", "middle"], "middle"),
         (["numpy", "--output", "mine.npz"], "mine.py exists; pass --overwrite"),

@@ -29,10 +29,12 @@ def no_pictures(monkeypatch):
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    """A sweep and its page."""
+    """A sweep and its page; test_report_learning.py looks at the pictures."""
     directory = make_sweep(tmp_path_factory.mktemp("sweeps") / "sweep", num_seeds=40)
     page = directory / "report.html"
-    report.write_report([directory], page)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "render_chart", lambda *_: {})
+        report.write_report([directory], page)
     return directory, page
 
 
@@ -141,15 +143,13 @@ def test_tables_and_figures_agree_on_who_solved(tmp_path):
     ).read_text(encoding="utf-8")
 
 
-def test_numbers_and_pictures_lie_beside(written):
+def test_numbers_lie_beside(written):
     directory, page = written
     beside = directory / "report"
     lines = (beside / "results.csv").read_text().splitlines()
     assert lines[0].startswith("configuration,learning_rate,discount,seed,final_return")
     assert len(lines) == 1 + 16 * 40
     assert content(page)["results"].splitlines() == lines
-    for name in ("final", "curves", "solved", "distribution", "profile", "sensitivity-0", "worst"):
-        assert (beside / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
 def cells(path):
@@ -186,11 +186,6 @@ def test_every_table_names_its_configurations(written):
     files = sorted((written[0] / "report").glob("*.csv"))
     assert {path.name for path in files} >= {"band.csv", "worst.csv", "curves.csv"}
     assert [p.name for p in files if "configuration" not in p.read_text().splitlines()[0]] == []
-
-
-def test_every_picture_can_be_downloaded(written):
-    buttons = set(re.findall(r'data-png="([^"]+)"', written[1].read_text(encoding="utf-8")))
-    assert buttons == {path.stem for path in (written[0] / "report").glob("*.png")}
 
 
 def test_a_thousand_seeds_make_no_larger_charts(tmp_path):

@@ -76,8 +76,13 @@ def test_nobody_solves_it_is_no_race(tmp_path):
 
 
 def test_every_figure_is_a_vector_and_every_table_has_a_number(crossed):
-    beside = crossed[0] / "report"
+    beside, page = crossed[0] / "report", crossed[0] / "report.html"
+    buttons = set(re.findall(r'data-png="([^"]+)"', page.read_text(encoding="utf-8")))
+    assert buttons == {path.stem for path in beside.glob("*.png")}
+    names = ("final", "curves", "solved", "distribution", "profile", "sensitivity-0", "worst")
+    assert buttons == {*names, "sensitivity-1"}
     for path in beside.glob("*.png"):
+        assert path.read_bytes().startswith(b"\x89PNG")
         svg = path.with_suffix(".svg").read_text(encoding="utf-8")
         assert svg.startswith("<svg")
         assert "var(--" not in svg
