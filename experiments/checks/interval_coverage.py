@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from scipy import stats
 
-from mjx_reinforce.reports.statistics import aggregates, bootstrap, comparisons, survival
+from mjx_reinforce.reports.statistics import aggregates, comparisons, survival
 
 SEEDS = (6, 20, 50, 200)
 Ends = tuple[np.ndarray, np.ndarray]
@@ -28,8 +28,6 @@ def two_peaks(u: np.ndarray) -> np.ndarray:
     return np.where(u < 1 / 3, 100 + 600 * u, 700 + 300 * u)
 
 
-#: What the optimality gap is taken to.
-_TARGETS = {"solved or not": 950.0, "two peaks": 900.0}
 #: Distributions of a return, as quantile functions.
 DISTRIBUTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "normal": stats.norm.ppf,
@@ -38,48 +36,29 @@ DISTRIBUTIONS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "two peaks": two_peaks,
     "heavy tail (Student's t, 3)": stats.t(3).ppf,
 }
-STATISTICS = ("mean", "median", "iqm", "optimality-gap", "cvar")
+STATISTICS = ("mean", "median", "iqm", "cvar")
 
 
-def truth(quantile: Callable[[np.ndarray], np.ndarray], statistic: str, target: float) -> float:
+def truth(quantile: Callable[[np.ndarray], np.ndarray], statistic: str) -> float:
     """Returns a statistic of the distribution itself, from a million of its quantiles."""
     if statistic == "median":
         return float(quantile(np.array(0.5)))
     values = quantile((np.arange(10**6) + 0.5) / 10**6)
-    if statistic == "optimality-gap":
-        return target - float(np.mean(np.minimum(values, target)))
     low, high = {"mean": (0, 1), "iqm": (0.25, 0.75), "cvar": (0, 0.1)}[statistic]
     return float(np.mean(values[int(low * 10**6) : int(high * 10**6)]))
-
-
-def percentile_interval(values: np.ndarray) -> Ends:
-    """Returns the IQM's plain percentile bootstrap interval, rliable's, of rows of values."""
-    parts = np.array_split(values, max(1, len(values) // 400))
-    ends = [bootstrap.percentiles(bootstrap.resampled_trim_means(p, 0.25), 0.025) for p in parts]
-    low, high = np.concatenate(ends, axis=1)
-    return low, high
 
 
 def one_sample(draws: int) -> Iterator[tuple[str, str, list[str]]]:
     """Yields interval, distribution and coverage by seeds for statistics of one configuration."""
     for statistic in STATISTICS:
         for name, quantile in DISTRIBUTIONS.items():
-            target = _TARGETS.get(name, np.nan)
-            if statistic == "optimality-gap" and np.isnan(target):
-                continue
-            true = truth(quantile, statistic, target)
+            true = truth(quantile, statistic)
             cells = []
             for num_seeds in SEEDS:
                 values = quantile(np.random.default_rng(num_seeds).random((draws, num_seeds)))
-                found = aggregates.interval(statistic, values, target=target)
+                found = aggregates.interval(statistic, values)
                 cells.append(share(found.low, found.high, true))
             yield statistic, name, cells
-    for name, quantile in DISTRIBUTIONS.items():
-        true, cells = truth(quantile, "iqm", np.nan), []
-        for num_seeds in SEEDS:
-            values = quantile(np.random.default_rng(num_seeds).random((draws, num_seeds)))
-            cells.append(share(*percentile_interval(values), true))
-        yield "iqm, plain percentiles (rliable)", name, cells
 
 
 def stratified(draws: int) -> Iterator[tuple[str, str, list[str]]]:

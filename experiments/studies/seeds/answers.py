@@ -45,13 +45,13 @@ class Contrast(NamedTuple):
         return " against ".join(self.names)
 
 
-_LEARNED, _OTHERS, _NONE = "a learned baseline", "the other episodes' mean", "no baseline"
+_LEARNED, _OTHERS, _NONE = "learned", "leave-one-out", "none"
 CONTRASTS = (
     Contrast("baseline", "estimator", ("value-baseline", "reward-to-go"), (_LEARNED, _NONE)),
     Contrast("baseline", "estimator", ("value-baseline", "leave-one-out"), (_LEARNED, _OTHERS)),
     Contrast("baseline", "estimator", ("leave-one-out", "reward-to-go"), (_OTHERS, _NONE)),
-    Contrast("discount", "discount_weights", (True, False), ("gamma^t", "no gamma^t")),
-    Contrast("normalise", "standardize", (True, False), ("normalisation", "no normalisation")),
+    Contrast("discount", "discount_weights", (True, False), ("gamma^t", "without")),
+    Contrast("normalise", "standardize", (True, False), ("normalised", "raw")),
 )
 
 
