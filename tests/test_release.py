@@ -68,7 +68,7 @@ def test_constraints_are_the_versions_of_the_figures():
 def test_a_release_runs_what_main_must_pass():
     for name in ("ci", "release"):
         workflow = text(f".github/workflows/{name}.yml")
-        assert "- run: .ci/run all\n" in workflow
+        assert "- run: .ci/run\n" in workflow
         assert "uses: ./.github/workflows/wheel.yml" in workflow
     needed = re.search(r"publish:\n    needs: \[(.*)\]", text(".github/workflows/release.yml"))[1]
     assert needed == "check, wheel"
