@@ -3,12 +3,7 @@
 They run on the CPU unless JAX_PLATFORMS names something else.
 """
 
-import argparse
-import atexit
 import os
-import shutil
-import tempfile
-import zlib
 from importlib.metadata import version
 from pathlib import Path
 
@@ -26,10 +21,10 @@ os.environ.setdefault(
 )
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    cache = tempfile.mkdtemp(prefix="mjx-reinforce-tests-")
-    atexit.register(shutil.rmtree, cache, ignore_errors=True)
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = cache
+# All workers share what they compile, and the next run finds it.
+os.environ.setdefault(
+    "JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "programs")
+)
 
 import jax
 import pytest
@@ -38,71 +33,16 @@ from verify import verify
 
 from mjx_reinforce.fused import scalarized
 
-SLOW = Path(__file__).with_name("slow.txt")
-_STALE = pytest.StashKey[list[str]]()
-
 scalarized.inspect = verify
 jax.config.update("jax_default_matmul_precision", "highest")
 
 
-def _share(words):
-    shares, _, text = words.partition(":")
-    if not (shares.isdecimal() and int(shares)):
-        raise argparse.ArgumentTypeError(f"must be K:TEXT, with K 1 or more, got {words!r}")
-    return int(shares), text
-
-
-def pytest_addoption(parser):
-    parser.addoption(
-        "--slow-share",
-        type=_share,
-        default=(1, ""),
-        metavar="K:TEXT",
-        help="of the slow tests, run one in K; TEXT says which, by chance but always the same",
-    )
-
-
-def pytest_collection_modifyitems(config, items):
-    """Marks what slow.txt lists, and puts it first, so that no worker ends with a slow test."""
-    slow = {line for line in SLOW.read_text().splitlines() if not line.startswith("#")}
-    found = set()
+def pytest_collection_modifyitems(items):
+    """Puts slow tests first, so that no worker ends with one; skips those of CPUs elsewhere."""
     for item in items:
-        case = f"{item.path.name}::{item.name}"
-        if lines := slow & {case, case.partition("[")[0]}:
-            item.add_marker("slow")
-            found |= lines
         if item.get_closest_marker("cpu") and jax.default_backend() != "cpu":
             item.add_marker(pytest.mark.skip(reason="it is for CPUs"))
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
-    _deselect(config, items)
-    whole = not (any("::" in each for each in config.args) or config.getoption("lf", False))
-    collected = {item.path.name for item in items} if whole else set()
-    config.stash[_STALE] = _stale(slow - found, collected)
-
-
-def _deselect(config, items):
-    """Takes those slow tests away that are of another share."""
-    shares, text = config.getoption("slow_share")
-
-    def left_out(item):
-        drawn = zlib.crc32(f"{text} {item.nodeid}".encode()) % shares == 0
-        return item.get_closest_marker("slow") and not drawn
-
-    config.hook.pytest_deselected(items=[item for item in items if left_out(item)])
-    items[:] = [item for item in items if not left_out(item)]
-
-
-@pytest.fixture
-def stale_lines(request):
-    """The lines of slow.txt that name no file, or nothing in a file that was collected whole."""
-    return request.config.stash[_STALE]
-
-
-def _stale(lines, collected):
-    """Returns those of some lines whose file is among the collected ones, or is not there."""
-    files = {line: line.partition("::")[0] for line in lines}
-    there = {path.name for path in SLOW.parent.rglob("test_*.py")}
-    return sorted(line for line, file in files.items() if file in collected or file not in there)
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from mjx_reinforce.reports.sources import read_experiment
 DRIFT = "--env toys:Drift --num-episodes 4 --eval-episodes 2 --hidden-sizes 4 --env-steps None"
 
 
+@pytest.mark.slow
 def test_shares_are_trained_and_reported_on_together(tmp_path, monkeypatch):
     pytest.importorskip("ray")
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}:{ROOT / 'tests' / 'helpers'}")

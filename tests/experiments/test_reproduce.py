@@ -106,6 +106,7 @@ class Count(Toy):
         return ToyState(count[None], state.obs[0], done, count)
 
 
+@pytest.mark.slow
 def test_a_stale_start_shows_the_episode_before():
     """The reward is what was shown before the step: 0 + 1 + 2, then 2 + 1 + 2."""
     settings = {"num_episodes": 1, "normalize_steps": 0, "engine": "vmap"}
