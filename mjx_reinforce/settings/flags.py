@@ -29,6 +29,7 @@ Form = TypeVar("Form")
 _LEAST_WIDTH = 60
 #: What tyro says of a value -> what we say, of its first paragraph.
 _OUR_WORDS = {
+    r"\{None\}\||'None', |, 'None'": "",  # who leaves a flag out means that
     r"Error parsing (PATH|\[.*\]): .*": "'' is no path",  # without a flag
     r"Missing value for argument '(\S+)'.*": r"\1 needs a value after it",
     r"Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]": (
@@ -37,7 +38,7 @@ _OUR_WORDS = {
     r"Error parsing (\S+): no type matching (.+?) could be instantiated from \[(.*?)\]\..*": (
         r"\1 takes \2, got \3"
     ),
-    r"invalid choice (\S+) for argument '(\S+)'\. Expected one of (\(.*\))\.": (
+    r"invalid choice (\S+) for argument '(\S+)'\. Expected one of \((.*)\)\.": (
         r"\2 takes one of \3, got \1"
     ),
     r"Error parsing (\S+): (takes .*)": r"\1 \2",

@@ -9,7 +9,7 @@ from toys import Busy, Drifting
 
 from mjx_reinforce import Box, make_vec
 from mjx_reinforce.engines import choice
-from mjx_reinforce.engines.native import available
+from mjx_reinforce.engines.native import available, objects
 from mjx_reinforce.engines.native.gpu import lockstep, ptx
 
 if reason := available.unavailable():
@@ -86,6 +86,7 @@ def test_machine_code_for_a_gpu_is_chosen_where_a_step_is_large(monkeypatch):
 def test_llvm_makes_ptx_of_it(monkeypatch):
     """For the real target, where this LLVM has it."""
     kept = {}
+    monkeypatch.setattr(objects, "folder", lambda: None)
     monkeypatch.setattr(available, "platform", lambda: "gpu")
     monkeypatch.setattr(available.gpu, "kernels_unavailable", lambda: None)
     monkeypatch.setattr(available.gpu, "compute_capability", lambda: "9.0")

@@ -87,6 +87,7 @@ def test_episodes_follow_each_other(engine, autoreset):
     assert ends > 2 * num
 
 
+@pytest.mark.cpu
 @pytest.mark.slow
 def test_machine_code_computes_the_same_for_any_number():
     env = envs.make("InvertedPendulum-v5")
@@ -221,6 +222,7 @@ def test_gymnasiums_own_names_of_autoreset():
     assert make_vec("CartPole-v1", 1, autoreset=mode).autoreset == "same_step"
 
 
+@pytest.mark.cpu
 def test_why_an_engine_was_chosen():
     assert make_vec("CartPole-v1", 2).engine.why == "machine code for this CPU"
     assert make_vec("CartPole-v1", 2, engine="vmap").engine.why == "chosen by name"
