@@ -35,9 +35,7 @@ _OUR_WORDS = {
     r"Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]": (
         r"\1 takes numbers with spaces between them, such as 32 32, got \2"
     ),
-    r"Error parsing (\S+): no type matching (.+?) could be instantiated from \[(.*?)\]\..*": (
-        r"\1 takes \2, got \3"
-    ),
+    r"Error parsing (\S+): no type matching (.+?) could .*?\[(.*?)\]\..*": r"\1 takes \2, got \3",
     r"invalid choice (\S+) for argument '(\S+)'\. Expected one of \((.*)\)\.": (
         r"\2 takes one of \3, got \1"
     ),

@@ -162,13 +162,9 @@ def test_segments_go_on(autoreset):
     np.testing.assert_array_equal(second.observation[0], between.obs)
     np.testing.assert_array_equal(second.log_prob.shape, (20, 6))
     outputs = jax.vmap(jax.vmap(act, (None, 0)), (None, 0))(params, first.observation)
-    np.testing.assert_allclose(
-        # The sum of a log-probability may be near zero, where its terms, of size one, are rounded.
-        first.log_prob,
-        distribution.log_prob(outputs, first.action),
-        rtol=1e-5,
-        atol=1e-6,
-    )
+    want = distribution.log_prob(outputs, first.action)
+    # The sum of a log-probability may be near zero, where its terms, of size one, are rounded.
+    np.testing.assert_allclose(first.log_prob, want, rtol=1e-5, atol=1e-6)
     goes_on = ~np.asarray(first.done[:-1])
     np.testing.assert_array_equal(
         np.asarray(first.next_observation[:-1])[goes_on], np.asarray(first.observation[1:])[goes_on]
