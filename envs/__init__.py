@@ -9,8 +9,8 @@ import re
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from mjx_reinforce.checks import BadEnvironmentError, check_parts, explain
-from mjx_reinforce.physics import silence_mjx
+from mjx_reinforce.engine.checks import BadEnvironmentError, check_parts, explain
+from mjx_reinforce.engine.physics import silence_mjx
 from mjx_reinforce.registry import check_name, load_definition, load_ours, load_own
 
 if TYPE_CHECKING:
@@ -106,7 +106,9 @@ def make_set(id: str, words: Sequence[str] = ()) -> Any:
 
 def make_vec(env: object, num_envs: int, **options: object) -> Any:
     """Makes N environments that play at once: ``mjx_reinforce.make_vec``, beside ``make``."""
-    return load_definition("mjx_reinforce.vector.environment:make_vec")(env, num_envs, **options)
+    return load_definition("mjx_reinforce.engine.vector.environment:make_vec")(
+        env, num_envs, **options
+    )
 
 
 def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+from mjx_reinforce.engine.base import Environment, MjModel
+from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
 from mjx_reinforce.envs.parts import Named, View
-from mjx_reinforce.physics.mjx_internals import Simulation
-from mjx_reinforce.types import Environment, MjModel
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco

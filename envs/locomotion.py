@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.envs.base import NearPose
 from mjx_reinforce.envs.settings import Interval
-from mjx_reinforce.physics.mjx_internals import Simulation
 
 
 class Body(NearPose):

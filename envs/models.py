@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 from mujoco import MjModel, MjSpec, mjx  # pyright: ignore[reportAttributeAccessIssue]
 
-from mjx_reinforce.checks import explain
-from mjx_reinforce.physics.contacts import UNLIKE_C
-from mjx_reinforce.physics.mjx_internals import geom_pairs
+from mjx_reinforce.engine.checks import explain
+from mjx_reinforce.engine.physics.contacts import UNLIKE_C
+from mjx_reinforce.engine.physics.mjx_internals import geom_pairs
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco

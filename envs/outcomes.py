@@ -5,9 +5,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.checks import BadEnvironmentError
+from mjx_reinforce.engine.base import MjModel
+from mjx_reinforce.engine.checks import BadEnvironmentError
 from mjx_reinforce.envs.models import RANDOM
-from mjx_reinforce.types import MjModel
 
 
 def check_start(name: str, start: object, sizes: tuple[int, int]) -> tuple[Any, Any]:

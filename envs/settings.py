@@ -9,7 +9,7 @@ import typing
 from collections.abc import Sequence
 from typing import Any
 
-from mjx_reinforce.checks import check_type, is_nan, read_as, spoken_kind
+from mjx_reinforce.engine.checks import check_type, is_nan, read_as, spoken_kind
 from mjx_reinforce.registry import check_name
 
 #: A range (low, high), of which ``EpisodeSettings`` checks that it contains something.

@@ -19,9 +19,8 @@ _HOME = {
 }
 #: Folders and files that are attributes too, also imported on first use.
 _MODULES = (
-    *("console", "engines", "envs", "export", "files", "fused", "learners", "physics"),
-    *("playing", "policies", "registry", "reports", "runs", "settings", "store", "sweeps"),
-    *("training", "types", "vector"),
+    *("console", "engine", "envs", "export", "files", "learning", "playing", "published"),
+    *("registry", "reports", "runs", "settings", "statistics", "store", "sweeps", "training"),
 )
 # Checkers read the list in the stub.
 __all__ = sorted([*_HOME, "__version__"])  # pyright: ignore[reportUnsupportedDunderAll]

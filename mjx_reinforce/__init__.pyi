@@ -1,11 +1,23 @@
 """The public names and their homes: what type checkers read, and ``__init__.py`` too."""
 
-from mjx_reinforce.engines.any_policy import rollout
+from mjx_reinforce.engine.base import Box, Discrete, Environment, Trajectory
+from mjx_reinforce.engine.play.any_policy import rollout
+from mjx_reinforce.engine.vector.environment import VectorEnv, make_vec
+from mjx_reinforce.engine.vector.episodes import VectorState
+from mjx_reinforce.engine.vector.segments import Segment, unroll
 from mjx_reinforce.export.player import Player, load
 from mjx_reinforce.export.policy_files import load_policy, save_policy
 from mjx_reinforce.export.run_files import pretrained
-from mjx_reinforce.learners.ars import ars
-from mjx_reinforce.learners.estimators import (
+from mjx_reinforce.learning.actor import Actor, act
+from mjx_reinforce.learning.distributions.bounded import (
+    clipped_normal,
+    tanh_normal,
+    truncated_normal,
+)
+from mjx_reinforce.learning.distributions.categorical import categorical
+from mjx_reinforce.learning.distributions.distribution import Distribution
+from mjx_reinforce.learning.distributions.gaussian import deterministic, normal
+from mjx_reinforce.learning.estimators import (
     Estimator,
     discount_weights,
     leave_one_out,
@@ -16,59 +28,44 @@ from mjx_reinforce.learners.estimators import (
     standardize,
     total_return,
 )
-from mjx_reinforce.learners.learner import Learner, TrainState, train_step
-from mjx_reinforce.learners.natural_gradient import natural_gradient
-from mjx_reinforce.learners.reinforce import reinforce
-from mjx_reinforce.learners.schedules import Cut
-from mjx_reinforce.learners.updates import each_step, full_batch, make_optimizer, minibatches
-from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
-from mjx_reinforce.policies.actor import Actor, act
-from mjx_reinforce.policies.distributions.bounded import (
-    clipped_normal,
-    tanh_normal,
-    truncated_normal,
-)
-from mjx_reinforce.policies.distributions.categorical import categorical
-from mjx_reinforce.policies.distributions.distribution import Distribution
-from mjx_reinforce.policies.distributions.gaussian import deterministic, normal
-from mjx_reinforce.policies.policy import Policy, mlp_policy
-from mjx_reinforce.reports.statistics import iqm, iqm_interval, mean_interval
-from mjx_reinforce.reports.statistics.comparisons import (
+from mjx_reinforce.learning.learner import Learner, TrainState, train_step
+from mjx_reinforce.learning.natural_gradient import natural_gradient
+from mjx_reinforce.learning.policy import Policy, mlp_policy
+from mjx_reinforce.learning.reinforce import reinforce
+from mjx_reinforce.learning.schedules import Cut
+from mjx_reinforce.learning.updates import each_step, full_batch, make_optimizer, minibatches
+from mjx_reinforce.learning.value_baseline import full_batch_value_baseline, value_baseline
+from mjx_reinforce.published.ars import ars
+from mjx_reinforce.runs.run import RunResults, run
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.statistics import iqm, iqm_interval, mean_interval
+from mjx_reinforce.statistics.comparisons import (
     compare_all,
     paired_difference,
     probability_of_improvement,
 )
-from mjx_reinforce.reports.statistics.survival import kaplan_meier, log_rank
-from mjx_reinforce.runs.run import RunResults, run
-from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.statistics.survival import kaplan_meier, log_rank
 from mjx_reinforce.sweeps.perform import SweepResults, sweep
 from mjx_reinforce.training.driver import Evaluation
 from mjx_reinforce.training.evaluation import evaluate
-from mjx_reinforce.types import Box, Discrete, Environment, Trajectory
-from mjx_reinforce.vector.environment import VectorEnv, make_vec
-from mjx_reinforce.vector.episodes import VectorState
-from mjx_reinforce.vector.segments import Segment, unroll
 
 from . import console as console
-from . import engines as engines
+from . import engine as engine
 from . import envs as envs
 from . import export as export
 from . import files as files
-from . import fused as fused
-from . import learners as learners
-from . import physics as physics
+from . import learning as learning
 from . import playing as playing
-from . import policies as policies
+from . import published as published
 from . import registry as registry
 from . import reports as reports
 from . import runs as runs
 from . import settings as settings
+from . import statistics as statistics
 from . import store as store
 from . import sweeps as sweeps
 from . import training as training
-from . import types as types
-from . import vector as vector
 
 __version__: str
 __all__ = [

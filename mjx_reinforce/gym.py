@@ -16,8 +16,8 @@ from mjx_reinforce.settings.tables import TASKS
 for _id in envs.names():
     gymnasium.register(
         f"mjx_reinforce/{_id}",
-        entry_point="mjx_reinforce.vector.for_gymnasium:only_many",
-        vector_entry_point="mjx_reinforce.vector.for_gymnasium:make",
+        entry_point="mjx_reinforce.engine.vector.for_gymnasium:only_many",
+        vector_entry_point="mjx_reinforce.engine.vector.for_gymnasium:make",
         max_episode_steps=TASKS[_id].horizon if _id in TASKS else None,
         kwargs={"env": _id},
     )

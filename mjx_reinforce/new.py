@@ -16,7 +16,7 @@ from mjx_reinforce.files import write_bytes
 from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 
 if TYPE_CHECKING:
-    from mjx_reinforce.types import MjModel
+    from mjx_reinforce.engine.base import MjModel
 
 #: Of a robot that stands on its own.
 _WALKING = """\

@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engines.episode import begin, hold, step
+from mjx_reinforce.engine.play.episode import begin, hold, step
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export.player import Player
-from mjx_reinforce.policies.actor import act
+from mjx_reinforce.learning.actor import act
 
 if TYPE_CHECKING:
-    from mjx_reinforce.types import Environment
+    from mjx_reinforce.engine.base import Environment
 
 
 class Episode(NamedTuple):

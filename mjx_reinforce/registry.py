@@ -8,34 +8,34 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from mjx_reinforce.checks import explain
+from mjx_reinforce.engine.checks import explain
 
 #: Action distributions: name -> "module:function" of an action space.
 DISTRIBUTIONS = {
-    "normal": "mjx_reinforce.policies.distributions.gaussian:normal",
-    "normal-softplus": "mjx_reinforce.policies.distributions.gaussian:normal_softplus",
-    "normal-sigmoid": "mjx_reinforce.policies.distributions.gaussian:normal_sigmoid",
-    "truncated-normal": "mjx_reinforce.policies.distributions.bounded:truncated_normal",
-    "clipped-normal": "mjx_reinforce.policies.distributions.bounded:clipped_normal",
-    "tanh-normal": "mjx_reinforce.policies.distributions.bounded:tanh_normal",
-    "deterministic": "mjx_reinforce.policies.distributions.gaussian:deterministic",
-    "categorical": "mjx_reinforce.policies.distributions.categorical:categorical",
+    "normal": "mjx_reinforce.learning.distributions.gaussian:normal",
+    "normal-softplus": "mjx_reinforce.learning.distributions.gaussian:normal_softplus",
+    "normal-sigmoid": "mjx_reinforce.learning.distributions.gaussian:normal_sigmoid",
+    "truncated-normal": "mjx_reinforce.learning.distributions.bounded:truncated_normal",
+    "clipped-normal": "mjx_reinforce.learning.distributions.bounded:clipped_normal",
+    "tanh-normal": "mjx_reinforce.learning.distributions.bounded:tanh_normal",
+    "deterministic": "mjx_reinforce.learning.distributions.gaussian:deterministic",
+    "categorical": "mjx_reinforce.learning.distributions.categorical:categorical",
 }
 
 #: Gradient estimators: name -> "module:function" of a discount.
 ESTIMATORS = {
-    "total-return": "mjx_reinforce.learners.estimators:total_return",
-    "reward-to-go": "mjx_reinforce.learners.estimators:reward_to_go",
-    "leave-one-out": "mjx_reinforce.learners.estimators:leave_one_out",
-    "value-baseline": "mjx_reinforce.learners.value_baseline:value_baseline",
-    "mean-log-prob": "mjx_reinforce.learners.estimators:mean_log_prob",
-    "normalized-returns": "mjx_reinforce.learners.estimators:normalized_returns",
+    "total-return": "mjx_reinforce.learning.estimators:total_return",
+    "reward-to-go": "mjx_reinforce.learning.estimators:reward_to_go",
+    "leave-one-out": "mjx_reinforce.learning.estimators:leave_one_out",
+    "value-baseline": "mjx_reinforce.learning.value_baseline:value_baseline",
+    "mean-log-prob": "mjx_reinforce.learning.estimators:mean_log_prob",
+    "normalized-returns": "mjx_reinforce.learning.estimators:normalized_returns",
 }
 
 #: Ways to learn: name -> "module:function" of an environment, see ``store.build``.
 ALGORITHMS = {
-    "reinforce": "mjx_reinforce.learners.reinforce:reinforce",
-    "ars": "mjx_reinforce.learners.ars:ars",
+    "reinforce": "mjx_reinforce.learning.reinforce:reinforce",
+    "ars": "mjx_reinforce.published.ars:ars",
 }
 
 #: What the system's loader says of a library for which there is no memory.

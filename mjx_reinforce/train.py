@@ -33,9 +33,9 @@ from mjx_reinforce.settings.own_code import code_flags
 from mjx_reinforce.training import resume
 
 if TYPE_CHECKING:
+    from mjx_reinforce.engine.base import Environment
     from mjx_reinforce.store.ready import Ready
     from mjx_reinforce.training.checkpoint import Checkpoint
-    from mjx_reinforce.types import Environment
 
 
 def main() -> None:

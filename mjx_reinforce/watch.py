@@ -35,8 +35,8 @@ from mjx_reinforce.settings.flags import read_command_line
 from mjx_reinforce.settings.own_code import check_named
 
 if TYPE_CHECKING:
+    from mjx_reinforce.engine.base import Environment
     from mjx_reinforce.export.player import Player
-    from mjx_reinforce.types import Environment
 
 #: Where runs are put that name no other place, see ``runs.directory.choose_directory``.
 RUNS = Path("runs")
@@ -243,8 +243,8 @@ def untrained(player: "Player") -> "Player":
     """Returns a player whose policy has random parameters, as training begins with."""
     import jax
 
-    from mjx_reinforce.policies import normalize
-    from mjx_reinforce.policies.actor import Actor
+    from mjx_reinforce.learning import normalize
+    from mjx_reinforce.learning.actor import Actor
 
     params = player.policy.init(jax.random.key(player.seed))
     actor = Actor(params=params, normalizer=normalize.init(player.observation_size))
@@ -253,7 +253,7 @@ def untrained(player: "Player") -> "Player":
 
 def _check_observations(env: "Environment", player: "Player", run: Run) -> None:
     """Raises ValueError for a policy of a run whose observations are not the environment's."""
-    from mjx_reinforce.types import observation_size
+    from mjx_reinforce.engine.base import observation_size
 
     if (size := observation_size(env)) != player.observation_size:
         raise ValueError(

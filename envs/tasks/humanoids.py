@@ -5,9 +5,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
+from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.envs.locomotion import Body, Healthy, within
 from mjx_reinforce.envs.settings import Interval
-from mjx_reinforce.physics.mjx_internals import Simulation
 
 
 class Person(Body):

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from scipy import stats
 
-from mjx_reinforce.reports.statistics import aggregates, comparisons, survival
+from mjx_reinforce.statistics import aggregates, comparisons, survival
 
 SEEDS = (6, 20, 50, 200)
 Ends = tuple[np.ndarray, np.ndarray]

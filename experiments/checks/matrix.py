@@ -26,10 +26,10 @@ from jax import lax
 
 from experiments.checks.mechanisms import MOTOR, Mechanism, Start, mechanisms
 from mjx_reinforce import normal
-from mjx_reinforce.engines.native import rollout as native
+from mjx_reinforce.engine.physics import step as physics
+from mjx_reinforce.engine.play import native
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
-from mjx_reinforce.physics import step as physics
 
 mujoco: Any = importlib.import_module("mujoco")  # pyright does not know what is in it
 

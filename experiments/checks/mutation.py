@@ -84,7 +84,7 @@ def main() -> None:
     folder.mkdir(exist_ok=True)
     copy_checkout(folder)
     # The mutants are made, and the tests that reach each function found, before the first runs.
-    mutmut(folder, "run", "mjx_reinforce.policies.normalize.x_init__mutmut_1")
+    mutmut(folder, "run", "mjx_reinforce.learning.normalize.x_init__mutmut_1")
     chosen = {
         module: draw(list(codes), arguments.sample, arguments.seed)
         for module, codes in read(folder).items()

@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from mjx_reinforce.reports.experiment import relabel
 from mjx_reinforce.reports.findings import Findings, compute_findings
 from mjx_reinforce.reports.sources import read_experiment
-from mjx_reinforce.reports.statistics.aggregates import interval
-from mjx_reinforce.reports.statistics.survival import combined, log_rank
+from mjx_reinforce.statistics.aggregates import interval
+from mjx_reinforce.statistics.survival import combined, log_rank
 
 
 def read(directories: list[Path]) -> list[Findings]:

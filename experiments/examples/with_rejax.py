@@ -12,7 +12,7 @@ import jax
 from rejax import PPO  # pyright: ignore[reportMissingImports]
 from rejax.compat.brax2gymnax import Brax2GymnaxEnv  # pyright: ignore[reportMissingImports]
 
-from mjx_reinforce.vector import for_brax
+from mjx_reinforce.engine.vector import for_brax
 
 
 class OneOfMany(Brax2GymnaxEnv):

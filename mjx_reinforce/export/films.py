@@ -15,7 +15,7 @@ import numpy as np
 from mjx_reinforce.files import write_bytes
 
 if TYPE_CHECKING:
-    from mjx_reinforce.types import MjModel, MjSpec
+    from mjx_reinforce.engine.base import MjModel, MjSpec
 
 #: Colours of a .gif, beside the one that is transparent.
 _COLORS = 255

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from mjx_reinforce.checks import check_type
+from mjx_reinforce.engine.checks import check_type
 from mjx_reinforce.export.policy_files import SavedPolicy, read_policy
 from mjx_reinforce.export.run_files import (
     FOLDER,
@@ -21,8 +21,8 @@ from mjx_reinforce.export.run_files import (
     provenance_of,
     read_run,
 )
-from mjx_reinforce.policies.actor import Actor, act
-from mjx_reinforce.policies.policy import Policy
+from mjx_reinforce.learning.actor import Actor, act
+from mjx_reinforce.learning.policy import Policy
 
 
 class Player(NamedTuple):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mjx_reinforce.reports.statistics import enough, iqm, iqm_interval, smooth
+from mjx_reinforce.statistics import enough, iqm, iqm_interval, smooth
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.reports.statistics import Estimate
+from mjx_reinforce.statistics import Estimate
 
 
 class Configuration(NamedTuple):

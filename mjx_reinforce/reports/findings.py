@@ -16,11 +16,11 @@ from mjx_reinforce.reports.experiment import (
     Solving,
     shared_seeds,
 )
-from mjx_reinforce.reports.statistics import Estimate, iqm, iqm_interval
-from mjx_reinforce.reports.statistics.aggregates import interval, wilson
-from mjx_reinforce.reports.statistics.comparisons import Comparison, compare_all, holm
-from mjx_reinforce.reports.statistics.power import seeds_needed, wrong_winner
-from mjx_reinforce.reports.statistics.survival import (
+from mjx_reinforce.statistics import Estimate, iqm, iqm_interval
+from mjx_reinforce.statistics.aggregates import interval, wilson
+from mjx_reinforce.statistics.comparisons import Comparison, compare_all, holm
+from mjx_reinforce.statistics.power import seeds_needed, wrong_winner
+from mjx_reinforce.statistics.survival import (
     collapses,
     log_rank,
     mean_while_training,

@@ -8,11 +8,11 @@ import numpy as np
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
+from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.runs.plan import said_time
 from mjx_reinforce.settings import tables
 from mjx_reinforce.settings.config import Config, as_flag, changed, is_read
 from mjx_reinforce.settings.defaults import expected_seconds, of_task
-from mjx_reinforce.types import Environment
 
 if TYPE_CHECKING:
     from mjx_reinforce.envs.base import MujocoEnv
@@ -38,7 +38,7 @@ def about_task(id: str) -> str:
 
 def _sizes(id: str, env: "MujocoEnv") -> str:
     """Returns the sizes of a task, a line each."""
-    from mjx_reinforce.types import observation_size
+    from mjx_reinforce.engine.base import observation_size
 
     known = tables.TASKS.get(id)
     observation = observation_size(env) if known is None else known.observation
@@ -72,7 +72,7 @@ def _as_text(value: object) -> str:
 
 
 def _action_in_words(env: Environment) -> str:
-    from mjx_reinforce.types import Discrete, action_space
+    from mjx_reinforce.engine.base import Discrete, action_space
 
     space = action_space(env)
     if isinstance(space, Discrete):

@@ -18,8 +18,8 @@ from rich.text import Text
 
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import heartbeat
-from mjx_reinforce.reports.statistics import enough, iqm
 from mjx_reinforce.settings.own_code import env_flag
+from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import progress
 
 

@@ -12,16 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce import envs
-from mjx_reinforce.checks import check_kind
 from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.export.player import Player
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.export.run_files import Which
-from mjx_reinforce.learners import counts
-from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.policies.policy import Policy
+from mjx_reinforce.learning import counts
+from mjx_reinforce.learning.actor import Actor
+from mjx_reinforce.learning.policy import Policy
 from mjx_reinforce.reports.curves import draw_learning_curve
-from mjx_reinforce.reports.statistics import worst_if_not_finite
 from mjx_reinforce.runs.directory import locked, make_directory, remove_empty
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.observers import Callbacks, RunFiles, RunLog, Screen
@@ -29,6 +28,7 @@ from mjx_reinforce.runs.plan import make_plan
 from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.memory import check_memory
+from mjx_reinforce.statistics import worst_if_not_finite
 from mjx_reinforce.store.ready import get_ready
 from mjx_reinforce.training.driver import Driver, Evaluation, first_best
 from mjx_reinforce.training.programs import RunPrograms, compile_run

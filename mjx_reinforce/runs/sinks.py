@@ -22,8 +22,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from mjx_reinforce.files import append, finite, read_json, write_bytes, write_json
-from mjx_reinforce.reports.statistics import iqm, iqm_interval
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.statistics import iqm, iqm_interval
 from mjx_reinforce.training.rows import Cells, parse_cell
 
 #: Settings that need a package, and the package.

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from mjx_reinforce import envs
-from mjx_reinforce.checks import changed_fields, check_type
+from mjx_reinforce.engine.checks import changed_fields, check_type
 from mjx_reinforce.envs.settings import split_words
 from mjx_reinforce.registry import ALGORITHMS, DISTRIBUTIONS, ESTIMATORS, check_choice, is_own
 from mjx_reinforce.settings.declare import MAX_COUNT, MAX_OF_UPDATE, Range

@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Sequence
 
 from mjx_reinforce import envs
-from mjx_reinforce.checks import whole_number
+from mjx_reinforce.engine.checks import whole_number
 from mjx_reinforce.settings import tables
 from mjx_reinforce.settings.config import Config, spoken
 from mjx_reinforce.settings.memory import cpu_factor, has_gpu, num_parameters

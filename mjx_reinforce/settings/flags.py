@@ -16,9 +16,9 @@ import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from mjx_reinforce import envs
-from mjx_reinforce.checks import whole_number
 from mjx_reinforce.console.commands import COMMANDS, command
 from mjx_reinforce.console.streams import columns_of, say_error, wrapped
+from mjx_reinforce.engine.checks import whole_number
 from mjx_reinforce.registry import is_own, nearest
 from mjx_reinforce.settings.config import flag, spoken
 from mjx_reinforce.settings.tables import PRESETS

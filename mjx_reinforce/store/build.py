@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from mjx_reinforce.checks import check_kind, explain
+from mjx_reinforce.engine.checks import check_kind, explain
 from mjx_reinforce.registry import ALGORITHMS, ESTIMATORS, is_own, load_choice, load_definition
 from mjx_reinforce.settings.config import Config, check_step_count
 
@@ -12,12 +12,12 @@ if TYPE_CHECKING:
     import jax
     import optax
 
-    from mjx_reinforce.devices import Devices
-    from mjx_reinforce.learners.estimators import Estimator
-    from mjx_reinforce.learners.learner import Learner
-    from mjx_reinforce.learners.updates import Update
-    from mjx_reinforce.policies.policy import Policy
-    from mjx_reinforce.types import Environment
+    from mjx_reinforce.engine.base import Environment
+    from mjx_reinforce.engine.devices import Devices
+    from mjx_reinforce.learning.estimators import Estimator
+    from mjx_reinforce.learning.learner import Learner
+    from mjx_reinforce.learning.policy import Policy
+    from mjx_reinforce.learning.updates import Update
 
 
 def build(
@@ -40,9 +40,9 @@ def build(
     Raises:
       ValueError: the settings do not fit the environment.
     """
-    from mjx_reinforce.engines.contract import check_environment
+    from mjx_reinforce.engine.contract import check_environment
     from mjx_reinforce.export.policy_files import build_policy
-    from mjx_reinforce.learners.contract import check_horizon
+    from mjx_reinforce.learning.contract import check_horizon
 
     check_environment(env)
     if config.stop_when_solved and getattr(env, "reward_threshold", None) is None:
@@ -68,7 +68,7 @@ def build(
 
 def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
     """Returns what ``policy_files.build_policy`` needs to build the policy without the env."""
-    from mjx_reinforce.types import Discrete, action_space, observation_size
+    from mjx_reinforce.engine.base import Discrete, action_space, observation_size
 
     space = action_space(env)
     if isinstance(space, Discrete):
@@ -91,9 +91,9 @@ def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
 
 def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
     from mjx_reinforce.console.streams import to_screen
-    from mjx_reinforce.engines.native import available
-    from mjx_reinforce.learners.reinforce import reinforce
-    from mjx_reinforce.learners.schedules import Cut
+    from mjx_reinforce.engine.play import available
+    from mjx_reinforce.learning.reinforce import reinforce
+    from mjx_reinforce.learning.schedules import Cut
 
     if config.engine in ("auto", "native") and (said := available.announcement(env)):
         to_screen(said)
@@ -117,7 +117,7 @@ def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any])
 
 
 def _build_ars(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
-    from mjx_reinforce.learners.ars import ars
+    from mjx_reinforce.published.ars import ars
 
     return ars(
         env,
@@ -136,7 +136,7 @@ def _build_own(env: "Environment", config: Config, shared: dict[str, Any]) -> "L
 
     ``shared`` are the keywords that ``reinforce`` and ``ars`` have in common.
     """
-    from mjx_reinforce.learners.contract import check_learner
+    from mjx_reinforce.learning.contract import check_learner
 
     learner = _made_by_user("algorithm", config.algorithm, ALGORITHMS, env, config, **shared)
     check_learner(config.algorithm, learner)
@@ -158,7 +158,7 @@ def _build_estimator(
     config: Config, horizon: int
 ) -> "Estimator | Callable[[jax.Array], Estimator]":
     """Returns an estimator; where its discount changes, a function from the used share to one."""
-    from mjx_reinforce.learners.schedules import look_further
+    from mjx_reinforce.learning.schedules import look_further
 
     first, last = config.discount, config.final_discount
     if last is None:
@@ -167,8 +167,8 @@ def _build_estimator(
 
 
 def _estimator(config: Config, horizon: int, discount: "float | jax.Array") -> "Estimator":
-    from mjx_reinforce.learners import estimators
-    from mjx_reinforce.policies.arguments import known_number
+    from mjx_reinforce.engine.arguments import known_number
+    from mjx_reinforce.learning import estimators
 
     if config.estimator == "value-baseline":
         estimator = _build_value_baseline(config, horizon, discount)
@@ -193,8 +193,8 @@ def _build_value_baseline(
 ) -> "Estimator":
     import optax
 
-    from mjx_reinforce.learners.value_baseline import full_batch_value_baseline, value_baseline
-    from mjx_reinforce.policies.policy import MLP
+    from mjx_reinforce.learning.policy import MLP
+    from mjx_reinforce.learning.value_baseline import full_batch_value_baseline, value_baseline
 
     shared = {
         "network": MLP(config.value_hidden_sizes, 1, initializer=config.initializer),
@@ -209,8 +209,8 @@ def _build_value_baseline(
 def _build_optimizer(config: Config) -> "optax.GradientTransformation":
     import optax
 
-    from mjx_reinforce.learners import schedules
-    from mjx_reinforce.learners.updates import make_optimizer
+    from mjx_reinforce.learning import schedules
+    from mjx_reinforce.learning.updates import make_optimizer
 
     rate: Any = config.learning_rate
     final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
@@ -239,8 +239,8 @@ def _build_optimizer(config: Config) -> "optax.GradientTransformation":
 
 
 def _build_update(config: Config, policy: "Policy") -> "Update":
-    from mjx_reinforce.learners import updates
-    from mjx_reinforce.learners.natural_gradient import natural_gradient
+    from mjx_reinforce.learning import updates
+    from mjx_reinforce.learning.natural_gradient import natural_gradient
 
     if config.update == "natural-gradient":
         assert config.max_kl is not None  # checked

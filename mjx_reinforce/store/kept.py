@@ -19,12 +19,13 @@ import numpy as np
 from jax import export
 
 from mjx_reinforce import envs
-from mjx_reinforce.engines.native import objects
-from mjx_reinforce.engines.native.available import made_for, platform
-from mjx_reinforce.engines.native.cpu import seam
-from mjx_reinforce.engines.native.gpu import seam as gpu_seam
+from mjx_reinforce.engine.base import PyTree, is_key, plain
+from mjx_reinforce.engine.cpu import seam
+from mjx_reinforce.engine.gpu import seam as gpu_seam
+from mjx_reinforce.engine.play import objects
+from mjx_reinforce.engine.play.available import made_for, platform
 from mjx_reinforce.envs.settings import split_words
-from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.learning.actor import Actor
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import Config, marked
 from mjx_reinforce.settings.declare import Mark
@@ -34,7 +35,6 @@ from mjx_reinforce.training.block import Block
 from mjx_reinforce.training.programs import Programs
 from mjx_reinforce.training.resume import recordable
 from mjx_reinforce.training.state import Budget, RunState, restored
-from mjx_reinforce.types import PyTree, is_key, plain
 
 _PROGRAMS = ("begin", "advance", "evaluate")
 

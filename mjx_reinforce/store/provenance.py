@@ -15,7 +15,7 @@ def provenance() -> dict[str, Any]:
     """Returns what a result depends on besides its settings."""
     import jax
 
-    from mjx_reinforce.engines.native import available
+    from mjx_reinforce.engine.play import available
     from mjx_reinforce.settings.memory import num_cores
 
     return {

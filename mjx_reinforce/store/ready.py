@@ -4,12 +4,12 @@ import dataclasses
 from typing import Any, NamedTuple
 
 from mjx_reinforce import envs
+from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.settings.config import Config, check_read_by_policy, check_step_count
 from mjx_reinforce.store import kept
 from mjx_reinforce.store.build import build, policy_settings
 from mjx_reinforce.training.division import Division, divide_run
 from mjx_reinforce.training.programs import Programs, programs_of
-from mjx_reinforce.types import Environment
 
 
 class Ready(NamedTuple):

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.types import PyTree, plain, with_keys
+from mjx_reinforce.engine.base import PyTree, plain, with_keys
 
 
 class StateRows:

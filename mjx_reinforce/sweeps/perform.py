@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.checks import check_kind
 from mjx_reinforce.console.commands import command, typed
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import heartbeat, to_screen
+from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.files import read_arrays, read_json, write_json
 from mjx_reinforce.runs.directory import choose_directory, locked, make_directory
 from mjx_reinforce.settings.config import Config

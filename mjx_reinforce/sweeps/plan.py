@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce import envs
-from mjx_reinforce.devices import Devices
+from mjx_reinforce.engine.base import Environment
+from mjx_reinforce.engine.devices import Devices
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.reports.experiment import counted
 from mjx_reinforce.runs.plan import idle, said_time, task_of, this_hardware
@@ -24,7 +25,6 @@ from mjx_reinforce.settings.tables import Task
 from mjx_reinforce.store.build import build, policy_settings
 from mjx_reinforce.sweeps.design import Design
 from mjx_reinforce.sweeps.grid import configure
-from mjx_reinforce.types import Environment
 
 
 class Group(NamedTuple):

@@ -12,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.devices import NONE, RUNS, Devices
+from mjx_reinforce.engine.base import Environment, PyTree
+from mjx_reinforce.engine.devices import NONE, RUNS, Devices
 from mjx_reinforce.files import Arrays
-from mjx_reinforce.learners import counts
+from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.settings.memory import num_cores
 from mjx_reinforce.sweeps.history import Measured
@@ -22,7 +23,6 @@ from mjx_reinforce.sweeps.layout import StateRows, pack_slots
 from mjx_reinforce.training.block import BuildLearner
 from mjx_reinforce.training.programs import Programs, compiling, programs_of
 from mjx_reinforce.training.state import Budget, RunState, Seed, budget_of
-from mjx_reinforce.types import Environment, PyTree
 
 
 @dataclasses.dataclass

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from mjx_reinforce.learners import counts
-from mjx_reinforce.learners.learner import Guests, Learner, TrainState
+from mjx_reinforce.learning import counts
+from mjx_reinforce.learning.learner import Guests, Learner, TrainState
 from mjx_reinforce.training.evaluation import measure
 from mjx_reinforce.training.state import Budget, RunState
 

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from mjx_reinforce.engine.base import PyTree, is_key, plain
 from mjx_reinforce.files import Arrays, members, write_bytes
-from mjx_reinforce.types import PyTree, is_key, plain
 
 _KEPT = 2
 _NAME = re.compile(r"\d{6,}-(even-)?[0-9a-f]{16}\.npz")

@@ -15,11 +15,11 @@ import jax
 import numpy as np
 from jax.sharding import PartitionSpec
 
-from mjx_reinforce.devices import NONE, RUNS, Devices
-from mjx_reinforce.engines.episode import largest_divisor
+from mjx_reinforce.engine.base import PyTree
+from mjx_reinforce.engine.devices import NONE, RUNS, Devices
+from mjx_reinforce.engine.play.episode import largest_divisor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.state import RunState, shape_of_all
-from mjx_reinforce.types import PyTree
 
 #: Episodes are divided among GPUs only where each plays so many of an update, of all seeds: fewer
 #: take as long as these. Devices of a CPU are there because the user made them.

@@ -10,9 +10,9 @@ import numpy as np
 from flax import struct
 
 from mjx_reinforce.files import Arrays
-from mjx_reinforce.learners import counts
-from mjx_reinforce.learners.learner import TrainState
-from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.learning import counts
+from mjx_reinforce.learning.actor import Actor
+from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.programs import Looked, RunPrograms

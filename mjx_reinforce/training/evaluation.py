@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.engines.episode import episode_keys
-from mjx_reinforce.engines.rollouts import episode_lengths, episode_returns
-from mjx_reinforce.learners.learner import Guests, Learner
-from mjx_reinforce.policies.actor import Actor
-from mjx_reinforce.types import Environment, Trajectory
+from mjx_reinforce.engine.base import Environment, Trajectory
+from mjx_reinforce.engine.play.episode import episode_keys
+from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
+from mjx_reinforce.learning.actor import Actor
+from mjx_reinforce.learning.learner import Guests, Learner
 
 
 def guests_of(

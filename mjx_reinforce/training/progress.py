@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.files import Arrays
-from mjx_reinforce.reports.statistics import iqm
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.statistics import iqm
 
 #: The time left is estimated from so many of the latest blocks: episodes change their length.
 BLOCKS = 10

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from mjx_reinforce.files import Arrays
-from mjx_reinforce.reports.statistics import summarize
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.statistics import summarize
 from mjx_reinforce.training import progress, rows
 from mjx_reinforce.training.progress import BLOCKS, Progress, measure_progress, used
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from mjx_reinforce.checks import fits
+from mjx_reinforce.engine.checks import fits
 from mjx_reinforce.settings.config import Config, flag, marked
 from mjx_reinforce.settings.declare import Mark
 

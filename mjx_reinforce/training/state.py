@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from mjx_reinforce.learners import counts
-from mjx_reinforce.learners.learner import TrainState
-from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce.engine.base import PyTree, with_keys
+from mjx_reinforce.learning import counts
+from mjx_reinforce.learning.actor import Actor
+from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.settings.config import MAX_COUNT, Config, flag
-from mjx_reinforce.types import PyTree, with_keys
 
 #: A root of randomness; traced inside of programs.
 Seed = int | np.uint32 | jax.Array

@@ -11,8 +11,8 @@ from places import ROOT
 
 from mjx_reinforce import __main__ as script
 from mjx_reinforce import envs, registry
-from mjx_reinforce.checks import whole_number
 from mjx_reinforce.console import commands, streams
+from mjx_reinforce.engine.checks import whole_number
 from mjx_reinforce.envs.__main__ import main as envs_main
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.settings.defaults import of_task

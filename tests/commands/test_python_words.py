@@ -61,7 +61,7 @@ REFUSED = {
 def test_a_learner_is_refused(message, monkeypatch):
     """When it is built, and before anything is compiled."""
     monkeypatch.setattr(
-        "mjx_reinforce.engines.choice.choose", lambda *_: pytest.fail("it was not refused")
+        "mjx_reinforce.engine.play.choice.choose", lambda *_: pytest.fail("it was not refused")
     )
     with pytest.raises(ValueError, match=message) as error:
         m.reinforce(ENV, **REFUSED[message])

@@ -17,9 +17,9 @@ from toys import Survive
 from mjx_reinforce import load, load_policy
 from mjx_reinforce import train as train_module
 from mjx_reinforce.files import append_csv, create_csv
-from mjx_reinforce.policies import normalize
-from mjx_reinforce.reports.statistics import smooth
+from mjx_reinforce.learning import normalize
 from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, check_step_count
+from mjx_reinforce.statistics import smooth
 from mjx_reinforce.store.build import build
 
 ARGUMENTS = ["--env", "Survive-v0", "--num-seeds", "3", "--env-steps", "1500"]

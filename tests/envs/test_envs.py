@@ -16,10 +16,10 @@ from gymnasium.envs.registration import load_env_creator
 from mujoco import mjx
 
 from mjx_reinforce import Environment, envs
+from mjx_reinforce.engine.base import Discrete, action_space, null_action, observation_size
+from mjx_reinforce.engine.physics.mjx_internals import fenced
 from mjx_reinforce.envs.settings import EpisodeSettings
-from mjx_reinforce.physics.mjx_internals import fenced
 from mjx_reinforce.settings.tables import TASKS
-from mjx_reinforce.types import Discrete, action_space, null_action, observation_size
 
 IDS = envs.names()
 #: Arguments of Gymnasium's tasks that are about pictures.

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.checks import BadEnvironmentError
+from mjx_reinforce.engine.checks import BadEnvironmentError
 from mjx_reinforce.envs.outcomes import check_outcome, check_shape, check_start
 
 SIZES = (3, 2)

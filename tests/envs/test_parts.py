@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce import mlp_policy, normal, reinforce
-from mjx_reinforce.engines.episode import episode_keys
+from mjx_reinforce.engine.play.episode import episode_keys
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import MujocoEnv
 from mjx_reinforce.envs.in_mujoco import InMujoco

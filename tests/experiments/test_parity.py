@@ -17,7 +17,7 @@ from experiments.checks.parity.native import Native
 from experiments.checks.parity.sides import Ours, make_peer
 from experiments.checks.parity.states import draw_states
 from mjx_reinforce import envs
-from mjx_reinforce.engines.native import available
+from mjx_reinforce.engine.play import available
 
 NUM_STATES = 64
 #: CartPole-v0 is v1, cut short.

@@ -13,7 +13,7 @@ from experiments.studies.reproduce.cases import CASES, load_reference
 from experiments.studies.reproduce.mistakes import stale_starts
 from experiments.studies.reproduce.statistics import compare, rank_test, reached, windowed
 from mjx_reinforce import reinforce
-from mjx_reinforce.learners.estimators import reward_to_go
+from mjx_reinforce.learning.estimators import reward_to_go
 from mjx_reinforce.settings.config import check
 from mjx_reinforce.settings.tables import PRESETS
 

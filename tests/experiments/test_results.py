@@ -11,9 +11,9 @@ from experiments.studies.results import __main__ as results
 from experiments.studies.results import films, kept, runs, tables
 from experiments.studies.results.tasks import TASKS, settings_of
 from mjx_reinforce.files import write_json
-from mjx_reinforce.reports.statistics import Estimate
 from mjx_reinforce.runs import command_line
 from mjx_reinforce.settings.config import check
+from mjx_reinforce.statistics import Estimate
 
 PENDULUM = TASKS["InvertedPendulum-v5"]
 GPU = {"device": "NVIDIA X", "git_commit": "0123456789abcdef", "cpu": None, "cores": None}

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.vector import for_brax
+from mjx_reinforce.engine.vector import for_brax
 
 
 @pytest.mark.filterwarnings("ignore")

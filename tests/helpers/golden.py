@@ -1,4 +1,4 @@
-"""One whole update of a toy by each engine, as kept in tests/engines/golden.
+"""One whole update of a toy by each engine, as kept in tests/engine/play/golden.
 
 ``JAX_PLATFORMS=cpu PYTHONPATH=. python tests/helpers/golden.py`` writes these files again: where
 the mathematics is changed on purpose, which the commit says.
@@ -13,7 +13,7 @@ from toys import Drifting
 
 from mjx_reinforce import reinforce, train_step
 
-FOLDER = ROOT / "tests" / "engines" / "golden"
+FOLDER = ROOT / "tests" / "engine" / "play" / "golden"
 ENGINES = ("vmap", "native")
 
 

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engines.native import available
-from mjx_reinforce.engines.native.cpu import machine
-from mjx_reinforce.engines.native.gpu import ptx, seam
-from mjx_reinforce.engines.native.gpu.kernel import ENTRY
+from mjx_reinforce.engine.cpu import machine
+from mjx_reinforce.engine.gpu import ptx, seam
+from mjx_reinforce.engine.gpu.kernel import ENTRY
+from mjx_reinforce.engine.play import available
 
 _SOME = re.compile(r'call i32 asm sideeffect "[^"]*bar.red[^"]*", "=r,r"\(i32 (%\w+)\) convergent')
 _ALL = re.compile(r'call void asm sideeffect "[^"]*bar.sync[^\n]*')

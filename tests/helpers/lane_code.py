@@ -4,7 +4,7 @@ import ctypes
 
 import numpy as np
 
-from mjx_reinforce.fused.backends.llvm_text import Text
+from mjx_reinforce.engine.llvm.text import Text
 
 BYTE, BOOL = np.dtype(np.int8), np.dtype(np.bool_)
 

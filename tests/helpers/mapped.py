@@ -1,4 +1,4 @@
-"""Functions to be mapped, and what ``fused.vmap`` and ``jax.vmap`` must have in common."""
+"""Functions to be mapped, and what ``scalar.vmap`` and ``jax.vmap`` must have in common."""
 
 from typing import Any
 
@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from mjx_reinforce import fused
-from mjx_reinforce.fused import evaluate, jaxprs
-from mjx_reinforce.fused.graph import Graph, Limits
+from mjx_reinforce.engine import scalar
+from mjx_reinforce.engine.scalar import evaluate, jaxprs
+from mjx_reinforce.engine.scalar.graph import Graph, Limits
 
 BATCH = 6
 
@@ -20,9 +20,9 @@ def batch_of(*shape, seed=0, low=-2.0, high=2.0):
 
 
 def assert_same(fn, *args, in_axes: Any = 0, out_axes: Any = 0, rtol=2e-6, atol=2e-6):
-    """``fused.vmap`` and ``jax.vmap`` compute the same, which is returned."""
+    """``scalar.vmap`` and ``jax.vmap`` compute the same, which is returned."""
     expected = jax.jit(jax.vmap(fn, in_axes, out_axes))(*args)
-    actual = jax.jit(fused.vmap(fn, in_axes, out_axes))(*args)
+    actual = jax.jit(scalar.vmap(fn, in_axes, out_axes))(*args)
     assert jax.tree.structure(actual) == jax.tree.structure(expected)
     named = jax.tree_util.tree_leaves_with_path(expected)
     for x, (path, y) in zip(jax.tree.leaves(actual), named, strict=True):
@@ -57,7 +57,7 @@ def folded(fn, *args):
 
 
 def count(fn, *examples):
-    return sum(fused.scalarize(fn, *examples).operations.values())
+    return sum(scalar.scalarize(fn, *examples).operations.values())
 
 
 def equations(jaxpr):

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engines.native.cpu import handler, machine, seam
+from mjx_reinforce.engine.cpu import handler, machine, seam
 
 N, T = 3, 5
 _FIELD = {name: number for number, name in enumerate(handler.FIELDS)}

@@ -4,16 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce import mlp_policy, normal, types
-from mjx_reinforce.engines import rollouts
-from mjx_reinforce.engines.native import rollout
-from mjx_reinforce.policies import normalize
-from mjx_reinforce.policies.actor import Actor
+from mjx_reinforce import mlp_policy, normal
+from mjx_reinforce.engine import base
+from mjx_reinforce.engine.play import native, rollouts
+from mjx_reinforce.learning import normalize
+from mjx_reinforce.learning.actor import Actor
 
 
 def actor_and_act(env, hidden_sizes, seed=0, distribution=None):
-    size = types.observation_size(env)
-    policy = mlp_policy(size, distribution or normal(types.action_space(env)), hidden_sizes)
+    size = base.observation_size(env)
+    policy = mlp_policy(size, distribution or normal(base.action_space(env)), hidden_sizes)
     key = jax.random.key(seed)
     statistics = normalize.update(
         normalize.init(size), jax.random.normal(key, (5, 3, size)), jnp.ones((5, 3), bool), 100
@@ -53,7 +53,7 @@ def played(play, env, player, num_seeds=3, num_episodes=5, **options):
 
 
 def both(env, player, other=rollouts.rollout, **options):
-    got = played(rollout.rollout, env, player, **options)
+    got = played(native.rollout, env, player, **options)
     return got, played(other, env, player, **options)
 
 

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.learners import schedules
-from mjx_reinforce.learners.updates import Problem
+from mjx_reinforce.learning import schedules
+from mjx_reinforce.learning.updates import Problem
 
 LENGTHS = np.array([4, 1, 3])
 

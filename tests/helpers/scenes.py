@@ -6,8 +6,8 @@ import mujoco
 from mujoco import mjx
 from toys import Survive, ToyState
 
-from mjx_reinforce.physics import step as physics
-from mjx_reinforce.physics.mjx_internals import jax_fields
+from mjx_reinforce.engine.physics import step as physics
+from mjx_reinforce.engine.physics.mjx_internals import jax_fields
 
 SCENE = """
 <mujoco><worldbody><geom type="plane" size="5 5 1"/>

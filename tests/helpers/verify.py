@@ -11,12 +11,12 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import DTypeLike
 
-from mjx_reinforce.fused.backends.backend import Backend
-from mjx_reinforce.fused.nodes import BOOL, Captured, Node, Scalar
-from mjx_reinforce.fused.ops import FACTS, Op
-from mjx_reinforce.fused.passes.liveness import LiveGate, LiveLoop
-from mjx_reinforce.fused.rules.iterate import varies
-from mjx_reinforce.fused.scalarized import Scalarized
+from mjx_reinforce.engine.scalar.backend import Backend
+from mjx_reinforce.engine.scalar.nodes import BOOL, Captured, Node, Scalar
+from mjx_reinforce.engine.scalar.ops import FACTS, Op
+from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop
+from mjx_reinforce.engine.scalar.rules.iterate import varies
+from mjx_reinforce.engine.scalar.scalarized import Scalarized
 
 Dtypes = dict[Node, np.dtype]
 

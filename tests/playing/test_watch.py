@@ -16,7 +16,7 @@ from saved_runs import change, change_arrays, make_run
 from toys import Survive
 
 from mjx_reinforce import act, envs, load_policy, playing, watch
-from mjx_reinforce.engines.rollouts import rollout
+from mjx_reinforce.engine.play.rollouts import rollout
 from mjx_reinforce.export import takes
 from mjx_reinforce.export.run_files import read_run
 

@@ -5,8 +5,8 @@ import types
 import numpy as np
 
 from mjx_reinforce.reports import findings
-from mjx_reinforce.reports.statistics.comparisons import holm
-from mjx_reinforce.reports.statistics.survival import log_rank
+from mjx_reinforce.statistics.comparisons import holm
+from mjx_reinforce.statistics.survival import log_rank
 
 SEEDS = np.arange(6)
 UNTIL = 1000

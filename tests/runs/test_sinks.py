@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from mjx_reinforce import files
 from mjx_reinforce import train as train_module
-from mjx_reinforce.reports.statistics import iqm, iqm_interval
 from mjx_reinforce.runs import sinks
 from mjx_reinforce.runs.observers import RunLog
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.statistics import iqm, iqm_interval
 from mjx_reinforce.training import rows
 
 

@@ -18,10 +18,10 @@ from toys import Survive
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.engines.native import objects
-from mjx_reinforce.engines.native.cpu import machine
-from mjx_reinforce.engines.native.gpu import ptx
-from mjx_reinforce.engines.native.gpu import seam as gpu
+from mjx_reinforce.engine.cpu import machine
+from mjx_reinforce.engine.gpu import ptx
+from mjx_reinforce.engine.gpu import seam as gpu
+from mjx_reinforce.engine.play import objects
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store import kept, ready
 from mjx_reinforce.training.programs import compile_run

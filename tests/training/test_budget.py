@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from experiments.kit.trainings import results
-from mjx_reinforce.learners import counts
+from mjx_reinforce.learning import counts
 from mjx_reinforce.runs.command_line import parse
 from mjx_reinforce.runs.run import env_steps_in
 from mjx_reinforce.settings import defaults, tables

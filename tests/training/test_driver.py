@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from mjx_reinforce.learners import counts
+from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.driver import Best, Driver, drive, first_best, keep_best, shape_of_best
 from mjx_reinforce.training.programs import Looked, RunPrograms

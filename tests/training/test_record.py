@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mjx_reinforce.reports.statistics import summarize
+from mjx_reinforce.engine.base import Trajectory
 from mjx_reinforce.runs import display
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.statistics import summarize
 from mjx_reinforce.training import progress
 from mjx_reinforce.training.evaluation import evaluate
 from mjx_reinforce.training.progress import Progress, as_events
 from mjx_reinforce.training.record import RunRecord
-from mjx_reinforce.types import Trajectory
 
 
 def block(random, num_updates, num_seeds):

@@ -19,7 +19,7 @@ from saved_runs import assert_same, change
 from mjx_reinforce import files
 from mjx_reinforce import files as export_files
 from mjx_reinforce import train as train_module
-from mjx_reinforce.engines.native.cpu import machine
+from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.runs.directory import locked, make_directory
 from mjx_reinforce.runs.observers import RunLog
 from mjx_reinforce.training import checkpoint

@@ -10,12 +10,12 @@ import pytest
 from toys import Toy
 
 from mjx_reinforce import envs
-from mjx_reinforce.learners import counts
+from mjx_reinforce.engine.base import plain, with_keys
+from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store import ready
 from mjx_reinforce.training.programs import compile_run
 from mjx_reinforce.training.state import budget_of, seed_keys
-from mjx_reinforce.types import plain, with_keys
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
 

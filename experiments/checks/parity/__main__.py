@@ -28,7 +28,7 @@ from experiments.checks.parity.sides import Ours, Outcome, Peer, make_peer, stac
 from experiments.checks.parity.states import draw_states
 from experiments.kit.markdown import table
 from mjx_reinforce import envs
-from mjx_reinforce.types import Discrete
+from mjx_reinforce.engine.base import Discrete
 
 DTYPES = ("float64", "float32")
 KEYS = ("env", "dtype", "states", "qpos", "qvel", "observation", "reward")

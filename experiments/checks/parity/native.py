@@ -9,8 +9,8 @@ import numpy as np
 
 from experiments.checks.parity.sides import Outcome
 from mjx_reinforce import categorical, envs, normal
-from mjx_reinforce.engines.native import rollout as native
-from mjx_reinforce.types import Discrete, null_action
+from mjx_reinforce.engine.base import Discrete, null_action
+from mjx_reinforce.engine.play import native
 
 #: Episodes for each row of a table. They take rows at random: one of 2,000 is missed with
 #: probability 2,000 exp(-20) = 4e-6.

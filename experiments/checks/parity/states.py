@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from experiments.checks.parity.sides import Peer
-from mjx_reinforce.types import Discrete
+from mjx_reinforce.engine.base import Discrete
 
 
 def draw_states(

@@ -12,10 +12,10 @@ from flax import struct
 
 from experiments.speed.benchmark.rows import Candidate
 from mjx_reinforce import Actor, act, envs, mlp_policy, reinforce
-from mjx_reinforce.engines.choice import ActingPolicy, choose
-from mjx_reinforce.learners.reinforce import default_distribution
-from mjx_reinforce.policies import normalize
-from mjx_reinforce.types import action_space, observation_size
+from mjx_reinforce.engine.base import action_space, observation_size
+from mjx_reinforce.engine.play.choice import ActingPolicy, choose
+from mjx_reinforce.learning import normalize
+from mjx_reinforce.learning.reinforce import default_distribution
 
 #: Name in the table -> engine, and the solver of the environment's physics.
 ENGINES = {

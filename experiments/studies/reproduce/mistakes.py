@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.learners.learner import Learner
+from mjx_reinforce.learning.learner import Learner
 
 STALE = "stale first observation"
 

@@ -20,8 +20,8 @@ from experiments.studies.results.runs import ended
 from experiments.studies.results.tasks import Task
 from mjx_reinforce.files import csv_bytes, read_json, write_bytes, write_json
 from mjx_reinforce.reports.directories import PROVENANCE, read_columns, read_metrics
-from mjx_reinforce.reports.statistics import steps_to_solve
-from mjx_reinforce.reports.statistics.aggregates import interval
+from mjx_reinforce.statistics import steps_to_solve
+from mjx_reinforce.statistics.aggregates import interval
 
 #: The policies that are played, by rank in the final evaluation.
 POLICIES = ("best", "median")

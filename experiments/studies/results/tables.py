@@ -12,8 +12,8 @@ from experiments.kit.markdown import fixed, percent, table
 from experiments.studies.results import kept
 from experiments.studies.results.kept import POLICIES, Columns, Group, Result
 from experiments.studies.results.tasks import PUBLISHED_SEEDS
-from mjx_reinforce.reports.statistics import Estimate, finite_or_nan
-from mjx_reinforce.reports.statistics.aggregates import interval
+from mjx_reinforce.statistics import Estimate, finite_or_nan
+from mjx_reinforce.statistics.aggregates import interval
 
 #: Env steps within which the pendulum should be solved.
 WITHIN = (50_000, 100_000)

@@ -9,8 +9,8 @@ import numpy as np
 from scipy import stats
 
 from experiments.studies.seeds.runs import Task
-from mjx_reinforce.reports.statistics import iqm
-from mjx_reinforce.reports.statistics.comparisons import (
+from mjx_reinforce.statistics import iqm
+from mjx_reinforce.statistics.comparisons import (
     Difference,
     holm,
     paired_difference,

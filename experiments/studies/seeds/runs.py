@@ -11,8 +11,8 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.files import read_arrays, read_json, write_arrays
-from mjx_reinforce.reports.statistics.survival import time_to_threshold
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.statistics.survival import time_to_threshold
 from mjx_reinforce.sweeps.design import Design, read_design
 from mjx_reinforce.sweeps.perform import perform
 

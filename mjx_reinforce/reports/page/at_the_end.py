@@ -11,8 +11,8 @@ from mjx_reinforce.reports.findings import Findings, swept, values_of
 from mjx_reinforce.reports.page import vega
 from mjx_reinforce.reports.page.columns import Table, short, stacked
 from mjx_reinforce.reports.page.words import number, within
-from mjx_reinforce.reports.statistics import Estimate
-from mjx_reinforce.reports.statistics.aggregates import performance_profile
+from mjx_reinforce.statistics import Estimate
+from mjx_reinforce.statistics.aggregates import performance_profile
 
 #: Height of a configuration's row in the histograms, in pixels.
 ROW = 66

@@ -11,8 +11,8 @@ from mjx_reinforce.reports.findings import Findings, SpeedTest
 from mjx_reinforce.reports.page import words
 from mjx_reinforce.reports.page.over_time import worst_seeds
 from mjx_reinforce.reports.page.words import interval_in_words, number, percent, short_p, steps
-from mjx_reinforce.reports.statistics import Estimate
-from mjx_reinforce.reports.statistics.comparisons import Comparison
+from mjx_reinforce.statistics import Estimate
+from mjx_reinforce.statistics.comparisons import Comparison
 
 #: A table: its ``header``, and ``rows`` of a ``label`` and ``cells``, pairs of a value and what
 #: stands below it. Where the header has a column more, the first is the rank of the row.

@@ -12,7 +12,7 @@ from mjx_reinforce.reports.findings import Findings
 from mjx_reinforce.reports.page import vega
 from mjx_reinforce.reports.page.columns import Table, short, stacked
 from mjx_reinforce.reports.page.words import number
-from mjx_reinforce.reports.statistics.survival import kaplan_meier
+from mjx_reinforce.statistics.survival import kaplan_meier
 
 _HEIGHT = 320
 #: Points of a worst seed's curve, at most.

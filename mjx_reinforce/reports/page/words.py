@@ -14,9 +14,9 @@ from mjx_reinforce.reports.experiment import (
     shared_seeds,
 )
 from mjx_reinforce.reports.findings import Findings, fastest
-from mjx_reinforce.reports.statistics import Estimate, enough
-from mjx_reinforce.reports.statistics.comparisons import Comparison
 from mjx_reinforce.settings.tables import OF_TASKS
+from mjx_reinforce.statistics import Estimate, enough
+from mjx_reinforce.statistics.comparisons import Comparison
 
 #: What counts as a difference after Holm's correction.
 LEVEL = 0.05

@@ -1,0 +1,198 @@
+"""Checks of what users give, and one line for what their code, or a library, raised."""
+
+import contextlib
+import dataclasses
+import decimal
+import math
+import numbers
+import sysconfig
+import traceback
+import types
+import typing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+_HERE = Path(__file__).resolve().parents[1]
+#: Code that no user wrote: Python's, installed packages, and ours.
+_LIBRARIES = (
+    *(Path(sysconfig.get_path(name)).resolve() for name in ("stdlib", "purelib", "platlib")),
+    *(_HERE, (_HERE / "envs").resolve()),
+)
+#: Characters of somebody else's message that are shown.
+_LENGTH = 300
+#: What every environment has.
+_PARTS = ("reset", "step", "action_size")
+_KINDS: dict[Any, tuple[Any, str]] = {
+    bool: (bool, "True or False"),
+    int: (numbers.Integral, "a whole number"),
+    float: (numbers.Real, "a number"),
+    str: (str, "text"),
+    type(None): (type(None), "None"),
+}
+
+
+class BadEnvironmentError(ValueError):
+    """An environment's code does not do what an environment must."""
+
+
+def explain(error: BaseException) -> str:
+    """Returns in one line what was raised, and the last line of the user's own code before it.
+
+    The messages of JAX and MuJoCo have many lines, of which the first ones say what is wrong.
+    """
+    message = " ".join(str(error).split())
+    message = message if len(message) <= _LENGTH else f"{message[:_LENGTH]} ..."
+    said = f"{type(error).__name__}: {message}" if message else type(error).__name__
+    own = [
+        frame
+        for frame in traceback.extract_tb(error.__traceback__)
+        if not frame.filename.startswith("<") and not _in_library(Path(frame.filename).resolve())
+    ]
+    return f"{said} ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else said
+
+
+def _in_library(file: Path) -> bool:
+    return any(file.is_relative_to(folder) for folder in _LIBRARIES)
+
+
+def check_type(name: str, value: object, kind: object) -> None:
+    """Raises ValueError for a value that is not of its annotation.
+
+    Args:
+      name: what it is called, for the message.
+      value: what the user gave.
+      kind: the annotation. Of those that are neither numbers, text, None, Literal, tuples nor
+        unions of these, only classes are checked.
+    """
+    if not fits(value, kind):
+        raise ValueError(f"{name} must be {spoken_kind(kind)}, got {value!r}")
+
+
+def fits(value: object, kind: object) -> bool:
+    """Returns whether a value is of an annotation, see ``check_type``."""
+    if len(kinds := alternatives(kind)) > 1:
+        return any(fits(value, each) for each in kinds)
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Literal:
+        return any(type(value) is type(each) and value == each for each in inner)
+    if origin is tuple:
+        if not isinstance(value, tuple | list):
+            return False
+        kinds = inner[:1] * len(value) if inner[-1] is ... else inner
+        return len(kinds) == len(value) and all(map(fits, value, kinds))
+    if kind in (int, float) and isinstance(value, bool):
+        return False
+    expected = _KINDS[kind][0] if kind in _KINDS else kind
+    return isinstance(value, expected) if isinstance(expected, type) else True
+
+
+def alternatives(kind: object) -> tuple[Any, ...]:
+    """Returns the annotations of a union, or the one that is given."""
+    union = typing.get_origin(kind) in (typing.Union, types.UnionType)
+    return typing.get_args(kind) if union else (kind,)
+
+
+def spoken_kind(kind: object) -> str:
+    """Returns an annotation in words."""
+    if len(kinds := alternatives(kind)) > 1:
+        return " or ".join(map(spoken_kind, kinds))
+    origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if origin is typing.Literal:
+        return f"one of {', '.join(map(repr, inner))}"
+    if origin is tuple and inner[-1] is ...:
+        return f"a tuple, each entry {spoken_kind(inner[0])}"
+    if origin is tuple:
+        return f"({', '.join(map(spoken_kind, inner))})"
+    return _KINDS[kind][1] if kind in _KINDS else getattr(kind, "__name__", str(kind))
+
+
+def read_as(kind: Any, word: str) -> Any:
+    """Returns a text as a value of an annotation, of a union the first that fits.
+
+    Raises:
+      ValueError: it is none.
+    """
+    if len(kinds := alternatives(kind)) > 1:
+        for each in kinds:
+            with contextlib.suppress(ValueError):
+                return read_as(each, word)
+        raise ValueError(word)
+    if kind is type(None):
+        return {"none": None}[word.lower()] if word.lower() == "none" else _no(word)
+    if kind is bool:
+        words = {"true": True, "false": False}
+        return words[word.lower()] if word.lower() in words else _no(word)
+    if typing.get_origin(kind) is typing.Literal:
+        return word if word in typing.get_args(kind) else _no(word)
+    if typing.get_origin(kind) is tuple:
+        inner = typing.get_args(kind)[0]
+        return tuple(read_as(inner, part) for part in word.split(",")) if word != "none" else ()
+    return whole_number(word) if kind is int else kind(word)
+
+
+def _no(word: str) -> Any:
+    raise ValueError(word)
+
+
+def check_kind(name: str, value: object, kind: type, example: str) -> None:
+    """Raises ValueError for an object of another class.
+
+    Args:
+      name: what it is called, for the message.
+      value: what the user gave.
+      kind: the class.
+      example: what to write instead.
+    """
+    if not isinstance(value, kind):
+        what = getattr(value, "__name__", repr(value) if isinstance(value, str) else None)
+        got = what or f"a {type(value).__name__}"
+        raise ValueError(f"{name} must be of type {kind.__name__}, such as {example}, got {got}")
+
+
+def changed_fields(settings: "DataclassInstance") -> str:
+    """Returns the fields of a dataclass that have other values than their defaults, as code."""
+    given = (
+        f"{field.name}={value!r}"
+        for field in dataclasses.fields(settings)
+        if field.init and (value := getattr(settings, field.name)) != field.default
+    )
+    return ", ".join(given)
+
+
+def whole_number(text: str) -> int:
+    """Returns a whole number as people write it, such as 2000000, 2_000_000 or 2e6.
+
+    Raises:
+      ValueError: the text is no number, or one with a fraction, or of a hundred digits and more.
+    """
+    try:
+        number = decimal.Decimal(text)
+    except decimal.InvalidOperation:
+        number = decimal.Decimal("nan")
+    if not number.is_finite() or number.adjusted() >= 100 or number != int(number):
+        raise ValueError(f"takes a whole number, such as 4 or 2e6, got {text!r}")
+    return int(number)
+
+
+def is_nan(value: object) -> bool:
+    """Returns whether a value is a number that is none."""
+    return isinstance(value, numbers.Real) and math.isnan(value)
+
+
+def check_parts(env: object) -> None:
+    """Raises ValueError for an object that has not the methods of an environment."""
+    name = type(env).__name__
+    if isinstance(env, type):
+        raise BadEnvironmentError(f"{env.__name__} is a class, no environment yet: call it")
+    try:
+        missing = [part for part in _PARTS if not hasattr(env, part)]
+    except Exception as error:  # action_size may be a property, the user's code
+        raise BadEnvironmentError(f"{name}.action_size fails: {explain(error)}") from error
+    if missing:
+        raise BadEnvironmentError(
+            f"{name} is no environment: it has no {', '.join(missing)}; "
+            "mjx_reinforce.Environment says what one has"
+        )

@@ -1,0 +1,186 @@
+"""Does an environment do what an environment must? Found from shapes: nothing is simulated."""
+
+import numbers
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_reinforce.engine.base import Box, Discrete, Environment, PyTree, action_space
+from mjx_reinforce.engine.checks import BadEnvironmentError, check_parts, explain, is_nan
+
+#: What JAX raises where Python or NumPy asks for the value of a traced array.
+_NEED_VALUES = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
+_TRACED = "; it is compiled by JAX: write jnp.where for `if`, and jnp for numpy, math and float()"
+#: Ends of names of brax's and Playground's wrappers that map an environment, or reset it where an
+#: episode ends: what the last action led to is lost there.
+_NOT_HERE = ("AutoResetWrapper", "VmapWrapper")
+
+
+def check_environment(env: Environment) -> None:
+    """Raises ValueError for an environment that cannot be played, in one line that says why.
+
+    Args:
+      env: what a user gave. Its ``reset`` and ``step`` are traced, and nothing is compiled.
+    """
+    name = type(env).__name__
+    check_parts(env)
+    _check_wrappers(env)
+    _check_limits(name, env)
+    _check_action_space(name, env)
+    start = _shapes(name, "reset", env.reset, jax.random.key(0))
+    _check_state(name, start)
+    after = _shapes(name, "step", env.step, start, _action_shape(env))
+    _check_same(name, start, after)
+
+
+def _check_wrappers(env: object) -> None:
+    """Raises ValueError for many environments, or one that begins its next episode by itself."""
+    wrapper: Any = env
+    while wrapper is not None:
+        name = type(wrapper).__name__
+        if name.endswith(_NOT_HERE):
+            raise BadEnvironmentError(
+                f"{name} does what is done here: give the environment that it wraps, its env, "
+                "as brax.envs.create(..., auto_reset=False) makes it"
+            )
+        wrapper = getattr(wrapper, "__dict__", {}).get("env")
+
+
+def _check_limits(name: str, env: object) -> None:
+    """Raises ValueError for a time limit or threshold that is none."""
+    limit = _declared(name, env, "max_episode_steps")
+    if limit is not None and not _is_count(limit):
+        raise BadEnvironmentError(
+            f"{name}.max_episode_steps must be a whole number, 1 or more, got {limit!r}"
+        )
+    threshold = _declared(name, env, "reward_threshold")
+    if threshold is not None and (not isinstance(threshold, numbers.Real) or is_nan(threshold)):
+        raise BadEnvironmentError(
+            f"{name}.reward_threshold must be a number or None, got {threshold!r}"
+        )
+
+
+def _check_action_space(name: str, env: Environment) -> None:
+    """Raises ValueError for actions that cannot be drawn."""
+    size, declared = env.action_size, _declared(name, env, "action_space")
+    if not _is_count(size):
+        raise BadEnvironmentError(
+            f"{name}.action_size must be a whole number, 1 or more, got {size!r}"
+        )
+    if isinstance(declared, Discrete) and declared.num_actions != size:
+        raise BadEnvironmentError(
+            f"{name}.action_size is {size}, but its action_space has {declared.num_actions} actions"
+        )
+    if isinstance(declared, Box):
+        if not _are_bounds(declared, size):
+            raise BadEnvironmentError(
+                f"{name}.action_space must have low < high, of {size} entries each as action_size "
+                f"says, got low {declared.low} and high {declared.high}"
+            )
+    elif declared is not None and not isinstance(declared, Discrete):
+        raise BadEnvironmentError(
+            f"{name}.action_space is a {type(declared).__module__}.{type(declared).__name__}; "
+            "make it a mjx_reinforce.Box(low, high) or mjx_reinforce.Discrete(num_actions)"
+        )
+
+
+def _declared(name: str, env: object, what: str) -> Any:
+    """Returns what an environment says of itself, None if it says nothing."""
+    try:
+        return getattr(env, what, None)
+    except Exception as error:  # it may be a property, the user's code
+        raise BadEnvironmentError(f"{name}.{what} fails: {explain(error)}") from error
+
+
+def _is_count(value: object) -> bool:
+    """Returns whether a value is a whole number, 1 or more; True is none."""
+    return isinstance(value, numbers.Integral) and not isinstance(value, bool) and int(value) >= 1
+
+
+def _are_bounds(space: Box, size: int) -> bool:
+    """Returns whether a space has two vectors of numbers [size], the lower one below the other."""
+    try:
+        low, high = np.asarray(space.low, float), np.asarray(space.high, float)
+    except (TypeError, ValueError):
+        return False
+    return low.shape == high.shape == (size,) and bool(np.all(low < high))
+
+
+def _shapes(name: str, what: str, function: Callable[..., Any], *arguments: PyTree) -> Any:
+    """Returns the shapes of what a method returns."""
+    try:
+        return jax.eval_shape(function, *arguments)
+    except BadEnvironmentError:
+        raise
+    except (Exception, SystemExit) as error:  # it is the user's code, which may raise anything
+        remedy = _TRACED if isinstance(error, _NEED_VALUES) else ""
+        raise BadEnvironmentError(f"{name}.{what} fails: {explain(error)}{remedy}") from error
+
+
+def _action_shape(env: Environment) -> jax.ShapeDtypeStruct:
+    if isinstance(action_space(env), Discrete):
+        return jax.ShapeDtypeStruct((), jnp.int32)
+    return jax.ShapeDtypeStruct((env.action_size,), jnp.result_type(float))
+
+
+def _check_state(name: str, start: PyTree) -> None:
+    """Raises ValueError for a state without a vector ``obs``, a scalar ``reward`` and ``done``."""
+    for field, axes, shape, remedy in (
+        ("obs", 1, "a vector [O]", "concatenate its parts"),
+        ("reward", 0, "a scalar []", "sum it, or take an entry"),
+        ("done", 0, "a scalar []", "reduce it, as with jnp.any"),
+    ):
+        value: Any = getattr(start, field, None)
+        if not hasattr(value, "shape"):
+            got = f"there is no {field}" if value is None else f"it is {_described(value)}"
+            raise BadEnvironmentError(
+                f"{name}.reset must return a state whose {field} is {shape}, and {got}; "
+                "brax.envs.State has all that is needed"
+            )
+        if len(value.shape) != axes or 0 in value.shape:
+            raise BadEnvironmentError(
+                f"the {field} of {name}.reset must be {shape}, its shape is "
+                f"{list(value.shape)}; {remedy}"
+            )
+        if not jnp.isrealobj(value):
+            raise BadEnvironmentError(
+                f"the {field} of {name}.reset must hold real numbers, it holds {value.dtype}"
+            )
+
+
+def _check_same(name: str, start: PyTree, after: PyTree) -> None:
+    """Raises ValueError if ``step`` returns a state of another kind than ``reset``."""
+    if jax.tree.structure(start) != jax.tree.structure(after):
+        before, now = _paths(start), _paths(after)
+        only = [f"{path} only after reset" for path in before if path not in now]
+        only += [f"{path} only after step" for path in now if path not in before]
+        raise BadEnvironmentError(
+            f"{name}.step must return a state with the entries that reset's has"
+            f"{': ' if only else ''}{', '.join(only[:4])}"
+        )
+    for (path, old), new in zip(_paths(start).items(), jax.tree.leaves(after), strict=True):
+        if old.shape != new.shape or not _holds(old.dtype, new.dtype):
+            raise BadEnvironmentError(
+                f"{name}.step must return a state like reset's: {path} is {_described(old)} after "
+                f"reset, and {_described(new)} after step"
+            )
+
+
+def _paths(tree: PyTree) -> dict[str, Any]:
+    """Returns the leaves by where they are."""
+    leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
+    return {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in leaves}
+
+
+def _holds(old: PyTree, new: PyTree) -> bool:
+    """Returns whether a new value may be kept in place of an old one, as ``hold`` does."""
+    return old == new or jnp.promote_types(old, new) == old
+
+
+def _described(value: jax.Array) -> str:
+    if hasattr(value, "shape"):
+        return f"{value.dtype}{list(value.shape)}"
+    return f"a {type(value).__name__}"

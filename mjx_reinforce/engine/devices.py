@@ -1,0 +1,70 @@
+"""Programs over the devices of this process. The one file that knows ``jax.shard_map``."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax import lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from mjx_reinforce.engine.base import PyTree
+
+_AXIS = "devices"
+#: The first axis is divided among the devices, such as that of the runs; the second is; none is.
+RUNS, SECOND, NONE = PartitionSpec(_AXIS), PartitionSpec(None, _AXIS), PartitionSpec()
+
+
+class Devices:
+    """The devices of this process, among which an axis of arrays is divided."""
+
+    def __init__(self, most: int | None = None):
+        """Takes the first ``most`` devices of this process, or all."""
+        self.mesh = Mesh(jax.local_devices()[:most], (_AXIS,))
+        self.count = self.mesh.size
+
+    def map(self, function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Any:
+        """Returns a function that runs on every device, on its own part of what is divided.
+
+        Loops are each device's own: a device that is done waits for the others only where somebody
+        reads the results.
+
+        Args:
+          function: of arrays that hold one device's part.
+          in_specs: for its arguments, how they are divided.
+          out_specs: for its result, how it is divided.
+        """
+        return jax.shard_map(
+            function, mesh=self.mesh, in_specs=in_specs, out_specs=out_specs, check_vma=False
+        )
+
+    def sum(self, x: jax.Array) -> jax.Array:
+        """Returns the sum over all devices, within what ``map`` runs."""
+        return lax.psum(x, _AXIS)
+
+    def number(self) -> jax.Array:
+        """Returns the number [] of the device, within what ``map`` runs."""
+        return lax.axis_index(_AXIS)
+
+    def jit(
+        self, function: Callable[..., Any], in_specs: Any, out_specs: Any, **options: Any
+    ) -> Any:
+        """Returns ``map`` of a function, compiled; ``options`` are those of ``jax.jit``."""
+        # Said again: arrays without entries would else be on all devices.
+        shardings = self.shardings(out_specs)
+        mapped = self.map(function, in_specs, out_specs)
+        return jax.jit(mapped, out_shardings=shardings, **options)
+
+    def shardings(self, specs: Any) -> Any:
+        """Returns how arrays are divided, for JAX."""
+        return jax.tree.map(lambda spec: NamedSharding(self.mesh, spec), specs)
+
+    def put(self, tree: PyTree, spec: PartitionSpec) -> Any:
+        """Returns arrays divided among the devices."""
+        return jax.device_put(tree, NamedSharding(self.mesh, spec))
+
+    def shapes(self, tree: PyTree, spec: PartitionSpec) -> Any:
+        """Returns the shapes of arrays that are divided among the devices."""
+        sharding = NamedSharding(self.mesh, spec)
+        return jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), tree
+        )

@@ -1,0 +1,259 @@
+"""The kernel that every thread of a GPU runs: a thread plays one episode after the other.
+
+A thread whose episode is over takes the next one, of whatever seed, so few threads wait for longer
+episodes beside theirs. What a thread computes depends on its episode alone: results are the same
+for any number of threads.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_reinforce.engine.gpu.lockstep import (
+    LONG,
+    LOOP_FACTS,
+    Lockstep,
+    ScratchText,
+    operations,
+    some_of_block,
+)
+from mjx_reinforce.engine.llvm.emit import Input
+from mjx_reinforce.engine.play.native_step import NOT_PLAYED
+from mjx_reinforce.engine.scalar import scalarized
+
+_INT = np.dtype(np.int32)
+#: The kernel's name. Its attributes are #0.
+ENTRY = "play"
+#: What a kernel reads before the actor and the state, by name; see ``kernel_text``.
+CONTROLS = ("sizes", "plays", "keys")
+#: What it writes.
+RESULTS = ("observation", "action", "reward", "length", "broken", "simulated", "next")
+#: The arguments of a step behind the actor and the state: keys, t, deterministic.
+_NUM_OTHERS = 3
+#: A block's threads, and how many blocks a multiprocessor holds at once, for programs that fit into
+#: its instruction caches and for longer ones. A thread has 128 registers, in a longer program 255.
+_SHORT_BLOCKS, _LONG_BLOCKS = (32, 16), (256, 1)
+#: XLA's buffers begin at multiples of more bytes. A thread loads as many at once.
+_BUFFER_ALIGN = 16
+#: Denormals are zero, as in machine code for CPUs.
+_ATTRIBUTES = """attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
+  "nvvm.maxntid"="{}" "nvvm.minctasm"="{}" }}
+"""
+
+
+def entry_text(text: ScratchText, parameters: Sequence[str], written: scalarized.Scalarized) -> str:
+    """Returns the kernel of a body, with the bounds of its threads."""
+    parameters = [*parameters, *(["ptr noalias %scratch"] if text.words else [])]
+    blocks = _LONG_BLOCKS if operations(written.schedule) > LONG else _SHORT_BLOCKS
+    kernel = text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
+    return kernel + _ATTRIBUTES.format(*blocks) + LOOP_FACTS
+
+
+class _Leaf(NamedTuple):
+    """An argument of a step: where it is, the dtype and the number of its entries."""
+
+    pointer: str
+    dtype: np.dtype
+    size: int
+
+
+def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
+    """Returns the LLVM IR of ``@play``, without a target.
+
+    Its arguments are pointers to: sizes [3] int32 (seeds S, episodes N, steps T), plays [S, N]
+    int32 (of ``native.plays``), keys [S, N, 2] uint32, the leaves of the actor [S, ...] and of the
+    state [S, N, ...] that are not empty; as many again as there are results, which it does not
+    read; and the results, which are zero when it starts: observation [S, T, O, N], action
+    [S, T, A, N], reward [S, T, N], length [S, N] int32, broken [S, N] int32, simulated [S] int32
+    and next [1] int32, the item to be fetched next; and, if there are long arrays, the buffer of
+    ``ScratchText``. Item k is episode k % N of seed k / N. A thread counts the steps that
+    it waits for others in its block as simulated for the seed it played last, if there is one.
+
+    Args:
+      step: of ``step.step_function`` where an episode is running, written out.
+      num_actor: how many leaves of its arguments are the actor's.
+    """
+    return _Kernel(step, num_actor).write()
+
+
+class _Kernel:
+    """Writes ``@play``."""
+
+    def __init__(self, step: scalarized.Scalarized, num_actor: int):
+        self.text, self.step = ScratchText(), step
+        avals = [(np.dtype(x.dtype), int(np.prod(x.shape, dtype=int))) for x in step.in_avals]
+        actor, own = avals[:num_actor], avals[num_actor:]
+        state = own[: len(own) - _NUM_OTHERS]
+        self.given = {  # no argument is empty
+            kind: [f"%{kind}{k}" for k, (_, count) in enumerate(leaves) if count]
+            for kind, leaves in (("actor", actor), ("state", state))
+        }
+        self.shared = [
+            _Leaf(f"%actor{k}" if leaf[1] else "null", *leaf) for k, leaf in enumerate(actor)
+        ]
+        self.own = [_Leaf(self.text.reserve(*leaf), *leaf) for leaf in own]
+        self.state, (self.keys, self.at, self.mode) = self.own[: len(state)], self.own[len(state) :]
+        self.row, self.limit, self.asks, self.waited, self.running = (
+            self.text.reserve(_INT, 1) for _ in range(5)
+        )
+
+    def write(self) -> str:
+        """Returns the kernel."""
+        text = self.text
+        self.seeds, self.episodes, self.horizon = (
+            text.load(text.at("%sizes", _INT, k), _INT) for k in range(3)
+        )
+        items = text.let(f"mul i32 {self.seeds}, {self.episodes}")
+        text.store("0", self.waited, _INT)
+        text.store("1", self.asks, _INT)
+        self._begin("0", "0", "0", "0")  # a thread without an episode has the values of one
+        head, body, end = text.label(), text.label(), text.label()
+        text.line(f"br label %{head}")
+        text.start(head)
+        idle = text.let(f"icmp eq i32 {text.load(self.running, _INT)}, 0")
+        with text.when(idle):
+            self._fetch(items)
+        running = text.let(f"icmp ne i32 {text.load(self.running, _INT)}, 0")
+        some = some_of_block(text, running)
+        text.line(f"br i1 {some}, label %{body}, label %{end}")
+        text.start(body)
+        waited = text.let(f"add i32 {text.load(self.waited, _INT)}, 1")
+        text.store(waited, self.waited, _INT)
+        self._play(running)
+        text.line(f"br label %{head}")
+        text.start(end)
+        played = text.let(f"icmp ne i32 {text.load(self.at.pointer, _INT)}, 0")
+        with text.when(played):
+            self._count_steps()
+        text.line("ret void")
+        pointers = [*(f"%{name}" for name in CONTROLS), *self.given["actor"], *self.given["state"]]
+        unread = [f"%zero.{name}" for name in RESULTS]
+        written = [f"%{name}" for name in RESULTS]
+        parameters = [f"ptr noalias readonly {x}" for x in pointers]
+        parameters += [f"ptr {x}" for x in [*unread, *written]]
+        return entry_text(text, parameters, self.step)
+
+    def _fetch(self, items: str) -> None:
+        """Writes how a thread takes the next episode that is played, if there is one."""
+        text = self.text
+        head, look, fill, end = (text.label() for _ in range(4))
+        text.line(f"br label %{head}")
+        text.start(head)
+        # A thread that has found no more does not ask again.
+        asks = text.let(f"icmp ne i32 {text.load(self.asks, _INT)}, 0")
+        asked = text.label()
+        text.line(f"br i1 {asks}, label %{asked}, label %{end}")
+        text.start(asked)
+        item = text.let("atomicrmw add ptr %next, i32 1 monotonic")
+        some = text.let(f"icmp ult i32 {item}, {items}")
+        none = text.label()
+        text.line(f"br i1 {some}, label %{look}, label %{none}")
+        text.start(none)
+        text.store("0", self.asks, _INT)
+        text.line(f"br label %{end}")
+        text.start(look)
+        plays = text.load(text.at("%plays", _INT, self._wide(item)), _INT)
+        is_played = text.let(f"icmp ne i32 {plays}, {NOT_PLAYED}")
+        text.line(f"br i1 {is_played}, label %{fill}, label %{head}")
+        text.start(fill)
+        is_mode = text.let(f"icmp slt i32 {plays}, 0")
+        negated = text.let(f"sub i32 0, {plays}")
+        limit = text.let(f"select i1 {is_mode}, i32 {negated}, i32 {plays}")
+        self._begin(item, text.let(f"zext i1 {is_mode} to i32"), limit, "1")
+        text.line(f"br label %{end}")
+        text.start(end)
+
+    def _begin(self, item: str, mode: str, limit: str, running: str) -> None:
+        """Writes how a thread begins an episode of so many steps at most."""
+        text = self.text
+        place = self._wide(item)
+        for leaf, given in zip((x for x in self.state if x.size), self.given["state"], strict=True):
+            self._copy(given, place, leaf, leaf.size)
+        self._copy("%keys", place, self.keys, 2)
+        for value, where in (
+            (mode, self.mode.pointer),
+            ("0", self.at.pointer),
+            (item, self.row),
+            (limit, self.limit),
+            (running, self.running),
+        ):
+            text.store(value, where, _INT)
+
+    def _copy(self, source: str, row: str, leaf: _Leaf, count: int) -> None:
+        """Writes the copy of a row [count] of an array into a leaf of the thread's own."""
+        text = self.text
+        before = text.let(f"mul i64 {row}, {count}")
+        start = text.at(source, leaf.dtype, before)
+        for k in range(count):
+            value = text.load(text.at(start, leaf.dtype, k), leaf.dtype)
+            text.store(value, text.at(leaf.pointer, leaf.dtype, k), leaf.dtype)
+
+    def _play(self, running: str) -> None:
+        """Writes a step of the thread's episode, which counts if it is running, and its end."""
+        text = self.text
+        seed = text.let(f"udiv i32 {text.load(self.row, _INT)}, {self.episodes}")
+        actor = [self._row(leaf, seed) for leaf in self.shared]
+        leaves = [*actor, *(Input(leaf.pointer, leaf.dtype) for leaf in self.own)]
+        emit = Lockstep(text, leaves.__getitem__)
+        values = emit.compile(self.step.schedule, self.step.outputs)
+        *records, (goes_on,), (broken,) = values[:5]
+        with text.when(running):
+            self._keep(records, seed, values[5:])
+            self._end(goes_on, broken)
+
+    def _keep(self, records: list[list[Any]], seed: str, carried: list[list[Any]]) -> None:
+        """Writes what a step leaves: records, and what the next step reads."""
+        text = self.text
+        self._record(records, seed)
+        for leaf, to in zip(carried, self.own, strict=False):
+            for k, value in enumerate(leaf):
+                text.store(value, text.at(to.pointer, to.dtype, k), to.dtype)
+
+    def _end(self, goes_on: str, broken: str) -> None:
+        """Writes the end of an episode, if it has come."""
+        text = self.text
+        steps = text.let(f"add i32 {text.load(self.at.pointer, _INT)}, 1")
+        text.store(steps, self.at.pointer, _INT)
+        late = text.let(f"icmp sge i32 {steps}, {text.load(self.limit, _INT)}")
+        ends = text.let(f"icmp eq i32 {goes_on}, 0")
+        with text.when(text.let(f"or i1 {late}, {ends}")):
+            row = self._wide(text.load(self.row, _INT))
+            text.store(steps, text.at("%length", _INT, row), _INT)
+            text.store(broken, text.at("%broken", _INT, row), _INT)
+            text.store("0", self.running, _INT)
+            self._count_steps()
+
+    def _row(self, leaf: _Leaf, seed: str) -> Input:
+        """Returns a seed's row of a leaf of the actor."""
+        first = self.text.let(f"mul i64 {self._wide(seed)}, {leaf.size}")
+        align = math.gcd(_BUFFER_ALIGN, leaf.dtype.itemsize * leaf.size)
+        return Input(self.text.at(leaf.pointer, leaf.dtype, first), leaf.dtype, align)
+
+    def _record(self, records: list[list[Any]], seed: str) -> None:
+        """Writes observation, action and reward."""
+        text = self.text
+        row, at = text.load(self.row, _INT), text.load(self.at.pointer, _INT)
+        episode = self._wide(text.let(f"urem i32 {row}, {self.episodes}"))
+        episodes = self._wide(self.episodes)
+        before = text.let(f"mul i64 {self._wide(seed)}, {self._wide(self.horizon)}")
+        before = text.let(f"add i64 {before}, {self._wide(at)}")
+        for values, name, aval in zip(records, RESULTS, self.step.out_avals, strict=False):
+            first = text.let(f"mul i64 {before}, {len(values)}")
+            for k, value in enumerate(values):
+                index = text.let(f"add i64 {first}, {k}")
+                index = text.let(f"mul i64 {index}, {episodes}")
+                index = text.let(f"add i64 {index}, {episode}")
+                text.store(value, text.at(f"%{name}", aval.dtype, index), aval.dtype)
+
+    def _count_steps(self) -> None:
+        """Writes the addition of the steps since the last one to those of the present seed."""
+        text = self.text
+        seed = text.let(f"udiv i32 {text.load(self.row, _INT)}, {self.episodes}")
+        place = text.at("%simulated", _INT, self._wide(seed))
+        text.let(f"atomicrmw add ptr {place}, i32 {text.load(self.waited, _INT)} monotonic")
+        text.store("0", self.waited, _INT)
+
+    def _wide(self, number: str) -> str:
+        return self.text.let(f"zext i32 {number} to i64")

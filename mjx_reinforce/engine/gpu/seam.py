@@ -1,0 +1,225 @@
+"""How JAX launches kernels on an NVIDIA GPU.
+
+A kernel is launched within compiled programs and loops without Python: a handler of JAX's foreign
+function interface launches machine code, which is assembled while XLA compiles.
+"""
+
+import ctypes
+import functools
+import math
+import re
+import threading
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_reinforce.engine.gpu import launcher, ptx
+from mjx_reinforce.engine.gpu.lockstep import WARP
+from mjx_reinforce.engine.play import objects
+
+#: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
+_OLDEST = (22,)
+#: What may assemble a kernel, what is preferred first.
+Assemblers = tuple[launcher.Assembler, ...]
+#: XLA's names of the handlers that it knows.
+_HANDLERS: set[str] = set()
+_LOCK = threading.Lock()
+
+
+def kernels_unavailable() -> str | None:
+    """Returns why kernels of ours cannot run on this GPU, None if they can."""
+    import llvmlite.binding as llvm
+
+    capability = compute_capability()
+    if capability.partition(".")[0] not in map(str, range(7, 100)):
+        return f"it runs on NVIDIA GPUs of compute capability 7.0 or more, this is {capability!r}"
+    if jax.config.values["jax_enable_x64"]:
+        return "on GPUs it plays in float32 alone, and jax_enable_x64 is set"
+    if llvm.llvm_version_info < _OLDEST:
+        return "its kernels need llvmlite 0.48 or newer; pip install 'llvmlite>=0.48'"
+    llvm.initialize_all_targets()
+    try:
+        llvm.Target.from_triple(ptx.TRIPLE)
+    except RuntimeError as error:
+        return f"this llvmlite has no code for GPUs: {error}"
+    return _assemblers()[1]
+
+
+@functools.cache
+def _assemblers() -> tuple[Assemblers, str | None]:
+    """Returns what assembles kernels, what is preferred first; or why nothing does."""
+    capabilities = {getattr(x, "compute_capability", "") for x in jax.local_devices()}
+    if len(capabilities) > 1:
+        return (), f"its kernels are for GPUs of one kind, not {' and '.join(sorted(capabilities))}"
+    found = launcher.assemblers(compute_capability())
+    return found, None if found else "NVIDIA's driver, libcuda.so.1, is not found"
+
+
+def targets() -> list[str]:
+    """Returns XLA's names of the handlers of all kernels in memory."""
+    return [_target(key) for key in ptx.in_memory()]
+
+
+def restore(program: bytes) -> bool:
+    """Makes ready the kernels that a program launches, from disk; returns whether all are there.
+
+    Args:
+      program: as JAX exports it, or anything else that has the names of handlers in it.
+    """
+    folder = objects.folder()
+    for key in set(re.findall(rb"mjx_reinforce_gpu_([0-9a-f]{64})", program)):
+        kernel = ptx.kept(key.decode(), folder) if folder else None
+        assemblers, _ = _assemblers()
+        if kernel is None or not assemblers:
+            return False
+        _handler(kernel, assemblers)
+    return True
+
+
+def _target(key: str) -> str:
+    """Returns XLA's name of the handler of a kernel; kept programs find it again by it."""
+    return f"mjx_reinforce_gpu_{key}"
+
+
+def _handler(kernel: ptx.Kernel, assemblers: Assemblers) -> str:
+    """Returns XLA's name of the handler that launches a kernel, which is assembled meanwhile."""
+    name = _target(kernel.key)
+    with _LOCK:
+        if name not in _HANDLERS:
+            handler, slot = launcher.launcher(kernel.key)
+            address = jax.ffi.pycapsule(ctypes.c_void_p(handler))
+            jax.ffi.register_ffi_target(name, address, platform="CUDA")
+            given = (slot, kernel, assemblers, objects.folder())
+            threading.Thread(target=launcher.fill, args=given, daemon=True).start()
+            _HANDLERS.add(name)
+    return name
+
+
+def compute_capability() -> str:
+    """Returns that of the GPU, such as "9.0"; what other devices say instead; "" if nothing."""
+    return str(getattr(jax.devices()[0], "compute_capability", ""))
+
+
+def kernel_dependencies() -> str:
+    """Returns what a program with kernels depends on."""
+    processors = jax.devices()[0].core_count
+    return f"compute capability {compute_capability()}, {processors} multiprocessors"
+
+
+def launch(
+    kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: jax.Array
+) -> Sequence[jax.Array]:
+    """Runs a kernel on a GPU; vmapped, it remains one launch.
+
+    Args:
+      kernel: of ``kernel.kernel_text``.
+      record: shape and dtype of the observation, the action and the reward of a step.
+      horizon: T, the steps of an episode at most.
+      args: plays [N], keys [N, 2], and the leaves of the actor [...] and of the state [N, ...].
+
+    Returns:
+      What the kernel does, without the seeds' axis.
+    """
+    play = in_one_launch(lambda *stacked: _launch(kernel, record, horizon, *stacked))
+    return [x[0] for x in play(*(x[None] for x in args))]
+
+
+def in_one_launch(run: Callable[..., Sequence[jax.Array]]) -> Callable[..., Sequence[jax.Array]]:
+    """Returns ``run``, which is called once also where it is vmapped.
+
+    Args:
+      run: arrays [B, ...] -> a list of arrays [B, ...]; vmapped, it is given all examples along B.
+    """
+    together = jax.custom_batching.custom_vmap(run)
+
+    @together.def_vmap
+    def _(size, mapped, *args):
+        along = [
+            x if is_mapped else jnp.broadcast_to(x, (size, *x.shape))
+            for x, is_mapped in zip(args, mapped, strict=True)
+        ]
+        results = together(*(x.reshape(-1, *x.shape[2:]) for x in along))
+        return [x.reshape(size, -1, *x.shape[1:]) for x in results], [True] * len(results)
+
+    return together
+
+
+def _launch(
+    kernel: ptx.Kernel, record: Sequence[jax.ShapeDtypeStruct], horizon: int, *args: jax.Array
+) -> Sequence[jax.Array]:
+    seeds, episodes = args[0].shape
+    shape = jax.ShapeDtypeStruct
+    records = [
+        shape((seeds, horizon, int(np.prod(x.shape, dtype=int)), episodes), x.dtype) for x in record
+    ]
+    counts = [shape(x, jnp.int32) for x in ((seeds, episodes), (seeds, episodes), (seeds,), (1,))]
+    grid = _grid(seeds * episodes, kernel.threads, kernel.blocks)
+    sizes = jnp.array([seeds, episodes, horizon], jnp.int32)
+    return _fill(kernel, grid, [sizes, *args], [*records, *counts])[:-1]
+
+
+def launch_map(
+    kernel: ptx.Kernel, results: Sequence[jax.ShapeDtypeStruct], *args: jax.Array
+) -> Sequence[jax.Array]:
+    """Runs a kernel that maps a function; vmapped, it remains one launch.
+
+    Args:
+      kernel: of ``mapping.mapping_text``.
+      results: shape [N, ...] and dtype of what it returns.
+      args: its arguments [N, ...].
+    """
+
+    def play(*args):
+        examples = len(args[0])
+        grid = _grid(examples, kernel.threads, kernel.blocks)
+        sizes = jnp.array([examples, math.prod(grid)], jnp.int32)
+        made = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in results]
+        return _fill(kernel, grid, [sizes, *args], made)
+
+    return in_one_launch(play)(*args)
+
+
+def _fill(
+    kernel: ptx.Kernel,
+    grid: tuple[int, int],
+    given: Sequence[jax.Array],
+    results: Sequence[jax.ShapeDtypeStruct],
+) -> Sequence[jax.Array]:
+    """Returns what a kernel writes into zeros of these shapes."""
+    words = kernel.scratch * math.prod(grid)
+    scratch = [jax.ShapeDtypeStruct((words,), jnp.int32)] if words else []
+    zeros = [jnp.zeros(x.shape, x.dtype) for x in results]
+    return _call(kernel, grid, given, zeros, scratch)[: len(results)]
+
+
+def _call(
+    kernel: ptx.Kernel,
+    grid: tuple[int, int],
+    given: Sequence[jax.Array],
+    written: Sequence[jax.Array],
+    scratch: Sequence[jax.ShapeDtypeStruct] = (),
+) -> Sequence[jax.Array]:
+    """Launches so many blocks of so many threads.
+
+    They also write into ``scratch``, a buffer that begins with any values. Returns ``written`` as
+    they leave it, and then that buffer.
+    """
+    results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
+    aliases = {len(given) + k: k for k in range(len(results))}
+    blocks, threads = map(np.int32, grid)
+    target = _handler(kernel, _assemblers()[0])
+    call = jax.ffi.ffi_call(target, [*results, *scratch], input_output_aliases=aliases)
+    return call(*given, *written, blocks=blocks, threads=threads)
+
+
+def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:
+    """Returns how many blocks of how many threads, at most so many, play so many episodes.
+
+    They are spread over all multiprocessors, each of which has so many blocks at most.
+    """
+    processors = jax.devices()[0].core_count
+    warps = -(-items // (WARP * processors))
+    threads = min(WARP * warps, most)
+    return min(-(-items // threads), blocks * processors), threads

@@ -1,0 +1,251 @@
+"""Products with the Jacobian of the constraint rows, where few contacts touch.
+
+A contact that does not touch has rows of zeros, and of those that touch not all push. Machine code
+for one episode (``fused``) skips such a contact by a branch. Where XLA computes many episodes at
+once both sides of a branch would be computed, and there these are products of whole matrices.
+
+The rows of a contact with friction are the edges n + t_i and n - t_i of a pyramid (MuJoCo's
+documentation, "Computation", "Friction cones"). They lie in the space of n and all t_i, a basis of
+fewer vectors, with which machine code computes. And it leaves out the degrees of freedom that no
+contact can couple, such as two legs of Ant, of which each touches the floor alone.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from mujoco import mjx
+
+from mjx_reinforce.engine.physics.mjx_internals import geom_groups
+from mjx_reinforce.engine.scalar import by_engine, skippable
+
+Pair = tuple[jax.Array, jax.Array]
+
+
+class Group(NamedTuple):
+    """Contacts with equally many rows.
+
+    contacts: how many
+    pyramid: [rows of a contact, vectors of its basis] the rows as sums of the vectors
+    coupled: [nv, nv] whether rows of one of them may have both degrees of freedom
+    """
+
+    contacts: int
+    pyramid: np.ndarray
+    coupled: np.ndarray
+
+
+class Blocks(NamedTuple):
+    """How the rows divide.
+
+    others: the leading rows, which belong to no contact
+    groups: the contacts
+    may_unroll: whether loops over contacts may be written out, see ``scalar.by_engine``
+    """
+
+    others: int
+    groups: tuple[Group, ...]
+    may_unroll: bool
+
+
+class Jacobian(NamedTuple):
+    """The rows, and for machine code the bases of the contacts.
+
+    rows: [rows, nv]
+    bases: of each group, [contacts, vectors, nv]
+    """
+
+    rows: jax.Array
+    bases: Sequence[jax.Array]
+
+
+def blocks(
+    others: int, dims: np.ndarray, couplings: Mapping[int, np.ndarray], may_unroll: bool = True
+) -> Blocks:
+    """Returns the division for contacts [C] of these dimensions under pyramidal cones.
+
+    Args:
+      others: the rows of no contact, which come first.
+      dims: [C]
+      couplings: of ``couplings``.
+      may_unroll: see ``scalar.by_engine``.
+    """
+    groups = tuple(
+        Group(int((dims == dim).sum()), _pyramid(dim), coupled)
+        for dim, coupled in sorted(couplings.items())
+        if (dims == dim).any()
+    )
+    return Blocks(others, groups, may_unroll)
+
+
+def couplings(model: mjx.Model) -> dict[int, np.ndarray]:
+    """Returns for each dimension of contacts which degrees of freedom one of them may couple.
+
+    A contact's rows have those that move one of its two bodies. The bools are [nv, nv].
+    """
+    moves = _moves(model)
+    found: dict[int, np.ndarray] = {}
+    for dim, first, second in geom_groups(model):
+        either = moves[model.geom_bodyid[first]] | moves[model.geom_bodyid[second]]
+        found[dim] = found.get(dim, False) | np.outer(either, either)
+    return found
+
+
+def _moves(model: mjx.Model) -> np.ndarray:
+    """Returns which degrees of freedom move a body, [nbody, nv]."""
+    moves = model.dof_bodyid == np.arange(model.nbody)[:, None]
+    for body in range(1, model.nbody):  # parents come first
+        moves[body] |= moves[model.body_parentid[body]]
+    return moves
+
+
+def _pyramid(dim: int) -> np.ndarray:
+    """Returns the edges [rows, dim] of a contact's pyramid: n + t_i, n - t_i; for one row, n."""
+    if dim == 1:
+        return np.eye(1)
+    tangents = np.kron(np.eye(dim - 1), [[1.0], [-1.0]])
+    return np.hstack([np.ones((len(tangents), 1)), tangents])
+
+
+def with_bases(division: Blocks, rows: jax.Array, touching: jax.Array) -> Jacobian:
+    """Returns the Jacobian of rows [rows, nv].
+
+    Args:
+      division: of the rows.
+      rows: [rows, nv]
+      touching: [C] whether a contact's rows may be other than zero.
+    """
+
+    def whole(rows: jax.Array, touching: jax.Array) -> list[jax.Array]:
+        """Nothing reads them there."""
+        return [
+            jnp.zeros((group.contacts, group.pyramid.shape[1], rows.shape[1]), rows.dtype)
+            for group in division.groups
+        ]
+
+    def by_contact(rows: jax.Array, touching: jax.Array) -> list[jax.Array]:
+        made, first = [], 0
+        for group, edges in zip(division.groups, by_group(division, rows), strict=True):
+            pyramid = group.pyramid
+            inverse = jnp.asarray(pyramid.T / np.sum(pyramid**2, 0)[:, None], rows.dtype)
+
+            def basis(_: None, one: tuple, inverse: jax.Array = inverse) -> tuple[None, jax.Array]:
+                edges, touches = one
+                zeros = jnp.zeros((len(inverse), edges.shape[1]), edges.dtype)
+                return None, skippable(touches, lambda: inverse @ edges, zeros)
+
+            touches = touching[first : first + group.contacts]
+            made.append(lax.scan(basis, None, (edges, touches))[1])
+            first += group.contacts
+        return made
+
+    bases = by_engine(by_contact, whole, rows, touching, may_unroll=division.may_unroll)
+    return Jacobian(rows, bases)
+
+
+def weighted(
+    division: Blocks, start: jax.Array, jacobian: Jacobian, mass: jax.Array, force: jax.Array
+) -> Pair:
+    """Returns start [nv, nv] + J' diag(mass) J, and J' force [nv].
+
+    Args:
+      division: of the rows.
+      start: [nv, nv] what the first product is added to.
+      jacobian: of ``with_bases``.
+      mass: [rows]; where all of a contact's are zero, its forces are zero too.
+      force: [rows]
+    """
+
+    def whole(start: jax.Array, jacobian: Jacobian, mass: jax.Array, force: jax.Array) -> Pair:
+        rows = jacobian.rows
+        return start + (rows.T * mass) @ rows, rows.T @ force
+
+    def by_contact(start: jax.Array, jacobian: Jacobian, mass: jax.Array, force: jax.Array) -> Pair:
+        others = slice(division.others)
+        sums = whole(start, Jacobian(jacobian.rows[others], []), mass[others], force[others])
+        parts = by_group(division, mass), by_group(division, force)
+        for group, basis, *each in zip(division.groups, jacobian.bases, *parts, strict=True):
+            pyramid = jnp.asarray(group.pyramid, start.dtype)
+
+            def add(
+                sums: tuple, one: tuple, pyramid: jax.Array = pyramid, group: Group = group
+            ) -> tuple[tuple, None]:
+                basis, mass, force = one
+
+                def pushed() -> tuple:
+                    hessian, joint_force = sums
+                    weights = (pyramid.T * mass) @ pyramid @ basis
+                    added = _plus_product(hessian, basis.T[:, None], weights.T[None])
+                    return (
+                        jnp.where(group.coupled, added, hessian),
+                        _plus_product(joint_force, basis.T, pyramid.T @ force),
+                    )
+
+                return skippable(jnp.any(mass != 0), pushed, sums), None
+
+            sums, _ = lax.scan(add, sums, (basis, *each))
+        return sums
+
+    operands = start, jacobian, mass, force
+    return by_engine(by_contact, whole, *operands, may_unroll=division.may_unroll)
+
+
+def along(
+    division: Blocks, jacobian: Jacobian, direction: jax.Array, touching: jax.Array
+) -> jax.Array:
+    """Returns J direction, [rows].
+
+    Args:
+      division: of the rows.
+      jacobian: of ``with_bases``.
+      direction: [nv]
+      touching: [C] whether a contact's rows may be other than zero.
+    """
+
+    def whole(jacobian: Jacobian, direction: jax.Array, touching: jax.Array) -> jax.Array:
+        return jacobian.rows @ direction
+
+    def by_contact(jacobian: Jacobian, direction: jax.Array, touching: jax.Array) -> jax.Array:
+        parts, first = [jacobian.rows[: division.others] @ direction], 0
+        for group, basis in zip(division.groups, jacobian.bases, strict=True):
+            pyramid = jnp.asarray(group.pyramid, direction.dtype)
+
+            def product(
+                _: None, one: tuple, pyramid: jax.Array = pyramid
+            ) -> tuple[None, jax.Array]:
+                basis, touches = one
+                zeros = jnp.zeros(len(pyramid), pyramid.dtype)
+                return None, skippable(touches, lambda: pyramid @ (basis @ direction), zeros)
+
+            touches = touching[first : first + group.contacts]
+            parts.append(lax.scan(product, None, (basis, touches))[1].reshape(-1))
+            first += group.contacts
+        return jnp.concatenate(parts)
+
+    operands = jacobian, direction, touching
+    return by_engine(by_contact, whole, *operands, may_unroll=division.may_unroll)
+
+
+def _plus_product(start: jax.Array, left: jax.Array, right: jax.Array) -> jax.Array:
+    """Returns start + sum over the last axis of left * right.
+
+    Each entry is added up from its start on: in machine code these are fused multiply-adds.
+    """
+    left, right = jnp.broadcast_arrays(left, right)
+    terms = jnp.concatenate([start[..., None], left], -1)
+    factors = jnp.concatenate([jnp.ones_like(start)[..., None], right], -1)
+    return jnp.einsum("...k,...k->...", terms, factors)
+
+
+def by_group(division: Blocks, rows: jax.Array) -> list[jax.Array]:
+    """Divides an array [rows, ...] into the groups' [contacts, rows of a contact, ...]."""
+    divided, first = [], division.others
+    for group in division.groups:
+        size = len(group.pyramid)
+        last = first + group.contacts * size
+        divided.append(rows[first:last].reshape(group.contacts, size, *rows.shape[1:]))
+        first = last
+    return divided

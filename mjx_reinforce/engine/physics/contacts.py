@@ -1,0 +1,296 @@
+"""Contacts as C MuJoCo makes them, where MJX makes others.
+
+Gymnasium runs C MuJoCo, and MJX 3.17 departs from it in these collision functions, by enough to
+change an episode. Those here agree with MuJoCo 4.0 to rounding, with exceptions at the end.
+
+- ``plane_capsule``: MJX's contact frame no longer follows a capsule that is more than 60 degrees
+  from the plane, and the friction pyramid turns with the frame.
+- ``plane_box`` and ``plane_cylinder``: MJX leaves out corners that are more than 1 mm above the
+  lowest, and the far end of a cylinder whose end is more than 1 mm deeper.
+- ``sphere_capsule`` and ``capsule_capsule``: MJX adds 1e-6 to its denominators.
+- ``sphere_cylinder`` and ``capsule_cylinder``: MJX looks for their contacts in ten steps of
+  gradient descent. So it does for the pairs of ``UNLIKE_C``, which ``envs/models.py`` refuses.
+
+These differences remain:
+
+- Capsules within 1e-4 rad of parallel meet in two contacts in C, at the ends of their overlap, and
+  here in one, at its middle: the number of rows is static in JAX, so that every pair of capsules
+  would pay for a second row (a fifth of Humanoid's time on a CPU). None of 60,000 states of
+  Humanoid, HumanoidStandup and Hopper under random actions had such a pair.
+- C finds capsule and cylinder by an iteration that ends at 1e-6 m. Its normals are then right to
+  some 1e-5, and its position between parallel surfaces may be anywhere along them. A capsule whose
+  axis enters the cylinder is pushed out by the shortest way of its deepest point, and in C of the
+  whole capsule. Of a capsule that lies on a cap with one end beyond the margin, C doubles the
+  contact at the other end if the rim cuts it.
+
+``fwd_position`` is MJX's with these functions in the table of collision functions.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from mujoco import mjx
+
+from mjx_reinforce.engine.physics import inertia
+from mjx_reinforce.engine.physics.mjx_internals import (
+    Collision,
+    GeomInfo,
+    collider,
+    collision_with,
+    make_frame,
+)
+from mjx_reinforce.engine.physics.pairs import one_by_one
+from mjx_reinforce.engine.physics.rows import make_constraint
+from mjx_reinforce.engine.scalar import by_engine
+
+# What C takes for zero (mjMINVAL); in single precision, what rounding may leave of a zero distance
+# between points a few metres from the origin. Axes that cross, as in a planar Hopper, have that.
+_MIN_LENGTH = {"float64": 1e-15, "float32": 2e-6}
+# Capsules are parallel in C (``mjc_segWeights``) below this square of their angle's sine.
+_PARALLEL = 1e-8
+# The sine of the angle to a cap up to which a capsule lies on it in C.
+_LIES = 0.0888
+# A distance at which nothing touches, in meters.
+_FAR = 1e3
+
+
+@collider(ncon=2)
+def plane_capsule(plane: GeomInfo, capsule: GeomInfo) -> Collision:
+    """Collides both ends of a capsule with a plane; the first tangents follow its axis."""
+    normal, axis = plane.mat[:, 2], capsule.mat[:, 2]
+    tangent, _ = _direction(axis - normal * jnp.dot(normal, axis))
+    frame = jnp.stack([normal, tangent, jnp.cross(normal, tangent)])
+    segment = axis * capsule.size[1]
+    ends = capsule.pos + jnp.stack([segment, -segment])
+    dist = (ends - plane.pos) @ normal - capsule.size[0]
+    pos = ends - normal * (capsule.size[0] + dist[:, None] / 2)
+    return dist, pos, jnp.stack([frame, frame])
+
+
+@collider(ncon=4)
+def plane_box(plane: GeomInfo, box: GeomInfo) -> Collision:
+    """Collides a plane with the lower corner of each of a box's four diagonals."""
+    corners = np.array([[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1]]) * box.size @ box.mat.T
+    up = corners @ plane.mat[:, 2] > 0
+    return _collide_points(plane, box.pos + jnp.where(up[:, None], -corners, corners))
+
+
+@collider(ncon=3)
+def plane_cylinder(plane: GeomInfo, cylinder: GeomInfo) -> Collision:
+    """Collides a plane with a cylinder's lowest point and with two more.
+
+    They are two of the lower rim, a third around, or the lowest of the other rim if it is lower: C
+    has that one in addition, which matters only where all four are within the margin.
+    """
+    normal, axis = plane.mat[:, 2], cylinder.mat[:, 2]
+    axis = jnp.where(jnp.dot(normal, axis) > 0, -axis, axis)
+    down, length = _direction(axis * jnp.dot(axis, normal) - normal)
+    down = cylinder.size[0] * jnp.where(length == 0, cylinder.mat[:, 0], down)
+    across, half = jnp.cross(down, axis) * np.sqrt(0.75), cylinder.size[1] * axis
+    rim = half + jnp.stack([down, across - down / 2, -across - down / 2])
+    other = down - half
+    lower = jnp.dot(other, normal) < jnp.dot(rim[1], normal)
+    return _collide_points(plane, cylinder.pos + rim.at[1].set(jnp.where(lower, other, rim[1])))
+
+
+@collider(ncon=1)
+def sphere_capsule(sphere: GeomInfo, capsule: GeomInfo) -> Collision:
+    """Collides a sphere with the point of a capsule's axis that is closest to it."""
+    axis, half = capsule.mat[:, 2], capsule.size[1]
+    along = jnp.clip(jnp.dot(axis, sphere.pos - capsule.pos), -half, half)
+    return _collide_spheres(sphere, sphere.pos, capsule, capsule.pos + along * axis)
+
+
+@collider(ncon=1)
+def capsule_capsule(first: GeomInfo, second: GeomInfo) -> Collision:
+    """Collides two capsules where their axes are closest."""
+    point1, point2 = _closest_points(first, second)
+    return _collide_spheres(first, point1, second, point2)
+
+
+def _closest_points(first: GeomInfo, second: GeomInfo) -> tuple[jax.Array, jax.Array]:
+    """Returns the point of each capsule's axis that is closest to the other's axis, [3] each."""
+    axis1, axis2 = first.mat[:, 2] * first.size[1], second.mat[:, 2] * second.size[1]
+    offset = first.pos - second.pos
+
+    def meet(along1: float | jax.Array) -> jax.Array:
+        """Returns a place on the first axis and the closest on the second, in half lengths."""
+        free = jnp.dot(offset + along1 * axis1, axis2) / jnp.dot(axis2, axis2)
+        along2 = jnp.clip(free, -1, 1)
+        back = jnp.dot(along2 * axis2 - offset, axis1) / jnp.dot(axis1, axis1)
+        return jnp.stack([jnp.where(free == along2, along1, jnp.clip(back, -1, 1)), along2])
+
+    normal = jnp.cross(axis1, axis2)
+    square, scale = jnp.dot(normal, normal), jnp.dot(axis1, axis1) * jnp.dot(axis2, axis2)
+    parallel = square <= _PARALLEL * scale
+    crossing = jnp.dot(normal, jnp.cross(axis2, offset)) / jnp.where(parallel, scale, square)
+    middle = (meet(-1.0) + meet(1.0)) / 2
+    along1, along2 = jnp.where(parallel, middle, meet(jnp.clip(crossing, -1, 1)))
+    return first.pos + along1 * axis1, second.pos + along2 * axis2
+
+
+@collider(ncon=1)
+def sphere_cylinder(sphere: GeomInfo, cylinder: GeomInfo) -> Collision:
+    """Collides a sphere with the point of a cylinder's surface that is closest to its center."""
+    dist, outward = _from_cylinder((sphere.pos - cylinder.pos) @ cylinder.mat, cylinder.size)
+    normal = -cylinder.mat @ outward
+    dist = dist - sphere.size[0]
+    return dist, sphere.pos + normal * (sphere.size[0] + dist / 2), make_frame(normal)
+
+
+@collider(ncon=2)
+def capsule_cylinder(capsule: GeomInfo, cylinder: GeomInfo) -> Collision:
+    """Collides a capsule with a cylinder where its axis is closest, or with a cap it lies on.
+
+    On a cap are two contacts, at the ends of the part of the capsule's lowest line that is above a
+    polygon of 16 corners in the cap's rim, as in C; elsewhere one, and one that is far.
+    """
+    radius, half = capsule.size[0], capsule.size[1]
+    center = (capsule.pos - cylinder.pos) @ cylinder.mat
+    axis = capsule.mat[:, 2] @ cylinder.mat
+    along = _closest_along(center, axis, half, cylinder.size)
+    dist, outward = _from_cylinder(center + along * axis, cylinder.size)
+    one = center + along * axis - outward * (radius + (dist - radius) / 2)
+
+    cap = jnp.where(outward[2] > 0, 1.0, -1.0) * jnp.eye(3, dtype=axis.dtype)[2]
+    line = center - radius * (outward - axis * jnp.dot(axis, outward))
+    start, end = _above_polygon(line, axis, half, cylinder.size[0])
+    lies = (jnp.abs(axis[2]) < _LIES) & (outward[2] != 0) & (start < end)
+    ends = line + jnp.stack([start, end])[:, None] * axis
+    depths = ends @ cap - cylinder.size[1]
+
+    dist = jnp.where(lies, depths, jnp.stack([dist - radius, jnp.full((), _FAR, axis.dtype)]))
+    pos = jnp.where(lies, ends - depths[:, None] / 2 * cap, one)
+    frame = make_frame(-cylinder.mat @ jnp.where(lies, cap, outward))
+    return dist, cylinder.pos + pos @ cylinder.mat.T, jnp.stack([frame, frame])
+
+
+def _from_cylinder(point: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns the signed distance [] from a cylinder's surface, and its gradient, of length 1 [3].
+
+    Args:
+      point: [3] in the cylinder's frame.
+      size: the cylinder's radius and half length.
+    """
+    upright = jnp.eye(3, dtype=point.dtype)[2]
+    outward, away = _direction(point * (1 - upright))
+    side, cap = away - size[0], jnp.abs(point[2]) - size[1]
+    outside = jnp.maximum(jnp.stack([side, cap]), 0)
+    length = jnp.sqrt(jnp.dot(outside, outside))
+    nearest = jnp.stack([side >= cap, side < cap]).astype(point.dtype)
+    share = jnp.where(length > 0, outside / jnp.where(length > 0, length, 1), nearest)
+    gradient = share[0] * outward + share[1] * jnp.where(point[2] > 0, upright, -upright)
+    return jnp.where(length > 0, length, jnp.maximum(side, cap)), gradient
+
+
+def _closest_along(
+    center: jax.Array, axis: jax.Array, half: jax.Array, size: jax.Array
+) -> jax.Array:
+    """Returns where a line segment is closest to a cylinder, from its center [].
+
+    The distance is convex along the segment: its slope is bisected, for the first and the last of
+    the places that are equally close, of which this is the middle.
+    """
+    level = jnp.asarray([-1, 1], axis.dtype) * jnp.sqrt(jnp.finfo(axis.dtype).eps)
+
+    def halve(ends: jax.Array, _: None) -> tuple[jax.Array, None]:
+        middle = (ends[0] + ends[1]) / 2
+        points = center + middle[:, None] * axis
+        slope = jax.vmap(lambda point: _from_cylinder(point, size)[1])(points) @ axis
+        ahead = slope < level
+        return jnp.where(ahead, jnp.stack([middle, ends[1]]), jnp.stack([ends[0], middle])), None
+
+    ends = half * jnp.asarray([[-1, -1], [1, 1]], axis.dtype)
+    steps = jnp.finfo(axis.dtype).nmant
+    ends = by_engine(
+        lambda *_: lax.scan(halve, ends, None, steps)[0],
+        lambda *_: lax.scan(halve, ends, None, steps, unroll=steps)[0],  # see `fenced`
+    )
+    return jnp.mean(ends)
+
+
+def _above_polygon(
+    center: jax.Array, axis: jax.Array, half: jax.Array, radius: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Returns from where to where a segment is above a regular polygon, in reverse if nowhere.
+
+    The polygon has 16 corners on a circle about the origin, one of them on the x axis.
+    """
+    angle = (np.arange(16) + 0.5) * np.pi / 8
+    sides = jnp.asarray(np.stack([np.cos(angle), np.sin(angle)], 1), axis.dtype)
+    room = radius * np.cos(np.pi / 16) - sides @ center[:2]
+    speed = sides @ axis[:2]
+    meets = room / jnp.where(speed == 0, 1, speed)
+    start = jnp.max(jnp.where(speed < 0, meets, -half))
+    end = jnp.min(jnp.where(speed > 0, meets, half))
+    out = jnp.any((speed == 0) & (room < 0))
+    return jnp.where(out, half, jnp.maximum(start, -half)), jnp.minimum(end, half)
+
+
+def _collide_points(plane: GeomInfo, points: jax.Array) -> Collision:
+    """Collides points [N, 3] with a plane."""
+    normal = plane.mat[:, 2]
+    dist = (points - plane.pos) @ normal
+    frame = jnp.broadcast_to(make_frame(normal), (len(points), 3, 3))
+    return dist, points - normal * dist[:, None] / 2, frame
+
+
+def _collide_spheres(
+    first: GeomInfo, point1: jax.Array, second: GeomInfo, point2: jax.Array
+) -> Collision:
+    """Collides spheres of two geoms' radii about given points."""
+    normal, length = _direction(point2 - point1)
+    across, _ = _direction(jnp.cross(first.mat[:, 2], second.mat[:, 2]))
+    normal = jnp.where(length == 0, across, normal)
+    dist = length - (first.size[0] + second.size[0])
+    return dist, point1 + normal * (first.size[0] + dist / 2), make_frame(normal)
+
+
+def _direction(vector: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns a unit vector and the length; the x axis and 0 for what counts as no length."""
+    square = jnp.dot(vector, vector)
+    short = square < _MIN_LENGTH[square.dtype.name] ** 2
+    length = jnp.sqrt(jnp.where(short, 1, square))
+    unit = jnp.where(short, jnp.eye(3, dtype=vector.dtype)[0], vector / length)
+    return unit, jnp.where(short, 0, length)
+
+
+_OURS = {
+    (mjx.GeomType.PLANE, mjx.GeomType.CAPSULE): plane_capsule,
+    (mjx.GeomType.PLANE, mjx.GeomType.CYLINDER): plane_cylinder,
+    (mjx.GeomType.PLANE, mjx.GeomType.BOX): plane_box,
+    (mjx.GeomType.SPHERE, mjx.GeomType.CAPSULE): sphere_capsule,
+    (mjx.GeomType.CAPSULE, mjx.GeomType.CAPSULE): capsule_capsule,
+    (mjx.GeomType.SPHERE, mjx.GeomType.CYLINDER): sphere_cylinder,
+    (mjx.GeomType.CAPSULE, mjx.GeomType.CYLINDER): capsule_cylinder,
+}
+#: Pairs of types of geoms, in MJX's order, whose contacts MJX finds at other places than C.
+UNLIKE_C = {
+    (mjx.GeomType.SPHERE, mjx.GeomType.ELLIPSOID),
+    (mjx.GeomType.CAPSULE, mjx.GeomType.ELLIPSOID),
+    (mjx.GeomType.ELLIPSOID, mjx.GeomType.ELLIPSOID),
+    (mjx.GeomType.ELLIPSOID, mjx.GeomType.CYLINDER),
+    (mjx.GeomType.CYLINDER, mjx.GeomType.CYLINDER),
+}
+_ROUND_GEOMS = {mjx.GeomType.SPHERE, mjx.GeomType.CAPSULE, mjx.GeomType.CYLINDER}
+_collision = collision_with(
+    lambda table: {
+        pair: one_by_one(function) if set(pair) <= _ROUND_GEOMS else function
+        for pair, function in (table | _OURS).items()
+    }
+)
+
+
+def fwd_position(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Computes what depends on position: ``mjx.fwd_position`` with this module's contacts."""
+    data = mjx.kinematics(model, data)
+    data = mjx.com_pos(model, data)
+    data = mjx.camlight(model, data)
+    data = mjx.tendon(model, data)
+    data = mjx.crb(model, data)
+    data = inertia.tendon_armature(model, data)
+    data = mjx.factor_m(model, data)
+    data = _collision(model, data)
+    data = make_constraint(model, data)
+    return mjx.transmission(model, data)

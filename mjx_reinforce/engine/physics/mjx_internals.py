@@ -1,0 +1,177 @@
+"""Everything that this package uses of MJX and that MJX does not publish.
+
+No other file imports MJX's private modules or reads the private part of its data. Three kinds:
+
+- Names that MJX keeps private, here without underscore: the imports, and ``advance``.
+- Fields of ``mjx.Data`` that only MJX's JAX implementation has: ``jax_fields``, ``with_fields``,
+  ``rows_of``, ``with_rows``, ``with_contact``, ``Simulation``, ``num_contacts``.
+- Functions of MJX in which a name is given another meaning: ``collision_with`` and ``fenced``. They
+  would do nothing, silently, if MJX stopped looking that name up; ``check_lookup`` raises then.
+
+``tests/engine/physics/test_mjx_internals.py`` holds a hash of each MJX function that this package
+replaces or whose source it depends on: a new MJX fails there first.
+
+``fenced`` makes a change for XLA's CPU backend that changes no answer. A body's pose needs every
+entry of its parent's. XLA fuses the whole chain and then computes the parent's entries again for
+each entry of the child: time grows exponentially with depth. Pusher's arm, ten bodies deep, takes a
+second a state; with a fence between levels, 50 us.
+"""
+
+import functools
+import inspect
+import threading
+import types
+from collections.abc import Callable, Iterator
+from typing import Any, cast
+
+import jax
+import numpy as np
+from mujoco import mjx
+from mujoco.mjx._src import (
+    collision_driver,
+    collision_primitive,
+    collision_types,
+    forward,
+    math,
+    scan,
+    smooth,
+    support,
+)
+
+advance = forward._advance
+collider = collision_primitive.collider
+geom_pairs = collision_driver.geom_pairs
+make_frame, quat_mul_axis = math.make_frame, math.quat_mul_axis
+muscle_gain = support.muscle_gain
+solve_m = smooth.solve_m
+Collision = collision_types.Collision
+GeomInfo = collision_types.GeomInfo
+
+#: What this package was tested with; ``pyproject.toml`` bounds the versions at the same.
+TESTED_VERSIONS = {"mujoco": "4.0", "mujoco-mjx": "3.17"}
+
+
+# ---------------------------------------------------------------------------- names in MJX's code
+
+
+def check_lookup(function: Callable[..., Any], name: str) -> None:
+    """Checks that a function of MJX looks up a global name, so that it sees another meaning.
+
+    Raises:
+      RuntimeError: it does not.
+    """
+    if name not in inspect.unwrap(function).__code__.co_names:
+        tested = " and ".join(f"{package}=={it}.*" for package, it in TESTED_VERSIONS.items())
+        raise RuntimeError(
+            f"{function.__module__}.{function.__name__} does not look up {name}, which "
+            f"mjx_reinforce replaces: install {tested}, or adapt {__name__}"
+        )
+
+
+check_lookup(mjx.collision, "_COLLISION_FUNC")
+check_lookup(scan.flat, "_nvmap")
+check_lookup(scan.body_tree, "_nvmap")
+
+
+def geom_groups(model: mjx.Model) -> Iterator[tuple[int, int, int]]:
+    """Yields for each pair of geoms that may meet the dimension of their contacts, and the two."""
+    for key, pairs in collision_driver._geom_groups(model).items():
+        for first, second, _ in pairs:
+            yield int(key.condim), first, second
+
+
+_Colliders = dict[tuple[mjx.GeomType, mjx.GeomType], Callable[..., Any]]
+
+
+def collision_with(
+    functions: Callable[[_Colliders], _Colliders],
+) -> Callable[[mjx.Model, mjx.Data], mjx.Data]:
+    """Returns a copy of ``mjx.collision`` with other collision functions.
+
+    MJX finds its collision functions in one table, a global of a module; the copy has a table of
+    its own, and MJX stays as it is.
+
+    Args:
+      functions: from MJX's table, a ``collider`` for each pair of types of geoms in MJX's order,
+        makes the copy's.
+    """
+    plain = inspect.unwrap(mjx.collision)
+    table = functions(dict(collision_driver._COLLISION_FUNC))
+    return types.FunctionType(plain.__code__, {**plain.__globals__, "_COLLISION_FUNC": table})
+
+
+_lock = threading.RLock()
+_level = scan._nvmap
+
+
+def fenced(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """Returns a function that traces MJX with a fence between levels."""
+
+    @functools.wraps(fn)
+    def traced(*args: Any) -> Any:
+        with _lock:
+            before, scan._nvmap = scan._nvmap, _fenced_level
+            try:
+                return fn(*args)
+            finally:
+                scan._nvmap = before
+
+    return traced
+
+
+def _fenced_level(*inputs: Any) -> Any:
+    """Computes one level of bodies, and lets nothing of it be computed again."""
+    return jax.lax.optimization_barrier(_level(*inputs))
+
+
+# --------------------------------------------------------------------------- fields of MJX's data
+
+
+def jax_fields(data: mjx.Data) -> mjx.DataJAX:
+    """Returns the fields that only MJX's JAX implementation has, by MuJoCo's names."""
+    return cast(mjx.DataJAX, data._impl)
+
+
+def with_fields(data: mjx.Data, **fields: Any) -> mjx.Data:
+    """Returns the data with other values of fields that only MJX's JAX implementation has."""
+    return cast(mjx.Data, data.tree_replace({f"_impl.{name}": x for name, x in fields.items()}))
+
+
+_ROW_FIELDS = ("efc_J", "efc_D", "efc_aref", "efc_pos", "efc_margin", "efc_frictionloss")
+
+
+def rows_of(data: mjx.Data) -> list[jax.Array]:
+    """Returns what ``mjx.make_constraint`` makes."""
+    return [getattr(jax_fields(data), name) for name in _ROW_FIELDS]
+
+
+def with_rows(data: mjx.Data, rows: list[jax.Array]) -> mjx.Data:
+    """Returns the data with rows as ``rows_of`` lists them."""
+    return with_fields(data, **dict(zip(_ROW_FIELDS, rows, strict=True)))
+
+
+def with_contact(data: mjx.Data, contact: Any, dim: np.ndarray) -> mjx.Data:
+    """Returns the data with other contacts, of these dimensions."""
+    return with_fields(data, contact=contact.replace(dim=dim))
+
+
+class Simulation:
+    """A read-only view of an ``mjx.Data``: every field of mjData under MuJoCo's own name.
+
+    MJX keeps some fields (``cinert``, ``cfrc_ext``, ``efc_force``, ...) in a part of its own;
+    here all stand side by side, as in C.
+    """
+
+    def __init__(self, data: Any):
+        self._data = data
+
+    def __getattr__(self, name: str) -> Any:
+        for part in (self._data, self._data._impl):
+            if hasattr(part, name):
+                return getattr(part, name)
+        raise AttributeError(f"mjx.Data has no field {name!r}; see mjData in MuJoCo's reference")
+
+
+def num_contacts(data: mjx.Data) -> int:
+    """Returns the most contacts that a model can have at once, from its ``mjx.Data``."""
+    return int(jax_fields(data).ncon)

@@ -1,0 +1,290 @@
+r"""The constraint solver of C MuJoCo, with a line search that ends when it is exact.
+
+The acceleration a minimises (MuJoCo's documentation, "Computation", "Constraint model")
+
+    (a - a_s)' M (a - a_s) / 2 + \sum_i D_i min(0, J_i a - r_i)^2 / 2
+
+with the unconstrained acceleration a_s, the inertia matrix M and, of the constraint rows, the
+Jacobian J, reference r and constraint mass D (``efc_J``, ``efc_aref``, ``efc_D``); rows of equality
+constraints count on both sides of zero. The cost is convex, and quadratic for a given set of active
+rows, so that Newton's method, with an exact line search, ends after finitely many steps: when a
+full step leaves the set as it is, that step led to the minimum.
+
+MJX's own solver does the same steps, but its line search evaluates three points in each of
+``ls_iterations`` (50) rounds, which ``jax.vmap`` carries out for every episode until the slowest is
+done; here a round evaluates one point, and the search ends when no row changes any more.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from mujoco import mjx
+
+from mjx_reinforce.engine.physics import contact_rows
+from mjx_reinforce.engine.physics.inertia import solve
+from mjx_reinforce.engine.physics.mjx_internals import jax_fields
+
+# mjMINVAL: what C takes for zero.
+_MIN_TRACE = 1e-15
+
+
+class Rows(NamedTuple):
+    """Constraint rows.
+
+    jacobian: J
+    reference: [rows] r
+    constraint_mass: [rows] D
+    equality: [rows] whether a row is active on both sides
+    """
+
+    jacobian: Any
+    reference: jax.Array
+    constraint_mass: jax.Array
+    equality: jax.Array
+
+    def active(self, residual: jax.Array) -> jax.Array:
+        """Returns which rows push at residuals [rows]; a NaN pushes, so that it is not lost."""
+        return self.equality | ~(residual >= 0)
+
+    def force(self, residual: jax.Array) -> jax.Array:
+        """Returns the rows' forces, [rows]."""
+        return jnp.where(self.active(residual), -self.constraint_mass * residual, 0)
+
+
+class _Point(NamedTuple):
+    """An acceleration and what the next step needs of it.
+
+    qacc: [nv]
+    imbalance: [nv] M a minus the unconstrained forces
+    residual: [rows] J a - r
+    """
+
+    qacc: jax.Array
+    imbalance: jax.Array
+    residual: jax.Array
+
+
+class Search(NamedTuple):
+    """The state of Newton's method.
+
+    point: the acceleration reached, and what the next step needs of it
+    steps: [] how many were made
+    settled: [] whether the last step led to the minimum
+    """
+
+    point: Any
+    steps: jax.Array
+    settled: jax.Array
+
+
+class Line(NamedTuple):
+    """The cost's derivative along a step, for the rows that push at one length of it.
+
+    at_zero: [] where the line is at length zero
+    rate: [] how fast it increases
+    """
+
+    at_zero: jax.Array
+    rate: jax.Array
+
+
+class _LineSearch(NamedTuple):
+    """The state of a line search along one step, by lengths of the step.
+
+    low: [] the largest length known to have a negative derivative
+    high: [] the smallest length known to have a positive derivative
+    root: [] where the last line is zero
+    line: of the last length evaluated
+    evaluated: [] how many lengths were
+    settled: [] whether the last two lengths evaluated have the same line
+    """
+
+    low: jax.Array
+    high: jax.Array
+    root: jax.Array
+    line: Line
+    evaluated: jax.Array
+    settled: jax.Array
+
+
+def supports(model: mjx.Model, data: mjx.Data) -> bool:
+    """Returns whether ``solve_newton`` fits: Newton, pyramidal cones, no friction loss."""
+    return (
+        model.opt.solver == mjx.SolverType.NEWTON
+        and model.opt.cone == mjx.ConeType.PYRAMIDAL
+        and not jax_fields(data).nf
+    )
+
+
+def solve_newton(
+    model: mjx.Model, data: mjx.Data, may_unroll: bool = True
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Finds the acceleration under constraints, from the start that costs less.
+
+    The starts are the unconstrained acceleration and, unless the model disables it, the warm start.
+
+    Args:
+      model: a model that ``supports`` accepts; ``iterations`` and ``ls_iterations`` bound the
+        loops.
+      data: with its constraint rows made.
+      may_unroll: whether loops over contacts may be written out, see ``scalar.by_engine``.
+
+    Returns:
+      The acceleration [nv], the constraints' joint forces [nv] and the rows' forces [rows].
+    """
+    fields = jax_fields(data)
+    equality = jnp.arange(fields.efc_D.shape[0]) < fields.ne
+    num_others = fields.ne + fields.nf + fields.nl
+    coupled = contact_rows.couplings(model)
+    division = contact_rows.blocks(num_others, fields.contact.dim, coupled, may_unroll)
+    # A NaN counts as touching, so that it gets to the acceleration.
+    touching = ~(fields.contact.dist - fields.contact.includemargin >= 0)
+    jacobian = contact_rows.with_bases(division, fields.efc_J, touching)
+    rows = Rows(jacobian, fields.efc_aref, fields.efc_D, equality)
+    inertia = mjx.full_m(model, data)
+
+    def along(direction: jax.Array) -> jax.Array:
+        return contact_rows.along(division, rows.jacobian, direction, touching)
+
+    smallest = smallest_decrement(model, inertia)
+
+    def improve(search: Search) -> Search:
+        before = search.point
+        direction, decrement = _newton_direction(division, inertia, rows, before)
+        change, change_of_imbalance = along(direction), inertia @ direction
+        without_rows = Line(
+            jnp.dot(direction, before.imbalance), jnp.dot(direction, change_of_imbalance)
+        )
+        length = _line_search(rows, before, change, without_rows, model.opt.ls_iterations)
+        after = _Point(
+            before.qacc + length * direction,
+            before.imbalance + length * change_of_imbalance,
+            before.residual + length * change,
+        )
+        same = jnp.all(rows.active(after.residual) == rows.active(before.residual))
+        settled = same | (decrement < smallest)
+        return Search(after, search.steps + 1, settled)
+
+    def begin(qacc: jax.Array) -> _Point:
+        imbalance = inertia @ qacc - data.qfrc_smooth
+        return _Point(qacc, imbalance, along(qacc) - rows.reference)
+
+    start = begin(data.qacc_smooth)
+    if not model.opt.disableflags & mjx.DisableBit.WARMSTART:
+        warm = begin(data.qacc_warmstart)
+        better = _cost(rows, data, warm) < _cost(rows, data, start)
+        start = jax.tree.map(lambda w, s: jnp.where(better, w, s), warm, start)
+    end = descend(model, improve, start)
+    force = rows.force(end.residual)
+    joint_force = contact_rows.weighted(division, inertia, rows.jacobian, force, force)[1]
+    return end.qacc, joint_force, force
+
+
+def descend(model: mjx.Model, improve: Callable[[Search], Search], start: Any) -> Any:
+    """Returns the point that Newton's method reaches from a start."""
+    return jax.lax.while_loop(
+        lambda search: ~search.settled & (search.steps < model.opt.iterations),
+        improve,
+        Search(start, jnp.int32(0), jnp.array(False)),
+    ).point
+
+
+def smallest_decrement(model: mjx.Model, inertia: jax.Array) -> jax.Array:
+    """Returns by how much a step must lower the cost for another one to be made, []."""
+    return model.opt.tolerance * jnp.maximum(jnp.trace(inertia), _MIN_TRACE)
+
+
+def _cost(rows: Rows, data: mjx.Data, point: _Point) -> jax.Array:
+    """Returns what is minimised, []."""
+    active = rows.active(point.residual)
+    penalty = jnp.sum(jnp.where(active, rows.constraint_mass * point.residual**2, 0))
+    return (jnp.dot(point.imbalance, point.qacc - data.qacc_smooth) + penalty) / 2
+
+
+def _newton_direction(
+    division: contact_rows.Blocks, inertia: jax.Array, rows: Rows, point: _Point
+) -> tuple[jax.Array, jax.Array]:
+    """Returns Newton's step [nv].
+
+    Also returns by how much the cost would fall [] along the whole step if no row changed. That is
+    half the product of gradient and step, up to the sign; it keeps its digits near the minimum,
+    where the difference of two costs would be rounding error.
+    """
+    active_mass = jnp.where(rows.active(point.residual), rows.constraint_mass, 0)
+    hessian, joint_force = contact_rows.weighted(
+        division, inertia, rows.jacobian, active_mass, rows.force(point.residual)
+    )
+    gradient = point.imbalance - joint_force
+    direction = -solve(hessian, gradient)
+    return direction, -jnp.dot(gradient, direction) / 2
+
+
+def _line_search(
+    rows: Rows, point: _Point, change: jax.Array, without_rows: Line, max_rounds: int
+) -> jax.Array:
+    """Returns the length of the step that leads to the least cost, [].
+
+    Args:
+      rows: the constraints.
+      point: where the step starts.
+      change: [rows] how the residual changes along it.
+      without_rows: the derivative along it that has no rows.
+      max_rounds: lengths to evaluate at most.
+    """
+    row_slope = rows.constraint_mass * change * point.residual
+    row_curvature = rows.constraint_mass * change**2
+
+    def line(active: jax.Array) -> Line:
+        return Line(
+            without_rows.at_zero + jnp.sum(jnp.where(active, row_slope, 0)),
+            without_rows.rate + jnp.sum(jnp.where(active, row_curvature, 0)),
+        )
+
+    def at(length: jax.Array) -> Line:
+        return line(rows.equality | (point.residual + length * change < 0))
+
+    return root(line(rows.active(point.residual)), at, max_rounds)
+
+
+def root(first: Line, at: Callable[[jax.Array], Line], max_rounds: int) -> jax.Array:
+    """Returns the length of a step at which the cost's derivative along it is zero, [].
+
+    The derivative increases, and is linear as long as no row changes. Each round evaluates the root
+    of the linear piece found last; where rounding puts that root outside of the interval known to
+    hold the derivative's, the round evaluates the interval's middle. At the minimum the direction
+    is zero, and the length is 1.
+
+    Args:
+      first: the line where the step starts.
+      at: length [] -> the line there.
+      max_rounds: lengths to evaluate at most.
+    """
+
+    def evaluate(last: _LineSearch) -> _LineSearch:
+        inside = (last.low < last.root) & (last.root < last.high)
+        length = jnp.where(inside, last.root, (last.low + last.high) / 2)
+        found = at(length)
+        root = jnp.where(found.rate > 0, -found.at_zero / found.rate, length)
+        moved = [(new < old) | (new > old) for new, old in zip(found, last.line, strict=True)]
+        return _LineSearch(
+            low=jnp.where(root > length, length, last.low),
+            high=jnp.where(root > length, last.high, length),
+            root=root,
+            line=found,
+            evaluated=last.evaluated + 1,
+            settled=~jnp.any(jnp.stack(moved)),  # a NaN does not move
+        )
+
+    start = _LineSearch(
+        low=jnp.zeros_like(first.rate),
+        high=jnp.full_like(first.rate, jnp.inf),
+        root=jnp.ones_like(first.rate),  # a full Newton step
+        line=first,
+        evaluated=jnp.int32(0),
+        settled=jnp.array(False),
+    )
+    return jax.lax.while_loop(
+        lambda last: ~last.settled & (last.evaluated < max_rounds), evaluate, start
+    ).root

@@ -1,0 +1,153 @@
+"""Whether machine code can play here, what its numbers depend on, and how long it takes to make.
+
+The time is found before anything is written. It goes with the number of scalar operations, and
+with the square of the entries of an observation, all of which LLVM holds at once. On two quiet
+cores a training had started after 48 s with Humanoid-v5 (1.9 million operations), 54 s with
+dm_control's humanoid (2.7 million), and after 19 s and 116 s with observations of 500 and 2,000
+entries, of which some 8 s are XLA's.
+"""
+
+import hashlib
+import platform as host
+import sys
+from typing import Any
+
+import jax
+
+from mjx_reinforce.engine.base import Environment, null_action
+from mjx_reinforce.engine.cpu import machine
+from mjx_reinforce.engine.gpu import seam as gpu
+from mjx_reinforce.engine.scalar import TooLarge, jaxprs, size
+
+#: LLVM 20, which llvmlite 0.45 has, is the first that reads the IR as it is written here.
+_OLDEST = (20,)
+#: JAX's generator whose noise it draws; ``rollout`` looks at the keys that it gets.
+GENERATOR = "threefry2x32"
+#: Settings of JAX that change numbers.
+_SETTINGS = (
+    *("jax_default_matmul_precision", "jax_default_prng_impl", "jax_threefry_partitionable"),
+    *("jax_random_seed_offset", "jax_disable_most_optimizations", "jax_numpy_dtype_promotion"),
+)
+#: Nobody waits longer for what ``jax.vmap`` compiles in less.
+MAX_SECONDS = 80
+#: People are told beforehand of what takes longer.
+_WORTH_SAYING = 15
+_PER_SCALAR, _PER_PAIR_OF_ENTRIES = 2e-5, 2.7e-5
+
+
+def platform() -> str:
+    """Returns what JAX computes on: "cpu", "gpu" or another name."""
+    return jax.default_backend()
+
+
+def made_for() -> str:
+    """Returns what machine code is made by, and for which machine; or why there is none here."""
+    if reason := unavailable():
+        return reason
+    import llvmlite
+
+    made_for = gpu.kernel_dependencies() if platform() == "gpu" else machine.this_machine()
+    return f"{llvmlite.__version__} {made_for}"
+
+
+def known_by() -> dict[str, Any]:
+    """Returns what decides how this machine rounds, in a few words each.
+
+    XLA compiles for the CPU that is here; native code may be made for an older one.
+    """
+    if reason := unavailable():
+        code = reason
+    elif platform() == "gpu":
+        code = made_for()
+    else:
+        code = f"llvmlite {made_for().partition(' ')[0]}, {_short(machine.this_machine())}"
+    cpu = _host_cpu() if platform() == "cpu" else None  # a GPU's numbers do not depend on it
+    settings = {name: str(jax.config.values[name]) for name in _SETTINGS}
+    return {"cpu": cpu, "machine_code": code, "jax_settings": settings}
+
+
+def _host_cpu() -> str:
+    """Returns the CPU that XLA compiles for."""
+    try:
+        return _short(machine.this_machine(machine.HOST))
+    except (ImportError, OSError):  # no llvmlite
+        return host.processor() or host.machine()
+
+
+def _short(made_for: machine.Machine) -> str:
+    """Returns a machine's name, with a hash of its many features."""
+    digest = hashlib.sha256(made_for.features.encode()).hexdigest()[:8]
+    return f"{made_for.cpu}, {made_for.lanes} lanes, features {digest}"
+
+
+def unavailable() -> str | None:
+    """Returns why JAX cannot run machine code of ours here, None if it can."""
+    if platform() not in ("cpu", "gpu"):
+        return f"it runs on CPUs and NVIDIA GPUs, this is JAX on a {platform()}"
+    if sys.platform == "win32":
+        return "it was never tried on Windows"
+    if sys.maxsize < 2**32 or sys.byteorder != "little":
+        return "it needs a little-endian machine of 64 bits"
+    try:
+        import llvmlite.binding
+    except (ImportError, OSError) as error:
+        return f"llvmlite cannot be loaded: {error}; pip install 'llvmlite>=0.45'"
+    if llvmlite.binding.llvm_version_info < _OLDEST:
+        return f"llvmlite {llvmlite.__version__} is too old; pip install 'llvmlite>=0.45'"
+    generator = jax.config.values["jax_default_prng_impl"]
+    if generator != GENERATOR:
+        return f"it draws noise as {GENERATOR} does, not as {generator}"
+    if not jax.config.values["jax_threefry_partitionable"]:
+        return "it draws noise as JAX does with jax_threefry_partitionable"
+    return gpu.kernels_unavailable() if platform() == "gpu" else None
+
+
+def check_seconds(env: Environment, traced: jaxprs.Program, entries: int) -> None:
+    """Raises TooLarge for a step that takes too long to write and compile.
+
+    Args:
+      env: whose step it is.
+      traced: the step.
+      entries: of an observation.
+    """
+    expected = _seconds(traced, entries)
+    if expected > MAX_SECONDS:
+        model = getattr(env, "mj_model", None)
+        wide = _PER_PAIR_OF_ENTRIES * entries**2 > expected / 2
+        cause = f"of an observation of {entries:,} entries" if wide else "of its size"
+        remedy = ""
+        if not wide and model is not None:
+            from mjx_reinforce.engine.physics.pairs import (
+                advice,  # imports MJX, which takes a second
+            )
+
+            remedy = f"; {advice(model)}"
+        raise TooLarge(
+            f"writing it out and compiling it would take about {expected:.0f} s, more than "
+            f"{MAX_SECONDS} s, because {cause}{remedy}"
+        )
+
+
+def seconds(env: Environment) -> float:
+    """Returns about how long writing and compiling an environment's step takes (s)."""
+    start = jax.eval_shape(env.reset, jax.random.key(0))
+    traced, _ = jaxprs.trace(env.step, start, null_action(env))
+    return _seconds(traced, start.obs.shape[0])
+
+
+def _seconds(traced: jaxprs.Program, entries: int) -> float:
+    return _PER_SCALAR * size.num_scalars(traced) + _PER_PAIR_OF_ENTRIES * entries**2
+
+
+def announcement(env: Environment) -> str | None:
+    """Returns what people must know who wait for machine code; None where nobody waits long."""
+    if unavailable():
+        return None
+    expected, contacts = seconds(env), getattr(env, "num_contacts", 0)
+    if not _WORTH_SAYING < expected <= MAX_SECONDS:
+        return None
+    cause = f", with up to {contacts} contacts," if contacts else ""
+    return (
+        f"writing the simulation out{cause} and compiling it takes about {expected:.0f} s, or much "
+        "less if this was compiled before"
+    )

@@ -1,0 +1,223 @@
+"""The choice of an engine: the same episodes, from the same noise, at different speeds.
+
+``vmap`` maps the environment's step with ``jax.vmap``. ``native`` writes out the whole step, policy
+included, in scalars (``engine.scalar``), and repeats it in machine code for a CPU or in a kernel
+for an NVIDIA GPU (``engine.cpu``, ``engine.gpu``). Trajectories agree up to rounding.
+``choose`` is for episodes, ``map_function`` for a function of one environment over many.
+"""
+
+import functools
+import time
+import warnings
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeAlias, TypeVar
+
+import jax
+
+from mjx_reinforce.engine import scalar
+from mjx_reinforce.engine.base import Environment, PyTree, Trajectory, observation_size
+from mjx_reinforce.engine.play import available, native, program
+from mjx_reinforce.engine.play.mapping import machine_map
+from mjx_reinforce.engine.play.rollouts import rollout
+from mjx_reinforce.engine.scalar import jaxprs, size
+from mjx_reinforce.engine.scalar.vmap import MAX_OPERATIONS
+from mjx_reinforce.learning.distributions.distribution import Distribution
+from mjx_reinforce.registry import check_name
+
+#: This JAX multiplies wrongly on CPUs, in some functions that are mapped over some 16,000 rows and
+#: more, and says nothing (JAX's issue 39103). Where we looked, with 33,000 to 65,000 rows, no
+#: step, policy or gradient of ours was wrong.
+_WRONG_JAX = "0.10.2"
+#: Scalar operations of a step, before any fold away: between those of the tasks without contacts
+#: and those of the others. On an H100, XLA's kernels of InvertedPendulum played 1.6 times as many
+#: env steps a second as ours, and those of HalfCheetah were still compiling after a minute.
+_SMALL = 100_000
+
+#: What an engine plays with: a rollout, or a function of many environments.
+Made = TypeVar("Made")
+Rollout: TypeAlias = Callable[..., Trajectory]
+MappedFunction: TypeAlias = Callable[..., Any]
+
+
+class ActingPolicy(NamedTuple):
+    """The policy that all episodes share.
+
+    act: (actor, observation [..., O]) -> outputs [..., K] of the distribution
+    actor: what ``act`` reads, or its shapes
+    distribution: the family whose parameters the outputs are
+    """
+
+    act: Callable[[Any, jax.Array], jax.Array]
+    actor: Any
+    distribution: Distribution
+
+
+class Engine(NamedTuple):
+    """A way to play episodes.
+
+    name: "vmap" or "native"
+    why: the reason it was chosen, for people
+    rollout: as ``mjx_reinforce.engine.play.rollouts.rollout``
+    seconds: wall time that making it took, most of it for machine code
+    """
+
+    name: str
+    why: str
+    rollout: Rollout
+    seconds: float = 0.0
+
+    def __repr__(self) -> str:
+        return f"Engine({self.name})"
+
+
+ENGINES = ("auto", "vmap", "native")
+
+
+def choose(
+    name: str, env: Environment, player: ActingPolicy | None = None, horizon: int | None = None
+) -> Engine:
+    """Returns an engine by name; "auto" is the fastest that supports the environment.
+
+    Args:
+      name: one of ``ENGINES``.
+      env: what is played.
+      player: who plays it; None where every episode has parameters of its own, which
+      machine code cannot hold.
+      horizon: T, the time limit in steps, for machine code.
+
+    Raises:
+      ValueError: the name is unknown, or the engine does not support the environment.
+    """
+    began = time.perf_counter()
+
+    def in_machine_code() -> Rollout | str:
+        if player is None or horizon is None:
+            return "every episode has a policy of its own"
+        play = _from_any_key if name == "auto" else native.rollout
+        return native.unsupported(env, *player, horizon) or play
+
+    return Engine(*pick(name, in_machine_code, rollout), time.perf_counter() - began)
+
+
+def pick(
+    name: str, in_machine_code: Callable[[], Made | str], by_vmap: Made
+) -> tuple[str, str, Made]:
+    """Returns an engine's name, the reason it was chosen, and what it made.
+
+    Args:
+      name: one of ``ENGINES``.
+      in_machine_code: returns what plays, or why machine code cannot.
+      by_vmap: what plays with ``vmap``.
+
+    Raises:
+      ValueError: the name is unknown, or the engine cannot play this.
+    """
+    check_name("engine", name, dict.fromkeys(ENGINES))
+    why = "chosen by name"
+    if name != "vmap":
+        made = in_machine_code()
+        if not isinstance(made, str):
+            device = "CPU" if jax.default_backend() == "cpu" else "GPU"
+            return "native", f"machine code for this {device}" if name == "auto" else why, made
+        if name == "native":
+            raise ValueError(f"the native engine cannot play this: {made}; choose auto")
+        why = f"machine code cannot play this: {made}"
+    if (jax.default_backend(), jax.__version__) == ("cpu", _WRONG_JAX):
+        warnings.warn(
+            f"JAX {_WRONG_JAX} computes some products of many rows wrongly on CPUs, and the engine "
+            "is vmap, which leaves all to it; with Python 3.12 or newer take a newer JAX "
+            "(docs/troubleshooting.md)",
+            stacklevel=2,
+        )
+    return "vmap", why, by_vmap
+
+
+def _from_any_key(*given: Any, **options: Any) -> Trajectory:
+    """Plays in machine code, or as ``vmap`` where that cannot draw the noise of the key.
+
+    Args:
+      *given: the environment, the policy, the actor, the distribution and the key.
+      **options: see ``rollouts.rollout``.
+    """
+    against = native.against_key(given[4])
+    if against:
+        warnings.warn(f"machine code cannot play this: {against}; vmap plays it", stacklevel=2)
+    return (rollout if against else native.rollout)(*given, **options)
+
+
+class MapEngine(NamedTuple):
+    """A way to map a function.
+
+    name: "vmap" or "native"; "fused" where XLA has the function written out in scalars
+    why: the reason it was chosen, for people
+    call: the function of a batch, whose first axis of every array is N
+    seconds: wall time that making it took, most of it for machine code
+    """
+
+    name: str
+    why: str
+    call: MappedFunction
+    seconds: float = 0.0
+
+    def __repr__(self) -> str:
+        return f"MapEngine({self.name})"
+
+
+def map_function(
+    name: str, env: Environment, function: Callable[..., Any], *examples: PyTree
+) -> MapEngine:
+    """Returns a function of one environment mapped over many.
+
+    Args:
+      name: one of ``choice.ENGINES``; "auto" is the fastest that supports the function.
+      env: the environment.
+      function: of its state, and of what else there is; it draws from no typed key that is given.
+      *examples: the function's arguments, or their shapes.
+
+    Raises:
+      ValueError: the name is unknown, or the engine does not support the function.
+    """
+    began = time.perf_counter()
+    made = _in_scalars(function, *examples) if name == "auto" else None
+    if made is None:
+        in_machine_code = functools.partial(machine_code, env, function, *examples)
+        made = pick(name, in_machine_code, jax.vmap(function))
+    return MapEngine(*made, time.perf_counter() - began)
+
+
+def _in_scalars(
+    function: Callable[..., Any], *examples: PyTree
+) -> tuple[str, str, MappedFunction] | None:
+    """Returns a function that is small enough for XLA's kernels on a GPU, written out for them."""
+    if (
+        available.platform() != "gpu"
+        or size.num_scalars(jaxprs.trace(function, *examples)[0]) >= _SMALL
+    ):
+        return None
+    # On a GPU a real branch makes the host wait for its predicate: both sides are computed.
+    mapped = scalar.vmap(function, branch_cost=MAX_OPERATIONS)
+    batch = jax.tree.map(lambda x: jax.ShapeDtypeStruct((1, *x.shape), x.dtype), examples)
+    try:
+        written = mapped.write(*batch)
+    except Exception:  # whatever it is, another engine may play this
+        return None
+    if sum(written.operations.values()) > MAX_OPERATIONS:
+        return None
+    return "fused", "on a GPU XLA's kernels are the fastest for so small a step", mapped
+
+
+def machine_code(
+    env: Environment, function: Callable[..., Any], *examples: PyTree
+) -> MappedFunction | str:
+    """Returns the function of many environments in machine code, or why that is not possible.
+
+    Arguments are those of ``map_function``.
+    """
+    if against := available.unavailable():
+        return against
+    check = functools.partial(available.check_seconds, env, entries=observation_size(env))
+    name = f"{getattr(function, '__name__', 'a function')} of {program.name_of(env)}"
+    try:
+        return machine_map(function, *examples, check=check, name=name)
+    except Exception as error:  # whatever it is, another engine may play this
+        return program.refusal(error)

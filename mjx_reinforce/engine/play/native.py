@@ -1,0 +1,126 @@
+"""Complete episodes in machine code: the whole rollout is one call.
+
+``rollout`` is ``rollouts.rollout`` for CPUs and NVIDIA GPUs. Start states are drawn by the same
+calls as everywhere, noise from the same keys, so the same key gives the same episodes, up to
+rounding.
+"""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from mjx_reinforce.engine.base import Environment, PyTree, Trajectory
+from mjx_reinforce.engine.cpu import machine
+from mjx_reinforce.engine.cpu import seam as cpu
+from mjx_reinforce.engine.gpu import seam as gpu
+from mjx_reinforce.engine.play import available, episode
+from mjx_reinforce.engine.play.native_step import plays, stored
+from mjx_reinforce.engine.play.program import NativeProgram, build_program, refusal
+from mjx_reinforce.engine.scalar import TooLarge, UnsupportedPrimitive
+from mjx_reinforce.learning.distributions.distribution import Distribution
+
+_REMEDY = f'make keys with jax.random.key(seed, impl="{available.GENERATOR}"), or choose auto'
+
+
+def rollout(
+    env: Environment,
+    act: episode.Act,
+    actor: PyTree,
+    distribution: Distribution,
+    key: jax.Array,
+    *,
+    num_episodes: int,
+    horizon: int,
+    deterministic: bool | jax.Array = False,
+    active: bool | jax.Array = True,
+    limit: int | jax.Array | None = None,
+    threads: int = 0,
+) -> Trajectory:
+    """Plays N episodes from fresh resets; arguments and result are those of ``rollouts.rollout``.
+
+    Vmapped over seeds it remains one call, in which no lane waits for another: an episode that is
+    over makes room for the next, of whatever seed. One that is not played takes no lane.
+
+    At most ``threads`` threads play; 0 stands for all that XLA has.
+
+    Raises:
+      ValueError: machine code cannot play this; see ``unsupported``.
+    """
+    steps = horizon if limit is None else limit
+    flags = {"deterministic": deterministic, "active": active, "limit": steps}
+    episode.check_shapes((), (num_episodes,), **flags)
+    episode.check_shapes((), threads=threads)
+    if against := against_key(key):
+        raise ValueError(f"the native engine cannot play this: {against}; {_REMEDY}")
+    try:
+        program = build_program(env, act, actor, distribution, episode.chunk_length(horizon))
+    except (TooLarge, UnsupportedPrimitive) as error:
+        raise ValueError(f"the native engine cannot play this: {error}") from error
+    begin = functools.partial(episode.begin, env)
+    state, keys = jax.vmap(begin)(episode.episode_keys(key, num_episodes))
+    given = (
+        jnp.broadcast_to(plays(active, deterministic, jnp.minimum(steps, horizon)), num_episodes),
+        jax.random.key_data(keys),
+        *(x.reshape(-1) for x in jax.tree.leaves(actor) if x.size),
+        *(stored(x).reshape(num_episodes, -1) for x in jax.tree.leaves(state) if x.size),
+    )
+    if isinstance(program.code, machine.Code):
+        results = _results(program, horizon, num_episodes)
+        played = cpu.call(program.code, results, given[0], jnp.int32(threads), *given[1:])
+    else:
+        played = _episodes_before_numbers(gpu.launch(program.code, program.record, horizon, *given))
+    observation, action, reward, length, broken, simulated = played
+    return Trajectory(
+        observation=observation,
+        action=action.reshape(horizon, num_episodes, *program.record[1].shape),
+        reward=reward,
+        mask=jnp.arange(horizon)[:, None] < length,
+        nonfinite=broken != 0,
+        simulated=simulated,
+    )
+
+
+def against_key(key: jax.Array) -> str | None:
+    """Returns why machine code cannot play from a key, or None: its noise is threefry2x32's."""
+    implementation = str(jax.random.key_impl(key))
+    if implementation == available.GENERATOR:
+        return None
+    return f"it draws noise as {available.GENERATOR} does, and the key is of {implementation}"
+
+
+def _episodes_before_numbers(results: Sequence[jax.Array]) -> Sequence[jax.Array]:
+    """Returns a kernel's results with the records' axes in the order that a CPU writes them in."""
+    observation, action, reward = (jnp.swapaxes(x, 1, 2) for x in results[:3])
+    return observation, action, reward[..., 0], *results[3:]
+
+
+def unsupported(
+    env: Environment, act: episode.Act, actor: PyTree, distribution: Distribution, horizon: int
+) -> str | None:
+    """Returns why machine code cannot play this here, or None; it is compiled if it can."""
+    if reason := available.unavailable():
+        return reason
+    try:
+        build_program(env, act, actor, distribution, episode.chunk_length(horizon))
+    except Exception as error:  # whatever it is, another engine may play this
+        return refusal(error)
+    return None
+
+
+def _results(program: NativeProgram, horizon: int, num_episodes: int) -> list[jax.ShapeDtypeStruct]:
+    """Returns the shapes of what a call returns; see ``handler.handler_text``."""
+    shape = jax.ShapeDtypeStruct
+    observation, action, reward = program.record
+    size = int(np.prod(action.shape, dtype=int))
+    flags = shape((num_episodes,), jnp.int32)
+    return [
+        shape((horizon, num_episodes, *observation.shape), observation.dtype),
+        shape((horizon, num_episodes, size), action.dtype),
+        shape((horizon, num_episodes), reward.dtype),
+        flags,
+        flags,
+        shape((), jnp.int32),
+    ]

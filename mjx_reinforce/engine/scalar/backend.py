@@ -1,0 +1,96 @@
+"""What all backends share: the walk through a schedule."""
+
+import abc
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Generic, TypeVar
+
+from mjx_reinforce.engine.scalar.nodes import Node, Scalar, is_constant
+from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
+
+#: What a backend makes of a scalar: a lane, the name of a variable, ...
+Value = TypeVar("Value")
+
+
+class Backend(abc.ABC, Generic[Value]):
+    """Makes something of a scalar graph, step by step.
+
+    An *environment* has the value of each node that is known so far. What a loop's body or a
+    branch computes is known only inside, so it is run in an environment of its own (``inside``).
+
+    OPERATIONS: what the backend makes of each operation, by name, with an entry for every
+      name of ``ops.FACTS``; None for a backend without a table of its own.
+    """
+
+    OPERATIONS: ClassVar[Mapping[str, Any] | None] = None
+
+    @abc.abstractmethod
+    def constant(self, number: Any) -> Value:
+        """Returns what a NumPy scalar becomes."""
+
+    @abc.abstractmethod
+    def leaf(self, node: Node) -> Value:
+        """Returns what an input becomes, or an element of a captured array.
+
+        It is called when the value is first needed.
+        """
+
+    @abc.abstractmethod
+    def node(self, node: Node, operands: list[Value]) -> Value:
+        """Returns what the operation of a node becomes."""
+
+    @abc.abstractmethod
+    def gate(self, gate: LiveGate, values: dict[Node, Value]) -> Sequence[Value]:
+        """Returns a value for each of the gate's outs."""
+
+    @abc.abstractmethod
+    def loop(
+        self, loop: LiveLoop, values: dict[Node, Value]
+    ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
+        """Returns the final value of each carry, and each record's value in each iteration."""
+
+    def result(self, outputs: list[list[Value]]) -> Any:
+        """Returns what the caller gets: here the value of each element of each output."""
+        return outputs
+
+    def compile(self, schedule: Schedule, outputs: list[list[Scalar]]) -> Any:
+        """Runs a whole program; returns its ``result``."""
+        values: dict[Node, Value] = {}
+        self.run(schedule, values)
+        return self.result([[self.value(x, values) for x in leaf] for leaf in outputs])
+
+    def run(self, schedule: Schedule, values: dict[Node, Value]) -> None:
+        """Adds to the values what the steps of a schedule compute."""
+        for step in schedule:
+            if isinstance(step, LiveLoop):
+                carries, records = self.loop(step, values)
+                values.update(zip((carry.out for carry in step.carries), carries, strict=True))
+                for record, kept in zip(step.records, records, strict=True):
+                    values.update(zip(record.outs, kept, strict=True))
+            elif isinstance(step, LiveGate):
+                values.update(
+                    zip((out.leaf for out in step.outs), self.gate(step, values), strict=True)
+                )
+            else:
+                values[step] = self.node(step, [self.value(arg, values) for arg in step.args])
+
+    def inside(
+        self, body: Schedule, values: dict[Node, Value], known: Mapping[Node, Value] | None = None
+    ) -> dict[Node, Value]:
+        """Runs the body of a loop or a gate; returns the values at its end.
+
+        Args:
+          body: its steps.
+          values: the values known around it, left as they are.
+          known: the values of the leaves that the body starts from.
+        """
+        inner = {**values, **(known or {})}
+        self.run(body, inner)
+        return inner
+
+    def value(self, scalar: Scalar, values: dict[Node, Value]) -> Value:
+        """Returns a scalar's value, reading leaves when they are first needed."""
+        if is_constant(scalar):
+            return self.constant(scalar)
+        if scalar not in values:
+            values[scalar] = self.leaf(scalar)
+        return values[scalar]

@@ -1,0 +1,197 @@
+"""The scalar graph: a program as elementwise operations on scalars.
+
+``nodes`` has the parts; here they are made. Equal nodes are one object, so common subexpressions
+are shared. A node that needs nothing of a loop's body is placed before the loop. Nothing is moved
+out of a branch, because then it would run also where the branch is skipped.
+"""
+
+from collections.abc import Hashable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from mjx_reinforce.engine.scalar import arrays, jaxprs, ops
+from mjx_reinforce.engine.scalar.nodes import BOOL, Captured, Node, Scalar, Scope, identity
+from mjx_reinforce.engine.scalar.passes import simplify
+from mjx_reinforce.engine.scalar.size import MAX_SCALARS, TooLarge
+
+
+class Limits(NamedTuple):
+    """Up to which length a scan is written out.
+
+    Constants fold iteration by iteration in a scan that is written out, and a loop is shorter. A
+    scan whose own ``unroll`` is its whole length is always written out, as JAX does.
+
+    scans: of any scan.
+    unrollable: of one for which ``by_engine`` says that it may be, instead of the former.
+    """
+
+    scans: int = 4
+    unrollable: int = 4
+
+
+#: ``size`` foresees what is written; where it errs, writing ends here.
+_MOST = 3 * MAX_SCALARS
+
+
+class Graph:
+    """Makes nodes, folding constants and sharing equal ones.
+
+    branch_cost: a branch of more scalar operations than this is skipped where no element of
+      the batch needs it.
+    limits: up to which length scans are written out.
+    may_unroll: whether ``limits.unrollable`` is that of a scan that is evaluated now.
+    path: the equations that are being evaluated, from the outermost one, by their ids.
+    learned: what was found out on a path. The body of a loop is evaluated again and again, each
+      time with less assumed of what never changes, and what was found out inside still holds.
+    captured: the arrays that the program closes over and whose values are not known yet, by id.
+    certain: predicates of the branches and loops around the present scope. Its code runs only
+      if each of them is true for at least one element of the batch.
+    """
+
+    def __init__(self, branch_cost: int, limits: Limits):
+        self.branch_cost = branch_cost
+        self.limits = limits
+        self.may_unroll = False
+        self.path: tuple[int, ...] = ()
+        self.learned: dict[Hashable, Any] = {}
+        self._evaluated: dict[int, Any] = {}  # kept, so that no id is given twice
+        self.certain: set[Node] = set()
+        self._scopes = [Scope(depth=0, floor=0)]
+        self._count = self._applied = 0
+        self.captured: dict[int, tuple[Captured, np.ndarray]] = {}
+
+    @property
+    def scope(self) -> Scope:
+        """The innermost scope."""
+        return self._scopes[-1]
+
+    @contextmanager
+    def evaluating(self, eqn: jaxprs.Equation) -> Iterator[None]:
+        """Lengthens the path by an equation."""
+        self._evaluated[id(eqn)] = eqn
+        before, self.path = self.path, (*self.path, id(eqn))
+        try:
+            yield
+        finally:
+            self.path = before
+
+    def source(self, eqn: jaxprs.Equation) -> str:
+        """Returns the user's line that an equation is from, or else the innermost call around it.
+
+        Inside of a jitted function of JAX no line is the user's.
+        """
+        around = [eqn, *(self._evaluated[number] for number in reversed(self.path))]
+        return next(filter(None, map(jaxprs.source, around)), "an unknown line")
+
+    def loop_body(self) -> AbstractContextManager[Scope]:
+        """Opens the scope of a loop's body; nodes that do not depend on it are placed outside."""
+        return self._open(self.scope.floor)
+
+    def branch(self) -> AbstractContextManager[Scope]:
+        """Opens the scope of a branch; everything made in it stays in it."""
+        return self._open(self.scope.depth + 1)
+
+    @contextmanager
+    def _open(self, floor: int) -> Iterator[Scope]:
+        scope = Scope(depth=self.scope.depth + 1, floor=floor)
+        self._scopes.append(scope)
+        try:
+            yield scope
+        finally:
+            self._scopes.pop()
+            self.scope.cost += scope.cost
+            self.scope.has_loop |= scope.has_loop
+
+    @contextmanager
+    def again(self, scope: Scope) -> Iterator[None]:
+        """Opens the scope of a branch once more; it is still the innermost's child."""
+        before = scope.cost
+        self._scopes.append(scope)
+        try:
+            yield
+        finally:
+            self._scopes.pop()
+            self.scope.cost += scope.cost - before
+
+    @contextmanager
+    def assuming(self, predicate: Scalar) -> Iterator[None]:
+        """Assumes in a block that a predicate is true for at least one element of the batch."""
+        before = set(self.certain)
+        if isinstance(predicate, Node):
+            self.certain.add(predicate)
+        try:
+            yield
+        finally:
+            self.certain = before
+
+    def leaf(
+        self, dtype: DTypeLike, varying: bool, owner: Any = None, position: Any = None
+    ) -> Node:
+        """Makes a node that nothing computes: an input, a loop's carry, a gate's result."""
+        index = self.number()
+        return Node(np.dtype(dtype), varying, self.scope, index, owner=owner, position=position)
+
+    def constant(self, value: Any) -> np.ndarray:
+        """Returns a captured array: its value, or for a tracer one leaf for each element."""
+        known = jaxprs.as_numpy(value)
+        if known is not None:
+            return known
+        if id(value) not in self.captured:
+            source = Captured(value)
+            leaves = [
+                Node(value.dtype, False, self._scopes[0], self.number(), owner=source, position=i)
+                for i in range(value.size)
+            ]
+            self.captured[id(value)] = (source, arrays.pack(leaves, value.shape, value.dtype))
+        return self.captured[id(value)][1]
+
+    def number(self) -> int:
+        """Returns the next index."""
+        self._count += 1
+        return self._count
+
+    def call(self, name: str, *args: Scalar) -> Scalar:
+        """Applies one of the named operations to scalars."""
+        predicate = ops.FACTS[name].is_predicate
+        return self.apply(ops.Op(name), args, BOOL if predicate else args[-1].dtype)
+
+    def convert(self, value: Scalar, dtype: DTypeLike) -> Scalar:
+        """Converts a scalar to another dtype."""
+        dtype = np.dtype(dtype)
+        return self.apply(ops.conversion(dtype), (value,), dtype)
+
+    def select(self, predicate: Scalar, on_true: Scalar, on_false: Scalar) -> Scalar:
+        """Returns on_true where the predicate holds, else on_false."""
+        return self.apply(ops.SELECT, (predicate, on_false, on_true), on_true.dtype)
+
+    def apply(self, op: ops.Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar:
+        """Applies an operation: a constant, an existing node, a simpler one or a new one."""
+        nodes = [arg for arg in args if isinstance(arg, Node)]
+        if not nodes:
+            return simplify.fold(op, args, dtype)
+        self._applied += 1
+        if self._applied > _MOST:
+            raise TooLarge(f"written out it is more than {_MOST:,} scalar operations")
+        simpler = simplify.simplify(self, op, args, dtype)
+        return self._share(op, args, nodes, dtype) if simpler is None else simpler
+
+    def _share(
+        self, op: ops.Op, args: tuple[Scalar, ...], nodes: list[Node], dtype: np.dtype
+    ) -> Node:
+        keys = [arg if isinstance(arg, Node) else identity(arg) for arg in args]
+        key = (op, frozenset(keys) if ops.FACTS[op.name].commutes else tuple(keys))
+        least = max([node.scope.depth for node in nodes])  # no node of these is further outside
+        depth = max(self.scope.floor, least)
+        for k in range(depth, least - 1, -1):
+            known = self._scopes[k].known.get(key)
+            if known is not None:
+                return known
+        scope = self._scopes[depth]
+        varying = any(node.varying for node in nodes)
+        node = Node(dtype, varying, scope, self.number(), op=op, args=args)
+        scope.known[key] = node
+        scope.cost += 1
+        return node

@@ -1,0 +1,317 @@
+"""Reading jaxprs: the one file that knows what differs between JAX releases.
+
+Written against JAX 0.10.2, 0.11.2 and 0.12.0. jaxprs are not a frozen interface; when a release
+moves something, it moves here.
+"""
+
+import functools
+import hashlib
+import re
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.core
+import numpy as np
+from jax import lax
+from jax.extend import core
+from jax.interpreters import partial_eval
+
+from mjx_reinforce.engine.base import PyTree, is_key
+from mjx_reinforce.engine.scalar.ops import FACTS
+
+# The parameter under which a call-like primitive keeps the jaxpr that it calls.
+_CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
+
+
+class UnsupportedPrimitive(NotImplementedError):  # noqa: N818 (reads as what it is)
+    """A JAX primitive that cannot be written out, or not for a backend."""
+
+
+def no_keys() -> UnsupportedPrimitive:
+    """Returns the error for typed PRNG keys."""
+    return UnsupportedPrimitive(
+        "typed PRNG keys (jax.random.key) cannot be written out; draw the random numbers outside "
+        "and pass them, or use jax.vmap for this function"
+    )
+
+
+def no_rule(name: str, source: str) -> UnsupportedPrimitive:
+    """Returns the error for a primitive without a rule.
+
+    Args:
+      name: the primitive's.
+      source: the line of the user's code that it came from.
+    """
+    return UnsupportedPrimitive(
+        f"there is no rule for the primitive {name!r}, used at {source}; use jax.vmap for this "
+        "function, or add a rule in mjx_reinforce/engine/scalar/rules"
+    )
+
+
+class Program(NamedTuple):
+    """A jaxpr with the values of its constant variables.
+
+    jaxpr: the equations.
+    consts: one array for each constant variable; may be tracers.
+    """
+
+    jaxpr: core.Jaxpr
+    consts: list[Any]
+
+
+class Shape(Protocol):
+    """What is known of an operand or a result; JAX's own type for it declares neither."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+class Atom(Protocol):
+    """An operand or a result of an equation."""
+
+    aval: Shape
+
+
+class Equation(Protocol):
+    """An equation of a jaxpr, a ``jax.extend.core.JaxprEqn``, by what is read of it.
+
+    primitive: what is done.
+    params: how.
+    invars: the operands.
+    outvars: the results.
+    source_info: where it was written.
+    """
+
+    primitive: core.Primitive
+    params: dict[str, Any]
+    invars: list[Atom]
+    outvars: list[Atom]
+    source_info: Any
+
+
+def trace(fn: Callable, *examples: PyTree) -> tuple[Program, Any]:
+    """Returns fn's program for one example and the pytree of its output shapes."""
+    closed, out_shape = jax.make_jaxpr(fn, return_shape=True)(*examples)
+    return program(closed), out_shape
+
+
+def fingerprint(traced: Program) -> str:
+    """Returns a hash of a program and of the constants in it, the same in every process."""
+    digest = hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", str(traced.jaxpr)).encode())
+    for const in [*traced.consts, *_inner_constants(traced.jaxpr)]:
+        value = as_numpy(const)
+        if value is None:
+            digest.update(b"unknown")
+        else:
+            digest.update(f"{value.dtype}{value.shape}".encode() + value.tobytes())
+    return digest.hexdigest()
+
+
+def _inner_constants(jaxpr: core.Jaxpr) -> list[Any]:
+    """Returns the constants of the programs that a program calls."""
+    found = []
+    for eqn in jaxpr.eqns:
+        for inner in subprograms(eqn.params.values()):
+            found += [*inner.consts, *_inner_constants(inner.jaxpr)]
+    return found
+
+
+def subprograms(params: Iterable[Any]) -> list[Program]:
+    """Returns the programs among the parameters of an equation."""
+    found = []
+    for value in params:
+        if isinstance(value, (tuple, list)):
+            found += subprograms(value)
+        elif isinstance(value, core.Jaxpr) or hasattr(type(value), "jaxpr"):  # open, or closed
+            found.append(program(value))
+    return found
+
+
+def program(closed: Any) -> Program:
+    """Returns the program of a closed or an open jaxpr."""
+    return Program(getattr(closed, "jaxpr", closed), list(getattr(closed, "consts", ())))
+
+
+def callee(eqn: Equation) -> Program | None:
+    """Returns the program that a call-like equation calls, or None."""
+    for name in _CALLEE_PARAMS:
+        if name in eqn.params:
+            return program(eqn.params[name])
+    if eqn.primitive.name == "call_hi_primitive":  # JAX 0.12: composite primitives
+        avals = [variable.aval for variable in eqn.invars]
+        return program(jax.make_jaxpr(eqn.params["_prim"].expand)(*avals))
+    if eqn.primitive.name in _OF_KEYS:  # a key is an array of its words
+        return program(jax.make_jaxpr(_OF_KEYS[eqn.primitive.name](eqn))(*map(words, eqn.invars)))
+    return None
+
+
+def words(atom: Atom) -> jax.ShapeDtypeStruct:
+    """Returns the shape of an operand, of which a key is an array of words."""
+    shape, dtype = atom.aval.shape, atom.aval.dtype
+    if is_key(atom.aval):
+        shape, dtype = (*shape, *_implementation(atom).key_shape), np.dtype(np.uint32)
+    return jax.ShapeDtypeStruct(shape, dtype)
+
+
+def on_words(eqn: Equation) -> Equation:
+    """Returns an equation that moves keys as one that moves a word of each."""
+
+    def word(atom: Atom) -> Any:
+        if not is_key(atom.aval):
+            return atom
+        return SimpleNamespace(aval=jax.ShapeDtypeStruct(atom.aval.shape, np.dtype(np.uint32)))
+
+    one: Any = SimpleNamespace(
+        primitive=eqn.primitive,
+        params=eqn.params,
+        invars=list(map(word, eqn.invars)),
+        outvars=list(map(word, eqn.outvars)),
+        source_info=eqn.source_info,
+    )
+    return one
+
+
+def _implementation(key: Atom) -> Any:
+    """Returns the generator of a key: functions of words."""
+    dtype: Any = key.aval.dtype
+    return dtype._impl
+
+
+#: What is done to keys, as functions of their words: equation -> function.
+_OF_KEYS: dict[str, Callable[[Equation], Callable[..., Any]]] = {
+    "random_bits": lambda eqn: (
+        lambda key: _implementation(eqn.invars[0]).random_bits(
+            key, eqn.params["bit_width"], eqn.params["shape"]
+        )
+    ),
+    "random_split": lambda eqn: (
+        lambda key: _implementation(eqn.invars[0]).split(key, eqn.params["shape"])
+    ),
+    "random_fold_in": lambda eqn: _implementation(eqn.invars[0]).fold_in,
+}
+
+
+def default_platform(eqn: Any) -> int | None:
+    """Returns which branch of ``platform_dependent`` is the default; None if it has no default.
+
+    The default is taken because what is written out does not depend on where it will run, and the
+    default alone is right on every platform.
+    """
+    platforms = list(eqn.params["platforms"])
+    return platforms.index(None) if None in platforms else None
+
+
+def depends(closed: Any, given: Iterable[bool]) -> list[bool]:
+    """Returns which results of a program may depend on some of its arguments.
+
+    Args:
+      closed: a closed jaxpr.
+      given: for each argument, whether it is one of them.
+    """
+    jaxpr = program(closed).jaxpr
+    found = {variable for variable, is_given in zip(jaxpr.invars, given, strict=True) if is_given}
+    for eqn in jaxpr.eqns:
+        if any(not is_literal(atom) and atom in found for atom in eqn.invars):
+            found.update(eqn.outvars)
+    return [not is_literal(out) and out in found for out in jaxpr.outvars]
+
+
+def scan_parts(eqn: Equation) -> tuple[int, int]:
+    """Returns how the operands and results of a ``scan`` equation divide.
+
+    Returns:
+      How many leading operands are the same in every iteration; and how many operands after them,
+      and leading results, are the carry. The rest are xs and ys.
+    """
+    if "num_consts" in eqn.params:  # JAX 0.10
+        return eqn.params["num_consts"], eqn.params["num_carry"]
+    consts, carry, _ = eqn.params["ft_in"].update(list(eqn.invars)).unpack()
+    return len(list(consts)), len(list(carry))
+
+
+def is_literal(atom: Any) -> bool:
+    """Returns whether an operand is a literal, which is not hashable in every release."""
+    return isinstance(atom, core.Literal)
+
+
+def literal_value(atom: Any) -> np.ndarray:
+    """Returns a literal's value in its own dtype."""
+    return np.asarray(atom.val, atom.aval.dtype)
+
+
+def as_numpy(value: object) -> np.ndarray | None:
+    """Returns a constant's value, or None for a tracer, which has none yet."""
+    if isinstance(value, jax.core.Tracer):
+        return None
+    if is_key(jax.typeof(value)):
+        raise no_keys()
+    return np.asarray(value)
+
+
+def prune(fn: Callable) -> Callable:
+    """Returns fn without the operations that its results do not need; call it under ``jax.jit``.
+
+    Simulators compute much that one task does not read, and ``jax.vmap`` and the compiler pay for
+    all of it.
+    """
+
+    @functools.wraps(fn)
+    def pruned(*args: PyTree) -> Any:
+        leaves, in_tree = jax.tree.flatten(args)
+        (jaxpr, consts), out_shape = trace(lambda *flat: fn(*in_tree.unflatten(flat)), *leaves)
+        outs = [True] * len(jaxpr.outvars)
+        jaxpr, _ = partial_eval.dce_jaxpr(jaxpr, outs, instantiate=True)
+        results = jax.core.eval_jaxpr(jaxpr, consts, *leaves)
+        return jax.tree.structure(out_shape).unflatten(results)
+
+    return pruned
+
+
+def live_equations(jaxpr: core.Jaxpr, used: Iterable[bool]) -> list[Any]:
+    """Returns the equations that the used outputs need, in order.
+
+    Equations are pure here: one with an effect (a print, a callback) is dropped like any other
+    when nothing reads it.
+    """
+    needed = {
+        out for out, use in zip(jaxpr.outvars, used, strict=True) if use and not is_literal(out)
+    }
+    kept = []
+    for eqn in reversed(jaxpr.eqns):
+        if any(out in needed for out in eqn.outvars):
+            kept.append((eqn, [out in needed for out in eqn.outvars]))
+            needed.update(atom for atom in eqn.invars if not is_literal(atom))
+    return kept[::-1]
+
+
+def source(eqn: Equation) -> str:
+    """Returns 'file:line (function)' of the user's code that an equation came from.
+
+    It is "" where the equation came from inside of a jitted function of JAX, or from here.
+    """
+    try:
+        from jax._src import source_info_util  # no public equivalent
+
+        line = source_info_util.summarize(eqn.source_info)
+    except (ImportError, AttributeError):
+        return ""
+    return "" if line.startswith(str(Path(__file__).parent)) else line
+
+
+def operation(name: str) -> Callable[..., Any]:
+    """Returns JAX's function for an operation of the scalar graph."""
+    return getattr(lax, FACTS[name].in_jax or name)
+
+
+def compute_constants(
+    function: Callable, params: dict, operands: Sequence[Any]
+) -> list[np.ndarray]:
+    """Computes an operation of JAX on constants at once; takes about 1 ms."""
+    with jax.ensure_compile_time_eval():
+        arrays = [jax.numpy.asarray(operand) for operand in operands]
+        results = function(*arrays, **params)
+        results = results if isinstance(results, (list, tuple)) else [results]
+        return [np.asarray(result) for result in results]

@@ -1,0 +1,204 @@
+"""What the results need, in the order in which it is computed.
+
+A *schedule* is a list of steps. A step is a node, a loop or a gate; the latter two have a schedule
+of their own, and keep only the values that something reads.
+"""
+
+import dataclasses
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+from mjx_reinforce.engine.scalar.nodes import Gate, Loop, Node, Scalar, Scope
+
+
+class Out(NamedTuple):
+    """One result of a gate.
+
+    leaf: the node that stands for it after the gate.
+    hot: its value at the end of the body.
+    cold: its value if the body is skipped; computed before the gate.
+    """
+
+    leaf: Node
+    hot: Scalar
+    cold: Scalar
+
+
+class Carry(NamedTuple):
+    """One value that a loop changes.
+
+    leaf: the node that stands for it in the body.
+    init: its value before the loop; zero where nothing reads that.
+    next: its value at the end of the body.
+    out: the node that stands for it after the loop.
+    """
+
+    leaf: Node
+    init: Scalar
+    next: Scalar
+    out: Node
+
+
+class Element(NamedTuple):
+    """One value that a loop reads from a list, another one in each iteration.
+
+    leaf: the node that stands for it in the body.
+    values: its value in each iteration; computed before the loop.
+    """
+
+    leaf: Node
+    values: list[Scalar]
+
+
+class Record(NamedTuple):
+    """One value that a loop keeps of each iteration.
+
+    value: its value at the end of the body.
+    outs: the nodes that stand for it after the loop, one for each iteration.
+    """
+
+    value: Scalar
+    outs: list[Node]
+
+
+@dataclasses.dataclass(frozen=True)
+class LiveGate:
+    """A branch that runs only if some lane needs it.
+
+    predicate: which lanes need the branch.
+    body: what it computes.
+    outs: its results.
+    """
+
+    predicate: Node
+    body: "Schedule"
+    outs: list[Out]
+
+
+@dataclasses.dataclass(frozen=True)
+class LiveLoop:
+    """A loop.
+
+    length: the number of iterations, or None for no limit.
+    active: the position in ``carries`` of the bool that ends the loop when no lane has it; None
+      if the loop always runs to its length.
+    body: what one iteration computes.
+    carries: what it changes.
+    elements: what it reads.
+    records: what it keeps.
+    """
+
+    length: int | None
+    active: int | None
+    body: "Schedule"
+    carries: list[Carry]
+    elements: list[Element]
+    records: list[Record]
+
+
+Schedule = list[Node | LiveGate | LiveLoop]
+
+
+def nodes(body: Schedule) -> Iterator[Node]:
+    """Yields the nodes of a schedule, also inside of its loops and gates."""
+    for step in body:
+        yield from [step] if isinstance(step, Node) else nodes(step.body)
+
+
+def schedule(root: Scope, results: Iterable[Scalar]) -> Schedule:
+    """Returns what these scalars need, directly or through loops and gates.
+
+    Args:
+      root: the scope of the whole program.
+      results: scalars of that scope.
+    """
+    needs = _Needs()
+    waiting, seen = list(results), set()
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, Node) and node not in seen:
+            seen.add(node)
+            waiting.extend(needs.note(node))
+    return needs.steps_of(root)
+
+
+class _Needs:
+    """What was found to be needed so far."""
+
+    def __init__(self) -> None:
+        self._steps: dict[Scope, set[Node | Gate | Loop]] = defaultdict(set)
+        self._outs: dict[Gate, set[int]] = defaultdict(set)
+        # For each loop the positions of what is needed, by its role.
+        self._places: dict[Loop, dict[str, set[int]]] = defaultdict(lambda: defaultdict(set))
+
+    def note(self, node: Node) -> list[Scalar]:
+        """Notes that a node is needed; returns what it needs in turn."""
+        owner = node.owner
+        if node.op is not None:
+            self._steps[node.scope].add(node)
+            return list(node.args)
+        if isinstance(owner, Gate):
+            self._steps[owner.scope].add(owner)
+            self._outs[owner].add(node.position)
+            return [owner.predicate, owner.hot[node.position], owner.cold[node.position]]
+        if isinstance(owner, Loop):
+            self._steps[owner.scope].add(owner)
+            return self._note_loop(owner, node.position)
+        return []
+
+    def _note_loop(self, loop: Loop, position: tuple) -> list[Scalar]:
+        role, i = position[:2]
+        if role == "element":
+            self._places[loop]["element"].add(i)
+            needs = list(loop.xs[i])
+        elif role == "y":
+            self._places[loop]["y"].add(i)
+            needs = [loop.ys[i]]
+        elif role == "out" and loop.length and loop.active is None:  # of an iteration that runs
+            self._places[loop]["out"].add(i)
+            needs = [loop.nexts[i]]
+        else:
+            self._places[loop]["carry"].add(i)
+            needs = [loop.inits[i], loop.nexts[i]]
+        if loop.active is not None:
+            needs.append(loop.carries[loop.active])
+        return needs
+
+    def steps_of(self, scope: Scope) -> Schedule:
+        """Returns the steps of a scope in order."""
+        steps: Schedule = []
+        for step in sorted(self._steps[scope], key=lambda step: step.index):
+            if isinstance(step, Gate):
+                steps.append(self._gate(step))
+            elif isinstance(step, Loop):
+                steps.append(self._loop(step))
+            else:
+                steps.append(step)
+        return steps
+
+    def _gate(self, gate: Gate) -> LiveGate:
+        outs = [
+            Out(leaf, gate.hot[i], gate.cold[i])
+            for i in sorted(self._outs[gate])
+            if (leaf := gate.outs[i]) is not None
+        ]
+        return LiveGate(gate.predicate, self.steps_of(gate.body), outs)
+
+    def _loop(self, loop: Loop) -> LiveLoop:
+        places = {role: sorted(found) for role, found in self._places[loop].items()}
+        read = set(places.get("carry", ()))
+        carried = sorted(read.union(places.get("out", ())))
+        carries = [
+            Carry(leaf, loop.inits[i] if i in read else leaf.dtype.type(0), loop.nexts[i], out)
+            for i in carried
+            if (leaf := loop.carries[i]) is not None and (out := loop.outs[i]) is not None
+        ]
+        elements = [
+            Element(leaf, loop.xs[j])
+            for j in places.get("element", [])
+            if (leaf := loop.elements[j]) is not None
+        ]
+        records = [Record(loop.ys[j], loop.stacked[j]) for j in places.get("y", [])]
+        active = None if loop.active is None else carried.index(loop.active)
+        return LiveLoop(loop.length, active, self.steps_of(loop.body), carries, elements, records)

@@ -1,0 +1,230 @@
+"""Rules for gather, scatter and dynamic slices.
+
+All of them read or write *windows* of an operand. Where a window starts is mostly a constant, and
+then elements are only moved; a start that depends on the lane becomes a chain of selections.
+"""
+
+import functools
+import itertools
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_reinforce.engine.scalar import arrays, jaxprs
+from mjx_reinforce.engine.scalar.graph import Graph
+from mjx_reinforce.engine.scalar.nodes import is_constant
+
+
+class Unknown(NamedTuple):
+    """A start that is not a constant.
+
+    index: the scalar that holds it.
+    stride: how far apart two starts are in the flat operand.
+    num_starts: the number of starts that keep the window inside.
+    """
+
+    index: Any
+    stride: int
+    num_starts: int
+
+
+class Window(NamedTuple):
+    """One window of a flat operand.
+
+    positions: where its elements are while the unknown starts are 0.
+    unknowns: the starts that are not constants.
+    inside: whether the constant starts keep it inside the operand.
+    """
+
+    positions: np.ndarray
+    unknowns: list[Unknown]
+    inside: bool
+
+
+def _window(shape: Sequence[int], sizes: Sequence[int], starts: Sequence[Any]) -> Window:
+    """Places a window; a constant start is moved to the nearest place inside."""
+    strides = [int(np.prod(shape[axis + 1 :], dtype=int)) for axis in range(len(shape))]
+    grids = np.meshgrid(*(np.arange(size) for size in sizes), indexing="ij", copy=False)
+    positions = np.zeros(tuple(sizes), int)
+    for grid, stride in zip(grids, strides, strict=True):
+        positions = positions + grid * stride
+    unknowns, inside = [], True
+    for start, stride, limit, size in zip(starts, strides, shape, sizes, strict=True):
+        if isinstance(start, (int, np.integer)):
+            nearest = min(max(int(start), 0), limit - size)
+            inside &= nearest == start
+            positions = positions + nearest * stride
+        else:
+            unknowns.append(Unknown(start, stride, limit - size + 1))
+    return Window(positions, unknowns, inside)
+
+
+def _read_window(
+    graph: Graph, flat: np.ndarray, positions: np.ndarray, unknowns: list
+) -> np.ndarray:
+    """Reads a window; an unknown start outside counts as the nearest inside."""
+    if not unknowns:
+        return arrays.lift(flat[positions.reshape(-1)].reshape(positions.shape))
+    (index, stride, count), *rest = unknowns
+    values = _read_window(graph, flat, positions, rest)
+    for k in range(1, count):
+        later = _read_window(graph, flat, positions + k * stride, rest)
+        reached = graph.call("ge", index, index.dtype.type(k))
+        select = functools.partial(graph.select, reached)
+        values = arrays.map_elements(select, values.shape, object, later, values)
+    return values
+
+
+def _write_window(
+    graph: Graph, flat: np.ndarray, window: Window, updates: np.ndarray, combine: Callable
+) -> None:
+    """Combines updates into a window, in place; a start outside changes nothing."""
+    for ks in itertools.product(*(range(unknown.num_starts) for unknown in window.unknowns)):
+        hit, offset = np.True_, 0
+        for k, (index, stride, _) in zip(ks, window.unknowns, strict=True):
+            hit = graph.call("and", hit, graph.call("eq", index, index.dtype.type(k)))
+            offset += k * stride
+        places = (window.positions + offset).reshape(-1)
+        for place, update in zip(places, arrays.elements(updates), strict=True):
+            flat[place] = graph.select(hit, combine(graph, flat[place], update), flat[place])
+
+
+def _starts(
+    indices: np.ndarray, rank: int, index_dims: Any, batching_dims: Any, indices_batching_dims: Any
+) -> Iterator[list[Any]]:
+    """Yields where each window starts, one entry for each axis of the operand."""
+    for place in np.ndindex(*indices.shape[:-1]):
+        start: list[Any] = [0] * rank
+        for k, axis in enumerate(index_dims):
+            start[axis] = indices[place][k]
+        for axis, source in zip(batching_dims, indices_batching_dims, strict=True):
+            start[axis] = place[source]
+        yield start
+
+
+def _outside_mode(eqn: jaxprs.Equation) -> str:
+    """Returns what happens to a window outside: 'drop' or 'clip'."""
+    return "drop" if "FILL" in str(eqn.params["mode"]) else "clip"
+
+
+def _gather_rule(
+    graph: Graph, eqn: jaxprs.Equation, operand: np.ndarray, indices: np.ndarray
+) -> list[np.ndarray]:
+    dims, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
+    aval, flat = eqn.outvars[0].aval, operand.reshape(-1)
+    hidden = {*dims.collapsed_slice_dims, *dims.operand_batching_dims}
+    window_shape = [size for axis, size in enumerate(sizes) if axis not in hidden]
+    batching = (dims.operand_batching_dims, dims.start_indices_batching_dims)
+    windows = []
+    for start in _starts(indices, operand.ndim, dims.start_index_map, *batching):
+        window = _window(operand.shape, sizes, start)
+        values = _read_window(graph, flat, window.positions, window.unknowns)
+        if _outside_mode(eqn) == "drop":
+            values = _fill_outside(graph, eqn, values, window)
+        windows.append(values.reshape(window_shape))
+    if not windows:
+        return [arrays.zeros(aval)]
+    gathered = np.stack(windows).reshape([*indices.shape[:-1], *window_shape])
+    first = indices.ndim - 1
+    sources = range(first, first + len(window_shape))
+    gathered = np.moveaxis(gathered, list(sources), list(dims.offset_dims))
+    return [arrays.settle(gathered, aval.dtype)]
+
+
+def _fill_outside(
+    graph: Graph, eqn: jaxprs.Equation, values: np.ndarray, window: Window
+) -> np.ndarray:
+    """Replaces the values of a window that is outside by the fill value."""
+    dtype = np.dtype(eqn.outvars[0].aval.dtype)
+    inside = np.bool_(window.inside)
+    for index, _, count in window.unknowns:
+        low = graph.call("ge", index, index.dtype.type(0))
+        high = graph.call("lt", index, index.dtype.type(count))
+        inside = graph.call("and", inside, graph.call("and", low, high))
+    value = eqn.params["fill_value"]
+    fill = dtype.type(_default_fill(dtype) if value is None else value)
+    return arrays.map_elements(
+        lambda x: graph.select(inside, x, fill), values.shape, object, values
+    )
+
+
+def _default_fill(dtype: np.dtype) -> Any:
+    if np.issubdtype(dtype, np.signedinteger):
+        return np.iinfo(dtype).min
+    if np.issubdtype(dtype, np.unsignedinteger):
+        return np.iinfo(dtype).max
+    return True if dtype == np.bool_ else np.nan
+
+
+def _scatter(
+    graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray, combine: Callable
+) -> list[np.ndarray]:
+    operand, indices, updates = operands
+    dims = eqn.params["dimension_numbers"]
+    hidden = {*dims.inserted_window_dims, *dims.operand_batching_dims}
+    window_axes = list(dims.update_window_dims)
+    update_sizes = iter([updates.shape[axis] for axis in window_axes])
+    sizes = [1 if axis in hidden else next(update_sizes) for axis in range(operand.ndim)]
+    trailing = range(updates.ndim - len(window_axes), updates.ndim)
+    blocks = np.moveaxis(updates, window_axes, list(trailing))
+    blocks = blocks.reshape([math.prod(indices.shape[:-1]), math.prod(sizes)])
+    flat = arrays.lift(operand).reshape(-1).copy()
+    batching = (dims.operand_batching_dims, dims.scatter_indices_batching_dims)
+    starts = _starts(indices, operand.ndim, dims.scatter_dims_to_operand_dims, *batching)
+    for start, block in zip(starts, blocks, strict=True):
+        if _outside_mode(eqn) == "clip":
+            start = _clip(graph, start, operand.shape, sizes)
+        window = _window(operand.shape, sizes, start)
+        if window.inside:
+            _write_window(graph, flat, window, block, combine)
+    return [arrays.settle(flat.reshape(operand.shape), eqn.outvars[0].aval.dtype)]
+
+
+def _clip(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequence[int]) -> list:
+    """Moves starts to the nearest place that keeps the window inside."""
+    clipped = []
+    for start, limit, size in zip(starts, shape, sizes, strict=True):
+        if is_constant(start) or isinstance(start, int):
+            clipped.append(min(max(int(start), 0), limit - size))
+        else:
+            low, high = start.dtype.type(0), start.dtype.type(limit - size)
+            clipped.append(graph.call("min", graph.call("max", start, low), high))
+    return clipped
+
+
+def _dynamic_slice(
+    graph: Graph, eqn: jaxprs.Equation, operand: np.ndarray, *starts: np.ndarray
+) -> list[np.ndarray]:
+    aval = eqn.outvars[0].aval
+    window = _window(operand.shape, eqn.params["slice_sizes"], [s[()] for s in starts])
+    values = _read_window(graph, operand.reshape(-1), window.positions, window.unknowns)
+    return [arrays.settle(values, aval.dtype)]
+
+
+def _dynamic_update_slice(
+    graph: Graph, eqn: jaxprs.Equation, operand: np.ndarray, update: np.ndarray, *starts: np.ndarray
+) -> list[np.ndarray]:
+    clipped = _clip(graph, [s[()] for s in starts], operand.shape, update.shape)
+    flat = arrays.lift(operand).reshape(-1).copy()
+    _write_window(graph, flat, _window(operand.shape, update.shape, clipped), update, _replace)
+    return [arrays.settle(flat.reshape(operand.shape), eqn.outvars[0].aval.dtype)]
+
+
+def _replace(graph: Graph, old: Any, new: Any) -> Any:
+    return new
+
+
+def _combining(name: str) -> Callable:
+    return functools.partial(_scatter, combine=lambda graph, x, y: graph.call(name, x, y))
+
+
+RULES = {
+    "gather": _gather_rule,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "scatter": functools.partial(_scatter, combine=_replace),
+    **{f"scatter-{name}": _combining(name) for name in ("add", "sub", "mul", "min", "max")},
+    **{f"scatter_{name}": _combining(name) for name in ("add", "sub", "mul", "min", "max")},
+}

@@ -1,0 +1,162 @@
+"""Rules for ``while`` and ``scan``: loops that end when no lane needs another iteration."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.engine.scalar import arrays, jaxprs
+from mjx_reinforce.engine.scalar.graph import Graph
+from mjx_reinforce.engine.scalar.nodes import Gate, Loop, Node, Scalar, is_constant, same
+from mjx_reinforce.engine.scalar.rules import iterate
+from mjx_reinforce.engine.scalar.rules.iterate import Assumption, Iteration, varies
+
+
+def while_rule(
+    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: Any, *operands: np.ndarray
+) -> list:
+    """Makes a loop; a lane that is done keeps its values while others go on."""
+    num_cond, num_body = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
+    cond_consts, body_consts = operands[:num_cond], operands[num_cond : num_cond + num_body]
+    carry = arrays.Layout([out.aval for out in eqn.outvars])
+    cond, body = (jaxprs.program(eqn.params[name]) for name in ("cond_jaxpr", "body_jaxpr"))
+
+    def goes_on(state: list[Scalar]) -> Scalar:
+        return run(cond, [*cond_consts, *carry.pack(state)])[0][()]
+
+    def step(state: list[Scalar], _: list[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
+        active, *old = state
+        new = carry.unpack(run(body, [*body_consts, *carry.pack(old)]))
+        if varies(active):
+            new = [graph.select(active, n, o) for n, o in zip(new, old, strict=True)]
+            return [graph.call("and", active, goes_on(new)), *new], []
+        return [goes_on(new), *new], []
+
+    start = carry.unpack(operands[num_cond + num_body :])
+    active = goes_on(start)
+    if is_constant(active) and not active:
+        return carry.pack(start)
+    foreseen = None
+    if iterate.has_loops(body) or iterate.has_loops(cond):
+        kept = iterate.keeps(body, num_body, len(eqn.outvars))
+        outside, inside = _varying(cond_consts), _varying(body_consts)
+
+        def after(varying: list[bool]) -> list[bool]:
+            new = jaxprs.depends(body, [*inside, *varying[1:]])
+            new = [n or (varying[0] and not k) for n, k in zip(new, kept, strict=True)]
+            return [*jaxprs.depends(cond, [*outside, *new]), *new]
+
+        of_goes_on, *of_carry = iterate.spread(
+            after, [varies(active), *_varying(operands[num_cond + num_body :])]
+        )
+        foreseen = Assumption([False, *carry.repeat(kept)], [of_goes_on, *carry.repeat(of_carry)])
+    loop = iterate.iterate(graph, step, [active, *start], active=0, foreseen=foreseen)
+    return carry.pack(loop.results()[0][1:])
+
+
+def scan_rule(
+    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: Any, *operands: np.ndarray
+) -> list:
+    """Writes a short scan out; makes a loop of a longer one, which may end early."""
+    length, (num_consts, num_carry) = eqn.params["length"], jaxprs.scan_parts(eqn)
+    body = jaxprs.program(eqn.params["jaxpr"])
+    split = num_consts + num_carry
+    consts, init = list(operands[:num_consts]), operands[num_consts:split]
+    carry = arrays.Layout([out.aval for out in eqn.outvars[:num_carry]])
+    outs = arrays.Layout([out.aval for out in body.jaxpr.outvars[num_carry:]])
+    ins = arrays.Layout([var.aval for var in body.jaxpr.invars[split:]])
+    order = range(length)[::-1] if eqn.params["reverse"] else range(length)
+
+    def step(state: list[Scalar], row: list[Scalar]) -> tuple[list[Scalar], list[Scalar]]:
+        results = run(body, [*consts, *carry.pack(state), *ins.pack(row)])
+        return carry.unpack(results[:num_carry]), outs.unpack(results[num_carry:])
+
+    rows = [ins.unpack([x[t : t + 1] for x in operands[split:]]) for t in order]
+    limit = graph.limits.unrollable if graph.may_unroll else graph.limits.scans
+    if length <= max(limit, eqn.params["unroll"]):
+        final, table = _unroll(step, carry.unpack(init), rows)
+    else:
+        foreseen = None
+        if iterate.has_loops(body):
+            kept = iterate.keeps(body, num_consts, num_carry)
+            before, beside = _varying(consts), _varying(operands[split:])
+
+            def after(varying: list[bool]) -> list[bool]:
+                return jaxprs.depends(body, [*before, *varying, *beside])[:num_carry]
+
+            varying = iterate.spread(after, _varying(init))
+            foreseen = Assumption(carry.repeat(kept), carry.repeat(varying))
+        final, table = _as_loop(graph, step, carry.unpack(init), rows, length, foreseen)
+    table = [table[k] for k in np.argsort(order)] if length else []
+    stacked = [outs.pack(row) for row in table]
+    ys = [np.stack(arrays.together(column)) for column in zip(*stacked, strict=True)]
+    if not table:
+        ys = [arrays.zeros(out.aval) for out in eqn.outvars[num_carry:]]
+    return [*carry.pack(final), *ys]
+
+
+def _varying(operands: Sequence[np.ndarray]) -> list[bool]:
+    """Returns which arrays have elements that differ from lane to lane."""
+    return [any(map(varies, operand.flat)) for operand in operands]
+
+
+def _unroll(step: Iteration, state: list[Scalar], rows: list[list[Scalar]]) -> tuple[list, list]:
+    """Runs the iterations one by one; returns the final carry and the ys of each."""
+    table = []
+    for row in rows:
+        state, ys = step(state, row)
+        table.append(ys)
+    return state, table
+
+
+def _as_loop(
+    graph: Graph,
+    step: Iteration,
+    inits: list,
+    rows: list[list[Scalar]],
+    length: int,
+    foreseen: Assumption | None,
+) -> tuple[list, list]:
+    """Builds a scan's loop; returns the final carry and the ys of each iteration."""
+    xs = [list(column) for column in zip(*rows, strict=True)]
+    loop = iterate.iterate(graph, step, inits, length=length, xs=xs, foreseen=foreseen)
+    switch = None if xs or loop.ys else _switch(loop)
+    if switch is not None:
+        loop = iterate.iterate(graph, step, inits, length=length, active=switch, foreseen=foreseen)
+    final, columns = loop.results()
+    return final, [list(row) for row in zip(*columns, strict=True)] or [[]] * length
+
+
+def _switch(loop: Loop) -> int | None:
+    """Finds a bool carry that, once False in a lane, leaves that lane's whole carry as it is.
+
+    MJX's line search is such a scan: its body is cond(active, iterate, identity).
+    """
+    changing = [i for i, carry in enumerate(loop.carries) if carry is not None]
+    for i in changing:
+        switch = loop.carries[i]
+        if switch is None or switch.dtype != np.bool_:
+            continue
+        off = [_when_false(loop.nexts[k], switch) for k in changing]
+        kept = [np.False_ if k == i else loop.carries[k] for k in changing]
+        if all(same(value, before) for value, before in zip(off, kept, strict=True)):
+            return i
+    return None
+
+
+def _when_false(value: Scalar, switch: Node) -> Scalar:
+    """Returns what a scalar is where the switch is False, or itself where that is not known."""
+    if value is switch:
+        return np.False_
+    if not isinstance(value, Node):
+        return value
+    gate = value.owner
+    if isinstance(gate, Gate) and gate.predicate is switch:
+        return _when_false(gate.cold[value.position], switch)
+    if value.op is not None and value.op.name == "select_n" and value.args[0] is switch:
+        return _when_false(value.args[1], switch)
+    if value.op is not None and value.op.name == "and":
+        sides = [_when_false(arg, switch) for arg in value.args]
+        if any(is_constant(side) and not side for side in sides):
+            return np.False_
+    return value

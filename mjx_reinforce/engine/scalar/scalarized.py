@@ -1,0 +1,120 @@
+"""``scalarize``: a function of one example, written out in scalars."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from mjx_reinforce.engine.base import PyTree, is_key
+from mjx_reinforce.engine.checks import explain
+from mjx_reinforce.engine.scalar import arrays, evaluate, jaxprs, size
+from mjx_reinforce.engine.scalar.backend import Backend
+from mjx_reinforce.engine.scalar.graph import Graph, Limits
+from mjx_reinforce.engine.scalar.nodes import Scalar
+from mjx_reinforce.engine.scalar.passes import liveness
+
+#: Looks at every program that was written out. The tests set it to ``verify``; users leave it.
+inspect: Callable[["Scalarized"], None] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Scalarized:
+    """A function written out in scalars.
+
+    in_avals: shape and dtype of each leaf of the arguments.
+    out_tree: the structure of its result.
+    out_avals: shape and dtype of each leaf of the result.
+    outputs: the scalars of each leaf of the result.
+    schedule: the steps that compute them.
+    captures: whether it closes over an array that an outer transformation traces.
+    """
+
+    in_avals: list[Any]
+    out_tree: Any
+    out_avals: list[Any]
+    outputs: list[list[Scalar]]
+    schedule: liveness.Schedule
+    captures: bool
+
+    def compile(self, backend: Backend) -> Any:
+        """Returns what a backend makes of the function."""
+        return backend.compile(self.schedule, self.outputs)
+
+    @property
+    def operations(self) -> Counter[str]:
+        """How many scalar operations it takes, by name; a loop's body counts once."""
+        return Counter(node.op.name for node in liveness.nodes(self.schedule) if node.op)
+
+
+def scalarize(fn: Callable, *examples: PyTree, branch_cost: int = 400) -> Scalarized:
+    """Writes a function out in scalars, for a backend.
+
+    Args:
+      fn: a function of one example.
+      *examples: its arguments, or their ``jax.ShapeDtypeStruct``s.
+      branch_cost: a branch of ``cond`` with more operations than this, or with a loop, is skipped
+        where no lane needs it; others are computed for every lane.
+    """
+    return build(fn, examples, [True] * len(jax.tree.leaves(examples)), branch_cost)
+
+
+def build(
+    fn: Callable,
+    examples: Sequence[Any],
+    varying: Sequence[bool],
+    branch_cost: int,
+    limits: Limits = Limits(),  # noqa: B008 (a tuple of numbers)
+) -> Scalarized:
+    """Writes a function out.
+
+    Args:
+      fn: a function of one example.
+      examples: its arguments, or their shapes.
+      varying: which of their leaves differ from lane to lane.
+      branch_cost: as in ``scalarize``.
+      limits: up to which length scans are written out.
+
+    Raises:
+      TooLarge: it is more than is written out.
+      UnsupportedPrimitive: it uses a primitive that has no rule.
+    """
+    program, out_shape = jaxprs.trace(fn, *examples)
+    if any(is_key(variable.aval) for variable in program.jaxpr.invars):
+        raise jaxprs.no_keys()
+    size.check_size(program)
+    graph = Graph(branch_cost, limits)
+    inputs = [
+        _input_array(graph, number, variable.aval, varies)
+        for number, (variable, varies) in enumerate(zip(program.jaxpr.invars, varying, strict=True))
+    ]
+    with np.errstate(all="ignore"):
+        results = evaluate.run(graph, program, inputs)
+    outputs = [arrays.elements(result) for result in results]
+    out_avals, out_tree = jax.tree.flatten(out_shape)
+    written = Scalarized(
+        in_avals=[variable.aval for variable in program.jaxpr.invars],
+        out_tree=out_tree,
+        out_avals=out_avals,
+        outputs=outputs,
+        schedule=liveness.schedule(graph.scope, (x for leaf in outputs for x in leaf)),
+        captures=bool(graph.captured),
+    )
+    if inspect is not None:
+        inspect(written)
+    return written
+
+
+def _input_array(graph: Graph, number: int, aval: Any, varying: bool) -> np.ndarray:
+    places = [(number, k) for k in range(int(np.prod(aval.shape, dtype=int)))]
+    leaves = [graph.leaf(aval.dtype, varying, position=place) for place in places]
+    return arrays.pack(leaves, aval.shape, aval.dtype)
+
+
+def refusal(error: Exception) -> str:
+    """Returns in one line why a function cannot be written out, from what was raised."""
+    if isinstance(error, (size.TooLarge, jaxprs.UnsupportedPrimitive)):
+        return " ".join(str(error).split())
+    return f"it cannot be written out ({explain(error)})"

@@ -1,0 +1,73 @@
+"""How large a program is when it is written out, found in a moment from its equations.
+
+For HalfCheetah, Humanoid and observations of 500 and 1,000 entries this was 0.89 to 1.15 times what
+was then written.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from mjx_reinforce.engine.scalar import jaxprs, ops
+
+#: What is larger takes minutes to write, and longer to compile.
+MAX_SCALARS = 4_000_000
+#: A loop's body is written again and again until what never changes in it is known.
+_LOOP = 2
+#: The program that is written out of a primitive of ours, among its parameters.
+_CARRIES = {"by_engine": "one", "skippable": "computation"}
+_ELEMENTWISE = {*ops.FACTS, "integer_pow", "square", "add_any", "clamp"}
+
+
+class TooLarge(NotImplementedError):  # noqa: N818 (reads as what it is)
+    """A function that is too large to be written out."""
+
+
+def check_size(program: jaxprs.Program) -> None:
+    """Raises TooLarge for a program that is not to be written out."""
+    size = num_scalars(program)
+    if size > MAX_SCALARS:
+        raise TooLarge(
+            f"written out it is about {size:.2g} scalar operations, more than {MAX_SCALARS:.2g}"
+        )
+
+
+def num_scalars(program: jaxprs.Program) -> int:
+    """Returns about how many scalar operations are written, those that fold away included."""
+    default = {
+        eqn.outvars[0]: jaxprs.default_platform(eqn)
+        for eqn in program.jaxpr.eqns
+        if eqn.primitive.name == "platform_index"
+    }
+    return sum(_equation_size(eqn, default) for eqn in program.jaxpr.eqns)
+
+
+def _equation_size(eqn: Any, default: Mapping[Any, int | None]) -> int:
+    """Returns the size of one equation."""
+    name, params = eqn.primitive.name, eqn.params
+    if name == "cond":
+        sizes = [num_scalars(jaxprs.program(branch)) for branch in params["branches"]]
+        index = eqn.invars[0]
+        known = None if jaxprs.is_literal(index) else default.get(index)
+        return sum(sizes) if known is None else sizes[known]
+    if name in _CARRIES:
+        return num_scalars(jaxprs.program(params[_CARRIES[name]]))
+    if name == "while":
+        bodies = (params[part] for part in ("cond_jaxpr", "body_jaxpr"))
+        return _LOOP * sum(num_scalars(jaxprs.program(body)) for body in bodies)
+    if name == "scan":
+        return min(_LOOP, params["length"]) * num_scalars(jaxprs.program(params["jaxpr"]))
+    made, read = (
+        sum(math.prod(atom.aval.shape) for atom in atoms) for atoms in (eqn.outvars, eqn.invars)
+    )
+    if name == "dot_general":
+        (contracted, _), _ = params["dimension_numbers"]
+        return 2 * made * math.prod(eqn.invars[0].aval.shape[axis] for axis in contracted)
+    if name in ("cholesky", "triangular_solve"):
+        return made * eqn.invars[0].aval.shape[-1]
+    if name in _ELEMENTWISE:
+        return made
+    if name.startswith(("reduce_", "cum", "arg")):
+        return read
+    program = jaxprs.callee(eqn)
+    return 0 if program is None else num_scalars(program)

@@ -1,0 +1,177 @@
+"""``vmap``: a drop-in for ``jax.vmap`` that leaves only elementwise work."""
+
+import functools
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from mjx_reinforce.engine.base import PyTree
+from mjx_reinforce.engine.scalar import jaxprs, scalarized
+from mjx_reinforce.engine.scalar.xla import XLA
+
+#: XLA takes minutes to compile more operations, and what it makes of them is slow.
+MAX_OPERATIONS = 20_000
+
+
+def vmap(
+    fn: Callable, in_axes: PyTree = 0, out_axes: PyTree = 0, branch_cost: int = 32
+) -> "Mapped":
+    """Maps a function over a batch, like ``jax.vmap``, one array over the batch for each scalar.
+
+    The function is traced for one example and evaluated element by element; see the package's
+    docstring for what that costs and which floating-point promises it loosens. Call the result
+    under ``jax.jit``. The fastest layout keeps the batch last (axes of -1): then each scalar's lane
+    is one contiguous row.
+
+    Args:
+      fn: a function of one example; pytrees in and out.
+      in_axes: for each argument an axis, None for one that all lanes share, or a pytree prefix.
+      out_axes: the same for the result; None only for what does not depend on the lane.
+      branch_cost: a branch of ``cond`` with more scalar operations than this, or with a loop, is
+        skipped where no lane needs it; others are computed for every lane. XLA's CPU backend
+        computes shared values again in each fusion, and a real branch also stops that.
+
+    Returns:
+      The mapped function. Keyword arguments are mapped over their first axis.
+
+    Raises:
+      ValueError: if no argument is mapped, the mapped sizes differ, or an axis does not fit.
+      TooLarge: if fn is more than is written out.
+      UnsupportedPrimitive: if fn uses a primitive that has no rule, or reads typed PRNG keys.
+    """
+    return Mapped(fn, in_axes, out_axes, branch_cost)
+
+
+class Mapped:
+    """What ``vmap`` returns: a function that is written out once for each kind of arguments."""
+
+    def __init__(self, fn: Callable, in_axes: PyTree, out_axes: PyTree, branch_cost: int):
+        """Takes the arguments of ``vmap``."""
+        functools.update_wrapper(self, fn)
+        self._fn = fn
+        self._in_axes, self._out_axes = in_axes, out_axes
+        self._branch_cost = branch_cost
+        self._written: dict[Any, scalarized.Scalarized] = {}
+
+    def __call__(self, *args: PyTree, **kwargs: PyTree) -> Any:
+        """Evaluates the function for every example of a batch."""
+        args, kwargs = jax.tree.map(jnp.asarray, (args, kwargs))
+        written, axes = self._write(args, kwargs)
+        count = sum(written.operations.values())
+        if count > MAX_OPERATIONS:
+            warnings.warn(
+                f"written out this function is {count:,} scalar operations, and XLA takes minutes "
+                f"to compile more than {MAX_OPERATIONS:,}; use jax.vmap for it",
+                stacklevel=2,
+            )
+        leaves = jax.tree.leaves((args, kwargs))
+        batch = _batch_size(leaves, axes)
+        rows = [_rows(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
+
+        def read(place: tuple[int, int]) -> jax.Array:
+            return lax.index_in_dim(rows[place[0]], place[1], keepdims=False)
+
+        values = written.compile(XLA(read, (batch,)))
+        out_tree = written.out_tree
+        target = jax.tree.unflatten(out_tree, range(out_tree.num_leaves))
+        ends = _axes(self._out_axes, target)
+        outputs = [
+            _assemble(scalars, aval, axis, batch)
+            for scalars, aval, axis in zip(values, written.out_avals, ends, strict=True)
+        ]
+        return jax.tree.unflatten(out_tree, outputs)
+
+    def write(self, *args: PyTree, **kwargs: PyTree) -> scalarized.Scalarized:
+        """Returns what is evaluated for these arguments, of which the shapes are enough."""
+        return self._write(args, kwargs)[0]
+
+    def _write(
+        self, args: tuple, kwargs: dict[str, Any]
+    ) -> tuple[scalarized.Scalarized, list[int | None]]:
+        """Returns the function written out for these arguments, and the axis of each leaf."""
+        axes = [*_axes(self._in_axes, args), *_axes(0, kwargs)]
+        leaves, in_tree = jax.tree.flatten((args, kwargs))
+        axes = [
+            None if axis is None else _axis(axis, leaf.ndim)
+            for axis, leaf in zip(axes, leaves, strict=True)
+        ]
+        examples = [_example(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
+        varying = tuple(axis is not None for axis in axes)
+        precision = jnp.result_type(float)  # constants inside depend on it
+        key = (in_tree, tuple((x.shape, x.dtype) for x in examples), varying, precision)
+
+        def flat_fn(*flat: PyTree) -> Any:
+            args, kwargs = jax.tree.unflatten(in_tree, flat)
+            return self._fn(*args, **kwargs)
+
+        written = self._written.get(key)
+        if written is None:  # writing it out takes about a second
+            written = scalarized.build(flat_fn, examples, varying, self._branch_cost)
+            if not written.captures:
+                self._written[key] = written
+        return written, axes
+
+
+def _axes(prefix: PyTree, tree: PyTree) -> list[Any]:
+    """Returns the axis of each leaf of the tree, as a pytree prefix says."""
+    if isinstance(prefix, list) and isinstance(tree, tuple):
+        prefix = tuple(prefix)
+    axes: list[Any] = []
+
+    def note(axis: Any, subtree: PyTree) -> None:
+        axes.extend([axis] * len(jax.tree.leaves(subtree)))
+
+    jax.tree.map(note, prefix, tree, is_leaf=lambda x: x is None)
+    return axes
+
+
+def _axis(axis: int, ndim: int) -> int:
+    """Returns a mapped axis counted from the front."""
+    if not -ndim <= axis < ndim:
+        raise ValueError(f"axis {axis} does not exist in an argument of {ndim} dimensions")
+    return axis % ndim
+
+
+def _batch_size(leaves: list[jax.Array], axes: list[int | None]) -> int:
+    sizes = {x.shape[axis] for x, axis in zip(leaves, axes, strict=True) if axis is not None}
+    if len(sizes) != 1:
+        raise ValueError(
+            f"scalar.vmap needs mapped arguments of one size, got sizes {sorted(sizes)}"
+        )
+    return sizes.pop()
+
+
+def _example(x: jax.Array, axis: int | None) -> jax.ShapeDtypeStruct:
+    """Returns the shape of one example."""
+    shape = tuple(size for i, size in enumerate(x.shape) if i != axis)
+    return jax.ShapeDtypeStruct(shape, x.dtype)
+
+
+def _rows(x: jax.Array, axis: int | None) -> jax.Array:
+    """Returns an argument as [elements, batch], or [elements] where lanes share it."""
+    if axis is None:
+        return x.reshape(-1)
+    return jnp.moveaxis(x, axis, -1).reshape(-1, x.shape[axis])
+
+
+def _assemble(scalars: list[Any], aval: jaxprs.Shape, axis: int | None, batch: int) -> jax.Array:
+    """Puts one leaf of the result together."""
+    shared = all(np.ndim(scalar) == 0 for scalar in scalars)
+    if axis is None and not shared:
+        raise ValueError("out_axes is None for a result that differs from lane to lane")
+    if not scalars:
+        stacked = jnp.zeros((0,) if axis is None else (0, batch), aval.dtype)
+    elif axis is None:
+        stacked = jnp.stack([jnp.asarray(scalar, aval.dtype) for scalar in scalars])
+    else:
+        lanes = [x if np.ndim(x) else lax.broadcast(x, (batch,)) for x in scalars]
+        stacked = jnp.stack(lanes)
+    if axis is None:
+        return stacked.reshape(aval.shape)
+    ndim = len(aval.shape) + 1
+    return jnp.moveaxis(stacked.reshape((*aval.shape, batch)), -1, _axis(axis, ndim))

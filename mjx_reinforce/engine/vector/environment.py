@@ -1,0 +1,271 @@
+"""N environments in JAX, whose step is one call."""
+
+import enum
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from mjx_reinforce import envs
+from mjx_reinforce.engine.arguments import check_count, check_key
+from mjx_reinforce.engine.base import Box, Discrete, Environment, action_space, null_action
+from mjx_reinforce.engine.checks import check_parts, check_type
+from mjx_reinforce.engine.contract import check_environment
+from mjx_reinforce.engine.play import episode
+from mjx_reinforce.engine.play.available import GENERATOR
+from mjx_reinforce.engine.play.choice import MapEngine, map_function
+from mjx_reinforce.engine.vector.episodes import AUTORESETS, VectorState, advance_function, blank
+from mjx_reinforce.registry import check_name, nearest
+from mjx_reinforce.settings.memory import gigabytes, host_memory
+
+#: Copies of the states that a step has in memory: 4.6 of HalfCheetah, a million of them.
+_COPIES = 5
+#: Those of ``make_vec`` that are no settings of the task.
+_ARGUMENTS = ("num_envs", "autoreset", "max_episode_steps", "engine")
+
+
+class VectorEnv:
+    """N environments; what ``make_vec`` returns.
+
+    ``reset`` and ``step`` are pure functions of arrays: call them under ``jax.jit``, ``jax.vmap``
+    and in ``lax.scan``, and donate the state. They are not differentiated.
+
+    Attributes:
+      env: the environment of which there are N
+      num_envs: N
+      autoreset: when the next episode begins: "next_step", "same_step" or "disabled"
+      max_episode_steps: the time limit in steps, which truncates an episode; None for none
+      observation_size: O
+      action_size: A
+      action_space: a ``Box`` or ``Discrete`` of one environment
+      engine: how the step is mapped: ``name``, and ``why``
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> vec = mr.make_vec("CartPole-v1", num_envs=8)
+      >>> state = vec.reset(jax.random.key(0))
+      >>> state = vec.step(state, vec.sample_actions(jax.random.key(1)))
+      >>> state.obs.shape, state.reward.tolist()[:2]
+      ((8, 4), [1.0, 1.0])
+    """
+
+    def __init__(
+        self,
+        env: Environment,
+        num_envs: int,
+        autoreset: str,
+        max_episode_steps: int | None,
+        engine: str,
+    ):
+        """Compiles the step; the arguments are those of ``make_vec``."""
+        self.env, self.num_envs, self.autoreset = env, num_envs, autoreset
+        self.max_episode_steps = max_episode_steps
+        self.action_space: Box | Discrete = action_space(env)
+        self._blank = blank(env)
+        none = null_action(env)
+        self._null_action = np.asarray(none, jnp.result_type(float) if none.ndim else none.dtype)
+        self.observation_size = int(self._blank.final_obs.shape[0])
+        self.action_size = env.action_size
+        self._check_memory()
+        advance = advance_function(env, max_episode_steps, autoreset)
+        flag = jax.ShapeDtypeStruct((), bool)
+        self.engine: MapEngine = map_function(
+            engine, env, advance, self._blank, self._null_action, flag
+        )
+
+    def reset(self, key: jax.Array) -> VectorState:
+        """Returns N environments at the start of their first episodes.
+
+        Args:
+          key: consumed; [] and that of environment i is this one folded with i, or [N] their own.
+
+        Raises:
+          ValueError: it is no key, or of another generator than JAX's default.
+        """
+        check_key(key)
+        key = (
+            key if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else jax.random.wrap_key_data(key)
+        )
+        made_by = str(jax.random.key_impl(key))
+        if made_by != GENERATOR:
+            raise ValueError(
+                f"the key is of the generator {made_by}; make it with "
+                f'jax.random.key(seed, impl="{GENERATOR}")'
+            )
+        words = jax.random.key_data(episode.episode_keys(key, self.num_envs))
+        state = jax.tree.map(
+            lambda x: jnp.zeros((self.num_envs, *x.shape), x.dtype), self._blank
+        ).replace(keys=words)
+        return self._advance(state, self._null_actions(), True)
+
+    def step(self, state: VectorState, action: jax.Array) -> VectorState:
+        """Returns the environments one step later.
+
+        With "next_step", an environment whose episode has ended ignores its action and begins the
+        next one, with reward 0. With "same_step" it has begun it in the step that ended the last.
+
+        Args:
+          state: of ``reset`` or ``step``.
+          action: [N, A], or int [N] if discrete. It is not clipped: MuJoCo clamps what actuators
+            get, and the reward is of what was asked for, as in Gymnasium.
+
+        Raises:
+          ValueError: the action has another shape or kind.
+        """
+        return self._advance(state, self._checked(action), False)
+
+    def restart(self, state: VectorState, where: jax.Array) -> VectorState:
+        """Returns the environments with new episodes where a mask [N] says so; others stay."""
+        if jnp.shape(where) != (self.num_envs,):
+            raise ValueError(
+                f"the mask must be [{self.num_envs}], got the shape {list(jnp.shape(where))}"
+            )
+        where = jnp.asarray(where, bool)
+        begun = self._advance(state, self._null_actions(), where)
+        return jax.tree.map(
+            lambda new, old: jnp.where(where.reshape(-1, *[1] * (new.ndim - 1)), new, old),
+            begun,
+            state,
+        )
+
+    def sample_actions(self, key: jax.Array) -> jax.Array:
+        """Returns random actions [N, A] or [N]: uniform, and normal where there is no bound."""
+        check_key(key)
+        space, shape = self.action_space, (self.num_envs, self.action_size)
+        if isinstance(space, Discrete):
+            return jax.random.randint(key, shape[:1], 0, space.num_actions)
+        uniform_key, normal_key = jax.random.split(key)
+        uniform = jax.random.uniform(uniform_key, shape)
+        bounded = np.isfinite(space.low) & np.isfinite(space.high)
+        low, high = np.where(bounded, space.low, 0), np.where(bounded, space.high, 1)
+        within = jnp.asarray(low) + uniform * (high - low)
+        return jnp.where(bounded, within, jax.random.normal(normal_key, shape)).astype(
+            uniform.dtype
+        )
+
+    def check_state(self, state: object) -> None:
+        """Raises ValueError for what is no state of these environments: machine code trusts it."""
+        if not isinstance(state, VectorState):
+            raise ValueError(
+                f"the state must be what reset or step returned, got a {type(state).__name__}"
+            )
+        rows = jnp.shape(state.reward)[:1]
+        if rows != (self.num_envs,):
+            raise ValueError(f"the state is of {_count(rows)}, not of {self.num_envs}")
+        same = jax.tree.structure(state) == jax.tree.structure(self._blank)
+        pairs = zip(jax.tree.leaves(state), jax.tree.leaves(self._blank), strict=False)
+        if not same or any(
+            jnp.shape(x) != (self.num_envs, *y.shape) or jnp.result_type(x) != y.dtype
+            for x, y in pairs
+        ):
+            raise ValueError(f"the state is of another task than {self.env!r}, or was changed")
+
+    def __repr__(self) -> str:
+        return (
+            f"VectorEnv({self.num_envs} x {self.env!r}, autoreset={self.autoreset}, "
+            f"engine={self.engine.name})"
+        )
+
+    def _advance(self, state: VectorState, action: jax.Array, begins: ArrayLike) -> VectorState:
+        self.check_state(state)
+        return self.engine.call(state, action, jnp.broadcast_to(begins, self.num_envs))
+
+    def _null_actions(self) -> jax.Array:
+        return jnp.zeros((self.num_envs, *self._null_action.shape), self._null_action.dtype)
+
+    def _checked(self, action: ArrayLike) -> jax.Array:
+        """Returns the actions, or raises ValueError where they are none."""
+        expected = (self.num_envs, *self._null_action.shape)
+        if jnp.shape(action) != expected:
+            raise ValueError(
+                f"the actions must be {list(expected)}, got the shape {list(jnp.shape(action))}"
+            )
+        kind, wanted = jnp.result_type(action), self._null_action.dtype
+        if not jnp.can_cast(kind, wanted, "same_kind"):
+            raise ValueError(f"the actions must be {wanted}, got {kind}")
+        return jnp.asarray(action, wanted)
+
+    def _check_memory(self) -> None:
+        """Raises ValueError for more environments than there is memory for."""
+        each = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(self._blank))
+        needed, there = _COPIES * each * self.num_envs, _memory()
+        if needed > there:
+            raise ValueError(
+                f"{self.num_envs:,} environments need {gigabytes(needed)}, and there are "
+                f"{gigabytes(there)}; make at most {int(there / _COPIES / each):,}"
+            )
+
+
+def _count(rows: tuple[int, ...]) -> str:
+    return f"{rows[0]} environments" if rows else "one environment"
+
+
+def _memory() -> float:
+    """Returns the bytes of memory of the device that JAX computes on."""
+    stats = jax.devices()[0].memory_stats() or {}
+    return float(stats.get("bytes_limit", host_memory()))
+
+
+def make_vec(
+    env: str | Environment,
+    num_envs: int,
+    *,
+    autoreset: str | enum.Enum = "next_step",
+    max_episode_steps: int | None = None,
+    engine: str = "auto",
+    **settings: object,
+) -> VectorEnv:
+    """Makes N environments that play at once, for any algorithm.
+
+    Args:
+      env: an id of ``envs.names()``, "module:Class" of your own, or an environment.
+      num_envs: N.
+      autoreset: when an environment whose episode has ended begins the next: "next_step" and
+        "same_step" are Gymnasium's, whose ``AutoresetMode`` may be given; with "disabled" only
+        ``restart`` does.
+      max_episode_steps: the time limit in steps; by default the task's.
+      engine: "auto", "native" (machine code) or "vmap".
+      **settings: of the task, where ``env`` is an id.
+
+    Raises:
+      ValueError: an argument makes no sense, the environment is none, or it does not fit in memory.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> vec = mr.make_vec("CartPole-v1", num_envs=8)
+      >>> state = vec.reset(jax.random.key(0))
+      >>> state = vec.step(state, vec.sample_actions(jax.random.key(1)))
+      >>> state.obs.shape, state.reward.tolist()[:2]
+      ((8, 4), [1.0, 1.0])
+    """
+    check_count("num_envs", num_envs)
+    mode = autoreset.name.lower() if isinstance(autoreset, enum.Enum) else autoreset
+    check_name("autoreset", str(mode), dict.fromkeys(AUTORESETS))
+    check_type("max_episode_steps", max_episode_steps, int | None)
+    try:
+        made = _made(env, settings)
+    except ValueError as error:
+        meant = [own for own in (nearest(name, _ARGUMENTS) for name in settings) if own]
+        if not meant:
+            raise
+        hint = f"make_vec itself takes {meant[0]!r}"
+        raise ValueError(f"{str(error).rstrip('.')}; {hint}") from error
+    check_parts(made)
+    check_environment(made)
+    if max_episode_steps is None:
+        max_episode_steps = getattr(made, "max_episode_steps", None)
+    else:
+        check_count("max_episode_steps", max_episode_steps)
+    return VectorEnv(made, num_envs, str(mode), max_episode_steps, engine)
+
+
+def _made(env: str | Environment, settings: dict[str, object]) -> Environment:
+    """Returns the environment, built where it is an id."""
+    if isinstance(env, str):
+        return envs.make(env, **settings)
+    if settings:
+        raise ValueError(f"{sorted(settings)} are for an id; this environment is made already")
+    return env

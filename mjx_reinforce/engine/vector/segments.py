@@ -1,0 +1,145 @@
+"""Segments of fixed length, which go on where the last one ended: what PPO and A2C learn from."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import lax
+
+from mjx_reinforce.engine.arguments import check_count, check_key
+from mjx_reinforce.engine.base import PyTree
+from mjx_reinforce.engine.checks import check_kind
+from mjx_reinforce.engine.play.any_policy import check_policy
+from mjx_reinforce.engine.play.episode import Act
+from mjx_reinforce.engine.vector.environment import VectorEnv
+from mjx_reinforce.engine.vector.episodes import VectorState
+from mjx_reinforce.learning.distributions.distribution import Distribution
+
+
+@struct.dataclass(kw_only=True)
+class Segment:
+    """T steps of N environments, time first.
+
+    Attributes:
+      observation: [T, N, O] what the policy saw
+      action: [T, N, A], or [T, N] if discrete: what it drew
+      log_prob: [T, N] the logarithm of the action's probability density
+      reward: [T, N] what that earned
+      terminated: [T, N] bool, whether the task ended the episode by it
+      truncated: [T, N] bool, whether the time limit did
+      nonfinite: [T, N] bool, whether it left the finite numbers, which terminates the episode
+      next_observation: [T, N, O] what it led to, before any reset: its value belongs to a truncated
+        episode
+      played: [T, N] bool, False where ``next_step`` spent the step on a reset: no loss has it
+      metrics: [T, N] each, the terms of the reward and what else the task tells
+      episode_return: [T, N] the rewards of the episode so far; of all of it where it ended
+      episode_length: [T, N] int32, its steps so far
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> vec = mr.make_vec("CartPole-v1", num_envs=8)
+      >>> state = vec.reset(jax.random.key(0))
+      >>> family = mr.categorical(vec.action_space)
+      >>> policy = mr.mlp_policy(vec.observation_size, family)
+      >>> params = policy.init(jax.random.key(1))
+      >>> state, segment = mr.unroll(
+      ...     vec, policy.apply, params, family, state, jax.random.key(2), num_steps=5
+      ... )
+      >>> segment.reward.shape, segment.observation.shape
+      ((5, 8), (5, 8, 4))
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    nonfinite: jax.Array
+    next_observation: jax.Array
+    played: jax.Array
+    metrics: dict[str, jax.Array]
+    episode_return: jax.Array
+    episode_length: jax.Array
+
+    @property
+    def done(self) -> jax.Array:
+        """Whether the episode ended [T, N], for one reason or the other."""
+        return self.terminated | self.truncated
+
+
+def unroll(
+    vec: VectorEnv,
+    act: Act,
+    params: PyTree,
+    distribution: Distribution,
+    state: VectorState,
+    key: jax.Array,
+    num_steps: int,
+) -> tuple[VectorState, Segment]:
+    """Plays T steps from where the environments are.
+
+    The policy is computed for all environments together, by XLA, whatever its size; the step is
+    that of ``vec``. Call this under ``jax.jit``, alone or within a whole training.
+
+    Args:
+      vec: the environments.
+      act: (params, observation [O]) -> outputs [K] of the distribution.
+      params: what ``act`` reads, a pytree of arrays.
+      distribution: the family whose parameters the outputs are, ours or your own.
+      state: of ``vec.reset``, or what this function returned before.
+      key: of the actions' noise; consumed.
+      num_steps: T.
+
+    Returns:
+      Where the environments are after that, and what was played.
+
+    Raises:
+      ValueError: an argument makes no sense.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> vec = mr.make_vec("CartPole-v1", num_envs=8)
+      >>> state = vec.reset(jax.random.key(0))
+      >>> family = mr.categorical(vec.action_space)
+      >>> policy = mr.mlp_policy(vec.observation_size, family)
+      >>> params = policy.init(jax.random.key(1))
+      >>> state, segment = mr.unroll(
+      ...     vec, policy.apply, params, family, state, jax.random.key(2), num_steps=5
+      ... )
+      >>> segment.reward.shape, segment.observation.shape
+      ((5, 8), (5, 8, 4))
+    """
+    check_kind("vec", vec, VectorEnv, "mjx_reinforce.make_vec(id, num_envs)")
+    vec.check_state(state)
+    check_key(key)
+    check_count("num_steps", num_steps)
+    one = jax.ShapeDtypeStruct(state.obs.shape[1:], state.obs.dtype)
+    check_policy(act, params, distribution, one)
+    waits = vec.autoreset == "next_step"
+
+    def step(state: VectorState, key: jax.Array) -> tuple[VectorState, Segment]:
+        observation, over = state.obs, state.done
+        outputs = jax.vmap(act, (None, 0))(params, observation)
+        action = distribution.sample(outputs, distribution.noise(key, (vec.num_envs,)))
+        after = vec.step(state, action)
+        return after, Segment(
+            observation=observation,
+            action=action,
+            log_prob=distribution.log_prob(outputs, action),
+            reward=after.reward,
+            terminated=after.terminated,
+            truncated=after.truncated,
+            nonfinite=after.nonfinite,
+            next_observation=after.final_obs,
+            played=~over if waits else jnp.ones_like(over),
+            metrics=after.metrics,
+            episode_return=after.episode_return,
+            episode_length=after.episode_length,
+        )
+
+    result: Any = lax.scan(step, state, jax.random.split(key, num_steps))
+    return result

@@ -1,0 +1,186 @@
+"""Do the parts of a learner fit together? Found from shapes: nothing is compiled."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from mjx_reinforce.engine.base import Environment, PyTree, Trajectory, null_action
+from mjx_reinforce.engine.checks import check_kind, check_type, explain
+from mjx_reinforce.learning import updates
+from mjx_reinforce.learning.distributions.distribution import Distribution
+from mjx_reinforce.learning.estimators import Estimator
+from mjx_reinforce.learning.learner import Learner
+from mjx_reinforce.learning.natural_gradient import natural_gradient
+from mjx_reinforce.learning.policy import Policy
+
+#: Steps and episodes of the trajectory that an estimator is tried on: no two axes have one size.
+_NUM_STEPS = 5
+#: Metrics without which no run can be recorded.
+_METRICS = (
+    *("episodes", "episode_return", "episode_length", "env_steps", "simulated_steps"),
+    *("nonfinite_episodes", "skipped_update"),
+)
+
+
+def check_horizon(env: Environment, horizon: int | None) -> int:
+    """Returns the time limit in steps, or raises ValueError."""
+    horizon = getattr(env, "max_episode_steps", None) if horizon is None else horizon
+    if horizon is None:
+        raise ValueError("this environment declares no max_episode_steps: give a horizon")
+    check_type("horizon", horizon, int)
+    if horizon < 1:
+        raise ValueError(f"the horizon must be at least one step, got {horizon}")
+    return horizon
+
+
+def check_policy(
+    policy: Policy, env: Environment, observation_size: int, *, likelihood: bool = False
+) -> None:
+    """Raises ValueError for a policy that cannot play an environment, in one line that says why.
+
+    Args:
+      policy: what a user gave. Its functions are traced.
+      env: what it plays, checked already.
+      observation_size: O.
+      likelihood: whether its log-probability is needed.
+    """
+    check_kind("policy", policy, Policy, "mjx_reinforce.mlp_policy(observation_size, distribution)")
+    distribution = policy.distribution
+    check_kind(
+        "policy.distribution", distribution, Distribution, "mjx_reinforce.normal(env.action_space)"
+    )
+    params = _traced("policy.init(key)", policy.init, jax.random.key(0))
+    observation = jax.ShapeDtypeStruct((2, observation_size), jnp.result_type(float))
+    given = f"policy.apply(params, observation [2, {observation_size}])"
+    outputs = _traced(given, policy.apply, params, observation)
+    count, constants = distribution.num_outputs, len(distribution.constants)
+    if getattr(outputs, "shape", None) != (2, count + constants):
+        fixed = f", then distribution.constants [2, {constants}], as parameters" * bool(constants)
+        raise ValueError(
+            f"{given} must return [2, {count + constants}]: what a network computes [2, {count}]"
+            f"{fixed}; got {_shape_or_type(outputs)}"
+        )
+    if not jnp.issubdtype(outputs.dtype, jnp.floating):
+        raise ValueError(f"{given} must return floating-point numbers, got {outputs.dtype}")
+
+    def draw(outputs):
+        return distribution.sample(outputs, distribution.noise(jax.random.key(0), (2,)))
+
+    action, size = _traced("policy.distribution.sample", draw, outputs), null_action(env).shape
+    if getattr(action, "shape", None) != (2, *size):
+        raise ValueError(
+            f"policy.distribution draws actions {_shape_or_type(action)} for two observations, "
+            f"{type(env).__name__} takes {[2, *size]}; make it for the actions of this environment"
+        )
+    if likelihood:
+        _traced("policy.distribution.log_prob", distribution.log_prob, outputs, action)
+
+
+def check_optimizer(name: str, value: optax.GradientTransformation) -> None:
+    """Raises ValueError for what is no optimiser."""
+    check_kind(name, value, optax.GradientTransformation, "optax.adam(1e-2)")
+
+
+def check_update(update: updates.Update) -> None:
+    """Raises ValueError for what is no update, or a function that makes one."""
+    makers = updates.full_batch, updates.minibatches, updates.each_step, natural_gradient
+    if update in makers or not callable(update):
+        got = f"{update.__name__}, which is to be called" if update in makers else repr(update)
+        raise ValueError(f"update must be such as mjx_reinforce.full_batch(), got {got}")
+
+
+def check_estimator(
+    estimator: Estimator, env: Environment, observation_size: int, num_episodes: int
+) -> None:
+    """Raises ValueError for an estimator whose weights are not [T, N], in one line that says why.
+
+    Args:
+      estimator: what a user gave. Its functions are traced.
+      env: whose actions a trajectory holds.
+      observation_size: O.
+      num_episodes: N.
+    """
+    check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
+    if num_episodes < estimator.min_episodes:
+        raise ValueError(
+            f"this estimator needs at least {estimator.min_episodes} episodes an update, "
+            f"got num_episodes={num_episodes}"
+        )
+    shape, action = (_NUM_STEPS, num_episodes), null_action(env)
+    number = jnp.result_type(float)
+    trajectory = Trajectory(
+        observation=_shaped((*shape, observation_size), number),
+        action=_shaped((*shape, *action.shape), action.dtype),
+        reward=_shaped(shape, number),
+        mask=_shaped(shape, bool),
+        nonfinite=_shaped((num_episodes,), bool),
+        simulated=_shaped((), jnp.int32),
+    )
+
+    def update(key, trajectory):
+        return estimator.update(estimator.init(key, observation_size), trajectory)
+
+    returned = _traced("estimator.init or update", update, jax.random.key(0), trajectory)
+    if not (isinstance(returned, tuple) and len(returned) == 3):
+        raise ValueError(
+            "estimator.update must return three things, (weight [T, N], next state, metrics), "
+            f"got {type(returned).__name__}"
+        )
+    weight, _, metrics = returned
+    if getattr(weight, "shape", None) != shape or not jnp.issubdtype(weight.dtype, jnp.floating):
+        got = f"{weight.dtype}{list(weight.shape)}" if hasattr(weight, "shape") else type(weight)
+        raise ValueError(
+            f"estimator.update must return a weight for every action, float [T, N], here "
+            f"{list(shape)}; got {got}"
+        )
+    if not isinstance(metrics, dict):
+        raise ValueError(
+            f"estimator.update must return its metrics as a dict, got {type(metrics).__name__}"
+        )
+
+
+def check_learner(name: str, learner: Learner) -> None:
+    """Raises ValueError for a learner that a run cannot train, in one line that says why.
+
+    Args:
+      name: of the function that returned it.
+      learner: what it returned. Its functions are traced.
+    """
+    check_kind(f"what {name} returns", learner, Learner, "mjx_reinforce.reinforce(env)")
+    state = _traced(f"the learner of {name}", learner.init, jax.random.key(0))
+    after, metrics = _traced(f"the learner of {name}", learner.step, state)
+    if _shapes(after) != _shapes(state):
+        raise ValueError(
+            f"learn of the learner of {name} must return a state of the structure, shapes and "
+            "dtypes of the one that it gets"
+        )
+    if missing := [each for each in _METRICS if each not in metrics]:
+        raise ValueError(
+            f"learn of the learner of {name} must also return the metrics {', '.join(missing)}: "
+            "see mjx_reinforce.train_step"
+        )
+
+
+def _traced(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> Any:
+    """Returns the shapes of what a user's function returns, or raises ValueError if it fails."""
+    try:
+        return jax.eval_shape(function, *arguments)
+    except Exception as error:  # it is the user's code, which may raise anything
+        raise ValueError(f"{name} fails: {explain(error)}") from error
+
+
+_shaped: Any = jax.ShapeDtypeStruct
+
+
+def _shapes(tree: PyTree) -> Any:
+    """Returns the structure of a tree, and the shape and dtype of each leaf."""
+    leaves, structure = jax.tree.flatten(tree)
+    return structure, [(x.shape, x.dtype) for x in leaves]
+
+
+def _shape_or_type(value: Any) -> str:
+    """Returns the shape of an array, or the type of what is none."""
+    return str(list(value.shape)) if hasattr(value, "shape") else f"a {type(value).__name__}"

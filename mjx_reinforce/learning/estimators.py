@@ -1,0 +1,442 @@
+"""Estimators of the policy gradient: the weight of every log-probability.
+
+REINFORCE ascends ``(1/N) sum_n sum_t weight[t, n] * grad log pi(a[t, n] | o[t, n])``
+(Williams 1992, equation 8). An estimator turns a trajectory into that weight
+and never sees the policy. With the discounted return to go written
+
+    G[t] = r[t] + discount * G[t + 1],
+
+most estimators here are unbiased for the same gradient, that of a step's own action on what it is
+worth from there, and differ in variance. ``total_return`` is for the gradient of the discounted
+return from the start, in which step t counts discount^t: the same only without a discount.
+``standardize`` divides the weights of an update by a number that it computes from them, so that
+its gradient has another length, and is no longer exactly unbiased. ``mean_log_prob`` and
+``normalized_returns`` come from published programs, and say what they follow instead.
+
+An episode in which the simulation left the finite numbers counts as the worst of the others: at
+each step its G[t] is the least of theirs (``replace_broken``). In ``mean_log_prob`` and
+``normalized_returns``, where an episode is compared with itself, its weight is.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from mjx_reinforce.engine.arguments import check_number, known_number
+from mjx_reinforce.engine.base import Trajectory
+from mjx_reinforce.engine.checks import check_kind
+
+
+class Estimator(NamedTuple):
+    """A pair of pure functions, as in optax, and what they require.
+
+    Attributes:
+      init: (key, observation_size) -> state; consumes the key
+      update: (state, trajectory) -> (weight [T, N], next state, metrics); the weight
+        is zero outside the mask, and the trajectory's observations are normalised; what an episode
+        earned that broke (``trajectory.nonfinite``) is no return, see ``replace_broken``
+      min_episodes: the least N that ``update`` accepts
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> def update(state, trajectory):
+      ...     return jnp.where(trajectory.mask, 1.0, 0.0), state, {}
+      >>> estimator = mr.Estimator(init=lambda key, observation_size: None, update=update)
+      >>> estimator.update(None, played)[0].shape
+      (3, 2)
+    """
+
+    init: Callable[[jax.Array, int], Any]
+    update: Callable[[Any, Trajectory], tuple[jax.Array, Any, dict[str, jax.Array]]]
+    min_episodes: int = 1
+
+    def __repr__(self) -> str:
+        return f"Estimator(of {self.min_episodes} episodes or more)"
+
+
+def total_return(discount: float | jax.Array = 0.99) -> Estimator:
+    """Weights every action of an episode by the return of the whole, G[0] (Williams 1992).
+
+    Rewards from before an action add noise alone. Those after it are discounted from the start.
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.total_return(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()
+      [3.0, 3.0, 3.0]
+    """
+    _check_discount(discount)
+
+    def weigh(trajectory):
+        returns = _returns(trajectory, discount)
+        return jnp.broadcast_to(returns[0], returns.shape)
+
+    return _stateless(weigh)
+
+
+def reward_to_go(discount: float | jax.Array = 0.99) -> Estimator:
+    """Weights an action by what came after it, G[t] (Sutton et al. 1999, theorem 1).
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.reward_to_go(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()
+      [3.0, 2.0, 1.0]
+    """
+    _check_discount(discount)
+    return _stateless(lambda trajectory: _returns(trajectory, discount))
+
+
+def leave_one_out(discount: float | jax.Array = 0.99, *, ended: str = "zero") -> Estimator:
+    """Weights an action by G[t] less the mean G[t] of the other episodes.
+
+    The others are independent of the action, so the baseline adds no bias
+    (Kool et al. 2019, "Buy 4 REINFORCE samples"; the mean over all N episodes
+    would shrink the gradient by (N - 1) / N).
+
+    Args:
+      discount: in [0, 1].
+      ended: "zero" counts an episode that is over as the 0 it will still earn;
+        "skip" averages over the episodes alive at t alone, 0 where there is none.
+
+    Raises:
+      ValueError: ``ended`` is unknown or the discount is not in [0, 1].
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.leave_one_out(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()  # both episodes earned the same
+      [0.0, 0.0, 0.0]
+    """
+    _check_discount(discount)
+    if ended not in ("zero", "skip"):
+        raise ValueError(f"ended must be 'zero' or 'skip', got {ended!r}")
+
+    def update(state, trajectory):
+        returns = _returns(trajectory, discount)
+        counted = jnp.ones_like(trajectory.mask) if ended == "zero" else trajectory.mask
+        others = jnp.sum(counted, axis=1, keepdims=True) - counted
+        sums = jnp.sum(jnp.where(counted, returns, 0.0), axis=1, keepdims=True)
+        baseline = (sums - jnp.where(counted, returns, 0.0)) / jnp.maximum(others, 1)
+        weight = returns - jnp.where(others > 0, baseline, 0.0)
+        weight = jnp.where(trajectory.mask, weight, 0.0)
+        explained = explained_variance(weight, returns, trajectory.mask)
+        return weight, state, {"explained_variance": explained}
+
+    return Estimator(lambda key, observation_size: (), update, min_episodes=2)
+
+
+def mean_log_prob(discount: float | jax.Array = 0.99) -> Estimator:
+    """Weights every action of an episode of L steps by sum_t G[t] / L.
+
+    That is what the loss ``-sum(mean(log_probs) * returns)`` of Gymnasium's first
+    REINFORCE tutorial comes to, though its comment promises the sum of the
+    products log pi[t] G[t]: the mean over log-probabilities is taken before the
+    product. Its gradient is unbiased, except for E[sum_t G[t] / L], which counts a
+    reward the more often the later it comes. It is also noisy, because the weight of an action
+    contains the rewards from before that action.
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.mean_log_prob(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()  # (3 + 2 + 1) / 3
+      [2.0, 2.0, 2.0]
+    """
+    _check_discount(discount)
+
+    def weigh(trajectory):
+        returns = discounted_returns(trajectory.reward, discount)
+        mean = _episode_mean(returns, trajectory.mask)
+        return jnp.broadcast_to(replace_broken(mean, trajectory.nonfinite), returns.shape)
+
+    return _stateless(weigh)
+
+
+def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
+    """Weights an action by G[t], normalised within its episode.
+
+    The weight is ``(G[t] - mean) / (std + 1.19e-7)``, with the mean and the
+    unbiased standard deviation over the steps of the episode, and 0 in an episode
+    of one step. It is biased. The mean depends on the action. Every episode is scaled to the same
+    spread, so that a long episode counts no more than a short one. Where each step earns the
+    same, the weight depends on the remaining time alone: it is positive for early actions and
+    negative for late ones.
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.normalized_returns(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].round(3).tolist()
+      [1.0, 0.0, -1.0]
+    """
+    _check_discount(discount)
+
+    def weigh(trajectory):
+        mask = trajectory.mask
+        returns = discounted_returns(trajectory.reward, discount)
+        centred = jnp.where(mask, returns - _episode_mean(returns, mask), 0.0)
+        variance = jnp.sum(centred**2, axis=0) / jnp.maximum(jnp.sum(mask, axis=0) - 1, 1)
+        normalized = centred / (jnp.sqrt(variance) + float(jnp.finfo(jnp.float32).eps))
+        return replace_broken(normalized, trajectory.nonfinite)
+
+    return _stateless(weigh)
+
+
+def standardize(
+    estimator: Estimator, *, floor: float | jax.Array = 1e-8, center: bool = False
+) -> Estimator:
+    """Divides an estimator's weights by their standard deviation plus ``floor``.
+
+    The weights of a solved policy are noise. A floor as large as the noise of the return keeps
+    them small; without it they would be scaled up and would spoil the policy.
+
+    Args:
+      estimator: whose weights are divided.
+      floor: added to the standard deviation, in the unit of the return.
+      center: also subtract the mean over all steps; the root mean square is
+        taken about zero otherwise.
+
+    Raises:
+      ValueError: what is given is no estimator, or the floor is negative.
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.standardize(mr.reward_to_go(1.0))
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight.std().round(2).item() < 1
+      True
+    """
+    check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
+    check_number("floor", floor, finite=False)
+
+    def update(state, trajectory):
+        weight, state, metrics = estimator.update(state, trajectory)
+        mask = trajectory.mask
+        steps = jnp.maximum(jnp.sum(mask), 1)
+        mean = jnp.sum(jnp.where(mask, weight, 0.0)) / steps if center else 0.0
+        variance = jnp.sum(jnp.where(mask, (weight - mean) ** 2, 0.0)) / steps
+        scaled = jnp.where(mask, (weight - mean) / (jnp.sqrt(variance) + floor), 0.0)
+        return scaled, state, metrics | {"weight_std": jnp.sqrt(variance)}
+
+    return estimator._replace(update=update)
+
+
+def discount_weights(estimator: Estimator, discount: float | jax.Array = 0.99) -> Estimator:
+    """Multiplies the weight at step t by discount^t.
+
+    Without that factor the gradient is not that of the discounted return from
+    the start, nor of any other objective (Nota and Thomas 2020,
+    arXiv:1906.07073); with it, late steps hardly count. Most programs leave it
+    out, and so does everything here unless wrapped in this, but for ``total_return``, which
+    has it already and would discount twice.
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.discount_weights(mr.total_return(1.0), 0.5)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()
+      [3.0, 1.5, 0.75]
+    """
+    check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
+    _check_discount(discount)
+
+    def update(state, trajectory):
+        weight, state, metrics = estimator.update(state, trajectory)
+        powers = discount ** jnp.arange(weight.shape[0], dtype=weight.dtype)
+        return weight * powers[:, None], state, metrics
+
+    return estimator._replace(update=update)
+
+
+def shift_rewards(estimator: Estimator, shift: float | jax.Array) -> Estimator:
+    """Gives an estimator the rewards less ``shift``, which is what the policy then learns from.
+
+    Where an episode can end early, that is another objective: a bonus for every step survived is
+    worth that much less (Mania et al. 2018, arXiv:1803.07055, subtract the survival
+    bonus of MuJoCo's walkers, whose policies would else learn to stand still). Where all episodes
+    are of one length, the gradient is the same up to its noise. Returns that are reported stay
+    those of the task.
+
+    Args:
+      estimator: whose rewards are shifted.
+      shift: subtracted from the reward of every step, in its unit; it may be negative.
+
+    Raises:
+      ValueError: what is given is no estimator, or the shift is no finite number.
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.shift_rewards(mr.reward_to_go(1.0), 1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight[:, 0].tolist()
+      [0.0, 0.0, 0.0]
+    """
+    check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
+    number = known_number(shift)
+    if not (number is None or math.isfinite(number)):
+        raise ValueError(f"the shift of the rewards must be a finite number, got {shift!r}")
+
+    def update(state, trajectory):
+        reward = jnp.where(trajectory.mask, trajectory.reward - shift, 0.0)
+        return estimator.update(state, dataclasses.replace(trajectory, reward=reward))
+
+    return estimator._replace(update=update)
+
+
+def _returns(trajectory: Trajectory, discount: float | jax.Array) -> jax.Array:
+    """Returns G [T, N]; of an episode that broke, the least of the others."""
+    returns = discounted_returns(trajectory.reward, discount)
+    return replace_broken(returns, trajectory.nonfinite)
+
+
+def _stateless(weigh: Callable[[Trajectory], jax.Array]) -> Estimator:
+    """An estimator that learns nothing, from its weights [T, N]."""
+
+    def update(state, trajectory):
+        return jnp.where(trajectory.mask, weigh(trajectory), 0.0), state, {}
+
+    return Estimator(lambda key, observation_size: (), update)
+
+
+def _episode_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
+    """Returns the mean [N] of ``x`` [T, N] over the steps of every episode."""
+    return jnp.sum(jnp.where(mask, x, 0.0), axis=0) / jnp.maximum(jnp.sum(mask, axis=0), 1)
+
+
+def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array) -> jax.Array:
+    """Returns how much of the returns a baseline explains, 1 - Var(residual) / Var(returns), [].
+
+    1 is a perfect baseline, 0 as good as a constant, and less is worse than none. It is NaN where
+    the returns vary by rounding only: there is nothing to explain.
+
+    Args:
+      residual: [T, N] what the baseline leaves of the returns.
+      returns: [T, N] G.
+      mask: [T, N] which steps count.
+    """
+    steps = jnp.maximum(jnp.sum(mask), 1)
+
+    def mean(x):
+        return jnp.sum(jnp.where(mask, x, 0.0)) / steps
+
+    def variance(x):
+        return mean((x - mean(x)) ** 2)
+
+    total = variance(returns)
+    varies = total > 1e-12 * mean(returns) ** 2
+    return jnp.where(varies, 1.0 - variance(residual) / jnp.where(varies, total, 1.0), jnp.nan)
+
+
+def _check_discount(discount: float | jax.Array) -> None:
+    """Raises ValueError for a discount outside [0, 1]; a traced one is taken on trust."""
+    number = known_number(discount)
+    if not (number is None or 0.0 <= number <= 1.0):
+        raise ValueError(f"the discount must lie in [0, 1], got {discount!r}")
+
+
+def discounted_returns(reward: jax.Array, discount: float | jax.Array) -> jax.Array:
+    """Returns G [T, N] with ``G[t] = reward[t] + discount * G[t + 1]`` and ``G[T] = 0``.
+
+    Args:
+      reward: [T, N], zero where the episode is over.
+      discount: in [0, 1].
+    """
+    # Products of matrices, in blocks of about sqrt(T) steps: within each block, then over the
+    # blocks. A scan takes T steps one after the other, and an associative scan compiles for long.
+    discount = jnp.asarray(discount, reward.dtype)
+    horizon, num_episodes = reward.shape
+    length = math.isqrt(horizon - 1) + 1
+    count = -(-horizon // length)
+    blocks = jnp.pad(reward, ((0, count * length - horizon), (0, 0)))
+    blocks = blocks.reshape(count, length, num_episodes)
+    own = _discounted_sums(blocks, discount)
+    total = _discounted_sums(own[:, 0], jnp.power(discount, length))
+    later = jnp.pad(total[1:], ((0, 1), (0, 0)))
+    steps_left = jnp.arange(length, 0, -1, dtype=reward.dtype)
+    returns = own + jnp.power(discount, steps_left)[:, None] * later[:, None]
+    return returns.reshape(-1, num_episodes)[:horizon]
+
+
+def replace_broken(returns: jax.Array, broken: jax.Array) -> jax.Array:
+    """Returns the returns, of an episode that broke the least of the others'.
+
+    What it earned until the simulation left the finite numbers is no return: where rewards are
+    negative, it would speak for breaking early. So would leaving it out: the gradient of what
+    remains is that of an episode which earned 0.
+
+    Args:
+      returns: [..., N] such as G [T, N]; the others are those of the same step.
+      broken: [N] ``Trajectory.nonfinite``; where all are, all returns are infinite.
+    """
+    least = jnp.min(jnp.where(broken, jnp.inf, returns), axis=-1, keepdims=True)
+    return jnp.where(broken, least, returns)
+
+
+def _discounted_sums(x: jax.Array, discount: jax.Array) -> jax.Array:
+    """Returns y [..., T, N] with ``y[t] = x[t] + discount * y[t + 1]`` and ``y[T] = 0``."""
+    time = jnp.arange(x.shape[-2], dtype=x.dtype)
+    ahead = time - time[:, None]
+    factors = jnp.where(ahead < 0, 0, jnp.power(discount, jnp.maximum(ahead, 0)))
+    return jnp.matmul(factors, x, precision="highest")

@@ -1,0 +1,180 @@
+"""The natural gradient: the steepest ascent where distance is how far the policy moves.
+
+Of all small changes of the parameters that move the policy equally far in KL divergence, the best
+is along ``F^-1 g`` (Kakade 2001, "A natural policy gradient"), with the Fisher matrix
+
+    F = E[J^T H J]
+
+averaged over the visited steps; J is the derivative of the distribution's parameters in those of
+the policy, and H the second derivative of KL(old || new) in the former, at new = old.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from mjx_reinforce.engine.arguments import check_count, check_number
+from mjx_reinforce.engine.checks import check_kind
+from mjx_reinforce.learning.gradients import accumulate, draw_steps
+from mjx_reinforce.learning.policy import Policy
+from mjx_reinforce.learning.updates import Problem, Update, whole_rollout
+
+#: Conjugate gradients know F from so many of the visited steps at most.
+MAX_FISHER_STEPS = 4096
+#: They end where the residual is this share of the gradient.
+_TOLERANCE = 1e-8
+
+#: (problem, key, params, gradient) -> (F + damping I)^-1 gradient; may consume the key.
+LinearSolver = Callable[[Problem, jax.Array, Any, Any], Any]
+
+
+def natural_gradient(
+    policy: Policy,
+    max_kl: float | jax.Array,
+    *,
+    damping: float | jax.Array = 0.1,
+    iterations: int = 10,
+) -> Update:
+    """One step along x = (F + damping I)^-1 g, with the gradient g of the whole rollout.
+
+    The step's length is that at which the quadratic model of the KL divergence, half the square of
+    the step in F + damping I, is ``max_kl``: sqrt(2 max_kl / g'x) x (Schulman et al. 2015,
+    arXiv:1502.05477, appendix C; Rajeswaran et al. 2017, arXiv:1703.02660, equation 5, who leave
+    out the 2). The scale of the weights has no effect on it. The optimiser is given that step in
+    the place of a gradient: ``optax.sgd(1.0)`` makes the step as it is, and a schedule shortens it.
+    ``reinforce(max_kl=...)`` shortens a step for which the model was too good.
+
+    Where a linear policy has a distribution whose Fisher matrix depends on constants alone
+    (``normal``), F is exact, a matrix (O + 1) x (O + 1) for each entry of the action, which is
+    factored. Else conjugate gradients solve for x, with products of F and a vector that are two
+    passes through the network (Schulman et al. 2015, appendix C), over all visited steps or
+    ``MAX_FISHER_STEPS`` that are drawn.
+
+    The metrics are those of ``full_batch``; ``gradient_norm`` and ``gradient_snr`` are of g.
+
+    Args:
+      policy: the one that is trained.
+      max_kl: in nats, the mean over the visited steps.
+      damping: added to the diagonal of F, in its unit, nats per square of a parameter. It keeps
+        directions in which the policy hardly changes, where the gradient is mostly noise, from
+        being followed far. What it adds to the model of the KL divergence, the policy moves less.
+      iterations: of the conjugate gradients.
+
+    Raises:
+      ValueError: the policy's distribution does not know its KL divergence, ``max_kl`` or
+        ``damping`` is not positive, or ``iterations`` is less than one.
+
+    Examples:
+      >>> import jax, optax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> policy = mr.mlp_policy(env.observation_size, mr.categorical(env.action_space), ())
+      >>> update = mr.natural_gradient(policy, max_kl=0.01)
+      >>> learner = mr.reinforce(
+      ...     env, policy=policy, update=update, optimizer=optax.sgd(1.0), num_episodes=4
+      ... )
+      >>> state, metrics = mr.train_step(learner, learner.init(jax.random.key(0)))
+      >>> metrics["kl"].shape
+      ()
+    """
+    check_kind("policy", policy, Policy, "mjx_reinforce.mlp_policy(...)")
+    check_number("max_kl", max_kl, positive=True)
+    check_number("damping", damping, positive=True)
+    check_count("iterations", iterations)
+    if policy.distribution.kl is None:
+        raise ValueError(
+            "the natural gradient needs a distribution whose KL divergence is known: choose "
+            "normal, normal-softplus, normal-sigmoid or categorical, or another update"
+        )
+    if policy.distribution.fisher is not None and _is_linear(policy):
+        solve = _exact(policy, damping)
+    else:
+        solve = _by_conjugate_gradients(policy, damping, iterations)
+
+    def turn(problem, key, params, gradient):
+        flat, unravel = ravel_pytree(gradient)
+        norm = jnp.linalg.norm(flat)
+        unit = flat / jnp.where(norm > 0, norm, 1.0)
+        direction = ravel_pytree(solve(problem, key, params, unravel(unit)))[0]
+        slope = jnp.vdot(unit, direction, precision="highest")
+        length = jnp.where(slope > 0, jnp.sqrt(2 * max_kl / jnp.where(slope > 0, slope, 1.0)), 0.0)
+        return unravel((length * direction).astype(flat.dtype))
+
+    return whole_rollout(turn)
+
+
+def _is_linear(policy: Policy) -> bool:
+    """Returns whether these are the parameters of an ``mlp_policy`` without hidden layers."""
+    params = jax.eval_shape(policy.init, jax.random.key(0))
+    layer = {"params": {"Dense_0": {"bias": 0, "kernel": 0}}}
+    like = {"network": layer, "constants": 0}
+    return jax.tree.structure(params) == jax.tree.structure(like)
+
+
+def _exact(policy: Policy, damping: float | jax.Array) -> LinearSolver:
+    """Factors F: kron(E[o o^T], D) of the weights with D diagonal, and a diagonal of constants."""
+
+    def solve(problem, key, params, gradient):
+        del key
+
+        def products(chunk):
+            observation, mask = chunk
+            seen = jnp.concatenate([observation, jnp.ones((*mask.shape, 1))], axis=-1)
+            seen = jnp.where(mask[..., None], seen, 0.0)
+            return jnp.einsum("tni,tnj->ij", seen, seen, precision="highest")
+
+        observation, *_, mask = problem.samples
+        second = accumulate(products, (observation, mask)) / jnp.maximum(jnp.sum(mask), 1)
+        fisher = policy.distribution.fisher(params["constants"])  # type: ignore[misc]
+        means, constants = jnp.split(fisher, [policy.distribution.num_outputs])
+        matrices = means[:, None, None] * second + damping * jnp.eye(len(second))
+        layer = gradient["network"]["params"]["Dense_0"]
+        right = jnp.concatenate([layer["kernel"], layer["bias"][None]]).T[..., None]
+        factors = jnp.linalg.cholesky(matrices)
+        weights = jax.scipy.linalg.cho_solve((factors, True), right)[..., 0].T
+        return {
+            "network": {"params": {"Dense_0": {"kernel": weights[:-1], "bias": weights[-1]}}},
+            "constants": gradient["constants"] / (constants + damping),
+        }
+
+    return solve
+
+
+def _by_conjugate_gradients(
+    policy: Policy, damping: float | jax.Array, iterations: int
+) -> LinearSolver:
+    """Solves with products of F alone."""
+
+    def solve(problem, key, params, gradient):
+        observation, *_, mask = problem.samples
+        observation = observation.reshape(mask.size, -1)
+        if mask.size > MAX_FISHER_STEPS:
+            observation = observation[draw_steps(key, mask, (MAX_FISHER_STEPS,))]
+            share = jnp.full(MAX_FISHER_STEPS, 1 / MAX_FISHER_STEPS)
+        else:
+            share = mask.reshape(-1) / jnp.maximum(jnp.sum(mask), 1)
+
+        def outputs(params):
+            return policy.apply(params, observation)
+
+        old, push = jax.linearize(outputs, params)
+        pull = jax.linear_transpose(push, params)
+
+        def distance(new):
+            return jnp.sum(share * policy.distribution.kl(old, new))  # type: ignore[misc]
+
+        curve = jax.linearize(jax.grad(distance), old)[1]
+
+        flat, unravel = ravel_pytree(gradient)
+
+        def damped_fisher(vector):
+            (product,) = pull(curve(push(unravel(vector))))
+            return ravel_pytree(product)[0] + jnp.asarray(damping, flat.dtype) * vector
+
+        cg = jax.scipy.sparse.linalg.cg
+        return unravel(cg(damped_fisher, flat, tol=_TOLERANCE, maxiter=iterations)[0])
+
+    return solve

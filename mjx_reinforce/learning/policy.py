@@ -1,0 +1,175 @@
+"""Policies: a multilayer perceptron from observations to the parameters of a distribution."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from mjx_reinforce.engine.arguments import check_count
+from mjx_reinforce.engine.checks import check_kind, check_type
+from mjx_reinforce.learning.distributions.distribution import Distribution
+from mjx_reinforce.registry import check_name
+
+#: The ways to draw initial weights.
+INITIALIZERS = ("orthogonal", "torch")
+
+# With TF32, the default on NVIDIA's GPUs, small policies fail to learn and nothing reports it.
+_PRECISION = jax.lax.Precision.HIGHEST
+
+
+class MLP(nn.Module):
+    """A multilayer perceptron with tanh units and a linear last layer.
+
+    hidden_sizes: units of each hidden layer; none for a linear function
+    num_outputs: entries of the output
+    output_scale: gain of the last layer's orthogonal initial weights; with 0.01 an
+      untrained policy does nearly the same in all states (Andrychowicz et al. 2020,
+      arXiv:2006.05990, section 3.2)
+    initializer: "orthogonal": orthogonal weights in the last layer, LeCun's normal
+      weights in the hidden layers, zero biases; "torch": all weights and biases
+      uniform within 1 / sqrt(fan-in), as in ``torch.nn.Linear``, and ``output_scale``
+      is not used
+    """
+
+    hidden_sizes: Sequence[int]
+    num_outputs: int
+    output_scale: float = 1.0
+    initializer: str = "orthogonal"
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """Returns [..., num_outputs] of ``x`` [..., O]; ValueError: unknown initialiser."""
+        check_name("initializer", self.initializer, dict.fromkeys(INITIALIZERS))
+        for size in self.hidden_sizes:
+            x = nn.tanh(self._dense(x, size, nn.initializers.lecun_normal()))
+        return self._dense(x, self.num_outputs, nn.initializers.orthogonal(self.output_scale))
+
+    def _dense(self, x: jax.Array, size: int, kernel_init: nn.initializers.Initializer):
+        bias_init = nn.initializers.zeros
+        if self.initializer == "torch":
+            kernel_init = bias_init = _symmetric_uniform(x.shape[-1] ** -0.5)
+        return nn.Dense(size, kernel_init=kernel_init, bias_init=bias_init, precision=_PRECISION)(x)
+
+
+def _symmetric_uniform(bound: float) -> nn.initializers.Initializer:
+    """Returns an initialiser that draws from the uniform distribution on (-bound, bound)."""
+
+    def draw(key, shape, dtype=float, out_sharding=None):
+        del out_sharding
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return draw
+
+
+class Policy(NamedTuple):
+    """A parametrised distribution over actions, given the observation.
+
+    Attributes:
+      init: (key) -> params; consumes the key
+      apply: (params, observation [..., O]) -> outputs [..., K] of ``distribution``: the
+        ``num_outputs`` entries that a network computes, then one for each of
+        ``distribution.constants``, which are parameters; ``normal`` has a log standard deviation
+        for each entry of the action. ``mlp_policy`` is an example
+      distribution: the family of distributions that the outputs are the parameters of
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> policy = mr.mlp_policy(env.observation_size, mr.categorical(env.action_space), (8,))
+      >>> params = policy.init(jax.random.key(0))
+      >>> policy.apply(params, jax.numpy.zeros((5, 4))).shape  # a logit for each action
+      (5, 2)
+    """
+
+    init: Callable[[jax.Array], Any]
+    apply: Callable[[Any, jax.Array], jax.Array]
+    distribution: Distribution
+
+    def __repr__(self) -> str:
+        return f"Policy({self.distribution!r})"
+
+
+def mlp_policy(
+    observation_size: int,
+    distribution: Distribution,
+    hidden_sizes: Sequence[int] = (32, 32),
+    *,
+    shared_trunk: bool = True,
+    initializer: str = "orthogonal",
+) -> Policy:
+    """Builds a policy whose distribution has its parameters from an MLP with tanh units.
+
+    Args:
+      observation_size: O.
+      distribution: the family whose parameters the network computes.
+      hidden_sizes: units of each hidden layer; empty for a linear policy.
+      shared_trunk: True for one network that computes means and standard deviations;
+        False for a second network, of the same sizes, for the standard deviations.
+      initializer: of the weights, see ``MLP``.
+
+    Returns:
+      The policy; its params are ``{"network": ..., "constants": [K - num_outputs]}``,
+      and ``"scale_network"`` without a shared trunk.
+
+    Raises:
+      ValueError: a layer has no units, the initialiser is unknown, or a second network
+        is asked for and no standard deviation depends on the observation.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> policy = mr.mlp_policy(env.observation_size, mr.categorical(env.action_space), (8,))
+      >>> params = policy.init(jax.random.key(0))
+      >>> policy.apply(params, jax.numpy.zeros((5, 4))).shape  # a logit for each action
+      (5, 2)
+    """
+    check_count("observation_size", observation_size)
+    check_kind("distribution", distribution, Distribution, "mjx_reinforce.normal(env.action_space)")
+    check_type("hidden_sizes", hidden_sizes, tuple[int, ...])
+    networks = _networks(distribution, tuple(hidden_sizes), shared_trunk, initializer)
+    constants = distribution.constants
+
+    def init(key):
+        keys = [key] if len(networks) == 1 else jax.random.split(key, len(networks))
+        params = {
+            name: network.init(key, jnp.zeros(observation_size))
+            for (name, network), key in zip(networks.items(), keys, strict=True)
+        }
+        return params | {"constants": jnp.asarray(constants, jnp.result_type(float))}
+
+    def apply(params, observation):
+        outputs = [
+            jnp.asarray(network.apply(params[name], observation))
+            for name, network in networks.items()
+        ]
+        batch = outputs[0].shape[:-1]
+        fixed = jnp.broadcast_to(params["constants"], (*batch, len(constants)))
+        return jnp.concatenate([*outputs, fixed], axis=-1)
+
+    return Policy(init, apply, distribution)
+
+
+def _networks(
+    distribution: Distribution, hidden_sizes: tuple[int, ...], shared_trunk: bool, initializer: str
+) -> dict[str, MLP]:
+    """Returns the networks by their name in the params; raises ValueError as ``mlp_policy``."""
+    if any(size < 1 for size in hidden_sizes):
+        raise ValueError(f"every hidden layer needs at least one unit, got {hidden_sizes}")
+    check_name("initializer", initializer, dict.fromkeys(INITIALIZERS))
+    num_outputs, num_scales = distribution.num_outputs, distribution.num_scales
+    if not (shared_trunk or num_scales):
+        raise ValueError(
+            "without a shared trunk the standard deviation must come from the state, "
+            "as in normal-softplus; this distribution's is a constant, or it has none"
+        )
+    sizes = {"network": num_outputs}
+    if not shared_trunk:
+        sizes = {"network": num_outputs - num_scales, "scale_network": num_scales}
+    return {
+        name: MLP(hidden_sizes, size, output_scale=0.01, initializer=initializer)
+        for name, size in sizes.items()
+    }

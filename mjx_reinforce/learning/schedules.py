@@ -1,0 +1,141 @@
+"""What changes as a run goes on: behind an optimiser, in the discount, in how episodes are cut.
+
+Optax transformations go by the share of the budget that is used, which ``updates`` tells the
+optimiser of, or by the env steps played. Counted in env steps, a policy whose episodes are short
+keeps its rate and its noise, and one that has learned to play long ones settles soon.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from mjx_reinforce.engine.arguments import check_count, check_number
+
+#: The standard deviation shrinks in so many steps. Each is far greater than float32's rounding of
+#: its logarithm, however many updates there are.
+_STEPS = 4096
+
+
+class Cut(NamedTuple):
+    """Episodes of training end after some steps, until a share of the budget is used.
+
+    On a GPU an update of cut episodes is done sooner. A policy that was trained on cut episodes
+    alone may fail later in an episode, where it never was.
+
+    Attributes:
+      steps: after which an episode ends
+      until: the share of the budget, in [0, 1], from which on episodes are whole
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, horizon=100, cut=mr.Cut(steps=20, until=0.5))
+      >>> state, metrics = learner.step(learner.init(jax.random.key(0)))
+      >>> int(metrics["episode_length"]) <= 20
+      True
+    """
+
+    steps: int
+    until: float
+
+    def limit(self, progress: jax.Array, horizon: int) -> jax.Array:
+        """Returns the most steps [] of an episode where this share [] of the budget is used."""
+        return jnp.where(progress < self.until, min(self.steps, horizon), horizon)
+
+
+def check_cut(cut: Cut) -> None:
+    """Raises ValueError for numbers that make no sense."""
+    check_count("cut.steps", cut.steps)
+    check_number("cut.until", cut.until)
+    if cut.until > 1:
+        raise ValueError(f"cut.until must be a share of the budget in [0, 1], got {cut.until}")
+
+
+class Clock(NamedTuple):
+    """How far a run was before a rollout.
+
+    progress: [] the share of its budget that was used
+    env_steps: [] float, how many the seed had played
+    """
+
+    progress: jax.Array
+    env_steps: jax.Array
+
+
+class Shrunk(NamedTuple):
+    """State of ``shrink_std``: the share of its change that was made so far, []."""
+
+    share: jax.Array
+
+
+def share(clock: Clock, env_steps: float | jax.Array | None) -> jax.Array:
+    """Returns how much [] of a schedule has passed, at most 1.
+
+    Args:
+      clock: of the run.
+      env_steps: the schedule's length; None is as long as the budget.
+    """
+    passed = clock.progress if env_steps is None else clock.env_steps / env_steps
+    return jnp.minimum(passed, 1.0)
+
+
+def decay_rate(
+    least: float | jax.Array, env_steps: float | jax.Array | None = None
+) -> optax.GradientTransformationExtraArgs:
+    """Multiplies changes by a factor that falls linearly from 1 to ``least``, then stays.
+
+    Args:
+      least: the factor at the end.
+      env_steps: over which it falls; None: over the budget.
+    """
+
+    def update(updates, state, params=None, **rollout: Any):
+        del params
+        factor = 1 + (least - 1) * share(rollout["clock"], env_steps)
+        return jax.tree.map(lambda x: factor * x, updates), state
+
+    return optax.GradientTransformationExtraArgs(lambda params: optax.EmptyState(), update)
+
+
+def shrink_std(
+    ratio: float | jax.Array, env_steps: float | jax.Array | None = None
+) -> optax.GradientTransformationExtraArgs:
+    """Multiplies standard deviations that are parameters by ``ratio`` in all, evenly in the log.
+
+    Learning changes them besides, and an update that ``max_kl`` shortens shrinks them less. They
+    are the entry ``constants`` of ``mlp_policy``'s parameters, log standard deviations of the
+    families that keep one for all states; others have no entries.
+
+    Args:
+      ratio: of the standard deviation at the end to that at the start.
+      env_steps: over which it shrinks; None: over the budget.
+    """
+
+    def update(updates, state, params=None, **rollout: Any):
+        del params
+        now = jnp.floor(share(rollout["clock"], env_steps) * _STEPS) / _STEPS
+        change = (now - state.share) * jnp.log(ratio)
+        return updates | {"constants": updates["constants"] + change}, Shrunk(now)
+
+    def init(params):
+        del params
+        return Shrunk(jnp.zeros(()))
+
+    return optax.GradientTransformationExtraArgs(init, update)
+
+
+def look_further(
+    first: float | jax.Array, last: float | jax.Array, progress: jax.Array
+) -> jax.Array:
+    """Returns the discount [] at a share of the budget: 1 / (1 - discount) changes geometrically.
+
+    Args:
+      first: the discount at the beginning, less than 1.
+      last: the discount at the end, less than 1.
+      progress: [] the share of the budget that is used.
+    """
+    ahead = jnp.log1p(-jnp.asarray(first)), jnp.log1p(-jnp.asarray(last))
+    return -jnp.expm1(ahead[0] + progress * (ahead[1] - ahead[0]))

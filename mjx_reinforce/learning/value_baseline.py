@@ -1,0 +1,256 @@
+"""Estimators with a learned baseline: a value network that is fitted to the returns to go.
+
+The network is fitted after its values were used, so that no weight depends on its own episode
+through it, and the gradient stays unbiased (Sutton and Barto 2018, section 13.4).
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import linen as nn
+from jax import lax
+
+from mjx_reinforce.engine.arguments import check_count
+from mjx_reinforce.learning.estimators import Estimator, explained_variance, reward_to_go
+from mjx_reinforce.learning.gradients import accumulate_gradient, draw_steps, map_steps
+from mjx_reinforce.learning.policy import MLP
+
+#: The share that an update has in the running mean and variance of the returns.
+_UPDATE_SHARE = 0.1
+
+
+class Critic(NamedTuple):
+    """State of ``value_baseline``.
+
+    params, opt_state: of the network
+    seed: [] uint32, from which, with the number of updates, the minibatches are drawn
+    updates: [] int32, those in which anything was played
+    mean, variance: [] running moments of the returns to go; the network's values are in their
+      standard deviations from their mean, 0 before the first update
+    """
+
+    params: Any
+    opt_state: Any
+    seed: jax.Array
+    updates: jax.Array
+    mean: jax.Array
+    variance: jax.Array
+
+
+def value_baseline(
+    discount: float | jax.Array = 0.99,
+    *,
+    horizon: int = 1000,
+    network: nn.Module | None = None,
+    optimizer: optax.GradientTransformation | None = None,
+    num_fits: int = 32,
+    batch_size: int = 256,
+) -> Estimator:
+    """Weights an action by G[t] - V(o[t], t), V learned (Sutton and Barto 2018, section 13.4).
+
+    V reads the time besides the observation, for what is still earned depends on the steps that
+    are left (Pardo et al. 2018, arXiv:1712.00378). Each update goes on from the network and the
+    optimiser's state that the last one left, and fits them to G in units of its running standard
+    deviation, from its running mean, so that a learning rate means the same in every task. (Before
+    the first update V is 0.)
+
+    Args:
+      discount: in [0, 1].
+      horizon: steps after which the time counts as 1.
+      network: a flax module from [..., O + 1], the normalised observation and the time, to
+        [..., 1]; by default an MLP of 64 and 64 tanh units.
+      optimizer: what fits it; by default Adam at 3e-3.
+      num_fits: gradient steps on the mean squared error, each update.
+      batch_size: steps of the episodes, drawn with replacement, for each of them.
+
+    Raises:
+      ValueError: ``horizon``, ``num_fits`` or ``batch_size`` is less than one or the discount is
+        not in [0, 1].
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.value_baseline(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight.shape
+      (3, 2)
+    """
+    for name, count in (("horizon", horizon), ("num_fits", num_fits), ("batch_size", batch_size)):
+        check_count(name, count)
+    to_go, network, fitter = _defaults(discount, network, optimizer)
+
+    def value(params, observation, time):
+        share = jnp.asarray(time, observation.dtype) / horizon
+        seen = jnp.concatenate([observation, share[..., None]], axis=-1)
+        return jnp.asarray(network.apply(params, seen))[..., 0]
+
+    def init(key, observation_size):
+        network_key, key = jax.random.split(key)
+        seed = jax.random.bits(key, (), jnp.uint32)
+        params = _first_params(network, network_key, observation_size + 1)
+        zero = jnp.zeros(())
+        return Critic(params, fitter.init(params), seed, jnp.zeros((), jnp.int32), zero, zero)
+
+    def update(critic, trajectory):
+        mask, num_episodes = trajectory.mask, trajectory.mask.shape[1]
+        returns = to_go.update((), trajectory)[0]
+        time = jnp.broadcast_to(jnp.arange(len(mask))[:, None], mask.shape)
+        data = (trajectory.observation, time, mask)
+        scaled = map_steps(lambda chunk: value(critic.params, *chunk[:2]), data)
+        values = critic.mean + jnp.sqrt(critic.variance) * scaled
+        weight, metrics = _residual(returns, values, mask)
+
+        updates, mean, variance = _moments(critic, returns, mask)
+        unit = jnp.where(variance > 0, jnp.sqrt(variance), 1.0)
+        draw_key = jax.random.fold_in(jax.random.key(critic.seed), critic.updates)
+        observations = trajectory.observation.reshape(mask.size, -1)
+        targets = (returns.reshape(-1) - mean) / unit
+
+        def fit(carry, index):
+            params, opt_state = carry
+
+            def squared_error(params):
+                predicted = value(params, observations[index], index // num_episodes)
+                return jnp.mean((predicted - targets[index]) ** 2)
+
+            grads = jax.grad(squared_error)(params)
+            changes, opt_state = fitter.update(grads, opt_state, params)
+            return (optax.apply_updates(params, changes), opt_state), None
+
+        indices = draw_steps(draw_key, mask, (num_fits, batch_size))
+        (params, opt_state), _ = lax.scan(fit, (critic.params, critic.opt_state), indices)
+        return weight, Critic(params, opt_state, critic.seed, updates, mean, variance), metrics
+
+    return Estimator(init, update)
+
+
+class FullBatchCritic(NamedTuple):
+    """State of ``full_batch_value_baseline``: the network's parameters, its optimiser's state."""
+
+    params: Any
+    opt_state: Any
+
+
+def full_batch_value_baseline(
+    discount: float | jax.Array = 0.99,
+    *,
+    network: nn.Module | None = None,
+    optimizer: optax.GradientTransformation | None = None,
+    num_fits: int = 10,
+) -> Estimator:
+    """Weights an action by G[t] - V(o[t]), V learned, as published programs fit it.
+
+    V reads the observation alone, is in the unit of the return, and every gradient step takes the
+    whole rollout: slow for what it learns.
+
+    Args:
+      discount: in [0, 1].
+      network: a flax module from [..., O] to [..., 1]; by default an MLP of 64
+        and 64 tanh units.
+      optimizer: what fits it; by default Adam at 3e-3.
+      num_fits: gradient steps on the mean squared error, each update.
+
+    Raises:
+      ValueError: ``num_fits`` is less than one or the discount is not in [0, 1].
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> ones = jnp.ones((3, 2))  # two episodes of three steps
+      >>> played = mr.Trajectory(
+      ...     observation=ones[..., None], action=ones[..., None], reward=ones, mask=ones > 0,
+      ...     nonfinite=jnp.zeros(2, bool), simulated=jnp.asarray(6),
+      ... )
+      >>> estimator = mr.full_batch_value_baseline(discount=1.0)
+      >>> weight, _, _ = estimator.update(estimator.init(jax.random.key(0), 1), played)
+      >>> weight.shape
+      (3, 2)
+    """
+    check_count("num_fits", num_fits)
+    to_go, network, fitter = _defaults(discount, network, optimizer)
+
+    def value(params, observation):
+        return jnp.asarray(network.apply(params, observation))[..., 0]
+
+    def squared_error(params, chunk):
+        observation, returns, mask = chunk
+        return jnp.sum(jnp.where(mask, (value(params, observation) - returns) ** 2, 0.0)), {}
+
+    def init(key, observation_size):
+        params = _first_params(network, key, observation_size)
+        return FullBatchCritic(params, fitter.init(params))
+
+    def update(critic, trajectory):
+        returns, mask = to_go.update((), trajectory)[0], trajectory.mask
+        values = value(critic.params, trajectory.observation)
+        weight, metrics = _residual(returns, values, mask)
+        steps = jnp.maximum(jnp.sum(mask), 1)
+        data = (trajectory.observation, returns, mask)
+
+        def fit(critic, _):
+            _, grads, _ = accumulate_gradient(squared_error, critic.params, data)
+            grads = jax.tree.map(lambda g: g / steps, grads)
+            changes, opt_state = fitter.update(grads, critic.opt_state, critic.params)
+            return FullBatchCritic(optax.apply_updates(critic.params, changes), opt_state), None
+
+        critic, _ = lax.scan(fit, critic, length=num_fits)
+        return weight, critic, metrics
+
+    return Estimator(init, update)
+
+
+def _defaults(
+    discount: float | jax.Array,
+    network: nn.Module | None,
+    optimizer: optax.GradientTransformation | None,
+) -> tuple[Estimator, nn.Module, optax.GradientTransformation]:
+    """Returns what gives the returns to go, the network, and the optimiser."""
+    network = MLP((64, 64), 1) if network is None else network
+    return reward_to_go(discount), network, optax.adam(3e-3) if optimizer is None else optimizer
+
+
+def _first_params(network: nn.Module, key: jax.Array, inputs: int) -> Any:
+    """Returns the network's first parameters; raises ValueError if it returns no values."""
+    params = network.init(key, jnp.zeros(inputs))
+    shape = jax.eval_shape(network.apply, params, jnp.zeros(inputs)).shape
+    if shape != (1,):
+        raise ValueError(f"the network must return values [..., 1], got {list(shape)}")
+    return params
+
+
+def _residual(
+    returns: jax.Array, values: jax.Array, mask: jax.Array
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Returns the weights [T, N], and how good the values [T, N] were."""
+    weight = jnp.where(mask, returns - values, 0.0)
+    error = jnp.sum(weight**2) / jnp.maximum(jnp.sum(mask), 1)
+    return weight, {
+        "explained_variance": explained_variance(weight, returns, mask),
+        "value_loss": error,
+    }
+
+
+def _moments(
+    critic: Critic, returns: jax.Array, mask: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Returns the updates counted, the mean and the variance, those of this rollout included.
+
+    The first updates count alike, so that no start has to be forgotten.
+    """
+    steps = jnp.sum(mask)
+    updates = critic.updates + (steps > 0)
+    share = jnp.where(steps > 0, jnp.maximum(1 / jnp.maximum(updates, 1), _UPDATE_SHARE), 0.0)
+
+    def mean(x):
+        return jnp.sum(jnp.where(mask, x, 0.0)) / jnp.maximum(steps, 1)
+
+    centre = critic.mean + share * (mean(returns) - critic.mean)
+    spread = mean((returns - centre) ** 2)
+    return updates, centre, critic.variance + share * (spread - critic.variance)

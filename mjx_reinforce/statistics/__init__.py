@@ -1,0 +1,218 @@
+"""Statistics over seeds: what a few numbers can and cannot say of a distribution."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mjx_reinforce.statistics.bootstrap import expanded_tail, percentiles, resampled_trim_means
+
+#: What an interquartile mean leaves out at each end.
+_QUARTER = 0.25
+#: Points whose resamples are in memory at once.
+_POINTS = 400
+
+
+class Estimate(NamedTuple):
+    """A statistic and the ends of its confidence interval: numbers, or arrays of one shape."""
+
+    value: Any
+    low: Any
+    high: Any
+
+
+def enough(num_seeds: int, confidence: float = 0.95) -> bool:
+    """Returns whether so many seeds can bear an interval: at 95 %, six can.
+
+    All seeds lie on one side of the truth, if a seed is as likely to lie on either, with the
+    probability 2^(1 - n). No interval within the range of fewer holds the truth as often as it
+    says, and no test of signs rejects.
+    """
+    return 2.0 ** (1 - num_seeds) <= 1 - confidence
+
+
+def alike(values: np.ndarray, size: Any = 0.0) -> np.ndarray:
+    """Returns where values [..., S] differ by no more than the rounding of float32 numbers, [...].
+
+    Args:
+      values: finite or -inf.
+      size: [...] of the numbers that were rounded, where that is more than the values'.
+    """
+    low, high = np.min(values, axis=-1), np.max(values, axis=-1)
+    largest = np.maximum(np.maximum(np.abs(low), np.abs(high)), size)
+    with np.errstate(invalid="ignore"):  # where all failed
+        return high - low <= np.finfo(np.float32).eps * np.where(largest < np.inf, largest, 0.0)
+
+
+def worst_if_not_finite(values: ArrayLike) -> np.ndarray:
+    """Returns the values, -inf for those that are not finite: a seed that failed is the worst."""
+    values = np.asarray(values, float)
+    return np.where(np.isfinite(values), values, -np.inf)
+
+
+def iqm(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    """Returns the interquartile mean: the mean of the middle half (Agarwal et al. 2021).
+
+    It is robust to a few failed or lucky seeds and uses more data than the median
+    (arXiv:2108.13264, section 4.3). Fewer than four values are averaged whole.
+
+    A value that is not finite is of a seed that failed, and counts as worse than every other,
+    whatever the sign of returns. Where so many failed that they reach the middle half, there is
+    no mean: it is NaN.
+
+    Examples:
+      >>> import mjx_reinforce as mr
+      >>> mr.iqm([0.0, 1.0, 2.0, 100.0]).item()  # the middle half
+      1.5
+    """
+    failed_first = np.where(np.isfinite(values), values, -np.inf)
+    ranked = np.sort(np.moveaxis(failed_first, axis, -1), axis=-1)
+    cut = int(_QUARTER * ranked.shape[-1])
+    return finite_or_nan(ranked[..., cut : ranked.shape[-1] - cut].mean(axis=-1))
+
+
+def iqm_interval(
+    values: np.ndarray, axis: int = -1, confidence: float = 0.95
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a confidence interval of the interquartile mean over seeds.
+
+    It is Hesterberg's expanded percentile bootstrap, see ``bootstrap.expanded_tail``, of 5000
+    resamples. At every point the same ranks are drawn, so the interval of a curve's point is that
+    of the point alone. docs/statistics.md says how often it covers the truth.
+
+    Args:
+      values: one entry a seed along ``axis``; not finite where the seed failed, see ``iqm``.
+      axis: the seeds.
+      confidence: the interval's level.
+
+    Returns:
+      Its lower and upper ends. Both are NaN of fewer than six seeds (see ``enough``) and of fewer
+      than eleven that are all alike: as many as that are, one time in twenty, also where a quarter
+      of all seeds differs. An end is NaN too where so many seeds failed that there is no mean in
+      the resamples around it.
+
+    Examples:
+      >>> import numpy as np
+      >>> import mjx_reinforce as mr
+      >>> low, high = mr.iqm_interval(np.arange(20.0))
+      >>> bool(low < 9.5 < high)
+      True
+    """
+    return _expanded_percentiles(
+        np.moveaxis(np.asarray(values, float), axis, -1), _QUARTER, confidence
+    )
+
+
+def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a confidence interval of the mean of values [..., S]; as ``iqm_interval``.
+
+    Seeds that are all alike, however many, do not show how far a rare other would move the mean.
+
+    Examples:
+      >>> import numpy as np
+      >>> import mjx_reinforce as mr
+      >>> low, high = mr.mean_interval(np.arange(20.0))
+      >>> bool(low < 9.5 < high)
+      True
+    """
+    return _expanded_percentiles(np.asarray(values, float), 0.0, confidence)
+
+
+def _expanded_percentiles(
+    values: np.ndarray, cut: float, confidence: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the ends of the interval of a trimmed mean over the last axis."""
+    *shape, num_seeds = values.shape
+    points = worst_if_not_finite(values).reshape(-1, num_seeds)
+    ends = np.full((2, len(points)), np.nan)
+    if enough(num_seeds, confidence):
+        # Only means without trimming were seen to spread too little (interval_coverage.py).
+        shrinkage = 1.0 if cut else math.sqrt(1 - 1 / num_seeds)
+        tail = expanded_tail(confidence, num_seeds - 1, shrinkage)
+        for first in range(0, len(points), _POINTS):
+            some = slice(first, first + _POINTS)
+            ends[:, some] = percentiles(resampled_trim_means(points[some], cut), tail)
+        if (1 - cut) ** num_seeds > 1 - confidence:
+            ends[:, alike(points)] = np.nan
+    low, high = finite_or_nan(ends).reshape(2, *shape)
+    return low[()], high[()]
+
+
+def finite_or_nan(values: ArrayLike) -> Any:
+    """Returns the values, NaN for those that are not finite."""
+    return np.where(np.isfinite(values), values, np.nan)[()]
+
+
+def steps_to_solve(
+    returns: np.ndarray, env_steps: np.ndarray, threshold: float | None
+) -> list[int | None]:
+    """Returns each seed's env steps at its first evaluation at or above the threshold.
+
+    Args:
+      returns: [E, S] the deterministic return at each evaluation.
+      env_steps: [E, S] the env steps trained until then.
+      threshold: the return that counts as solved, or None where there is none.
+
+    Returns:
+      [S] env steps, None for a seed that never got there.
+    """
+    if threshold is None:
+        return [None] * returns.shape[1]
+    solved = returns >= threshold
+    first = np.argmax(solved, axis=0)
+    return [int(env_steps[e, s]) if solved[e, s] else None for s, e in enumerate(first)]
+
+
+def summarize(history: dict[str, np.ndarray], threshold: float | None) -> dict[str, Any]:
+    """Returns the statistics over seeds of a run.
+
+    Args:
+      history: ``eval_return``, and the ``env_steps`` and ``episodes`` until then, each
+        [E, S]: evaluations by seeds.
+      threshold: the return that counts as solved, if any.
+
+    Returns:
+      ``final_returns`` [S], NaN of a seed that failed; their interquartile mean ``iqm`` with
+      its 95 % interval ``iqm_ci``, where a failed seed counts as the worst; how many seeds have
+      that as their last return, ``seeds_nonfinite_at_end``. Then of the threshold, None without
+      one: how many seeds reached it in their last evaluation, ``seeds_solved_at_end``, also as a
+      fraction, ``solve_rate``; how many in any evaluation, ``seeds_ever_solved``; and
+      ``env_steps_to_solve`` and ``episodes_to_solve`` [S], until the first that did.
+    """
+    returns = history["eval_return"]
+    final = returns[-1]
+    low, high = iqm_interval(final)
+    solved = None if threshold is None else returns >= threshold
+    return {
+        "final_returns": final.tolist(),
+        "iqm": float(iqm(final)),
+        "iqm_ci": [float(low), float(high)],
+        "seeds_nonfinite_at_end": int(np.sum(~np.isfinite(final))),
+        "seeds_solved_at_end": None if solved is None else int(solved[-1].sum()),
+        "seeds_ever_solved": None if solved is None else int(solved.any(axis=0).sum()),
+        "solve_rate": None if solved is None else float(np.mean(solved[-1])),
+        "env_steps_to_solve": steps_to_solve(returns, history["env_steps"], threshold),
+        "episodes_to_solve": steps_to_solve(returns, history["episodes"], threshold),
+    }
+
+
+def smooth(values: np.ndarray, window: int) -> np.ndarray:
+    """Returns the mean of each value [U, ...] and up to ``window`` - 1 before it.
+
+    It is NaN where one of these is not finite, and only there.
+    """
+    finite = np.isfinite(values)
+    last = np.arange(len(values)) + 1
+    first = np.maximum(last - window, 0)
+    count = (last - first).reshape(-1, *(1,) * (values.ndim - 1))
+    sums = _sums_before(np.where(finite, values, 0))
+    known = _sums_before(finite)
+    mean = (sums[last] - sums[first]) / count
+    return np.where(known[last] - known[first] == count, mean, np.nan)
+
+
+def _sums_before(values: np.ndarray) -> np.ndarray:
+    """Returns the sums of the first 0, 1, ..., U values [U, ...]."""
+    sums = np.cumsum(values, axis=0)
+    return np.concatenate([np.zeros_like(sums[:1]), sums])

@@ -1,0 +1,242 @@
+"""Which of two configurations is better, by how much, and how sure that is."""
+
+import itertools
+import math
+import warnings
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import stats
+
+from mjx_reinforce.statistics import Estimate, alike, enough, worst_if_not_finite
+from mjx_reinforce.statistics.aggregates import wilson
+
+
+class Difference(NamedTuple):
+    """How much higher the first of two configurations is, and how sure it is that they differ.
+
+    value: the difference, first minus second, in units of return.
+    low, high: its confidence interval.
+    p_value: of no difference, two-sided.
+    """
+
+    value: Any
+    low: Any
+    high: Any
+    p_value: Any
+
+
+class Comparison(NamedTuple):
+    """Two configurations, ``first`` and ``second`` being their places in the list.
+
+    improvement: the probability that a seed of the first is better than one of the second.
+    difference: how much higher the first's mean is, in units of return.
+    p_value: of no difference, two-sided.
+    adjusted: the same after Holm's correction for all pairs.
+    """
+
+    first: int
+    second: int
+    improvement: Estimate
+    difference: Estimate
+    p_value: float
+    adjusted: float
+
+
+def probability_of_improvement(
+    x: ArrayLike, y: ArrayLike, *, paired: bool = False, confidence: float = 0.95
+) -> Estimate:
+    """Returns the probability that a value of x is above one of y, ties counting half.
+
+    That of Agarwal et al. (2021, arXiv:2108.13264, section 4.3), which is Mann and Whitney's U
+    over the number of pairs. The interval is Wilson's, at the number of trials that would give a
+    rate the variance this estimate has (DeLong et al. 1988; Kottas et al. 2014, BMC Medical
+    Research Methodology 14:26).
+
+    Args:
+      x: [..., S] values of one configuration; a seed that failed is worse than every other.
+      y: [..., S'] values of another.
+      paired: both have the same seeds in the same order. The value is that without, but the
+        interval takes account of the luck that they share (Munzel 1999, Statistics in Medicine 18);
+        too few show nothing of that luck, and count as one trial each.
+      confidence: the interval's level.
+
+    Raises:
+      ValueError: paired values of different number.
+
+    Examples:
+      >>> import mjx_reinforce as mr
+      >>> mr.probability_of_improvement([3.0, 4.0], [1.0, 2.0]).value.item()
+      1.0
+    """
+    x, y = worst_if_not_finite(x), worst_if_not_finite(y)
+    of_x, of_y = _placements(x, y)
+    rate = of_x.mean(axis=-1)
+    if not paired:
+        variance = _variance_of_mean(of_x) + _variance_of_mean(of_y)
+    elif x.shape == y.shape:
+        variance = _variance_of_mean(of_x + of_y)
+    else:
+        raise ValueError(f"paired values must be as many: {x.shape[-1]} and {y.shape[-1]} given")
+    fewest = min(x.shape[-1], y.shape[-1])
+    known = (variance > 1e-20) & (rate > 0) & (rate < 1)  # which is more than rounding
+    known &= not paired or enough(fewest, confidence)
+    trials = np.where(known, rate * (1 - rate) / np.where(known, variance, 1), fewest)
+    return wilson(rate * trials, trials, confidence)
+
+
+def _variance_of_mean(values: np.ndarray) -> np.ndarray:
+    """Returns how uncertain the mean of values [..., S] is, [...]; 0 for one."""
+    return values.var(axis=-1) / max(values.shape[-1] - 1, 1)
+
+
+def _placements(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the share of y below each of x [..., S] and of x above each of y [..., S']."""
+    together = stats.rankdata(np.concatenate([x, y], axis=-1), axis=-1)
+    sizes = x.shape[-1], y.shape[-1]
+    of_x = (together[..., : sizes[0]] - stats.rankdata(x, axis=-1)) / sizes[1]
+    of_y = (together[..., sizes[0] :] - stats.rankdata(y, axis=-1)) / sizes[0]
+    return of_x, 1 - of_y
+
+
+def failures_as_worst(x: ArrayLike, y: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Returns x and y [..., S], the worst finite value of both for each that is not finite."""
+    x, y = np.asarray(x, float), np.asarray(y, float)
+    both = np.concatenate([x, y], axis=-1)
+    worst = np.min(both, axis=-1, keepdims=True, initial=np.inf, where=np.isfinite(both))
+    worst = np.where(np.isfinite(worst), worst, 0.0)
+    return np.where(np.isfinite(x), x, worst), np.where(np.isfinite(y), y, worst)
+
+
+def paired_difference(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> Difference:
+    """Returns how much higher the mean of x is than that of y on the same seeds: paired t-test.
+
+    The test knows only the pairs that it can tell apart, those that differ. That all K of them
+    favour the same one has the probability 2^(1 - K) without any difference, so p is no less.
+
+    Args:
+      x: [..., S] values of one configuration. A seed that failed counts as the worst finite value
+        of both configurations, so the difference it makes is understated.
+      y: [..., S] values of another, with the same seeds in the same order.
+      confidence: the interval's level.
+
+    Returns:
+      Arrays [...]. The interval is NaN where all differences are equal, for they do not show how
+      far others would be from them, and of fewer than six seeds.
+
+    Raises:
+      ValueError: x and y differ in number.
+
+    Examples:
+      >>> import numpy as np
+      >>> import mjx_reinforce as mr
+      >>> seeds = np.arange(20.0)
+      >>> mr.paired_difference(seeds + 1, seeds).value.item()
+      1.0
+    """
+    if np.shape(x) != np.shape(y):
+        raise ValueError(f"paired values must be as many: {np.size(x)} and {np.size(y)} given")
+    x, y = failures_as_worst(x, y)
+    difference, size = x - y, np.max(np.maximum(np.abs(x), np.abs(y)), axis=-1)
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore", RuntimeWarning)  # of equal differences, for which see below
+        test = stats.ttest_1samp(difference, 0, axis=-1)
+        low, high = test.confidence_interval(confidence)
+    told_apart = np.sum(difference != 0, axis=-1)
+    p_value = np.maximum(np.nan_to_num(np.asarray(test[1])), np.minimum(2.0 ** (1 - told_apart), 1))
+    hidden = alike(difference, size) | (not enough(difference.shape[-1], confidence))
+    low, high = (np.where(hidden, np.nan, end)[()] for end in (low, high))
+    return Difference(difference.mean(axis=-1), low, high, p_value[()])
+
+
+def least_p(first: int, second: int) -> float:
+    """Returns the least two-sided p value of a test of two groups of so many seeds, in any order.
+
+    Without a difference, all orders are alike, and in two of them a group is all above the other.
+    """
+    return 2 / math.comb(first + second, first)
+
+
+def paired_rates(x: ArrayLike, y: ArrayLike, confidence: float = 0.95) -> Difference:
+    """Returns how much higher the rate of x is than that of y on the same seeds.
+
+    The interval is Newcombe's (1998, Statistics in Medicine 17, 2635-2650, method 10): Wilson's of
+    both rates, squared and added, with the correlation of the pairs. Unlike that of a t-test it has
+    width also where all seeds agree. The p value is McNemar's exact one: of the seeds that tell x
+    from y, as many would be for either.
+
+    Args:
+      x: [..., S] whether each seed of one configuration did it, such as solve the task.
+      y: [..., S] the same of another, with the same seeds in the same order.
+      confidence: the interval's level.
+
+    Raises:
+      ValueError: x and y differ in number.
+    """
+    x, y = np.asarray(x, bool), np.asarray(y, bool)
+    if x.shape != y.shape:
+        raise ValueError(f"paired values must be as many: {x.size} and {y.size} given")
+    num_seeds = x.shape[-1]
+    both, first, second, none = (np.sum(a & b, axis=-1) for a in (x, ~x) for b in (y, ~y))
+    of_x, of_y = (wilson(z.sum(axis=-1), num_seeds, confidence) for z in (x, y))
+    value = of_x.value - of_y.value
+    # The correlation, shrunk where it is positive; 0 where a rate is 0 or 1.
+    product = 1.0 * both * none - 1.0 * first * second
+    shrunk = np.where(product < 0, product, np.maximum(product - num_seeds / 2, 0))
+    spread = num_seeds**2 * np.sqrt(of_x.value * (1 - of_x.value) * of_y.value * (1 - of_y.value))
+    correlation = np.divide(shrunk, spread, out=np.zeros_like(value), where=spread > 0)
+
+    def half(one: np.ndarray, other: np.ndarray) -> Any:
+        return np.sqrt(one**2 - 2 * correlation * one * other + other**2)
+
+    low = value - half(of_x.value - of_x.low, of_y.high - of_y.value)
+    high = value + half(of_y.value - of_y.low, of_x.high - of_x.value)
+    fewer = stats.binom.cdf(np.minimum(first, second), first + second, 0.5)
+    return Difference(value, low, high, np.minimum(2 * fewer, 1.0)[()])
+
+
+def compare_all(values: Sequence[np.ndarray], confidence: float = 0.95) -> list[Comparison]:
+    """Compares every pair of configurations, p values corrected after Holm.
+
+    Args:
+      values: [S] of each configuration, the same seeds in the same order; an entry that is not
+        finite is of a seed that failed.
+      confidence: the level of each interval (which is not corrected).
+
+    Examples:
+      >>> import numpy as np
+      >>> import mjx_reinforce as mr
+      >>> seeds = np.arange(20.0)
+      >>> len(mr.compare_all([seeds, seeds + np.sin(seeds), seeds + 5]))  # three pairs
+      3
+    """
+    pairs = list(itertools.combinations(range(len(values)), 2))
+    differences = [paired_difference(values[i], values[j], confidence=confidence) for i, j in pairs]
+    adjusted = holm([difference.p_value for difference in differences])
+    return [
+        Comparison(
+            i,
+            j,
+            probability_of_improvement(values[i], values[j], paired=True, confidence=confidence),
+            Estimate(difference.value, difference.low, difference.high),
+            difference.p_value,
+            float(corrected),
+        )
+        for (i, j), difference, corrected in zip(pairs, differences, adjusted, strict=True)
+    ]
+
+
+def holm(p_values: ArrayLike) -> np.ndarray:
+    """Returns p values [K] corrected for there being K of them (Holm 1979).
+
+    To call significant what is below a level then wrongly does so once or more with at most that
+    probability, whatever the tests' dependence.
+    """
+    p_values = np.asarray(p_values, float)
+    order = np.argsort(p_values)
+    scaled = p_values[order] * np.arange(len(p_values), 0, -1)
+    adjusted = np.empty_like(p_values)
+    adjusted[order] = np.minimum(np.maximum.accumulate(scaled), 1.0)
+    return adjusted

@@ -1,0 +1,120 @@
+"""A function of one example in machine code: ``jax.vmap``'s results of batches of any size."""
+
+import jax
+import jax.numpy as jnp
+import native_items as items
+import numpy as np
+import pytest
+
+from mjx_reinforce.engine.cpu import machine
+from mjx_reinforce.engine.cpu.handler import Flush, flush
+from mjx_reinforce.engine.cpu.machine import this_machine
+from mjx_reinforce.engine.play import program
+from mjx_reinforce.engine.play.mapping import machine_map
+
+pytest.importorskip("llvmlite", reason="machine code is written by llvmlite")
+pytestmark = pytest.mark.cpu
+
+
+def function(x, nothing, more):
+    """Leaves of every kind; two results, one of them empty, one a bool, one an integer."""
+    flag, count = more
+    y = jnp.where(flag, x, -2 * x) + count
+    return {"y": y, "none": nothing * 2, "big": y.sum() > 1, "n": count * 2 + 1, "x": x[1]}
+
+
+def batch(size):
+    rng = np.random.default_rng(size)
+    flags, counts = rng.integers(0, 2, size) > 0, rng.integers(-5, 5, size).astype(np.int32)
+    x = rng.normal(size=(size, 3)).astype(np.float32)
+    return jnp.asarray(x), jnp.zeros((size, 0)), (jnp.asarray(flags), jnp.asarray(counts))
+
+
+@pytest.fixture(scope="module")
+def mapped():
+    return jax.jit(machine_map(function, *jax.tree.map(lambda x: x[0], batch(1))))
+
+
+def test_results_are_those_of_vmap(mapped):
+    """The last lanes have no example where the size is no multiple of theirs."""
+    for size in (1, 16, 37):
+        got, want = mapped(*batch(size)), jax.vmap(function)(*batch(size))
+        assert jax.tree.structure(got) == jax.tree.structure(want)
+        for x, exact in zip(jax.tree.leaves(got), jax.tree.leaves(want), strict=True):
+            assert (x.shape, x.dtype) == (exact.shape, exact.dtype)
+            np.testing.assert_allclose(x, exact, rtol=1e-6)
+        assert size % this_machine().lanes or size == 16
+
+
+def test_a_loop_reads_what_one_before_it_has_kept():
+    """In its order, backwards and in parts."""
+
+    def sums(x):
+        kept = jax.lax.scan(lambda y, _: (0.9 * y, jnp.sin(y)), x, None, 7)[1]
+        add = lambda y, row: (0.5 * y + row, None)  # noqa: E731
+        parts = kept, kept[::-1], kept[:4], kept[3:], kept[4::-1], kept[:2:-1], kept[::2]
+        return [jax.lax.scan(add, x, part)[0] for part in parts]
+
+    x, *_ = batch(37)
+    got = jax.jit(machine_map(sums, x[0]))(x)
+    np.testing.assert_allclose(got, jax.vmap(sums)(x), rtol=1e-5, atol=1e-6)
+
+
+def test_integers_divide_as_everywhere():
+    """By zero, and the least one by -1, for both of which a processor stops the program."""
+    edges = jnp.int32([-(2**31), -7, -1, 0, 1, 5, 2**31 - 1])
+    x, y = (x.ravel() for x in jnp.meshgrid(edges, edges))
+    for function in (jax.lax.div, jax.lax.rem):
+        got = jax.jit(machine_map(function, x[0], y[0]))(x, y)
+        np.testing.assert_array_equal(got, jax.vmap(function)(x, y))
+
+
+def test_a_long_text_takes_less_effort_and_gives_the_same_bits(mapped, monkeypatch):
+    efforts = []
+    effort = machine._effort
+
+    def noted(text):
+        efforts.append(effort(text))
+        return efforts[-1]
+
+    def named(x, nothing, more):
+        return function(x, nothing, more) | {"one": x[0] * 0}  # XLA has not met its handler
+
+    monkeypatch.setattr(machine, "_effort", noted)
+    monkeypatch.setattr(machine, "_LONG_TEXT", 0)
+    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(program.objects, "folder", lambda: None)
+    other = jax.jit(machine_map(named, *jax.tree.map(lambda x: x[0], batch(1))))(*batch(37))
+    for name, x in mapped(*batch(37)).items():
+        np.testing.assert_array_equal(x, other[name])
+    assert set(efforts) == {1}
+
+
+def test_numbers_of_8_bits_are_refused():
+    with pytest.raises(TypeError, match="it has numbers of int8, not of 32 or 64 bits"):
+        machine_map(lambda x: x, jnp.int8(1))
+    with pytest.raises(TypeError, match="numbers of uint8"):
+        machine_map(lambda x: x.astype(jnp.uint8), jnp.int32(1))
+
+
+def test_numbers_below_the_smallest_normal_are_zero(monkeypatch):
+    """Also in threads of Python's: XLA has its own flush too."""
+    if not flush(this_machine().triple).begin:
+        pytest.skip("unknown on this machine")
+    texts, load = [], machine.load_module
+    noted = lambda source, write, *x: texts.append(write()) or load(source, write, *x)  # noqa: E731
+    monkeypatch.setattr(machine, "load_module", noted)
+    machine_map(lambda x, y: x * y, jnp.float32(0), jnp.float32(0))
+    monkeypatch.setattr(machine, "load_module", load)
+    x = np.float32([1e-20, 1e-19, 1.0, 1e-38]).repeat(9)
+    y = np.float32([1e-20, 1e-18, 1e-39, 0.5]).repeat(9)
+    small = np.full(x.shape, np.nan, np.float32)
+    items.by_hand(texts[0], [np.zeros(1, np.int32), x, y], [small], (1, x.size, 1))
+    np.testing.assert_array_equal(small, np.where(x * y < 2.0**-126, 0, x * y))
+    assert (x * y > 0).all()
+
+
+def test_flushing_is_known_by_the_architecture():
+    assert flush("arm64-apple-darwin") == flush("aarch64-unknown-linux-gnu") != Flush()
+    assert flush("x86_64-pc-linux-gnu").begin != flush("aarch64-linux").begin
+    assert flush("riscv64-linux") == Flush()

@@ -1,0 +1,306 @@
+"""The native engine plays the same episodes as `rollouts.rollout`, in machine code."""
+
+import functools
+import itertools
+import re
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from players import actor_and_act, assert_same_episodes, both, only_active, played
+from scenes import SCENE
+from toys import Bytes, Drifting
+
+from mjx_reinforce import Box
+from mjx_reinforce.engine.base import Discrete
+from mjx_reinforce.engine.cpu import lanes, machine
+from mjx_reinforce.engine.gpu import ptx
+from mjx_reinforce.engine.play import available, choice, native, objects, program, rollouts
+from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
+
+if reason := available.unavailable():
+    pytest.skip(reason, allow_module_level=True)
+
+
+@pytest.mark.parametrize("name", sorted(DISTRIBUTIONS))
+def test_every_distribution_draws_the_same_noise(name):
+    """Over three chunks, in lanes that are at different steps."""
+    space = Box(np.array([-3.0]), np.array([1.0]))
+    try:
+        distribution = load_definition(DISTRIBUTIONS[name])(space)
+    except ValueError:
+        space = Discrete(3)
+        distribution = load_definition(DISTRIBUTIONS[name])(space)
+    env = Drifting(space)
+    player = actor_and_act(env, (4,), distribution=distribution)
+    got, want = both(env, player, deterministic=jnp.arange(5) % 2 == 0)
+    assert len(np.unique(want.mask.sum(axis=1))) > 5
+    assert_same_episodes(got, want, rounding=2e-5)
+    assert np.all(got.observation[~got.mask] == 0)
+    assert np.all(got.action[~got.mask] == 0)
+
+
+def test_a_limit_for_each_episode():
+    """Also one beyond the horizon, and one of no step; some take the mode."""
+    env = Drifting()
+    limit, modes = jnp.array([60, 3, 0, 200, 51]), jnp.arange(5) % 2 == 1
+    options = {"deterministic": modes, "horizon": 100, "limit": limit}
+    got, want = both(env, actor_and_act(env, (4,)), **options)
+    assert_same_episodes(got, want, rounding=2e-5)
+    lengths = got.mask.sum(axis=1)
+    assert (lengths <= np.array(limit)).all()
+    assert {3, 0, 51} & set(lengths.ravel().tolist()) >= {3, 0}
+    whole, _ = both(env, actor_and_act(env, (4,)), **options | {"limit": None})
+    np.testing.assert_array_equal(got.reward, np.where(got.mask, whole.reward, 0))
+
+
+@pytest.mark.cpu
+def test_no_lane_waits():
+    """Lengths from 4 to 84, a lane's next episode of any seed: nearly all that is played counts."""
+    env = Drifting()
+    got = played(native.rollout, env, actor_and_act(env, ()), num_seeds=64, num_episodes=32)
+    lengths = got.mask.sum(axis=1)
+    assert lengths.max() > 4 * lengths.min()
+    assert lengths.sum() > 0.9 * got.simulated.sum()
+    assert np.all(got.simulated > 0)
+
+
+def test_only_active_episodes_are_played():
+    """Of each seed as many as it has, some of which are modes."""
+    chosen = np.arange(120).reshape(3, 40) % 3 == 1
+    chosen[1] = False
+    options = {"horizon": 60, "deterministic": np.arange(40) % 2 == 0}
+    some = only_active(
+        native.rollout, Drifting(), actor_and_act(Drifting(), (5,)), chosen, **options
+    )
+    assert (some.simulated > 0).tolist() == [True, False, True]
+
+
+def test_episodes_have_keys_of_their_own():
+    env, keys = Drifting(), jax.random.split(jax.random.key(1), 9)
+    actor, act, distribution = actor_and_act(env, (5,))
+    size = {"num_episodes": 9, "horizon": 60}
+    whole = native.rollout(env, act, actor, distribution, keys, **size)
+    size["num_episodes"] = 4
+    some = native.rollout(env, act, actor, distribution, keys[::-2][:4], **size)
+    for name in ("observation", "action", "reward", "mask"):
+        want = getattr(whole, name)[:, ::-2][:, :4]
+        np.testing.assert_array_equal(getattr(some, name), want, err_msg=name)
+
+
+@pytest.mark.cpu
+def test_steps_are_counted_for_the_seed_that_a_lane_played():
+    """A lane waits for the longest episode; lanes without any count nothing."""
+    env = Drifting()
+    got = played(native.rollout, env, actor_and_act(env, ()), num_seeds=2, num_episodes=2)
+    lengths = got.mask.sum(axis=1)
+    assert len(np.unique(lengths)) > 1
+    np.testing.assert_array_equal(got.simulated, 2 * lengths.max())
+    many = played(native.rollout, env, actor_and_act(env, ()), num_episodes=200)
+    assert many.simulated.sum() % machine.this_machine().lanes == 0
+    assert np.all(many.simulated >= many.mask.sum((1, 2)))
+
+
+def test_the_number_of_threads_changes_nothing():
+    player = actor_and_act(Drifting(), (5,))
+    options = {"num_episodes": 40, "horizon": 60}
+    want = played(native.rollout, Drifting(), player, **options)
+    for threads in (1, 2, 0):
+        play = functools.partial(native.rollout, threads=threads)
+        got = played(play, Drifting(), player, **options)
+        for name in ("observation", "action", "reward", "mask", "nonfinite"):
+            np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
+
+
+def test_a_nan_stays_in_its_lane():
+    """As an observation and as ``done``; the other episodes are as without it."""
+
+    class Breaking(Drifting):
+        def step(self, state, action):
+            after = super().step(state, action)
+            x = after.obs[0]
+            return after.replace(
+                obs=jnp.where(x > 0.75, jnp.nan, after.obs),
+                done=jnp.where(x < -0.75, jnp.nan, after.done),
+            )
+
+    player = actor_and_act(Breaking(), (4,))
+    got, want = both(Breaking(), player, num_episodes=20)
+    assert_same_episodes(got, want, rounding=2e-5)
+    alone = played(native.rollout, Drifting(), player, num_episodes=20)
+    reached = alone.observation[:, 1:, :, 0]
+    high, low = (reached > 0.75).any(axis=1), (reached < -0.75).any(axis=1)
+    assert (low & ~high).any()
+    assert high.any()
+    assert got.nonfinite[low | high].all()
+    kept = ~got.nonfinite
+    assert kept.any()
+    for name in ("observation", "action", "reward"):
+        one, other = (np.moveaxis(getattr(x, name), 1, 2)[kept] for x in (got, alone))
+        np.testing.assert_array_equal(one, other)
+
+
+def test_vectors_begin_at_multiples_of_their_size():
+    """As LLVM takes for granted, also of 16 numbers of 8 bytes."""
+    kinds = np.float32, np.float64, np.int32, np.int64
+    leaves = [jax.ShapeDtypeStruct((3,), x) for x in (*kinds, *kinds)]
+    for count in (1, 4, 8, 16):
+        places = lanes.layout(leaves, 1, count)
+        fields = [*places.inputs, places.broken, places.seed, places.episode]
+        for field, after in itertools.pairwise(fields):
+            assert after.offset >= field.offset + field.entries * field.dtype.itemsize * count
+        for field in fields:
+            vector = field.dtype.itemsize * count
+            assert field.offset % vector == lanes.ALIGNMENT % vector == 0
+
+
+@pytest.mark.cpu
+def test_double_precision():
+    """Networks have float32 parameters, whatever jax_enable_x64 says."""
+    with jax.enable_x64(True):
+        env = Drifting()
+        player = actor_and_act(env, (4, 3))
+        assert np.dtype(np.float32) in {x.dtype for x in jax.tree.leaves(player[0].params)}
+        got, want = both(env, player, num_episodes=20)
+        assert got.observation.dtype == np.float64
+        assert_same_episodes(got, want, rounding=1e-12)
+    jax.clear_caches()
+
+
+def test_no_code_is_made_twice(tmp_path, monkeypatch):
+    """Not in a process, and not in the next, which reads it from the disk."""
+    env = Drifting()
+    actor, act, distribution = actor_and_act(env, ())
+    monkeypatch.setattr(objects, "folder", lambda: tmp_path)
+    first = program.build_program(env, act, actor, distribution, 17)
+    assert first.code.compiled
+    assert program.build_program(env, act, actor, distribution, 17).code is first.code
+    assert program.build_program(env, act, actor, distribution, 19).code is not first.code
+    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(ptx, "_LOADED", {})
+    monkeypatch.setattr(program.scalarized, "build", None)
+    assert not program.build_program(env, act, actor, distribution, 17).code.compiled
+
+
+def test_constants_are_part_of_the_code():
+    class Pays(Drifting):
+        def step(self, state, action):
+            after = super().step(state, action)
+            return after.replace(reward=after.reward * self.prices[0])
+
+    actor, act, distribution = actor_and_act(Drifting(), ())
+    keys = set()
+    for price in (2.0, 3.0, 3.0):
+        env = Pays()
+        env.prices = jnp.array([price])
+        keys.add(program.build_program(env, act, actor, distribution, 10).code.key)
+    assert len(keys) == 2
+
+
+def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
+    env = Drifting()
+    actor, act, distribution = actor_and_act(env, ())
+    player = choice.ActingPolicy(act, actor, distribution)
+    assert choice.choose("auto", env, player, 500).name == "native"
+    assert choice.choose("auto", env).name == "vmap"
+
+    class Gamma(Drifting):
+        def step(self, state, action):
+            after = super().step(state, action)
+            return after.replace(reward=jax.lax.lgamma(after.reward + 5.0))
+
+    gamma = Gamma()
+    actor, act, distribution = actor_and_act(gamma, ())
+    player = choice.ActingPolicy(act, actor, distribution)
+    assert choice.choose("auto", gamma, player, 500).name == "vmap"
+    with pytest.raises(ValueError, match=r"native engine cannot play this: .*lgamma.*choose auto"):
+        choice.choose("native", gamma, player, 500)
+    monkeypatch.setattr(available, "unavailable", lambda: "llvmlite is not installed")
+    with pytest.raises(ValueError, match="llvmlite is not installed; choose auto"):
+        choice.choose("native", env, player, 500)
+
+
+@pytest.mark.cpu
+def test_lanes_have_no_numbers_of_8_bits():
+    env = Bytes()
+    actor, act, distribution = actor_and_act(env, ())
+    chosen = choice.choose("auto", env, choice.ActingPolicy(act, actor, distribution), 500)
+    assert chosen.name == "vmap"
+    assert "machine code cannot play this: its state has numbers of int8" in chosen.why
+
+
+def test_keys_of_another_generator():
+    """Their noise is not drawn here; auto plays them as ``vmap`` does, and says so."""
+    env = Drifting()
+    actor, act, distribution = actor_and_act(env, (4,))
+    key = jax.random.key(1, impl="rbg")
+    engine = choice.choose("auto", env, choice.ActingPolicy(act, actor, distribution), 20)
+    assert engine.name == "native"
+
+    def play(engine):
+        return engine(env, act, actor, distribution, key, num_episodes=6, horizon=20)
+
+    with pytest.warns(UserWarning, match="the key is of rbg; vmap plays it"):
+        got = play(engine.rollout)
+    assert_same_episodes(got, play(rollouts.rollout), rounding=0)
+    with pytest.raises(ValueError, match=r'of rbg; make .*impl="threefry2x32"'):
+        play(native.rollout)
+
+
+def chosen(env, name="auto"):
+    actor, act, distribution = actor_and_act(env, (4,))
+    return choice.choose(name, env, choice.ActingPolicy(act, actor, distribution), 20)
+
+
+@pytest.mark.cpu
+def test_auto_falls_back_whatever_the_writer_raises(monkeypatch):
+    def write(*_):
+        raise error
+
+    monkeypatch.setattr(program.kernel, "player_text", write)
+    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(objects, "folder", lambda: None)
+    for error in (KeyError("lost"), ValueError("cannot reshape"), RecursionError("deep")):
+        engine = chosen(Drifting())
+        assert engine.name == "vmap"
+        assert f"it cannot be written out ({type(error).__name__}" in engine.why
+        with pytest.raises(ValueError, match="native engine cannot play this: it cannot be writ"):
+            chosen(Drifting(), "native")
+
+
+class Panorama(Drifting):
+    """Sees 2,000 numbers."""
+
+    def reset(self, rng):
+        state = super().reset(rng)
+        return state.replace(obs=jnp.tile(state.obs, 1_000))
+
+    def step(self, state, action):
+        return state.replace(obs=0.9 * state.obs, reward=jnp.sum(state.obs))
+
+
+def test_wide_observations_are_not_for_machine_code():
+    engine = chosen(Panorama())
+    assert engine.name == "vmap"
+    assert "109 s, more than 80 s, because of an observation of 2,000 entries" in engine.why
+    assert available.announcement(Panorama()) is None
+    assert available.announcement(Drifting()) is None
+
+
+@pytest.mark.cpu
+def test_large_models_are_not_for_machine_code(monkeypatch):
+    """The reason says which bodies meet most, and people who wait are told of it beforehand."""
+    env = Drifting()
+    env.mj_model = mujoco.MjModel.from_xml_string(SCENE)  # pyright: ignore
+    env.num_contacts = 14
+    monkeypatch.setattr(objects, "folder", lambda: None)
+    monkeypatch.setattr(machine, "_LOADED", {})
+    monkeypatch.setattr(available, "_WORTH_SAYING", 0)
+    assert "with up to 14 contacts, and compiling" in str(available.announcement(env))
+    monkeypatch.setattr(available, "MAX_SECONDS", 1e-9)
+    engine = chosen(env)
+    assert engine.name == "vmap"
+    assert "more than 1e-09 s, because of its size; its geoms can meet in" in engine.why
+    assert re.search(r"bodies 'world' \(\d+\), .* the feet alone, by contype", engine.why)

@@ -1,0 +1,273 @@
+"""The native engine's kernels for GPUs: what they play, run on this CPU, and what they are."""
+
+import re
+import shutil
+import subprocess
+
+import gpu_on_cpu
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from players import actor_and_act, assert_same_episodes, only_active, played
+from scenes import THREE_FEET, Scene
+from toys import Busy, Bytes, Chain, categorical
+
+from mjx_reinforce.engine import scalar
+from mjx_reinforce.engine.gpu import kernel as kernels
+from mjx_reinforce.engine.gpu import lockstep, ptx, seam
+from mjx_reinforce.engine.physics import touching
+from mjx_reinforce.engine.play import available, native, native_step, objects, program, rollouts
+from mjx_reinforce.engine.scalar import scalarized
+
+if reason := available.unavailable():
+    pytest.skip(reason, allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def busy():
+    env = Busy()
+    return env, actor_and_act(env, (5, 6))
+
+
+def assert_identical(got, want):
+    for name in ("observation", "action", "reward", "mask", "nonfinite"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("env", "distribution"),
+    [
+        pytest.param(Busy(), None, id="loops", marks=pytest.mark.slow),
+        pytest.param(Bytes(), None, id="8 bits"),
+        pytest.param(Chain(), categorical(2), id="integer actions", marks=pytest.mark.slow),
+    ],
+)
+def test_the_same_episodes_as_everywhere(env, distribution, monkeypatch):
+    """Of toys whose state has a counter, a flag, a limit and a number of 8 bits."""
+    who = actor_and_act(env, (4,), distribution=distribution)
+    options = {"deterministic": jnp.arange(5) < 2, "horizon": 100}
+    options["limit"] = jnp.array([200, 7, 100, 1, 63])
+    want = None
+    for threads in (1, 3):
+        gpu_on_cpu.emulate(monkeypatch, threads)
+        got = played(native.rollout, env, who, **options)
+        want = want or played(rollouts.rollout, env, who, **options)
+        assert got.action.dtype == want.action.dtype
+        assert got.mask[:, 0].all()
+        assert not got.mask[:, -1].all()
+        assert_same_episodes(got, want, rounding=2e-5)
+        if threads == 1:
+            np.testing.assert_array_equal(got.simulated, got.mask.sum((1, 2)))
+
+
+@pytest.mark.slow
+def test_episodes_that_are_not_active_are_not_played(busy, monkeypatch):
+    """Also in step with others: a thread that never had an episode counts no steps."""
+    monkeypatch.setattr(lockstep, "LONG", 0)
+    chosen = np.array([[0] * 5, [0, 1, 0, 0, 1], [0] * 5]).astype(bool)
+    options = {"horizon": 20, "deterministic": jnp.arange(5) % 2 == 1}
+    for threads in (1, 3):
+        block = gpu_on_cpu.Block(threads)
+        gpu_on_cpu.emulate(monkeypatch, block=block)
+        some = only_active(native.rollout, *busy, chosen, **options)
+        assert block.apart is None
+        assert not some.simulated[[0, 2]].any()
+        lengths = some.mask[1].sum(axis=0)
+        assert some.simulated[1] == (lengths.sum() if threads == 1 else 2 * lengths.max())
+
+
+@pytest.mark.slow
+def test_in_step_or_apart_and_with_long_arrays_in_a_buffer_an_episode_is_the_same(
+    busy, monkeypatch
+):
+    """Loops and branches are entered by all threads together or by each alone.
+
+    Threads of a block meet at one place, also where their episodes have ended.
+    """
+    gpu_on_cpu.emulate(monkeypatch)
+    want = played(native.rollout, *busy, horizon=30)
+    made, meetings = [], []
+    for long, longest in ((10**9, 25), (4, 25), (0, 4)):
+        block = gpu_on_cpu.Block(3)
+        gpu_on_cpu.emulate(monkeypatch, block=block)
+        load = ptx.load_kernel
+        monkeypatch.setattr(
+            ptx, "load_kernel", lambda *x, load=load: made.append(load(*x)) or made[-1]
+        )
+        monkeypatch.setattr(lockstep, "LONG", long)
+        monkeypatch.setattr(lockstep, "WRITTEN_OUT", longest)
+        got = played(native.rollout, *busy, horizon=30)
+        assert block.apart is None
+        meetings.append(block.meetings)
+        assert_identical(got, want)
+    assert [kernel.scratch > 0 for kernel in made] == [False, False, True]
+    assert 0 < meetings[0] < meetings[1] < meetings[2]
+
+
+@pytest.mark.slow
+def test_threads_meet_where_some_have_no_room_for_their_contacts(monkeypatch):
+    monkeypatch.setattr(touching, "_room", lambda model: 1)
+    env = Scene(THREE_FEET)
+    who = actor_and_act(env, ())
+    size = {"num_episodes": 12, "horizon": 2}
+    gpu_on_cpu.emulate(monkeypatch)
+    want = played(native.rollout, env, who, **size)
+    touch = want.observation[:, 1, :, -3:].sum(axis=-1)
+    assert {0, 1, 2} <= {*touch.ravel().astype(int)}
+    block = gpu_on_cpu.Block(3)
+    gpu_on_cpu.emulate(monkeypatch, block=block)
+    monkeypatch.setattr(lockstep, "LONG", 0)
+    assert_identical(played(native.rollout, env, who, **size), want)
+    assert block.apart is None
+
+
+def test_each_thread_has_words_of_its_own():
+    """Those of the threads of a warp are side by side."""
+    text = lockstep.ScratchText()
+    arrays = [text.reserve_long(np.int32, count) for count in (30, 40)]
+    block, lane = (
+        text.let(f"call i32 @llvm.nvvm.read.ptx.sreg.{x}()") for x in ("ctaid.x", "tid.x")
+    )
+    thread = text.let(f"add i32 {text.let(f'mul i32 {block}, 32')}, {lane}")
+    for array, count in zip(arrays, (30, 40), strict=True):
+        for k in range(count):
+            value = text.let(f"add i32 {text.let(f'mul i32 {thread}, 100')}, {k + count}")
+            text.store(value, text.at(array, np.int32, text.let(f"add i64 {k}, 0")), np.int32)
+    text.line("ret void")
+    code = gpu_on_cpu.compiled(text.function("ptx_kernel void @play(ptr %scratch) #0"))
+    buffer = np.zeros((2, 70, 32), np.int32)
+    gpu_on_cpu.run_threads(code.addresses["play"], 64, [buffer])
+    entries = np.concatenate([np.arange(30) + 30, np.arange(40) + 40])
+    threads = np.arange(64).reshape(2, 1, 32)
+    np.testing.assert_array_equal(buffer, 100 * threads + entries[:, None])
+
+
+def kernel_text(env, actor, act, distribution):
+    examples = native_step.examples(env, actor)[:-1]
+    function = native_step.step_function(env, act, distribution, 50)
+    written = scalarized.build(
+        lambda *args: function(*args, jnp.int32(1)),
+        examples,
+        [True] * len(jax.tree.leaves(examples)),
+        native_step.BRANCH_COST,
+        program.GPU_LOOPS,
+    )
+    return kernels.kernel_text(written, len(jax.tree.leaves(actor)))
+
+
+def test_a_division_that_llvm_spells_otherwise_is_not_left():
+    """That of doubles is exact, as in XLA."""
+    text = "div.rn.ftz.f32 %f1, %f2, %f3;\n\tdiv.rn.f64 %d1, %d2, %d3;"
+    assert ptx._with_xla_divisions(text) == text.replace("div.rn.ftz", "div.full.ftz")
+    with pytest.raises(AssertionError, match="another name"):
+        ptx._with_xla_divisions("div.rn.f32 %f1, %f2, %f3;")
+
+
+@pytest.mark.parametrize("long", [False, True])
+def test_ptx(busy, long, tmp_path, monkeypatch):
+    """It is one kernel that calls nothing; NVIDIA's assembler takes it, where there is one."""
+    env, player = busy
+    if long:
+        monkeypatch.setattr(kernels, "LONG", 10)
+        monkeypatch.setattr(lockstep, "LONG", 4)
+        monkeypatch.setattr(lockstep, "WRITTEN_OUT", 4)
+    text = kernel_text(env, *player)
+    for capability in ("7.5", "9.0"):
+        made = ptx.load_kernel(text, lambda: text, capability, tmp_path)
+        assert made.compiled
+        assert (made.threads, made.blocks) == ((256, 1) if long else (32, 16))
+        assert (made.scratch > 0) == long
+        assert made.text.count(".entry play(") == 1
+        assert f".target sm_{capability.replace('.', '')}" in made.text
+        assert "call" not in made.text
+        assert '.pragma "nounroll";' in made.text  # the assembler leaves our loops as they are
+        meetings = re.findall(r"(bar.warp.sync 0xffffffff; )?bar(?:rier)?\.(?:sync|red)", made.text)
+        assert meetings
+        assert all(meetings)  # a warp comes together before each: an H200 waited forever without
+        ptx._LOADED.clear()
+        again = ptx.load_kernel(text, lambda: pytest.fail("it is on disk"), capability, tmp_path)
+        assert again == made._replace(compiled=False)
+        if shutil.which("ptxas"):
+            source = tmp_path / "play.ptx"
+            source.write_text(made.text)
+            architecture = f"-arch=sm_{capability.replace('.', '')}"
+            subprocess.run(["ptxas", "-O0", architecture, source, "-o", "/dev/null"], check=True)
+
+
+def test_the_buffer_has_room_for_the_threads_of_all_blocks(busy, monkeypatch, tmp_path):
+    env, (actor, act, distribution) = busy
+    monkeypatch.setattr(lockstep, "WRITTEN_OUT", 4)
+    monkeypatch.setattr(objects, "folder", lambda: tmp_path)
+    monkeypatch.setattr(ptx, "_LOADED", {})
+
+    def one(key):
+        return native.rollout(env, act, actor, distribution, key, num_episodes=70, horizon=50)
+
+    text = gpu_on_cpu.lowered(monkeypatch, one, jax.random.key(0))
+    (kernel,) = ptx._LOADED.values()
+    assert kernel.scratch > 0
+    (call,) = (line for line in text.splitlines() if "@mjx_reinforce_gpu_" in line)
+    assert "blocks = 3 : i32" in call
+    assert f"tensor<{kernel.scratch * 96}xi32>)" in call
+
+
+def test_a_gpu_that_llvm_does_not_know_is_refused():
+    text = "define ptx_kernel void @play() { ret void }"
+    assert ".target sm_90" in ptx._compile(text, "9.0")
+    with pytest.raises(RuntimeError, match="does not know GPUs of compute capability 99"):
+        ptx._compile(text, "99.0")
+
+
+def test_what_no_kernel_computes_is_refused():
+    with pytest.raises(scalar.UnsupportedPrimitive, match="cosh: no kernel"):
+        ptx._compile("declare double @cosh(double)\n", "9.0")
+
+
+def test_one_launch_for_all_seeds_in_loops(busy, monkeypatch):
+    """Vmapped twice, in a scan, it is one custom call that writes over zeros."""
+    env, (actor, act, distribution) = busy
+
+    def one(key):
+        return native.rollout(env, act, actor, distribution, key, num_episodes=8, horizon=50)
+
+    def repeated(keys):
+        def body(keys, _):
+            seeds = jax.vmap(jax.vmap(one))(keys)
+            return jax.vmap(jax.vmap(lambda k: jax.random.split(k)[0]))(keys), seeds.reward.sum()
+
+        return jax.lax.scan(body, keys, length=3)
+
+    text = gpu_on_cpu.lowered(monkeypatch, repeated, jax.random.split(jax.random.key(0), (2, 3)))
+    calls = [line for line in text.splitlines() if "@mjx_reinforce_gpu_" in line]
+    assert len(calls) == 1
+    assert "tensor<6x50x2x8xf32>" in calls[0]
+    assert calls[0].count("operand_index") == len(kernels.RESULTS)
+    assert "blocks = 2 : i32" in calls[0]
+    assert "threads = 32 : i32" in calls[0]
+
+
+@pytest.mark.cpu
+def test_it_says_why_there_are_no_kernels(monkeypatch):
+    monkeypatch.setattr(seam, "compute_capability", lambda: "gfx90a")
+    assert "this is 'gfx90a'" in (seam.kernels_unavailable() or "")
+    monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
+    with monkeypatch.context() as patch:
+        patch.setattr("llvmlite.binding.llvm_version_info", (20, 1, 8))
+        assert "llvmlite>=0.48" in (seam.kernels_unavailable() or "")
+    with jax.enable_x64(True):
+        assert "float32 alone" in (seam.kernels_unavailable() or "")
+    assert "libcuda.so.1, is not found" in (seam.kernels_unavailable() or "")
+    monkeypatch.setattr(available, "platform", lambda: "gpu")
+    assert "libcuda.so.1, is not found" in (available.unavailable() or "")
+
+
+def test_few_episodes_are_spread_over_all_multiprocessors(monkeypatch):
+    monkeypatch.setattr(jax, "devices", lambda: [type("GPU", (), {"core_count": 100})])
+    assert seam._grid(1, 512, 2) == (1, 32)
+    assert seam._grid(1_600, 512, 2) == (50, 32)
+    assert seam._grid(6_400, 512, 2) == (100, 64)
+    assert seam._grid(15_000, 512, 2) == (94, 160)
+    assert seam._grid(51_200, 512, 2) == (100, 512)
+    assert seam._grid(10**7, 512, 2) == (200, 512)
+    assert seam._grid(10**7, 32, 16) == (1_600, 32)

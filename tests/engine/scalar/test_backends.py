@@ -1,0 +1,243 @@
+"""Every backend knows every operation, and a new one is a class."""
+
+import itertools
+import re
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax import lax
+
+from mjx_reinforce.engine import scalar
+from mjx_reinforce.engine.llvm.emit import LLVM, Input
+from mjx_reinforce.engine.llvm.text import Text
+from mjx_reinforce.engine.scalar import ops, scalarized
+from mjx_reinforce.engine.scalar.backend import Backend
+from mjx_reinforce.engine.scalar.graph import Graph, Limits
+from mjx_reinforce.engine.scalar.nodes import is_constant
+from mjx_reinforce.engine.scalar.passes import simplify
+from mjx_reinforce.engine.scalar.xla import XLA
+
+#: Operands of which every float operation is finite.
+FLOATS = np.float32([0.25, 0.5, 0.75])
+BITS = np.int32([6, 3, 0])
+ON_BITS = {
+    *("and", "or", "xor", "not", "shift_left", "shift_right_arithmetic", "shift_right_logical"),
+    *("clz", "population_count"),
+}
+PARAMS = {
+    "convert_element_type": {"new_dtype": np.dtype(np.int32)},
+    "bitcast_convert_type": {"new_dtype": np.dtype(np.int32)},
+    "reduce_precision": {"exponent_bits": 8, "mantissa_bits": 7},
+    "round": {"rounding_method": lax.RoundingMethod.TO_NEAREST_EVEN},
+}
+
+
+def operands_of(name):
+    values = BITS if name in ON_BITS else FLOATS
+    operands = list(values[: ops.FACTS[name].arity])
+    if name == "select_n":
+        operands[0] = np.True_
+    if name == "acosh":
+        operands = [np.float32(1.5)]
+    return operands
+
+
+def dtype_of(op, operands):
+    if "new_dtype" in dict(op.params):
+        return dict(op.params)["new_dtype"]
+    return np.dtype(bool) if ops.FACTS[op.name].is_predicate else operands[-1].dtype
+
+
+def test_a_backend_with_a_table_knows_every_operation():
+    for backend in (XLA, LLVM):
+        assert set(backend.OPERATIONS or ops.FACTS) == set(ops.FACTS)
+
+
+def test_a_backend_walks_loops_and_gates():
+    """Of a loop that ends by what the lanes hold, and a branch that some lanes do not need."""
+
+    def branches_and_repeats(x):
+        x = lax.while_loop(lambda y: y < 3.0, lambda y: jnp.sin(y) + 2.0 * y, x)
+        return lax.cond(x > 5.0, lambda y: jnp.exp(jnp.cos(y) / y), lambda y: y, x)
+
+    written = scalar.scalarize(branches_and_repeats, jnp.ones(()), branch_cost=1)
+    for backend in (
+        XLA(lambda place: jnp.linspace(1.0, 2.0, 4), (4,)),
+        LLVM(Text(4), lambda number: Input("%input", np.dtype(np.float32))),
+        Listing(),
+    ):
+        assert written.compile(backend)
+
+
+@pytest.mark.parametrize("align", [1, 8, 16])
+def test_a_load_says_how_its_place_is_aligned(align):
+    """Of arguments read one by one, and in a loop that takes every second."""
+
+    def total(x):
+        pairs = x[:4].reshape(2, 2)
+        return lax.scan(lambda sums, row: (sums * row[0], None), x[5], pairs)[0]
+
+    written = scalarized.build(total, (jnp.ones(6),), [True], 400, Limits(1, 1))
+    text = Text(1)
+    backend = LLVM(text, lambda number: Input("%input", np.dtype(np.float32), align))
+    backend.compile(written.schedule, written.outputs)
+    body = text.function("void @total(ptr %input)")
+    loads = re.findall(r"load float, ptr %\w+(?:, align (\d+))?", body)
+    known = str(min(align, 8)) if align > 4 else ""  # every second float, from the first
+    assert sorted(loads) == sorted(["", known])
+
+
+def folded_and_computed(name):
+    """Returns [mixes, 2] what XLA computes of constants and lanes in every order, and the fold."""
+    op = ops.Op(name, tuple(sorted(PARAMS.get(name, {}).items())))
+    operands = operands_of(name)
+    dtype = dtype_of(op, operands)
+    folded = simplify.fold(op, operands, dtype)
+    assert (folded.dtype, np.ndim(folded)) == (dtype, 0), name
+    assert np.isfinite(folded), name
+    _, *mixes = itertools.product([False, True], repeat=len(operands))
+    steps, outputs, graph = [], [], Graph(0, Limits())
+    leaves = [graph.leaf(x.dtype, True, position=(0, i)) for i, x in enumerate(operands)]
+    for mix in mixes:
+        mixed = [leaf if lane else x for leaf, x, lane in zip(leaves, operands, mix, strict=True)]
+        node = graph.apply(op, tuple(mixed), dtype)
+        steps += [] if is_constant(node) or node.op is None or node in steps else [node]
+        outputs.append(node)
+    backend = XLA(lambda place: jnp.full(2, operands[place[1]]), (2,))
+    return [np.broadcast_to(x, 2) for x in backend.compile(steps, [outputs])[0]], folded
+
+
+@pytest.mark.slow
+def test_constants_fold_to_what_jax_computes():
+    """The same operation on constants, on lanes, and on both, in every order."""
+    for name in ops.FACTS:
+        computed, folded = folded_and_computed(name)
+        want = np.full((len(computed), 2), folded)
+        np.testing.assert_allclose(computed, want, rtol=1e-5, err_msg=name)
+
+
+def test_operations_that_commute_are_shared():
+    graph = Graph(0, Limits())
+    for name in (n for n, facts in ops.FACTS.items() if facts.commutes):
+        x, y = (graph.leaf(operands_of(name)[0].dtype, True) for _ in range(2))
+        assert graph.call(name, x, y) is graph.call(name, y, x), name
+
+
+def test_equal_operations_are_equal():
+    float32, int32 = np.dtype(np.float32), np.dtype(np.int32)
+    assert len({ops.conversion(float32), ops.conversion(float32), ops.conversion(int32)}) == 2
+
+
+class Listing(Backend[str]):
+    """Writes a program out as text, one statement a line."""
+
+    def __init__(self):
+        self.lines = []
+
+    def constant(self, number):
+        return f"{number:g}"
+
+    def leaf(self, node):
+        return f"x{node.position[1]}"
+
+    def node(self, node, operands):
+        return self.assign(f"{node.op.name}({', '.join(operands)})")
+
+    def gate(self, gate, values):
+        cold = [self.value(out.cold, values) for out in gate.outs]
+        self.lines.append(f"if any {self.value(gate.predicate, values)}")
+        inner = self.inside(gate.body, values)
+        hot = [self.value(out.hot, inner) for out in gate.outs]
+        return [self.assign(f"{on} else {off}") for on, off in zip(hot, cold, strict=True)]
+
+    def loop(self, loop, values):
+        starts = [self.assign(self.value(carry.init, values)) for carry in loop.carries]
+        rows = [[self.value(x, values) for x in element.values] for element in loop.elements]
+        self.lines.append(f"repeat {loop.length}")
+        known = {c.leaf: start for c, start in zip(loop.carries, starts, strict=True)}
+        known.update(
+            {e.leaf: f"[{' '.join(row)}]" for e, row in zip(loop.elements, rows, strict=True)}
+        )
+        inner = self.inside(loop.body, values, known)
+        ends = [self.value(carry.next, inner) for carry in loop.carries]
+        kept = [self.value(record.value, inner) for record in loop.records]
+        self.lines.append(f"next {' '.join(ends)}")
+        return ends, [
+            [f"{y}[{t}]" for t in range(len(record.outs))]
+            for y, record in zip(kept, loop.records, strict=True)
+        ]
+
+    def result(self, outputs):
+        return [*self.lines, *(f"return {' '.join(leaf)}" for leaf in outputs)]
+
+    def assign(self, text):
+        name = f"v{sum(' = ' in line for line in self.lines)}"
+        self.lines.append(f"{name} = {text}")
+        return name
+
+
+def listing(fn, *args, **kwargs):
+    return scalar.scalarize(fn, *args, **kwargs).compile(Listing())
+
+
+def test_a_backend_of_arithmetic():
+    assert listing(lambda x: (x[0] * 2 + x[1], x[1]), jnp.ones(2)) == [
+        "v0 = mul(x0, 2)",
+        "v1 = add(v0, x1)",
+        "return v1",
+        "return x1",
+    ]
+
+
+def test_a_backend_gets_only_what_is_needed_of_a_loop():
+    def fn(x):
+        def body(carry, row):
+            y, unused = carry
+            return (y * row, jnp.exp(unused)), (y, unused)
+
+        (y, _), (kept, _) = lax.scan(body, (x, x), jnp.arange(2.0, 8.0))
+        return y, kept[1]
+
+    assert listing(fn, 1.0) == [
+        "v0 = x0",
+        "repeat 6",
+        "v1 = mul(v0, [2 3 4 5 6 7])",
+        "next v1",
+        "return v1",
+        "return v0[1]",
+    ]
+
+
+def test_a_backend_gets_a_gate_for_an_expensive_branch():
+    fn = lambda x: lax.cond(x > 0, lambda: jnp.sin(jnp.cos(x)), lambda: x)  # noqa: E731
+    assert listing(fn, 1.0, branch_cost=1) == [
+        "v0 = gt(x0, 0)",
+        "if any v0",
+        "v1 = cos(x0)",
+        "v2 = sin(v1)",
+        "v3 = select_n(v0, x0, v2)",
+        "v4 = v3 else x0",
+        "return v4",
+    ]
+
+
+def test_operations_are_counted_inside_loops_and_branches():
+    def fn(x):
+        y = lax.fori_loop(0, 30, lambda _, y: jnp.sin(y) * x, x)
+        return lax.cond(x > 0, lambda: jnp.cos(jnp.cos(x)), lambda: y)
+
+    counted = scalar.scalarize(fn, 1.0, branch_cost=1).operations
+    assert counted == {"gt": 1, "sin": 1, "mul": 1, "cos": 2, "select_n": 1}
+
+
+def test_the_graph_itself_knows_no_jax():
+    """What is computed is the backend's; the graph, its algebra and its rules move scalars."""
+    root, found = Path(scalar.__file__).parent, []
+    for module in ("ops", "nodes", "graph", "passes", "rules"):
+        where = root / module
+        for path in where.glob("*.py") if where.is_dir() else [where.with_suffix(".py")]:
+            text = path.read_text("utf-8")
+            found += [path] * bool(re.search(r"^ *(import|from) jax\b", text, re.MULTILINE))
+    assert found == []

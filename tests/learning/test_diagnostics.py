@@ -1,0 +1,216 @@
+"""Diagnostics against closed forms, enumerated episodes, and updates made to be so."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jax.flatten_util import ravel_pytree
+from problems import MASK, PARAMS, make_problem
+from scipy import stats
+from toys import Survive, Target, categorical
+
+from mjx_reinforce import Box, Discrete, Trajectory, mlp_policy, normal, reinforce, train_step
+from mjx_reinforce.learning import diagnostics, normalize, updates
+from mjx_reinforce.learning.actor import Actor
+from mjx_reinforce.learning.distributions.categorical import categorical as softmax
+from mjx_reinforce.published.ars import ars
+
+BOX = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))
+
+
+def make_trajectory(lengths, horizon, poison=0.0):
+    """The observation is the number of the step; behind the end stands ``poison``."""
+    mask = np.arange(horizon)[:, None] < np.array(lengths)
+    number = np.broadcast_to(np.arange(horizon, dtype=float)[:, None], mask.shape)
+    seen = jnp.asarray(np.where(mask, number, poison))[..., None]
+    return Trajectory(
+        observation=seen,
+        action=0.1 * seen,
+        reward=jnp.asarray(mask, float),
+        mask=jnp.asarray(mask),
+        nonfinite=jnp.zeros(len(lengths), bool),
+        simulated=jnp.int32(mask.size),
+    )
+
+
+def test_of_few_steps_all_are_visited():
+    visited = diagnostics.visited_steps(make_trajectory([5, 1, 3], 7))
+    weight, seen = np.asarray(visited.weight), np.asarray(visited.observation[..., 0])
+    for n, length in enumerate([5, 1, 3]):
+        assert sorted(seen[weight[:, n] > 0, n]) == list(range(length))
+    np.testing.assert_allclose(weight[weight > 0], 1 / 9, rtol=1e-6)
+    assert float(visited.mean(visited.observation[..., 0])) == pytest.approx(13 / 9, rel=1e-6)
+
+
+def test_of_many_steps_each_stands_for_its_neighbours(monkeypatch):
+    """Three of each episode: of 10 steps every fourth, of 2 both; each counts as its share."""
+    monkeypatch.setattr(diagnostics, "MAX_COMPARED", 6)
+    visited = diagnostics.visited_steps(make_trajectory([10, 2], 10))
+    weight, seen = np.asarray(visited.weight), np.asarray(visited.observation[..., 0])
+    assert seen[weight[:, 0] > 0, 0].tolist() == [2, 6]
+    assert seen[weight[:, 1] > 0, 1].tolist() == [0, 1]
+    np.testing.assert_allclose(weight.sum(axis=0), [10 / 12, 2 / 12], rtol=1e-6)
+
+
+@pytest.mark.parametrize("num_episodes", [1, 40, 64, 65, 1000])
+def test_no_more_steps_than_promised_are_visited(num_episodes):
+    visited = diagnostics.visited_steps(make_trajectory([300] * num_episodes, 300, np.nan))
+    assert 32 <= visited.weight.size <= diagnostics.MAX_COMPARED
+    assert float(jnp.sum(visited.weight)) == pytest.approx(1, rel=1e-5)
+    assert np.all(np.isfinite(visited.observation))
+
+
+@pytest.mark.slow
+def test_nothing_after_the_end_is_visited():
+    policy = mlp_policy(1, normal(Target.action_space), ())
+    actor = Actor(params=policy.init(jax.random.key(0)), normalizer=normalize.init(1))
+    moved = actor.replace(params=jax.tree.map(lambda x: x + 0.1, actor.params))
+    clean, poisoned = (
+        diagnostics.policy_metrics(
+            policy, actor, moved, diagnostics.visited_steps(make_trajectory([4, 9], 20, poison))
+        )
+        for poison in (0.0, np.nan)
+    )
+    assert clean == poisoned
+    assert clean["policy_std"] == pytest.approx(0.5, rel=1e-6)
+    assert clean["kl"] > 0
+
+
+@pytest.mark.cpu  # GPUs divide within 2 units in the last place
+def test_the_kl_of_normals_to_themselves_is_0():
+    family = normal(BOX, std="softplus")
+    outputs = jnp.array([0.3, -0.2, 0.1, -0.5])
+    assert float(family.kl(outputs, outputs)) == 0.0
+
+
+def test_the_kl_of_categoricals_is_the_sum():
+    old, new = np.array([0.3, -1.0, 2.0]), np.array([0.0, 0.5, 1.0])
+    p, q = (np.exp(x) / np.exp(x).sum() for x in (old, new))
+    kl = softmax(Discrete(3)).kl(jnp.asarray(old), jnp.asarray(new))
+    assert float(kl) == pytest.approx(stats.entropy(p, q), rel=1e-5)
+
+
+def test_the_estimated_kl_is_unbiased_and_never_negative():
+    """Its mean over all actions, weighted by the old policy, is the divergence."""
+    family, actions = categorical(3), jnp.arange(3)
+    old, new = jnp.array([0.3, -1.0, 2.0]), jnp.array([0.0, 0.5, 1.0])
+    each = diagnostics.kl_divergence(family, *(jnp.tile(x, (3, 1)) for x in (old, new)), actions)
+    p, q = jax.nn.softmax(old), jax.nn.softmax(new)
+    assert float(p @ each) == pytest.approx(stats.entropy(p, q), rel=1e-5)
+    assert np.all(np.asarray(each) > 0)
+
+
+def test_the_noise_of_all_episodes_is_the_sample_variance_of_their_mean():
+    each = np.random.default_rng(0).normal(size=(6, 3)) + 1
+    mean = each.mean(axis=0)
+    got = diagnostics.signal_to_noise(jnp.asarray(mean), jnp.asarray(each), 6)
+    noise = np.sum(np.var(each, axis=0, ddof=1)) / 6
+    assert float(got) == pytest.approx((np.sum(mean**2) - noise) / noise, rel=1e-4)
+
+
+def test_the_noise_is_that_of_some_episodes_beside_the_mean_of_all():
+    """Of 65 episodes that of two; see ``diagnostics.signal_to_noise``."""
+    mask = np.arange(5)[:, None] < np.random.default_rng(1).integers(1, 6, 65)
+    problem = make_problem(optax.sgd(0.1), mask=mask)
+    _, _, metrics = updates.full_batch()(problem, None, PARAMS, problem.optimizer.init(PARAMS))
+
+    def gradient(part):
+        samples = tuple(x[:, part] for x in problem.samples)
+        grads = jax.grad(lambda p: problem.surrogate(p, samples)[0])(PARAMS)
+        return np.array(jax.tree.leaves(grads))
+
+    mean = gradient(slice(None)) / 65
+    apart = [np.sum((gradient(slice(n, n + 1)) - mean) ** 2) for n in (0, 1)]
+    expected = np.sum(mean**2) / (np.mean(apart) / 64) - 1
+    assert float(metrics["gradient_snr"]) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize(("bound", "share"), [(1e-6, 1.0), (1e6, 0.0)])
+@pytest.mark.parametrize(
+    "update", [updates.full_batch(), updates.each_step(), updates.minibatches(3, 4)]
+)
+def test_all_gradients_are_clipped_or_none(update, bound, share):
+    problem = make_problem(updates.make_optimizer(max_grad_norm=bound))
+    _, _, metrics = update(problem, jax.random.key(1), PARAMS, problem.optimizer.init(PARAMS))
+    assert float(metrics["clipped_gradients"]) == share
+
+
+def test_the_share_of_clipped_gradients_is_that_of_the_steps():
+    """A rate of 0 keeps the parameters, so that a step's gradient is that of its time alone."""
+    problem = make_problem(optax.chain(updates.clip_by_norm(0.3), optax.sgd(0.0)))
+    state = problem.optimizer.init(PARAMS)
+    _, _, metrics = updates.each_step()(problem, jax.random.key(0), PARAMS, state)
+    norms = []
+    for t in range(MASK.sum(axis=0).max()):
+        grads = jax.grad(lambda p, t=t: problem.surrogate(p, [x[t] for x in problem.samples])[0])
+        norms.append(float(optax.tree.norm(grads(PARAMS))) / 3)
+    share = np.mean(np.array(norms) > 0.3)
+    assert 0 < share < 1
+    assert float(metrics["clipped_gradients"]) == pytest.approx(share)
+
+
+def test_what_does_not_clip_has_no_share():
+    problem = make_problem(updates.make_optimizer(max_grad_norm=None))
+    _, _, metrics = updates.full_batch()(problem, None, PARAMS, problem.optimizer.init(PARAMS))
+    assert "clipped_gradients" not in metrics
+
+
+@pytest.mark.slow
+def test_an_update_goes_no_further_than_it_may():
+    """From the second update on: the first also scales the observations, which counts, too."""
+
+    @jax.jit
+    def moved(max_kl):
+        learner = reinforce(Survive(), num_episodes=4, max_kl=max_kl)
+        state = learner.init(jax.random.key(0))
+        state = dataclasses.replace(state, actor=scaled(state.actor))
+        after, metrics = learner.step(state)
+        change = jax.tree.map(jnp.subtract, after.actor.params, state.actor.params)
+        return ravel_pytree(change)[0], metrics["kl"]
+
+    def scaled(actor):  # counted enough already
+        counted = actor.normalizer.replace(count=jnp.float32(2000), m2=jnp.full(1, 2000.0))
+        return actor.replace(normalizer=counted)
+
+    free, free_kl = moved(jnp.inf)
+    np.testing.assert_allclose(free, moved(None)[0], atol=1e-6)  # it rounds otherwise
+    for share in (0.5, 0.1, 0.01):
+        short, kl = moved(share * free_kl)
+        assert kl == pytest.approx(share * float(free_kl), rel=0.1)
+        cosine = free @ short / np.linalg.norm(free) / np.linalg.norm(short)
+        assert cosine == pytest.approx(1, abs=1e-4)
+    same, same_kl = moved(2 * free_kl)
+    assert np.array_equal(same, free)
+    assert same_kl == free_kl
+
+
+@pytest.mark.slow
+def test_a_change_without_a_kl_is_kept_as_it_is():
+    policy = mlp_policy(1, normal(Survive.action_space), ())
+    actor = Actor(params=policy.init(jax.random.key(0)), normalizer=normalize.init(1))
+    visited = diagnostics.visited_steps(make_trajectory([4, 9], 20))
+    same = diagnostics.within_kl(policy, actor, actor.params, visited, 0.01)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), same, actor.params))
+    broken = jax.tree.map(lambda x: x * jnp.nan, actor.params)
+    kept = diagnostics.within_kl(policy, actor, broken, visited, 0.01)
+    assert all(np.isnan(x).all() for x in jax.tree.leaves(kept))  # for ``keep_finite`` to see
+
+
+@pytest.mark.slow
+def test_a_search_has_the_noise_of_its_directions_alone():
+    learner = ars(Target(), num_directions=5)
+    state = jax.jit(learner.init)(jax.random.key(0))
+    play_key = jax.random.split(state.key, 3)[1]
+    trial = jax.jit(learner.play)(state, play_key, True)
+    returns = np.sum(np.asarray(trial.trajectory.reward), axis=0).reshape(2, 5)
+    difference = returns[0] - returns[1]
+    leaves = [np.asarray(x).reshape(5, -1) for x in jax.tree.leaves(trial.directions)]
+    each = difference[:, None] * np.concatenate(leaves, axis=1)
+    noise = np.sum(np.var(each, axis=0, ddof=1)) / 5
+    metrics = train_step(learner, state)[1]
+    expected = np.sum(each.mean(axis=0) ** 2) / noise - 1
+    assert float(metrics["gradient_snr"]) == pytest.approx(expected, rel=1e-3)
+    assert not metrics.keys() & {"kl", "policy_std", "explained_variance", "clipped_gradients"}

@@ -1,0 +1,389 @@
+"""Updates and optimisers against loops by hand."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from jax.flatten_util import ravel_pytree
+from problems import MASK, PARAMS, START, make_problem, surrogate
+from toys import Late, Survive
+
+from mjx_reinforce import reinforce, train_step
+from mjx_reinforce.learning import counts, estimators, schedules, updates
+from mjx_reinforce.learning.updates import Problem
+from mjx_reinforce.settings.config import Config
+from mjx_reinforce.store.build import _build_optimizer
+
+
+def run(update, problem, key=None):
+    key = jax.random.key(1) if key is None else key
+    return update(problem, key, PARAMS, problem.optimizer.init(PARAMS))
+
+
+def descend(problem, params, opt_state, samples, divisor):
+    grads, sums = jax.grad(surrogate, has_aux=True)(params, samples)
+    grads = jax.tree.map(lambda g: g / divisor, grads)
+    changes, opt_state = problem.optimizer.update(grads, opt_state, params)
+    norm = np.sqrt(sum(float(g) ** 2 for g in grads.values()))
+    return optax.apply_updates(params, changes), opt_state, norm, float(sums["entropy"])
+
+
+def assert_close(got, expected):
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-5, atol=1e-6), got, expected)
+
+
+#: It reads its state, and the parameters for their decay.
+ADAMW = optax.adamw(0.1, weight_decay=0.3)
+
+
+def test_full_batch_is_one_step():
+    problem = make_problem(ADAMW)
+    params, opt_state, metrics = run(updates.full_batch(), problem)
+    start = PARAMS, problem.optimizer.init(PARAMS)
+    expected = descend(problem, *start, problem.samples, 3)
+    assert_close((params, opt_state), expected[:2])
+    assert float(metrics["gradient_norm"]) == pytest.approx(expected[2], rel=1e-5)
+    assert float(metrics["entropy"]) == pytest.approx(expected[3] / MASK.sum(), rel=1e-5)
+
+
+@pytest.mark.parametrize("update", [updates.full_batch(), updates.each_step()])
+def test_metrics_of_a_single_step_and_of_none(update):
+    """A mean over one step divides by one; nothing played measures nothing, and is finite."""
+    one = np.zeros((5, 3), bool)
+    one[0, 1] = True
+    problem = make_problem(optax.sgd(0.1), divisor=2, mask=one)
+    _, _, metrics = run(update, problem)
+    expected = descend(problem, PARAMS, problem.optimizer.init(PARAMS), problem.samples, 2)
+    assert float(metrics["gradient_norm"]) == pytest.approx(expected[2], rel=1e-5)
+    assert float(metrics["entropy"]) == pytest.approx(expected[3], rel=1e-5)
+    params, _, metrics = run(update, make_problem(optax.sgd(0.1), mask=np.zeros((5, 3), bool)))
+    assert_close(params, PARAMS)
+    assert np.isnan(metrics.pop("gradient_snr", np.nan))
+    assert {name: float(x) for name, x in metrics.items()} == {"entropy": 0, "gradient_norm": 0}
+
+
+def each_step_by_hand(problem):
+    params, opt_state = PARAMS, problem.optimizer.init(PARAMS)
+    norms, entropy, mask = [], 0.0, np.asarray(problem.samples[-1])
+    for t in range(len(mask)):
+        if mask[t].any():
+            now = tuple(x[t] for x in problem.samples)
+            params, opt_state, norm, sums = descend(problem, params, opt_state, now, 3)
+            norms, entropy = [*norms, norm], entropy + sums
+    return params, opt_state, {"entropy": entropy / mask.sum(), "gradient_norm": np.mean(norms)}
+
+
+@pytest.mark.parametrize("longest", [1, 4, 5])
+def test_each_step_is_a_loop_over_time(longest):
+    """Up to the end of the longest episode, which may be the horizon of 5."""
+    mask = np.arange(5)[:, None] < np.minimum([longest, 1, 3], longest)
+    problem = make_problem(ADAMW, mask=mask)
+    assert_close(run(updates.each_step(), problem), each_step_by_hand(problem))
+
+
+def test_each_step_of_one_seed_ends_with_its_own_episodes():
+    """Beside a seed whose episodes are longer; Adam would move on without a gradient."""
+    short, optimizer = np.arange(5)[:, None] < np.array([2, 1, 1]), optax.adam(0.1)
+    problems = [make_problem(optimizer), make_problem(optimizer, mask=short, seed=1)]
+    samples = jax.tree.map(lambda *x: jnp.stack(x), *[p.samples for p in problems])
+
+    def update(samples):
+        return run(updates.each_step(), Problem(surrogate, optimizer, samples, 3, START))
+
+    together = jax.vmap(update)(samples)
+    for s, problem in enumerate(problems):
+        alone = jax.tree.map(lambda x, s=s: x[s], together)
+        assert_close(alone, each_step_by_hand(problem))
+
+
+def test_minibatches_are_steps_on_drawn_samples():
+    problem, key = make_problem(ADAMW), jax.random.key(5)
+    got = run(updates.minibatches(3, 4), problem, key)
+    drawn = jax.random.randint(key, (3, 4), 1, MASK.sum() + 1)
+    flat = [x.reshape(-1, *x.shape[2:]) for x in problem.samples]
+    params, opt_state, norms, entropy = PARAMS, problem.optimizer.init(PARAMS), [], []
+    for index in np.flatnonzero(MASK)[np.asarray(drawn) - 1]:
+        batch = tuple(x[index] for x in flat)
+        params, opt_state, norm, sums = descend(problem, params, opt_state, batch, 4)
+        norms, entropy = [*norms, norm], [*entropy, sums / 4]
+    metrics = {"entropy": np.mean(entropy), "gradient_norm": np.mean(norms)}
+    assert_close(got, (params, opt_state, metrics))
+
+
+def test_minibatches_divide_by_their_own_size():
+    """One minibatch of one sample is a step on that sample's own gradient."""
+    one = np.zeros((5, 3), bool)
+    one[2, 0] = True
+    problem = make_problem(optax.sgd(0.1), divisor=7, mask=one)
+    expected = descend(problem, PARAMS, problem.optimizer.init(PARAMS), problem.samples, 1)
+    params, _, metrics = run(updates.minibatches(1, 1), problem)
+    assert_close(params, expected[0])
+    assert float(metrics["gradient_norm"]) == pytest.approx(expected[2], rel=1e-5)
+    assert float(metrics["entropy"]) == pytest.approx(expected[3], rel=1e-5)
+
+
+def test_minibatches_of_nothing_stay_in_bounds():
+    """A seed that stands still draws too; what it draws is thrown away, and must be finite."""
+    params, _, metrics = run(
+        updates.minibatches(2, 3), make_problem(optax.adam(0.1), mask=np.zeros((5, 3), bool))
+    )
+    assert all(np.isfinite(x) for x in jax.tree.leaves((params, metrics)))
+
+
+def test_minibatches_draw_every_played_step_alike_and_no_other():
+    """The weights outside the mask are NaN here."""
+
+    def which(key):
+        number = jnp.asarray(np.where(MASK, np.arange(MASK.size).reshape(MASK.shape), np.nan))
+        samples = tuple(map(jnp.asarray, (number, MASK)))
+        total = lambda w, s: (w * jnp.sum(s[0]), {"entropy": 0.0})  # noqa: E731
+        linear = Problem(total, optax.sgd(1.0), samples, 1, START)
+        return -updates.minibatches(1, 1)(linear, key, jnp.zeros(()), linear.optimizer.init(0.0))[0]
+
+    drawn = np.asarray(jax.vmap(which)(jax.random.split(jax.random.key(0), 8000))).round()
+    counts = np.bincount(drawn.astype(int), minlength=MASK.size).reshape(MASK.shape)
+    assert np.all(counts[~MASK] == 0)
+    np.testing.assert_allclose(counts[MASK], 1000, atol=5 * np.sqrt(1000 * 7 / 8))
+
+
+@pytest.mark.slow
+def test_a_seed_that_stands_still_stays_as_it_is():
+    learner = reinforce(Survive(), num_episodes=4, update=updates.each_step())
+    states = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 2))
+    after, metrics = jax.jit(jax.vmap(learner.step))(states, jnp.array([True, False]))
+    assert int(metrics["env_steps"][1]) == 0
+
+    def same(seed, x, y):
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            x, y = jax.random.key_data(x), jax.random.key_data(y)
+        return bool(np.all(np.asarray(x[seed]) == np.asarray(y[seed])))
+
+    assert all(jax.tree.leaves(jax.tree.map(functools.partial(same, 1), states, after)))
+    assert not all(jax.tree.leaves(jax.tree.map(functools.partial(same, 0), states, after)))
+
+
+def adam_by_hand(grads, decay, *, decoupled):
+    """PyTorch's documented recursion, at a learning rate of 0.1."""
+    x, m, v = 2.0, 0.0, 0.0
+    for i, g in enumerate(grads, 1):
+        if decoupled:
+            x -= 0.1 * decay * x
+        else:
+            g = g + decay * x
+        m, v = 0.9 * m + 0.1 * g, 0.999 * v + 0.001 * g * g
+        x -= 0.1 * (m / (1 - 0.9**i)) / (np.sqrt(v / (1 - 0.999**i)) + 1e-8)
+    return x
+
+
+@pytest.mark.parametrize("name", updates.OPTIMIZERS)
+def test_optimizers_by_hand(name):
+    grads, decay = [0.5, -3.0, 1.0], 0.3
+    optimizer = updates.make_optimizer(name, 0.1, weight_decay=decay, max_grad_norm=None)
+    x = jnp.array(2.0)
+    state = optimizer.init(x)
+    for g in grads:
+        change, state = optimizer.update(jnp.array(g), state, x)
+        x = x + change
+    expected = 2.0
+    for g in grads:
+        expected -= 0.1 * (g + decay * expected)
+    if name != "sgd":
+        expected = adam_by_hand(grads, decay, decoupled=name == "adamw")
+    assert float(x) == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["adam", "adamw"])
+def test_without_momentum_adam_follows_the_last_gradient_alone(name):
+    optimizer = updates.make_optimizer(name, 0.1, max_grad_norm=None, momentum=0.0)
+    got = changes(optimizer, jnp.array(2.0), *map(jnp.array, (0.5, -3.0)))
+    second = (0.999 * 0.001 * 0.5**2 + 0.001 * 3.0**2) / (1 - 0.999**2)
+    np.testing.assert_allclose(got, [-0.1, 0.1 * 3.0 / np.sqrt(second)], rtol=1e-5)
+
+
+def test_the_norm_is_clipped_before_the_weight_decay():
+    optimizer = updates.make_optimizer("sgd", 1.0, weight_decay=0.5, max_grad_norm=1.0)
+    x = jnp.array([6.0, 8.0])
+    change, _ = optimizer.update(jnp.array([3.0, 4.0]), optimizer.init(x), x)
+    np.testing.assert_allclose(change, [-0.6 - 3.0, -0.8 - 4.0], rtol=1e-6)
+
+
+def changes(optimizer, params, *grads):
+    """Returns what an optimiser makes of a sequence of gradients."""
+    state, made = optimizer.init(params), []
+    for g in grads:
+        change, state = optimizer.update(g, state, params)
+        made.append(change)
+    return np.stack(made)
+
+
+def test_the_default_optimizer_is_adam_of_a_gradient_of_norm_one():
+    x, grads = jnp.array([6.0, 8.0]), [jnp.array([3.0, 4.0]), jnp.array([0.3, -0.4])]
+    explicit = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-2))
+    got = changes(updates.make_optimizer(), x, *grads)
+    np.testing.assert_allclose(got, changes(explicit, x, *grads), rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", updates.OPTIMIZERS)
+def test_no_weight_decay_by_default_and_a_clipped_norm_in_all(name):
+    """The parameters do not matter; 5 times the gradient is 1 times it at a norm of at most 1."""
+    optimizer, g = updates.make_optimizer(name, 0.1), jnp.array([0.6, 0.8])
+    got = changes(optimizer, jnp.array([6.0, 8.0]), g, 5 * g, 0.1 * g)
+    np.testing.assert_allclose(got, changes(optimizer, jnp.zeros(2), g, g, 0.1 * g), rtol=1e-5)
+    assert np.all(got != 0)
+
+
+@pytest.mark.parametrize("name", updates.OPTIMIZERS)
+def test_the_learning_rate_may_be_a_schedule(name):
+    schedule = optax.piecewise_constant_schedule(0.1, {1: 10.0})
+    optimizer, g = updates.make_optimizer(name, schedule, max_grad_norm=None), jnp.array(0.5)
+    first, second = changes(optimizer, jnp.array(0.0), g, g)
+    assert float(second / first) == pytest.approx(10, rel=1e-4)
+
+
+UPDATES = {
+    "full-batch": updates.full_batch(),
+    "minibatches": updates.minibatches(3, 4),
+    "each-step": updates.each_step(),
+}
+
+
+def clock(progress=0.0, env_steps=0.0):
+    return schedules.Clock(jnp.asarray(progress), jnp.asarray(env_steps))
+
+
+@pytest.mark.parametrize("name", UPDATES)
+@pytest.mark.parametrize("length", [None, 10])
+def test_the_rate_falls_with_the_budget_or_with_env_steps(name, length):
+    """All optimiser steps of an update have the rate of its beginning."""
+    plain = updates.make_optimizer("sgd", 0.1, max_grad_norm=None)
+    decaying = optax.chain(plain, schedules.decay_rate(0.2, length))
+
+    def moved(optimizer, now):
+        problem = make_problem(optimizer)._replace(clock=now)
+        return UPDATES[name](problem, jax.random.key(3), PARAMS, optimizer.init(PARAMS))[0]
+
+    for share, factor in ((0.0, 1.0), (0.5, 0.6), (1.0, 0.2), (3.0, 0.2)):
+        now = clock(share) if length is None else clock(0.9, 10 * share)
+        scaled = updates.make_optimizer("sgd", 0.1 * factor, max_grad_norm=None)
+        expected, actual = moved(scaled, now), moved(decaying, now)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), actual, expected)
+
+
+def test_the_std_shrinks_with_the_budget_besides_what_is_learned():
+    params = {"network": jnp.ones(2), "constants": jnp.log(jnp.array([0.5, 0.3]))}
+    learned = jax.tree.map(lambda x: 0.1 * jnp.ones_like(x), params)
+    optimizer = optax.chain(optax.sgd(1.0), schedules.shrink_std(0.1, 20))
+    state = optimizer.init(params)
+    total = jnp.zeros(2)
+    for played, share in ((0, 0.0), (5, 0.25), (15, 0.5), (25, 0.25), (35, 0.0), (10, -0.5)):
+        now = clock(env_steps=float(played))
+        change, state = optimizer.update(learned, state, params, clock=now)
+        np.testing.assert_allclose(change["network"], [-0.1, -0.1], rtol=1e-6)
+        expected = np.full(2, -0.1 + share * np.log(0.1))
+        np.testing.assert_allclose(change["constants"], expected, rtol=1e-5)
+        total += change["constants"] + 0.1
+    np.testing.assert_allclose(total, [0.5 * np.log(0.1)] * 2, rtol=1e-5)
+
+
+@pytest.mark.parametrize("budget", [10**6, 10**12, 2**53])
+def test_schedules_are_exact_for_budgets_of_any_size(budget):
+    """Shares of counts in two words, and the std after 10,000 updates however small each is."""
+    limit = counts.from_int(budget)
+    rate = schedules.decay_rate(0.0)
+
+    @jax.jit
+    def share_of(count):
+        return counts.as_float(count) / counts.as_float(limit)
+
+    for used in (0, 1, budget // 3, 2**31 - 1, 2**31, 2**32, 2**32 + 7, budget - 1, budget):
+        if used <= budget:
+            now = schedules.Clock(share_of(counts.from_int(used)), jnp.zeros(()))
+            factor = rate.update(jnp.ones(()), (), clock=now)[0]
+            assert float(factor) == pytest.approx(1 - used / budget, abs=2e-7)
+
+    shrink = schedules.shrink_std(1e-3)
+    each, log_std = budget // 10_000, jnp.zeros(1)
+
+    def one(carry, _):
+        state, log_std, count = carry
+        now = schedules.Clock(share_of(count), jnp.zeros(()))
+        change, state = shrink.update({"constants": jnp.zeros(1)}, state, None, clock=now)
+        count = jax.lax.fori_loop(0, each // 2**30, lambda _, c: counts.plus(c, 2**30), count)
+        count = counts.plus(count, each % 2**30)
+        return (state, log_std + change["constants"], count), None
+
+    start = shrink.init(None), log_std, counts.zero()
+    (_, log_std, count), _ = jax.lax.scan(one, start, length=10_001)
+    assert counts.to_int(count) == each * 10_001
+    np.testing.assert_allclose(log_std, np.log(1e-3), rtol=3e-4)
+
+
+def test_the_discount_looks_further_ahead():
+    found = [float(schedules.look_further(0.9, 0.999, jnp.asarray(s))) for s in (0, 0.5, 1)]
+    np.testing.assert_allclose(found, [0.9, 0.99, 0.999], rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_an_estimator_may_change_with_the_budget():
+    """Halfway through the budget the update is that of the discount that lies between."""
+
+    def changing(progress):
+        return estimators.reward_to_go(schedules.look_further(0.9, 0.999, progress))
+
+    def step(estimator, progress):
+        learner = reinforce(Late(), estimator=estimator, num_episodes=4)
+        state = jax.jit(learner.init)(jax.random.key(0))
+        return train_step(learner, dataclasses.replace(state, progress=jnp.asarray(progress)))[0]
+
+    halfway, fixed = step(changing, 0.5), step(estimators.reward_to_go(0.99), 0.0)
+    for one, other in zip(*map(jax.tree.leaves, (halfway.actor, fixed.actor)), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
+    first = step(changing, 0.0)
+    one, other = (ravel_pytree(x.actor.params)[0] for x in (first, fixed))
+    assert not np.allclose(one, other, rtol=1e-4, atol=1e-6)
+
+
+def test_settings_become_the_schedules_they_name():
+    """The rate falls to a tenth if nothing is said; the noise by the ratio of its two settings."""
+    params = {"network": jnp.ones(2), "constants": jnp.zeros(1)}
+
+    def changes(**settings):
+        config = Config(optimizer="sgd", learning_rate=0.1, max_grad_norm=None, **settings)
+        optimizer = _build_optimizer(config)
+        state, found = optimizer.init(params), []
+        for now in (clock(0.0, 0.0), clock(0.25, 50.0), clock(0.5, 100.0)):
+            change, state = optimizer.update(params, state, params, clock=now)
+            found.append((float(change["network"][0]), float(change["constants"][0])))
+        return np.array(found)
+
+    rates = changes(decay_steps=100)
+    np.testing.assert_allclose(rates[:, 0], [-0.1, -0.055, -0.01], rtol=1e-5)
+    np.testing.assert_allclose(changes()[:, 0], [-0.1, -0.0775, -0.055], rtol=1e-5)
+    rates = changes(decay_steps=100, final_learning_rate=0.05)
+    np.testing.assert_allclose(rates[:, 0], [-0.1, -0.075, -0.05], rtol=1e-5)
+    np.testing.assert_allclose(changes(decay_steps=None)[:, 0], [-0.1] * 3, rtol=1e-5)
+    rates = changes(decay_steps=None, decay_updates=2)
+    np.testing.assert_allclose(rates[:, 0], [-0.1, -0.055, -0.01], rtol=1e-5)
+    shrunk = changes(decay_steps=100, initial_std=0.6, final_std=0.03)
+    np.testing.assert_allclose(shrunk[:, 1], np.log(0.05) * np.array([0, 0.5, 0.5]), rtol=1e-5)
+
+
+def test_a_policy_without_an_std_of_its_own_has_nothing_to_shrink():
+    params = {"network": jnp.ones(2), "constants": jnp.zeros(0)}
+    shrink = schedules.shrink_std(0.1, 20)
+    changes, _ = shrink.update(params, shrink.init(params), params, clock=clock(env_steps=10.0))
+    assert changes["constants"].shape == (0,)
+    np.testing.assert_array_equal(changes["network"], 1)
+
+
+def test_nonsense_is_refused():
+    with pytest.raises(ValueError, match="num_updates must be at least 1, got 0"):
+        updates.minibatches(0, 8)
+    with pytest.raises(ValueError, match="batch_size must be at least 1, got -1"):
+        updates.minibatches(1, -1)
+    with pytest.raises(ValueError, match=r"unknown optimizer 'adamww'\. Did you mean 'adamw'"):
+        updates.make_optimizer("adamww")

@@ -1,0 +1,109 @@
+"""What too few seeds, or seeds that are all alike, cannot say: no interval, and no small p."""
+
+import numpy as np
+import pytest
+
+from mjx_reinforce.statistics.aggregates import interval
+from mjx_reinforce.statistics.comparisons import (
+    compare_all,
+    paired_difference,
+    probability_of_improvement,
+)
+from mjx_reinforce.statistics.power import seeds_needed
+from mjx_reinforce.statistics.survival import combined, log_rank, median_steps, restricted_mean
+
+NAMES = ("mean", "median", "iqm", "optimality-gap", "cvar")
+MOST = "mean median iqm optimality-gap"
+
+
+@pytest.mark.parametrize(
+    ("values", "bounded"),
+    [
+        ([3.0], ""),
+        ([3.0, 5.0], ""),
+        ([3.0, 5.0, 9.0], ""),
+        (np.arange(5.0), ""),
+        (np.arange(6.0), MOST),
+        (np.arange(60.0), f"{MOST} cvar"),
+        (np.full(5, 7.0), ""),
+        (np.full(6, 7.0), "median"),
+        (np.full(10, 7.0), "median"),
+        (np.full(11, 7.0), "median iqm"),
+        (np.full(60, 7.0), "median iqm"),
+        (0.1 + 1e-9 * np.arange(9), "median"),  # float32 numbers are not as exact
+        ([np.nan, 3.0], ""),
+        ([np.nan] * 60, ""),
+        ([-np.inf, *range(59)], "median iqm"),
+        ([np.inf] * 30 + [5.0] * 30, ""),
+        (np.repeat([0.0, 1.0], [10, 50]), MOST),  # of the worst tenth, all are alike
+    ],
+)
+def test_an_interval_is_of_seeds_that_can_bear_it(values, bounded):
+    for name in NAMES:
+        found = interval(name, np.asarray(values), target=100.0)
+        assert np.all(np.isfinite(found[1:])) == (name in bounded.split()), name
+
+
+def test_tasks_side_by_side_need_seeds_each():
+    """Three of each, and as many in all as leave five beside the tasks."""
+    for each, tasks, bounded in ((2, 20, False), (3, 2, False), (3, 3, True), (6, 1, True)):
+        strata, values = np.repeat(np.arange(tasks), each), np.arange(float(each * tasks))
+        for name in ("mean", "iqm"):
+            assert np.isfinite(interval(name, values, strata=strata).low) == bounded
+    assert np.isnan(interval("mean", np.repeat([1.0, 5.0], 9), strata=np.repeat([0, 1], 9)).low)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "p_value", "bounded"),
+    [
+        ([3.0], [1.0], 1.0, False),
+        ([3.0, 4.0], [1.0, 2.0], 0.5, False),
+        ([3.0, 4.0, 5.0], [1.0, 2.0, 2.999], 0.25, False),
+        (np.arange(5.0) + 2, np.arange(5.0), 2**-4, False),
+        (np.arange(6.0) + 2, np.arange(6.0), 2**-5, False),
+        (np.arange(6.0) + 0.1, np.arange(6.0), 2**-5, False),  # equal but for rounding
+        (np.array([9.0, 9, 9, 9, 9, 8]), np.zeros(6), 2**-5, True),
+        (np.arange(99.0), np.arange(99.0), 1.0, False),
+        (np.eye(99)[0] + np.eye(99)[1], np.zeros(99), 0.5, True),  # two can be told apart
+        ([np.nan] * 3, [1.0, 2.0, 3.0], 0.5, False),
+        ([np.inf] * 9, [np.nan] * 9, 1.0, False),
+    ],
+)
+def test_no_p_is_less_than_the_pairs_that_differ_allow(first, second, p_value, bounded):
+    found = paired_difference(first, second)
+    assert found.p_value == pytest.approx(p_value, rel=1e-12)
+    assert np.isfinite(found.low) == np.isfinite(found.high) == bounded
+    (pair,) = compare_all([np.asarray(first), np.asarray(second)])
+    assert pair.adjusted == pytest.approx(p_value, rel=1e-12)
+    _, low, high = probability_of_improvement(first, second, paired=True)
+    assert high - low > 0.02
+
+
+@pytest.mark.parametrize(("seeds", "least"), [(1, 1.0), (2, 2 / 6), (3, 0.1), (4, 2 / 70)])
+def test_no_p_of_times_is_less_than_their_orders_allow(seeds, least):
+    soon, late, all_of_them = np.arange(1, seeds + 1), np.arange(seeds) + 1000, np.ones(seeds)
+    test = log_rank(soon, all_of_them, late, all_of_them)
+    assert test.p_value == pytest.approx(max(least, 0.01), abs=0.02)
+    assert test.p_value >= least - 1e-12
+    assert combined([test.statistic]) == pytest.approx(test.p_value)
+
+
+@pytest.mark.parametrize(
+    ("steps", "mean", "median"),
+    [
+        ([10], False, False),
+        (np.arange(5), False, False),
+        (np.arange(9), True, True),
+        (np.full(9, 10), False, True),
+    ],
+)
+def test_times_of_few_seeds_have_no_interval(steps, mean, median):
+    done = np.ones(len(steps), bool)
+    assert np.isfinite(restricted_mean(steps, done, 50).low) == mean
+    assert np.isfinite(median_steps(steps, done).low) == median
+    assert np.isnan(restricted_mean(steps, ~done, max(steps)).low) if max(steps) else True
+
+
+def test_two_constants_need_as_many_seeds_as_have_orders_enough():
+    assert seeds_needed(np.full(9, 2.0), np.full(9, 1.0)) == 4
+    assert seeds_needed(np.full(9, 2.0), np.full(9, 1.0), alpha=0.001) == 7

@@ -1,0 +1,169 @@
+"""Env steps to a threshold against hand counts."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from mjx_reinforce.statistics.survival import (
+    collapses,
+    combined,
+    kaplan_meier,
+    log_rank,
+    mean_while_training,
+    median_steps,
+    restricted_mean,
+    time_to_threshold,
+)
+
+
+def test_time_to_threshold_is_the_first_time_or_the_last_known():
+    returns = np.array([[0.0, np.nan, 9.0, np.inf], [10.0, 2.0, 11.0, 1.0], [3.0, 4.0, 1.0, 1.0]])
+    steps = np.array([[0, 0, 5, 0], [50, 60, 70, 80], [100, 120, 140, 160]])
+    found, solved = time_to_threshold(returns, steps, 9.0)
+    assert found.tolist() == [50, 120, 5, 160]
+    assert solved.tolist() == [True, False, True, False]
+
+
+def test_collapse_is_to_have_solved_and_not_to_at_the_end():
+    returns = np.array([[9.0, 9.0, 0.0, 0.0, 9.0], [0.0, 9.0, 0.0, 9.0, np.nan]])
+    assert collapses(returns, 9.0).tolist() == [True, False, False, False, True]
+
+
+def test_kaplan_meier_by_hand():
+    """Two of six are still unsolved when their training ends at 6; one ended unsolved at 3."""
+    curve = kaplan_meier([1, 2, 2, 3, 5, 6], [True, True, True, False, True, False])
+    np.testing.assert_allclose(curve.steps, [1, 2, 3, 5, 6])
+    np.testing.assert_allclose(curve.probability, [5 / 6, 1 / 2, 1 / 2, 1 / 4, 1 / 4])
+
+
+def test_band_by_hand():
+    """Log-log with Greenwood's variance: after two of four, S = 1/2, sum of 1/12 and 1/6."""
+    curve = kaplan_meier([1, 2, 3, 4], [True, True, False, False])
+    spread = stats.norm.ppf(0.975) * np.sqrt(1 / 12 + 1 / 6) / np.log(0.5)
+    np.testing.assert_allclose(curve.low[1], 0.5 ** np.exp(-spread))
+    np.testing.assert_allclose(curve.high[1], 0.5 ** np.exp(spread))
+
+
+def test_median_by_hand():
+    steps, solved = [10, 20, 30, 40, 50, 60], np.array([True, True, True, False, True, False])
+    assert median_steps(steps, solved).value == 30
+    value, low, high = median_steps(steps, solved & (np.arange(6) < 2))
+    assert np.isnan(value)
+    assert low == 10  # so few could be the half
+    assert np.isnan(high)
+
+
+def test_median_interval_is_between_order_statistics():
+    """Of a hundred, the 40th and the 61st cover with 96.5 %, the 41st and the 60th with 94.3 %."""
+    value, low, high = median_steps(np.arange(1, 101), np.full(100, True))
+    assert value == 50
+    assert low in (40, 41)
+    assert high in (60, 61)
+
+
+def test_restricted_mean_without_censoring_before_the_end_is_the_mean():
+    times = np.random.default_rng(1).exponential(size=30)
+    steps = np.minimum(times, 1.2)
+    found = restricted_mean(steps, times <= 1.2, 1.2)
+    low, high = stats.ttest_1samp(steps, 0).confidence_interval()
+    np.testing.assert_allclose(found, [steps.mean(), low, high])
+
+
+def test_restricted_mean_by_hand():
+    """One of four is lost at 2: after 1 the share is 3/4, after 3, of two left, it is 3/8."""
+    value, low, high = restricted_mean([1, 2, 3, 4], [True, False, True, False], 4, 0.8)
+    assert value == pytest.approx(1 + 0.75 * 2 + 0.375)
+    error = np.sqrt((1.875**2 / (4 * 3) + 0.375**2 / (2 * 1)) * 4 / 3)
+    half = stats.t.ppf(0.9, 3) * error
+    np.testing.assert_allclose([low, high], [max(value - half, 0), min(value + half, 4)])
+
+
+def test_restricted_mean_ends_where_training_does():
+    with pytest.raises(ValueError, match="until: 9 env steps, but the longest seed has 4"):
+        restricted_mean([1, 4], [True, False], 9)
+
+
+def test_no_seed_or_every_seed_solves():
+    never = np.zeros(6, bool)
+    assert np.all(np.isnan(median_steps(np.full(6, 100), never)))
+    assert restricted_mean(np.full(6, 100), never, 100).value == 100
+    np.testing.assert_allclose(median_steps(np.full(6, 100), ~never), 100)
+    assert restricted_mean(np.full(6, 100), ~never, 100).value == 100
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 50), st.booleans()), min_size=2, max_size=15))
+def test_properties(seeds):
+    """The curve falls within its band; the order of the seeds does not matter."""
+    steps, solved = (np.array(column) for column in zip(*seeds, strict=True))
+    curve = kaplan_meier(steps, solved)
+    assert np.all(np.diff(curve.probability) <= 1e-12)
+    known = ~np.isnan(curve.low)
+    assert np.all((curve.low <= curve.probability)[known])
+    assert np.all((curve.probability <= curve.high)[known])
+    until = int(steps.max())
+    found = restricted_mean(steps, solved, until)
+    np.testing.assert_allclose(restricted_mean(steps[::-1], solved[::-1], until), found)
+    assert np.isnan(found.low) or 0 <= found.low <= found.value <= found.high <= until
+
+
+def expected_less_observed(steps, solved, others, others_solved):
+    """Mantel's statistic by its definition: a table of two rows at each time that a seed solves."""
+    difference = variance = 0.0
+    for when in np.unique(np.concatenate([steps[solved], others[others_solved]])):
+        left, right = np.sum(steps >= when), np.sum(others >= when)
+        events = np.sum(steps[solved] == when) + np.sum(others[others_solved] == when)
+        total = left + right
+        difference += np.sum(steps[solved] == when) - events * left / total
+        if total > 1:
+            variance += events * left * right * (total - events) / (total**2 * (total - 1))
+    return difference / np.sqrt(variance)
+
+
+def test_log_rank_is_mantels():
+    random = np.random.default_rng(4)
+    steps, others = random.integers(1, 30, 25), random.integers(5, 40, 31)
+    solved, others_solved = random.random(25) < 0.7, random.random(31) < 0.6
+    found = log_rank(steps, solved, others, others_solved)
+    by_hand = expected_less_observed(steps, solved, others, others_solved)
+    assert found.statistic == pytest.approx(by_hand)
+    assert found.statistic > 0  # the first solve it sooner
+    assert found.p_value == pytest.approx(2 * stats.norm.sf(abs(by_hand)))
+    turned = log_rank(others, others_solved, steps, solved)
+    assert turned.statistic == pytest.approx(-found.statistic)
+
+
+def test_log_rank_of_what_does_not_differ():
+    none, all_of_them = np.zeros(4, bool), np.ones(4, bool)
+    for solved in (none, all_of_them):
+        assert log_rank([7] * 4, solved, [7] * 4, solved) == (0.0, 1.0)
+
+
+def test_log_rank_finds_nothing_where_there_is_nothing():
+    """Of equal groups, one test in twenty has p below 0.05."""
+    random = np.random.default_rng(0)
+    steps = random.exponential(100, (400, 2, 40))
+    ends = np.minimum(steps, 150)
+    found = [
+        log_rank(e[0], s[0] < 150, e[1], s[1] < 150).p_value
+        for e, s in zip(ends, steps, strict=True)
+    ]
+    assert 0.02 < np.mean(np.array(found) < 0.05) < 0.09
+
+
+def test_tests_of_several_tasks_together():
+    assert combined([1.96]) == pytest.approx(0.05, abs=1e-3)
+    assert combined([2.0, -2.0]) == 1.0
+    assert combined([1.5] * 4) == pytest.approx(2 * stats.norm.sf(3.0))
+
+
+def test_mean_while_training_is_the_area_by_the_width():
+    steps = np.array([[0, 0, 0], [10, 10, 10], [30, 10, 30]])
+    returns = np.array([[0.0, 4.0, 1.0], [10.0, 8.0, np.nan], [10.0, 8.0, 1.0]])
+    whole = mean_while_training(returns, steps, 30)
+    assert whole[:2].tolist() == pytest.approx([(50 + 200) / 30, 6.0])  # the second stood still
+    assert np.isnan(whole[2])
+    assert mean_while_training(returns, steps, 5)[0] == pytest.approx(2.5)
+    assert mean_while_training(returns[:1], steps[:1], 5).tolist() == [0.0, 4.0, 1.0]
