@@ -14,7 +14,7 @@ COMMANDS = {
         "train many configurations at once, and compare them",
     ),
     "report": ("mjx_reinforce.report", "make a page of figures of runs and sweeps"),
-    "export": ("mjx_reinforce.export.__main__", "write a policy as NumPy or ONNX"),
+    "export": ("mjx_reinforce.export.__main__", "write a policy for NumPy alone"),
     "new": ("mjx_reinforce.new", "write the class of a task from a MuJoCo model"),
     "envs": ("mjx_reinforce.envs.__main__", "list the tasks, or describe one"),
 }

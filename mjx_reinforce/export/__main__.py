@@ -1,10 +1,9 @@
-"""``python -m mjx_reinforce.export RUN --to numpy`` takes a trained policy out of the program."""
+"""``python -m mjx_reinforce.export RUN`` takes a trained policy out of the program."""
 
 import dataclasses
 import keyword
 import sys
 from pathlib import Path
-from typing import Literal
 
 import tyro
 
@@ -17,19 +16,16 @@ from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportSettings:
-    """Write the deterministic action of a trained policy as a file that needs no JAX."""
+    """Write a trained policy without noise for NumPy alone: an archive .npz and a short .py."""
 
     run: tyro.conf.Positional[Path]
     """The run directory that training left, or a task whose policy comes with the package."""
-    to: Literal["numpy", "onnx"]
-    """"numpy": an archive .npz and a short .py beside it that needs NumPy alone. "onnx": a model
-    from observation, float32 [N, O], to action [N, A]; needs pip install onnx."""
     seed: SeedChoice = "best"
     """Which of the run's seeds: best, worst or median by its final evaluation, or a number."""
     which: Which = "last"
     """The policy at the end of training, or the one that did best on the way, if it was kept."""
     output: Path | None = None
-    """The file, .npz or .onnx. By default seed_NUMBER in the run directory; of a policy of the
+    """The archive, .npz. By default seed_NUMBER in the run directory; of a policy of the
     package, the name of its task in the current folder."""
     overwrite: bool = False
     """Replace files that exist."""
@@ -50,26 +46,21 @@ def export(settings: ExportSettings) -> list[Path]:
     """Writes the files and returns their names.
 
     Raises:
-      ValueError: a setting is out of range, the run is damaged, or a package is missing.
+      ValueError: a setting is out of range, or the run is damaged.
       OSError: a file cannot be written.
     """
     if not is_pretrained(settings.run):
         read_run(settings.run)
-    from mjx_reinforce.export.arithmetic import arithmetic, import_onnx, numpy_source, onnx_model
+    from mjx_reinforce.export.arithmetic import arithmetic, numpy_source
     from mjx_reinforce.export.player import load_saved
     from mjx_reinforce.files import write_arrays, write_bytes
 
     player, saved = load_saved(settings.run, settings.seed, settings.which)
     outputs = output_files(settings, player.seed)
-    if settings.to == "onnx":
-        import_onnx()
     plain = arithmetic(saved)
-    if settings.to == "onnx":
-        write_bytes(outputs[0], onnx_model(plain, player.env, player.seed))
-    else:
-        write_arrays(outputs[0], plain.arrays)
-        source = numpy_source(plain, outputs[0].stem, player.env, player.seed)
-        write_bytes(outputs[1], source.encode())
+    write_arrays(outputs[0], plain.arrays)
+    source = numpy_source(plain, outputs[0].stem, player.env, player.seed)
+    write_bytes(outputs[1], source.encode())
     return outputs
 
 
@@ -79,16 +70,14 @@ def output_files(settings: ExportSettings, seed: int) -> list[Path]:
     Raises:
       ValueError: their name does not fit, they exist, or they cannot be written.
     """
-    suffix = {"numpy": ".npz", "onnx": ".onnx"}[settings.to]
-    in_run = settings.run / f"seed_{seed}{suffix}"
-    of_package = Path(str(settings.run).replace("-", "_") + suffix)
+    in_run = settings.run / f"seed_{seed}.npz"
+    of_package = Path(str(settings.run).replace("-", "_") + ".npz")
     output = settings.output or (of_package if is_pretrained(settings.run) else in_run)
-    if output.suffix != suffix:
-        raise ValueError(f"--to {settings.to} writes {suffix}, got --output {output}")
+    if output.suffix != ".npz":
+        raise ValueError(f"export writes .npz, got --output {output}")
     check_folder(output.parent)
-    if settings.to == "numpy":
-        _check_module(output.stem)
-    outputs = [output, output.with_suffix(".py")] if settings.to == "numpy" else [output]
+    _check_module(output.stem)
+    outputs = [output, output.with_suffix(".py")]
     for path in outputs:
         if path.is_dir() or (path.exists() and not settings.overwrite):
             raise ValueError(f"{path} exists; pass --overwrite or another --output")

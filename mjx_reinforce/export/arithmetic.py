@@ -1,4 +1,4 @@
-"""A trained policy's deterministic action as plain arithmetic, as Python and as ONNX."""
+"""A trained policy's deterministic action as plain arithmetic, in Python."""
 
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -148,76 +148,3 @@ def _statements(plain: Arithmetic) -> list[str]:
         "argmax": "np.argmax(x, axis=-1)",
     }
     return [*lines, f"x = {layers[-1]}", f"return {endings[plain.head]}"]
-
-
-# Of 2021 and 2022: runtimes that are installed anywhere know them.
-_OPSET, _IR_VERSION = 17, 8
-
-
-def import_onnx() -> Any:
-    """Returns the package ``onnx``.
-
-    Raises:
-      ValueError: it is not installed.
-    """
-    try:
-        import onnx
-    except ImportError as error:
-        raise ValueError(f"--to onnx needs the package onnx ({error}); pip install onnx") from error
-    return onnx
-
-
-def onnx_model(plain: Arithmetic, env: str, seed: int) -> bytes:
-    """Returns the content of an .onnx file.
-
-    Its input ``observation`` is float32 [N, O]; its output ``action`` is float32 [N, A] or, if
-    discrete, int64 [N].
-
-    Args:
-      plain: what it computes.
-      env: the id of the environment, for the model's description.
-      seed: the number of the seed, for the description too.
-    """
-    onnx = import_onnx()
-    helper, float32 = onnx.helper, onnx.TensorProto.FLOAT
-    size, out = plain.sizes
-    nodes: list[Any] = []
-
-    def add(operation: str, *inputs: str, name: str = "", **attributes: int) -> str:
-        """Adds an operation, and returns the name of what comes out of it."""
-        name = name or f"{operation.lower()}_{len(nodes)}"
-        nodes.append(helper.make_node(operation, inputs, [name], **attributes))
-        return name
-
-    x = "observation"
-    if plain.normalized:
-        x = add("Clip", add("Div", add("Sub", x, "mean"), "std"), "least", "greatest")
-    for i in range(plain.num_layers):
-        x = add("Gemm", add("Tanh", x) if i else x, f"weight_{i}", f"bias_{i}")
-    if plain.head == "clip":
-        x = add("Min", add("Max", x, "low"), "high")
-    elif plain.head == "tanh":
-        x = add("Add", add("Mul", add("Tanh", x), "half"), "middle")
-    elif plain.head == "argmax":
-        x = add("ArgMax", x, axis=1, keepdims=0)
-    add("Identity", x, name="action")
-    clips = {"least": np.float32(-plain.clip), "greatest": np.float32(plain.clip)}
-    constants = plain.arrays | (clips if plain.normalized else {})
-    discrete = plain.head == "argmax"
-    kind, shape = (onnx.TensorProto.INT64, ["N"]) if discrete else (float32, ["N", out])
-    graph = helper.make_graph(
-        nodes,
-        "policy",
-        [helper.make_tensor_value_info("observation", float32, ["N", size])],
-        [helper.make_tensor_value_info("action", kind, shape)],
-        [onnx.numpy_helper.from_array(x, name) for name, x in sorted(constants.items())],
-        doc_string=f"The deterministic action of a trained policy for {env}, seed {seed}.",
-    )
-    model = helper.make_model(
-        graph,
-        opset_imports=[helper.make_opsetid("", _OPSET)],
-        ir_version=_IR_VERSION,
-        producer_name="mjx_reinforce",
-    )
-    onnx.checker.check_model(model, full_check=True)
-    return model.SerializeToString()

@@ -1,4 +1,4 @@
-"""Policies outside this program: as NumPy and as ONNX, they act as here."""
+"""Policies outside this program: in NumPy alone, they act as here."""
 
 import importlib.util
 import subprocess
@@ -44,38 +44,26 @@ def import_file(path):
     return module
 
 
-def onnx_actions(path, observations):
-    import onnxruntime
-
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    [entry], [out] = session.get_inputs(), session.get_outputs()
-    assert (entry.name, out.name) == ("observation", "action")
-    assert entry.shape == ["N", 4]
-    assert session.get_modelmeta().graph_description.endswith(", seed 1.")
-    return session.run(None, {"observation": observations.astype(np.float32)})[0]
-
-
 @pytest.mark.parametrize(
     ("family", "case"),
     [*((x, "linear") for x in DISTRIBUTIONS), *(("normal", x) for x in CASES if x != "linear")],
 )
 def test_the_exported_policy_acts_as_ours(tmp_path, monkeypatch, capsys, family, case):
     run = make(tmp_path, family, *CASES[case])
-    run_export(monkeypatch, run, "--to", "numpy")
-    run_export(monkeypatch, run, "--to", "onnx", "--seed", 1)
-    written = [run / name for name in ("seed_1.npz", "seed_1.py", "seed_1.onnx")]
+    run_export(monkeypatch, run)
+    written = [run / name for name in ("seed_1.npz", "seed_1.py")]
     assert capsys.readouterr().out.split() == list(map(str, written))
     module, player = import_file(run / "seed_1.py"), load(run)
     assert player.env == module.ENVIRONMENT
     assert module.SEED == 1
     expected = player.act(OBSERVATIONS)
-    for actions in (module.act(OBSERVATIONS), onnx_actions(run / "seed_1.onnx", OBSERVATIONS)):
-        assert actions.shape == expected.shape
-        if family == "categorical":
-            np.testing.assert_array_equal(actions, expected)
-        else:
-            assert actions.dtype == np.float32
-            np.testing.assert_allclose(actions, expected, rtol=1e-6, atol=1e-6)
+    actions = module.act(OBSERVATIONS)
+    assert actions.shape == expected.shape
+    if family == "categorical":
+        np.testing.assert_array_equal(actions, expected)
+    else:
+        assert actions.dtype == np.float32
+        np.testing.assert_allclose(actions, expected, rtol=1e-6, atol=1e-6)
     one = module.act(OBSERVATIONS[0])
     np.testing.assert_allclose(one, expected[0], rtol=1e-6, atol=1e-6)
     if HEADS[family] == "clip":
@@ -92,7 +80,7 @@ def test_two_networks_and_unbounded_actions(tmp_path, monkeypatch):
     settings = {"shared_trunk": False, "policy": "normal-softplus"}
     space = {"action_low": [-np.inf, -1.0], "action_high": [np.inf, 3.0]}
     run = make_run(tmp_path, "InvertedPendulum-v5", **settings, **space)
-    run_export(monkeypatch, run, "--to", "numpy")
+    run_export(monkeypatch, run)
     actions = import_file(run / "seed_1.py").act(OBSERVATIONS)
     np.testing.assert_allclose(actions, load(run).act(OBSERVATIONS), rtol=1e-6, atol=1e-6)
 
@@ -100,7 +88,7 @@ def test_two_networks_and_unbounded_actions(tmp_path, monkeypatch):
 def test_the_numpy_file_is_short_and_needs_nothing_else(tmp_path, monkeypatch):
     """It is imported where nothing but NumPy and the standard library can be."""
     run = make_run(tmp_path, "InvertedPendulum-v5")
-    run_export(monkeypatch, run, "--to", "numpy", "--output", run / "brain.npz")
+    run_export(monkeypatch, run, "--output", run / "brain.npz")
     source = (run / "brain.py").read_text()
     code = [line for line in source.split('"""', 2)[2].splitlines() if line.strip()]
     assert len(code) <= 20
@@ -129,13 +117,13 @@ def test_names_in_files_stay_text(tmp_path, monkeypatch):
     for file in ("config.json", "policy/policy.json"):
         change(run / file, env=name)
     change_arrays(run / "policy" / "actor.npz", checksum=None)
-    run_export(monkeypatch, run, "--to", "numpy")
+    run_export(monkeypatch, run)
     assert name == import_file(run / "seed_1.py").ENVIRONMENT
 
 
 def test_a_policy_of_the_package_can_be_exported(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run_export(monkeypatch, "Swimmer-v5", "--to", "numpy")
+    run_export(monkeypatch, "Swimmer-v5")
     observation = np.linspace(-1, 1, 8)
     theirs = import_file(tmp_path / "Swimmer_v5.py").act(observation)
     np.testing.assert_allclose(theirs, load("Swimmer-v5").act(observation), atol=2e-6)
@@ -144,22 +132,20 @@ def test_a_policy_of_the_package_can_be_exported(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["numpy", "--output", "policy.onnx"], "--to numpy writes .npz, got --output policy.onnx"),
-        (["onnx", "--output", "policy.npz"], "--to onnx writes .onnx, got --output policy.npz"),
-        (["numpy", "--output", "my-policy.npz"], "cannot import a module called 'my-policy'"),
-        (["numpy", "--output", "class.npz"], "cannot import a module called 'class'"),
-        (["numpy", "--output", "numpy.npz"], "numpy.py would hide Python's or NumPy's numpy"),
-        (["numpy", "--output", "random.npz"], "random.py would hide"),
-        (["numpy", "--output", "nowhere/policy.npz"], "cannot write to nowhere"),
-        (["numpy", "--output", "mine.py/policy.npz"], "cannot write to mine.py"),
-        (["numpy", "--output", "/proc/policy.npz"], "cannot write to /proc; choose another"),
-        (["numpy", "--sede", "1"], "unknown flag '--sede'. Did you mean '--seed'?"),
-        (["numpy", "--seed", "middle"], "middle"),
-        (["numpy", "--output", "mine.npz"], "mine.py exists; pass --overwrite"),
-        (["numpy", "--output", "folder.npz", "--overwrite"], "folder.npz exists"),
-        (["onnx"], "pip install onnx"),
-        (["numpy", "--seed", "9"], "has no seed 9: its seeds are 0 to 2"),
-        (["numpy", "--which", "best"], "has no policy/best"),
+        (["--output", "policy.onnx"], "export writes .npz, got --output policy.onnx"),
+        (["--output", "my-policy.npz"], "cannot import a module called 'my-policy'"),
+        (["--output", "class.npz"], "cannot import a module called 'class'"),
+        (["--output", "numpy.npz"], "numpy.py would hide Python's or NumPy's numpy"),
+        (["--output", "random.npz"], "random.py would hide"),
+        (["--output", "nowhere/policy.npz"], "cannot write to nowhere"),
+        (["--output", "mine.py/policy.npz"], "cannot write to mine.py"),
+        (["--output", "/proc/policy.npz"], "cannot write to /proc; choose another"),
+        (["--sede", "1"], "unknown flag '--sede'. Did you mean '--seed'?"),
+        (["--seed", "middle"], "middle"),
+        (["--output", "mine.npz"], "mine.py exists; pass --overwrite"),
+        (["--output", "folder.npz", "--overwrite"], "folder.npz exists"),
+        (["--seed", "9"], "has no seed 9: its seeds are 0 to 2"),
+        (["--which", "best"], "has no policy/best"),
     ],
 )
 def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
@@ -167,10 +153,9 @@ def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
     (tmp_path / "mine.py").write_text("mine")
     (tmp_path / "folder.npz").mkdir()
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "onnx", None)
     before = sorted(tmp_path.iterdir())
     with pytest.raises(SystemExit, match="2"):
-        run_export(monkeypatch, ".", "--to", *arguments)
+        run_export(monkeypatch, ".", *arguments)
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
@@ -181,5 +166,5 @@ def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
 def test_overwrite_is_by_request_alone(tmp_path, monkeypatch):
     run = make_run(tmp_path)
     (run / "seed_1.py").write_text("mine")
-    run_export(monkeypatch, run, "--to", "numpy", "--overwrite")
+    run_export(monkeypatch, run, "--overwrite")
     assert import_file(run / "seed_1.py").SEED == 1

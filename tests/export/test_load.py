@@ -203,7 +203,7 @@ def test_damage_is_named_in_one_line(tmp_path, monkeypatch, capsys, name):
     said = str(caught.value)
     assert file in said
     assert "\n" not in said
-    for main, arguments in ((watch.main, []), (export.main, ["--to", "numpy"])):
+    for main, arguments in ((watch.main, []), (export.main, [])):
         monkeypatch.setattr(sys, "argv", ["program", str(tmp_path), *arguments])
         with pytest.raises(SystemExit, match="2"):
             main()
