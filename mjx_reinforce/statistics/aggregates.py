@@ -26,24 +26,22 @@ def interval(
     *,
     strata: ArrayLike | None = None,
     confidence: float = 0.95,
-    target: float = 1.0,
     fraction: float = 0.1,
 ) -> Estimate:
     """Returns a statistic over seeds with its confidence interval.
 
-    The mean, the IQM and the optimality gap have Hesterberg's expanded percentile bootstrap
+    The mean and the IQM have Hesterberg's expanded percentile bootstrap
     (``bootstrap.expanded_tail``), the median has order statistics (``median_interval``), CVaR has
     the bootstrap t (``tails.cvar_interval``), and whatever has strata the expanded percentiles of
     the stratified bootstrap. docs/statistics.md says how often each covers the truth.
 
     Args:
-      statistic: "mean", "median", "iqm", "optimality-gap" or "cvar".
+      statistic: "mean", "median", "iqm" or "cvar".
       values: [..., S], the seeds last; not finite where a seed failed, which counts as the worst.
       strata: [S] the task of each entry, where values of several tasks stand side by side. Seeds
         are then resampled within each, and the mean and the median are over the tasks' means, as
         in rliable. None: all entries are alike.
       confidence: the interval's level.
-      target: of the optimality gap.
       fraction: of the seeds, that ``cvar`` is the mean of.
 
     Returns:
@@ -53,14 +51,10 @@ def interval(
     Raises:
       ValueError: an unknown statistic.
     """
-    known = ("mean", "median", "iqm", "optimality-gap", "cvar")
+    known = ("mean", "median", "iqm", "cvar")
     if statistic not in known:
         raise ValueError(f"statistic: {statistic!r} is unknown; choose one of {', '.join(known)}")
     values = worst_if_not_finite(values)
-    if statistic == "optimality-gap":
-        clipped = _clipped(values, target)
-        value, low, high = interval("mean", clipped, strata=strata, confidence=confidence)
-        return Estimate(target - value, target - high, target - low)
     if strata is not None:
         return _stratified(statistic, values, np.asarray(strata), confidence, fraction)
     if statistic == "mean":
@@ -174,10 +168,6 @@ def _median(values: np.ndarray, axis: int = -1) -> np.ndarray:
     """Returns the median of values, finite or -inf."""
     with np.errstate(invalid="ignore"):
         return np.median(values, axis=axis)
-
-
-def _clipped(values: ArrayLike, target: float) -> np.ndarray:
-    return np.minimum(worst_if_not_finite(values), target)
 
 
 def performance_profile(

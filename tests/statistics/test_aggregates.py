@@ -10,12 +10,11 @@ from scipy import stats
 from mjx_reinforce.statistics import aggregates, bootstrap, tails
 from mjx_reinforce.statistics.aggregates import cvar, interval, median_interval, wilson
 
-NAMES = ("mean", "median", "iqm", "optimality-gap", "cvar")
+NAMES = ("mean", "median", "iqm", "cvar")
 RLIABLE = {
     "mean": metrics.aggregate_mean,
     "median": metrics.aggregate_median,
     "iqm": metrics.aggregate_iqm,
-    "optimality-gap": metrics.aggregate_optimality_gap,
 }
 
 
@@ -43,10 +42,7 @@ def test_resamples_are_those_of_rliable(name):
     library_ends = library.get_interval_estimates(
         {"": table}, lambda x: np.array([RLIABLE[name](x)]), reps=5000
     )[1][""].ravel()
-    if name == "optimality-gap":
-        resampled = 1 - aggregates.resampled("mean", np.minimum(values, 1), tasks)
-    else:
-        resampled = aggregates.resampled(name, values, tasks)
+    resampled = aggregates.resampled(name, values, tasks)
     ends = bootstrap.percentiles(resampled, 0.025)
     assert np.max(np.abs(ends - library_ends)) < 4 * np.sqrt(2) * 0.038 * resampled.std()
 
@@ -61,9 +57,6 @@ def test_strata_are_resampled_apart():
 
 def test_values_by_hand():
     values = np.array([4.0, 1.0, 3.0, 10.0, 2.0])
-    assert interval("optimality-gap", values, target=3.0).value == pytest.approx(
-        (0 + 2 + 0 + 0 + 1) / 5
-    )
     assert interval("median", values).value == 3.0
     assert interval("mean", values).value == 4.0
     assert interval("iqm", values).value == 3.0
@@ -129,7 +122,6 @@ def test_a_failed_seed_is_the_worst(failed):
     values = np.arange(60.0)
     values[-1] = failed
     assert np.isnan(interval("mean", values)).tolist() == [True, True, False]
-    assert np.isnan(interval("optimality-gap", values)).tolist() == [True, False, True]
     assert np.all(np.isnan(interval("cvar", values)))
     assert interval("median", values).value == 28.5
     assert np.all(np.isfinite(interval("iqm", values)))
@@ -159,9 +151,8 @@ def test_a_better_seed_makes_nothing_worse(values, place, more, name):
     before = np.array(values)
     after = before.copy()
     after[place % len(before)] += more
-    sign = -1 if name == "optimality-gap" else 1
     for old, new in zip(interval(name, before), interval(name, after), strict=True):
-        assert np.isnan(old) or sign * new >= sign * old - 1e-9
+        assert np.isnan(old) or new >= old - 1e-9
 
 
 @settings(max_examples=25, deadline=None)
