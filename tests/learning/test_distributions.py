@@ -94,23 +94,16 @@ def test_probability_adds_up_to_one(name, distribution, outputs):
     assert total == pytest.approx(1.0, abs=1e-4)
 
 
-def test_expected_score_is_zero(distribution, outputs):
-    actions = draw(distribution, outputs)
-    score = jax.jit(jax.vmap(jax.grad(distribution.log_prob), (None, 0)))(outputs, actions)
-    error = np.std(score, axis=0) / np.sqrt(NUM_SAMPLES)
-    assert np.all(np.abs(np.mean(score, axis=0)) < 4 * error)
-
-
-@pytest.mark.parametrize("saturated", [-4.0, 3.0])
-@pytest.mark.parametrize("name", BOUNDED)
-def test_expected_score_is_zero_at_large_outputs(name, saturated):
-    """A Normal's mean is then out of bounds."""
-    distribution = build(name, initial_std=3.0)
-    outputs = jnp.array([saturated] * distribution.num_outputs + list(distribution.constants))
-    actions = draw(distribution, outputs)
-    score = jax.jit(jax.vmap(jax.grad(distribution.log_prob), (None, 0)))(outputs, actions)
-    error = np.std(score, axis=0) / np.sqrt(NUM_SAMPLES)
-    assert np.all(np.abs(np.mean(score, axis=0)) < 4 * error)
+def test_expected_score_is_zero(name, distribution, outputs):
+    """Also at large outputs of a bounded family, where a Normal's mean is out of bounds."""
+    cases = [(distribution, outputs)]
+    if name in BOUNDED:
+        wide = build(name, initial_std=3.0)
+        cases += [(wide, jnp.array([mean, *wide.constants])) for mean in (-4.0, 3.0)]
+    for family, given in cases:
+        score = jax.jit(jax.vmap(jax.grad(family.log_prob), (None, 0)))(given, draw(family, given))
+        error = np.std(score, axis=0) / np.sqrt(NUM_SAMPLES)
+        assert np.all(np.abs(np.mean(score, axis=0)) < 4 * error)
 
 
 def test_entropy_is_minus_the_mean_log_density(distribution, outputs):
@@ -287,29 +280,6 @@ def test_log_tail_against_scipy():
         np.testing.assert_allclose(-slope, hazard, rtol=1e-9)
 
 
-def test_clipped_normal_counts_what_it_clipped():
-    distribution = build("clipped-normal")
-    outputs = jnp.array([0.7, np.log(0.8)])
-    expected = stats.norm(-1.0 + 2.0 * 0.7, 0.8)
-    for action, log_prob in (
-        (LOW, expected.logcdf(LOW)),
-        (0.3, expected.logpdf(0.3)),
-        (HIGH, expected.logsf(HIGH)),
-    ):
-        got = distribution.log_prob(outputs, jnp.array([action]))
-        assert float(got) == pytest.approx(log_prob, rel=1e-5)
-
-
-def test_tanh_normal_density():
-    """By the change of variables; float32 leaves z, and with it the density, a thousandth."""
-    distribution = build("tanh-normal")
-    outputs = jnp.array([1.5, np.log(2.0)])
-    z = np.linspace(-4.9, 4.9, 21)
-    expected = stats.norm(1.5, 1.0).logpdf(z) - np.log(2.0 / np.cosh(z) ** 2)
-    actions = jnp.asarray(-1.0 + 2.0 * np.tanh(z))[:, None]
-    np.testing.assert_allclose(distribution.log_prob(outputs, actions), expected, atol=5e-3)
-
-
 def test_the_probabilities_of_a_categorical():
     """Entropy, mode, score and the frequencies of samples follow from them: a softmax."""
     distribution = build("categorical", ARMS)
@@ -340,7 +310,46 @@ def test_deterministic_has_no_density():
         distribution.log_prob(outputs, outputs)
 
 
-def test_nonsense_is_refused():
+@pytest.mark.parametrize("name", ["normal", "normal-softplus", "categorical"])
+def test_the_divergence_is_the_mean_log_ratio(name):
+    distribution = build(name, ARMS if name in DISCRETE else SPACE)
+    one = some_outputs(distribution)
+    other, actions = 1.3 * one, draw(distribution, one)
+    ratio = distribution.log_prob(one, actions) - distribution.log_prob(other, actions)
+    error = float(np.std(ratio)) / np.sqrt(NUM_SAMPLES)
+    assert float(distribution.kl(one, other)) == pytest.approx(np.mean(ratio), abs=4 * error)
+
+
+def test_the_divergence_of_nearly_equal_normals_is_no_difference_of_nearly_equal_numbers():
+    one = jnp.array([0.3, -0.7])
+    near = build("normal").kl(one, one + jnp.array([0.0, 1e-3]))
+    assert float(near) == pytest.approx(1e-6, rel=1e-2)
+
+
+def test_means_are_in_units_of_half_the_range_or_as_they_are():
+    """Where a bound is missing, the middle is 0 and half the range 1."""
+    space = Box(np.array([-2.0, -np.inf, 1.0]), np.array([4.0, 5.0, np.inf]))
+    for rescale, mode in ((True, [2.5, 0.5, 0.5]), (False, [0.5, 0.5, 0.5])):
+        distribution = build("normal", space, rescale=rescale)
+        outputs = jnp.array([0.5] * 3 + list(distribution.constants))
+        np.testing.assert_allclose(distribution.mode(outputs), mode)
+
+
+@pytest.mark.parametrize(
+    ("space", "settings", "said"),
+    [
+        ((-1, 1), {}, "normal needs an action space, .* got a tuple"),
+        (SPACE, {"std": "exp"}, "std must be 'parameter', 'softplus' or 'sigmoid', got 'exp'"),
+        (SPACE, {"initial_std": 0.0}, "initial_std must be positive"),
+        (SPACE, {"std": "sigmoid", "initial_std": 1.0}, "a sigmoid std stays below 1, got"),
+    ],
+)
+def test_nonsense_is_refused(space, settings, said):
+    with pytest.raises(ValueError, match=said):
+        normal(space, **settings)
+
+
+def test_actions_that_a_family_cannot_have_are_refused():
     with pytest.raises(ValueError, match="categorical needs a discrete action space"):
         build("categorical")
     for name in [*CONTINUOUS, "deterministic"]:
