@@ -120,7 +120,8 @@ def _start(
     ready = get_ready(config, default, env)
     if config.resume is None:
         return ready, None
-    resume.check_program(config.resume, provenance())
+    recorded = resume.read_record(config.resume)
+    resume.check_same_program(config.resume, recorded, provenance())
     like = shape_of_all(ready.programs.like, config.num_seeds)
     if config.minutes is not None:  # more than any checkpoint has used
         config = dataclasses.replace(config, env_steps=MAX_COUNT)

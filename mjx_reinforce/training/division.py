@@ -109,33 +109,27 @@ class Division:
         num_seeds = len(jax.tree.leaves(tree)[0])
         if num_seeds % self.seeds:
             total = self.seeds * self.width(num_seeds)
-            return _filled(devices, total)(devices.put(tree, NONE))
+            return _rows(devices, total, RUNS)(devices.put(tree, NONE))
         return devices.put(tree, RUNS)
 
     def view(self, tree: PyTree, num_seeds: int) -> Any:
         """Returns what ``place`` was given, or a function of ``jit`` made of it."""
         if self.seeds == 1 or num_seeds % self.seeds == 0:
             return tree
-        return _first(self.devices(), num_seeds)(tree)
+        return _rows(self.devices(), num_seeds, NONE)(tree)
 
 
 _devices = functools.cache(Devices)
 
 
 @functools.cache
-def _filled(devices: Devices, total: int) -> Callable[[PyTree], Any]:
-    def fill(tree: PyTree) -> Any:
-        return jax.tree.map(lambda x: x[np.minimum(np.arange(total), len(x) - 1)], tree)
+def _rows(devices: Devices, count: int, spec: PartitionSpec) -> Callable[[PyTree], Any]:
+    """Returns a function to the first rows of arrays, with the last again where there are fewer."""
 
-    return jax.jit(fill, out_shardings=devices.shardings(RUNS))
+    def rows(tree: PyTree) -> Any:
+        return jax.tree.map(lambda x: x[np.minimum(np.arange(count), len(x) - 1)], tree)
 
-
-@functools.cache
-def _first(devices: Devices, num_seeds: int) -> Callable[[PyTree], Any]:
-    def first(tree: PyTree) -> Any:
-        return jax.tree.map(lambda x: x[:num_seeds], tree)
-
-    return jax.jit(first, out_shardings=devices.shardings(NONE))
+    return jax.jit(rows, out_shardings=devices.shardings(spec))
 
 
 #: One device trains.

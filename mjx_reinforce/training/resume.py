@@ -136,20 +136,16 @@ def is_done(known: Config, asked: Config) -> bool:
     return status == "finished"
 
 
-def check_program(directory: Path, present: Mapping[str, Any]) -> None:
-    """Raises ValueError if a run was begun by a program whose numbers may differ.
-
-    Args:
-      directory: the run's.
-      present: what ``files.provenance`` returns.
-    """
-    check_same_program(directory, read_record(directory), present)
-
-
 def check_same_program(
     directory: Path, recorded: Mapping[str, Any], present: Mapping[str, Any]
 ) -> None:
-    """Raises ValueError as ``check_program``, of what a file in the directory recorded."""
+    """Raises ValueError if a run or a sweep was begun by a program whose numbers may differ.
+
+    Args:
+      directory: of the run, for the message.
+      recorded: what a file in it says of the program that began it.
+      present: what ``provenance`` returns.
+    """
     for name in (name for name in _PROGRAM if name in present):
         old, new = recorded.get(name), present[name]
         if name == "xla_flags":
@@ -189,7 +185,8 @@ def newest_checkpoint(like: "RunState", config: Config, say: Callable[[str], Non
     assert config.resume is not None
     _check_unchanged(config, checkpoint.settings_of(config.resume / "checkpoint"))
     states = like, shape_of_best(like.train_states)
-    length = _length(config.resume / "metrics.csv")
+    metrics = config.resume / "metrics.csv"
+    length = metrics.stat().st_size if metrics.exists() else 0
     for found in checkpoint.read_checkpoints(config.resume / "checkpoint", states, say):
         if found.metrics_bytes > length:
             say(f"metrics.csv is shorter than at checkpoint {found.number}; trying the one before")
@@ -212,10 +209,6 @@ def _check_unchanged(config: Config, trained: Mapping[str, Any]) -> None:
                 f"{config.resume}/config.json says that {name} is {said.get(name)}, but the run "
                 f"was trained with {value}; put that back, or start another run"
             )
-
-
-def _length(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0
 
 
 def _serves(found: "Checkpoint", config: Config) -> bool:

@@ -15,20 +15,9 @@ COLUMNS = (
 )
 #: Columns that an evaluation measures.
 _EVALUATION = ("eval_return", "eval_return_stochastic", "eval_length")
-#: Columns that the last update measured, and the names of its metrics.
-_LAST_UPDATE = {
-    "train_return": "episode_return",
-    "train_length": "episode_length",
-    "entropy": "entropy",
-    "gradient_norm": "gradient_norm",
-    "nonfinite_episodes": "nonfinite_episodes",
-    "skipped_update": "skipped_update",
-    "kl": "kl",
-    "policy_std": "policy_std",
-    "explained_variance": "explained_variance",
-    "gradient_snr": "gradient_snr",
-    "clipped_gradients": "clipped_gradients",
-}
+#: Columns that the last update measured, and the names of its metrics: the same, but for two.
+_RENAMED = {"train_return": "episode_return", "train_length": "episode_length"}
+_LAST_UPDATE = _RENAMED | {name: name for name in COLUMNS[COLUMNS.index("entropy") :]}
 
 
 def of_evaluation(

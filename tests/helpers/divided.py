@@ -63,7 +63,7 @@ def played(config, division):
 
 def main():
     settings = SMALL | {"env": "CartPole-v1"} | json.loads(sys.argv[1])
-    config = Config(**settings | {"hidden_sizes": tuple(settings["hidden_sizes"])})
+    config = Config(**{k: tuple(x) if isinstance(x, list) else x for k, x in settings.items()})
     divisions = [Division(**json.loads(each)) for each in sys.argv[2:]]
     expected, (learner, episodes) = trained(config, ALONE), played(config, ALONE)
     for division in divisions:

@@ -10,14 +10,13 @@ import numpy as np
 import optax
 import pytest
 from brax import envs as brax_envs
-from toys import Drifting, Late, SignedTarget, Survive
+from toys import Drifting, SignedTarget, Survive
 
-from mjx_reinforce import Cut, mlp_policy, normal, reinforce, rollout, train_step
+from mjx_reinforce import Cut, mlp_policy, normal, reinforce, train_step
 from mjx_reinforce.engine.play import available
-from mjx_reinforce.learning import counts, estimators, normalize, updates
+from mjx_reinforce.learning import counts, estimators, updates
 from mjx_reinforce.learning import learner as learner_module
 from mjx_reinforce.learning.estimators import discounted_returns
-from mjx_reinforce.learning.policy import MLP
 from mjx_reinforce.learning.value_baseline import value_baseline
 
 
@@ -36,17 +35,6 @@ def train(env, num_updates, **settings):
         return learner.step(state)
 
     return learner, *jax.jit(lambda s: jax.lax.scan(body, s, length=num_updates))(state)
-
-
-@pytest.mark.slow
-def test_probe_1_a_value_depends_on_the_observation_and_a_late_reward_is_discounted():
-    """At the first step, from which the others are a thousandth apart."""
-    _, state, _ = train(Late(), 60, estimator=value_baseline(0.5, optimizer=optax.adam(1e-2)))
-    scaled = normalize.apply(state.actor.normalizer, jnp.array([[0.0], [1.0]]))
-    seen, critic = jnp.append(scaled, jnp.zeros_like(scaled), axis=-1), state.estimator_state
-    units = MLP((64, 64), 1).apply(critic.params, seen)[..., 0]
-    value = critic.mean + jnp.sqrt(critic.variance) * units
-    np.testing.assert_allclose(value, [0.5, 1.0], atol=0.1)
 
 
 @pytest.mark.slow
@@ -74,15 +62,7 @@ def test_update_is_the_gradient_of_the_surrogate():
         )
         state = jax.jit(learner.init)(jax.random.key(3))
         after, _ = jax.jit(learner.step)(state)
-        trajectory = rollout(
-            env,
-            policy.apply,
-            state.actor.params,
-            policy.distribution,
-            jax.random.split(state.key)[1],
-            num_episodes=4,
-            horizon=20,
-        )
+        trajectory = learner.play(state, jax.random.split(state.key)[1], True)
         weight = discounted_returns(trajectory.reward, 0.9)
 
         def surrogate(params):
@@ -289,15 +269,12 @@ def test_nonsense_is_refused(settings, said):
 def test_a_brax_environment_trains():
     """Ours under brax's tools are in test_envs.py."""
     env = brax_envs.get_environment("inverted_pendulum", backend="generalized")
-    played = []
-    for engine in ("vmap", "auto"):
-        learner = reinforce(env, num_episodes=8, horizon=30, engine=engine)
-        state = learner.init(jax.random.key(0))
-        after, metrics = train_step(learner, state)
-        assert int(metrics["skipped_update"]) == 0
-        before, later = (jax.flatten_util.ravel_pytree(s.actor.params)[0] for s in (state, after))
-        assert np.all(np.isfinite(later))
-        assert np.any(before != later)
-        played.append(int(metrics["env_steps"]))
+    learner = reinforce(env, num_episodes=8, horizon=30)
     assert learner.engine.name == "native"
-    assert played[0] == played[1] > 8
+    state = learner.init(jax.random.key(0))
+    after, metrics = train_step(learner, state)
+    assert int(metrics["skipped_update"]) == 0
+    assert int(metrics["env_steps"]) > 8
+    before, later = (jax.flatten_util.ravel_pytree(s.actor.params)[0] for s in (state, after))
+    assert np.all(np.isfinite(later))
+    assert np.any(before != later)

@@ -9,9 +9,9 @@ import numpy as np
 import optax
 import pytest
 from jax.flatten_util import ravel_pytree
-from toys import Drift, SignedTarget
+from toys import Drift
 
-from mjx_reinforce import mlp_policy, natural_gradient, reinforce, train_step
+from mjx_reinforce import mlp_policy, natural_gradient, reinforce
 from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.learning import natural_gradient as module
 from mjx_reinforce.learning import schedules
@@ -21,7 +21,7 @@ from mjx_reinforce.learning.distributions.gaussian import normal
 from mjx_reinforce.learning.reinforce import _surrogate
 from mjx_reinforce.learning.updates import Problem, full_batch
 from mjx_reinforce.settings.config import Config, check
-from mjx_reinforce.store.build import _build_optimizer, build
+from mjx_reinforce.store.build import _build_optimizer
 
 MASK = np.arange(6)[:, None] < np.array([6, 1, 0, 4])
 BOX = Box(np.array([-1.0, 0.0]), np.array([1.0, 4.0]))
@@ -204,20 +204,7 @@ def test_a_step_moves_the_policy_by_about_the_divergence():
 @pytest.mark.slow
 def test_settings_become_the_update():
     """The learning rate leaves a share of the step, relative to its first value."""
-    natural = Config(
-        update="natural-gradient",
-        max_kl=0.01,
-        natural_damping=1e-4,
-        hidden_sizes=(),
-        normalize_steps=0,
-        num_episodes=64,
-        engine="vmap",
-        decay_steps=None,
-    )
-    check(natural)
-    learner, _ = build(SignedTarget(), natural)
-    _, metrics = train_step(learner, jax.jit(learner.init)(jax.random.key(0)))
-    assert float(metrics["kl"]) == pytest.approx(0.01, rel=0.25)
+    natural = Config(update="natural-gradient", max_kl=0.01, decay_steps=None)
     for settings, last in (({}, 1.0), ({"learning_rate": 1e-3}, 1.0), ({"decay_steps": 8}, 0.1)):
         optimizer = _build_optimizer(dataclasses.replace(natural, **settings))
         state = optimizer.init(jnp.ones(2))

@@ -20,17 +20,8 @@ from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.training import checkpoint, progress
 
-SMALL = [
-    "--env",
-    "ContinuousCartPole-v0",
-    "--num-seeds",
-    "3",
-    "--eval-episodes",
-    "2",
-    "--num-episodes",
-    "4",
-]
-SMALL += ["--hidden-sizes", "4"]
+SMALL = ["--env", "ContinuousCartPole-v0", "--num-seeds", "3", "--eval-episodes", "2"]
+SMALL += ["--num-episodes", "4", "--hidden-sizes", "4"]
 
 
 def settings(directory):

@@ -18,10 +18,8 @@ from mjx_reinforce.training.division import ALONE, Division, divide_run
 #: Settings, and how their runs are divided.
 VARIANTS = {
     "plain": ({}, [{"episodes": 8}, {"seeds": 3}]),
-    "value": (
-        {"estimator": "value-baseline", "update": "natural-gradient", "max_kl": 0.01},
-        [{"episodes": 8}],
-    ),
+    "value": ({"estimator": "value-baseline", "value_hidden_sizes": [4]}, [{"episodes": 8}]),
+    "natural": ({"update": "natural-gradient", "max_kl": 0.01}, [{"episodes": 8}]),
     "minibatches": (
         {"update": "minibatches", "minibatch_size": 16, "one_start": True, "max_kl": 0.01},
         [{"episodes": 2}],

@@ -4,11 +4,10 @@ from types import SimpleNamespace
 
 import jax
 import numpy as np
-import pytest
 
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.driver import Best, Driver, drive, first_best, keep_best, shape_of_best
+from mjx_reinforce.training.driver import Best, Driver, first_best, keep_best, shape_of_best
 from mjx_reinforce.training.programs import Looked, RunPrograms
 from mjx_reinforce.training.record import RunRecord
 
@@ -164,14 +163,6 @@ def test_a_restored_run_goes_on_where_it_was():
     second.drive(never)
     assert rest.looks == [True]
     assert second.record.history()["eval_return"][:, 0].tolist() == [0, 2, 4, 6]
-
-
-@pytest.mark.parametrize(("blocks", "asked", "ended"), [(2, 9, True), (3, 2, False), (0, 9, True)])
-def test_what_goes_on_block_by_block(blocks, asked, ended):
-    left = [None] * blocks
-    training = SimpleNamespace(over=lambda: not left, advance=left.pop)
-    assert drive(training, after(asked)) == ended
-    assert len(left) == (0 if ended else blocks - asked)
 
 
 # The best policy of each seed, by its evaluations so far.

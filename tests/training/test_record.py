@@ -101,9 +101,11 @@ def test_a_record_of_two_seeds_by_hand():
     record = RunRecord(config, threshold=8.0)
     first = record.add_evaluation(evaluation(1, 9), 0.5)
     assert first["train_return"] == ["", ""]
+    assert record.evaluated()
     assert not record.finished()
     assert record.progress().fraction == 0
     met = record.add_updates(METRICS)
+    assert not record.evaluated()
     assert as_events(met) == [{"seed": 0, "update": 1, "episodes": 2, "skipped": True}]
     second = record.add_evaluation(evaluation(7, 10), 2.00009)
     keys = ("seed", "update", "episodes", "env_steps", "wall_seconds", "train_return")
@@ -127,21 +129,6 @@ def test_a_record_of_two_seeds_by_hand():
     assert len(summary["nonfinite"]) == 1
     record.add_evaluation(evaluation(8, 8), 2.0)
     assert record.finished()
-
-
-def test_a_block_waits_for_its_evaluation():
-    record, nothing = (RunRecord(Config(num_seeds=3, max_updates=100), 2.0) for _ in range(2))
-    nothing.restore(record.arrays())
-    same(record.arrays(), nothing.arrays())
-    assert not record.evaluated()
-    assert record.add_evaluation(evaluation(1, 2, 3), 0.1)["train_return"] == [""] * 3
-    assert record.evaluated()
-    record.add_updates(block(np.random.default_rng(0), 4, 3))
-    assert not record.evaluated()
-    nothing.restore(record.arrays())
-    assert not nothing.evaluated()
-    nothing.add_evaluation(evaluation(1, 2, 3), 0.2)
-    assert nothing.evaluated()
 
 
 def test_a_test_counts_among_what_was_simulated():

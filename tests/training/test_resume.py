@@ -239,29 +239,14 @@ def test_a_screen_that_takes_nothing_ends_no_run(run, trained, tmp_path, monkeyp
 #: What is given besides --resume, what is changed in config.json by hand, and what is said.
 REFUSED = [
     ("--learning-rate 0.5", {}, "--learning-rate is 0.01 in parts and cannot become 0.5"),
-    ("--eval-every 1", {}, "--eval-every is 5"),
-    ("--num-seeds 4", {}, "--num-seeds is 3"),
     ("--output other", {}, "leave --output out"),
-    ("--overwrite", {}, "leave --output out"),
     ("--max-updates 13", {}, "--max-updates 13 is less than the 20"),
-    ("--checkpoint-every 0", {}, "--checkpoint-every must be at least 1"),
     ("", {"device": "TPU"}, "was begun with device TPU"),
-    ("", {"cpu": "i486"}, "was begun with cpu i486"),
-    ("", {"cores": 77}, "was begun with cores 77"),
     ("", {"packages": {"jax": "0.1"}}, "was begun with jax 0.1"),
-    (
-        "",
-        {"jax_settings": {"jax_default_matmul_precision": "low"}},
-        "was begun with jax_default_matmul_precision low",
-    ),
-    ("", {"num_seeds": "four"}, "num_seeds is 'four'"),
-    ("", {"hidden_sizes": [1.5]}, "hidden_sizes is (1.5,)"),
     ("", {"eval_every": None}, "eval_every is None: it is damaged, or of another version of the"),
     ("", {"engine": "kernel"}, "engine is 'kernel', not one of auto, vmap, native: it is damaged"),
     ("", {"learning_rate": 0.5}, "learning_rate is 0.5, but the run was trained with 0.01"),
     ("", {"hidden_sizes": [8]}, "hidden_sizes is [8], but the run was trained with [4]"),
-    ("", {"seed": 1}, "seed is 1, but the run was trained with 0"),
-    ("", {"horizon": 7}, "horizon is 7, but the run was trained with"),
 ]
 
 

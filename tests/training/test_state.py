@@ -135,45 +135,25 @@ def test_a_test_plays_whole_evaluations_from_starts_of_their_own():
 
 
 @pytest.mark.slow
-def test_training_is_cut_and_evaluations_are_whole():
-    """The updates are those of episodes that short; evaluations play to the time limit."""
-    env = envs.make(CONFIG.env)
-    cut = dataclasses.replace(CONFIG, train_horizon=6)
-    short = dataclasses.replace(CONFIG, horizon=6)
-    prepared = ready.made(env, cut)
-    assert prepared.horizon == 500
-    assert not prepared.programs.rides
-    (first, programs), (other, shorter) = (
-        compile_run(ready.made(env, x).programs, x) for x in (cut, short)
-    )
-    after, metrics, looked = programs.advance(first, True, budget_of(cut))
-    same, those, seen = shorter.advance(other, True, budget_of(short))
-    jax.tree.map(np.testing.assert_array_equal, plain(after), plain(same))
-    np.testing.assert_array_equal(metrics["env_steps"], those["env_steps"])
-    assert np.all(seen.measured["eval_length"] <= 6)
-    assert np.all(looked.measured["eval_length"] > 6)
-
-
-@pytest.mark.slow
-def test_training_is_cut_for_a_share_of_the_budget():
-    """Guests, who play whole episodes, ride from the start."""
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_training_is_cut_for_a_share_of_the_budget_and_evaluations_never(share):
+    """Guests, who play to the time limit, ride where training comes to do that, too."""
     config = dataclasses.replace(
-        CONFIG, num_seeds=1, env_steps=800, train_horizon=8, whole_after=0.5, eval_every=1
+        CONFIG, num_seeds=1, env_steps=800, train_horizon=8, whole_after=share, eval_every=1
     )
     prepared = ready.made(envs.make(config.env), config)
+    assert prepared.horizon == 500
+    assert prepared.programs.rides == (share < 1)
     state, programs = compile_run(prepared.programs, config)
-    budget, played, at = budget_of(config), [], []
-    for _ in range(40):
-        at.append(int(counts.to_int(state.train_states.env_steps)[0]))
+    budget, cut, whole = budget_of(config), [], []
+    while (steps := int(counts.to_int(state.train_states.env_steps)[0])) < config.env_steps:
         state, metrics, looked = programs.advance(state, True, budget)
-        if not metrics["active"].any():
-            break
-        played.append(float(metrics["episode_length"].max()))
+        lengths = cut if steps < share * config.env_steps else whole
+        lengths.append(float(metrics["episode_length"].max()))
         assert np.all(looked.measured["eval_length"] > 8)
-    before = [length for steps, length in zip(at, played, strict=False) if steps < 400]
-    after = [length for steps, length in zip(at, played, strict=False) if steps >= 400]
-    assert max(before) == 8
-    assert min(after) > 8
+    assert max(cut) == 8
+    assert bool(whole) == (share < 1)
+    assert all(length > 8 for length in whole)
 
 
 def test_a_cut_after_the_time_limit_is_none():
