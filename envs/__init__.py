@@ -5,20 +5,31 @@ An environment is a ``brax.envs.base.Env`` whose ``reset`` and ``step`` call MJX
 directly. Nothing heavy is imported before ``make``.
 """
 
+import enum
 import re
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from mjx_reinforce.engine.checks import BadEnvironmentError, check_parts, explain
+from mjx_reinforce.engine.checks import (
+    BadEnvironmentError,
+    check_name,
+    check_parts,
+    explain,
+    nearest,
+)
 from mjx_reinforce.engine.physics import silence_mjx
-from mjx_reinforce.registry import check_name, load_definition, load_ours, load_own
+from mjx_reinforce.registry import load_ours, load_own
 
 if TYPE_CHECKING:
+    from mjx_reinforce.engine.base import Environment
+    from mjx_reinforce.engine.vector.environment import VectorEnv
     from mjx_reinforce.envs.base import MujocoEnv
 
 silence_mjx()  # before any environment imports it
 
 _TASKS = "mjx_reinforce.envs.tasks"
+#: Arguments of ``make_vec`` that are no settings of the task.
+_OF_MAKE_VEC = ("num_envs", "autoreset", "max_episode_steps", "engine")
 
 #: id -> ("module:Class" or a callable, constructor arguments). One line a task.
 _TABLE: dict[str, tuple[str | Callable[..., Any], dict[str, Any]]] = {
@@ -104,11 +115,53 @@ def make_set(id: str, words: Sequence[str] = ()) -> Any:
     return make(id, **read_settings(task, words))
 
 
-def make_vec(env: object, num_envs: int, **options: object) -> Any:
-    """Makes N environments that play at once: ``mjx_reinforce.make_vec``, beside ``make``."""
-    return load_definition("mjx_reinforce.engine.vector.environment:make_vec")(
-        env, num_envs, **options
-    )
+def make_vec(
+    env: "str | Environment",
+    num_envs: int,
+    *,
+    autoreset: "str | enum.Enum" = "next_step",
+    max_episode_steps: int | None = None,
+    engine: str = "auto",
+    **settings: object,
+) -> "VectorEnv":
+    """Makes N environments that play at once, for any algorithm: ``mjx_reinforce.make_vec``.
+
+    Args:
+      env: an id of ``names()``, "module:Class" of your own, or an environment.
+      num_envs: N.
+      autoreset: when an environment whose episode has ended begins the next: "next_step" and
+        "same_step" are Gymnasium's, whose ``AutoresetMode`` may be given; with "disabled" only
+        ``restart`` does.
+      max_episode_steps: the time limit in steps; by default the task's.
+      engine: "auto", "native" (machine code) or "vmap".
+      **settings: of the task, where ``env`` is an id.
+
+    Raises:
+      ValueError: an argument makes no sense, the environment is none, or it does not fit in memory.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> vec = mr.make_vec("CartPole-v1", num_envs=8)
+      >>> state = vec.reset(jax.random.key(0))
+      >>> state = vec.step(state, vec.sample_actions(jax.random.key(1)))
+      >>> state.obs.shape, state.reward.tolist()[:2]
+      ((8, 4), [1.0, 1.0])
+    """
+    from mjx_reinforce.engine.vector import environment  # loads JAX
+
+    try:
+        made = make(env, **settings) if isinstance(env, str) else env
+        if made is env and settings:
+            raise ValueError(f"{sorted(settings)} are for an id; this environment is made already")
+    except ValueError as error:
+        meant = [own for own in (nearest(name, _OF_MAKE_VEC) for name in settings) if own]
+        if not meant:
+            raise
+        hint = f"make_vec itself takes {meant[0]!r}"
+        raise ValueError(f"{str(error).rstrip('.')}; {hint}") from error
+    options: Any = {"autoreset": autoreset, "max_episode_steps": max_episode_steps}
+    return environment.make_vec(made, num_envs, engine=engine, **options)
 
 
 def _import(id: str, entry: str | Callable[..., Any]) -> Callable[..., Any]:

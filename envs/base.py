@@ -14,7 +14,7 @@ from flax import struct
 from mujoco import mjMAXVAL, mjx  # pyright: ignore[reportAttributeAccessIssue] (a C extension)
 
 from mjx_reinforce.engine.base import Box, MjModel
-from mjx_reinforce.engine.checks import changed_fields
+from mjx_reinforce.engine.checks import changed_fields, check_name
 from mjx_reinforce.engine.physics import mjx_internals
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
@@ -23,7 +23,6 @@ from mjx_reinforce.envs import models
 from mjx_reinforce.envs.outcomes import check_episode, check_outcome, check_shape, check_start
 from mjx_reinforce.envs.parts import Named, View
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings, check_positive
-from mjx_reinforce.registry import check_name
 
 SOLVERS = ("exact", "mjx", "fast")
 

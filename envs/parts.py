@@ -5,8 +5,8 @@ from typing import Any
 import jax
 
 from mjx_reinforce.engine.base import MjModel
+from mjx_reinforce.engine.checks import check_name
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
-from mjx_reinforce.registry import check_name
 
 #: Kind -> how many of it a model has, and what comes before the name of a field of mjData, such as
 #: in ``site_xpos``; the fields of joints and sensors are found in other ways.

@@ -9,8 +9,7 @@ import typing
 from collections.abc import Sequence
 from typing import Any
 
-from mjx_reinforce.engine.checks import check_type, is_nan, read_as, spoken_kind
-from mjx_reinforce.registry import check_name
+from mjx_reinforce.engine.checks import check_name, check_type, is_nan, read_as, spoken_kind
 
 #: A range (low, high), of which ``EpisodeSettings`` checks that it contains something.
 Interval = tuple[float, float]

@@ -2,9 +2,10 @@
 
 from mjx_reinforce.engine.base import Box, Discrete, Environment, Trajectory
 from mjx_reinforce.engine.play.any_policy import rollout
-from mjx_reinforce.engine.vector.environment import VectorEnv, make_vec
+from mjx_reinforce.engine.vector.environment import VectorEnv
 from mjx_reinforce.engine.vector.episodes import VectorState
 from mjx_reinforce.engine.vector.segments import Segment, unroll
+from mjx_reinforce.envs import make_vec
 from mjx_reinforce.export.player import Player, load
 from mjx_reinforce.export.policy_files import load_policy, save_policy
 from mjx_reinforce.export.run_files import pretrained

@@ -5,19 +5,62 @@
 
 Gymnasium 1.0 and newer ask no package for its tasks by themselves, so this import is needed, or the
 id asks for it: "mjx_reinforce.gym:mjx_reinforce/HalfCheetah-v5". The arguments of ``make_vec`` are
-those of ``vector.for_gymnasium.make``.
+those of ``make``.
 """
 
+from typing import TYPE_CHECKING, Any
+
 import gymnasium
+from gymnasium.vector import AutoresetMode
 
 from mjx_reinforce import envs
 from mjx_reinforce.settings.tables import TASKS
 
+if TYPE_CHECKING:
+    from mjx_reinforce.engine.base import Environment
+    from mjx_reinforce.engine.vector.for_gymnasium import GymnasiumVectorEnv
+
 for _id in envs.names():
     gymnasium.register(
         f"mjx_reinforce/{_id}",
-        entry_point="mjx_reinforce.engine.vector.for_gymnasium:only_many",
-        vector_entry_point="mjx_reinforce.engine.vector.for_gymnasium:make",
+        entry_point="mjx_reinforce.gym:only_many",
+        vector_entry_point="mjx_reinforce.gym:make",
         max_episode_steps=TASKS[_id].horizon if _id in TASKS else None,
         kwargs={"env": _id},
+    )
+
+
+def make(
+    env: "str | Environment",
+    num_envs: int = 1,
+    *,
+    arrays: str = "numpy",
+    render_mode: str | None = None,
+    autoreset: str | AutoresetMode = "next_step",
+    **options: Any,
+) -> "GymnasiumVectorEnv":
+    """Makes N environments for Gymnasium; ``gymnasium.make_vec("mjx_reinforce/ID", N)`` calls it.
+
+    Args:
+      env: as of ``make_vec``.
+      num_envs: N.
+      arrays: "numpy", "jax" or "torch".
+      render_mode: "rgb_array", or None for no pictures.
+      autoreset: as of ``make_vec``, or Gymnasium's ``AutoresetMode``.
+      **options: further arguments of ``make_vec``, and of the task.
+
+    Raises:
+      ValueError: as of ``make_vec``.
+    """
+    from mjx_reinforce.engine.vector.for_gymnasium import GymnasiumVectorEnv  # loads JAX
+
+    vec = envs.make_vec(env, num_envs, autoreset=autoreset, **options)
+    return GymnasiumVectorEnv(vec, arrays, render_mode)
+
+
+def only_many(env: str, **options: object) -> gymnasium.Env:
+    """Raises ValueError: Gymnasium's ``make`` asks for one environment."""
+    raise ValueError(
+        f"these are many at once: gymnasium.make_vec('mjx_reinforce/{env}', num_envs=...); one of "
+        f"Gymnasium's own is gymnasium.make('{env}')"
     )

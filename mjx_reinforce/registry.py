@@ -1,14 +1,13 @@
 """Tables from the names a user types to the definitions, imported only when chosen."""
 
-import difflib
 import importlib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from mjx_reinforce.engine.checks import explain
+from mjx_reinforce.engine.checks import check_name, explain
 
 #: Action distributions: name -> "module:function" of an action space.
 DISTRIBUTIONS = {
@@ -40,23 +39,6 @@ ALGORITHMS = {
 
 #: What the system's loader says of a library for which there is no memory.
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory")
-#: How alike names are, as ``difflib`` counts, of which a third of the letters differ.
-_ALIKE = 0.66
-
-
-def check_name(kind: str, name: str, known: Mapping[str, Any]) -> None:
-    """Raises ValueError for a name that is not known, with the known ones and the nearest.
-
-    Args:
-      kind: what is named, for the message.
-      name: what the user typed.
-      known: the table.
-    """
-    if name in known:
-        return
-    near = nearest(name, known)
-    hint = f" Did you mean {near!r}?" if near else ""
-    raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(known))}.")
 
 
 def is_own(name: str) -> bool:
@@ -125,27 +107,6 @@ def _imported(
         raise ValueError(
             f"cannot import the {kind} {name!r}: {explain(error)}; {remedy}"
         ) from error
-
-
-def nearest(name: str, known: Iterable[str]) -> str | None:
-    """Returns the known name that somebody meant, whatever the case of the letters, if any is near.
-
-    Args:
-      name: what the user typed; a known name that contains it is near. A version, such as -v5,
-        makes no two names alike.
-      known: the names; of versions of one name the last is meant, unless the user typed another.
-    """
-    typed, versions = _plain(name), {}
-    for each in sorted(known):
-        versions.setdefault(_plain(each), []).append(each)
-    inside = [each for each in versions if len(typed) > 2 and typed in each]
-    near = difflib.get_close_matches(typed, inside or versions, n=1, cutoff=0 if inside else _ALIKE)
-    return difflib.get_close_matches(name, versions[near[0]], n=1, cutoff=0)[0] if near else None
-
-
-def _plain(name: str) -> str:
-    """Returns a name in small letters, without the version of a task."""
-    return re.sub(r"-v\d+$", "", name.lower())
 
 
 def load_definition(entry: str | Callable[..., Any]) -> Callable[..., Any]:

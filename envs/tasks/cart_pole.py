@@ -13,10 +13,9 @@ import numpy as np
 from flax import struct
 
 from mjx_reinforce.engine.base import Box, Discrete
-from mjx_reinforce.engine.checks import changed_fields
+from mjx_reinforce.engine.checks import changed_fields, check_name
 from mjx_reinforce.envs.base import Env, State
 from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
-from mjx_reinforce.registry import check_name
 
 _GRAVITY, _CART_MASS, _POLE_MASS, _HALF_LENGTH = 9.8, 1.0, 0.1, 0.5
 _TIMESTEP, _FORCE = 0.02, 10.0

@@ -12,7 +12,8 @@ import jax
 from rejax import PPO  # pyright: ignore[reportMissingImports]
 from rejax.compat.brax2gymnax import Brax2GymnaxEnv  # pyright: ignore[reportMissingImports]
 
-from mjx_reinforce.engine.vector import for_brax
+from mjx_reinforce import make_vec
+from mjx_reinforce.engine.vector.for_brax import BraxVectorEnv
 
 
 class OneOfMany(Brax2GymnaxEnv):
@@ -20,7 +21,7 @@ class OneOfMany(Brax2GymnaxEnv):
 
     def __init__(self, task: str):
         """Takes an id of ours whose actions have bounds."""
-        self.env = for_brax.make(task, 1)
+        self.env = BraxVectorEnv(make_vec(task, 1, autoreset="same_step"))
         self.max_steps_in_episode = self.env.vec.max_episode_steps
 
     def reset(self, key: jax.Array, params: Any = None) -> tuple[jax.Array, Any]:

@@ -4,11 +4,20 @@ Axes are named throughout: S seeds, T time steps, N episodes, O observation
 entries, A action entries.
 """
 
-from typing import Any, NamedTuple, Protocol, TypeAlias, runtime_checkable
+import dataclasses
+from collections.abc import Callable
+from typing import (
+    Any,
+    NamedTuple,
+    Protocol,
+    Self,
+    TypeAlias,
+    dataclass_transform,
+    runtime_checkable,
+)
 
 import jax
 import numpy as np
-from flax import struct
 
 #: A tree of arrays, as ``jax.tree`` sees it: dataclasses, tuples, lists and dicts, nested at will.
 #: Type checkers have no name for that.
@@ -16,6 +25,21 @@ PyTree: TypeAlias = Any
 #: A ``mujoco.MjModel`` or ``mujoco.MjSpec``; MuJoCo's extension module comes without stubs.
 MjModel: TypeAlias = Any
 MjSpec: TypeAlias = Any
+#: A policy: (params, observation [O]) -> outputs [K], the parameters of a distribution.
+Act: TypeAlias = Callable[[Any, jax.Array], jax.Array]
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+class Arrays:
+    """A frozen dataclass of arrays, or of pytrees of them, that is a pytree in field order."""
+
+    def __init_subclass__(cls) -> None:
+        fields = dataclasses.fields(dataclasses.dataclass(frozen=True, kw_only=True)(cls))
+        jax.tree_util.register_dataclass(cls, [field.name for field in fields], [])
+
+    def replace(self, **changes: Any) -> Self:
+        """Returns the same with other values in some fields."""
+        return dataclasses.replace(self, **changes)  # pyright: ignore[reportArgumentType]
 
 
 class Box(NamedTuple):
@@ -78,7 +102,34 @@ class Environment(Protocol):
         ...
 
 
-class Trajectory(struct.PyTreeNode, kw_only=True):
+@runtime_checkable
+class Acts(Protocol):
+    """A family of distributions over actions: all that is asked of one to play.
+
+    The noise depends on the key alone, so it can be drawn before the outputs are known, and every
+    engine gets the same actions from the same key. A family may say how long its outputs are by
+    ``num_outputs`` and ``constants``, as ``mjx_reinforce.Distribution`` does.
+
+    Examples:
+      >>> import mjx_reinforce as mr
+      >>> isinstance(mr.categorical(mr.Discrete(2)), mr.engine.Acts)
+      True
+    """
+
+    def noise(self, key: jax.Array, shape: tuple[int, ...], /) -> jax.Array:
+        """Returns the noise [*shape, E] of actions; consumes the key."""
+        ...
+
+    def sample(self, outputs: jax.Array, noise: jax.Array, /) -> jax.Array:
+        """Returns actions [..., A], or int32 [...] if discrete, of outputs [..., K] and noise."""
+        ...
+
+    def mode(self, outputs: jax.Array, /) -> jax.Array:
+        """Returns the actions of a policy without noise, like ``sample``."""
+        ...
+
+
+class Trajectory(Arrays):
     """N complete episodes, time first.
 
     Attributes:

@@ -3,12 +3,15 @@
 import contextlib
 import dataclasses
 import decimal
+import difflib
 import math
 import numbers
+import re
 import sysconfig
 import traceback
 import types
 import typing
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +26,8 @@ _LIBRARIES = (
 )
 #: Characters of somebody else's message that are shown.
 _LENGTH = 300
+#: How alike names are, as ``difflib`` counts, of which a third of the letters differ.
+_ALIKE = 0.66
 #: What every environment has.
 _PARTS = ("reset", "step", "action_size")
 _KINDS: dict[Any, tuple[Any, str]] = {
@@ -196,3 +201,79 @@ def check_parts(env: object) -> None:
             f"{name} is no environment: it has no {', '.join(missing)}; "
             "mjx_reinforce.Environment says what one has"
         )
+
+
+def known_number(value: Any) -> float | None:
+    """Returns a number, NaN for what is none, and None for one that is traced."""
+    import jax.core  # here alone: commands that compute nothing do not wait for it
+
+    if isinstance(value, jax.core.Tracer):
+        return None
+    try:
+        return math.nan if isinstance(value, bool | str) else float(value)
+    except (TypeError, ValueError):
+        return math.nan
+
+
+def check_number(name: str, value: object, *, positive: bool = False, finite: bool = True) -> None:
+    """Raises ValueError for what is no number, or one that is negative."""
+    number = known_number(value)
+    if number is None:
+        return
+    allowed = number > 0 if positive else number >= 0
+    if not allowed or (finite and math.isinf(number)):
+        kind = "positive" if positive else "0 or more"
+        raise ValueError(f"{name} must be {kind}{' and finite' * finite}, got {value!r}")
+
+
+def check_count(name: str, value: int, least: int = 1) -> None:
+    """Raises ValueError for what is no whole number, or one that is less than ``least``."""
+    check_type(name, value, int)
+    if value < least:
+        raise ValueError(f"{name} must be at least {least}, got {value}")
+
+
+def check_key(key: object) -> None:
+    """Raises ValueError for what is no random key."""
+    import jax
+
+    dtype = getattr(key, "dtype", None)
+    typed = dtype is not None and jax.numpy.issubdtype(dtype, jax.dtypes.prng_key)
+    if not (typed or dtype == jax.numpy.uint32):
+        raise ValueError(f"the key must be a random key, such as jax.random.key(0), got {key!r}")
+
+
+def check_name(kind: str, name: str, known: Mapping[str, Any]) -> None:
+    """Raises ValueError for a name that is not known, with the known ones and the nearest.
+
+    Args:
+      kind: what is named, for the message.
+      name: what the user typed.
+      known: the table.
+    """
+    if name in known:
+        return
+    near = nearest(name, known)
+    hint = f" Did you mean {near!r}?" if near else ""
+    raise ValueError(f"unknown {kind} {name!r}.{hint} Known: {', '.join(sorted(known))}.")
+
+
+def nearest(name: str, known: Iterable[str]) -> str | None:
+    """Returns the known name that somebody meant, whatever the case of the letters, if any is near.
+
+    Args:
+      name: what the user typed; a known name that contains it is near. A version, such as -v5,
+        makes no two names alike.
+      known: the names; of versions of one name the last is meant, unless the user typed another.
+    """
+    typed, versions = _plain(name), {}
+    for each in sorted(known):
+        versions.setdefault(_plain(each), []).append(each)
+    inside = [each for each in versions if len(typed) > 2 and typed in each]
+    near = difflib.get_close_matches(typed, inside or versions, n=1, cutoff=0 if inside else _ALIKE)
+    return difflib.get_close_matches(name, versions[near[0]], n=1, cutoff=0)[0] if near else None
+
+
+def _plain(name: str) -> str:
+    """Returns a name in small letters, without the version of a task."""
+    return re.sub(r"-v\d+$", "", name.lower())

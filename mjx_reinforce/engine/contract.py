@@ -1,4 +1,4 @@
-"""Does an environment do what an environment must? Found from shapes: nothing is simulated."""
+"""Is what a user gives what it must be? Found from shapes: nothing is simulated."""
 
 import numbers
 from collections.abc import Callable
@@ -7,8 +7,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
-from mjx_reinforce.engine.base import Box, Discrete, Environment, PyTree, action_space
+from mjx_reinforce.engine.base import Act, Acts, Box, Discrete, Environment, PyTree, action_space
 from mjx_reinforce.engine.checks import BadEnvironmentError, check_parts, explain, is_nan
 
 #: What JAX raises where Python or NumPy asks for the value of a traced array.
@@ -184,3 +185,51 @@ def _described(value: jax.Array) -> str:
     if hasattr(value, "shape"):
         return f"{value.dtype}{list(value.shape)}"
     return f"a {type(value).__name__}"
+
+
+def check_policy(
+    act: Act, params: PyTree, distribution: Acts, observation: jax.ShapeDtypeStruct
+) -> None:
+    """Raises ValueError for a policy whose outputs are not the distribution's parameters.
+
+    Args:
+      act: (params, observation [O]) -> outputs [K].
+      params: what ``act`` reads.
+      distribution: the family whose parameters the outputs are.
+      observation: shape and dtype of one.
+    """
+    if not callable(act):
+        raise ValueError(f"act must be a function, such as learner.act, got a {type(act).__name__}")
+    if not isinstance(distribution, Acts):
+        raise ValueError(
+            "distribution must have the functions noise, sample and mode, as "
+            f"learner.policy.distribution has, got {distribution!r}"
+        )
+    found = jax.eval_shape(act, params, observation).shape
+    of_network = getattr(distribution, "num_outputs", None)
+    if of_network is None:
+        return
+    constants = len(getattr(distribution, "constants", ()))
+    if found != (of_network + constants,):
+        behind = f", and behind them {constants} that no observation changes" if constants else ""
+        raise ValueError(
+            f"act must return [{of_network + constants}] outputs of one observation: {of_network} "
+            f"that a network computes{behind} (they start at distribution.constants); it returns "
+            f"the shape {list(found)}"
+        )
+
+
+def check_shapes(*shapes: tuple[int, ...], remedy: str = "", **arguments: ArrayLike) -> None:
+    """Raises ValueError for an argument whose shape is none of ``shapes``.
+
+    Args:
+      *shapes: those that it may have.
+      remedy: what to do instead, for the message.
+      **arguments: what the user gave, by name.
+    """
+    for name, value in arguments.items():
+        if jnp.shape(value) not in shapes:
+            raise ValueError(
+                f"{name} must be {' or '.join(str(list(x)) for x in shapes)}, got the shape "
+                f"{list(jnp.shape(value))}{remedy}"
+            )

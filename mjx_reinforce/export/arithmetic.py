@@ -6,11 +6,11 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from mjx_reinforce.engine.base import Discrete
+from mjx_reinforce.engine.checks import check_name
 from mjx_reinforce.export.policy_files import SavedPolicy, saved_action_space
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.learning.distributions.distribution import middle_and_half_range
 from mjx_reinforce.learning.distributions.gaussian import gaussian_outputs
-from mjx_reinforce.registry import check_name
 
 #: What the deterministic action of a family is of the network's last layer x, once the scaling
 #: of means is part of that layer: x, x clipped to the bounds, middle + half tanh(x), or the

@@ -9,9 +9,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from mjx_reinforce.engine.checks import nearest
 from mjx_reinforce.export.policy_checks import is_number
 from mjx_reinforce.files import read_json
-from mjx_reinforce.registry import nearest
 from mjx_reinforce.settings.config import read_seeds
 
 #: A seed by its rank in the run's final evaluation, or by its number.

@@ -26,9 +26,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.engine.arguments import check_number, known_number
 from mjx_reinforce.engine.base import Trajectory
-from mjx_reinforce.engine.checks import check_kind
+from mjx_reinforce.engine.checks import check_kind, check_number, known_number
 
 
 class Estimator(NamedTuple):

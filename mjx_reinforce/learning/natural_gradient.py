@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from mjx_reinforce.engine.arguments import check_count, check_number
-from mjx_reinforce.engine.checks import check_kind
+from mjx_reinforce.engine.checks import check_count, check_kind, check_number
 from mjx_reinforce.learning.gradients import accumulate, draw_steps
 from mjx_reinforce.learning.policy import Policy
 from mjx_reinforce.learning.updates import Problem, Update, whole_rollout

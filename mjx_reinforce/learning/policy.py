@@ -7,10 +7,9 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from mjx_reinforce.engine.arguments import check_count
-from mjx_reinforce.engine.checks import check_kind, check_type
+from mjx_reinforce.engine.checks import check_count, check_kind, check_name, check_type
+from mjx_reinforce.engine.play import units
 from mjx_reinforce.learning.distributions.distribution import Distribution
-from mjx_reinforce.registry import check_name
 
 #: The ways to draw initial weights.
 INITIALIZERS = ("orthogonal", "torch")
@@ -42,6 +41,9 @@ class MLP(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         """Returns [..., num_outputs] of ``x`` [..., O]; ValueError: unknown initialiser."""
         check_name("initializer", self.initializer, dict.fromkeys(INITIALIZERS))
+        if units.wanted(x) and not self.is_initializing():
+            params = self.variables["params"]
+            return units.tanh_network([params[f"Dense_{i}"] for i in range(len(params))], x)
         for size in self.hidden_sizes:
             x = nn.tanh(self._dense(x, size, nn.initializers.lecun_normal()))
         return self._dense(x, self.num_outputs, nn.initializers.orthogonal(self.output_scale))

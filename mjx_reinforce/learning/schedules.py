@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from mjx_reinforce.engine.arguments import check_count, check_number
+from mjx_reinforce.engine.checks import check_count, check_number
 
 #: The standard deviation shrinks in so many steps. Each is far greater than float32's rounding of
 #: its logarithm, however many updates there are.

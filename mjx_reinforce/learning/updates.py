@@ -15,12 +15,11 @@ import optax
 from jax import lax
 from optax import Params
 
-from mjx_reinforce.engine.arguments import check_count, check_number
+from mjx_reinforce.engine.checks import check_count, check_name, check_number
 from mjx_reinforce.engine.play.episode import while_any
 from mjx_reinforce.learning.diagnostics import signal_to_noise
 from mjx_reinforce.learning.gradients import accumulate_gradient, draw_steps, while_needed
 from mjx_reinforce.learning.schedules import Clock
-from mjx_reinforce.registry import check_name
 
 #: Optimisers by name.
 OPTIMIZERS = ("adam", "adamw", "sgd")

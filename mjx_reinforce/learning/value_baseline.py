@@ -12,7 +12,7 @@ import optax
 from flax import linen as nn
 from jax import lax
 
-from mjx_reinforce.engine.arguments import check_count
+from mjx_reinforce.engine.checks import check_count
 from mjx_reinforce.learning.estimators import Estimator, explained_variance, reward_to_go
 from mjx_reinforce.learning.gradients import accumulate_gradient, draw_steps, map_steps
 from mjx_reinforce.learning.policy import MLP

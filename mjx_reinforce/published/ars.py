@@ -21,7 +21,6 @@ import optax
 from jax.typing import ArrayLike
 from optax import Params
 
-from mjx_reinforce.engine.arguments import check_count, check_key, check_number
 from mjx_reinforce.engine.base import (
     Discrete,
     Environment,
@@ -29,7 +28,7 @@ from mjx_reinforce.engine.base import (
     action_space,
     observation_size,
 )
-from mjx_reinforce.engine.checks import check_type
+from mjx_reinforce.engine.checks import check_count, check_key, check_number, check_type
 from mjx_reinforce.engine.contract import check_environment
 from mjx_reinforce.engine.play import choice
 from mjx_reinforce.engine.play.choice import Engine

@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.settings import tables
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import expected_seconds
-from mjx_reinforce.settings.memory import check_fits, gigabytes, host_memory, needed, num_cores
+from mjx_reinforce.settings.memory import check_fits, needed, num_cores
 from mjx_reinforce.settings.tables import Task
 
 if TYPE_CHECKING:

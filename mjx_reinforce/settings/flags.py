@@ -18,8 +18,8 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import COMMANDS, command
 from mjx_reinforce.console.streams import columns_of, say_error, wrapped
-from mjx_reinforce.engine.checks import whole_number
-from mjx_reinforce.registry import is_own, nearest
+from mjx_reinforce.engine.checks import nearest, whole_number
+from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import flag, spoken
 from mjx_reinforce.settings.tables import PRESETS
 

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, flag, marked
 from mjx_reinforce.settings.declare import Range
 from mjx_reinforce.settings.tables import TASKS, Task
@@ -150,25 +151,10 @@ def check_memory(config: Config) -> None:
         check_fits(config, task, host_memory(), task.base_memory)
 
 
-def host_memory() -> float:
-    """Returns the bytes of main memory that this process may use."""
-    memory = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
-    limit = Path("/sys/fs/cgroup/memory.max")  # of a container
-    text = limit.read_text(encoding="ascii").strip() if limit.is_file() else "max"
-    return memory if text == "max" else min(memory, float(text))
-
-
 def num_cores() -> int:
     """Returns how many CPU cores this process may use."""
     affinity = getattr(os, "sched_getaffinity", None)  # not on every system
     return len(affinity(0)) if affinity else os.cpu_count() or 1
-
-
-def gigabytes(size: float) -> str:
-    """Returns a number of bytes for people: in GB, or where that is nearly none, in MB."""
-    if size < 5e7:
-        return f"{max(1, round(size / 1e6))} MB"
-    return f"{size / 1e9:,.1f} GB" if size < 1e10 else f"{size / 1e9:,.0f} GB"
 
 
 def has_gpu() -> bool:

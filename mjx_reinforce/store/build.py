@@ -167,7 +167,7 @@ def _build_estimator(
 
 
 def _estimator(config: Config, horizon: int, discount: "float | jax.Array") -> "Estimator":
-    from mjx_reinforce.engine.arguments import known_number
+    from mjx_reinforce.engine.checks import known_number
     from mjx_reinforce.learning import estimators
 
     if config.estimator == "value-baseline":

@@ -9,10 +9,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.files import read_json
 from mjx_reinforce.settings.config import Config, check_each, flag, marked, spoken
 from mjx_reinforce.settings.declare import Mark
-from mjx_reinforce.settings.memory import check_memory, gigabytes, host_memory
+from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.sweeps.grid import check_over, configure, grid
 from mjx_reinforce.training.resume import PLACES, as_config
 

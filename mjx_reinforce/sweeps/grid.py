@@ -8,8 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.engine.checks import alternatives, read_as
-from mjx_reinforce.registry import check_name, nearest
+from mjx_reinforce.engine.checks import alternatives, check_name, nearest, read_as
 from mjx_reinforce.settings.config import Config, check, check_read, flag, spoken
 from mjx_reinforce.settings.groups import LogSettings
 

@@ -10,8 +10,9 @@ import pytest
 from places import ROOT
 
 from mjx_reinforce import __main__ as script
-from mjx_reinforce import envs, registry
+from mjx_reinforce import envs
 from mjx_reinforce.console import commands, streams
+from mjx_reinforce.engine import checks
 from mjx_reinforce.engine.checks import whole_number
 from mjx_reinforce.envs.__main__ import main as envs_main
 from mjx_reinforce.runs.command_line import parse
@@ -187,7 +188,7 @@ def test_the_nearest_name_is_found():
     }
     for right, words in meant.items():
         for typed in words.split():
-            assert registry.nearest(typed, envs.names()) == right, typed
+            assert checks.nearest(typed, envs.names()) == right, typed
 
 
 # The newest run.

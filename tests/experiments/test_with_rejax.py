@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.engine.vector import for_brax
+from mjx_reinforce import make_vec
+from mjx_reinforce.engine.vector.for_brax import BraxVectorEnv
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -14,7 +15,7 @@ def test_rejax_maps_one_environment_in_one_call():
     from experiments.examples.with_rejax import OneOfMany
 
     task = "InvertedPendulum-v5"
-    one, many = OneOfMany(task), for_brax.make(task, 3)
+    one, many = OneOfMany(task), BraxVectorEnv(make_vec(task, 3, autoreset="same_step"))
     keys = jax.random.split(jax.random.PRNGKey(0), 3)
     first = jax.vmap(lambda key: jax.random.fold_in(key, 0))(keys)
     (obs, state), other = jax.vmap(one.reset)(keys), many.reset(first)

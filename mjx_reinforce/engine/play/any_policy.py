@@ -8,12 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engine.arguments import check_count, check_key
-from mjx_reinforce.engine.base import Environment, PyTree, Trajectory, null_action
-from mjx_reinforce.engine.checks import check_kind, check_parts
+from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory, null_action
+from mjx_reinforce.engine.checks import check_count, check_key, check_parts
+from mjx_reinforce.engine.contract import check_policy
 from mjx_reinforce.engine.play import available, choice, rollouts
-from mjx_reinforce.engine.play.episode import Act
-from mjx_reinforce.learning.distributions.distribution import Distribution
 
 #: A policy of more parameters than about 64-64 is computed for all episodes together, by XLA: each
 #: lane of machine code would read all parameters in each step.
@@ -24,7 +22,7 @@ def rollout(
     env: Environment,
     act: Act,
     actor: PyTree,
-    distribution: Distribution,
+    distribution: Acts,
     key: jax.Array,
     *,
     num_episodes: int,
@@ -94,37 +92,12 @@ def rollout(
     )
 
 
-def check_policy(
-    act: Act, params: PyTree, distribution: Distribution, observation: jax.ShapeDtypeStruct
-) -> None:
-    """Raises ValueError for a policy whose outputs are not the distribution's parameters.
-
-    Args:
-      act: (params, observation [O]) -> outputs [K].
-      params: what ``act`` reads.
-      distribution: the family whose parameters the outputs are.
-      observation: shape and dtype of one.
-    """
-    if not callable(act):
-        raise ValueError(f"act must be a function, such as learner.act, got a {type(act).__name__}")
-    check_kind("distribution", distribution, Distribution, "learner.policy.distribution")
-    of_network, constants = distribution.num_outputs, len(distribution.constants)
-    found = jax.eval_shape(act, params, observation).shape
-    if found != (of_network + constants,):
-        behind = f", and behind them {constants} that no observation changes" if constants else ""
-        raise ValueError(
-            f"act must return [{of_network + constants}] outputs of one observation: {of_network} "
-            f"that a network computes{behind} (they start at distribution.constants); it returns "
-            f"the shape {list(found)}"
-        )
-
-
 def _player(
     engine: str,
     env: Environment,
     act: Act,
     params: PyTree,
-    distribution: Distribution,
+    distribution: Acts,
     horizon: int,
 ) -> Callable[..., Trajectory]:
     """Returns what plays."""

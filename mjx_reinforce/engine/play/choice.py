@@ -15,14 +15,13 @@ from typing import Any, NamedTuple, TypeAlias, TypeVar
 import jax
 
 from mjx_reinforce.engine import scalar
-from mjx_reinforce.engine.base import Environment, PyTree, Trajectory, observation_size
+from mjx_reinforce.engine.base import Acts, Environment, PyTree, Trajectory, observation_size
+from mjx_reinforce.engine.checks import check_name
 from mjx_reinforce.engine.play import available, native, program
 from mjx_reinforce.engine.play.mapping import machine_map
 from mjx_reinforce.engine.play.rollouts import rollout
 from mjx_reinforce.engine.scalar import jaxprs, size
 from mjx_reinforce.engine.scalar.vmap import MAX_OPERATIONS
-from mjx_reinforce.learning.distributions.distribution import Distribution
-from mjx_reinforce.registry import check_name
 
 #: This JAX multiplies wrongly on CPUs, in some functions that are mapped over some 16,000 rows and
 #: more, and says nothing (JAX's issue 39103). Where we looked, with 33,000 to 65,000 rows, no
@@ -49,7 +48,7 @@ class ActingPolicy(NamedTuple):
 
     act: Callable[[Any, jax.Array], jax.Array]
     actor: Any
-    distribution: Distribution
+    distribution: Acts
 
 
 class Engine(NamedTuple):

@@ -12,16 +12,16 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.typing import ArrayLike
 
-from mjx_reinforce.engine.base import Environment, PyTree
+from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree
+from mjx_reinforce.engine.contract import check_shapes
 from mjx_reinforce.engine.scalar import any_lane
-from mjx_reinforce.learning.distributions.distribution import Distribution
 
-Act = Callable[[Any, jax.Array], jax.Array]
 LoopState = TypeVar("LoopState")
 #: Noise is drawn for so many steps at once, and only then is it seen whether all episodes are over.
 CHUNK_STEPS = 50
+#: What to do with arrays of several seeds.
+ONE_SEED = "; play several seeds by jax.vmap"
 
 
 class Step(NamedTuple):
@@ -43,16 +43,6 @@ class Step(NamedTuple):
     state: Any
 
 
-def check_shapes(*shapes: tuple[int, ...], **arguments: ArrayLike) -> None:
-    """Raises ValueError for an argument of a rollout whose shape is none of ``shapes``."""
-    for name, value in arguments.items():
-        if jnp.shape(value) not in shapes:
-            raise ValueError(
-                f"{name} must be {' or '.join(str(list(x)) for x in shapes)}, got the shape "
-                f"{list(jnp.shape(value))}; play several seeds by jax.vmap"
-            )
-
-
 def episode_keys(key: jax.Array, num_episodes: int) -> jax.Array:
     """Returns the keys [N] of N episodes.
 
@@ -64,7 +54,7 @@ def episode_keys(key: jax.Array, num_episodes: int) -> jax.Array:
       ValueError: the keys are of another number.
     """
     several = jax.random.key_data(key)[..., 0]
-    check_shapes((), (num_episodes,), key=several)
+    check_shapes((), (num_episodes,), remedy=ONE_SEED, key=several)
     if several.ndim:
         return key
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_episodes))
@@ -76,9 +66,7 @@ def begin(env: Environment, key: jax.Array) -> tuple[Any, jax.Array]:
     return env.reset(reset_key), noise_key
 
 
-def draw_noise(
-    distribution: Distribution, length: int, key: jax.Array
-) -> tuple[jax.Array, jax.Array]:
+def draw_noise(distribution: Acts, length: int, key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Returns the next key of an episode's noise, and its noise [length, E] for a chunk."""
     key, noise_key = jax.random.split(key)
     return key, distribution.noise(noise_key, (length,))
@@ -87,7 +75,7 @@ def draw_noise(
 def step(
     env_step: Callable[[Any, jax.Array], Any],
     act: Act,
-    distribution: Distribution,
+    distribution: Acts,
     actor: PyTree,
     state: PyTree,
     noise: jax.Array,
@@ -162,7 +150,7 @@ def chunk_length(horizon: int) -> int:
 
 def play_chunks(
     play: Callable[[jax.Array, Any], tuple[Any, Any]],
-    distribution: Distribution,
+    distribution: Acts,
     keys: jax.Array,
     progress: PyTree,
     records: PyTree,

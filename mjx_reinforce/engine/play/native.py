@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engine.base import Environment, PyTree, Trajectory
+from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
+from mjx_reinforce.engine.contract import check_shapes
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.cpu import seam as cpu
 from mjx_reinforce.engine.gpu import seam as gpu
@@ -20,16 +21,15 @@ from mjx_reinforce.engine.play import available, episode
 from mjx_reinforce.engine.play.native_step import plays, stored
 from mjx_reinforce.engine.play.program import NativeProgram, build_program, refusal
 from mjx_reinforce.engine.scalar import TooLarge, UnsupportedPrimitive
-from mjx_reinforce.learning.distributions.distribution import Distribution
 
 _REMEDY = f'make keys with jax.random.key(seed, impl="{available.GENERATOR}"), or choose auto'
 
 
 def rollout(
     env: Environment,
-    act: episode.Act,
+    act: Act,
     actor: PyTree,
-    distribution: Distribution,
+    distribution: Acts,
     key: jax.Array,
     *,
     num_episodes: int,
@@ -51,8 +51,8 @@ def rollout(
     """
     steps = horizon if limit is None else limit
     flags = {"deterministic": deterministic, "active": active, "limit": steps}
-    episode.check_shapes((), (num_episodes,), **flags)
-    episode.check_shapes((), threads=threads)
+    check_shapes((), (num_episodes,), remedy=episode.ONE_SEED, **flags)
+    check_shapes((), threads=threads)
     if against := against_key(key):
         raise ValueError(f"the native engine cannot play this: {against}; {_REMEDY}")
     try:
@@ -98,7 +98,7 @@ def _episodes_before_numbers(results: Sequence[jax.Array]) -> Sequence[jax.Array
 
 
 def unsupported(
-    env: Environment, act: episode.Act, actor: PyTree, distribution: Distribution, horizon: int
+    env: Environment, act: Act, actor: PyTree, distribution: Acts, horizon: int
 ) -> str | None:
     """Returns why machine code cannot play this here, or None; it is compiled if it can."""
     if reason := available.unavailable():

@@ -1,29 +1,21 @@
 """One step of one episode as a scalar graph: noise, policy, physics, reward, end."""
 
-import functools
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import linen as nn
 from jax import lax
 
-from mjx_reinforce.engine.base import Environment, PyTree
-from mjx_reinforce.engine.play import episode
+from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree
+from mjx_reinforce.engine.play import episode, units
 from mjx_reinforce.engine.play.counter import at_counter, split
-from mjx_reinforce.learning.distributions.distribution import Distribution
-from mjx_reinforce.learning.policy import MLP
 
 #: A branch of more scalar operations is skipped where no lane needs it.
 BRANCH_COST = 40
 #: What machine code is told of an episode that is not played; see ``plays``.
 NOT_PLAYED = 0
-#: Units of one iteration. Their activations do not wait for each other, and the sums of the next
-#: layer stay in registers from one to the next.
-_UNITS_AT_ONCE = 4
 
 
 class Carried(NamedTuple):
@@ -53,7 +45,7 @@ class StepResult(NamedTuple):
 
 
 def step_function(
-    env: Environment, act: episode.Act, distribution: Distribution, length: int
+    env: Environment, act: Act, distribution: Acts, length: int
 ) -> Callable[..., StepResult]:
     """Returns (actor, carried, t, deterministic, alive) -> ``StepResult``, for one episode.
 
@@ -77,7 +69,7 @@ def step_function(
         keys = lax.cond(at == 0, lambda keys: split(keys[0]), lambda keys: keys, carried.keys)
         offset = (at * words).astype(jnp.uint32)
         noise = distribution.noise(at_counter(keys[1], offset), ())
-        with nn.intercept_methods(unit_by_unit):
+        with units.one_at_a_time():
             played = episode.step(
                 env.step, act, distribution, actor, state, noise, alive, deterministic != 0
             )
@@ -108,7 +100,7 @@ def examples(env: Environment, actor: PyTree) -> tuple[Any, ...]:
     return actor, Carried(state, shape((2, 2), jnp.uint32)), flag, flag, flag
 
 
-def _words_per_step(distribution: Distribution) -> int:
+def _words_per_step(distribution: Acts) -> int:
     """Returns how many random words the noise of a step takes."""
     noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
     return int(np.prod(noise.shape, dtype=int))
@@ -124,39 +116,3 @@ def plays(
     """
     steps = jnp.maximum(jnp.asarray(limit, jnp.int32), 0)
     return jnp.where(active, jnp.where(deterministic, -steps, steps), NOT_PLAYED)
-
-
-def unit_by_unit(
-    call: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any], context: Any
-) -> Any:
-    """Computes an ``MLP`` of one observation two layers at a time, as a loop; for flax to call.
-
-    Each unit of the first layer is computed and at once added to all units of the second, in the
-    order of the units. Written out, a network of 64 and 64 units would be a program of 9,000
-    operations.
-    """
-    network = context.module
-    if not (isinstance(network, MLP) and context.method_name == "__call__" and args[0].ndim == 1):
-        return call(*args, **kwargs)
-    params = network.variables["params"]
-    layers = [params[f"Dense_{i}"] for i in range(len(params))]
-    x = args[0]
-    while len(layers) > 1:
-        first, second, *layers = layers
-        size = len(first["bias"])
-        together = math.gcd(size, _UNITS_AT_ONCE)
-        weights = first["kernel"].T, first["bias"], second["kernel"]
-        rows = [w.reshape(size // together, together, *w.shape[1:]) for w in weights]
-        bias = second["bias"].astype(jnp.result_type(x, *weights, second["bias"]))
-        # Of a function that it knows, JAX takes the body that it traced before, with its x.
-        x, _ = lax.scan(functools.partial(_add_units, x), bias, rows)
-        x = jnp.tanh(x) if layers else x
-    return jnp.dot(x, layers[0]["kernel"]) + layers[0]["bias"] if layers else x
-
-
-def _add_units(x: jax.Array, sums: jax.Array, weights: Any) -> tuple[jax.Array, None]:
-    """Adds a few units of a layer to all units of the next."""
-    units = [jnp.tanh(jnp.dot(x, into) + bias) for into, bias in zip(*weights[:2], strict=True)]
-    for unit, out in zip(units, weights[2], strict=True):
-        sums = sums + unit * out
-    return sums, None

@@ -9,16 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine import scalar
-from mjx_reinforce.engine.base import Environment, PyTree, observation_size
+from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, observation_size
 from mjx_reinforce.engine.cpu import handler, kernel, lanes, machine
 from mjx_reinforce.engine.gpu import kernel as gpu_kernel
 from mjx_reinforce.engine.gpu import lockstep, ptx
 from mjx_reinforce.engine.gpu import seam as gpu_seam
-from mjx_reinforce.engine.play import available, episode, native_step, objects
+from mjx_reinforce.engine.play import available, native_step, objects
 from mjx_reinforce.engine.play.native_step import StepResult
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
 from mjx_reinforce.engine.scalar.graph import Limits
-from mjx_reinforce.learning.distributions.distribution import Distribution
 
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
 LOOPS = Limits(scans=1, unrollable=1)
@@ -40,7 +39,7 @@ class NativeProgram(NamedTuple):
 
 
 def build_program(
-    env: Environment, act: episode.Act, actor: PyTree, distribution: Distribution, length: int
+    env: Environment, act: Act, actor: PyTree, distribution: Acts, length: int
 ) -> NativeProgram:
     """Returns the program of an environment and a policy, compiled unless memory or disk has it.
 

@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from mjx_reinforce.engine.base import Environment, PyTree, Trajectory
+from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
+from mjx_reinforce.engine.contract import check_shapes
 from mjx_reinforce.engine.play import episode
-from mjx_reinforce.learning.distributions.distribution import Distribution
 
 
 class _Progress(NamedTuple):
@@ -30,9 +30,9 @@ class _Progress(NamedTuple):
 
 def rollout(
     env: Environment,
-    act: episode.Act,
+    act: Act,
     actor: PyTree,
-    distribution: Distribution,
+    distribution: Acts,
     key: jax.Array,
     *,
     num_episodes: int,
@@ -70,7 +70,7 @@ def rollout(
     """
     steps = horizon if limit is None else limit
     flags = {"deterministic": deterministic, "active": active, "limit": steps}
-    episode.check_shapes((), (num_episodes,), **flags)
+    check_shapes((), (num_episodes,), remedy=episode.ONE_SEED, **flags)
     if env_step is None:
         env_step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
     # Inside, episodes are the last axis: each scalar of the state is a contiguous row.
@@ -102,8 +102,8 @@ def rollout(
 
 def _step(
     env_step: Callable[[Any, jax.Array], Any],
-    act: episode.Act,
-    distribution: Distribution,
+    act: Act,
+    distribution: Acts,
     actor: PyTree,
     deterministic: jax.Array | None,
     progress: _Progress,
@@ -127,7 +127,7 @@ def _step(
 
 
 def _empty_records(
-    step: Callable[..., Any], progress: _Progress, distribution: Distribution, horizon: int
+    step: Callable[..., Any], progress: _Progress, distribution: Acts, horizon: int
 ) -> Any:
     """Returns zeros [horizon, ...] of the shapes that ``step`` records."""
     shape = progress.alive.shape

@@ -7,22 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from mjx_reinforce import envs
-from mjx_reinforce.engine.arguments import check_count, check_key
 from mjx_reinforce.engine.base import Box, Discrete, Environment, action_space, null_action
-from mjx_reinforce.engine.checks import check_parts, check_type
-from mjx_reinforce.engine.contract import check_environment
+from mjx_reinforce.engine.checks import (
+    check_count,
+    check_key,
+    check_name,
+    check_type,
+)
+from mjx_reinforce.engine.contract import check_environment, check_shapes
+from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.engine.play import episode
 from mjx_reinforce.engine.play.available import GENERATOR
 from mjx_reinforce.engine.play.choice import MapEngine, map_function
 from mjx_reinforce.engine.vector.episodes import AUTORESETS, VectorState, advance_function, blank
-from mjx_reinforce.registry import check_name, nearest
-from mjx_reinforce.settings.memory import gigabytes, host_memory
 
 #: Copies of the states that a step has in memory: 4.6 of HalfCheetah, a million of them.
 _COPIES = 5
-#: Those of ``make_vec`` that are no settings of the task.
-_ARGUMENTS = ("num_envs", "autoreset", "max_episode_steps", "engine")
 
 
 class VectorEnv:
@@ -118,10 +118,7 @@ class VectorEnv:
 
     def restart(self, state: VectorState, where: jax.Array) -> VectorState:
         """Returns the environments with new episodes where a mask [N] says so; others stay."""
-        if jnp.shape(where) != (self.num_envs,):
-            raise ValueError(
-                f"the mask must be [{self.num_envs}], got the shape {list(jnp.shape(where))}"
-            )
+        check_shapes((self.num_envs,), **{"the mask": where})
         where = jnp.asarray(where, bool)
         begun = self._advance(state, self._null_actions(), where)
         return jax.tree.map(
@@ -177,11 +174,7 @@ class VectorEnv:
 
     def _checked(self, action: ArrayLike) -> jax.Array:
         """Returns the actions, or raises ValueError where they are none."""
-        expected = (self.num_envs, *self._null_action.shape)
-        if jnp.shape(action) != expected:
-            raise ValueError(
-                f"the actions must be {list(expected)}, got the shape {list(jnp.shape(action))}"
-            )
+        check_shapes((self.num_envs, *self._null_action.shape), **{"the actions": action})
         kind, wanted = jnp.result_type(action), self._null_action.dtype
         if not jnp.can_cast(kind, wanted, "same_kind"):
             raise ValueError(f"the actions must be {wanted}, got {kind}")
@@ -209,63 +202,39 @@ def _memory() -> float:
 
 
 def make_vec(
-    env: str | Environment,
+    env: Environment,
     num_envs: int,
     *,
     autoreset: str | enum.Enum = "next_step",
     max_episode_steps: int | None = None,
     engine: str = "auto",
-    **settings: object,
 ) -> VectorEnv:
     """Makes N environments that play at once, for any algorithm.
 
     Args:
-      env: an id of ``envs.names()``, "module:Class" of your own, or an environment.
+      env: the environment; ``mjx_reinforce.make_vec`` takes an id too.
       num_envs: N.
       autoreset: when an environment whose episode has ended begins the next: "next_step" and
         "same_step" are Gymnasium's, whose ``AutoresetMode`` may be given; with "disabled" only
         ``restart`` does.
       max_episode_steps: the time limit in steps; by default the task's.
       engine: "auto", "native" (machine code) or "vmap".
-      **settings: of the task, where ``env`` is an id.
 
     Raises:
       ValueError: an argument makes no sense, the environment is none, or it does not fit in memory.
 
     Examples:
-      >>> import jax
       >>> import mjx_reinforce as mr
-      >>> vec = mr.make_vec("CartPole-v1", num_envs=8)
-      >>> state = vec.reset(jax.random.key(0))
-      >>> state = vec.step(state, vec.sample_actions(jax.random.key(1)))
-      >>> state.obs.shape, state.reward.tolist()[:2]
-      ((8, 4), [1.0, 1.0])
+      >>> mr.engine.make_vec(mr.envs.make("CartPole-v1"), num_envs=8)
+      VectorEnv(8 x CartPole(), autoreset=next_step, engine=native)
     """
     check_count("num_envs", num_envs)
     mode = autoreset.name.lower() if isinstance(autoreset, enum.Enum) else autoreset
     check_name("autoreset", str(mode), dict.fromkeys(AUTORESETS))
     check_type("max_episode_steps", max_episode_steps, int | None)
-    try:
-        made = _made(env, settings)
-    except ValueError as error:
-        meant = [own for own in (nearest(name, _ARGUMENTS) for name in settings) if own]
-        if not meant:
-            raise
-        hint = f"make_vec itself takes {meant[0]!r}"
-        raise ValueError(f"{str(error).rstrip('.')}; {hint}") from error
-    check_parts(made)
-    check_environment(made)
+    check_environment(env)
     if max_episode_steps is None:
-        max_episode_steps = getattr(made, "max_episode_steps", None)
+        max_episode_steps = getattr(env, "max_episode_steps", None)
     else:
         check_count("max_episode_steps", max_episode_steps)
-    return VectorEnv(made, num_envs, str(mode), max_episode_steps, engine)
-
-
-def _made(env: str | Environment, settings: dict[str, object]) -> Environment:
-    """Returns the environment, built where it is an id."""
-    if isinstance(env, str):
-        return envs.make(env, **settings)
-    if settings:
-        raise ValueError(f"{sorted(settings)} are for an id; this environment is made already")
-    return env
+    return VectorEnv(env, num_envs, str(mode), max_episode_steps, engine)

@@ -9,18 +9,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jax import lax
 
-from mjx_reinforce.engine.base import Environment, PyTree
+from mjx_reinforce.engine.base import Arrays, Environment, PyTree
 from mjx_reinforce.engine.play.counter import key_of
 
 #: When an environment whose episode has ended begins the next (Gymnasium's ``AutoresetMode``).
 AUTORESETS = ("next_step", "same_step", "disabled")
 
 
-@struct.dataclass(kw_only=True)
-class VectorState:
+class VectorState(Arrays):
     """N environments.
 
     Attributes:
@@ -101,7 +99,7 @@ def advance_function(env: Environment, limit: int | None, autoreset: str) -> Cal
         if autoreset == "same_step":
             after = _play(env, limit, state, action)
             start = lax.cond(begins | after.done, lambda: _begin(env, state), lambda: after)
-            kept = after.replace(simulation=start.simulation, keys=start.keys)  # pyright: ignore
+            kept = after.replace(simulation=start.simulation, keys=start.keys)
             return jax.tree.map(lambda x, y: jnp.where(begins, x, y), start, kept)
         over = begins | (state.done if autoreset == "next_step" else False)
         return lax.cond(over, lambda: _begin(env, state), lambda: _play(env, limit, state, action))

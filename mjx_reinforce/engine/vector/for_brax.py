@@ -1,8 +1,9 @@
 """The environments as brax's trainers take them: batched, with actions from -1 to 1.
 
     from brax.training.agents.ppo import train as ppo
-    from mjx_reinforce.engine.vector import for_brax
-    env = for_brax.make("HalfCheetah-v5", 2048)
+    import mjx_reinforce
+    from mjx_reinforce.engine.vector.for_brax import BraxVectorEnv
+    env = BraxVectorEnv(mjx_reinforce.make_vec("HalfCheetah-v5", 2048, autoreset="same_step"))
     ppo.train(env, num_envs=2048, num_eval_envs=2048, wrap_env=False, episode_length=1000, ...)
 
 brax's trainers must not wrap them, and evaluate on as many as they train on.
@@ -15,13 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs.base import Env, State
 
-from mjx_reinforce.engine.base import Box, Environment
-from mjx_reinforce.engine.vector.environment import VectorEnv, make_vec
+from mjx_reinforce.engine.base import Box
+from mjx_reinforce.engine.vector.environment import VectorEnv
 from mjx_reinforce.engine.vector.episodes import VectorState
 
 
 class BraxVectorEnv(Env):
-    """N environments whose step is one call, and what brax's own wrappers tell; see ``make``.
+    """N environments whose step is one call, and what brax's own wrappers tell.
 
     Each begins its next episode in the step that ends one, from a new start; brax's
     ``AutoResetWrapper`` goes back to the first one.
@@ -33,8 +34,10 @@ class BraxVectorEnv(Env):
         """Takes environments with ``autoreset="same_step"``.
 
         Raises:
-          ValueError: the actions have no bounds.
+          ValueError: the actions have no bounds, or ``autoreset`` is another.
         """
+        if vec.autoreset != "same_step":
+            raise ValueError(f"autoreset must be 'same_step' for brax, got {vec.autoreset!r}")
         space = vec.action_space
         if not isinstance(space, Box) or not np.all(np.isfinite([space.low, space.high])):
             raise ValueError(f"actions must have bounds for brax's policies, got {space}")
@@ -77,17 +80,3 @@ class BraxVectorEnv(Env):
         }
         kept: Any = vector  # brax only passes it on
         return State(kept, vector.obs, vector.reward, done, dict(vector.metrics), info)
-
-
-def make(env: str | Environment, num_envs: int, **options: Any) -> BraxVectorEnv:
-    """Makes N environments for brax's trainers, which must not wrap them: ``wrap_env=False``.
-
-    Args:
-      env: as of ``make_vec``.
-      num_envs: N; it is the trainer's ``num_envs`` and ``num_eval_envs``.
-      **options: further arguments of ``make_vec`` except ``autoreset``, and of the task.
-
-    Raises:
-      ValueError: as of ``make_vec``, or the actions have no bounds.
-    """
-    return BraxVectorEnv(make_vec(env, num_envs, autoreset="same_step", **options))

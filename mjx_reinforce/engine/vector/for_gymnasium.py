@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from mjx_reinforce.engine.base import Discrete, Environment, PyTree
+from mjx_reinforce.engine.base import Discrete, PyTree
+from mjx_reinforce.engine.checks import check_name
 from mjx_reinforce.engine.play.available import GENERATOR
-from mjx_reinforce.engine.vector.environment import VectorEnv, make_vec
+from mjx_reinforce.engine.vector.environment import VectorEnv
 from mjx_reinforce.engine.vector.episodes import VectorState
-from mjx_reinforce.registry import check_name
 
 #: A seed of all environments, or one for each.
 Seeds: TypeAlias = int | Sequence[int | None] | None
@@ -36,7 +36,7 @@ _HAND_OUT: dict[str, Callable[[jax.Array], Any]] = {
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
-    """N environments under Gymnasium's interface; what ``make`` returns.
+    """N environments under Gymnasium's interface; what ``mjx_reinforce.gym.make`` returns.
 
     vec: the same environments in JAX
     state: theirs, as of the last ``reset`` or ``step``
@@ -253,40 +253,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         for i in np.flatnonzero(ended):
             found[i] = rows[i]
         return found
-
-
-def make(
-    env: str | Environment,
-    num_envs: int = 1,
-    *,
-    arrays: str = "numpy",
-    render_mode: str | None = None,
-    autoreset: str | AutoresetMode = "next_step",
-    **options: Any,
-) -> GymnasiumVectorEnv:
-    """Makes N environments for Gymnasium; ``gymnasium.make_vec("mjx_reinforce/ID", N)`` calls it.
-
-    Args:
-      env: as of ``make_vec``.
-      num_envs: N.
-      arrays: "numpy", "jax" or "torch".
-      render_mode: "rgb_array", or None for no pictures.
-      autoreset: as of ``make_vec``, or Gymnasium's ``AutoresetMode``.
-      **options: further arguments of ``make_vec``, and of the task.
-
-    Raises:
-      ValueError: as of ``make_vec``.
-    """
-    vec = make_vec(env, num_envs, autoreset=autoreset, **options)
-    return GymnasiumVectorEnv(vec, arrays, render_mode)
-
-
-def only_many(env: str, **options: object) -> gymnasium.Env:
-    """Raises ValueError: Gymnasium's ``make`` asks for one environment."""
-    raise ValueError(
-        f"these are many at once: gymnasium.make_vec('mjx_reinforce/{env}', num_envs=...); one of "
-        f"Gymnasium's own is gymnasium.make('{env}')"
-    )
 
 
 def _keys_of(seeds: Sequence[int]) -> jax.Array:

@@ -1,24 +1,28 @@
 """Segments of fixed length, which go on where the last one ended: what PPO and A2C learn from."""
 
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jax import lax
 
-from mjx_reinforce.engine.arguments import check_count, check_key
-from mjx_reinforce.engine.base import PyTree
-from mjx_reinforce.engine.checks import check_kind
-from mjx_reinforce.engine.play.any_policy import check_policy
-from mjx_reinforce.engine.play.episode import Act
+from mjx_reinforce.engine.base import Act, Acts, Arrays, PyTree
+from mjx_reinforce.engine.checks import check_count, check_key, check_kind
+from mjx_reinforce.engine.contract import check_policy
 from mjx_reinforce.engine.vector.environment import VectorEnv
 from mjx_reinforce.engine.vector.episodes import VectorState
-from mjx_reinforce.learning.distributions.distribution import Distribution
 
 
-@struct.dataclass(kw_only=True)
-class Segment:
+@runtime_checkable
+class ActsWithLogProb(Acts, Protocol):
+    """A family of distributions that ``unroll`` plays: ``Acts``, and how likely an action was."""
+
+    def log_prob(self, outputs: jax.Array, action: jax.Array, /) -> jax.Array:
+        """Returns the logarithm [...] of the probability density of actions."""
+        ...
+
+
+class Segment(Arrays):
     """T steps of N environments, time first.
 
     Attributes:
@@ -74,7 +78,7 @@ def unroll(
     vec: VectorEnv,
     act: Act,
     params: PyTree,
-    distribution: Distribution,
+    distribution: ActsWithLogProb,
     state: VectorState,
     key: jax.Array,
     num_steps: int,
@@ -119,6 +123,8 @@ def unroll(
     check_count("num_steps", num_steps)
     one = jax.ShapeDtypeStruct(state.obs.shape[1:], state.obs.dtype)
     check_policy(act, params, distribution, one)
+    if not isinstance(distribution, ActsWithLogProb):
+        raise ValueError(f"distribution must have the function log_prob, got {distribution!r}")
     waits = vec.autoreset == "next_step"
 
     def step(state: VectorState, key: jax.Array) -> tuple[VectorState, Segment]:

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from mjx_reinforce.engine.arguments import check_number, known_number
 from mjx_reinforce.engine.base import Box, Discrete
+from mjx_reinforce.engine.checks import check_number, known_number
 from mjx_reinforce.learning.distributions.distribution import (
     Distribution,
     continuous_box,

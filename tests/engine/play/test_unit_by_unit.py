@@ -1,11 +1,10 @@
 """A network as loops over its units computes what the network computes."""
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engine.play.native_step import unit_by_unit
+from mjx_reinforce.engine.play import units
 from mjx_reinforce.learning.policy import MLP
 
 
@@ -15,7 +14,7 @@ def both(sizes, x, outputs=2):
     params = network.init(jax.random.key(0), x)
     params = jax.tree.map(lambda p: p + 0.1, params)  # biases, too
     plain = network.apply(params, x)
-    with nn.intercept_methods(unit_by_unit):
+    with units.one_at_a_time():
         return plain, network.apply(params, x), jax.make_jaxpr(network.apply)(params, x)
 
 

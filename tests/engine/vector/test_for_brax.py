@@ -8,16 +8,20 @@ from brax.envs.wrappers.training import wrap
 from brax.training.agents.ppo import train as ppo
 from toys import Drifting
 
-from mjx_reinforce import Box, Discrete, envs
-from mjx_reinforce.engine.vector import for_brax
+from mjx_reinforce import Box, Discrete, envs, make_vec
+from mjx_reinforce.engine.vector.for_brax import BraxVectorEnv
 
 CART = "ContinuousCartPole-v0"
+
+
+def made(env, num_envs, **options):
+    return BraxVectorEnv(make_vec(env, num_envs, autoreset="same_step", **options))
 
 
 @pytest.mark.slow
 def test_brax_sees_the_environments_as_its_wrappers_show_them():
     """The same starts and actions: its rewards, ends and observations, until an episode ends."""
-    ours = for_brax.make(CART, 4, max_episode_steps=15)
+    ours = made(CART, 4, max_episode_steps=15)
     theirs = wrap(envs.make(CART), episode_length=15)
     keys = jax.random.split(jax.random.PRNGKey(0), 4)  # brax knows no others
     mine = ours.reset(keys)
@@ -45,7 +49,7 @@ def test_brax_sees_the_environments_as_its_wrappers_show_them():
 
 
 def test_a_new_episode_has_a_new_start():
-    env = for_brax.make(CART, 3, max_episode_steps=2)
+    env = made(CART, 3, max_episode_steps=2)
     state = env.reset(jax.random.key(0))
     starts = [state.obs]
     for _ in range(4):
@@ -58,7 +62,12 @@ def test_a_new_episode_has_a_new_start():
 def test_actions_have_bounds():
     for space in (Discrete(2), Box(np.array([-np.inf]), np.array([1.0]))):
         with pytest.raises(ValueError, match="actions must have bounds"):
-            for_brax.make(Drifting(space), 2)
+            made(Drifting(space), 2)
+
+
+def test_episodes_begin_in_the_step_that_ends_one():
+    with pytest.raises(ValueError, match="autoreset must be 'same_step' for brax, got 'next_step'"):
+        BraxVectorEnv(make_vec(CART, 2))
 
 
 @pytest.mark.slow
@@ -72,7 +81,7 @@ def test_its_ppo_trains(monkeypatch):
     )
     told = []
     ppo.train(
-        for_brax.make(CART, 16),
+        made(CART, 16),
         num_timesteps=4_000,
         num_evals=2,
         num_envs=16,

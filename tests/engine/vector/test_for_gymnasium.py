@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
 
-import mjx_reinforce.gym  # noqa: F401 (registers)
-from mjx_reinforce import envs
+from mjx_reinforce import envs, gym
 from mjx_reinforce.engine.vector import for_gymnasium
 
 CART, REACHER = "mjx_reinforce/CartPole-v1", "mjx_reinforce/Reacher-v5"
@@ -197,11 +196,11 @@ def test_wrong_order_and_bad_arguments(cart):
     with pytest.raises(ValueError, match="no MuJoCo model"):
         gymnasium.make_vec(CART, num_envs=1, render_mode="rgb_array")
     with pytest.raises(ValueError, match="arrays"):
-        for_gymnasium.make("CartPole-v1", 1, arrays="list")
+        gym.make("CartPole-v1", 1, arrays="list")
     with pytest.raises(ValueError, match=r"gymnasium\.make_vec\('mjx_reinforce/CartPole-v1'"):
         gymnasium.make(CART)
     with pytest.raises(TypeError, match="make it where it is used"):
-        pickle.dumps(for_gymnasium.make("CartPole-v1", 1))
+        pickle.dumps(gym.make("CartPole-v1", 1))
     for seed in (1.5, True, "abc"):
         with pytest.raises(ValueError, match="seed must be a whole number"):
             cart.reset(seed=seed)
@@ -227,7 +226,7 @@ def test_two_threads_with_an_environment_each():
     found = {}
 
     def run(name):
-        found[name] = play(for_gymnasium.make("CartPole-v1", 2))
+        found[name] = play(gym.make("CartPole-v1", 2))
 
     threads = [threading.Thread(target=run, args=(k,)) for k in range(2)]
     for thread in threads:
@@ -238,7 +237,7 @@ def test_two_threads_with_an_environment_each():
 
 
 def test_jax_arrays_are_handed_out_as_they_are():
-    env = for_gymnasium.make("InvertedPendulum-v5", 2, arrays="jax")
+    env = gym.make("InvertedPendulum-v5", 2, arrays="jax")
     first, _ = env.reset(seed=0)
     assert isinstance(first, jax.Array)
     kept = np.array(first)
@@ -249,7 +248,7 @@ def test_jax_arrays_are_handed_out_as_they_are():
 
 def test_torch_tensors_are_not_copied():
     torch = pytest.importorskip("torch")
-    env = for_gymnasium.make("InvertedPendulum-v5", 2, arrays="torch")
+    env = gym.make("InvertedPendulum-v5", 2, arrays="torch")
     env.reset(seed=0)
     observation, reward, *_ = env.step(torch.zeros((2, 1)))
     assert isinstance(reward, torch.Tensor)
@@ -271,7 +270,7 @@ def test_rendered():
 
 def test_seeds_of_64_bits(cart):
     """Those below 2^32 are `jax.random.key` of them; others are not those less 2^32."""
-    vec = for_gymnasium.make("CartPole-v1", 3).vec
+    vec = gym.make("CartPole-v1", 3).vec
     keys = jax.vmap(jax.random.key)(np.arange(7, 10))
     np.testing.assert_array_equal(cart.reset(seed=7)[0], vec.reset(keys).obs)
     assert np.any(cart.reset(seed=2**32 + 7)[0] != cart.reset(seed=7)[0])

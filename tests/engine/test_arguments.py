@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.engine.arguments import check_count, check_key, check_number, known_number
+from mjx_reinforce.engine.checks import check_count, check_key, check_number, known_number
 
 
 @pytest.mark.parametrize("value", [2, 2.0, np.float32(2), jnp.float32(2), np.int64(2)])
