@@ -34,7 +34,8 @@ class Arrays:
     """A frozen dataclass of arrays, or of pytrees of them, that is a pytree in field order."""
 
     def __init_subclass__(cls) -> None:
-        fields = dataclasses.fields(dataclasses.dataclass(frozen=True, kw_only=True)(cls))
+        made: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
+        fields = dataclasses.fields(made)
         jax.tree_util.register_dataclass(cls, [field.name for field in fields], [])
 
     def replace(self, **changes: Any) -> Self:
@@ -116,16 +117,19 @@ class Acts(Protocol):
       True
     """
 
-    def noise(self, key: jax.Array, shape: tuple[int, ...], /) -> jax.Array:
-        """Returns the noise [*shape, E] of actions; consumes the key."""
+    @property
+    def noise(self) -> Callable[..., jax.Array]:
+        """(key, shape) -> [*shape, E], what ``sample`` reads; consumes the key."""
         ...
 
-    def sample(self, outputs: jax.Array, noise: jax.Array, /) -> jax.Array:
-        """Returns actions [..., A], or int32 [...] if discrete, of outputs [..., K] and noise."""
+    @property
+    def sample(self) -> Callable[..., jax.Array]:
+        """(outputs [..., K], noise [..., E]) -> actions [..., A], or int32 [...] if discrete."""
         ...
 
-    def mode(self, outputs: jax.Array, /) -> jax.Array:
-        """Returns the actions of a policy without noise, like ``sample``."""
+    @property
+    def mode(self) -> Callable[..., jax.Array]:
+        """(outputs [..., K]) -> actions like ``sample``, of a policy without noise."""
         ...
 
 

@@ -219,17 +219,16 @@ def check_policy(
         )
 
 
-def check_shapes(*shapes: tuple[int, ...], remedy: str = "", **arguments: ArrayLike) -> None:
-    """Raises ValueError for an argument whose shape is none of ``shapes``.
+def check_shape(name: str, value: ArrayLike, *shapes: tuple[int, ...], remedy: str = "") -> None:
+    """Raises ValueError for an array whose shape is none of those it may have.
 
     Args:
+      name: what it is called, for the message.
+      value: what the user gave.
       *shapes: those that it may have.
       remedy: what to do instead, for the message.
-      **arguments: what the user gave, by name.
     """
-    for name, value in arguments.items():
-        if jnp.shape(value) not in shapes:
-            raise ValueError(
-                f"{name} must be {' or '.join(str(list(x)) for x in shapes)}, got the shape "
-                f"{list(jnp.shape(value))}{remedy}"
-            )
+    if jnp.shape(value) not in shapes:
+        expected = " or ".join(str(list(shape)) for shape in shapes)
+        got = list(jnp.shape(value))
+        raise ValueError(f"{name} must be {expected}, got the shape {got}{remedy}")

@@ -17,11 +17,11 @@ from mjx_reinforce.engine.base import (
     observation_size,
 )
 from mjx_reinforce.engine.checks import check_count, check_key, check_number, check_type
-from mjx_reinforce.engine.contract import check_environment, check_shapes
+from mjx_reinforce.engine.contract import check_environment
 from mjx_reinforce.engine.devices import NONE, RUNS, SECOND, Devices
 from mjx_reinforce.engine.play import choice
 from mjx_reinforce.engine.play.choice import Engine
-from mjx_reinforce.engine.play.episode import CHUNK_STEPS, ONE_SEED, episode_keys
+from mjx_reinforce.engine.play.episode import CHUNK_STEPS, check_each, episode_keys
 from mjx_reinforce.engine.scalar import any_lane
 from mjx_reinforce.learning import contract, counts, diagnostics, normalize
 from mjx_reinforce.learning.actor import Actor, act
@@ -251,7 +251,7 @@ class _Reinforce:
         self, state: TrainState, key: jax.Array, active: bool | jax.Array, guests: Guests | None
     ) -> tuple[Trajectory, Trajectory | None]:
         """Plays the episodes of an update, with guests before them if there are any."""
-        check_shapes((), (self.num_episodes,), remedy=ONE_SEED, active=active)
+        check_each(self.num_episodes, active=active)
         visitors = None if guests is None else (guests.keys, guests.deterministic(), guests.active)
         chosen = jnp.broadcast_to(active, self.num_episodes)
         keys = episode_keys(key, self.num_episodes)

@@ -119,7 +119,7 @@ def test_a_rollout_is_refused(learner, state):
     for changes, message in (
         ({"env": Survive}, "Survive is a class"),
         ({"act": LINEAR}, "act must be a function, such as learner.act, got a Policy"),
-        ({"distribution": LINEAR}, "type Distribution.* got a Policy"),
+        ({"distribution": LINEAR}, "functions noise, sample and mode, .* got Policy"),
         ({"key": 0}, r"a random key, such as jax.random.key\(0\), got 0"),
         ({"num_episodes": 0}, "num_episodes must be at least 1"),
         ({"horizon": 20.0}, "horizon must be a whole number, got 20.0"),
@@ -162,7 +162,7 @@ def test_an_object_is_one_short_line(learner, state):
 
 def test_modules_are_attributes():
     assert m.envs.names()
-    assert m.fused.vmap
+    assert m.engine.vmap
     assert m.reports.__name__ == "mjx_reinforce.reports"
     assert {"envs", "reinforce"} <= set(dir(m))
     with pytest.raises(AttributeError, match=r"has no attribute 'nonsense'"):

@@ -12,16 +12,15 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.typing import ArrayLike
 
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree
-from mjx_reinforce.engine.contract import check_shapes
+from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.scalar import any_lane
 
 LoopState = TypeVar("LoopState")
 #: Noise is drawn for so many steps at once, and only then is it seen whether all episodes are over.
 CHUNK_STEPS = 50
-#: What to do with arrays of several seeds.
-ONE_SEED = "; play several seeds by jax.vmap"
 
 
 class Step(NamedTuple):
@@ -43,6 +42,12 @@ class Step(NamedTuple):
     state: Any
 
 
+def check_each(num_episodes: int, **arguments: ArrayLike) -> None:
+    """Raises ValueError for an argument that is neither one for all [] nor one an episode [N]."""
+    for name, value in arguments.items():
+        check_shape(name, value, (), (num_episodes,), remedy="; play several seeds by jax.vmap")
+
+
 def episode_keys(key: jax.Array, num_episodes: int) -> jax.Array:
     """Returns the keys [N] of N episodes.
 
@@ -54,7 +59,7 @@ def episode_keys(key: jax.Array, num_episodes: int) -> jax.Array:
       ValueError: the keys are of another number.
     """
     several = jax.random.key_data(key)[..., 0]
-    check_shapes((), (num_episodes,), remedy=ONE_SEED, key=several)
+    check_each(num_episodes, key=several)
     if several.ndim:
         return key
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(num_episodes))

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
-from mjx_reinforce.engine.contract import check_shapes
+from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.cpu import seam as cpu
 from mjx_reinforce.engine.gpu import seam as gpu
@@ -50,9 +50,8 @@ def rollout(
       ValueError: machine code cannot play this; see ``unsupported``.
     """
     steps = horizon if limit is None else limit
-    flags = {"deterministic": deterministic, "active": active, "limit": steps}
-    check_shapes((), (num_episodes,), remedy=episode.ONE_SEED, **flags)
-    check_shapes((), threads=threads)
+    episode.check_each(num_episodes, deterministic=deterministic, active=active, limit=steps)
+    check_shape("threads", threads, ())
     if against := against_key(key):
         raise ValueError(f"the native engine cannot play this: {against}; {_REMEDY}")
     try:

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from jax import lax
 
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
-from mjx_reinforce.engine.contract import check_shapes
 from mjx_reinforce.engine.play import episode
 
 
@@ -69,8 +68,7 @@ def rollout(
       ValueError: an argument makes no sense.
     """
     steps = horizon if limit is None else limit
-    flags = {"deterministic": deterministic, "active": active, "limit": steps}
-    check_shapes((), (num_episodes,), remedy=episode.ONE_SEED, **flags)
+    episode.check_each(num_episodes, deterministic=deterministic, active=active, limit=steps)
     if env_step is None:
         env_step = jax.vmap(env.step, in_axes=-1, out_axes=-1)
     # Inside, episodes are the last axis: each scalar of the state is a contiguous row.

@@ -14,7 +14,7 @@ from mjx_reinforce.engine.checks import (
     check_name,
     check_type,
 )
-from mjx_reinforce.engine.contract import check_environment, check_shapes
+from mjx_reinforce.engine.contract import check_environment, check_shape
 from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.engine.play import episode
 from mjx_reinforce.engine.play.available import GENERATOR
@@ -118,7 +118,7 @@ class VectorEnv:
 
     def restart(self, state: VectorState, where: jax.Array) -> VectorState:
         """Returns the environments with new episodes where a mask [N] says so; others stay."""
-        check_shapes((self.num_envs,), **{"the mask": where})
+        check_shape("the mask", where, (self.num_envs,))
         where = jnp.asarray(where, bool)
         begun = self._advance(state, self._null_actions(), where)
         return jax.tree.map(
@@ -174,7 +174,7 @@ class VectorEnv:
 
     def _checked(self, action: ArrayLike) -> jax.Array:
         """Returns the actions, or raises ValueError where they are none."""
-        check_shapes((self.num_envs, *self._null_action.shape), **{"the actions": action})
+        check_shape("the actions", action, (self.num_envs, *self._null_action.shape))
         kind, wanted = jnp.result_type(action), self._null_action.dtype
         if not jnp.can_cast(kind, wanted, "same_kind"):
             raise ValueError(f"the actions must be {wanted}, got {kind}")

@@ -1,5 +1,6 @@
 """Segments of fixed length, which go on where the last one ended: what PPO and A2C learn from."""
 
+from collections.abc import Callable
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -17,8 +18,9 @@ from mjx_reinforce.engine.vector.episodes import VectorState
 class ActsWithLogProb(Acts, Protocol):
     """A family of distributions that ``unroll`` plays: ``Acts``, and how likely an action was."""
 
-    def log_prob(self, outputs: jax.Array, action: jax.Array, /) -> jax.Array:
-        """Returns the logarithm [...] of the probability density of actions."""
+    @property
+    def log_prob(self) -> Callable[..., jax.Array]:
+        """(outputs [..., K], actions) -> [...] the logarithm of their probability density."""
         ...
 
 
