@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from mjx_reinforce.engine.base import PyTree, is_key, plain
+from mjx_reinforce.engine.base import PyTree, plain, with_keys
 from mjx_reinforce.files import Arrays, members, write_bytes
 
 _KEPT = 2
@@ -186,8 +186,7 @@ def _unflatten(arrays: Arrays, like: PyTree) -> Any:
     Raises:
       ValueError: an array is missing, or superfluous, or has another shape or type.
     """
-    leaves, structure = jax.tree.flatten_with_path(like)
-    shapes, _ = jax.tree.flatten_with_path(jax.eval_shape(plain, like))
+    shapes, structure = jax.tree.flatten_with_path(jax.eval_shape(plain, like))
     expected = {_name(path): shape for path, shape in shapes}
     if wrong := sorted(expected.keys() ^ arrays.keys()):
         raise ValueError(f"{wrong[0]} is in one of the two only")
@@ -195,17 +194,13 @@ def _unflatten(arrays: Arrays, like: PyTree) -> Any:
         here, there = (shape.shape, shape.dtype), (arrays[name].shape, arrays[name].dtype)
         if here != there:
             raise ValueError(f"{name} is {there[1]} {there[0]} there, {here[1]} {here[0]} here")
-    return jax.tree.unflatten(structure, [_leaf(arrays[_name(path)], old) for path, old in leaves])
+    # Memory of the device's own, which may be donated.
+    values = [jax.numpy.array(arrays[name]) for name in expected]
+    return with_keys(jax.tree.unflatten(structure, values), like)
 
 
 def _name(path: jax.tree_util.KeyPath) -> str:
     return "state/" + jax.tree_util.keystr(path, simple=True, separator="/")
-
-
-def _leaf(values: np.ndarray, old: jax.Array) -> jax.Array:
-    """Returns values in memory of the device's own, which may be donated; a key where it was."""
-    array = jax.numpy.array(values)
-    return jax.random.wrap_key_data(array) if is_key(old) else array
 
 
 #: Between checkpoints, where the user has not said how many updates.

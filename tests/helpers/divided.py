@@ -1,10 +1,10 @@
-"""Trains runs on several devices of one process, and compares them with one device's.
+"""Trains on several devices of one process, and compares what comes out with one device's.
 
-``python divided.py '{"num_episodes": 8}' '{"episodes": 8}' ...`` takes the settings, and then how
-a run is divided, as often as is to be tried. Prints nothing; raises where something differs.
+``python divided.py run '{"num_episodes": 8}' '{"episodes": 8}'`` takes what is compared, a whole
+``run`` or a ``step`` of its learner, then the settings, and how they are divided. Prints nothing;
+raises where something differs.
 """
 
-import dataclasses
 import json
 import sys
 
@@ -49,31 +49,36 @@ def trained(config, division):
     return before, looked, *found, programs.evaluate(state).measured["eval_return"]
 
 
-def played(config, division):
-    """Returns the episodes of an update of all seeds."""
+def stepped(config, division):
+    """Returns the episodes of an update of all seeds, and what each has learned from its own."""
     devices = division.devices() if division.episodes > 1 else None
     learner = build.build(envs.make(config.env), config, devices=devices)[0]
-    keys = jax.random.split(jax.random.key(1), config.num_seeds)
 
-    def play(key):
-        return learner.play(learner.init(key), key, True)
+    @jax.jit
+    @jax.vmap
+    def step(key):
+        state = learner.init(key)
+        played, (after, metrics) = learner.play(state, key, True), learner.step(state)
+        del metrics["simulated_steps"]
+        episodes = [played.observation, played.action, played.reward, played.mask]
+        return episodes, plain(after), metrics
 
-    return learner, jax.device_get(jax.jit(jax.vmap(play))(keys))
+    return learner, jax.device_get(step(jax.random.split(jax.random.key(1), config.num_seeds)))
 
 
 def main():
-    settings = SMALL | {"env": "CartPole-v1"} | json.loads(sys.argv[1])
+    kind, settings, division = sys.argv[1], json.loads(sys.argv[2]), json.loads(sys.argv[3])
+    settings = SMALL | {"env": "CartPole-v1"} | settings
     config = Config(**{k: tuple(x) if isinstance(x, list) else x for k, x in settings.items()})
-    divisions = [Division(**json.loads(each)) for each in sys.argv[2:]]
-    expected, (learner, episodes) = trained(config, ALONE), played(config, ALONE)
-    for division in divisions:
-        close(expected, trained(config, division))
-        if division.episodes > 1:
-            again = played(config, division)[1]
-            alike = np.testing.assert_array_equal if learner.engine.name == "native" else close
-            for field in dataclasses.fields(again):
-                if field.name not in ("simulated", "played"):
-                    alike(getattr(episodes, field.name), getattr(again, field.name))
+    division = Division(**division)
+    if kind == "run":
+        close(trained(config, ALONE), trained(config, division))
+        return
+    learner, (episodes, *learned) = stepped(config, ALONE)
+    again, *other = stepped(config, division)[1]
+    close(learned, other)
+    alike = np.testing.assert_array_equal if learner.engine.name == "native" else close
+    jax.tree.map(alike, episodes, again)
 
 
 if __name__ == "__main__":

@@ -15,17 +15,23 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import resume
 from mjx_reinforce.training.division import ALONE, Division, divide_run
 
-#: Settings, and how their runs are divided.
+#: What is compared, the settings, and how that is divided.
 VARIANTS = {
-    "plain": ({}, [{"episodes": 8}, {"seeds": 3}]),
-    "value": ({"estimator": "value-baseline", "value_hidden_sizes": [4]}, [{"episodes": 8}]),
-    "natural": ({"update": "natural-gradient", "max_kl": 0.01}, [{"episodes": 8}]),
+    "episodes": ("run", {}, {"episodes": 8}),
+    "seeds": ("run", {}, {"seeds": 3}),
+    "ars": ("run", {"algorithm": "ars", "engine": "vmap", "num_directions": 2}, {"seeds": 2}),
+    "value": ("step", {"estimator": "value-baseline"}, {"episodes": 8}),
+    "natural": ("step", {"update": "natural-gradient", "max_kl": 0.01}, {"episodes": 8}),
     "minibatches": (
+        "step",
         {"update": "minibatches", "minibatch_size": 16, "one_start": True, "max_kl": 0.01},
-        [{"episodes": 2}],
+        {"episodes": 2},
     ),
-    "vmap": ({"engine": "vmap", "update": "each-step", "standardize": False}, [{"episodes": 2}]),
-    "ars": ({"algorithm": "ars", "engine": "vmap", "num_directions": 2}, [{"seeds": 2}]),
+    "vmap": (
+        "step",
+        {"engine": "vmap", "update": "each-step", "standardize": False},
+        {"episodes": 2},
+    ),
 }
 
 
@@ -44,9 +50,9 @@ def on_devices(count, folder, *line):
 @pytest.mark.cpu
 @pytest.mark.parametrize("name", VARIANTS)
 def test_devices_change_nothing_but_rounding(tmp_path, name):
-    settings, divisions = VARIANTS[name]
-    given = [json.dumps(each) for each in (settings, *divisions)]
-    on_devices(8, tmp_path, str(ROOT / "tests" / "helpers" / "divided.py"), *given)
+    kind, *given = VARIANTS[name]
+    program = str(ROOT / "tests" / "helpers" / "divided.py")
+    on_devices(8, tmp_path, program, kind, *map(json.dumps, given))
 
 
 @pytest.mark.parametrize(
