@@ -9,15 +9,15 @@ from mjx_reinforce.envs import make_vec
 from mjx_reinforce.export.player import Player, load
 from mjx_reinforce.export.policy_files import load_policy, save_policy
 from mjx_reinforce.export.run_files import pretrained
-from mjx_reinforce.learning.actor import Actor, act
-from mjx_reinforce.learning.distributions.bounded import (
+from mjx_reinforce.learning.distributions import (
+    Distribution,
+    categorical,
     clipped_normal,
+    deterministic,
+    normal,
     tanh_normal,
     truncated_normal,
 )
-from mjx_reinforce.learning.distributions.categorical import categorical
-from mjx_reinforce.learning.distributions.distribution import Distribution
-from mjx_reinforce.learning.distributions.gaussian import deterministic, normal
 from mjx_reinforce.learning.estimators import (
     Estimator,
     discount_weights,
@@ -29,13 +29,12 @@ from mjx_reinforce.learning.estimators import (
     standardize,
     total_return,
 )
-from mjx_reinforce.learning.learner import Learner, TrainState, train_step
+from mjx_reinforce.learning.learner import Learner, TrainState, reinforce, train_step
 from mjx_reinforce.learning.natural_gradient import natural_gradient
-from mjx_reinforce.learning.policy import Policy, mlp_policy
-from mjx_reinforce.learning.reinforce import reinforce
+from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy
 from mjx_reinforce.learning.schedules import Cut
 from mjx_reinforce.learning.updates import each_step, full_batch, make_optimizer, minibatches
-from mjx_reinforce.learning.value_baseline import full_batch_value_baseline, value_baseline
+from mjx_reinforce.learning.value import full_batch_value_baseline, value_baseline
 from mjx_reinforce.published.ars import ars
 from mjx_reinforce.runs.run import RunResults, run
 from mjx_reinforce.settings.config import Config

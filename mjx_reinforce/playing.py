@@ -11,7 +11,7 @@ import numpy as np
 from mjx_reinforce.engine.play.episode import begin, hold, step
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export.player import Player
-from mjx_reinforce.learning.actor import act
+from mjx_reinforce.learning.policy import act
 
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import Environment

@@ -11,14 +11,14 @@ from mjx_reinforce.engine.checks import check_name, explain
 
 #: Action distributions: name -> "module:function" of an action space.
 DISTRIBUTIONS = {
-    "normal": "mjx_reinforce.learning.distributions.gaussian:normal",
-    "normal-softplus": "mjx_reinforce.learning.distributions.gaussian:normal_softplus",
-    "normal-sigmoid": "mjx_reinforce.learning.distributions.gaussian:normal_sigmoid",
-    "truncated-normal": "mjx_reinforce.learning.distributions.bounded:truncated_normal",
-    "clipped-normal": "mjx_reinforce.learning.distributions.bounded:clipped_normal",
-    "tanh-normal": "mjx_reinforce.learning.distributions.bounded:tanh_normal",
-    "deterministic": "mjx_reinforce.learning.distributions.gaussian:deterministic",
-    "categorical": "mjx_reinforce.learning.distributions.categorical:categorical",
+    "normal": "mjx_reinforce.learning.distributions:normal",
+    "normal-softplus": "mjx_reinforce.learning.distributions:normal_softplus",
+    "normal-sigmoid": "mjx_reinforce.learning.distributions:normal_sigmoid",
+    "truncated-normal": "mjx_reinforce.learning.distributions:truncated_normal",
+    "clipped-normal": "mjx_reinforce.learning.distributions:clipped_normal",
+    "tanh-normal": "mjx_reinforce.learning.distributions:tanh_normal",
+    "deterministic": "mjx_reinforce.learning.distributions:deterministic",
+    "categorical": "mjx_reinforce.learning.distributions:categorical",
 }
 
 #: Gradient estimators: name -> "module:function" of a discount.
@@ -26,14 +26,14 @@ ESTIMATORS = {
     "total-return": "mjx_reinforce.learning.estimators:total_return",
     "reward-to-go": "mjx_reinforce.learning.estimators:reward_to_go",
     "leave-one-out": "mjx_reinforce.learning.estimators:leave_one_out",
-    "value-baseline": "mjx_reinforce.learning.value_baseline:value_baseline",
+    "value-baseline": "mjx_reinforce.learning.value:value_baseline",
     "mean-log-prob": "mjx_reinforce.learning.estimators:mean_log_prob",
     "normalized-returns": "mjx_reinforce.learning.estimators:normalized_returns",
 }
 
 #: Ways to learn: name -> "module:function" of an environment, see ``store.build``.
 ALGORITHMS = {
-    "reinforce": "mjx_reinforce.learning.reinforce:reinforce",
+    "reinforce": "mjx_reinforce.learning.learner:reinforce",
     "ars": "mjx_reinforce.published.ars:ars",
 }
 

@@ -244,7 +244,7 @@ def untrained(player: "Player") -> "Player":
     import jax
 
     from mjx_reinforce.learning import normalize
-    from mjx_reinforce.learning.actor import Actor
+    from mjx_reinforce.learning.policy import Actor
 
     params = player.policy.init(jax.random.key(player.seed))
     actor = Actor(params=params, normalizer=normalize.init(player.observation_size))

@@ -9,8 +9,7 @@ from mjx_reinforce.engine.base import Discrete
 from mjx_reinforce.engine.checks import check_name
 from mjx_reinforce.export.policy_files import SavedPolicy, saved_action_space
 from mjx_reinforce.learning import normalize
-from mjx_reinforce.learning.distributions.distribution import middle_and_half_range
-from mjx_reinforce.learning.distributions.gaussian import gaussian_outputs
+from mjx_reinforce.learning.distributions import gaussian_outputs, middle_and_half_range
 
 #: What the deterministic action of a family is of the network's last layer x, once the scaling
 #: of means is part of that layer: x, x clipped to the bounds, middle + half tanh(x), or the

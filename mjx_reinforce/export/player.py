@@ -21,8 +21,7 @@ from mjx_reinforce.export.run_files import (
     provenance_of,
     read_run,
 )
-from mjx_reinforce.learning.actor import Actor, act
-from mjx_reinforce.learning.policy import Policy
+from mjx_reinforce.learning.policy import Actor, Policy, act
 
 
 class Player(NamedTuple):

@@ -17,9 +17,8 @@ from mjx_reinforce.engine.checks import check_kind, explain
 from mjx_reinforce.export.policy_checks import check_arrays, check_finite, check_policy_settings
 from mjx_reinforce.files import Header, finite, read_arrays, read_json, write_arrays, write_json
 from mjx_reinforce.learning import normalize
-from mjx_reinforce.learning.actor import Actor
-from mjx_reinforce.learning.distributions.distribution import Distribution
-from mjx_reinforce.learning.policy import Policy, mlp_policy
+from mjx_reinforce.learning.distributions import Distribution
+from mjx_reinforce.learning.policy import Actor, Policy, mlp_policy
 from mjx_reinforce.registry import DISTRIBUTIONS, check_choice, is_own, load_choice
 
 #: The name in the archive of what says that it belongs to the settings beside it.

@@ -10,19 +10,13 @@ import optax
 from mjx_reinforce.engine.base import Environment, PyTree, Trajectory, null_action
 from mjx_reinforce.engine.checks import check_kind, check_type, explain
 from mjx_reinforce.learning import updates
-from mjx_reinforce.learning.distributions.distribution import Distribution
+from mjx_reinforce.learning.distributions import Distribution
 from mjx_reinforce.learning.estimators import Estimator
-from mjx_reinforce.learning.learner import Learner
 from mjx_reinforce.learning.natural_gradient import natural_gradient
 from mjx_reinforce.learning.policy import Policy
 
 #: Steps and episodes of the trajectory that an estimator is tried on: no two axes have one size.
 _NUM_STEPS = 5
-#: Metrics without which no run can be recorded.
-_METRICS = (
-    *("episodes", "episode_return", "episode_length", "env_steps", "simulated_steps"),
-    *("nonfinite_episodes", "skipped_update"),
-)
 
 
 def check_horizon(env: Environment, horizon: int | None) -> int:
@@ -52,10 +46,10 @@ def check_policy(
     check_kind(
         "policy.distribution", distribution, Distribution, "mjx_reinforce.normal(env.action_space)"
     )
-    params = _traced("policy.init(key)", policy.init, jax.random.key(0))
+    params = traced("policy.init(key)", policy.init, jax.random.key(0))
     observation = jax.ShapeDtypeStruct((2, observation_size), jnp.result_type(float))
     given = f"policy.apply(params, observation [2, {observation_size}])"
-    outputs = _traced(given, policy.apply, params, observation)
+    outputs = traced(given, policy.apply, params, observation)
     count, constants = distribution.num_outputs, len(distribution.constants)
     if getattr(outputs, "shape", None) != (2, count + constants):
         fixed = f", then distribution.constants [2, {constants}], as parameters" * bool(constants)
@@ -69,14 +63,14 @@ def check_policy(
     def draw(outputs):
         return distribution.sample(outputs, distribution.noise(jax.random.key(0), (2,)))
 
-    action, size = _traced("policy.distribution.sample", draw, outputs), null_action(env).shape
+    action, size = traced("policy.distribution.sample", draw, outputs), null_action(env).shape
     if getattr(action, "shape", None) != (2, *size):
         raise ValueError(
             f"policy.distribution draws actions {_shape_or_type(action)} for two observations, "
             f"{type(env).__name__} takes {[2, *size]}; make it for the actions of this environment"
         )
     if likelihood:
-        _traced("policy.distribution.log_prob", distribution.log_prob, outputs, action)
+        traced("policy.distribution.log_prob", distribution.log_prob, outputs, action)
 
 
 def check_optimizer(name: str, value: optax.GradientTransformation) -> None:
@@ -123,7 +117,7 @@ def check_estimator(
     def update(key, trajectory):
         return estimator.update(estimator.init(key, observation_size), trajectory)
 
-    returned = _traced("estimator.init or update", update, jax.random.key(0), trajectory)
+    returned = traced("estimator.init or update", update, jax.random.key(0), trajectory)
     if not (isinstance(returned, tuple) and len(returned) == 3):
         raise ValueError(
             "estimator.update must return three things, (weight [T, N], next state, metrics), "
@@ -142,29 +136,7 @@ def check_estimator(
         )
 
 
-def check_learner(name: str, learner: Learner) -> None:
-    """Raises ValueError for a learner that a run cannot train, in one line that says why.
-
-    Args:
-      name: of the function that returned it.
-      learner: what it returned. Its functions are traced.
-    """
-    check_kind(f"what {name} returns", learner, Learner, "mjx_reinforce.reinforce(env)")
-    state = _traced(f"the learner of {name}", learner.init, jax.random.key(0))
-    after, metrics = _traced(f"the learner of {name}", learner.step, state)
-    if _shapes(after) != _shapes(state):
-        raise ValueError(
-            f"learn of the learner of {name} must return a state of the structure, shapes and "
-            "dtypes of the one that it gets"
-        )
-    if missing := [each for each in _METRICS if each not in metrics]:
-        raise ValueError(
-            f"learn of the learner of {name} must also return the metrics {', '.join(missing)}: "
-            "see mjx_reinforce.train_step"
-        )
-
-
-def _traced(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> Any:
+def traced(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> Any:
     """Returns the shapes of what a user's function returns, or raises ValueError if it fails."""
     try:
         return jax.eval_shape(function, *arguments)
@@ -173,12 +145,6 @@ def _traced(name: str, function: Callable[..., PyTree], *arguments: PyTree) -> A
 
 
 _shaped: Any = jax.ShapeDtypeStruct
-
-
-def _shapes(tree: PyTree) -> Any:
-    """Returns the structure of a tree, and the shape and dtype of each leaf."""
-    leaves, structure = jax.tree.flatten(tree)
-    return structure, [(x.shape, x.dtype) for x in leaves]
 
 
 def _shape_or_type(value: Any) -> str:

@@ -10,13 +10,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 from optax import Params
 
 from mjx_reinforce.engine.base import Trajectory
-from mjx_reinforce.learning.actor import Actor, act
-from mjx_reinforce.learning.distributions.distribution import Distribution
-from mjx_reinforce.learning.policy import Policy
+from mjx_reinforce.learning.distributions import Distribution
+from mjx_reinforce.learning.policy import Actor, Policy, act
 
 Metrics = dict[str, jax.Array]
 
@@ -87,7 +85,7 @@ def policy_metrics(policy: Policy, before: Actor, after: Actor, visited: Visited
 
 
 def within_kl(
-    policy: Policy, actor: Actor, params: Params, visited: Visited, max_kl: float | jax.Array
+    policy: Policy, actor: Actor, params: Params, visited: Visited, max_kl: float | jax.Array | None
 ) -> Any:
     """Returns the parameters on the straight way to ``params`` at which KL is about ``max_kl``.
 
@@ -101,8 +99,10 @@ def within_kl(
       actor: the policy before the change.
       params: the parameters after it.
       visited: where the two are compared.
-      max_kl: in nats.
+      max_kl: in nats; None limits nothing.
     """
+    if max_kl is None:
+        return params
     changed = dataclasses.replace(actor, params=params)
     kl = policy_metrics(policy, actor, changed, visited)["kl"]
     share = jnp.where(kl > max_kl, jnp.sqrt(max_kl / kl), 1.0)
@@ -129,30 +129,6 @@ def kl_divergence(
         return distribution.kl(old, new)
     log_ratio = distribution.log_prob(new, action) - distribution.log_prob(old, action)
     return jnp.expm1(log_ratio) - log_ratio
-
-
-def signal_to_noise(mean: Params, each: Params, num_episodes: int) -> jax.Array:
-    """Returns an estimate [] of |E g|^2 / tr Cov(g), where g is the mean of N episodes' gradients.
-
-    It is |g|^2 / noise - 1, and the noise is (1 / M) sum_m |g_m - g|^2 / (N - 1): unbiased for
-    tr Cov(g), and |g|^2 - noise for |E g|^2, where episodes are independent and alike (McCandlish
-    et al. 2018, arXiv:1812.06162, appendix A.1, has the same two). N over the ratio is their simple
-    noise scale, in episodes.
-
-    The ratio of two unbiased estimates is not unbiased, and is below 0 where the noise happens to
-    exceed |g|^2. To average over updates, average |g|^2 (``gradient_norm`` squared) and the noise,
-    which is |g|^2 / (1 + ratio), and then divide. With leave-one-out, episodes share their
-    baselines, so that |E g|^2 is estimated 1 + 1 / (N - 1)^2 times as large.
-
-    Args:
-      mean: g, a pytree.
-      each: g_m of M of the N episodes, the same with a leading axis [M].
-      num_episodes: N, at least 2.
-    """
-    apart = jax.tree.map(lambda one, g: one - g, each, mean)
-    squares = jax.vmap(lambda tree: optax.tree.norm(tree, squared=True))(apart)
-    noise = jnp.mean(squares) / (num_episodes - 1)
-    return optax.tree.norm(mean, squared=True) / noise - 1
 
 
 def nan_unless(finite: jax.Array, metrics: Metrics) -> Metrics:

@@ -1,22 +1,39 @@
-"""What a learner is: ``init``, then ``play`` and ``learn`` in turn, over one state pytree."""
+"""REINFORCE (Williams 1992): ``reinforce`` has the formula, ``learn`` in it the update.
+
+A learner is ``init``, then ``play`` and ``learn`` in turn, over one state pytree.
+"""
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
 
-from mjx_reinforce.engine.base import PyTree, Trajectory
-from mjx_reinforce.engine.checks import check_kind
+from mjx_reinforce.engine.base import (
+    Environment,
+    PyTree,
+    Trajectory,
+    action_space,
+    observation_size,
+)
+from mjx_reinforce.engine.checks import check_count, check_key, check_kind, check_number
+from mjx_reinforce.engine.contract import check_environment
+from mjx_reinforce.engine.play import choice
 from mjx_reinforce.engine.play.choice import Engine
+from mjx_reinforce.engine.play.episode import check_each, episode_keys
 from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
-from mjx_reinforce.learning import counts
-from mjx_reinforce.learning.actor import Actor, act
+from mjx_reinforce.learning import contract, counts, diagnostics, normalize
 from mjx_reinforce.learning.diagnostics import Metrics
-from mjx_reinforce.learning.policy import Policy
+from mjx_reinforce.learning.distributions import default_distribution
+from mjx_reinforce.learning.estimators import Estimator, leave_one_out, standardize
+from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy
+from mjx_reinforce.learning.schedules import Clock, Schedule
+from mjx_reinforce.learning.updates import Problem, Update, full_batch, make_optimizer
 
 
 class TrainState(struct.PyTreeNode, kw_only=True):
@@ -58,48 +75,13 @@ class TrainState(struct.PyTreeNode, kw_only=True):
         return f"TrainState({self.actor!r}{seeds})"
 
 
-class Guests(NamedTuple):
-    """E episodes that are played in one go with those of an update, and from which nothing learns.
-
-    keys: [E] their own keys, as ``engines.episode.episode_keys`` makes them
-    num_modes: how many of them, the first, take the policy's mode; the others its samples
-    active: [] whether they are played
-    """
-
-    keys: jax.Array
-    num_modes: int
-    active: jax.Array
-
-    def deterministic(self) -> jax.Array:
-        """Returns which of them [E] take the mode."""
-        return jnp.arange(len(self.keys)) < self.num_modes
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Host:
-    """A ``Learner.play`` that can take guests.
-
-    with_guests: (TrainState, key, active, ``Guests`` or None) -> what is played, and the
-      ``Trajectory`` of the guests
-    """
-
-    with_guests: Callable[..., tuple[Any, Any]]
-
-    def alone(self, state: TrainState, key: jax.Array, active: bool | jax.Array = True) -> Any:
-        """Plays without guests."""
-        return self.with_guests(state, key, active, None)[0]
-
-    __call__ = alone
-
-
 class Learner(NamedTuple):
     """How a policy learns on one environment; any part may be replaced with ``_replace``.
 
     Attributes:
       init: (key) -> TrainState; consumes the key
       play: (TrainState, key, active) -> what is played for one update, a ``Trajectory`` of N fresh
-        episodes or a pytree that holds one; nothing where ``active`` [] is False; consumes the key.
-        A ``Host`` where guests do not make the others wait
+        episodes or a pytree that holds one; nothing where ``active`` [] is False; consumes the key
       learn: (TrainState, what was played, key) -> (TrainState, metrics), with the actor and all
         else that changes by learning; consumes the key
       policy: the policy that is trained
@@ -134,17 +116,19 @@ class Learner(NamedTuple):
           state: from ``init`` or the step before.
           active: [] where False nothing is played and the state stays.
         """
-        return self.step_with(state, active, None)[:2]
-
-    def step_with(
-        self, state: TrainState, active: bool | jax.Array, guests: Guests | None
-    ) -> tuple[TrainState, Metrics, Trajectory | None]:
-        """Makes one update as ``step``; also returns the episodes of guests, if there are any."""
         key, play_key, learn_key = jax.random.split(state.key, 3)
-        if guests is not None and isinstance(self.play, Host):
-            played, looked = self.play.with_guests(state, play_key, active, guests)
-        else:
-            played, looked = self.play(state, play_key, active), None
+        played = self.play(state, play_key, active)
+        return self.after(state, played, active, (key, learn_key))
+
+    def after(
+        self,
+        state: TrainState,
+        played: Any,
+        active: bool | jax.Array,
+        keys: tuple[jax.Array, jax.Array],
+    ) -> tuple[TrainState, Metrics]:
+        """Learns from what was played; the keys are the next state's, and the one of ``learn``."""
+        key, learn_key = keys
         learned, metrics = self.learn(state, played, learn_key)
         after = dataclasses.replace(
             learned,
@@ -154,11 +138,238 @@ class Learner(NamedTuple):
         )
         if active is not True:
             after = jax.tree.map(lambda new, old: jnp.where(active, new, old), after, state)
-        return after, metrics, looked
+        return after, metrics
 
     def act(self, actor: Actor, observation: jax.Array) -> jax.Array:
         """Returns the outputs [..., K] of the policy's distribution; see ``policies.actor.act``."""
         return act(self.policy, actor, observation)
+
+
+def reinforce(
+    env: Environment,
+    *,
+    policy: Policy | None = None,
+    estimator: Estimator | Schedule | None = None,
+    optimizer: optax.GradientTransformation | None = None,
+    update: Update | None = None,
+    num_episodes: int = 16,
+    horizon: int | None = None,
+    entropy_cost: float | jax.Array = 0.0,
+    max_kl: float | jax.Array | None = None,
+    normalize_steps: float = 1000,
+    normalize_min_std: float | jax.Array = 0.0,
+    engine: str = "auto",
+) -> Learner:
+    """Builds REINFORCE for an environment.
+
+    One update plays N complete episodes and follows the gradient of
+
+        (1/N) sum_n sum_t (weight[t, n] log pi(a[t, n] | o[t, n]) + entropy_cost H[t, n])
+
+    with the weights that the estimator gives. An episode in which the simulation left the finite
+    numbers counts as the worst of the others; where all did, nothing is learned.
+
+    Numbers such as ``entropy_cost``, the estimator's discount and the optimiser's learning rate
+    may be traced: build the learner inside a function to vmap over them.
+
+    Args:
+      env: what is played; any brax-style environment.
+      policy: by default an MLP of 32 and 32 tanh units with ``default_distribution``.
+      estimator: by default leave-one-out on the return to go (discount 0.99), divided by its
+        standard deviation plus 10; a ``Schedule`` of one where its numbers change as the budget is
+        used.
+      optimizer: by default Adam at 1e-2 with the gradient's norm clipped at 1.
+      update: how the gradient is spent, from ``updates``; by default in one optimiser step.
+      num_episodes: N, episodes an update.
+      horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
+      entropy_cost: weight of the policy's entropy H, in return per nat.
+      max_kl: the most, in nats, by which an update may move the policy: the mean over the steps
+        that it visited of KL(before || after). A change that goes further is shortened, see
+        ``diagnostics.within_kl``; None shortens none. A new scale of the observations comes on top.
+      normalize_steps: scale observations by the mean and std of about the first so many steps,
+        then keep that scale; 0 does not scale, inf never stops. (Where a policy learns to keep
+        the state near the middle, statistics that never stop shrink, and magnify the
+        observations until the policy fails.)
+      normalize_min_std: the least that an observation is divided by, in its own unit. (What hardly
+        changes in the first steps would be magnified for the rest of training.)
+      engine: how episodes are played: "auto", "vmap" or "native", see ``engine.play.choice``.
+
+    Raises:
+      ValueError: an argument makes no sense for this environment.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env, num_episodes=4, horizon=20)
+      >>> state = learner.init(jax.random.key(0))
+      >>> state, metrics = mr.train_step(learner, state)
+      >>> metrics["episodes"].item(), metrics["episode_return"].shape
+      (4, ())
+    """
+    check_environment(env)
+    size = observation_size(env)
+    check_count("num_episodes", num_episodes)
+    check_number("entropy_cost", entropy_cost)
+    check_number("normalize_steps", normalize_steps, finite=False)
+    check_number("normalize_min_std", normalize_min_std)
+    if max_kl is not None:
+        check_number("max_kl", max_kl, positive=True, finite=False)
+    horizon = contract.check_horizon(env, horizon)
+    policy = policy or mlp_policy(size, default_distribution(action_space(env)))
+    contract.check_policy(policy, env, size, likelihood=True)
+    optimizer = make_optimizer() if optimizer is None else optimizer
+    contract.check_optimizer("optimizer", optimizer)
+    update = update or full_batch()
+    contract.check_update(update)
+    estimator = standardize(leave_one_out(), floor=10.0) if estimator is None else estimator
+    schedule = estimator if isinstance(estimator, Schedule) else Schedule(lambda _: estimator)
+    contract.check_estimator(schedule.at(jnp.zeros(())), env, size, num_episodes)
+
+    example = jax.eval_shape(functools.partial(_first_actor, policy, size), jax.random.key(0))
+    player = choice.ActingPolicy(functools.partial(act, policy), example, policy.distribution)
+    plays = choice.choose(engine, env, player, horizon)
+    return Learner(
+        init=_init(policy, optimizer, schedule, size),
+        play=_play(env, policy, plays, num_episodes, horizon),
+        learn=_learn(
+            policy=policy,
+            schedule=schedule,
+            update=update,
+            problem=_problem(policy, optimizer, num_episodes, entropy_cost),
+            max_kl=max_kl,
+            normalize_limits=(normalize_steps, normalize_min_std),
+        ),
+        policy=policy,
+        engine=plays,
+    )
+
+
+def _first_actor(policy: Policy, observation_size: int, key: jax.Array) -> Actor:
+    return Actor(params=policy.init(key), normalizer=normalize.init(observation_size))
+
+
+def _init(
+    policy: Policy, optimizer: optax.GradientTransformation, schedule: Schedule, size: int
+) -> Callable[[jax.Array], TrainState]:
+    """Returns ``Learner.init``."""
+
+    def init(key: jax.Array) -> TrainState:
+        check_key(key)
+        policy_key, estimator_key, key = jax.random.split(key, 3)
+        actor = _first_actor(policy, size, policy_key)
+        return TrainState(
+            key=key,
+            actor=actor,
+            opt_state=optimizer.init(actor.params),
+            estimator_state=schedule.at(jnp.zeros(())).init(estimator_key, size),
+        )
+
+    return init
+
+
+def _play(
+    env: Environment, policy: Policy, plays: Engine, num_episodes: int, horizon: int
+) -> Callable[..., Trajectory]:
+    """Returns ``Learner.play``, which takes a ``limit`` [] of an episode's steps besides."""
+
+    def play(
+        state: TrainState,
+        key: jax.Array,
+        active: bool | jax.Array = True,
+        limit: jax.Array | None = None,
+    ) -> Trajectory:
+        check_each(num_episodes, active=active)
+        return plays.rollout(
+            env,
+            functools.partial(act, policy),
+            state.actor,
+            policy.distribution,
+            episode_keys(key, num_episodes),
+            num_episodes=num_episodes,
+            horizon=horizon,
+            active=active,
+            limit=None if limit is None else jnp.minimum(limit, horizon),
+        )
+
+    return play
+
+
+def _learn(
+    *,
+    policy: Policy,
+    schedule: Schedule,
+    update: Update,
+    problem: Callable[..., Problem],
+    max_kl: float | jax.Array | None,
+    normalize_limits: tuple[float, float | jax.Array],
+) -> Callable[[TrainState, Trajectory, jax.Array], tuple[TrainState, Metrics]]:
+    """Returns ``Learner.learn``: the update, in the order of the formula."""
+
+    def learn(
+        state: TrainState, trajectory: Trajectory, key: jax.Array
+    ) -> tuple[TrainState, Metrics]:
+        before, visited = state.actor, diagnostics.visited_steps(trajectory)
+        # Normalize, weigh, follow the gradient, limit the change, count, keep what is finite.
+        seen = normalize.seen(before.normalizer, trajectory)
+        weight, estimator_state, metrics = schedule.at(state.progress).update(
+            state.estimator_state, seen
+        )
+        params, opt_state, measured = update(
+            problem(state, seen, weight), key, before.params, state.opt_state
+        )
+        params = diagnostics.within_kl(policy, before, params, visited, max_kl)
+        normalizer = normalize.count(before.normalizer, trajectory, *normalize_limits)
+        learned, skipped = keep_finite(
+            (Actor(params=params, normalizer=normalizer), opt_state, estimator_state),
+            (before, state.opt_state, state.estimator_state),
+        )
+        actor, opt_state, estimator_state = learned
+        change = diagnostics.policy_metrics(policy, before, actor, visited)
+        sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
+        measured = diagnostics.nan_unless(sound, metrics | measured | change)
+        state = dataclasses.replace(
+            state, actor=actor, opt_state=opt_state, estimator_state=estimator_state
+        )
+        return state, episode_metrics(trajectory) | measured | {"skipped_update": skipped}
+
+    return learn
+
+
+def _problem(
+    policy: Policy,
+    optimizer: optax.GradientTransformation,
+    num_episodes: int,
+    entropy_cost: float | jax.Array,
+) -> Callable[[TrainState, Trajectory, jax.Array], Problem]:
+    """Returns (state, trajectory, weight [T, N]) -> the ``Problem`` of an update."""
+    surrogate = _surrogate(policy, entropy_cost)
+
+    def problem(state: TrainState, seen: Trajectory, weight: jax.Array) -> Problem:
+        return Problem(
+            surrogate=surrogate,
+            optimizer=optimizer,
+            samples=(seen.observation, seen.action, weight, seen.mask),
+            divisor=num_episodes,
+            clock=Clock(state.progress, counts.as_float(state.env_steps)),
+        )
+
+    return problem
+
+
+def _surrogate(policy: Policy, entropy_cost: float | jax.Array) -> Callable[..., Any]:
+    """Returns (params, samples) -> (minus the sum in the formula, the sum of the entropy)."""
+    distribution = policy.distribution
+
+    def surrogate(params, chunk):
+        observation, action, weight, mask = chunk
+        outputs = policy.apply(params, observation)
+        entropy = distribution.entropy(outputs)
+        terms = distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
+        loss = -jnp.sum(jnp.where(mask, terms, 0.0))
+        return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
+
+    return surrogate
 
 
 _step = jax.jit(Learner.step, static_argnums=0)

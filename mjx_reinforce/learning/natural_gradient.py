@@ -17,9 +17,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from mjx_reinforce.engine.checks import check_count, check_kind, check_number
-from mjx_reinforce.learning.gradients import accumulate, draw_steps
 from mjx_reinforce.learning.policy import Policy
-from mjx_reinforce.learning.updates import Problem, Update, whole_rollout
+from mjx_reinforce.learning.updates import Problem, Update, accumulate, draw_steps, whole_rollout
 
 #: Conjugate gradients know F from so many of the visited steps at most.
 MAX_FISHER_STEPS = 4096

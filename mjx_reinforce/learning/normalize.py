@@ -1,8 +1,12 @@
 """Observations scaled by the mean and standard deviation of the first ones."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from flax import struct
+
+from mjx_reinforce.engine.base import Trajectory
 
 #: Scaled observations are clipped to plus or minus this many standard deviations.
 CLIP = 10.0
@@ -78,6 +82,20 @@ def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
     std = standard_deviation(normalizer)
     scaled = jnp.clip((observation - normalizer.mean) / std, -CLIP, CLIP)
     return jnp.where(normalizer.count > 0, scaled, observation)
+
+
+def seen(normalizer: Normalizer, trajectory: Trajectory) -> Trajectory:
+    """Returns a trajectory with scaled observations."""
+    scaled = apply(normalizer, trajectory.observation)
+    return dataclasses.replace(trajectory, observation=scaled)
+
+
+def count(
+    normalizer: Normalizer, trajectory: Trajectory, at_most: float, min_std: float | jax.Array
+) -> Normalizer:
+    """Returns ``update`` by the observations of all episodes that did not break."""
+    counted = trajectory.mask & ~trajectory.nonfinite
+    return update(normalizer, trajectory.observation, counted, at_most, min_std)
 
 
 def standard_deviation(normalizer: Normalizer) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Policies: a multilayer perceptron from observations to the parameters of a distribution."""
+"""Policies: a network from observations to the parameters of a distribution, and who acts by it."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -6,10 +6,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+from flax import struct
 
 from mjx_reinforce.engine.checks import check_count, check_kind, check_name, check_type
 from mjx_reinforce.engine.play import units
-from mjx_reinforce.learning.distributions.distribution import Distribution
+from mjx_reinforce.learning import normalize
+from mjx_reinforce.learning.distributions import Distribution
 
 #: The ways to draw initial weights.
 INITIALIZERS = ("orthogonal", "torch")
@@ -175,3 +177,62 @@ def _networks(
         name: MLP(hidden_sizes, size, output_scale=0.01, initializer=initializer)
         for name, size in sizes.items()
     }
+
+
+class Actor(struct.PyTreeNode, kw_only=True):
+    """All that playing needs.
+
+    Attributes:
+      params: the policy's parameters
+      normalizer: the statistics that scale its observations
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env)
+      >>> actor = learner.init(jax.random.key(0)).actor
+      >>> mr.act(learner.policy, actor, jax.numpy.zeros((5, 4))).shape
+      (5, 2)
+    """
+
+    params: Any
+    normalizer: normalize.Normalizer
+
+    def __repr__(self) -> str:
+        count = sum(x.size for x in jax.tree.leaves(self.params))
+        return f"Actor({count:,} parameters, {self.normalizer!r})"
+
+
+def act(policy: Policy, actor: Actor, observation: jax.Array) -> jax.Array:
+    """Returns the parameters of the action distribution for each observation.
+
+    Args:
+      policy: the network and its distribution.
+      actor: the policy's parameters and the observation statistics.
+      observation: [..., O] as the environment returned it, not yet scaled.
+
+    Returns:
+      The outputs [..., K]: ``policy.distribution.mode(outputs)`` is the deterministic
+      action, ``policy.distribution.sample(outputs, noise)`` a random one.
+
+    Raises:
+      ValueError: an argument is of another type, or the observation of another size.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> learner = mr.reinforce(env)
+      >>> actor = learner.init(jax.random.key(0)).actor
+      >>> mr.act(learner.policy, actor, jax.numpy.zeros((5, 4))).shape
+      (5, 2)
+    """
+    check_kind("policy", policy, Policy, "learner.policy")
+    check_kind("actor", actor, Actor, "state.actor")
+    size = actor.normalizer.mean.shape[-1]
+    if observation.shape[-1:] != (size,):
+        raise ValueError(
+            f"the observation must be [..., {size}], got one of shape {list(observation.shape)}"
+        )
+    return policy.apply(actor.params, normalize.apply(actor.normalizer, observation))

@@ -5,6 +5,7 @@ optimiser of, or by the env steps played. Counted in env steps, a policy whose e
 keeps its rate and its noise, and one that has learned to play long ones settles soon.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +17,22 @@ from mjx_reinforce.engine.checks import check_count, check_number
 #: The standard deviation shrinks in so many steps. Each is far greater than float32's rounding of
 #: its logarithm, however many updates there are.
 _STEPS = 4096
+
+
+class Schedule(NamedTuple):
+    """An estimator whose numbers change as a run goes on.
+
+    Attributes:
+      at: the share [] of the budget that is used -> the estimator; its state is that of the first
+
+    Examples:
+      >>> import mjx_reinforce as mr
+      >>> from mjx_reinforce.learning.schedules import Schedule, look_further
+      >>> changing = Schedule(lambda used: mr.reward_to_go(look_further(0.9, 0.99, used)))
+      >>> learner = mr.reinforce(mr.envs.make("CartPole-v1"), estimator=changing)
+    """
+
+    at: Callable[[jax.Array], Any]
 
 
 class Cut(NamedTuple):
@@ -32,7 +49,7 @@ class Cut(NamedTuple):
       >>> import jax
       >>> import mjx_reinforce as mr
       >>> env = mr.envs.make("CartPole-v1")
-      >>> learner = mr.reinforce(env, horizon=100, cut=mr.Cut(steps=20, until=0.5))
+      >>> learner = mr.Cut(steps=20, until=0.5)(mr.reinforce(env, horizon=100))
       >>> state, metrics = learner.step(learner.init(jax.random.key(0)))
       >>> int(metrics["episode_length"]) <= 20
       True
@@ -41,17 +58,25 @@ class Cut(NamedTuple):
     steps: int
     until: float
 
-    def limit(self, progress: jax.Array, horizon: int) -> jax.Array:
+    def __call__(self, learner: Any) -> Any:
+        """Returns a learner of ``reinforce`` whose episodes of training are cut.
+
+        Raises:
+          ValueError: a number makes no sense.
+        """
+        check_count("cut.steps", self.steps)
+        check_number("cut.until", self.until)
+        if self.until > 1:
+            raise ValueError(f"cut.until must be a share of the budget in [0, 1], got {self.until}")
+
+        def play(state: Any, key: jax.Array, active: bool | jax.Array = True) -> Any:
+            return learner.play(state, key, active, limit=self.limit(state.progress))
+
+        return learner._replace(play=play)
+
+    def limit(self, progress: jax.Array) -> jax.Array:
         """Returns the most steps [] of an episode where this share [] of the budget is used."""
-        return jnp.where(progress < self.until, min(self.steps, horizon), horizon)
-
-
-def check_cut(cut: Cut) -> None:
-    """Raises ValueError for numbers that make no sense."""
-    check_count("cut.steps", cut.steps)
-    check_number("cut.until", cut.until)
-    if cut.until > 1:
-        raise ValueError(f"cut.until must be a share of the budget in [0, 1], got {cut.until}")
+        return jnp.where(progress < self.until, self.steps, jnp.iinfo(jnp.int32).max)
 
 
 class Clock(NamedTuple):

@@ -34,9 +34,7 @@ from mjx_reinforce.engine.play import choice
 from mjx_reinforce.engine.play.choice import Engine
 from mjx_reinforce.engine.play.rollouts import episode_returns
 from mjx_reinforce.learning import contract, diagnostics, normalize
-from mjx_reinforce.learning.actor import Actor, act
-from mjx_reinforce.learning.distributions.categorical import categorical
-from mjx_reinforce.learning.distributions.gaussian import deterministic
+from mjx_reinforce.learning.distributions import categorical, deterministic
 from mjx_reinforce.learning.estimators import replace_broken
 from mjx_reinforce.learning.learner import (
     Learner,
@@ -45,7 +43,8 @@ from mjx_reinforce.learning.learner import (
     episode_metrics,
     keep_finite,
 )
-from mjx_reinforce.learning.policy import Policy, mlp_policy
+from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy
+from mjx_reinforce.learning.updates import signal_to_noise
 
 
 def ars(
@@ -250,13 +249,13 @@ def _draw_directions(key: jax.Array, params: Params, num_directions: int) -> Any
 def _step_signal_to_noise(directions: Params, returns: jax.Array) -> jax.Array:
     """Returns the signal-to-noise ratio [] over all directions [D] of the mean step.
 
-    See ``diagnostics.signal_to_noise``; a direction's share is (r_plus - r_minus) delta. Where only
+    See ``signal_to_noise``; a direction's share is (r_plus - r_minus) delta. Where only
     the best directions count, the step is another, of which nothing is said.
     """
     difference = returns[0] - returns[1]
     each = jax.vmap(lambda r, delta: jax.tree.map(lambda x: r * x, delta))(difference, directions)
     mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
-    return diagnostics.signal_to_noise(mean, each, len(difference))
+    return signal_to_noise(mean, each, len(difference))
 
 
 def _join_rollouts(trajectory: Trajectory) -> Trajectory:

@@ -12,7 +12,7 @@ import numpy as np
 from mjx_reinforce import files
 from mjx_reinforce.export.policy_files import save_policy
 from mjx_reinforce.files import Arrays, write_arrays, write_bytes, write_json
-from mjx_reinforce.learning.actor import Actor
+from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.runs import sinks
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.sinks import Queue, open_sinks

@@ -18,8 +18,7 @@ from mjx_reinforce.export.player import Player
 from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.export.run_files import Which
 from mjx_reinforce.learning import counts
-from mjx_reinforce.learning.actor import Actor
-from mjx_reinforce.learning.policy import Policy
+from mjx_reinforce.learning.policy import Actor, Policy
 from mjx_reinforce.reports.curves import draw_learning_curve
 from mjx_reinforce.runs.directory import locked, make_directory, remove_empty
 from mjx_reinforce.runs.display import Display

@@ -1,7 +1,6 @@
 """From settings to a learner."""
 
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.engine.checks import check_kind, explain
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     from mjx_reinforce.learning.estimators import Estimator
     from mjx_reinforce.learning.learner import Learner
     from mjx_reinforce.learning.policy import Policy
+    from mjx_reinforce.learning.schedules import Schedule
     from mjx_reinforce.learning.updates import Update
 
 
@@ -63,7 +63,7 @@ def build(
         return _build_own(env, config, shared), horizon
     if config.algorithm == "ars":
         return _build_ars(env, config, shared), horizon
-    return _build_reinforce(env, config, {**shared, "devices": devices}), horizon
+    return _build_reinforce(env, config, shared, devices), horizon
 
 
 def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
@@ -89,31 +89,35 @@ def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
     }
 
 
-def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
+def _build_reinforce(
+    env: "Environment", config: Config, shared: dict[str, Any], devices: "Devices | None"
+) -> "Learner":
     from mjx_reinforce.console.streams import to_screen
     from mjx_reinforce.engine.play import available
-    from mjx_reinforce.learning.reinforce import reinforce
+    from mjx_reinforce.learning.learner import reinforce
     from mjx_reinforce.learning.schedules import Cut
+    from mjx_reinforce.training import hosting
 
     if config.engine in ("auto", "native") and (said := available.announcement(env)):
         to_screen(said)
-    cut = None
-    if config.train_horizon is not None and config.whole_after < 1:
-        cut = Cut(config.train_horizon, config.whole_after)
-    return reinforce(
+    learner = reinforce(
         env,
-        cut=cut,
         estimator=_build_estimator(config, shared["horizon"]),
         optimizer=_build_optimizer(config),
         update=_build_update(config, shared["policy"]),
         num_episodes=config.num_episodes,
         entropy_cost=config.entropy_cost,
-        loss_per=config.loss_per,
         max_kl=config.max_kl,
-        one_start=config.one_start,
-        num_seeds=config.num_seeds,
         **shared,
     )
+    cut = None
+    if config.train_horizon is not None and config.whole_after < 1:
+        cut = Cut(config.train_horizon, config.whole_after)
+    size = config.num_episodes, shared["horizon"]
+    learner = hosting.hosted(
+        learner, env, *size, cut=cut, devices=devices, one_start=config.one_start
+    )
+    return hosting.short_episodes(learner, size[1], config.num_seeds, cut.steps if cut else 0)
 
 
 def _build_ars(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
@@ -136,7 +140,7 @@ def _build_own(env: "Environment", config: Config, shared: dict[str, Any]) -> "L
 
     ``shared`` are the keywords that ``reinforce`` and ``ars`` have in common.
     """
-    from mjx_reinforce.learning.contract import check_learner
+    from mjx_reinforce.training.hosting import check_learner
 
     learner = _made_by_user("algorithm", config.algorithm, ALGORITHMS, env, config, **shared)
     check_learner(config.algorithm, learner)
@@ -154,16 +158,14 @@ def _made_by_user(
         raise ValueError(f"cannot build the {kind} {name!r}: {explain(error)}") from error
 
 
-def _build_estimator(
-    config: Config, horizon: int
-) -> "Estimator | Callable[[jax.Array], Estimator]":
-    """Returns an estimator; where its discount changes, a function from the used share to one."""
-    from mjx_reinforce.learning.schedules import look_further
+def _build_estimator(config: Config, horizon: int) -> "Estimator | Schedule":
+    """Returns an estimator, or a schedule of one where its discount changes."""
+    from mjx_reinforce.learning.schedules import Schedule, look_further
 
     first, last = config.discount, config.final_discount
     if last is None:
         return _estimator(config, horizon, first)
-    return lambda progress: _estimator(config, horizon, look_further(first, last, progress))
+    return Schedule(lambda used: _estimator(config, horizon, look_further(first, last, used)))
 
 
 def _estimator(config: Config, horizon: int, discount: "float | jax.Array") -> "Estimator":
@@ -194,7 +196,7 @@ def _build_value_baseline(
     import optax
 
     from mjx_reinforce.learning.policy import MLP
-    from mjx_reinforce.learning.value_baseline import full_batch_value_baseline, value_baseline
+    from mjx_reinforce.learning.value import full_batch_value_baseline, value_baseline
 
     shared = {
         "network": MLP(config.value_hidden_sizes, 1, initializer=config.initializer),
@@ -252,4 +254,5 @@ def _build_update(config: Config, policy: "Policy") -> "Update":
         )
     if config.update == "minibatches":
         return updates.minibatches(config.minibatch_updates, config.minibatch_size)
-    return updates.full_batch() if config.update == "full-batch" else updates.each_step()
+    chosen = updates.full_batch() if config.update == "full-batch" else updates.each_step()
+    return updates.per_step(chosen) if config.loss_per == "step" else chosen

@@ -25,7 +25,7 @@ from mjx_reinforce.engine.gpu import seam as gpu_seam
 from mjx_reinforce.engine.play import objects
 from mjx_reinforce.engine.play.available import made_for, platform
 from mjx_reinforce.envs.settings import split_words
-from mjx_reinforce.learning.actor import Actor
+from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import Config, marked
 from mjx_reinforce.settings.declare import Mark

@@ -14,7 +14,7 @@ import numpy as np
 from mjx_reinforce import files
 from mjx_reinforce.export.policy_files import actor_of, arrays_of, save_policy
 from mjx_reinforce.files import Arrays, read_arrays, write_arrays, write_bytes, write_json
-from mjx_reinforce.learning.actor import Actor
+from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.statistics import steps_to_solve
 from mjx_reinforce.sweeps import results
 from mjx_reinforce.sweeps.chunks import Runs

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from mjx_reinforce.learning import counts
-from mjx_reinforce.learning.learner import Guests, Learner, TrainState
+from mjx_reinforce.learning.learner import Learner, TrainState
 from mjx_reinforce.training.evaluation import measure
+from mjx_reinforce.training.hosting import Guests, step_with
 from mjx_reinforce.training.state import Budget, RunState
 
 #: Returns the learner of settings that may be traced, of one run each.
@@ -68,7 +69,7 @@ def block_of_updates(
         look: jax.Array,
     ) -> Any:
         guests = None if visit is None else visit(eval_key, look)
-        state, metrics, played = build_learner(settings).step_with(state, going, guests)
+        state, metrics, played = step_with(build_learner(settings), state, going, guests)
         looked = {} if guests is None or played is None else measure(played, guests)
         return state, metrics | {"active": going}, looked
 

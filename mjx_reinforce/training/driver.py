@@ -11,8 +11,8 @@ from flax import struct
 
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.learning import counts
-from mjx_reinforce.learning.actor import Actor
 from mjx_reinforce.learning.learner import TrainState
+from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.programs import Looked, RunPrograms

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from mjx_reinforce.engine.base import Environment, Trajectory
 from mjx_reinforce.engine.play.episode import episode_keys
 from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
-from mjx_reinforce.learning.actor import Actor
-from mjx_reinforce.learning.learner import Guests, Learner
+from mjx_reinforce.learning.learner import Learner
+from mjx_reinforce.learning.policy import Actor
+from mjx_reinforce.training.hosting import Guests
 
 
 def guests_of(

@@ -16,13 +16,14 @@ import numpy as np
 from mjx_reinforce.engine.base import Environment
 from mjx_reinforce.engine.devices import NONE, RUNS, SECOND
 from mjx_reinforce.files import Arrays
-from mjx_reinforce.learning.actor import Actor
-from mjx_reinforce.learning.learner import Guests, Host, TrainState
+from mjx_reinforce.learning.learner import TrainState
+from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import state
 from mjx_reinforce.training.block import Block, BuildLearner, block_of_updates
 from mjx_reinforce.training.division import ALONE, Division
 from mjx_reinforce.training.evaluation import evaluate, guests_of
+from mjx_reinforce.training.hosting import Guests, Host
 from mjx_reinforce.training.state import Budget, RunState, Seed
 
 

@@ -12,8 +12,8 @@ from flax import struct
 
 from mjx_reinforce.engine.base import PyTree, with_keys
 from mjx_reinforce.learning import counts
-from mjx_reinforce.learning.actor import Actor
 from mjx_reinforce.learning.learner import TrainState
+from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config, flag
 
 #: A root of randomness; traced inside of programs.

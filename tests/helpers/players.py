@@ -8,7 +8,7 @@ from mjx_reinforce import mlp_policy, normal
 from mjx_reinforce.engine import base
 from mjx_reinforce.engine.play import native, rollouts
 from mjx_reinforce.learning import normalize
-from mjx_reinforce.learning.actor import Actor
+from mjx_reinforce.learning.policy import Actor
 
 
 def actor_and_act(env, hidden_sizes, seed=0, distribution=None):

@@ -7,8 +7,8 @@ import numpy as np
 
 from experiments.kit.trainings import results
 from mjx_reinforce.export.policy_files import build_policy, save_policy
-from mjx_reinforce.learning.actor import Actor
 from mjx_reinforce.learning.normalize import Normalizer
+from mjx_reinforce.learning.policy import Actor
 
 SPACES = {
     "InvertedPendulum-v5": {

@@ -14,7 +14,7 @@ from toys import Survive, Target, categorical
 
 from mjx_reinforce import Box, Trajectory, mlp_policy, normal, reinforce, train_step
 from mjx_reinforce.learning import diagnostics, normalize, updates
-from mjx_reinforce.learning.actor import Actor
+from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.published.ars import ars
 
 BOX = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))
@@ -91,13 +91,13 @@ def test_the_estimated_kl_is_unbiased_and_never_negative():
 def test_the_noise_of_all_episodes_is_the_sample_variance_of_their_mean():
     each = np.random.default_rng(0).normal(size=(6, 3)) + 1
     mean = each.mean(axis=0)
-    got = diagnostics.signal_to_noise(jnp.asarray(mean), jnp.asarray(each), 6)
+    got = updates.signal_to_noise(jnp.asarray(mean), jnp.asarray(each), 6)
     noise = np.sum(np.var(each, axis=0, ddof=1)) / 6
     assert float(got) == pytest.approx((np.sum(mean**2) - noise) / noise, rel=1e-4)
 
 
 def test_the_noise_is_that_of_some_episodes_beside_the_mean_of_all():
-    """Of 65 episodes that of two; see ``diagnostics.signal_to_noise``."""
+    """Of 65 episodes that of two; see ``updates.signal_to_noise``."""
     mask = np.arange(5)[:, None] < np.random.default_rng(1).integers(1, 6, 65)
     problem = make_problem(optax.sgd(0.1), mask=mask)
     _, _, metrics = updates.full_batch()(problem, None, PARAMS, problem.optimizer.init(PARAMS))

@@ -12,8 +12,8 @@ from scipy import integrate, special, stats
 from mjx_reinforce import Box
 from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.base import Discrete
-from mjx_reinforce.learning.distributions import normal_integrals
-from mjx_reinforce.learning.distributions.gaussian import normal
+from mjx_reinforce.learning import normal_integrals
+from mjx_reinforce.learning.distributions import normal
 from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
 
 LOW, HIGH = -3.0, 1.0

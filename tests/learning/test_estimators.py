@@ -14,7 +14,7 @@ from mjx_reinforce import Trajectory, reinforce
 from mjx_reinforce.learning import estimators as est
 from mjx_reinforce.learning.estimators import discounted_returns
 from mjx_reinforce.learning.policy import MLP
-from mjx_reinforce.learning.value_baseline import full_batch_value_baseline, value_baseline
+from mjx_reinforce.learning.value import full_batch_value_baseline, value_baseline
 from mjx_reinforce.registry import ESTIMATORS, load_definition
 
 LENGTHS = np.array([4, 1, 3])

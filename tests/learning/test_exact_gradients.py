@@ -16,7 +16,7 @@ from toys import Chain, tabular_policy
 from mjx_reinforce import Trajectory, reinforce
 from mjx_reinforce.learning import estimators as est
 from mjx_reinforce.learning.policy import MLP
-from mjx_reinforce.learning.value_baseline import full_batch_value_baseline, value_baseline
+from mjx_reinforce.learning.value import full_batch_value_baseline, value_baseline
 
 #: How likely each state, or the end, follows a state and an action; and what these earn.
 NEXT = np.array(

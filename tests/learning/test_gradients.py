@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.learning.gradients import accumulate_gradient
+from mjx_reinforce.learning.updates import accumulate_gradient
 
 
 def loss(params, chunk):

@@ -17,7 +17,8 @@ from mjx_reinforce.engine.play import available
 from mjx_reinforce.learning import counts, estimators, updates
 from mjx_reinforce.learning import learner as learner_module
 from mjx_reinforce.learning.estimators import discounted_returns
-from mjx_reinforce.learning.value_baseline import value_baseline
+from mjx_reinforce.learning.value import value_baseline
+from mjx_reinforce.training import hosting
 
 
 @functools.cache
@@ -111,8 +112,8 @@ def test_no_key_is_used_twice():
             num_episodes=4,
             estimator=value_baseline(0.5),
             update=updates.minibatches(2, 8),
-            one_start=True,
         )
+        learner = hosting.hosted(learner, Survive(), 4, Survive.max_episode_steps, one_start=True)
         state = jax.jit(learner.init)(jax.random.key(0))
         state, _ = train_step(learner, state)
         train_step(learner, state)
@@ -128,7 +129,9 @@ class Scattered(Survive):
 @pytest.mark.slow
 @pytest.mark.parametrize("one_start", [True, False])
 def test_one_start_is_a_seeds_own_and_stays(one_start):
-    learner = reinforce(Scattered(), num_episodes=4, one_start=one_start)
+    learner = reinforce(Scattered(), num_episodes=4)
+    horizon = Scattered.max_episode_steps
+    learner = hosting.hosted(learner, Scattered(), 4, horizon, one_start=one_start)
     states = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 3))
     play = jax.jit(jax.vmap(learner.play))
     played = [play(states, jax.random.split(jax.random.key(update), 3)) for update in (1, 2)]
@@ -204,15 +207,10 @@ def test_short_episodes_are_learned_from_in_short(length, update, monkeypatch):
 
     learned, branches = [], []
     for many in (2 * 3 * 400, 2 * 3 * 400 + 1):
-        monkeypatch.setattr("mjx_reinforce.learning.reinforce._MANY", many)
-        learner = reinforce(
-            Ends(),
-            num_episodes=3,
-            update=update,
-            optimizer=optax.sgd(1.0),
-            num_seeds=2,
-            engine="vmap",
-        )
+        monkeypatch.setattr(hosting, "_MANY", many)
+        settings = {"update": update, "optimizer": optax.sgd(1.0), "engine": "vmap"}
+        learner = reinforce(Ends(), num_episodes=3, **settings)
+        learner = hosting.short_episodes(learner, Ends.max_episode_steps, num_seeds=2)
         seeds = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 2))
         program = jax.jit(jax.vmap(learner.step)).lower(seeds)
         branches.append("stablehlo.case" in program.as_text())
@@ -228,10 +226,11 @@ def test_episodes_are_cut_until_a_share_of_the_budget_is_used(engine, short_apar
     """An update learns what one does whose episodes all have that horizon."""
     if engine == "native" and (reason := available.unavailable()):
         pytest.skip(reason)
-    monkeypatch.setattr("mjx_reinforce.learning.reinforce._MANY", 0 if short_apart else 2**31)
+    monkeypatch.setattr(hosting, "_MANY", 0 if short_apart else 2**31)
     settings = {"num_episodes": 8, "engine": engine}
     settings["policy"] = mlp_policy(2, normal(Drifting.action_space), ())
-    cut = reinforce(Drifting(), horizon=100, cut=Cut(steps=50, until=0.5), **settings)
+    cut = hosting.short_episodes(reinforce(Drifting(), horizon=100, **settings), 100, 1, 50)
+    cut = Cut(steps=50, until=0.5)(cut)
     steps = {x: jax.jit(reinforce(Drifting(), horizon=x, **settings).step) for x in (50, 100)}
     first, cut = cut.init(jax.random.key(0)), jax.jit(cut.step)
     played = {}
@@ -253,15 +252,25 @@ def test_episodes_are_cut_until_a_share_of_the_budget_is_used(engine, short_apar
     ("settings", "said"),
     [
         ({"horizon": 0}, "horizon must be at least one"),
-        ({"loss_per": "batch"}, "'episode' or 'step'"),
-        ({"cut": Cut(0, 0.5)}, "cut.steps must be at least 1, got 0"),
-        ({"cut": Cut(5, 1.5)}, r"cut.until must be a share of the budget in \[0, 1\], got 1.5"),
-        ({"cut": Cut(5, -0.1)}, "cut.until must be 0 or more and finite, got -0.1"),
+        ({"estimator": lambda used: estimators.reward_to_go()}, "estimator must be of type"),
     ],
 )
 def test_nonsense_is_refused(settings, said):
     with pytest.raises(ValueError, match=said):
         reinforce(Survive(), **settings)
+
+
+@pytest.mark.parametrize(
+    ("cut", "said"),
+    [
+        (Cut(0, 0.5), "cut.steps must be at least 1, got 0"),
+        (Cut(5, 1.5), r"cut.until must be a share of the budget in \[0, 1\], got 1.5"),
+        (Cut(5, -0.1), "cut.until must be 0 or more and finite, got -0.1"),
+    ],
+)
+def test_a_cut_that_makes_no_sense_is_refused(cut, said):
+    with pytest.raises(ValueError, match=said):
+        cut(reinforce(Survive()))
 
 
 @pytest.mark.slow

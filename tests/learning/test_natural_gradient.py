@@ -15,10 +15,8 @@ from mjx_reinforce import mlp_policy, natural_gradient, reinforce
 from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.learning import natural_gradient as module
 from mjx_reinforce.learning import schedules
-from mjx_reinforce.learning.distributions.bounded import tanh_normal
-from mjx_reinforce.learning.distributions.categorical import categorical
-from mjx_reinforce.learning.distributions.gaussian import normal
-from mjx_reinforce.learning.reinforce import _surrogate
+from mjx_reinforce.learning.distributions import categorical, normal, tanh_normal
+from mjx_reinforce.learning.learner import _surrogate
 from mjx_reinforce.learning.updates import Problem, full_batch
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.store.build import _build_optimizer

@@ -9,8 +9,7 @@ import pytest
 from mjx_reinforce import Box, mlp_policy, normal
 from mjx_reinforce.engine.base import Discrete
 from mjx_reinforce.export import policy_files as checkpoint
-from mjx_reinforce.learning.distributions.categorical import categorical
-from mjx_reinforce.learning.distributions.gaussian import normal_softplus
+from mjx_reinforce.learning.distributions import categorical, normal_softplus
 from mjx_reinforce.learning.policy import MLP
 
 SPACE = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))

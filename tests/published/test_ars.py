@@ -10,7 +10,7 @@ from toys import Chain, SignedTarget, Survive, Target, Tempting
 from mjx_reinforce import evaluate, mlp_policy, rollout, train_step
 from mjx_reinforce.engine.base import Discrete
 from mjx_reinforce.learning import counts, normalize
-from mjx_reinforce.learning.distributions.gaussian import deterministic
+from mjx_reinforce.learning.distributions import deterministic
 from mjx_reinforce.published import ars as ars_module
 from mjx_reinforce.published.ars import ars, document_increment
 

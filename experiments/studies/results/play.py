@@ -65,7 +65,7 @@ def own_simulation(run: Run, player: Player, num_episodes: int) -> Any:
 
     from mjx_reinforce.engine.play import choice
     from mjx_reinforce.engine.play.rollouts import episode_returns
-    from mjx_reinforce.learning.actor import act
+    from mjx_reinforce.learning.policy import act
 
     env, policy = envs.make(run.env), player.policy
     whose = choice.ActingPolicy(functools.partial(act, policy), player.actor, policy.distribution)

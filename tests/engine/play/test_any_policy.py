@@ -11,7 +11,7 @@ from toys import Drifting
 
 from mjx_reinforce import Box, Discrete, make_vec, normal, rollout, unroll
 from mjx_reinforce.engine.play import any_policy, choice
-from mjx_reinforce.learning.distributions.categorical import categorical
+from mjx_reinforce.learning.distributions import categorical
 
 KEY = jax.random.key(0)
 

@@ -1,0 +1,600 @@
+"""Distributions of actions, whose parameters a policy network computes from the observation.
+
+A distribution is a tuple of pure functions. ``outputs`` [..., K] holds its parameters: first
+``num_outputs`` entries that the network computes, then one for each of ``constants``, which are
+trained and the same for all observations. Sampling has two steps, ``noise`` and ``sample``: the
+noise depends on the key alone, so that every engine gets the same actions from the same key.
+
+A family is one function of the action space, ``initial_std`` (the standard deviation before
+training, in the action's unit) and ``rescale`` (whether the network's output is scaled to the
+action's range). It raises ValueError for a space that it does not support.
+
+All Gaussian families are one: an independent Normal in each entry of the action, and what is done
+to a sample of it. ``normal`` leaves it, ``clipped_normal``, ``tanh_normal`` and
+``truncated_normal`` keep it within the action's range.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from mjx_reinforce.engine.base import Box, Discrete
+from mjx_reinforce.engine.checks import check_number, known_number
+from mjx_reinforce.learning import normal_integrals
+from mjx_reinforce.learning.normal_integrals import LOG_SQRT_2PI, log_tail
+
+_MIN_STD = 1e-6
+# float32 cannot recover a z much beyond the first number from tanh(z). Samples beyond it are all
+# recorded as the second.
+_SATURATED, _SATURATION = 5.0, 6.0
+
+
+class Distribution(NamedTuple):
+    """A family of distributions over actions.
+
+    Attributes:
+      num_outputs: entries of ``outputs`` that the network computes
+      constants: [K - num_outputs] initial values of the entries that are the same in every state
+      noise: (key, shape) -> [*shape, E] the noise that ``sample`` transforms; consumes the key
+      sample: (outputs [..., K], noise [..., E]) -> action [..., A]; discrete: int32 [...]
+      mode: (outputs [..., K]) -> action like ``sample``, the deterministic policy
+      log_prob: (outputs [..., K], action [..., A]) -> [...], summed over entries
+      entropy: (outputs [..., K]) -> [...], in nats
+      num_scales: how many of ``num_outputs``, counted from the last, determine the width
+        of the distribution; a second network may compute them
+      std: (outputs [..., K]) -> [..., A] the standard deviation in the action's unit, before what
+        the family does to keep actions in their range; None where there is none
+      kl: (outputs, other outputs) -> [...] the divergence KL(first || second) in nats, if known
+      fisher: (constants [K - num_outputs]) -> [K] the diagonal of the Fisher matrix in ``outputs``,
+        of a family in which it is diagonal and depends on these alone; else None
+
+    Examples:
+      >>> import jax, jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> family = mr.categorical(mr.Discrete(3))
+      >>> noise = family.noise(jax.random.key(0), (5,))
+      >>> family.sample(jnp.zeros((5, 3)), noise).shape
+      (5,)
+    """
+
+    num_outputs: int
+    constants: tuple[float, ...]
+    noise: Callable[[jax.Array, tuple[int, ...]], jax.Array]
+    sample: Callable[[jax.Array, jax.Array], jax.Array]
+    mode: Callable[[jax.Array], jax.Array]
+    log_prob: Callable[[jax.Array, jax.Array], jax.Array]
+    entropy: Callable[[jax.Array], jax.Array]
+    num_scales: int = 0
+    std: Callable[[jax.Array], jax.Array] | None = None
+    kl: Callable[[jax.Array, jax.Array], jax.Array] | None = None
+    fisher: Callable[[jax.Array], jax.Array] | None = None
+
+    def __repr__(self) -> str:
+        return f"Distribution({self.num_outputs} outputs, {len(self.constants)} constants)"
+
+
+def default_distribution(space: Box | Discrete) -> Distribution:
+    """Returns a Normal with a trained std, or a categorical distribution if discrete."""
+    return categorical(space) if isinstance(space, Discrete) else normal(space)
+
+
+def normal(
+    space: Box | Discrete,
+    *,
+    std: str = "parameter",
+    initial_std: float = 0.5,
+    rescale: bool = True,
+) -> Distribution:
+    """An independent Normal in each entry, unbounded.
+
+    The mean is the middle of the action's range plus half the range times the
+    network's output, so that outputs between -1 and 1 cover the range; in an unbounded
+    entry the mean is the output itself. Samples may fall outside the bounds, and the
+    environment decides what then happens (MuJoCo clamps them in the actuator).
+
+    Args:
+      space: the action bounds, [A] each.
+      std: "parameter" for one trained log-std an entry, the same in all states
+        (Schulman et al. 2015, arXiv:1502.05477); "softplus" for log(1 + exp(o))
+        of a second network output (Gymnasium's REINFORCE tutorial); "sigmoid" for
+        1 / (1 + exp(-o)), which stays below 1.
+      initial_std: the standard deviation before training, in the action's unit.
+      rescale: False takes the network's output as the mean itself.
+
+    Returns:
+      The distribution, with A ("parameter") or 2A network outputs.
+
+    Raises:
+      ValueError: the space is discrete, ``std`` is unknown, or ``initial_std`` is
+        not positive or, for "sigmoid", not below 1.
+
+    Examples:
+      >>> import jax.numpy as jnp, numpy as np
+      >>> import mjx_reinforce as mr
+      >>> family = mr.normal(mr.Box(-np.ones(2), np.ones(2)))
+      >>> outputs = jnp.append(jnp.zeros(2), jnp.asarray(family.constants))
+      >>> family.mode(outputs).tolist(), family.log_prob(outputs, jnp.zeros(2)).shape
+      ([0.0, 0.0], ())
+    """
+    layout = gaussian_outputs("normal", space, std, initial_std, rescale)
+
+    def kl(outputs, others):
+        return jnp.sum(normal_kl(*layout.split(outputs), *layout.split(others)), axis=-1)
+
+    def fisher(constants):
+        return jnp.concatenate([(layout.half * jnp.exp(-constants)) ** 2, 2.0 + 0.0 * constants])
+
+    family = layout.family(
+        sample=lambda noise, mean, std: mean + std * noise,
+        mode=lambda mean: mean,
+        log_density=normal_log_density,
+        entropy=lambda mean, std: normal_entropy(std),
+    )
+    return family._replace(kl=kl, fisher=fisher if std == "parameter" else None)
+
+
+def normal_softplus(
+    space: Box | Discrete, *, initial_std: float = 0.5, rescale: bool = True
+) -> Distribution:
+    """``normal`` with a state-dependent softplus standard deviation."""
+    return normal(space, std="softplus", initial_std=initial_std, rescale=rescale)
+
+
+def normal_sigmoid(
+    space: Box | Discrete, *, initial_std: float = 0.5, rescale: bool = True
+) -> Distribution:
+    """``normal`` with a state-dependent sigmoid standard deviation, below 1."""
+    return normal(space, std="sigmoid", initial_std=initial_std, rescale=rescale)
+
+
+def clipped_normal(
+    space: Box | Discrete,
+    *,
+    std: str = "parameter",
+    initial_std: float = 0.5,
+    rescale: bool = True,
+) -> Distribution:
+    """``normal``, clipped to the action's range, which must be finite.
+
+    The environment sees only the clipped action, so ``log_prob`` is the log of that
+    action's probability: the Normal's density inside the range, and at a bound the
+    probability of everything that is clipped to it. The gradient has the same mean as
+    that of ``normal`` and less variance (Fujita and Maeda 2018, arXiv:1802.07564,
+    equation 8). ``entropy`` is that of the clipped action, -E[log_prob].
+
+    Examples:
+      >>> import numpy as np
+      >>> import mjx_reinforce as mr
+      >>> mr.clipped_normal(mr.Box(-np.ones(2), np.ones(2)))
+      Distribution(2 outputs, 2 constants)
+    """
+    layout = gaussian_outputs("clipped-normal", space, std, initial_std, rescale, bounded=True)
+
+    def log_density(action, mean, std):
+        low, high = layout.bounds(mean)
+        inside = normal_log_density(action, mean, std)
+        below, above = log_tail((mean - low) / std), log_tail((high - mean) / std)
+        return jnp.where(action <= low, below, jnp.where(action >= high, above, inside))
+
+    return layout.family(
+        sample=lambda noise, mean, std: jnp.clip(mean + std * noise, *layout.bounds(mean)),
+        mode=lambda mean: jnp.clip(mean, *layout.bounds(mean)),
+        log_density=log_density,
+        entropy=lambda mean, std: _clipped_entropy(mean, std, *layout.bounds(mean)),
+    )
+
+
+def _clipped_entropy(mean: jax.Array, std: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Returns the entropy [...] of a clipped Normal in nats, entry by entry.
+
+    Inside the range -log_prob is x^2 / 2 + log(std sqrt(2 pi)) with x = (action - mean) / std.
+    With a and b the bounds in this unit, phi the standard Normal's density and P the probability
+    of [a, b], the integral of x^2 phi(x) from a to b is P + a phi(a) - b phi(b). Each bound adds
+    -p log p, with p the probability of what is clipped to it.
+    """
+    a, b = (low - mean) / std, (high - mean) / std
+    log_below, log_above = log_tail(-a), log_tail(b)
+    below, above = jnp.exp(log_below), jnp.exp(log_above)
+    edges = b * jnp.exp(-0.5 * b**2 - LOG_SQRT_2PI) - a * jnp.exp(-0.5 * a**2 - LOG_SQRT_2PI)
+    inside = (1.0 - below - above) * normal_entropy(std) - 0.5 * edges
+    return inside - below * log_below - above * log_above
+
+
+def tanh_normal(
+    space: Box | Discrete,
+    *,
+    std: str = "parameter",
+    initial_std: float = 0.5,
+    rescale: bool = True,
+) -> Distribution:
+    """``normal`` through a tanh into the action's finite range (Haarnoja et al. 2018, appendix C).
+
+    The action is middle + half tanh(z), where middle + half z is a sample of ``normal``:
+    a small deviation from the middle is hardly changed. ``log_prob`` recovers z from the
+    action, to a thousandth of a standard unit up to |z| = 5, which is within 5e-5 of the
+    range from a bound. Samples beyond are all recorded as z = 6 or -6 and counted with
+    the probability of that whole tail, so the expected score is zero however far the
+    policy saturates.
+
+    ``mode`` is the tanh of the mean: the median, as is usual, not the densest point.
+    ``entropy`` is exact to 1e-7 nats up to a standard deviation of 1 in z, 3e-3 at 3.
+
+    Examples:
+      >>> import numpy as np
+      >>> import mjx_reinforce as mr
+      >>> mr.tanh_normal(mr.Box(-np.ones(2), np.ones(2)))
+      Distribution(2 outputs, 2 constants)
+    """
+    layout = gaussian_outputs("tanh-normal", space, std, initial_std, rescale, bounded=True)
+    middle, half = middle_and_half_range(layout.box)
+
+    def of_z(mean, std):
+        return (mean - middle) / half, std / half
+
+    def sample(noise, mean, std):
+        mean, std = of_z(mean, std)
+        z = mean + std * noise
+        return middle + half * jnp.tanh(
+            jnp.where(jnp.abs(z) < _SATURATED, z, jnp.sign(z) * _SATURATION)
+        )
+
+    return layout.family(
+        sample=sample,
+        mode=lambda mean: middle + half * jnp.tanh((mean - middle) / half),
+        log_density=lambda action, mean, std: _tanh_log_density(
+            (action - middle) / half, *of_z(mean, std), half
+        ),
+        entropy=lambda mean, std: _tanh_entropy(*of_z(mean, std), half),
+    )
+
+
+def _tanh_log_density(
+    squashed: jax.Array, mean: jax.Array, std: jax.Array, half: np.ndarray
+) -> jax.Array:
+    """Returns the log-probability [..., A] of half tanh(z), where z is Normal.
+
+    Args:
+      squashed: [..., A] tanh(z).
+      mean: [..., A] of z.
+      std: [..., A] of z.
+      half: [A] half the width of the action's range.
+    """
+    saturated = jnp.abs(squashed) > 0.5 * (np.tanh(_SATURATED) + np.tanh(_SATURATION))
+    z = jnp.arctanh(jnp.where(saturated, 0.0, squashed))
+    inside = normal_log_density(z, mean, std) - _log_tanh_slope(z) - np.log(half)
+    beyond = log_tail((_SATURATED - jnp.sign(squashed) * mean) / std)
+    return jnp.where(saturated, beyond, inside)
+
+
+def _tanh_entropy(mean: jax.Array, std: jax.Array, half: np.ndarray) -> jax.Array:
+    """Returns the differential entropy [..., A] in nats of half tanh(z), arguments as above.
+
+    It is the entropy of z plus E[log(1 - tanh(z)^2)] + log(half), the expectation by
+    Gauss-Hermite quadrature.
+    """
+    nodes, weights = np.polynomial.hermite_e.hermegauss(32)
+    rule = zip(nodes.tolist(), (weights / np.sum(weights)).tolist(), strict=True)
+    slopes = [weight * _log_tanh_slope(mean + std * node) for node, weight in rule]
+    return normal_entropy(std) + sum(slopes) + np.log(half)
+
+
+def _log_tanh_slope(z: jax.Array) -> jax.Array:
+    """Returns log(1 - tanh(z)^2) [...] without cancellation."""
+    return 2.0 * (float(np.log(2.0)) - z - jax.nn.softplus(-2.0 * z))
+
+
+def truncated_normal(
+    space: Box | Discrete,
+    *,
+    std: str = "parameter",
+    initial_std: float = 0.5,
+    rescale: bool = True,
+) -> Distribution:
+    """``normal``, restricted to the action's range, which must be finite.
+
+    Density, entropy and their gradients stay exact when the mean is far outside the range, and so
+    does the sampling, by the inverse distribution function; see ``normal_integrals``. The noise is
+    uniform in (0, 1).
+
+    Examples:
+      >>> import numpy as np
+      >>> import mjx_reinforce as mr
+      >>> mr.truncated_normal(mr.Box(-np.ones(2), np.ones(2)))
+      Distribution(2 outputs, 2 constants)
+    """
+    layout = gaussian_outputs("truncated-normal", space, std, initial_std, rescale, bounded=True)
+
+    def restricted(function):
+        """Returns a function that is given the bounds after its other arguments."""
+        return lambda *given: function(*given, *layout.bounds(given[-1]))
+
+    return layout.family(
+        sample=restricted(normal_integrals.transform),
+        mode=restricted(jnp.clip),
+        log_density=restricted(normal_integrals.log_density),
+        entropy=restricted(normal_integrals.entropy),
+        noise=_open_uniform,
+    )
+
+
+def _open_uniform(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+    """Returns uniform noise that is never 0 or 1.
+
+    The generator returns multiples of the dtype's epsilon, 0 among them; half an
+    epsilon is added.
+    """
+    noise = jax.random.uniform(key, shape)
+    return noise + 0.5 * jnp.finfo(noise.dtype).eps
+
+
+def deterministic(
+    space: Box | Discrete, *, initial_std: float | None = None, rescale: bool = True
+) -> Distribution:
+    """A single point: the action is the network's output, rescaled like the mean of ``normal``.
+
+    It is for methods that need no likelihood, such as ``ars``: ``log_prob`` raises ValueError.
+
+    Examples:
+      >>> import jax.numpy as jnp, numpy as np
+      >>> import mjx_reinforce as mr
+      >>> family = mr.deterministic(mr.Box(-2 * np.ones(1), 2 * np.ones(1)))
+      >>> family.mode(jnp.ones(1)).tolist()  # 1 is the end of the range
+      [2.0]
+    """
+    del initial_std
+    layout = gaussian_outputs("deterministic", space, "parameter", 1.0, rescale)
+
+    def log_prob(outputs, action):
+        raise ValueError(
+            "a deterministic policy has no log-probability; choose a stochastic one for REINFORCE"
+        )
+
+    return Distribution(
+        num_outputs=layout.size,
+        constants=(),
+        noise=lambda key, shape: jnp.zeros((*shape, 1)),
+        sample=lambda outputs, noise: layout.mean(outputs),
+        mode=layout.mean,
+        log_prob=log_prob,
+        entropy=lambda outputs: jnp.zeros(outputs.shape[:-1], outputs.dtype),
+    )
+
+
+def categorical(
+    space: Box | Discrete, *, initial_std: float | None = None, rescale: bool = True
+) -> Distribution:
+    """A softmax over the actions of a discrete space; an action is an int32 [...].
+
+    The noise is Gumbel. The sample is the action with the greatest sum of logit and
+    noise (Maddison et al. 2014, "A* sampling"). The network has an output for each action.
+
+    Examples:
+      >>> import jax.numpy as jnp
+      >>> import mjx_reinforce as mr
+      >>> family = mr.categorical(mr.Discrete(2))
+      >>> family.mode(jnp.asarray([0.0, 1.0])).item()
+      1
+    """
+    del initial_std, rescale
+    check_space("categorical", space)
+    if not isinstance(space, Discrete):
+        raise ValueError(
+            "categorical needs a discrete action space, this one is continuous; choose normal"
+        )
+    size = space.num_actions
+
+    def greatest(scores):
+        return jnp.argmax(scores, axis=-1).astype(jnp.int32)
+
+    def log_prob(outputs, action):
+        chosen = jnp.arange(size) == action[..., None]
+        return jnp.sum(jnp.where(chosen, jax.nn.log_softmax(outputs), 0.0), axis=-1)
+
+    def entropy(outputs):
+        log_probs = jax.nn.log_softmax(outputs)
+        return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
+
+    def kl(outputs, others):
+        log_probs = jax.nn.log_softmax(outputs)
+        apart = log_probs - jax.nn.log_softmax(others)
+        return jnp.sum(jnp.exp(log_probs) * apart, axis=-1)
+
+    return Distribution(
+        num_outputs=size,
+        constants=(),
+        noise=lambda key, shape: jax.random.gumbel(key, (*shape, size)),
+        sample=lambda outputs, noise: greatest(outputs + noise),
+        mode=greatest,
+        log_prob=log_prob,
+        entropy=entropy,
+        kl=kl,
+    )
+
+
+class GaussianOutputs(NamedTuple):
+    """Where the outputs hold the means and standard deviations of a family's Normals.
+
+    box: the action bounds, [A] each
+    std: "parameter", "softplus" or "sigmoid"
+    initial_std: the standard deviation before training
+    middle: [A] the mean where the network's output is 0
+    half: [A] what a network output of 1 adds to it
+    """
+
+    box: Box
+    std: str
+    initial_std: float | jax.Array
+    middle: np.ndarray
+    half: np.ndarray
+
+    @property
+    def size(self) -> int:
+        """A."""
+        return len(self.middle)
+
+    def bounds(self, like: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns the lower and upper bounds, [A] each, in the dtype of ``like``."""
+        return jnp.asarray(self.box.low, like.dtype), jnp.asarray(self.box.high, like.dtype)
+
+    def mean(self, outputs: jax.Array) -> jax.Array:
+        """Returns the means [..., A]."""
+        return outputs[..., : self.size] * self.half + self.middle
+
+    def split(self, outputs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns the means and standard deviations, [..., A] each."""
+        raw, initial = outputs[..., self.size :], self.initial_std
+        # A fresh network's outputs are near 0; the added constants make the std initial_std there.
+        if self.std == "parameter":
+            std = jnp.exp(raw)
+        elif self.std == "softplus":
+            std = jax.nn.softplus(raw + float(np.log(np.expm1(initial)))) + _MIN_STD
+        else:
+            std = jax.nn.sigmoid(raw + float(np.log(initial / (1.0 - initial)))) + _MIN_STD
+        return self.mean(outputs), std
+
+    def family(
+        self,
+        *,
+        sample: Callable[..., Any],
+        mode: Callable[..., Any],
+        log_density: Callable[..., Any],
+        entropy: Callable[..., Any],
+        noise: Callable[..., Any] = jax.random.normal,
+    ) -> Distribution:
+        """Returns the distribution of independent entries.
+
+        Args:
+          sample: (noise, mean, std) -> action, [..., A] each.
+          mode: (mean) -> action.
+          log_density: (action, mean, std) -> the log-probability of each entry.
+          entropy: (mean, std) -> that of each entry, in nats.
+          noise: (key, shape) -> what ``sample`` transforms.
+        """
+        constant = self.std == "parameter"
+        return Distribution(
+            num_outputs=self.size if constant else 2 * self.size,
+            constants=(_log(self.initial_std),) * self.size if constant else (),
+            noise=lambda key, shape: noise(key, (*shape, self.size)),
+            sample=lambda outputs, noise: sample(noise, *self.split(outputs)),
+            mode=lambda outputs: mode(self.mean(outputs)),
+            log_prob=lambda outputs, action: jnp.sum(
+                log_density(action, *self.split(outputs)), axis=-1
+            ),
+            entropy=lambda outputs: jnp.sum(entropy(*self.split(outputs)), axis=-1),
+            num_scales=0 if constant else self.size,
+            std=lambda outputs: self.split(outputs)[1],
+        )
+
+
+def gaussian_outputs(
+    name: str,
+    space: Box | Discrete,
+    std: str,
+    initial_std: float | jax.Array,
+    rescale: bool,
+    *,
+    bounded: bool = False,
+) -> GaussianOutputs:
+    """Checks the arguments of a Gaussian family and returns the layout of its outputs.
+
+    Args:
+      name: the family's name, for the messages.
+      space: the action bounds, [A] each.
+      std: "parameter", "softplus" or "sigmoid", as in ``normal``.
+      initial_std: the standard deviation before training, in the action's unit; for "parameter"
+        it may be traced, and is then taken on trust.
+      rescale: False takes the network's output as the mean itself.
+      bounded: whether the family needs finite bounds.
+
+    Raises:
+      ValueError: the space is discrete or not bounded, ``std`` is unknown, or ``initial_std`` is
+        not positive or, for "sigmoid", not below 1.
+    """
+    box = continuous_box(name, space, bounded=bounded)
+    if std not in ("parameter", "softplus", "sigmoid"):
+        raise ValueError(f"std must be 'parameter', 'softplus' or 'sigmoid', got {std!r}")
+    check_number("initial_std", initial_std, positive=True)
+    number = known_number(initial_std)
+    if std == "sigmoid" and number is not None and number >= 1:
+        raise ValueError(f"a sigmoid std stays below 1, got initial_std={number}")
+    middle, half = middle_and_half_range(box)
+    if not rescale:
+        middle, half = np.zeros_like(middle), np.ones_like(half)
+    return GaussianOutputs(box, std, initial_std, middle, half)
+
+
+def _log(x: ArrayLike) -> Any:
+    """Returns a logarithm, rounded once where the number is known."""
+    return jnp.log(x) if isinstance(x, jax.core.Tracer) else float(np.log(x))
+
+
+def normal_log_density(x: jax.Array, mean: jax.Array, std: jax.Array) -> jax.Array:
+    """Returns the log-density [...] of a Normal at ``x``, entry by entry."""
+    return -0.5 * ((x - mean) / std) ** 2 - jnp.log(std) - LOG_SQRT_2PI
+
+
+def normal_entropy(std: jax.Array) -> jax.Array:
+    """Returns the entropy [...] of a Normal in nats, entry by entry."""
+    return jnp.log(std) + 0.5 + LOG_SQRT_2PI
+
+
+def normal_kl(
+    mean: jax.Array, std: jax.Array, other_mean: jax.Array, other_std: jax.Array
+) -> jax.Array:
+    """Returns KL(Normal(mean, std) || Normal(other_mean, other_std)) [...] in nats.
+
+    That is log(q / p) + (p^2 + d^2) / (2 q^2) - 1/2 with the standard deviations p and q and the
+    means d apart, arranged so that nearly equal ones do not cancel.
+    """
+    log_ratio = jnp.log(std / other_std)
+    width = 0.5 * jnp.expm1(2.0 * log_ratio) - log_ratio
+    return width + 0.5 * ((mean - other_mean) / other_std) ** 2
+
+
+def check_space(name: str, space: Box | Discrete) -> None:
+    """Raises ValueError for what is no action space."""
+    if not isinstance(space, Box | Discrete):
+        raise ValueError(
+            f"{name} needs an action space, such as env.action_space, or mjx_reinforce.Box(low, "
+            f"high) with arrays [A], got a {type(space).__name__}"
+        )
+
+
+def continuous_box(name: str, space: Box | Discrete, *, bounded: bool = False) -> Box:
+    """Returns the action space if it is continuous.
+
+    Args:
+      name: the family's name, for the message.
+      space: the action space.
+      bounded: whether all its bounds must be finite.
+
+    Raises:
+      ValueError: the space is discrete, or an entry is unbounded.
+    """
+    check_space(name, space)
+    if not isinstance(space, Box):
+        raise ValueError(
+            f"{name} needs a continuous action space, this one is discrete; choose categorical"
+        )
+    if bounded and not np.all(np.isfinite(space.low) & np.isfinite(space.high)):
+        raise ValueError(
+            f"{name} needs finite action bounds, got {space}; "
+            "choose normal, or declare bounds in the environment's action_space"
+        )
+    return space
+
+
+def middle_and_half_range(space: Box) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the centre and half the width of each entry's range, [A] each.
+
+    They are 0 and 1 for an entry that is not bounded on both sides.
+    """
+    low, high = np.asarray(space.low, np.float32), np.asarray(space.high, np.float32)
+    bounded = np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(bounded, low, -1.0), np.where(bounded, high, 1.0)
+    return (low + high) / 2, (high - low) / 2
