@@ -42,6 +42,7 @@ def advance(monkeypatch):
 
     def run(each, budget, look=False, visit=None, begun=0):
         monkeypatch.setattr(block, "measure", lambda played, guests: {"seen": guests})
+        monkeypatch.setattr(block, "step_with", Counter.step_with)
         num = len(each)
         none = jnp.stack([jnp.asarray(counts.from_int(begun))] * num)
         states = RunState(
