@@ -13,7 +13,7 @@ from mjx_reinforce.envs.base import MujocoEnv
 from mjx_reinforce.envs.in_mujoco import InMujoco
 from mjx_reinforce.export.player import Player
 from mjx_reinforce.learning import normalize
-from mjx_reinforce.learning.actor import Actor
+from mjx_reinforce.learning.policy import Actor
 
 MODEL = """<mujoco><option timestep="0.01"/><worldbody>
     <body><joint name="x" type="slide" axis="1 0 0"/><geom size="0.05"/></body></worldbody>
