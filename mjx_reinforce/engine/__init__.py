@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mjx_reinforce.engine.base import Discrete as Discrete
     from mjx_reinforce.engine.base import Environment as Environment
     from mjx_reinforce.engine.base import Trajectory as Trajectory
+    from mjx_reinforce.engine.cache import Cache as Cache
     from mjx_reinforce.engine.devices import Devices as Devices
     from mjx_reinforce.engine.play.any_policy import rollout as rollout
     from mjx_reinforce.engine.play.choice import Engine as Engine
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 #: Module -> its public names.
 _NAMES = {
     "base": ("Act", "Acts", "Box", "Discrete", "Environment", "Trajectory"),
+    "cache": ("Cache",),
     "devices": ("Devices",),
     "play.any_policy": ("rollout",),
     "play.choice": ("Engine", "choose"),

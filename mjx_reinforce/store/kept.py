@@ -10,20 +10,15 @@ import dataclasses
 import hashlib
 import importlib
 import json
-import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
-from jax import export
 
 from mjx_reinforce import envs
 from mjx_reinforce.engine.base import PyTree, is_key, plain
-from mjx_reinforce.engine.cpu import seam
-from mjx_reinforce.engine.gpu import seam as gpu_seam
-from mjx_reinforce.engine.play import objects
-from mjx_reinforce.engine.play.available import made_for, platform
+from mjx_reinforce.engine.cache import Cache
 from mjx_reinforce.envs.settings import split_words
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.registry import is_own
@@ -42,17 +37,14 @@ _PROGRAMS = ("begin", "advance", "evaluate")
 def key_of(config: Config) -> str | None:
     """Returns a name for all that the programs of a run depend on.
 
-    None where nothing is kept: on what is neither a CPU nor a GPU, of code or a model of the
-    user's, and where JAX is to look for NaNs or kernels are to be described, neither of which is
-    possible in a program that is not traced.
+    None where nothing is kept: where ``Cache.find`` finds no place, and of code or a model of the
+    user's.
     """
-    looks = any(jax.config.values[name] for name in ("jax_debug_nans", "jax_debug_infs"))
+    cache = Cache.find()
     own = not envs.is_ours(config.env) or any(is_own(getattr(config, name)) for name in CODE)
-    if looks or objects.is_described() or objects.folder() is None or own:
+    if cache is None or own:
         return None
     if "xml_file" in split_words(config.env_set):  # the file may change
-        return None
-    if platform() not in ("cpu", "gpu"):
         return None
     made_by = provenance()
     del made_by["git_commit"]  # the sources say it better
@@ -61,12 +53,9 @@ def key_of(config: Config) -> str | None:
     settings = {k: v for k, v in recordable(config).items() if k not in inputs}
     known = {
         "settings": settings | {"block": config.block_length},
-        "sources": objects.source_digest("mjx_reinforce"),
+        "engine": cache.made_by("mjx_reinforce"),
         "made_by": made_by,
         "numpy": version("numpy"),
-        "machine_code": made_for() if config.engine in ("auto", "native") else "",
-        "jax": {name: str(value) for name, value in jax.config.values.items()},
-        "variables": {k: v for k, v in os.environ.items() if k.startswith(("JAX_", "XLA_"))},
     }
     return hashlib.sha256(json.dumps(known, sort_keys=True).encode()).hexdigest()
 
@@ -81,12 +70,14 @@ def keep(key: str, facts: dict[str, Any], programs: Programs) -> Programs:
       facts: what else a run needs, in JSON's types.
       programs: of the run.
     """
-    like = programs.like
+    like, cache = programs.like, Cache.find()
+    if cache is None:
+        return programs
     try:
         whole = {"facts": facts, "like": describe_tree(like), "rides": programs.rides}
     except TypeError:
         return programs
-    _write_program(key, "facts", json.dumps(whole).encode())
+    cache.write(f"{key}-facts", json.dumps(whole).encode())
     leaves = jax.tree.leaves(jax.eval_shape(plain, like))
     actor, keys = jax.tree.leaves(like.train_states.actor), jax.eval_shape(plain, like.eval_keys)
     seed, numbers, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), keys.shape[:1], (2,)))
@@ -98,7 +89,7 @@ def keep(key: str, facts: dict[str, Any], programs: Programs) -> Programs:
     flat = _on_leaves(programs)
 
     def load(name: str) -> Callable[..., Any]:
-        return _export(key, name, flat[name], given[name])
+        return cache.keep(f"{key}-{name}", flat[name], given[name])
 
     kept = _on_states(load, like, programs.rides)
     return kept._replace(division=programs.division)
@@ -106,17 +97,17 @@ def keep(key: str, facts: dict[str, Any], programs: Programs) -> Programs:
 
 def read_programs(key: str) -> tuple[dict[str, Any], Programs] | None:
     """Returns the facts and the programs of a run; None unless all of them are on disk."""
-    read = {name: _read_program(key, name) for name in ("facts", *_PROGRAMS)}
-    found = {name: content for name, content in read.items() if content is not None}
-    if len(found) < len(read) or not all(map(_restore, found.values())):
+    cache = Cache.find()
+    facts = None if cache is None else cache.read(f"{key}-facts")
+    if cache is None or facts is None:
         return None
-    whole = json.loads(found["facts"])
+    found = {name: cache.load(f"{key}-{name}") for name in _PROGRAMS}
+    loaded = {name: program for name, program in found.items() if program is not None}
+    if len(loaded) < len(found):
+        return None
+    whole = json.loads(facts)
     like = rebuild(whole["like"])
-    return whole["facts"], _on_states(lambda name: _program(found[name]), like, whole["rides"])
-
-
-def _restore(program: bytes) -> bool:
-    return seam.restore(program) and gpu_seam.restore(program)
+    return whole["facts"], _on_states(loaded.__getitem__, like, whole["rides"])
 
 
 def _on_leaves(programs: Programs) -> dict[str, Callable[..., Any]]:
@@ -156,38 +147,6 @@ def _on_states(load: Callable[[str], Callable[..., Any]], like: RunState, rides:
         return load("evaluate")(jax.tree.leaves(actor), plain(keys))
 
     return Programs(begin, advance, evaluate, rides, like)
-
-
-def _program(content: bytes) -> Callable[..., Any]:
-    return export.deserialize(bytearray(content)).call
-
-
-def _export(
-    key: str, name: str, program: Callable[..., Any], given: tuple[Any, ...]
-) -> Callable[..., Any]:
-    """Returns a program as it is kept, or as it was where JAX cannot export it."""
-    names = (*seam.targets(), *gpu_seam.targets())
-    unsafe = [export.DisabledSafetyCheck.custom_call(x) for x in names]
-    try:
-        exported = export.export(jax.jit(program), disabled_checks=unsafe)(*given)
-        # That list names all code in memory, also of other tasks; ``seam.restore`` would load it.
-        own = dataclasses.replace(exported, disabled_safety_checks=())
-        content = bytes(own.serialize())
-    except (ValueError, NotImplementedError):
-        return program
-    _write_program(key, name, content)
-    return _program(content)
-
-
-def _read_program(key: str, name: str) -> bytes | None:
-    folder = objects.folder()
-    return None if folder is None else objects.read_object(folder, f"{key}-{name}")
-
-
-def _write_program(key: str, name: str, content: bytes) -> None:
-    folder = objects.folder()
-    if folder is not None:
-        objects.write_object(folder, f"{key}-{name}", content)
 
 
 #: The packages whose classes a description may name.

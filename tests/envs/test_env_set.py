@@ -7,6 +7,7 @@ import pytest
 from command_lines import run_command
 
 from mjx_reinforce import envs, watch
+from mjx_reinforce.engine.play import objects
 from mjx_reinforce.envs.settings import EpisodeSettings, read_settings
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store import kept
@@ -75,7 +76,7 @@ def test_the_table_s_own_settings_hold_beside_those():
 
 
 def test_programs_of_a_model_of_the_user_s_are_not_kept(monkeypatch, tmp_path):
-    monkeypatch.setattr(kept.objects, "folder", lambda: tmp_path)
+    monkeypatch.setattr(objects, "folder", lambda: tmp_path)
     assert kept.key_of(Config(env_set=("xml_file=./mine.xml",))) is None
     keys = [kept.key_of(Config(env_set=words)) for words in ((), ("frame_skip=2",))]
     assert None not in keys

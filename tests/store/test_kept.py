@@ -18,7 +18,8 @@ from toys import Survive
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.engine.cpu import machine
+from mjx_reinforce.engine import cache
+from mjx_reinforce.engine.cpu import machine, seam
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.play import objects
@@ -119,7 +120,7 @@ def test_programs_depend_on_sources_versions_the_machine_and_its_devices(monkeyp
     key, another = kept.key_of(CONFIG), {"git_commit": "", "python": "another"}
     for owner, name, value in (
         *((objects, "source_digest", another), (kept, "provenance", another)),
-        *((kept, "made_for", another), (kept, "version", another), (jax, "device_count", 8)),
+        *((cache, "made_for", another), (kept, "version", another), (jax, "device_count", 8)),
     ):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, lambda *_, value=value: value)
@@ -132,7 +133,7 @@ def test_programs_depend_on_what_jax_is_told(monkeypatch):
         keys.add(kept.key_of(CONFIG))
     monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
     keys.add(kept.key_of(CONFIG))
-    monkeypatch.setattr(kept, "platform", lambda: "tpu")
+    monkeypatch.setattr(cache, "platform", lambda: "tpu")
     keys.add(kept.key_of(CONFIG))
     assert len(keys) == 4
     assert None in keys
@@ -147,14 +148,15 @@ def test_a_program_that_launches_a_gpus_kernel_is_kept(monkeypatch):
     def add(x):
         return gpu._call(kernel, (1, 1), [jnp.ones(1, jnp.int32)], [x])
 
-    kept._export("key", "evaluate", add, (jax.ShapeDtypeStruct((1,), np.int32),))
-    assert gpu._target(kernel.key).encode() in kept._read_program("key", "evaluate")
+    place = cache.Cache.find()
+    place.keep("key", add, (jax.ShapeDtypeStruct((1,), np.int32),))
+    assert gpu._target(kernel.key).encode() in place.read("key")
 
 
-def test_a_program_whose_kernel_is_gone_is_not_read(folder):
+def test_a_program_whose_kernel_is_gone_is_not_read():
     name = gpu._target("0" * 64).encode()
     for each in ("facts", *kept._PROGRAMS):
-        kept._write_program("key", each, name if each == "advance" else b"{}")
+        cache.Cache.find().write(f"key-{each}", name if each == "advance" else b"{}")
     assert kept.read_programs("key") is None
 
 
@@ -208,8 +210,8 @@ def test_bad_input_is_refused_of_what_is_kept_too(expected):
 @pytest.mark.slow
 def test_programs_need_no_code_of_others(folder, monkeypatch):
     """A process that plays other tasks has their code in memory too."""
-    own = kept.seam.targets
-    monkeypatch.setattr(kept.seam, "targets", lambda: [*own(), "mjx_reinforce_" + 64 * "0"])
+    own = seam.targets
+    monkeypatch.setattr(seam, "targets", lambda: [*own(), "mjx_reinforce_" + 64 * "0"])
     prepared = ready.get_ready(CONFIG, CONFIG)
     compile_run(prepared.programs, CONFIG)
     assert kept.read_programs(kept.key_of(CONFIG)) is not None
@@ -282,7 +284,7 @@ def test_a_program_that_calls_python_is_not_kept(folder):
     def calls_python():
         return jax.pure_callback(lambda: np.float32(3), jax.ShapeDtypeStruct((), "f4"))
 
-    program = kept._export("key", "evaluate", calls_python, ())
+    program = cache.Cache.find().keep("key", calls_python, ())
     assert float(jax.jit(program)()) == 3
     assert not list(folder.iterdir())
 

@@ -9,6 +9,7 @@ import pytest
 from command_lines import run_command
 
 from mjx_reinforce import load, sweep
+from mjx_reinforce.engine.play import objects
 from mjx_reinforce.envs import make
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.store import kept
@@ -113,7 +114,7 @@ def test_what_is_no_name_is_refused_before_anything_is_imported():
 
 
 def test_programs_of_the_user_s_code_are_not_kept(monkeypatch, tmp_path):
-    monkeypatch.setattr(kept.objects, "folder", lambda: tmp_path)
+    monkeypatch.setattr(objects, "folder", lambda: tmp_path)
     assert kept.key_of(Config()) is not None
     for name in ("estimator", "policy", "algorithm"):
         assert kept.key_of(Config(**{name: "mine:weights"})) is None
