@@ -2,31 +2,29 @@ r"""PPO on the engine's pieces: the whole training is one compiled program.
 
     python experiments/examples/ppo.py              # HalfCheetah, about two minutes
     python experiments/examples/ppo.py --env Hopper-v5 --discount 0.99 --trace 0.95 \
-        --learning-rate 3e-4 --env-steps 5000000 --seeds 3 --csv rows.csv
+        --learning-rate 3e-4 --env-steps 5000000 --seeds 3
 
-An example of ``make_vec`` and ``unroll``; REINFORCE is what this project is about. The algorithm is
+An example of the engine alone: it takes the environments, ``unroll`` and ``rollout``, and nothing
+of REINFORCE, which is what this project is about. The algorithm is
 that of Schulman et al. 2017 (arXiv 1707.06347): a clipped surrogate loss over several epochs, with
 advantages by GAE (arXiv 1506.02438). Observations are normalized by their running mean and
 deviation, and rewards by the deviation of the running discounted return, as in Andrychowicz et al.
 2021 (arXiv 2006.05990).
 """
 
-import csv
 import dataclasses
 import time
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 import tyro
 from flax import linen as nn
 from jax import lax
 
-from mjx_reinforce import Distribution, Segment, VectorEnv, make_vec, normal, rollout, unroll
-from mjx_reinforce.console.jax_setup import configure_jax
+from mjx_reinforce import envs
+from mjx_reinforce.engine import Segment, VectorEnv, make_vec, rollout, unroll
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,8 +55,32 @@ class Settings:
     """How far the probability of an action may move in an update before it counts no more."""
     reports: int = 20
     """How often the policy is evaluated."""
-    csv: Path | None = None
-    """File for a row an evaluation."""
+
+
+class Gaussian(NamedTuple):
+    """A Normal in each of A entries of the action; outputs [..., 2A] are means and log deviations.
+
+    size: A
+    """
+
+    size: int
+
+    def noise(self, key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+        """Returns what ``sample`` reads [*shape, A]."""
+        return jax.random.normal(key, (*shape, self.size))
+
+    def sample(self, outputs: jax.Array, noise: jax.Array) -> jax.Array:
+        """Returns actions [..., A]."""
+        return self.mode(outputs) + noise * jnp.exp(outputs[..., self.size :])
+
+    def mode(self, outputs: jax.Array) -> jax.Array:
+        """Returns the means [..., A]."""
+        return outputs[..., : self.size]
+
+    def log_prob(self, outputs: jax.Array, action: jax.Array) -> jax.Array:
+        """Returns the logarithm [...] of the density of actions."""
+        std = jnp.exp(outputs[..., self.size :])
+        return jax.scipy.stats.norm.logpdf(action, self.mode(outputs), std).sum(-1)
 
 
 class Networks(nn.Module):
@@ -108,7 +130,7 @@ class Training(NamedTuple):
     seen: Moments
     returns: Moments
     running: jax.Array
-    envs: Any
+    vec_state: Any
     key: jax.Array
 
 
@@ -120,17 +142,15 @@ def start(settings: Settings, vec: VectorEnv, networks: Networks, optimizer: Any
     one = jnp.full((), 1e-4)
     seen = Moments(one, jnp.zeros(size), jnp.ones(size))
     returns = Moments(one, jnp.zeros(()), jnp.ones(()))
-    envs = vec.reset(reset_key)
+    vec_state = vec.reset(reset_key)
     zeros = jnp.zeros(settings.num_envs)
-    return Training(params, optimizer.init(params), seen, returns, zeros, envs, key)
+    return Training(params, optimizer.init(params), seen, returns, zeros, vec_state, key)
 
 
 def advantages(settings: Settings, value: Any, seen: Moments, played: Segment, reward: jax.Array):
     """Returns the advantages and the values' targets [T, N], by GAE."""
-    now, then = (
-        value(seen.normalize(played.observation)),
-        value(seen.normalize(played.next_observation)),
-    )
+    now = value(seen.normalize(played.observation))
+    then = value(seen.normalize(played.next_observation))
     error = reward + settings.discount * jnp.where(played.terminated, 0, then) - now
 
     def back(trace, row):
@@ -145,12 +165,13 @@ def advantages(settings: Settings, value: Any, seen: Moments, played: Segment, r
 def update(settings: Settings, vec: VectorEnv, networks: Networks, optimizer: Any, t: Training):
     """Returns a training after one more update: play, then learn from it."""
     play_key, shuffle_key, key = jax.random.split(t.key, 3)
-    family = normal(vec.action_space, rescale=False)
+    family = Gaussian(vec.action_size)
 
     def act(params, observation):
         return networks.apply(params, t.seen.normalize(observation))[0]
 
-    envs, played = unroll(vec, act, t.params, family, t.envs, play_key, settings.num_steps)
+    given = t.vec_state, play_key, settings.num_steps
+    vec_state, played = unroll(vec, act, t.params, family, *given)
 
     def discounted(running, row):
         reward, done = row
@@ -161,9 +182,7 @@ def update(settings: Settings, vec: VectorEnv, networks: Networks, optimizer: An
     returns = t.returns.update(sums)
     reward = played.reward / jnp.sqrt(returns.variance + 1e-8)
 
-    def value(x):
-        return jax.vmap(jax.vmap(lambda x: networks.apply(t.params, x)[1]))(x)
-
+    value = jax.vmap(jax.vmap(lambda x: networks.apply(t.params, x)[1]))
     advantage, target = advantages(settings, value, t.seen, played, reward)
     data = t.seen.normalize(played.observation), played.action, played.log_prob, advantage, target
     rows = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), data)
@@ -190,10 +209,11 @@ def update(settings: Settings, vec: VectorEnv, networks: Networks, optimizer: An
 
     keys = jax.random.split(shuffle_key, settings.epochs)
     (params, state), _ = lax.scan(epoch, (t.params, t.optimizer), keys)
-    return Training(params, state, t.seen.update(played.observation), returns, running, envs, key)
+    seen = t.seen.update(played.observation)
+    return Training(params, state, seen, returns, running, vec_state, key)
 
 
-def evaluate(vec: VectorEnv, networks: Networks, t: Training, family: Distribution, key: jax.Array):
+def evaluate(vec: VectorEnv, networks: Networks, t: Training, family: Gaussian, key: jax.Array):
     """Returns the returns [16] of episodes without noise."""
 
     def act(params, observation):
@@ -206,15 +226,14 @@ def evaluate(vec: VectorEnv, networks: Networks, t: Training, family: Distributi
 
 def main(settings: Settings) -> None:
     """Trains, and prints a line an evaluation."""
-    configure_jax()
-    vec = make_vec(settings.env, settings.num_envs, autoreset="same_step")
+    vec = make_vec(envs.make(settings.env), settings.num_envs, autoreset="same_step")
     networks = Networks(vec.action_size)
     updates = -(-settings.env_steps // (settings.num_envs * settings.num_steps))
     block = -(-updates // settings.reports)
     steps = block * settings.reports * settings.epochs * settings.minibatches
     schedule = optax.linear_schedule(settings.learning_rate, 0, steps)
     optimizer = optax.chain(optax.clip_by_global_norm(0.5), optax.adam(schedule, eps=1e-5))
-    family, rows = normal(vec.action_space, rescale=False), []
+    family = Gaussian(vec.action_size)
 
     @jax.jit
     def train(t: Training):
@@ -231,13 +250,8 @@ def main(settings: Settings) -> None:
             t, returns = jax.block_until_ready(train(t))
             seconds += time.perf_counter() - began
             played = report * block * settings.num_envs * settings.num_steps
-            rows.append([settings.env, seed, played, round(seconds, 2), float(np.mean(returns))])
-            print(f"seed {seed}  {played:>11,} steps  {seconds:6.1f} s  return {rows[-1][-1]:8.1f}")
-    if settings.csv:
-        with settings.csv.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(["env", "seed", "env_steps", "seconds", "return"])
-            writer.writerows(rows)
+            earned = float(returns.mean())
+            print(f"seed {seed}  {played:>11,} steps  {seconds:6.1f} s  return {earned:8.1f}")
 
 
 if __name__ == "__main__":
