@@ -53,7 +53,6 @@ REFUSED = {
     "entropy_cost must be 0 or more and finite, got nan": {"entropy_cost": NAN},
     "normalize_steps must be 0 or more, got nan": {"normalize_steps": NAN},
     "max_kl must be positive, got 0": {"max_kl": 0},
-    "one_start must be True or False, got 1": {"one_start": 1},
 }
 
 

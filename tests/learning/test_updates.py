@@ -288,6 +288,7 @@ def test_an_estimator_may_change_with_the_budget():
         state = jax.jit(learner.init)(jax.random.key(0))
         return train_step(learner, dataclasses.replace(state, progress=jnp.asarray(progress)))[0]
 
+    changing = schedules.Schedule(changing)
     halfway, fixed = step(changing, 0.5), step(estimators.reward_to_go(0.99), 0.0)
     for one, other in zip(*map(jax.tree.leaves, (halfway.actor, fixed.actor)), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-6)
