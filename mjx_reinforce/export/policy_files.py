@@ -14,8 +14,7 @@ from flax import serialization, traverse_util
 
 from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.engine.checks import check_kind, explain
-from mjx_reinforce.export.policy_checks import check_arrays, check_finite, check_policy_settings
-from mjx_reinforce.files import Header, finite, read_arrays, read_json, write_arrays, write_json
+from mjx_reinforce.files import Arrays, finite, read_arrays, read_json, write_arrays, write_json
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.learning.distributions import Distribution
 from mjx_reinforce.learning.policy import Actor, Policy, mlp_policy
@@ -124,9 +123,16 @@ def read_policy(
       own: "module:name" of a distribution that may be imported; what only a file names is not.
     """
     settings_path, actor_path = Path(directory) / "policy.json", Path(directory) / "actor.npz"
-    settings = read_json(settings_path)
+    settings, arrays = read_json(settings_path), read_arrays(actor_path, stored=True)
+    checksum = arrays.pop(_CHECKSUM, None)
+    # Files from before there was a checksum have none. It finds damage, not ill will: who changes
+    # the files can compute it again.
+    if checksum is not None and checksum != _checksum(settings, arrays):
+        raise ValueError(
+            f"{settings_path} is damaged, or actor.npz beside it: they do not belong together "
+            "(their checksum differs), so one of them was changed or is another run's"
+        )
     with _naming_damage(settings_path):
-        check_policy_settings(settings)
         check_choice("policy", settings["policy"], DISTRIBUTIONS)
     if is_own(settings["policy"]) and settings["policy"] != own:
         raise ValueError(
@@ -136,37 +142,60 @@ def read_policy(
         )
     with _naming_damage(settings_path):
         policy = build_policy(settings)
-    shapes = _array_shapes(policy, settings["observation_size"])
-
-    def check(found: Mapping[str, Header | np.ndarray]) -> int:
-        with _naming_damage(actor_path):
-            return check_arrays({k: x for k, x in found.items() if k != _CHECKSUM}, shapes)
-
-    arrays = read_arrays(actor_path, check, stored=True)
-    num_seeds, checksum = check(arrays), arrays.pop(_CHECKSUM, None)
+        shapes = _array_shapes(policy, settings["observation_size"])
+    with _naming_damage(actor_path):
+        num_seeds = _check_arrays(arrays, shapes)
     if seed is not None and not 0 <= seed < num_seeds:
         seeds = f"its seeds are 0 to {num_seeds - 1}" if num_seeds > 1 else "it has seed 0 alone"
         raise ValueError(f"{directory} has no seed {seed}: {seeds}")
     with _naming_damage(actor_path):
-        check_finite(arrays, seed)
-    # Files from before there was a checksum have none. It finds damage, not ill will: who changes
-    # the files can compute it again.
-    if checksum is not None and checksum != _checksum(settings, arrays):
-        raise ValueError(
-            f"{settings_path} is damaged, or actor.npz beside it: they do not belong together "
-            "(their checksum differs), so one of them was changed or is another run's"
-        )
+        _check_finite(arrays, seed)
     actor = jax.tree.map(lambda x: jnp.asarray(x if seed is None else x[seed]), actor_of(arrays))
     return SavedPolicy(policy, actor, settings, num_seeds)
 
 
 @contextlib.contextmanager
 def _naming_damage(path: Path) -> Iterator[None]:
-    """Names the file in the ValueErrors of a block."""
+    """Names the file in what a block raises."""
     try:
         yield
+    except KeyError as error:
+        raise ValueError(f"{path} is damaged: {error.args[0]} is missing") from error
     except ValueError as error:
         raise ValueError(f"{path} is damaged: {error}") from error
+    except Exception as error:  # what first reads an entry of another kind has no common class
+        raise ValueError(f"{path} is damaged: {explain(error)}") from error
+
+
+def _check_arrays(arrays: Arrays, expected: Mapping[str, tuple[int, ...]]) -> int:
+    """Returns the number of seeds S in the arrays of an archive.
+
+    Args:
+      arrays: [S, ...] each.
+      expected: the shapes of what the policy needs, without the seeds' axis.
+
+    Raises:
+      KeyError: there is no count of observations.
+      ValueError: an array is missing, is not of the policy, or has another shape.
+    """
+    num_seeds = len(arrays["normalizer/count"])
+    found = {name: array.shape for name, array in arrays.items()}
+    wanted = {name: (num_seeds, *shape) for name, shape in expected.items()}
+    for name in sorted(found.keys() | wanted.keys()):
+        if found.get(name) != wanted.get(name):
+            raise ValueError(
+                f"{name} has the shape {found.get(name, 'none')}, by policy.json and the "
+                f"{num_seeds} seeds it should be {wanted.get(name, 'none')}"
+            )
+    return num_seeds
+
+
+def _check_finite(arrays: Arrays, seed: int | None) -> None:
+    """Raises ValueError for numbers that are not finite, of one seed or, if None, of any."""
+    for name in sorted(arrays):
+        for s in range(len(arrays[name])) if seed is None else (seed,):
+            if not np.isfinite(arrays[name][s]).all():
+                raise ValueError(f"{name} of seed {s} has numbers that are not finite")
 
 
 def arrays_of(actor: Actor) -> dict[str, Any]:

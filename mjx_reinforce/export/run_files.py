@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from mjx_reinforce.engine.checks import nearest
-from mjx_reinforce.export.policy_checks import is_number
 from mjx_reinforce.files import read_json
 from mjx_reinforce.settings.config import read_seeds
 
@@ -154,6 +153,11 @@ def choose_seed(run: Run, seed: SeedChoice, which: Which = "last") -> int:
     return run.seeds[place]
 
 
+def _is_return(value: Any) -> bool:
+    """Returns whether it is a return in a file: a number that float can hold, or None."""
+    return value is None or (type(value) in (int, float) and abs(value) < 1e300)
+
+
 def final_returns(run: Run, which: Which) -> np.ndarray:
     """Returns each seed's return [S] in the final evaluation, -inf where it was not finite.
 
@@ -168,7 +172,7 @@ def final_returns(run: Run, which: Which) -> np.ndarray:
     if name not in summary:
         raise ValueError(f"{path} has no {name}; {remedy}")
     values = summary[name]
-    if not isinstance(values, list) or not all(x is None or is_number(x) for x in values):
+    if not isinstance(values, list) or not all(map(_is_return, values)):
         raise ValueError(f"{path} is damaged: {name} is not a list of numbers; {remedy}")
     values = np.array(values, float)  # None becomes nan
     if not np.any(np.isfinite(values)):

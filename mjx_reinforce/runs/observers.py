@@ -85,7 +85,7 @@ class RunLog:
 
     def _remove_parts(self) -> None:
         """Removes what a crash left of writing files."""
-        for path in (*(self.directory / name for name in _FILES), *sinks.files(self.directory)):
+        for path in (self.directory / name for name in (*_FILES, sinks.WANDB_RUN)):
             for part in path.parent.glob(f".{path.name}.*"):
                 part.unlink()
 

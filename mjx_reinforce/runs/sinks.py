@@ -1,16 +1,14 @@
-"""Where the rows of evaluations go besides metrics.csv: JSON lines, and charts of many seeds.
+"""Where the rows of evaluations go besides metrics.csv: charts of many seeds.
 
-Charts show statistics over the seeds, and a few seeds one by one. RUN/tensorboard has events,
+They show statistics over the seeds, and a few seeds one by one. RUN/tensorboard has events,
 written here and not by tensorboardX's ``SummaryWriter``, whose thread dies on a full disk and then
 keeps the program from ending. RUN/wandb has a run of Weights & Biases, offline unless WANDB_MODE
 says otherwise.
 """
 
 import contextlib
-import csv
 import importlib
 import importlib.util
-import json
 import os
 import socket
 import struct
@@ -21,10 +19,10 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mjx_reinforce.files import append, finite, read_json, write_bytes, write_json
+from mjx_reinforce.files import append, read_json, write_json
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import iqm, iqm_interval
-from mjx_reinforce.training.rows import Cells, parse_cell
+from mjx_reinforce.training.rows import Cells
 
 #: Settings that need a package, and the package.
 _NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
@@ -92,8 +90,6 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Que
       OSError: one of them cannot be written.
     """
     sinks = []
-    if config.jsonl:
-        sinks.append(Queue("metrics.jsonl", JsonLines(directory)))
     if config.tensorboard:
         sinks.append(Queue("tensorboard/", TensorBoard(directory, updates)))
     if config.wandb:
@@ -101,48 +97,10 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Que
     return sinks
 
 
-def files(directory: Path) -> list[Path]:
-    """Returns the files that sinks replace at once."""
-    return [directory / NAME, directory / WANDB_RUN]
-
-
 def remove_outputs(directory: Path) -> None:
     """Removes what the sinks of an older run left; W&B keeps its runs apart itself."""
-    events = (directory / TENSORBOARD).glob(EVENTS)
-    for path in (*files(directory), *events):
+    for path in (directory / WANDB_RUN, *(directory / TENSORBOARD).glob(EVENTS)):
         path.unlink(missing_ok=True)
-
-
-NAME = "metrics.jsonl"
-
-
-class JsonLines:
-    """Writes every row as a JSON object on a line.
-
-    A number that is not finite, or was not measured, is null.
-    """
-
-    def __init__(self, directory: Path):
-        """Writes the rows that metrics.csv has already, in place of what was there."""
-        self._path = directory / NAME
-        with (directory / "metrics.csv").open(encoding="utf-8", newline="") as file:
-            written = [*csv.reader(file)]
-        names = written[0]
-        columns = zip(*written[1:], strict=True) if written[1:] else ([] for _ in names)
-        write_bytes(self._path, _as_json_lines(dict(zip(names, columns, strict=True))))
-
-    def write(self, rows: Cells) -> None:
-        """Adds rows, or raises OSError and adds none."""
-        append(self._path, _as_json_lines(rows))
-
-    def close(self) -> None:
-        """Does nothing: every line is written."""
-
-
-def _as_json_lines(rows: Cells) -> bytes:
-    numbers = zip(*(map(parse_cell, cells) for cells in rows.values()), strict=True)
-    objects = (finite(dict(zip(rows, row, strict=True))) for row in numbers)
-    return "".join(json.dumps(each, allow_nan=False) + "\n" for each in objects).encode()
 
 
 #: Seeds that are shown one by one, the first ones: each is a curve for every column.

@@ -366,8 +366,6 @@ class LogSettings:
     """Write the same numbers for Weights & Biases (pip install wandb) to RUN/wandb, offline; wandb
     sync uploads them. With WANDB_MODE=online in the environment they are uploaded during the
     run."""
-    jsonl: bool = setting(False, Mark.NOT_COMPILED, once="its rows are in results.csv")
-    """Also write all rows to RUN/metrics.jsonl, one JSON object per line."""
 
 
 #: The groups of --help, in order, under their titles.

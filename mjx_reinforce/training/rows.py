@@ -62,13 +62,6 @@ def lines(rows: Cells) -> bytes:
     return "".join(",".join(row) + "\n" for row in zip(*rows.values(), strict=True)).encode()
 
 
-def parse_cell(cell: str) -> int | float | None:
-    """Returns what a cell says, an int in columns of counts; None if it is empty."""
-    if cell.lstrip("-").isdigit():
-        return int(cell)
-    return float(cell) if cell else None
-
-
 def _cells(values: np.ndarray) -> Sequence[str]:
     """Returns values [S] as text that, read as their own type, is the same to the last bit."""
     if values.dtype != np.float32:

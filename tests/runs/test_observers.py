@@ -109,7 +109,7 @@ def test_a_full_disk_is_a_warning_once_and_is_tried_again(watched):
 def test_rows_go_to_the_table_and_to_each_sink(watched):
     files, log, said, run = watched
     sunk = []
-    files._sinks = [SimpleNamespace(name="metrics.jsonl", write=sunk.append, close=lambda: None)]
+    files._sinks = [SimpleNamespace(name="tensorboard/", write=sunk.append, close=lambda: None)]
     log.full = {"add_rows"}
     files.evaluated(run, None, {"seed": ["0"]})
     assert sunk == [{"seed": ["0"]}]
@@ -122,7 +122,7 @@ def test_rows_go_to_the_table_and_to_each_sink(watched):
 def test_the_end_closes_the_sinks(watched):
     files, log, _, run = watched
     closed = []
-    files._sinks = [SimpleNamespace(name="metrics.jsonl", close=lambda: closed.append(True))]
+    files._sinks = [SimpleNamespace(name="tensorboard/", close=lambda: closed.append(True))]
     run.record.training = dict
     files.finish(run, b"png", {})
     assert log.written == ["save_policies", "finish"]

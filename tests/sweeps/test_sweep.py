@@ -438,7 +438,7 @@ def test_numbers_share_a_program_and_the_rest_does_not():
         ("--over learning-rate 1e-2 1e-3 --value-fits 3", "--value-fits 3 would do nothing"),
         ("--over learning-rate 1e-2 1e-3 --stop-when-solved", "not for sweeps"),
         ("--over learning-rate 1e-2 1e-3 --chunk-runs 0", "--chunk-runs must be at least 1"),
-        ("--over learning-rate 1e-2 1e-3 --jsonl", "--jsonl logs a run"),
+        ("--over learning-rate 1e-2 1e-3 --wandb", "--wandb logs a run"),
         ("--update natural-gradient --over max-kl None 0.1", "from --max-kl, which is None"),
         ("--over learning-rate 1 2 --num-seeds 2000000000", "results of 4,000,000,000 runs do not"),
         (

@@ -25,7 +25,7 @@ from mjx_reinforce.settings.defaults import of_task
 #: Roots of the starts on which policies are compared, and of those on which the best is measured.
 _CHOICE, _MEASURE = 718281828, 314159265
 #: What a run's command need not say.
-_NOT_SAID = {"output", "minutes", "overwrite", "env", "engine", "tensorboard", "wandb", "jsonl"}
+_NOT_SAID = {"output", "minutes", "overwrite", "env", "engine", "tensorboard", "wandb"}
 
 
 class Candidate(NamedTuple):
