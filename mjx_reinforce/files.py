@@ -4,32 +4,19 @@ import contextlib
 import csv
 import io
 import json
-import math
+import keyword
 import os
 import secrets
+import sys
 import tempfile
-import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 #: Named arrays, as an archive (.npz) holds them.
 Arrays = dict[str, np.ndarray]
-
-#: Versions of NumPy's format that arrays of numbers and text have, and what reads their headers.
-_HEADERS: dict[tuple[int, int], Callable[..., Any]] = {
-    (1, 0): np.lib.format.read_array_header_1_0,
-    (2, 0): np.lib.format.read_array_header_2_0,
-}
-
-
-class Header(NamedTuple):
-    """What an archive says of an array."""
-
-    shape: tuple[int, ...]
-    dtype: np.dtype
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -56,6 +43,23 @@ def check_folder(folder: Path) -> None:
     except OSError as error:
         missing = "" if folder.exists() else ", which does not exist"
         raise ValueError(f"cannot write to {folder}{missing}; choose another --output") from error
+
+
+def check_module(path: Path, example: str) -> None:
+    """Raises ValueError for a file that Python cannot import, or that hides another.
+
+    The message has the ``example`` of a better --output.
+    """
+    if path.suffix != ".py" or not path.stem.isidentifier() or keyword.iskeyword(path.stem):
+        raise ValueError(
+            f"Python cannot import {path.name!r}; choose an --output of letters, digits and "
+            f"underscores, such as {example}"
+        )
+    if path.stem == "numpy" or path.stem in sys.stdlib_module_names:
+        raise ValueError(
+            f"{path.name} would hide Python's or NumPy's {path.stem} from all programs beside it; "
+            f"choose another --output, such as {example}"
+        )
 
 
 def _sync(folder: Path) -> None:
@@ -98,74 +102,21 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = Fa
     write_bytes(path, content.getvalue())
 
 
-def read_arrays(
-    path: Path,
-    check: Callable[[Mapping[str, Header]], Any] | None = None,
-    *,
-    stored: bool = False,
-) -> Arrays:
-    """Returns the arrays of a NumPy archive by their names.
-
-    Args:
-      path: of the archive.
-      check: raises ValueError for names, shapes or types that the archive must not have; before any
-        array is read.
-      stored: whether it is known not to be compressed, see ``members``.
+def read_arrays(path: Path) -> Arrays:
+    """Returns the arrays of a NumPy archive by their names; no pickle.
 
     Raises:
       ValueError: it cannot be read, or is damaged.
     """
     try:
-        content = path.read_bytes()
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            return {name: np.asarray(archive[name]) for name in archive.files}
     except OSError as error:
         raise ValueError(f"cannot read {path} ({error.strerror})") from error
-    with _damage_in(path):
-        headers = members(content, stored=stored)
-    if check is not None:
-        check(headers)
-    with _damage_in(path), np.load(io.BytesIO(content), allow_pickle=False) as opened:
-        return {name: np.asarray(opened[name]) for name in opened.files}
-
-
-@contextlib.contextmanager
-def _damage_in(path: Path) -> Iterator[None]:
-    """Raises what zip and NumPy raise, which has no common class, as a ValueError with the name."""
-    try:
-        yield
-    except Exception as error:
+    except Exception as error:  # what zip and NumPy raise has no common class
         # NumPy's second sentence proposes to trust a pickle.
         reason = f"{type(error).__name__}: {error}".splitlines()[0].partition(". ")[0]
         raise ValueError(f"{path} is damaged: it is no whole NumPy archive ({reason})") from error
-
-
-def members(content: bytes, *, stored: bool) -> dict[str, Header]:
-    """Returns what an archive says of its arrays, by their names; reads none of them.
-
-    Args:
-      content: of the archive.
-      stored: refuse what is compressed. Arrays then take no more memory than the archive: a few
-        compressed bytes can ask for gigabytes.
-
-    Raises:
-      ValueError: an array is not as long as it says, is compressed, or is of Python objects.
-      Exception: of other kinds, for what is no archive.
-    """
-    found = {}
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        for info in archive.infolist():
-            name = info.filename.removesuffix(".npy")
-            if stored and info.compress_type != zipfile.ZIP_STORED:
-                raise ValueError(f"{name!a} is compressed")
-            with archive.open(info) as file:
-                read = _HEADERS[np.lib.format.read_magic(file)]
-                shape, _, dtype = read(file)
-                size = file.tell() + math.prod(shape) * dtype.itemsize
-            if size != info.file_size or any(length < 0 for length in shape):
-                raise ValueError(f"{name!a} is not as long as it says")
-            if dtype.hasobject:
-                raise ValueError(f"{name!a} holds Python objects")
-            found[name] = Header(shape, dtype)
-    return found
 
 
 def finite(value: object) -> Any:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import keyword
 import re
 import sys
 from collections.abc import Iterable, Sequence
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from mjx_reinforce.console.streams import accept_everything
-from mjx_reinforce.files import write_bytes
+from mjx_reinforce.files import check_module, write_bytes
 from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 
 if TYPE_CHECKING:
@@ -67,14 +66,7 @@ def write_class(settings: NewSettings) -> Path:
     output = settings.output or xml.with_name(f"{re.sub(r'[^0-9a-zA-Z]+', '_', xml.stem)}.py")
     if xml.suffix.lower() != ".xml":
         raise ValueError(f"{xml} is no model; give an MJCF file that ends in .xml")
-    name = output.stem
-    if output.suffix != ".py" or not name.isidentifier() or keyword.iskeyword(name):
-        raise ValueError(
-            f"Python cannot import {output.name!r}; choose an --output of letters, digits and "
-            "underscores that ends in .py, such as my_robot.py"
-        )
-    if name in sys.stdlib_module_names:
-        raise ValueError(f"{output.name} would hide Python's {name}; choose another --output")
+    check_module(output, "my_robot.py")
     if output.parent.resolve() != xml.parent.resolve():
         raise ValueError(f"{output} must be in the folder of {xml}, where it looks for the model")
     if output.exists() and not settings.overwrite:
@@ -84,7 +76,7 @@ def write_class(settings: NewSettings) -> Path:
     path = str(xml if xml.parent != Path() else Path.cwd() / xml)
     model = models.load_model(path)
     models.to_mjx(model, path)
-    write_bytes(output, class_source(model, xml.name, name).encode())
+    write_bytes(output, class_source(model, xml.name, output.stem).encode())
     return output
 
 

@@ -4,9 +4,9 @@ import dataclasses
 import shlex
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import tyro
 
@@ -21,12 +21,9 @@ from mjx_reinforce.reports.page import columns, document, words
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.over_time import worst_seeds
 from mjx_reinforce.reports.page.vega import render_chart
-from mjx_reinforce.settings.config import as_words
-from mjx_reinforce.settings.defaults import check_task, of_task
 from mjx_reinforce.settings.flags import read_command_line
 from mjx_reinforce.settings.own_code import env_flag
 from mjx_reinforce.store.provenance import version
-from mjx_reinforce.training.resume import recordable
 
 _ABOUT = (
     "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG, "
@@ -157,44 +154,20 @@ def _beside(output: Path) -> Path:
 
 
 def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:
-    """Returns how to see the worst seed of the best configuration.
-
-    By its run, by the policy that its sweep kept, or, where that is an older one, trained again.
-    """
+    """Returns how to see the worst seed of the best configuration: by what its directory kept."""
     best = findings.results[0]
     worst, own = worst_seeds(best)[0], env_flag(experiment.env)
     seed, place = int(best.configuration.seed[worst]), best.configuration.where[worst]
-    said, kept = f"To watch the worst, seed {seed}:", (place / "config.json").is_file()
-    if not kept:
+    said = f"To watch the worst, seed {seed}:"
+    if not (place / "config.json").is_file():  # a sweep
         first = experiment.directories[findings.order[0]]
         number = findings.order[0] - experiment.directories.index(first)
         place = place / "policies" / f"{number:03d}"
-        said, kept = f"{said[:-1]}, whose policy the sweep kept:", seed in seeds_in(place)
-    if kept:
-        command = f"python -m mjx_reinforce.watch {shlex.quote(str(place))} --seed {seed}{own}"
-        return Watch(said, command)
-    try:
-        check_task(experiment.env)
-    except ValueError as error:
-        return Watch(f"The worst is seed {seed}; it cannot be trained again here: {error}.", "")
-    flags = _flags(experiment.settings | best.configuration.settings | {"env": experiment.env})
-    return Watch(
-        f"The sweep has not kept the policy of the worst, seed {seed}. Trained again it begins "
-        "alike, but rounds in another way, which makes another run of it on chaotic tasks:",
-        f"python -m mjx_reinforce.train {flags} --num-seeds {seed + 1} --output again\n"
-        f"python -m mjx_reinforce.watch again --seed {seed}{own}",
-    )
-
-
-def _flags(settings: Mapping[str, Any]) -> str:
-    """Returns the flags of settings that are not the defaults of their task; not --num-seeds."""
-    defaults = recordable(of_task(settings["env"], settings.get("env_steps")))
-    del defaults["env"], defaults["num_seeds"]
-    words = ["--env", str(settings["env"])]
-    for name in (name for name in settings if name in defaults):
-        if settings[name] != defaults[name]:
-            words += as_words(name, settings[name])
-    return shlex.join(words)
+        if seed not in seeds_in(place):
+            return Watch(f"The worst is seed {seed}, whose policy was not kept.", "")
+        said = f"{said[:-1]}, whose policy the sweep kept:"
+    command = f"python -m mjx_reinforce.watch {shlex.quote(str(place))} --seed {seed}{own}"
+    return Watch(said, command)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,6 @@ from saved_runs import make_run
 import mjx_reinforce
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import COMMANDS
-from mjx_reinforce.reports.page.document import bibtex
 from mjx_reinforce.training.rows import COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -141,7 +140,10 @@ def test_thresholds_are_those_of_the_tasks():
 
 
 def test_the_site_says_how_to_cite():
-    assert bibtex("VERSION").strip() in page("index.md")
+    said = (ROOT / "CITATION.cff").read_text("utf-8")
+    for entry in (r'^title: "(.+)"', "^  - name: (.+)"):
+        value = re.search(entry, said, re.M)[1].replace("_", r"\_")
+        assert f"{{{{{value}}}}}" in page("index.md")
 
 
 def test_pages_name_experiments_that_exist():

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import re
 import sys
 import textwrap
 import threading
@@ -72,14 +73,8 @@ def wrapped(text: str, columns: int) -> str:
 
 
 def _wrapped_line(line: str, columns: int) -> str:
-    body = line.lstrip(" ")
-    indent = len(line) - len(body)
-    name, gap, _ = body.partition("  ")
-    later = 0
-    if indent and gap:
-        later = indent + len(body) - len(body.removeprefix(name).lstrip(" "))
-    elif indent:
-        later = indent + 2
+    entry = re.match(r" +(\S+(?: \S+)*  +)?", line)
+    later = 0 if entry is None else len(entry[0]) + (0 if entry[1] else 2)
     return textwrap.fill(
         line,
         columns,
@@ -87,7 +82,6 @@ def _wrapped_line(line: str, columns: int) -> str:
         break_long_words=False,
         break_on_hyphens=False,
         replace_whitespace=False,
-        drop_whitespace=True,
     )
 
 

@@ -1,7 +1,6 @@
 """``python -m mjx_reinforce.export RUN`` takes a trained policy out of the program."""
 
 import dataclasses
-import keyword
 import sys
 from pathlib import Path
 
@@ -10,7 +9,7 @@ import tyro
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import accept_everything
 from mjx_reinforce.export.run_files import SeedChoice, Which, is_pretrained, read_run
-from mjx_reinforce.files import check_folder
+from mjx_reinforce.files import check_folder, check_module
 from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 
 
@@ -76,26 +75,12 @@ def output_files(settings: ExportSettings, seed: int) -> list[Path]:
     if output.suffix != ".npz":
         raise ValueError(f"export writes .npz, got --output {output}")
     check_folder(output.parent)
-    _check_module(output.stem)
+    check_module(output.with_suffix(".py"), "policy.npz")
     outputs = [output, output.with_suffix(".py")]
     for path in outputs:
         if path.is_dir() or (path.exists() and not settings.overwrite):
             raise ValueError(f"{path} exists; pass --overwrite or another --output")
     return outputs
-
-
-def _check_module(name: str) -> None:
-    """Raises ValueError for the name of a module that cannot be imported, or hides another."""
-    if not name.isidentifier() or keyword.iskeyword(name):
-        raise ValueError(
-            f"Python cannot import a module called {name!r}; "
-            "choose an --output of letters, digits and underscores, such as policy.npz"
-        )
-    if name == "numpy" or name in sys.stdlib_module_names:
-        raise ValueError(
-            f"{name}.py would hide Python's or NumPy's {name} from all programs beside it; "
-            "choose another --output, such as policy.npz"
-        )
 
 
 if __name__ == "__main__":

@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike
 
-from mjx_reinforce.files import Header, read_arrays, read_json
+from mjx_reinforce.files import read_arrays, read_json
 from mjx_reinforce.reports.experiment import Configuration, Source, settings_in_words
 from mjx_reinforce.settings.config import read_seeds
 
@@ -163,24 +162,22 @@ def _swept(content: dict[str, Any], path: Path) -> dict[int, dict[str, Any]]:
 
 def _read_curves(path: Path) -> dict[str, np.ndarray]:
     """Returns the arrays of curves.npz."""
-
-    def check(arrays: Mapping[str, Header]) -> None:
-        for name in sorted(arrays.keys() - _CURVES.keys()):
-            raise ValueError(f"{path} is damaged: {name!a} is not an array of a sweep")
-        for name in _CURVES:
-            if name not in arrays:
-                raise ValueError(f"{path} is damaged: it has no array {name}")
-            if not np.issubdtype(arrays[name].dtype, np.number):
-                raise ValueError(f"{path} is damaged: {name} holds no numbers")
-        shape = arrays["eval_return"].shape
-        for name, axes in _CURVES.items():
-            wanted = shape[-axes:]
-            if len(shape) != 2 or shape[0] < 1 or arrays[name].shape != wanted:
-                raise ValueError(
-                    f"{path} is damaged: {name} has the shape {arrays[name].shape}, not {wanted}"
-                )
-
-    return read_arrays(path, check)
+    arrays = read_arrays(path)
+    for name in sorted(arrays.keys() - _CURVES.keys()):
+        raise ValueError(f"{path} is damaged: {name!a} is not an array of a sweep")
+    for name in _CURVES:
+        if name not in arrays:
+            raise ValueError(f"{path} is damaged: it has no array {name}")
+        if not np.issubdtype(arrays[name].dtype, np.number):
+            raise ValueError(f"{path} is damaged: {name} holds no numbers")
+    shape = arrays["eval_return"].shape
+    for name, axes in _CURVES.items():
+        wanted = shape[-axes:]
+        if len(shape) != 2 or shape[0] < 1 or arrays[name].shape != wanted:
+            raise ValueError(
+                f"{path} is damaged: {name} has the shape {arrays[name].shape}, not {wanted}"
+            )
+    return arrays
 
 
 def _nonfinite(path: Path, curves: dict[str, np.ndarray]) -> np.ndarray:
@@ -256,21 +253,12 @@ def read_columns(path: Path, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
             )
     found = {}
     for name, kind in kinds.items():
-        column = header.index(name)
-        texts = [row[column] for row in rows]
-        try:
-            found[name] = np.array(texts, dtype=kind)
-        except ValueError:
-            wrong = next(i for i, text in enumerate(texts) if not _reads_as(kind, text))
-            raise ValueError(
-                f"{path} is damaged: {name} in line {wrong + 2} is {texts[wrong]!r}"
-            ) from None
+        column, values = header.index(name), []
+        for line, row in enumerate(rows, start=2):
+            try:
+                values.append(kind(row[column]))
+            except ValueError:
+                said = f"{name} in line {line} is {row[column]!r}"
+                raise ValueError(f"{path} is damaged: {said}") from None
+        found[name] = np.array(values, kind)
     return found
-
-
-def _reads_as(kind: DTypeLike, text: str) -> bool:
-    try:
-        np.array([text], dtype=kind)
-    except ValueError:
-        return False
-    return True

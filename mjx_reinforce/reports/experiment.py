@@ -53,7 +53,6 @@ class Source(NamedTuple):
 class Experiment(NamedTuple):
     """All that a report is drawn from; the fields are named as those of ``Source``.
 
-    asked: the question, in a sentence
     directories: of each configuration, where it was read
     unfinished: the directories whose training goes on or was interrupted
     disagree: names in the provenance of which the sources say different things
@@ -62,7 +61,6 @@ class Experiment(NamedTuple):
     title: str
     env: str
     threshold: float | None
-    asked: str
     configurations: list[Configuration]
     settings: dict[str, Any]
     provenance: dict[str, Any]
@@ -97,32 +95,6 @@ def say(value: object) -> str:
 def counted(number: int, noun: str) -> str:
     """Returns a number and its noun: "1 seed", "1,024 seeds"."""
     return f"{number:,} {noun}" + ("" if number == 1 else "s")
-
-
-def asked(env: str, configurations: Sequence[Configuration]) -> str:
-    """Returns the question that configurations answer."""
-    numbers = sorted({part.eval_return.shape[1] for part in configurations})
-    seeds = counted(numbers[0], "seed")
-    if len(numbers) > 1:
-        seeds = f"{numbers[0]:,} to {counted(numbers[-1], 'seed')}"
-    steps = max(int(part.env_steps[-1].max()) for part in configurations)
-    if len(configurations) == 1:
-        return f"What return does {env} reach with {seeds} and {steps:,} env steps a seed?"
-    swept = "; ".join(f"{setting_in_words(k)} {v}" for k, v in _values(configurations).items())
-    return (
-        f"Which of {len(configurations):,} configurations of {env} ends with the greatest return, "
-        f"with {seeds} of each and up to {steps:,} env steps a seed? They differ in {swept}."
-    )
-
-
-def _values(configurations: Sequence[Configuration]) -> dict[str, str]:
-    """Returns the values of each setting that differs: all of them, or the first and last."""
-    found = {}
-    for name in configurations[0].settings:
-        values = ordered([part.settings.get(name) for part in configurations])
-        said = [say(value) for value in values]
-        found[name] = ", ".join(said) if len(said) <= 8 else f"from {said[0]} to {said[-1]}"
-    return found
 
 
 def ordered(values: Sequence[Any]) -> list[Any]:

@@ -18,8 +18,13 @@ from mjx_reinforce.reports.experiment import (
 )
 from mjx_reinforce.statistics import Estimate, iqm, iqm_interval
 from mjx_reinforce.statistics.aggregates import interval, wilson
-from mjx_reinforce.statistics.comparisons import Comparison, compare_all, holm
-from mjx_reinforce.statistics.power import seeds_needed, wrong_winner
+from mjx_reinforce.statistics.comparisons import (
+    Comparison,
+    compare_all,
+    holm,
+    seeds_needed,
+    wrong_winner,
+)
 from mjx_reinforce.statistics.survival import (
     collapses,
     log_rank,

@@ -12,7 +12,6 @@ from mjx_reinforce.reports.experiment import (
     Configuration,
     Experiment,
     Source,
-    asked,
     counted,
     settings_in_words,
 )
@@ -56,7 +55,6 @@ def read_experiment(sources: Sequence[Path]) -> Experiment:
         title=f"{env}, {counted(len(configurations), 'configuration')}",
         env=env,
         threshold=thresholds[0] if thresholds else None,
-        asked=asked(env, configurations),
         configurations=configurations,
         settings=_in_common([source.settings for source in found]),
         provenance=provenance,

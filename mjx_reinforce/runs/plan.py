@@ -55,7 +55,7 @@ def make_plan(ready: "Ready", config: Config) -> str:
     where = _where(machine, division)
     return (
         f"Training {what} on {where}, with the engine {ready.engine}: "
-        f"{ready.why}. {time}. It needs about {memory} of memory.{_idle(machine, division)}"
+        f"{ready.why}. {time}. It needs about {memory} of memory."
     )
 
 
@@ -67,34 +67,25 @@ def said_time(seconds: float | None) -> str:
 
 
 def _where(machine: Hardware, division: "Division") -> str:
-    """Returns on what a run trains."""
+    """Returns on what a run trains, and how many devices here are left out."""
     import jax
 
     here, name = jax.local_device_count(), machine.name
     if division.count > 1:
-        each = f"of {name}" if machine.shared else f"({name} each)"
         what = "seeds" if division.seeds > 1 else "episodes of an update"
-        name = f"{division.count} devices {each}, which share the {what}"
-    elif here > 1 and not machine.shared:
-        name += f", the first of the {here} here (more would not make so few episodes faster),"
+        return f"{devices_in_words(division.count, machine)}, which share the {what}"
+    if here > 1 and not machine.shared:
+        name += f", the first of the {here} here,"
     return name
 
 
-def _idle(machine: Hardware, division: "Division") -> str:
-    """Returns a sentence where devices stand idle and ``_where`` does not say so, else nothing."""
-    if division.count == 1 and not machine.shared:
-        return ""
-    why = "the seeds, or the episodes of an update, are too few or do not divide evenly among more"
-    return idle(division.count, why)
-
-
-def idle(busy: int, why: str) -> str:
-    """Returns a sentence on the devices of this process that stand idle; nothing if none does."""
+def devices_in_words(count: int, machine: Hardware) -> str:
+    """Returns how many devices compute, of how many here."""
     import jax
 
     here = jax.local_device_count()
-    rest = here - busy
-    return f" Of {here} devices here, {rest} stand{'s' * (rest == 1)} idle: {why}." if rest else ""
+    said = f"{count} devices" if count == here else f"{count} of the {here} devices here"
+    return said if machine.shared else f"{said} ({machine.name} each)"
 
 
 def this_hardware() -> Hardware:

@@ -16,7 +16,7 @@ from mjx_reinforce.engine.devices import Devices
 from mjx_reinforce.engine.memory import gigabytes
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.reports.experiment import counted
-from mjx_reinforce.runs.plan import idle, said_time, task_of, this_hardware
+from mjx_reinforce.runs.plan import devices_in_words, said_time, task_of, this_hardware
 from mjx_reinforce.settings.config import Config, marked
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.defaults import expected_seconds
@@ -203,28 +203,14 @@ def _describe(parts: Sequence[Part], engine: str, num_devices: int, *, exact: bo
         side = max(side, -(-group.num_runs // plan.num_chunks))
         together = dataclasses.replace(group.config, num_seeds=at_once * plan.widths[0])
         memory = max(memory, needed(together, _task(env, horizon, group.config)))
-    where = machine.name
-    if num_devices > 1:
-        where = f"{num_devices} devices" + (f" ({where} each)" if not machine.shared else "")
+    where = machine.name if num_devices == 1 else devices_in_words(num_devices, machine)
     return (
         f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
         f"of {first.env}, on {where}, with the engine {engine}: "
         f"{counted(len(groups), 'compiled program')}, {counted(chunks, 'chunk')} of up to {side:,} "
         f"runs. {_time(groups, num_devices)}. "
         f"It needs about {gigabytes(memory)} of memory beside the programs."
-        f"{_idle_devices(side, num_devices)}"
     )
-
-
-def _idle_devices(side: int, num_devices: int) -> str:
-    """Returns a sentence where devices stand idle, else nothing.
-
-    Args:
-      side: how many runs are under way at once at most.
-      num_devices: among which they are divided.
-    """
-    few = "no more runs are under way at once"
-    return idle(min(side, num_devices), few if side < num_devices else "--exact computes on one")
 
 
 def _time(groups: Sequence[Group], num_devices: int) -> str:

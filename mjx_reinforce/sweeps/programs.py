@@ -59,16 +59,7 @@ def started(task: Callable[[], Any]) -> Future:
 
     Python waits for it before it exits: a compiler that is cut off there ends the process.
     """
-    future: Future = Future()
-
-    def work() -> None:
-        try:
-            future.set_result(task())
-        except BaseException as error:
-            future.set_exception(error)
-
-    threading.Thread(target=work).start()
-    return future
+    return ThreadPoolExecutor(1).submit(task)
 
 
 #: What ``history.Measured`` has of a run's counts since the start.

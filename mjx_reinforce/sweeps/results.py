@@ -213,7 +213,7 @@ class SweepFiles:
     def _all(self) -> Arrays:
         """Returns what all chunks measured so far, sorted; empty if nothing."""
         paths = sorted(self.parts.glob("[0-9]*.npz"))
-        return join_parts([read_arrays(path, stored=True) for path in paths]) if paths else {}
+        return join_parts([*map(read_arrays, paths)]) if paths else {}
 
     def _write_rows(self, rows: Sequence[Mapping[str, Any]]) -> None:
         """Replaces results.csv at once."""

@@ -133,8 +133,8 @@ def test_a_policy_of_the_package_can_be_exported(tmp_path, monkeypatch):
     ("arguments", "message"),
     [
         (["--output", "policy.onnx"], "export writes .npz, got --output policy.onnx"),
-        (["--output", "my-policy.npz"], "cannot import a module called 'my-policy'"),
-        (["--output", "class.npz"], "cannot import a module called 'class'"),
+        (["--output", "my-policy.npz"], "cannot import 'my-policy.py'"),
+        (["--output", "class.npz"], "cannot import 'class.py'"),
         (["--output", "numpy.npz"], "numpy.py would hide Python's or NumPy's numpy"),
         (["--output", "random.npz"], "random.py would hide"),
         (["--output", "nowhere/policy.npz"], "cannot write to nowhere"),

@@ -7,7 +7,7 @@ from fake_sweeps import make_sweep
 from pages import findings_of
 
 from mjx_reinforce.reports import findings
-from mjx_reinforce.reports.page import at_the_end, over_time, vega, words
+from mjx_reinforce.reports.page import at_the_end, vega, words
 from mjx_reinforce.reports.page.document import charts
 
 
@@ -47,9 +47,9 @@ def numbers(found):
 def test_settings_share_a_number_and_others_count_up(found):
     names = ("final", "curves", "solved", "distribution", "profile")
     settings = [(6, "sensitivity-0"), (6, "sensitivity-1")]
-    assert numbers(found) == [*enumerate(names, start=1), *settings, (7, "worst")]
+    assert numbers(found) == [*enumerate(names, start=1), *settings]
     alone = found._replace(results=found.results[:1])  # has no ranks and no settings
-    assert numbers(alone) == [*enumerate((*names[1:], "worst"), start=1)]
+    assert numbers(alone) == [*enumerate(names[1:], start=1)]
 
 
 def test_without_a_threshold_nothing_is_solved(found):
@@ -77,24 +77,19 @@ def test_defaults_are_named_where_settings_are_compared(found):
     assert not any(said in one for one in words.caveats(own))
 
 
-def test_captions_have_the_numbers_of_the_findings(found, drawn, monkeypatch):
+def test_captions_have_the_numbers_of_the_findings(found, drawn):
     label = found.labels[0]
     assert drawn["final"].alt.startswith(f"6 rows, best first. The best, {label}, is at ")
     assert "reached 950.0 at" in drawn["solved"].caption
-    assert drawn["worst"].title == f"The worst seed of {label}"
     assert [drawn[f"sensitivity-{n}"].title for n in range(2)] == ["learning rate", "discount"]
     assert "over discount;" in drawn["sensitivity-1"].alt
-    monkeypatch.setattr(over_time, "worst_seeds", lambda best: [3, 1, 2])
-    (several,) = over_time.worst(found)
-    assert several.title == f"The worst 3 seeds of {label}"
 
 
 def test_a_chart_draws_what_it_names(found, drawn):
     """Data under these names alone, and of the configurations shown at first, the best four."""
     for each in drawn.values():
         assert {x["name"] for x in parts(each.spec, "data")} - {"one"} == {*each.data}, each.name
-        assert set(each.tables) == each.data.keys() - {"band"}
-        assert each.listed is None or each.listed in each.tables
+        assert each.listed is None or each.listed in each.data
         assert each.spec["description"] == each.alt
         assert each.spec["config"] == vega.config()
         assert each.spec["width"] == "container"
@@ -116,7 +111,7 @@ def test_curves_have_a_band_a_line_and_the_seeds_of_one(drawn):
 
 
 def test_the_threshold_is_a_line_with_its_name(drawn):
-    for name in ("curves", "final", "profile", "worst"):
+    for name in ("curves", "final", "profile"):
         assert 950.0 in list(parts(drawn[name].spec, "datum"))
         assert {"value": "solved"} in list(parts(drawn[name].spec, "text"))
 

@@ -68,7 +68,6 @@ def test_the_page_says_what_was_found(written, found):
         "--over learning-rate",
     ):
         assert fact in said
-    assert "--learning-rate" in said  # how to train the worst seed again
 
 
 def test_the_figures_are_those_of_the_curves(found):
@@ -184,7 +183,7 @@ def test_names_are_no_formulas_in_spreadsheets(tmp_path):
 
 def test_every_table_names_its_configurations(written):
     files = sorted((written[0] / "report").glob("*.csv"))
-    assert {path.name for path in files} >= {"band.csv", "worst.csv", "curves.csv"}
+    assert {path.name for path in files} >= {"final.csv", "curves.csv"}
     assert [p.name for p in files if "configuration" not in p.read_text().splitlines()[0]] == []
 
 
@@ -212,11 +211,6 @@ def test_a_run_alone_and_names_that_are_markup(tmp_path):
     assert f"watch '{directory}' --seed 0" in visible(page)
 
 
-def command_of(directory):
-    experiment = sources.read_experiment([directory])
-    return report.how_to_watch(experiment, findings.compute_findings(experiment))
-
-
 def test_the_worst_seed_is_watched_by_the_policy_that_its_sweep_kept(tmp_path):
     directory = make_sweep(tmp_path / "a sweep", num_seeds=12)
     experiment = sources.read_experiment([directory])
@@ -230,18 +224,8 @@ def test_the_worst_seed_is_watched_by_the_policy_that_its_sweep_kept(tmp_path):
     watch = report.how_to_watch(experiment, figures)
     assert watch.command == f"python -m mjx_reinforce.watch '{place}' --seed {seed}"
     (place / "config.json").write_text(json.dumps(known | {"seeds": [98, 99]}))
-    assert "train --env InvertedPendulum-v5" in command_of(directory).command
-
-
-def test_a_command_on_the_page_runs_nothing_else(tmp_path):
-    """Whatever sweep.json says: words are quoted, and an id that is none gives no command."""
-    hostile = "x; touch pwn; echo "
-    settings = {"env": "InvertedPendulum-v5", "num_seeds": 5, "seed": 0, "policy": hostile}
-    quoted = make_sweep(tmp_path / "quoted", num_seeds=5, over=ONE, settings=settings)
-    assert f" --policy '{hostile}' " in command_of(quoted).command
-    refused = make_sweep(tmp_path / "env", num_seeds=5, over=ONE, env=hostile, settings=settings)
-    assert command_of(refused).command == ""
-    assert "unknown environment" in command_of(refused).said
+    watch = report.how_to_watch(experiment, figures)
+    assert watch == (f"The worst is seed {seed}, whose policy was not kept.", "")
 
 
 @pytest.mark.usefixtures("no_pictures")

@@ -25,7 +25,6 @@ def test_a_run(tmp_path):
     assert found.timings == {"compile_seconds": 2.0}
     assert found.provenance["device"] == "cpu"
     assert found.settings["learning_rate"] == 0.01
-    assert "3 seeds" in found.asked
     assert found.unfinished == []
 
 

@@ -209,15 +209,17 @@ def test_a_plan_says_what_is_known(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("seeds", "episodes", "here", "idle"),
-    [(1, 7, 4, 3), (1, 6, 4, 1), (5, 16, 4, None), (9, 7, 4, 1), (1, 8, 4, None), (1, 8, 1, None)],
+    ("seeds", "episodes", "said"),
+    [
+        (1, 7, "a GPU, the first of the 4 here,"),
+        (1, 6, "3 of the 4 devices here (a GPU each), which share the episodes of an update"),
+        (5, 16, "4 devices (a GPU each), which share the seeds"),
+    ],
 )
-def test_a_plan_says_how_many_devices_stand_idle(monkeypatch, seeds, episodes, here, idle):
-    monkeypatch.setattr(jax, "local_device_count", lambda: here)
+def test_a_plan_says_how_many_devices_compute(monkeypatch, seeds, episodes, said):
+    monkeypatch.setattr(jax, "local_device_count", lambda: 4)
     config = Config(num_seeds=seeds, num_episodes=episodes)
-    said = plan._idle(plan.this_hardware(), divide_run(config))
-    verb = "stands" if idle == 1 else "stand"
-    assert said == "" if idle is None else f"Of {here} devices here, {idle} {verb} idle" in said
+    assert plan._where(plan.Hardware("a GPU", 1e9, False), divide_run(config)) == said
 
 
 def test_alarms_are_silenced_for_the_command_line_alone(run, monkeypatch):

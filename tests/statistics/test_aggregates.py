@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from rliable import library, metrics
 from scipy import stats
 
-from mjx_reinforce.statistics import aggregates, bootstrap, tails
+from mjx_reinforce.statistics import aggregates, bootstrap
 from mjx_reinforce.statistics.aggregates import cvar, interval, median_interval, wilson
 
 NAMES = ("mean", "median", "iqm", "cvar")
@@ -86,7 +86,7 @@ def test_bootstrap_t_by_hand():
         for v, e in map(value_and_error, values[drawn])
     ]
     low, high = np.quantile(t, [0.025, 0.975], method="closest_observation")
-    found = tails.cvar_interval(values, 0.2)
+    found = aggregates.cvar_interval(values, 0.2)
     np.testing.assert_allclose(found, [value - high * error, value - low * error], rtol=1e-9)
 
 

@@ -8,8 +8,8 @@ from mjx_reinforce.statistics.comparisons import (
     compare_all,
     paired_difference,
     probability_of_improvement,
+    seeds_needed,
 )
-from mjx_reinforce.statistics.power import seeds_needed
 from mjx_reinforce.statistics.survival import combined, log_rank, median_steps, restricted_mean
 
 NAMES = ("mean", "median", "iqm", "cvar")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mjx_reinforce.statistics.power import seeds_needed, wrong_winner
+from mjx_reinforce.statistics.comparisons import seeds_needed, wrong_winner
 
 NORMAL = stats.norm.ppf((np.arange(2000) + 0.5) / 2000)
 

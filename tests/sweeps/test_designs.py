@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 
@@ -90,21 +89,6 @@ def test_runs_are_in_as_few_chunks_as_there_is_room(limit, expected):
     part = plan.divide(group(), limit, 1, exact=False)
     assert part.num_chunks == expected
     assert plan.divide(group(), limit, 2, exact=True) == plan.GroupPlan(expected, (2,))
-
-
-@pytest.mark.parametrize(
-    ("side", "devices", "said"),
-    [
-        (8, 8, ""),
-        (9, 8, ""),
-        (3, 8, " Of 8 devices here, 5 stand idle: no more runs are under way at once."),
-        (7, 8, " Of 8 devices here, 1 stands idle: no more runs are under way at once."),
-        (3, 1, " Of 8 devices here, 7 stand idle: --exact computes on one."),
-    ],
-)
-def test_a_plan_says_how_many_devices_stand_idle(monkeypatch, side, devices, said):
-    monkeypatch.setattr(jax, "local_device_count", lambda: 8)
-    assert plan._idle_devices(side, devices) == said
 
 
 def test_slots_are_no_wider_than_the_chunk(monkeypatch):

@@ -9,8 +9,7 @@ from scipy import stats
 
 from experiments.studies.seeds.answers import CONTRASTS, LEVEL, MEASURES, Contrast, at_best
 from experiments.studies.seeds.runs import Task
-from mjx_reinforce.statistics.comparisons import holm, paired_difference
-from mjx_reinforce.statistics.power import seeds_needed, wrong_winner
+from mjx_reinforce.statistics.comparisons import holm, paired_difference, seeds_needed, wrong_winner
 
 #: Numbers of seeds of the tables.
 COUNTS = (3, 5, 10, 30, 100)

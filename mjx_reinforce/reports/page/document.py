@@ -1,4 +1,4 @@
-"""The report as one HTML page that needs nothing but itself; how to cite the program."""
+"""The report as one HTML page that needs nothing but itself."""
 
 import datetime
 import json
@@ -33,7 +33,7 @@ def charts(findings: Findings) -> list[vega.Chart]:
     made: list[vega.Chart] = []
     for build in (
         *(at_the_end.final, over_time.curves, over_time.solved, at_the_end.distribution),
-        *(at_the_end.profile, at_the_end.sensitivity, over_time.worst),
+        *(at_the_end.profile, at_the_end.sensitivity),
     ):
         place = made[-1].number + 1 if made else 1
         made += [each._replace(number=place) for each in build(findings)]
@@ -83,7 +83,6 @@ def render(
         **provenance_rows(findings.experiment),
         watch=watch,
         moments=stops,
-        bibtex=bibtex(version),
         date=f"{datetime.date.today():%d %B %Y}".lstrip("0"),
         size=_size_in_words(results),
         version=version,
@@ -132,7 +131,7 @@ def _text(findings: Findings, drawn: list[vega.Chart]) -> dict[str, Any]:
     figures = {figure.name: figure for figure in drawn}
     sensitivity = [figure for figure in drawn if figure.name.startswith("sensitivity-")]
     listed, matrix = listings(findings), pairs_matrix(findings)
-    names = ("final", "curves", "solved", "distribution", "profile", "worst")
+    names = ("final", "curves", "solved", "distribution", "profile")
     failures = any(not math.isfinite(x) for each in findings.results for x in each.final)
     return {
         "answer": words.headline(findings),
@@ -187,21 +186,3 @@ def _in_words(value: object) -> str:
     if isinstance(value, list):
         return ", ".join(map(_in_words, value))
     return say(value)
-
-
-#: CITATION.cff of the repository says the same.
-TITLE = "mjx_reinforce: REINFORCE on MuJoCo, a thousand seeds in one program"
-AUTHORS = "The mjx_reinforce authors"
-YEAR = 2026
-
-
-def bibtex(version: str) -> str:
-    """Returns an entry for a bibliography, of BibTeX's type misc, which every style knows."""
-    return (
-        (
-            f"@misc{{mjx_reinforce, author = {{{{{AUTHORS}}}}}, title = {{{{{TITLE}}}}}, "
-            f"year = {{{YEAR}}}, note = {{Version {version}}}}}"
-        )
-        .replace("mjx_reinforce:", r"mjx\_reinforce:")
-        .replace("{{The mjx_", r"{{The mjx\_")
-    )

@@ -1,4 +1,4 @@
-"""The report's charts over env steps: learning curves, who has solved the task, the worst seeds."""
+"""The report's charts over env steps: learning curves, and who has solved the task."""
 
 import math
 from collections.abc import Iterator
@@ -15,8 +15,6 @@ from mjx_reinforce.reports.page.words import number
 from mjx_reinforce.statistics.survival import kaplan_meier
 
 _HEIGHT = 320
-#: Points of a worst seed's curve, at most.
-_MOST_POINTS = 80
 #: Seeds that are drawn one by one: of one configuration, and of all together.
 _DRAWN_OF_ONE = 40
 _DRAWN_OF_ALL = 480
@@ -152,56 +150,6 @@ def _solved_shares(findings: Findings) -> Table:
         return {"configuration": place, "env_steps": short(steps, 7), **shares}
 
     return stacked(part(place, result) for place, result in enumerate(findings.results))
-
-
-def worst(findings: Findings) -> Iterator[vega.Chart]:
-    """Yields the worst seeds of the best configuration, as they were evaluated, over its band."""
-    best = findings.results[0]
-    places, known = worst_seeds(best), np.isfinite(best.band.value)
-    y, point = _return_axis(), {"size": 14, "color": "var(--series-1)"}
-    band, seeds = alt.Chart(alt.NamedData("band")), alt.Chart(alt.NamedData("worst"))
-    tips = vega.tooltips(env_steps=("env steps", ",.0f"), value=("return", ",.1f"))
-    layers = [
-        band.mark_line(strokeWidth=2.2, color="var(--series-0)").encode(x=vega.STEPS, y=y),
-        seeds.mark_line(strokeWidth=1.2, color="var(--series-1)", point=point).encode(
-            x=vega.STEPS, y=y, detail="seed:N", tooltip=["seed:N", *tips]
-        ),
-        *vega.threshold_line(findings, "y"),
-    ]
-    which = "worst seed" if len(places) == 1 else f"worst {len(places)} seeds"
-    interquartile = {
-        "configuration": 0,
-        "env_steps": short(findings.grid[known], 7),
-        "value": short(best.band.value[known]),
-    }
-    yield vega.make_chart(
-        findings,
-        layers,
-        260,
-        name="worst",
-        title=f"The {which} of {best.configuration.label}",
-        caption="Thin lines, with a point for each evaluation; thick: the interquartile mean.",
-        alt="Returns over env steps of the worst seeds; the table below says how each ended.",
-        data={
-            "worst": stacked(_worst_curve(best, int(s)) for s in places),
-            "band": stacked([interquartile]),
-        },
-        hidden=("band",),
-        listed="worst",
-    )
-
-
-def _worst_curve(result: Result, s: int) -> dict[str, Any]:
-    part = result.configuration
-    returns = part.eval_return[:, s]
-    keep = np.unique(np.linspace(0, len(returns) - 1, min(len(returns), _MOST_POINTS)).round())
-    at = keep.astype(int)[np.isfinite(returns[keep.astype(int)])]
-    return {
-        "configuration": 0,
-        "seed": int(part.seed[s]),
-        "env_steps": short(part.env_steps[at, s], 7),
-        "value": short(returns[at], 4),
-    }
 
 
 def worst_seeds(result: Result) -> np.ndarray:

@@ -97,7 +97,6 @@ class Chart(NamedTuple):
     alt: for who cannot see it
     spec: in Vega-Lite, without data
     data: tables by name
-    hidden: the names of those that can be found elsewhere, and not be downloaded here
     listed: the name of the table that the page can show, if any
     """
 
@@ -107,14 +106,8 @@ class Chart(NamedTuple):
     alt: str
     spec: dict[str, Any]
     data: dict[str, Table]
-    hidden: tuple[str, ...] = ()
     listed: str | None = None
     number: int = 0
-
-    @property
-    def tables(self) -> list[str]:
-        """The names of the tables that can be downloaded."""
-        return [name for name in self.data if name not in self.hidden]
 
 
 def make_chart(findings: Findings, layers: Sequence[Any], height: int, **fields: Any) -> Chart:

@@ -128,11 +128,9 @@
     made.finalize();
   };
 
-  const ALWAYS = "worst";  // seeds of the best configuration, whichever are shown
   const fill = (place) => {
     const table = document.createElement("table");
-    const listed = rows(place.dataset.table).filter((row) =>
-      place.dataset.table === ALWAYS || shown().includes(row.configuration));
+    const listed = rows(place.dataset.table).filter((row) => shown().includes(row.configuration));
     if (!listed.length) return;
     const line = (parent, cells, kind) => {
       const row = parent.insertRow();
