@@ -6,7 +6,6 @@
 
 # %%
 import dataclasses
-import os
 
 import jax
 import jax.numpy as jnp
@@ -75,16 +74,14 @@ class Arm(MujocoEnv):
 # %% [markdown]
 # ## Train
 #
-# `of_task` has settings for tasks that nobody tuned. More episodes in each update make the gradient less noisy. The
-# environment variable `ENV_STEPS` changes the budget.
+# `of_task` has settings for tasks that nobody tuned. More episodes in each update make the gradient less noisy.
 #
 # The class has a name in `envs`, so that `run` finds it. On the command line it would be `--env my_module:Arm`.
 
 # %%
 mr.envs.register("Arm-v0", Arm)
-ENV_STEPS = int(os.environ.get("ENV_STEPS", "6000000"))
 config = dataclasses.replace(
-    mr.of_task("Arm-v0", env_steps=ENV_STEPS),
+    mr.of_task("Arm-v0", env_steps=6_000_000),
     num_episodes=64,
     num_seeds=2,
     hidden_sizes=(32, 32),

@@ -3,17 +3,16 @@
 #
 # The default settings of a task follow the time that you have and the machine that you are on. Here each task gets
 # the same number of seconds of training, with two seeds. Compiling comes on top: a few seconds for Reacher, half a
-# minute for Walker2d. The environment variable `SECONDS` changes the time.
+# minute for Walker2d.
 
 # %%
-import os
 import time
 
 import matplotlib.pyplot as plt
 
 import mjx_reinforce as mr
 
-SECONDS = float(os.environ.get("SECONDS", "60"))
+SECONDS = 60
 TASKS = ("InvertedPendulum-v5", "Reacher-v5", "Swimmer-v5", "Hopper-v5", "HalfCheetah-v5")
 
 # %%

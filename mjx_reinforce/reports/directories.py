@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from mjx_reinforce.files import read_arrays, read_json
 from mjx_reinforce.reports.experiment import Configuration, Source, settings_in_words
@@ -253,12 +254,21 @@ def read_columns(path: Path, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
             )
     found = {}
     for name, kind in kinds.items():
-        column, values = header.index(name), []
-        for line, row in enumerate(rows, start=2):
-            try:
-                values.append(kind(row[column]))
-            except ValueError:
-                said = f"{name} in line {line} is {row[column]!r}"
-                raise ValueError(f"{path} is damaged: {said}") from None
-        found[name] = np.array(values, kind)
+        column = header.index(name)
+        texts = [row[column] for row in rows]
+        try:
+            found[name] = np.array(texts, dtype=kind)
+        except ValueError:
+            wrong = next(i for i, text in enumerate(texts) if not _reads_as(kind, text))
+            raise ValueError(
+                f"{path} is damaged: {name} in line {wrong + 2} is {texts[wrong]!r}"
+            ) from None
     return found
+
+
+def _reads_as(kind: DTypeLike, text: str) -> bool:
+    try:
+        np.array([text], dtype=kind)
+    except ValueError:
+        return False
+    return True

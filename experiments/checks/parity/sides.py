@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from mjx_reinforce import envs
+from mjx_reinforce.envs.base import MujocoEnv
 
 
 class Outcome(NamedTuple):
@@ -192,6 +193,8 @@ class Ours:
         self.step: Callable[..., Any] = jax.jit(jax.vmap(self.env.step))
 
     def _draw(self, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        if isinstance(self.env, MujocoEnv):  # without a forward pass, which takes seconds to trace
+            return self.env.draw(key)[1]
         physics = self.env.reset(key).pipeline_state
         return physics.qpos, physics.qvel
 
