@@ -14,13 +14,7 @@ from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import accept_everything, heartbeat, say_error, silence_alarms
-from mjx_reinforce.export.films import (
-    Renderer,
-    import_mujoco,
-    mediapy_with_ffmpeg,
-    with_sky,
-    write_film,
-)
+from mjx_reinforce.export.films import Renderer, gif, import_mujoco, with_sky
 from mjx_reinforce.export.run_files import (
     Run,
     SeedChoice,
@@ -30,7 +24,7 @@ from mjx_reinforce.export.run_files import (
     provenance_of,
     read_run,
 )
-from mjx_reinforce.files import check_folder
+from mjx_reinforce.files import check_folder, write_bytes
 from mjx_reinforce.settings.flags import read_command_line
 from mjx_reinforce.settings.own_code import check_named
 
@@ -72,8 +66,7 @@ class WatchSettings:
     noise: bool = False
     """Draw actions from the policy, as training does, instead of taking its mode."""
     output: Path | None = None
-    """The film, .gif or, after pip install mediapy imageio-ffmpeg, .mp4.
-    By default RUN/seed-NUMBER.gif; for a policy of the package TASK.gif."""
+    """The film, .gif. By default RUN/seed-NUMBER.gif; for a policy of the package TASK.gif."""
     seconds: float = 20.0
     """Length of the film at most, in simulated seconds; the episode is played to its end."""
     width: int = 480
@@ -149,7 +142,7 @@ def film(settings: WatchSettings) -> None:
     shown = side_by_side(takes, *size, seconds=settings.seconds, renderer=renderer)
     samples = [*map(shown.draw, shown.samples)]
     frames = map(shown.draw, track(range(shown.length), "drawing", transient=True))
-    write_film(output, frames, shown.rate, samples)
+    write_bytes(output, gif(frames, shown.rate, samples))
     lasting = max((len(take.qpos) - 1) * take.dt for take in takes)
     cut = f": {settings.seconds:g} of {lasting:g} s; --seconds {lasting:g} shows all"
     print(f"{shown.length} frames in {output}{cut * (settings.seconds < lasting)}")
@@ -202,13 +195,11 @@ def film_path(settings: WatchSettings, run: Run | None) -> Path:
             )
         by_default = Path(f"{settings.run}.gif")
     output = settings.output or by_default
-    if output.suffix.lower() not in (".gif", ".mp4"):
-        raise ValueError(f"{output} is no film; end --output in .gif or .mp4")
+    if output.suffix.lower() != ".gif":
+        raise ValueError(f"{output} is no film that watch writes; end --output in .gif")
     check_folder(output.parent)
     if output.is_dir() or (output.exists() and not settings.overwrite):
         raise ValueError(f"{output} exists; pass --overwrite or another --output")
-    if output.suffix.lower() == ".mp4":
-        mediapy_with_ffmpeg(output)
     return output
 
 

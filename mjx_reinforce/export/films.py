@@ -1,18 +1,14 @@
-"""Films of episodes: MuJoCo's renderer, and the files that its pictures become."""
+"""Films of episodes: MuJoCo's renderer, and the GIF that its pictures become."""
 
 import ctypes.util
 import io
 import os
-import tempfile
 import warnings
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-
-from mjx_reinforce.files import write_bytes
 
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import MjModel, MjSpec
@@ -126,35 +122,18 @@ def _no_drawing(error: Exception) -> ValueError:
     )
 
 
-def write_film(
-    path: Path,
-    frames: Iterable[np.ndarray],
-    rate: float,
-    samples: Sequence[np.ndarray],
-) -> None:
-    """Writes a film at once.
-
-    Args:
-      path: .gif or .mp4.
-      frames: pictures [height, width, 3] uint8.
-      rate: frames a second.
-      samples: a few of the pictures; a .gif has the colours that show these best.
-    """
-    if path.suffix.lower() == ".gif":
-        write_bytes(path, gif(frames, rate, samples))
-    else:
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            partial = Path(folder) / path.name
-            mediapy_with_ffmpeg(path).write_video(partial, list(frames), fps=rate)
-            os.replace(partial, path)
-
-
 def gif(
     frames: Iterable[np.ndarray], rate: float, samples: Sequence[np.ndarray], colors: int = _COLORS
 ) -> bytes:
-    """Returns a .gif with one palette, that of the samples: one a picture takes 6 ms.
+    """Returns a .gif with one palette: one a picture takes 6 ms.
 
     What does not change from a picture to the next is transparent, which packs well.
+
+    Args:
+      frames: pictures [height, width, 3] uint8.
+      rate: frames a second.
+      samples: a few of the pictures; the film has the colours that show these best.
+      colors: how many.
     """
     from PIL import Image
 
@@ -180,22 +159,3 @@ def gif(
         *(film, "GIF"), save_all=True, append_images=drawn, loop=0, optimize=False, **options
     )
     return film.getvalue()
-
-
-def mediapy_with_ffmpeg(path: Path) -> Any:
-    """Returns mediapy with an ffmpeg.
-
-    Raises:
-      ValueError: one of the two is not installed.
-    """
-    try:
-        import imageio_ffmpeg
-        import mediapy
-
-        mediapy.set_ffmpeg(imageio_ffmpeg.get_ffmpeg_exe())
-    except (ImportError, RuntimeError) as error:
-        raise ValueError(
-            f"cannot write {path} ({error}); "
-            "pip install mediapy imageio-ffmpeg, or end --output in .gif"
-        ) from error
-    return mediapy

@@ -15,7 +15,6 @@ from mjx_reinforce.export.run_files import (
     SeedChoice,
     Which,
     choose_seed,
-    final_returns,
     is_pretrained,
     policy_folder,
     provenance_of,
@@ -135,13 +134,6 @@ def load_seed(
     """Loads one seed, as ``load``, with what its files say."""
     folder, number = policy_folder(run, which), choose_seed(run, seed, which)
     saved = read_policy(folder, run.place(number), policy)
-    if isinstance(seed, str):
-        ranked = len(final_returns(run, which))
-        if ranked != saved.num_seeds:
-            raise ValueError(
-                f"{run.directory / 'summary.json'} ranks {ranked} seeds, {folder} holds "
-                f"{saved.num_seeds}: they are of different runs"
-            )
     if saved.settings.get("env", run.env) != run.env:
         raise ValueError(
             f"{folder / 'policy.json'} is for {saved.settings['env']}, "

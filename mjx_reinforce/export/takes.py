@@ -104,7 +104,7 @@ def caption(picture: np.ndarray, left: str, right: str) -> np.ndarray:
     from PIL import Image, ImageDraw
 
     height, width = picture.shape[:2]
-    strip = max(_LEAST + 2, 2 * round(height * _STRIP / 2))  # an .mp4 has an even height
+    strip = max(_LEAST + 2, 2 * round(height * _STRIP / 2))
     font, small = (_font(max(_LEAST, round(height * x))) for x in (_WORDS, _WORDS * 0.8))
     image = Image.new("RGB", (width, height + strip), _PAPER)
     image.paste(Image.fromarray(picture))

@@ -15,7 +15,7 @@ from mjx_reinforce.files import Arrays, write_arrays, write_bytes, write_json
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.runs import sinks
 from mjx_reinforce.runs.display import Display
-from mjx_reinforce.runs.sinks import Queue, open_sinks
+from mjx_reinforce.runs.sinks import Sink, open_sinks
 from mjx_reinforce.store.provenance import provenance
 from mjx_reinforce.training import checkpoint, resume, rows
 from mjx_reinforce.training.checkpoint import Attempts, Checkpoint, SaveDue
@@ -152,7 +152,7 @@ class RunFiles:
         #: Whether the newest checkpoint is of the present state.
         self._saved = False
         #: Where rows go besides metrics.csv.
-        self._sinks: list[Queue] = []
+        self._sinks: list[Sink] = []
 
     def begin(self, driver: Driver, found: Checkpoint | None) -> None:
         """Writes the first files, or takes the run and its files back to where it goes on."""

@@ -29,7 +29,12 @@ _NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 
 
 class Sink(Protocol):
-    """Takes the rows of evaluations, in order."""
+    """Takes the rows of evaluations, in order; metrics.csv has those that could not be written.
+
+    name: for people
+    """
+
+    name: str
 
     def write(self, rows: Cells) -> None:
         """Adds the rows of one evaluation; raises OSError, and adds nothing, if that fails."""
@@ -38,32 +43,6 @@ class Sink(Protocol):
     def close(self) -> None:
         """Ends it after the last rows; raises OSError if that fails."""
         ...
-
-
-class Queue:
-    """A sink to which rows that could not be written are written later.
-
-    name: for people
-    """
-
-    def __init__(self, name: str, sink: Sink):
-        self.name, self._sink = name, sink
-        self._waiting: list[Cells] = []
-
-    def write(self, rows: Cells) -> None:
-        """Adds the rows of one evaluation after those that wait, or raises OSError."""
-        self._waiting.append(rows)
-        self._write_waiting()
-
-    def close(self) -> None:
-        """Writes the rows that wait, and ends the sink, or raises OSError."""
-        self._write_waiting()
-        self._sink.close()
-
-    def _write_waiting(self) -> None:
-        while self._waiting:
-            self._sink.write(self._waiting[0])
-            del self._waiting[0]
 
 
 def check_installed(config: Config) -> None:
@@ -78,7 +57,7 @@ def check_installed(config: Config) -> None:
             )
 
 
-def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Queue]:
+def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Sink]:
     """Opens the sinks that the settings ask for, each where it is to go on.
 
     Args:
@@ -89,11 +68,11 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Que
     Raises:
       OSError: one of them cannot be written.
     """
-    sinks = []
+    sinks: list[Sink] = []
     if config.tensorboard:
-        sinks.append(Queue("tensorboard/", TensorBoard(directory, updates)))
+        sinks.append(TensorBoard(directory, updates))
     if config.wandb:
-        sinks.append(Queue("to W&B", WeightsAndBiases(directory)))
+        sinks.append(WeightsAndBiases(directory))
     return sinks
 
 
@@ -163,6 +142,8 @@ EVENTS = "events.out.tfevents.*"
 class TensorBoard:
     """Writes events whose step is the number of updates."""
 
+    name = "tensorboard/"
+
     def __init__(self, directory: Path, updates: int | None):
         """Begins a file of events beside those that are there.
 
@@ -222,6 +203,8 @@ class WeightsAndBiases:
     A resumed run goes on under the same id. Rows that it has already are not logged again: they
     are the same.
     """
+
+    name = "to W&B"
 
     def __init__(self, directory: Path):
         """Begins the run, or goes on with it.

@@ -172,7 +172,7 @@ def test_a_gif_is_whole(tmp_path):
     for i, frame in enumerate(frames):
         frame[:8, 8 * i : 8 * i + 8] = 255 * (i % 2)
     path = tmp_path / "film.gif"
-    films.write_film(path, iter(frames), 10.0, frames[:2])
+    path.write_bytes(films.gif(iter(frames), 10.0, frames[:2]))
     shown = [*pictures(path)]
     assert len(shown) == 6
     for got, frame in zip(shown, frames, strict=True):  # what is transparent is what was there

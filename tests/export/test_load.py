@@ -157,7 +157,6 @@ DAMAGE = {
     "no returns": (entries("summary.json", final_returns=...), "summary.json", "has no final_"),
     "text for returns": (entries("summary.json", final_returns="7"), "summary.json", "not a list"),
     "nothing finite": (entries("summary.json", final_returns=[None] * 3), "summary.json", "none"),
-    "more returns": (entries("summary.json", final_returns=[1.0] * 4), "summary.json", "ranks 4"),
     "another env": (entries("config.json", env="Reacher-v5"), "config.json", "different runs"),
     "no settings": (remove(JSON), "policy.json", "cannot read"),
     "empty settings": (old(content(JSON, b"{}")), "policy.json", "policy is missing"),

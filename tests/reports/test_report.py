@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+import vl_convert
 from browser import CHROMIUM, opened_browser
 from fake_sweeps import GRID, make_sweep
 from measured_runs import ONE, make_measured_run
@@ -25,6 +26,12 @@ HOSTILE = "x</script><script>alert(1)</script>\"'&"
 def no_pictures(monkeypatch):
     """Leaves out the files beside the page that take the most time."""
     monkeypatch.setattr(report, "render_chart", lambda *_: {})
+
+
+@pytest.fixture
+def text_alone(no_pictures, monkeypatch):
+    """Leaves out Vega too, which takes seconds to pack into the page."""
+    monkeypatch.setattr(vl_convert, "javascript_bundle", lambda code: code)
 
 
 @pytest.fixture(scope="module")
@@ -121,7 +128,7 @@ def solve_at_the_end(directory, runs, threshold):
     change_curves(directory, change)
 
 
-@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.usefixtures("text_alone")
 def test_tables_and_figures_agree_on_who_solved(tmp_path):
     """Seeds end at different env steps; the figures' last place is the end of each, as table 1."""
     directory = make_sweep(tmp_path / "sweep", num_seeds=40, over=ONE)
@@ -167,7 +174,7 @@ def is_number(text):
 FORMULAS = ("=HYPERLINK(1)", "@SUM(1+1)", "+A1", "-A1", "\tA1")
 
 
-@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.usefixtures("text_alone")
 def test_names_are_no_formulas_in_spreadsheets(tmp_path):
     """A spreadsheet computes what begins like a formula: numbers may, names may not."""
     runs = [make_measured_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
@@ -197,7 +204,7 @@ def test_a_thousand_seeds_make_no_larger_charts(tmp_path):
     assert sizes[1] < 1.2 * sizes[0]
 
 
-@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.usefixtures("text_alone")
 def test_a_run_alone_and_names_that_are_markup(tmp_path):
     directory = make_measured_run(tmp_path / "<b>run", env=HOSTILE, note=HOSTILE)
     page = tmp_path / "page.html"
@@ -228,7 +235,7 @@ def test_the_worst_seed_is_watched_by_the_policy_that_its_sweep_kept(tmp_path):
     assert watch == (f"The worst is seed {seed}, whose policy was not kept.", "")
 
 
-@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.usefixtures("text_alone")
 def test_a_path_that_the_locale_cannot_read_is_escaped(tmp_path):
     """Where Python reads the file system as ASCII, a path's other bytes are surrogates."""
     directory = make_measured_run(tmp_path / "run\udce6")
@@ -236,7 +243,7 @@ def test_a_path_that_the_locale_cannot_read_is_escaped(tmp_path):
     assert r"run\udce6" in (tmp_path / "page.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.usefixtures("text_alone")
 def test_seeds_that_all_failed_are_no_answer(tmp_path):
     directory = make_sweep(tmp_path / "sweep", num_seeds=5, over=ONE)
     change_curves(directory, lambda arrays: arrays["eval_return"][2:].fill(np.nan))

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+import vl_convert
 from fake_sweeps import make_sweep
 from measured_runs import make_measured_run
 from pages import change_curves, content, findings_of, visible
@@ -94,6 +95,7 @@ def test_configurations_have_the_names_that_are_asked_for(tmp_path, monkeypatch)
     names = ["learning rate 0.01=fast", "learning rate 0.001=slow"]
     monkeypatch.setattr("sys.argv", ["report", str(directory), "--labels", *names])
     monkeypatch.setattr(report, "render_chart", lambda *_: {})
+    monkeypatch.setattr(vl_convert, "javascript_bundle", lambda code: code)
     report.main()
     page = directory / "report.html"
     assert set(content(page)["labels"]) == {"fast", "slow", "learning rate 0.003"}

@@ -213,7 +213,7 @@ def test_a_plan_says_what_is_known(monkeypatch):
     [
         (1, 7, "a GPU, the first of the 4 here,"),
         (1, 6, "3 of the 4 devices here (a GPU each), which share the episodes of an update"),
-        (5, 16, "4 devices (a GPU each), which share the seeds"),
+        (8, 7, "4 devices (a GPU each), which share the seeds"),
     ],
 )
 def test_a_plan_says_how_many_devices_compute(monkeypatch, seeds, episodes, said):
