@@ -106,12 +106,6 @@ def test_what_does_nothing_is_not_found(found):
     assert not any(e.direction for e in found if e.contrast == GAMMA.name)
 
 
-def test_each_arm_has_its_own_best_rate(tasks):
-    for half in HALVES:
-        assert best_rates(tasks[0], NORMALISE, half) == (1e-2, 3e-2)
-        assert best_rates(tasks[1], NORMALISE, half) == (3e-2, 3e-2)
-
-
 def test_the_rates_are_not_chosen_on_the_seeds_that_are_reported(tasks):
     task = tasks[1]
     returns = task.average_return.copy()
@@ -124,27 +118,6 @@ def test_the_rates_are_not_chosen_on_the_seeds_that_are_reported(tasks):
         assert values[HALVES[0]].mean() == pytest.approx(30, abs=0.5)
     (effect, *_) = (e for e in effects([changed]) if e.contrast == GAMMA.name)
     assert effect.rates == ((3e-3, 3e-2), (3e-3, 3e-2))
-
-
-def test_every_seed_is_reported(tasks):
-    """Failures of one half are not lost because the other half has none."""
-    returns = np.full_like(tasks[0].final_return, 60.0)
-    one = FACTORS["estimator"].index("value-baseline")
-    returns[one, ..., : 2 * 13 : 2] = 0.0
-    found = effects([tasks[0]._replace(final_return=returns)])
-    effect = only(found, "Up-v0", LEARNED, "solved at the end", "best")
-    assert effect.difference.value == pytest.approx(-13 / SEEDS)
-    assert effect.difference.p_value == pytest.approx(2**-12)
-    assert effect.direction == -1
-
-
-def test_rates_without_a_failure_have_an_interval(tasks):
-    found = effects([tasks[0]._replace(final_return=np.full((*SHAPE, SEEDS), 60.0))])
-    difference = only(found, "Up-v0", LEARNED, "solved at the end", "best").difference
-    assert (difference.value, difference.p_value) == (0, 1)
-    # Wilson's interval of 200 successes in 200.
-    half = 1.96**2 / (SEEDS + 1.96**2)
-    assert [difference.low, difference.high] == pytest.approx([-half, half], rel=1e-4)
 
 
 def test_the_tables_say_what_the_numbers_are(tasks, tmp_path, monkeypatch):
@@ -236,10 +209,3 @@ def test_runs_are_measured(tmp_path):
     np.testing.assert_allclose(task.steps_to_solve, [[50, 100], [90, 100]])
     np.testing.assert_allclose(task.average_return[0], [7.5, 2.0], atol=0.01)
     assert task.record["nonfinite_runs"] == 1
-
-
-def test_arms_that_end_alike_name_nobody_wrong(tasks):
-    alike = tasks[0]._replace(final_return=np.full((*SHAPE, SEEDS), 50.0))
-    found = few_seeds([alike], ["final return"], COUNTS)
-    assert all(few.equal and not few.sure and few.needed is None for few in found)
-    assert not any(few.equal for few in few_seeds(tasks[:1], ["final return"], COUNTS))

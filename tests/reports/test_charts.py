@@ -44,6 +44,7 @@ def numbers(found):
     return [(each.number, each.name) for each in charts(found)]
 
 
+@pytest.mark.slow
 def test_settings_share_a_number_and_others_count_up(found):
     names = ("final", "curves", "solved", "distribution", "profile")
     settings = [(6, "sensitivity-0"), (6, "sensitivity-1")]
@@ -52,6 +53,7 @@ def test_settings_share_a_number_and_others_count_up(found):
     assert numbers(alone) == [*enumerate(names[1:], start=1)]
 
 
+@pytest.mark.slow
 def test_without_a_threshold_nothing_is_solved(found):
     experiment = found.experiment._replace(threshold=None)
     without = findings.compute_findings(experiment)

@@ -129,6 +129,7 @@ def solve_at_the_end(directory, runs, threshold):
 
 
 @pytest.mark.usefixtures("text_alone")
+@pytest.mark.slow
 def test_tables_and_figures_agree_on_who_solved(tmp_path):
     """Seeds end at different env steps; the figures' last place is the end of each, as table 1."""
     directory = make_sweep(tmp_path / "sweep", num_seeds=40, over=ONE)
@@ -175,6 +176,7 @@ FORMULAS = ("=HYPERLINK(1)", "@SUM(1+1)", "+A1", "-A1", "\tA1")
 
 
 @pytest.mark.usefixtures("text_alone")
+@pytest.mark.slow
 def test_names_are_no_formulas_in_spreadsheets(tmp_path):
     """A spreadsheet computes what begins like a formula: numbers may, names may not."""
     runs = [make_measured_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
@@ -194,6 +196,7 @@ def test_every_table_names_its_configurations(written):
     assert [p.name for p in files if "configuration" not in p.read_text().splitlines()[0]] == []
 
 
+@pytest.mark.slow
 def test_a_thousand_seeds_make_no_larger_charts(tmp_path):
     """Charts take the same room whatever the seeds; only results.csv grows, a line for each."""
     sizes = []

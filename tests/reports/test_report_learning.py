@@ -74,6 +74,7 @@ def test_nobody_solves_it_is_no_race(tmp_path):
     assert not re.search("faster|Fastest", said)
 
 
+@pytest.mark.slow
 def test_every_figure_is_a_vector_and_every_table_has_a_number(crossed):
     beside, page = crossed[0] / "report", crossed[0] / "report.html"
     buttons = set(re.findall(r'data-png="([^"]+)"', page.read_text(encoding="utf-8")))
@@ -90,6 +91,7 @@ def test_every_figure_is_a_vector_and_every_table_has_a_number(crossed):
     assert numbers == ["1", "2", "3", "4", "5"]
 
 
+@pytest.mark.slow
 def test_configurations_have_the_names_that_are_asked_for(tmp_path, monkeypatch):
     directory = make_sweep(tmp_path / "sweep", num_seeds=8, over=RATES)
     names = ["learning rate 0.01=fast", "learning rate 0.001=slow"]

@@ -370,6 +370,7 @@ def test_devices_change_nothing_but_rounding(run, tmp_path):
     assert close(curves(tmp_path / "one"), curves(tmp_path / "two"))
 
 
+@pytest.mark.slow
 def test_a_sweep_whose_first_file_cannot_be_written_was_not_begun(run, monkeypatch):
     """The same command line begins it once there is room."""
 
