@@ -455,7 +455,7 @@ def test_in_a_browser(written):
     """No error, no request, nothing wider than a phone; the keyboard moves the slider."""
     with opened_browser() as browser:
         browser.open(written[1])
-        assert browser.run("document.querySelectorAll('.chart svg').length") == 8
+        assert browser.run("document.querySelectorAll('.chart svg').length") == 7
         rows = "document.querySelectorAll('#chart-distribution .mark-text.role-mark text').length"
         before = browser.run("document.getElementById('chart-distribution').textContent")
         browser.run("document.getElementById('moment').focus()")
