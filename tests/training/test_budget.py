@@ -60,6 +60,7 @@ def test_minutes_become_env_steps_that_repeat_the_run_and_go_on(run, tmp_path, c
     assert results(second) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gpu", [False, True])
 def test_a_default_run_has_the_budget_of_its_machine(monkeypatch, gpu):
     monkeypatch.setattr(defaults, "has_gpu", lambda: gpu)

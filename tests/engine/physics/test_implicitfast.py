@@ -101,6 +101,7 @@ def compiled(chosen):
     return model, np.array([model.joint(joint).name for joint in model.dof_jntid])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("engine", "chosen"), [(jax.vmap, HINGES | OTHERS), (scalar.vmap, FEW)])
 def test_a_step_is_that_of_c(engine, chosen):
     with jax.enable_x64(True):

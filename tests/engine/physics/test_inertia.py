@@ -52,6 +52,7 @@ def at(model, in_jax, qpos, qvel):
     return inertia.fwd_acceleration(in_jax, data)
 
 
+@pytest.mark.slow
 def test_it_is_what_c_solves():
     with jax.enable_x64(True):
         model, in_jax = model_of()
@@ -92,6 +93,7 @@ def test_a_step_of_euler_is_that_of_mjx(option):
                 np.testing.assert_allclose(mine, theirs, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_without_implicit_damping_euler_is_that_of_mjx():
     """The damping at the step's end would change the velocity."""
     model, damped = model_of()

@@ -125,6 +125,7 @@ def test_as_many_rows_of_friction_are_no_limits():
     np.testing.assert_allclose(qacc, data.qacc, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_rows_are_those_of_the_limited_joints():
     data = forward(STATES[4], (0, 0, 0, 0))
     rows = jax.jit(lambda data: jax_fields(mjx.make_constraint(IN_JAX, data)).efc_J)

@@ -95,6 +95,7 @@ def assert_same_solutions(actual, expected, tolerance):
         assert np.max(np.abs(ours - theirs) / scale) < tolerance
 
 
+@pytest.mark.slow
 def test_finds_the_optimum_that_mjx_finds(problems, solve):
     """From good and bad starts."""
     model, ready = problems
@@ -105,6 +106,7 @@ def test_finds_the_optimum_that_mjx_finds(problems, solve):
     assert_same_solutions(solve(ready), expected, 1e-9)
 
 
+@pytest.mark.slow
 def test_in_loops_it_finds_the_same(problems, solve):
     """As for more contacts than there is room for."""
     model, ready = problems
@@ -113,6 +115,7 @@ def test_in_loops_it_finds_the_same(problems, solve):
     assert_same_solutions(found, solve(ready), 1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("double", [True, False])
 def test_ends_where_the_gradient_vanishes(problems, solve, double):
     """No reference: the acceleration balances all forces."""
@@ -155,6 +158,7 @@ def test_the_line_search_finds_the_root_among_kinks():
         assert cost(np.float64(found)) <= cost(grid).min() + 1e-4 * abs(cost(grid).min())
 
 
+@pytest.mark.slow
 def test_a_nan_ends_the_search(problems, solve):
     """It reaches the acceleration, and does not keep the other episodes waiting."""
     ready = in_single(problems[1])
@@ -178,6 +182,7 @@ def test_an_optimum_is_left_as_it_is():
     np.testing.assert_allclose(qacc, [0, 0, -9.81, 0, 0, 0], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_caps_leave_no_more_cost_than_the_start(problems, solve):
     model, ready = problems
     fields = jax.tree.map(np.asarray, jax_fields(ready))
