@@ -31,10 +31,22 @@ ESTIMATORS = {
     "normalized-returns": "mjx_reinforce.learning.estimators:normalized_returns",
 }
 
+#: Programs of published documents: name -> "module:function" of an environment and the settings.
+PROGRAMS = {
+    "gymnasium-tutorial": "mjx_reinforce.published.gymnasium_tutorial:reward_to_go",
+    "gymnasium-tutorial-v0.26": "mjx_reinforce.published.gymnasium_tutorial:mean_log_prob",
+    "baseline-truncated-normal": "mjx_reinforce.published.baseline_truncated_normal:make",
+    "continuous-cartpole": "mjx_reinforce.published.continuous_cartpole:reinforce",
+    "continuous-cartpole-ars": "mjx_reinforce.published.continuous_cartpole:random_search",
+    "categorical-cartpole": "mjx_reinforce.published.categorical_cartpole:make",
+}
+#: Those of these and of ``ALGORITHMS`` that follow no gradient -> episodes that an update plays.
+SEARCHES = {"ars": 16, "continuous-cartpole-ars": 20}
 #: Ways to learn: name -> "module:function" of an environment, see ``store.build``.
 ALGORITHMS = {
     "reinforce": "mjx_reinforce.learning.learner:reinforce",
     "ars": "mjx_reinforce.published.ars:ars",
+    **PROGRAMS,
 }
 
 #: What the system's loader says of a library for which there is no memory.

@@ -13,7 +13,14 @@ from typing import Any
 from mjx_reinforce import envs
 from mjx_reinforce.engine.checks import changed_fields, check_type
 from mjx_reinforce.envs.settings import split_words
-from mjx_reinforce.registry import ALGORITHMS, DISTRIBUTIONS, ESTIMATORS, check_choice, is_own
+from mjx_reinforce.registry import (
+    ALGORITHMS,
+    DISTRIBUTIONS,
+    ESTIMATORS,
+    SEARCHES,
+    check_choice,
+    is_own,
+)
 from mjx_reinforce.settings.declare import MAX_COUNT, MAX_OF_UPDATE, Range
 from mjx_reinforce.settings.groups import (
     CheckpointSettings,
@@ -23,7 +30,6 @@ from mjx_reinforce.settings.groups import (
     PolicySettings,
     Reader,
     RunSettings,
-    SearchSettings,
     UpdateSettings,
 )
 
@@ -36,7 +42,6 @@ class Config(
     LogSettings,
     CheckpointSettings,
     EvaluationSettings,
-    SearchSettings,
     UpdateSettings,
     EstimatorSettings,
     PolicySettings,
@@ -63,7 +68,7 @@ class Config(
     @property
     def episodes_per_update(self) -> int:
         """Episodes that a seed plays for an update."""
-        return 2 * self.num_directions if self.algorithm == "ars" else self.num_episodes
+        return SEARCHES.get(self.algorithm, self.num_episodes)
 
     def training_horizon(self, horizon: int) -> int:
         """Returns the time limit of a training episode of a task, in env steps.
@@ -163,8 +168,6 @@ def check_together(config: Config) -> None:
         raise ValueError("nothing would end this run: give --env-steps or --max-updates a number")
     if config.algorithm == "reinforce":
         _check_reinforce(config)
-    elif config.algorithm == "ars":
-        _check_ars(config)
 
 
 def flag(name: str) -> str:
@@ -234,41 +237,10 @@ def _check_reinforce(config: Config) -> None:
             f"the learning rate decays over --decay-steps {config.decay_steps} or over "
             f"--decay-updates {config.decay_updates}, not both: pass --decay-steps None"
         )
-    if config.update == "each-step" and config.decay_updates is not None:
-        raise ValueError(
-            "--update each-step makes as many optimiser steps as an episode has, so a decay over "
-            f"--decay-updates {config.decay_updates} has no length; choose --decay-steps"
-        )
-    steps = (config.decay_updates or 0) * config.minibatch_updates
-    if config.update == "minibatches" and steps > MAX_OF_UPDATE:
-        raise ValueError(
-            f"the learning rate would decay over {steps:,} optimiser steps, more than the 2^31 - 1 "
-            "that can be counted; lower --decay-updates or --minibatch-updates"
-        )
-
-
-def _check_ars(config: Config) -> None:
-    """Raises ValueError for settings that do not go together."""
-    if config.one_start:
-        raise ValueError(
-            "--one-start is for --algorithm reinforce; for ars, --shared-starts compares the two "
-            "episodes of a direction from one start"
-        )
-    top = config.top_directions
-    if top is not None and top > config.num_directions:
-        raise ValueError(
-            f"--top-directions must be at most --num-directions {config.num_directions}, got {top}"
-        )
-    if config.ars_update == "document" and (config.hidden_sizes or top is not None):
-        raise ValueError(
-            "--ars-update document is for linear policies and all directions, got --hidden-sizes "
-            f"{' '.join(map(str, config.hidden_sizes))} and --top-directions {top}; "
-            "pass --hidden-sizes alone and --top-directions None"
-        )
 
 
 #: What a policy reads, or not.
-_POLICIES = (Reader.CONJUGATE_GRADIENTS, Reader.FREE_STD, Reader.STD, Reader.CONTINUOUS)
+_POLICIES = (Reader.FREE_STD, Reader.STD)
 
 
 def is_read(name: str, config: Config) -> bool:

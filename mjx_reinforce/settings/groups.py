@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+from mjx_reinforce.registry import PROGRAMS, SEARCHES
 from mjx_reinforce.settings.declare import (
     COUNT,
     LAYERS,
@@ -37,37 +38,32 @@ class Reader(enum.Enum):
         self.said, self.holds = said, holds
 
     # An algorithm of the user's own may read all of them.
-    REINFORCE = "--algorithm reinforce", lambda c: c.algorithm != "ars"
-    ARS = "--algorithm ars", lambda c: c.algorithm != "reinforce"
-    VALUE_BASELINE = "--estimator value-baseline", lambda c: c.estimator == "value-baseline"
-    VALUE_MINIBATCHES = "--value-fit minibatches", lambda c: c.value_fit == "minibatches"
+    GRADIENT = "an --algorithm that follows a gradient", lambda c: c.algorithm not in SEARCHES
+    REINFORCE = (
+        "--algorithm reinforce",
+        lambda c: c.algorithm not in SEARCHES and c.algorithm not in PROGRAMS,
+    )
+    VALUE_BASELINE = (
+        "--estimator value-baseline",
+        lambda c: c.estimator == "value-baseline" or c.algorithm == "baseline-truncated-normal",
+    )
     LEAVE_ONE_OUT = "--estimator leave-one-out", lambda c: c.estimator == "leave-one-out"
     CUT = "--train-horizon N", lambda c: c.train_horizon is not None
     STANDARDIZE = "--standardize", lambda c: c.standardize
     DIRECTORY = "--output DIR", lambda c: c.output is not None or c.resume is not None
-    MINIBATCHES = "--update minibatches", lambda c: c.update == "minibatches"
     NATURAL_GRADIENT = "--update natural-gradient", lambda c: c.update == "natural-gradient"
-    CONJUGATE_GRADIENTS = (
-        "hidden layers or another --policy than normal",
-        lambda c: bool(c.hidden_sizes) or c.policy != "normal",
-    )
     # The natural gradient's step has its length from --max-kl.
     OPTIMIZER = "another --update than natural-gradient", lambda c: c.update != "natural-gradient"
     FIRST_RATE = (
         "another --update than natural-gradient, or --final-learning-rate",
         lambda c: c.update != "natural-gradient" or c.final_learning_rate is not None,
     )
-    # A minibatch is averaged over its own steps.
-    WHOLE_EPISODES = (
-        "--update full-batch or --update each-step",
-        lambda c: c.update != "minibatches",
-    )
+    NORMALIZATION = "--normalize-steps N", lambda c: c.normalize_steps != 0
+    ADAM = "--optimizer adam", lambda c: c.optimizer == "adam"
     DECAY = (
         "--decay-steps N (or --decay-updates N)",
         lambda c: c.decay_steps is not None or c.decay_updates is not None,
     )
-    NORMALIZATION = "--normalize-steps N", lambda c: c.normalize_steps != 0
-    ADAM = "--optimizer adam or --optimizer adamw", lambda c: c.optimizer in ("adam", "adamw")
     DECAY_STEPS = "--decay-steps N", lambda c: c.decay_steps is not None
     FREE_STD = (
         "a --policy whose standard deviation is the same in all states",
@@ -77,18 +73,17 @@ class Reader(enum.Enum):
         "a --policy with a standard deviation",
         lambda c: (
             c.policy not in ("categorical", "deterministic")
-            and not (c.policy == "auto" and c.algorithm == "ars")
+            and not (c.policy == "auto" and c.algorithm in SEARCHES)
         ),
     )
-    CONTINUOUS = "a --policy for continuous actions", lambda c: c.policy != "categorical"
 
 
 def _for_reinforce(default: Value, *marks: enum.Enum) -> Value:
     return setting(default, *marks, Reader.REINFORCE)
 
 
-def _for_ars(default: Value, *marks: enum.Enum) -> Value:
-    return setting(default, *marks, Reader.ARS)
+def _for_gradients(default: Value, *marks: enum.Enum) -> Value:
+    return setting(default, *marks, Reader.GRADIENT)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,7 +99,8 @@ class RunSettings:
     """Settings of the environment, such as frame_skip=4; `envs ID` lists them."""
     algorithm: str = "reinforce"
     """reinforce follows the policy gradient; ars (augmented random search, Mania et al. 2018) tries
-    out changes of the parameters; its settings are in the group "search". Or module:name."""
+    out changes of the parameters, with the numbers of mjx_reinforce.ars. A preset's name is its
+    program, without the preset's settings. Or module:name."""
     num_seeds: int = setting(4, Range.AT_LEAST_1, once="every configuration has as many seeds")
     """Number of independent seeds, trained together in one compiled program."""
     seeds: str | None = setting(
@@ -134,16 +130,14 @@ class RunSettings:
         False, Mark.BUDGET, once="a run would end when others beside it are solved"
     )
     """Stop once every seed's last evaluation reached the environment's reward threshold."""
-    num_episodes: int = _for_reinforce(16, *COUNT)
-    """Episodes that each seed plays for an update. With ars, use --num-directions."""
+    num_episodes: int = _for_gradients(16, *COUNT)
+    """Episodes that each seed plays for an update."""
     horizon: int | None = setting(None, *COUNT)
     """Time limit of an episode in env steps. None: the environment's own limit."""
     train_horizon: int | None = setting(None, *COUNT)
     """Cut training episodes, not evaluations, after this many env steps."""
-    whole_after: float = _for_reinforce(1.0, Range.SHARE, Reader.CUT)
+    whole_after: float = _for_gradients(1.0, Range.SHARE, Reader.CUT)
     """Cut until this share of the budget is used."""
-    one_start: bool = False
-    """Begin all training episodes, not evaluations, of a seed in one state."""
     engine: Literal["auto", "vmap", "native"] = setting(
         "auto", once="it changes no result but by rounding"
     )
@@ -172,11 +166,6 @@ class PolicySettings:
     hidden_sizes: tuple[int, ...] = setting((32, 32), *LAYERS)
     """Units of each tanh layer of the policy network. The flag without a number makes the policy
     linear."""
-    shared_trunk: bool = True
-    """Compute means and stds in one network; otherwise stds have their own."""
-    initializer: Literal["orthogonal", "torch"] = "orthogonal"
-    """Initial weights. orthogonal: the last layer's scaled by 0.01, so that an untrained policy
-    acts alike everywhere. torch: the uniform weights of torch.nn.Linear."""
     initial_std: float = setting(0.5, *POSITIVE, Reader.STD, Mark.TRACED, Mark.LOG)
     """Standard deviation of the actions before training, in the action's unit."""
     final_std: float | None = _for_reinforce(
@@ -184,9 +173,6 @@ class PolicySettings:
     )
     """Target of the standard deviation of the actions, reached over --decay-steps besides what
     is learned. With --max-kl it may stay above. None: learned only."""
-    rescale: bool = setting(True, Reader.CONTINUOUS)
-    """Scale the mean so that an output of 1 is the end of the action's range. Otherwise the output
-    of the network is the mean."""
     normalize_steps: int | None = setting(1000, Range.AT_LEAST_0, Range.INT32)
     """Scale observations by their mean and standard deviation over about this many first steps. 0:
     do not scale. None: update the statistics throughout training."""
@@ -208,7 +194,7 @@ class EstimatorSettings:
     ended_episodes: Literal["zero", "skip"] = _for_reinforce("zero", Reader.LEAVE_ONE_OUT)
     """How leave-one-out counts other episodes that are over at a step. zero: as the 0 that they
     still earn. skip: not at all, which may be less noisy."""
-    discount: float = _for_reinforce(0.99, Range.SHARE, Mark.TRACED, Mark.LOG_OF_REST)
+    discount: float = _for_gradients(0.99, Range.SHARE, Mark.TRACED, Mark.LOG_OF_REST)
     """Discount of rewards, in [0, 1]."""
     final_discount: float | None = _for_reinforce(None, Range.SHARE, Mark.TRACED)
     """Discount at the end of the budget. It changes evenly in the logarithm of 1 / (1 -
@@ -224,23 +210,15 @@ class EstimatorSettings:
         10.0, *NOT_NEGATIVE, Reader.STANDARDIZE, Mark.TRACED, Mark.LOG
     )
     """Number added to the standard deviation that divides the weights, in units of return."""
-    value_learning_rate: float = _for_reinforce(
+    value_learning_rate: float = _for_gradients(
         3e-3, *RATE, Reader.VALUE_BASELINE, Mark.TRACED, Mark.LOG
     )
     """Adam's learning rate for the value network of value-baseline."""
-    value_fit: Literal["minibatches", "full-batch"] = _for_reinforce(
-        "minibatches", Reader.VALUE_BASELINE
-    )
-    """How the value network is trained. minibatches: it reads observation and time, and is
-    fitted to steps drawn from the episodes, in units of the return's std. full-batch, as in
-    published programs: it reads the observation only, and each step takes the whole rollout."""
     value_fits: int = _for_reinforce(32, *STEPS, Reader.VALUE_BASELINE)
     """Gradient steps of the value network in each update, on the squared error."""
-    value_batch_size: int = _for_reinforce(
-        256, *COUNT, Reader.VALUE_BASELINE, Reader.VALUE_MINIBATCHES
-    )
+    value_batch_size: int = _for_reinforce(256, *COUNT, Reader.VALUE_BASELINE)
     """Env steps in each minibatch of the value network, drawn with replacement."""
-    value_hidden_sizes: tuple[int, ...] = _for_reinforce((64, 64), *LAYERS, Reader.VALUE_BASELINE)
+    value_hidden_sizes: tuple[int, ...] = _for_gradients((64, 64), *LAYERS, Reader.VALUE_BASELINE)
     """Units of each tanh layer of the value network."""
 
 
@@ -248,35 +226,20 @@ class EstimatorSettings:
 class UpdateSettings:
     """How the gradient becomes changes of the parameters (reinforce)."""
 
-    update: Literal["full-batch", "natural-gradient", "minibatches", "each-step"] = _for_reinforce(
-        "full-batch"
-    )
+    update: Literal["full-batch", "natural-gradient"] = _for_reinforce("full-batch")
     """How a rollout changes the policy. full-batch: one optimizer step. natural-gradient: one
-    step of length --max-kl, which a decay of the learning rate shortens. minibatches: several,
-    on steps drawn from the rollout. each-step: one for each time step, in order. Only the first
-    two measure gradient_snr."""
+    step of length --max-kl, which a decay of the learning rate shortens."""
     natural_damping: float = _for_reinforce(0.1, *POSITIVE, Reader.NATURAL_GRADIENT, Mark.TRACED)
     """Number added to the diagonal of the Fisher matrix of natural-gradient. It shortens the step
     along directions in which the policy hardly changes."""
-    natural_iterations: int = _for_reinforce(
-        10, *STEPS, Reader.NATURAL_GRADIENT, Reader.CONJUGATE_GRADIENTS
-    )
-    """Iterations of conjugate gradients that solve for the direction of natural-gradient. A linear
-    policy with the distribution normal needs none."""
-    minibatch_updates: int = _for_reinforce(50, *STEPS, Reader.MINIBATCHES)
-    """Optimizer steps in each update, with --update minibatches."""
-    minibatch_size: int = _for_reinforce(128, *COUNT, Reader.MINIBATCHES)
-    """Env steps in each minibatch, drawn with replacement. The loss is their mean."""
-    loss_per: Literal["episode", "step"] = _for_reinforce("episode", Reader.WHOLE_EPISODES)
-    """Average the gradient over episodes (the definition) or over steps."""
     entropy_cost: float = _for_reinforce(0.0, *NOT_NEGATIVE, Mark.TRACED)
     """Weight of the policy's entropy in the objective."""
-    optimizer: Literal["adam", "adamw", "sgd"] = _for_reinforce("adam", Reader.OPTIMIZER)
+    optimizer: Literal["adam", "sgd"] = _for_reinforce("adam", Reader.OPTIMIZER)
     """The rule that turns a gradient into a step."""
-    learning_rate: float = _for_reinforce(1e-2, *RATE, Reader.FIRST_RATE, Mark.TRACED, Mark.LOG)
+    learning_rate: float = _for_gradients(1e-2, *RATE, Reader.FIRST_RATE, Mark.TRACED, Mark.LOG)
     """Learning rate of the optimizer at the start of training."""
     momentum: float = _for_reinforce(0.9, Range.BELOW_1, Reader.OPTIMIZER, Reader.ADAM, Mark.TRACED)
-    """b1 of adam and adamw: the share of the last mean gradient that the next one keeps."""
+    """b1 of adam: the share of the last mean gradient that the next one keeps."""
     final_learning_rate: float | None = _for_reinforce(
         None, *RATE, Reader.DECAY, Mark.TRACED, Mark.LOG
     )
@@ -286,9 +249,6 @@ class UpdateSettings:
     noise. budget: the length of the run. None: no decay, unless --decay-updates gives one."""
     decay_updates: int | None = _for_reinforce(None, *COUNT)
     """Updates over which the learning rate decays. Requires --decay-steps None."""
-    weight_decay: float = _for_reinforce(0.0, *NOT_NEGATIVE, Reader.OPTIMIZER)
-    """Weight decay. adamw: the parameters shrink by the learning rate times this. adam, sgd: this
-    times the parameters is added to the gradient (L2, as in PyTorch)."""
     max_grad_norm: float | None = _for_reinforce(
         1.0, *POSITIVE, Reader.OPTIMIZER, Mark.TRACED, Mark.LOG
     )
@@ -297,25 +257,6 @@ class UpdateSettings:
     max_kl: float | None = _for_reinforce(None, *POSITIVE, Mark.TRACED, Mark.LOG)
     """Approximate maximum of the mean KL divergence, in nats, between the policies before and
     after an update, over the visited steps. A larger change is shortened. None: no maximum."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class SearchSettings:
-    """Augmented random search (ars)."""
-
-    num_directions: int = _for_ars(8, *COUNT)
-    """Directions tried in an update. Each takes one episode forwards and one backwards."""
-    top_directions: int | None = _for_ars(None, Range.AT_LEAST_1)
-    """Number of directions that are used, those with the greatest returns. If not given, all."""
-    step_size: float = _for_ars(0.02, *RATE, Mark.TRACED, Mark.LOG)
-    """Learning rate of ars."""
-    noise_std: float = _for_ars(0.03, *POSITIVE, Mark.TRACED, Mark.LOG)
-    """Distance along a direction between the current parameters and the parameters that are
-    tried."""
-    shared_starts: bool = _for_ars(False)
-    """Start both episodes of a direction in the same state."""
-    ars_update: Literal["paper", "document"] = _for_ars("paper")
-    """Update rule. paper: Mania et al. document: a published notebook, with its mistakes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -374,7 +315,6 @@ GROUPS = {
     "policy": PolicySettings,
     "estimator": EstimatorSettings,
     "updates": UpdateSettings,
-    "search": SearchSettings,
     "evaluation": EvaluationSettings,
     "checkpoints": CheckpointSettings,
     "logs": LogSettings,
@@ -386,7 +326,6 @@ MAIN = (
 )
 #: What it shows too where the default of one setting is not the usual one.
 UNUSUAL = {
-    "algorithm": ("num_directions", "step_size", "noise_std"),
     "train_horizon": ("train_horizon",),
     "update": ("update", "max_kl"),
 }

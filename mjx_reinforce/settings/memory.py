@@ -13,8 +13,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mjx_reinforce.engine.memory import gigabytes, host_memory
+from mjx_reinforce.registry import PROGRAMS, SEARCHES
 from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, flag, marked
 from mjx_reinforce.settings.declare import Range
+from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.settings.tables import TASKS, Task
 
 _FLOAT = 4  # bytes
@@ -61,21 +63,18 @@ def parts(config: Config, task: Task) -> list[MemoryPart]:
     steps = seeds * horizon * episodes
     values = task.observation + task.action + 3
     evaluated = seeds * (config.horizon or task.horizon) * 2 * config.eval_episodes
-    follows = config.algorithm != "ars"  # a gradient; else it searches with many policies
-    fewer = "--num-episodes" if follows else "--num-directions"
+    follows = config.algorithm not in SEARCHES  # a gradient; else it searches with many policies
+    fewer = "--num-episodes" if follows else "--hidden-sizes"
     held = seeds * (min(horizon, _CHUNK) if follows else 1) * episodes * sum(config.hidden_sizes)
-    policies = seeds if follows else seeds * 2 * config.num_directions
+    policies = seeds if follows else seeds * episodes
     network = _ACTIVATIONS * held + _PARAMETERS * policies * num_parameters(config, task)
-    critic = config.value_hidden_sizes if config.estimator == "value-baseline" else ()
+    critic = config.value_hidden_sizes if Reader.VALUE_BASELINE.holds(config) else ()
     critics = _CRITIC_PARAMETERS * seeds * critic_parameters(config, task)
     valued, fitted = steps, 0
-    if config.value_fit == "minibatches" and critic:
+    if critic and config.algorithm not in PROGRAMS:
         fitted = seeds * config.value_batch_size
         valued = seeds * min(horizon, _CHUNK) * episodes
-    widest = max([values, *config.hidden_sizes])
-    drawn = seeds * config.minibatch_size if config.update == "minibatches" else 0
     return [
-        MemoryPart(_FLOAT * drawn * widest, "--minibatch-size or --num-seeds"),
         MemoryPart(
             _FLOAT * fitted * (config.value_fits + values + _ACTIVATIONS * sum(critic)),
             "--value-batch-size, --value-fits or --num-seeds",
@@ -100,7 +99,7 @@ def num_parameters(config: Config, task: Task) -> int:
 
 def critic_parameters(config: Config, task: Task) -> int:
     """Returns how many parameters the value network has, 0 where there is none."""
-    if config.algorithm != "reinforce" or config.estimator != "value-baseline":
+    if config.algorithm in SEARCHES or not Reader.VALUE_BASELINE.holds(config):
         return 0
     return _num_weights([task.observation, *config.value_hidden_sizes, 1])
 

@@ -4,7 +4,15 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.engine.checks import check_kind, explain
-from mjx_reinforce.registry import ALGORITHMS, ESTIMATORS, is_own, load_choice, load_definition
+from mjx_reinforce.registry import (
+    ALGORITHMS,
+    ESTIMATORS,
+    PROGRAMS,
+    SEARCHES,
+    is_own,
+    load_choice,
+    load_definition,
+)
 from mjx_reinforce.settings.config import Config, check_step_count
 
 if TYPE_CHECKING:
@@ -40,7 +48,9 @@ def build(
     Raises:
       ValueError: the settings do not fit the environment.
     """
+    from mjx_reinforce.console.streams import to_screen
     from mjx_reinforce.engine.contract import check_environment
+    from mjx_reinforce.engine.play import available
     from mjx_reinforce.export.policy_files import build_policy
     from mjx_reinforce.learning.contract import check_horizon
 
@@ -61,46 +71,47 @@ def build(
     }
     if is_own(config.algorithm):
         return _build_own(env, config, shared), horizon
-    if config.algorithm == "ars":
-        return _build_ars(env, config, shared), horizon
-    return _build_reinforce(env, config, shared, devices), horizon
+    follows = config.algorithm not in SEARCHES
+    if follows and config.engine != "vmap" and (said := available.announcement(env)):
+        to_screen(said)
+    if config.algorithm == "reinforce":
+        learner = _build_reinforce(env, config, shared)
+    elif config.algorithm in PROGRAMS:
+        learner = load_definition(PROGRAMS[config.algorithm])(env, config, **shared)
+    else:
+        learner = load_definition(ALGORITHMS[config.algorithm])(env, **shared)
+    if follows:
+        learner = _for_many_seeds(learner, env, config, shared["horizon"], devices)
+    return learner, horizon
 
 
 def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
     """Returns what ``policy_files.build_policy`` needs to build the policy without the env."""
     from mjx_reinforce.engine.base import Discrete, action_space, observation_size
 
-    space = action_space(env)
+    space, published = action_space(env), config.algorithm in PROGRAMS
     if isinstance(space, Discrete):
         family, described = "categorical", {"num_actions": space.num_actions}
     else:
-        family = "deterministic" if config.algorithm == "ars" else "normal"
+        family = "deterministic" if config.algorithm in SEARCHES else "normal"
         described = {"action_low": space.low.tolist(), "action_high": space.high.tolist()}
     return {
         "env": config.env,
         "policy": family if config.policy == "auto" else config.policy,
         "hidden_sizes": list(config.hidden_sizes),
-        "shared_trunk": config.shared_trunk,
-        "initializer": config.initializer,
+        "shared_trunk": True,
+        "initializer": "torch" if published else "orthogonal",
         "initial_std": config.initial_std,
-        "rescale": config.rescale,
+        "rescale": not published,
         "observation_size": observation_size(env),
         **described,
     }
 
 
-def _build_reinforce(
-    env: "Environment", config: Config, shared: dict[str, Any], devices: "Devices | None"
-) -> "Learner":
-    from mjx_reinforce.console.streams import to_screen
-    from mjx_reinforce.engine.play import available
+def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
     from mjx_reinforce.learning.learner import reinforce
-    from mjx_reinforce.learning.schedules import Cut
-    from mjx_reinforce.training import hosting
 
-    if config.engine in ("auto", "native") and (said := available.announcement(env)):
-        to_screen(said)
-    learner = reinforce(
+    return reinforce(
         env,
         estimator=_build_estimator(config, shared["horizon"]),
         optimizer=_build_optimizer(config),
@@ -110,29 +121,24 @@ def _build_reinforce(
         max_kl=config.max_kl,
         **shared,
     )
+
+
+def _for_many_seeds(
+    learner: "Learner",
+    env: "Environment",
+    config: Config,
+    horizon: int,
+    devices: "Devices | None",
+) -> "Learner":
+    """Returns a learner with what many seeds need, see ``training.hosting``."""
+    from mjx_reinforce.learning.schedules import Cut
+    from mjx_reinforce.training import hosting
+
     cut = None
     if config.train_horizon is not None and config.whole_after < 1:
         cut = Cut(config.train_horizon, config.whole_after)
-    size = config.num_episodes, shared["horizon"]
-    learner = hosting.hosted(
-        learner, env, *size, cut=cut, devices=devices, one_start=config.one_start
-    )
-    return hosting.short_episodes(learner, size[1], config.num_seeds, cut.steps if cut else 0)
-
-
-def _build_ars(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
-    from mjx_reinforce.published.ars import ars
-
-    return ars(
-        env,
-        num_directions=config.num_directions,
-        top_directions=config.top_directions,
-        step_size=config.step_size,
-        noise_std=config.noise_std,
-        shared_starts=config.shared_starts,
-        update=config.ars_update,
-        **shared,
-    )
+    learner = hosting.hosted(learner, env, config.num_episodes, horizon, cut=cut, devices=devices)
+    return hosting.short_episodes(learner, horizon, config.num_seeds, cut.steps if cut else 0)
 
 
 def _build_own(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
@@ -196,16 +202,16 @@ def _build_value_baseline(
     import optax
 
     from mjx_reinforce.learning.policy import MLP
-    from mjx_reinforce.learning.value import full_batch_value_baseline, value_baseline
+    from mjx_reinforce.learning.value import value_baseline
 
-    shared = {
-        "network": MLP(config.value_hidden_sizes, 1, initializer=config.initializer),
-        "optimizer": optax.adam(config.value_learning_rate),
-        "num_fits": config.value_fits,
-    }
-    if config.value_fit == "full-batch":
-        return full_batch_value_baseline(discount, **shared)
-    return value_baseline(discount, horizon=horizon, batch_size=config.value_batch_size, **shared)
+    return value_baseline(
+        discount,
+        horizon=horizon,
+        network=MLP(config.value_hidden_sizes, 1),
+        optimizer=optax.adam(config.value_learning_rate),
+        num_fits=config.value_fits,
+        batch_size=config.value_batch_size,
+    )
 
 
 def _build_optimizer(config: Config) -> "optax.GradientTransformation":
@@ -216,14 +222,11 @@ def _build_optimizer(config: Config) -> "optax.GradientTransformation":
 
     rate: Any = config.learning_rate
     final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
-    if config.decay_updates is not None:
-        # The schedule counts optimiser steps.
-        each = config.minibatch_updates if config.update == "minibatches" else 1
-        rate = optax.linear_schedule(rate, final, config.decay_updates * each)
+    if config.decay_updates is not None:  # of one optimizer step each
+        rate = optax.linear_schedule(rate, final, config.decay_updates)
     optimizer = make_optimizer(
         config.optimizer,
         rate,
-        weight_decay=config.weight_decay,
         max_grad_norm=config.max_grad_norm,
         momentum=config.momentum,
     )
@@ -241,18 +244,10 @@ def _build_optimizer(config: Config) -> "optax.GradientTransformation":
 
 
 def _build_update(config: Config, policy: "Policy") -> "Update":
-    from mjx_reinforce.learning import updates
     from mjx_reinforce.learning.natural_gradient import natural_gradient
+    from mjx_reinforce.learning.updates import full_batch
 
-    if config.update == "natural-gradient":
-        assert config.max_kl is not None  # checked
-        return natural_gradient(
-            policy,
-            config.max_kl,
-            damping=config.natural_damping,
-            iterations=config.natural_iterations,
-        )
-    if config.update == "minibatches":
-        return updates.minibatches(config.minibatch_updates, config.minibatch_size)
-    chosen = updates.full_batch() if config.update == "full-batch" else updates.each_step()
-    return updates.per_step(chosen) if config.loss_per == "step" else chosen
+    if config.update == "full-batch":
+        return full_batch()
+    assert config.max_kl is not None  # checked
+    return natural_gradient(policy, config.max_kl, damping=config.natural_damping)

@@ -88,8 +88,9 @@ def _traced(config: Config, swept: Collection[str], exact: bool) -> dict[str, fl
     """Returns the numbers of a configuration that its programs take as arguments."""
     if is_own(config.algorithm):
         return {}
-    other = Reader.ARS if config.algorithm == "reinforce" else Reader.REINFORCE
-    names = set(marked(Mark.TRACED)).difference(marked(other))
+    names = set(marked(Mark.TRACED))
+    for reader in (Reader.GRADIENT, Reader.REINFORCE):
+        names.difference_update(() if reader.holds(config) else marked(reader))
     if not (Reader.REINFORCE.holds(config) and Reader.FREE_STD.holds(config)):
         # Others have ``initial_std`` in their actions, which an engine may compile.
         names.discard("initial_std")

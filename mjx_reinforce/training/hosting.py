@@ -191,7 +191,6 @@ def hosted(
     *,
     cut: Cut | None = None,
     devices: Devices | None = None,
-    one_start: bool = False,
 ) -> Learner:
     """Returns a learner of ``reinforce`` that plays as ``Host`` does.
 
@@ -202,18 +201,12 @@ def hosted(
       horizon: T, in steps.
       cut: of the episodes of training.
       devices: see ``Host``.
-      one_start: reset all episodes of a seed with one key, drawn at ``init``.
     """
     limit = None if cut is None else cut.limit
     host = Host(env, num_episodes, horizon, learner, limit, devices)
 
-    def init(key: jax.Array) -> TrainState:
-        state = learner.init(key)
-        key, start_key = jax.random.split(state.key)
-        return dataclasses.replace(state, key=key, start_key=start_key)
-
-    if one_start:
-        return learner._replace(init=init, play=host.__call__)
+    if jax.eval_shape(learner.init, jax.random.key(0)).start_key is not None:
+        return learner._replace(play=host.__call__)
     # Elsewhere an episode that is not played still takes its place.
     return learner._replace(play=host if learner.engine.name == "native" else host.__call__)
 

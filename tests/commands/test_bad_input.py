@@ -48,7 +48,6 @@ from mjx_reinforce.store.build import build
 # Settings that make no sense.
 
 NATURAL, VALUE = {"update": "natural-gradient", "max_kl": 0.01}, {"estimator": "value-baseline"}
-MINIBATCHES = {"update": "minibatches"}
 #: What is said of settings; each range and each rule once.
 NONSENSE = {
     "--num-seeds must be at least 1, got 0": {"num_seeds": 0},
@@ -71,8 +70,8 @@ NONSENSE = {
     "--hidden-sizes must be a tuple, each entry a whole number": {"hidden_sizes": (32, None)},
     "--learning-rate must be a number, got None": {"learning_rate": None},
     "--output must be Path or None, got 'out'": {"output": "out"},
-    "--optimizer must be one of 'adam', 'adamw', 'sgd', got 'rms'": {"optimizer": "rms"},
-    "--algorithm must be ars or reinforce, or module:name for your own": {"algorithm": "ppo"},
+    "--optimizer must be one of 'adam', 'sgd', got 'rms'": {"optimizer": "rms"},
+    "or reinforce, or module:name for your own, got 'ppo'": {"algorithm": "ppo"},
     "unknown policy 'gaussian'": {"policy": "gaussian"},
     "Did you mean 'leave-one-out'": {"estimator": "leave-one"},
     "Did you mean 'InvertedPendulum-v5'": {"env": "InvertedPendulm-v5"},
@@ -84,12 +83,6 @@ NONSENSE = {
     "one that changes must be less than 1": {"discount": 1.0, "final_discount": 0.9},
     "has the length of its steps from --max-kl, which is None": {"update": "natural-gradient"},
     "not both: pass --decay-steps None": {"decay_updates": 9},
-    "choose --decay-steps": {"update": "each-step", "decay_updates": 9, "decay_steps": None},
-    "decay over 2,500,000,000 optimiser steps": MINIBATCHES
-    | {"minibatch_updates": 50_000, "decay_updates": 50_000, "decay_steps": None},
-    "for ars, --shared-starts": {"algorithm": "ars", "one_start": True},
-    "at most --num-directions 8, got 9": {"algorithm": "ars", "top_directions": 9},
-    "pass --hidden-sizes alone": {"algorithm": "ars", "ars_update": "document"},
 }
 
 
@@ -101,28 +94,22 @@ def test_settings_that_make_no_sense_are_refused(words):
 
 #: Settings that would do nothing, by what would read them.
 IDLE = {
-    Reader.REINFORCE: {"discount": 0.5, "algorithm": "ars"},
-    Reader.ARS: {"num_directions": 4},
+    Reader.GRADIENT: {"discount": 0.5, "algorithm": "ars"},
+    Reader.REINFORCE: {"max_kl": 0.5, "algorithm": "categorical-cartpole"},
     Reader.VALUE_BASELINE: {"value_batch_size": 64},
-    Reader.VALUE_MINIBATCHES: VALUE | {"value_fit": "full-batch", "value_batch_size": 9},
     Reader.LEAVE_ONE_OUT: VALUE | {"ended_episodes": "skip"},
     Reader.CUT: {"whole_after": 0.5},
     Reader.STANDARDIZE: {"standardize": False, "standardize_floor": 1.0},
     Reader.DIRECTORY: {"overwrite": True},
-    Reader.MINIBATCHES: {"minibatch_size": 64},
     Reader.NATURAL_GRADIENT: {"natural_damping": 0.1},
-    Reader.CONJUGATE_GRADIENTS: NATURAL
-    | {"natural_iterations": 5, "hidden_sizes": (), "policy": "normal"},
     Reader.OPTIMIZER: NATURAL | {"optimizer": "sgd"},
     Reader.FIRST_RATE: NATURAL | {"learning_rate": 0.1},
-    Reader.WHOLE_EPISODES: MINIBATCHES | {"loss_per": "step"},
     Reader.DECAY: {"final_learning_rate": 1e-3, "decay_steps": None},
     Reader.NORMALIZATION: {"normalize_steps": 0, "normalize_min_std": 0.1},
     Reader.ADAM: {"optimizer": "sgd", "momentum": 0.5},
     Reader.DECAY_STEPS: {"final_std": 0.1, "decay_steps": None, "decay_updates": 3},
     Reader.FREE_STD: {"final_std": 0.1, "policy": "normal-softplus"},
     Reader.STD: {"initial_std": 0.3, "algorithm": "ars"},
-    Reader.CONTINUOUS: {"rescale": False, "policy": "categorical"},
 }
 
 
@@ -155,9 +142,9 @@ def refused(run, monkeypatch, tmp_path, capsys):
 #: What the command line is told: of its words, and of what depends on the environment.
 REFUSED = {
     "--num-seeds 0": "--num-seeds must be at least 1, got 0",
-    "--algorithm ars --discount 0.5 --no-standardize": "--discount 0.5 --no-standardize would do "
+    "--algorithm ars --max-kl 0.5 --no-standardize": "--no-standardize --max-kl 0.5 would do "
     "nothing: only --algorithm reinforce reads that; leave them out, or choose",
-    "gymnasium-tutorial --minibatch-size 64": "choose --update minibatches",
+    "gymnasium-tutorial --max-kl 0.1": "only --algorithm reinforce reads that",
     "gymnasium-tutorail": "Did you mean 'gymnasium-tutorial'",
     "--seeds 4:4": "--seeds must be FIRST:END, such as 64:128, got '4:4'",
     "--seeds 0:4 --num-seeds 4": "--seeds 0:4 says how many seeds there are",
@@ -170,10 +157,8 @@ REFUSED = {
     "--num-episodes 16 --env-steps None --max-updates 1125899906842624": "give --env-steps, or",
     # What auto stands for depends on the actions of the environment.
     "--env CartPole-v1 --initial-std 0.3": "--initial-std 0.3 would do nothing",
-    "--env CartPole-v1 --algorithm ars --no-rescale": "--no-rescale would do nothing",
     "--env CartPole-v1 --policy normal": "continuous action space",
     "--env Survive-v0 --policy categorical": "discrete action space",
-    "--env Survive-v0 --output new/deep/run --no-shared-trunk": "without a shared trunk",
     "--update natural-gradient --max-kl 0.1 --policy tanh-normal": "whose KL divergence is known",
     "--env os:path": "'os:path' is no class or function, but of type module",
     "--env nowhere:X": "No module named 'nowhere'",
@@ -380,8 +365,7 @@ class Watched:
     [
         {},
         {"algorithm": "ars", "hidden_sizes": ()},
-        {"update": "minibatches"},
-        {"update": "each-step"},
+        {"algorithm": "baseline-truncated-normal"},
         {"standardize": False, "estimator": "value-baseline"},
     ],
 )
@@ -392,8 +376,8 @@ def test_the_marks_say_what_is_read(changes):
     build(Survive(), watched)
     listed = {name for reader in Reader for name in marked(reader)}
     idle = {name for reader in Reader if not reader.holds(config) for name in marked(reader)}
-    # These three are always handed on; the policy or the update does not look at them.
-    handed = {"initial_std", "rescale", "loss_per"}
+    # It is always handed on; the policy may not look at it.
+    handed = {"initial_std"}
     assert (listed - idle) - handed == (listed & watched.read) - handed
     # What programs on disk do not depend on is not built into them: budgets are only checked.
     assert watched.read.isdisjoint({*marked(Mark.NOT_COMPILED)} - {"env_steps", "max_updates"})
@@ -403,7 +387,7 @@ def test_no_default_is_refused():
     """Also where a flag says what holds anyway, or another mode makes presets' settings idle."""
     for start in ([], ["gymnasium-tutorial"]):
         default = parse(start)
-        same = parse([*start, "--minibatch-size", str(default.minibatch_size)])
+        same = parse([*start, "--discount", str(default.discount)])
         other = "reinforce" if default.algorithm == "ars" else "ars"
         assert (same, parse([*start, "--algorithm", other]).algorithm) == (default, other), start
 
@@ -488,7 +472,7 @@ def named(*kinds):
 
 
 #: Whole numbers that are not at least 1 and less than 2^31.
-_OTHER_COUNTS = {"seed", "eval_seed", "num_seeds", "normalize_steps", "top_directions"}
+_OTHER_COUNTS = {"seed", "eval_seed", "num_seeds", "normalize_steps"}
 _COUNTS = sorted({*named(int, int | None)} - _OTHER_COUNTS)
 _NUMBERS, _SWITCHES = named(float, float | None), named(bool)
 _SIZES = named(tuple[int, ...])
@@ -519,16 +503,13 @@ RIGHT = {
     **{name: st.sampled_from(typing.get_args(kind)) for name, kind in _CHOICES.items()},
     "num_seeds": st.integers(1, 9),
     "num_episodes": st.integers(2, 9),
-    "num_directions": st.integers(9, 18),
     "normalize_steps": st.none() | st.integers(0, 9),
     "decay_steps": st.none() | st.integers(1, 9),
     "decay_updates": st.none(),
     "minutes": st.none(),
-    "top_directions": st.none() | st.integers(1, 9),
     "algorithm": st.sampled_from(["reinforce", "ars"]),
     "policy": st.sampled_from(["normal-softplus", "normal-sigmoid"]),
     "estimator": st.sampled_from([*ESTIMATORS]),
-    "ars_update": st.just("paper"),
     "reward_shift": st.floats(-5.0, 5.0),
 }
 

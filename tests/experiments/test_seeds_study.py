@@ -19,7 +19,10 @@ from experiments.studies.seeds.few import any_pair, few_seeds
 from experiments.studies.seeds.runs import Task, load, measure, save
 
 #: With a rate more than in the study, so that two are below its best and two are not.
-FACTORS = seeds_runs.FACTORS | {"learning_rate": [3e-3, 1e-2, 3e-2, 1e-1]}
+FACTORS = seeds_runs.FACTORS | {
+    "estimator": ["reward-to-go", "leave-one-out", "value-baseline"],
+    "learning_rate": [3e-3, 1e-2, 3e-2, 1e-1],
+}
 SHAPE = tuple(len(values) for values in FACTORS.values())
 SEEDS, BUDGET, COUNTS = 200, 1000, seeds_few.COUNTS
 LEARNED, _, _, GAMMA, NORMALISE = CONTRASTS

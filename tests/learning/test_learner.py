@@ -18,6 +18,7 @@ from mjx_reinforce.learning import counts, estimators, updates
 from mjx_reinforce.learning import learner as learner_module
 from mjx_reinforce.learning.estimators import discounted_returns
 from mjx_reinforce.learning.value import value_baseline
+from mjx_reinforce.published.gymnasium_tutorial import with_one_start
 from mjx_reinforce.training import hosting
 
 
@@ -113,7 +114,8 @@ def test_no_key_is_used_twice():
             estimator=value_baseline(0.5),
             update=updates.minibatches(2, 8),
         )
-        learner = hosting.hosted(learner, Survive(), 4, Survive.max_episode_steps, one_start=True)
+        learner = with_one_start(learner)
+        learner = hosting.hosted(learner, Survive(), 4, Survive.max_episode_steps)
         state = jax.jit(learner.init)(jax.random.key(0))
         state, _ = train_step(learner, state)
         train_step(learner, state)
@@ -130,8 +132,8 @@ class Scattered(Survive):
 @pytest.mark.parametrize("one_start", [True, False])
 def test_one_start_is_a_seeds_own_and_stays(one_start):
     learner = reinforce(Scattered(), num_episodes=4)
-    horizon = Scattered.max_episode_steps
-    learner = hosting.hosted(learner, Scattered(), 4, horizon, one_start=one_start)
+    learner = with_one_start(learner) if one_start else learner
+    learner = hosting.hosted(learner, Scattered(), 4, Scattered.max_episode_steps)
     states = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 3))
     play = jax.jit(jax.vmap(learner.play))
     played = [play(states, jax.random.split(jax.random.key(update), 3)) for update in (1, 2)]

@@ -77,7 +77,6 @@ def test_what_was_measured_are_our_tasks():
         ({"hidden_sizes": (100_000, 100_000)}, "lower --hidden-sizes"),
         ({"eval_episodes": 10**7}, "lower --eval-episodes"),
         ({"eval_every": 10**9, "env_steps": None, "max_updates": 10**9}, "lower --eval-every"),
-        ({"algorithm": "ars", "num_directions": 10**6}, "--num-directions or --train-horizon"),
         ({"estimator": "value-baseline", "value_hidden_sizes": (10**6,)}, "--value-hidden-sizes"),
         (
             {"value_hidden_sizes": (30_000, 30_000), "num_episodes": 1, "horizon": 2}
@@ -108,7 +107,7 @@ def test_the_memory_is_what_xla_says():
     """And not much more; a process takes more besides."""
     pendulum = of_task("InvertedPendulum-v5")
     many = dataclasses.replace(pendulum, num_seeds=1000, max_updates=3, num_episodes=16)
-    value = {"estimator": "value-baseline", "value_fit": "full-batch"}
+    value = {"algorithm": "baseline-truncated-normal"}
     for config, settings, gigabytes, factor in (
         (many, {}, 1.16, 1.7),
         (Config(), {"hidden_sizes": (20_000,)}, 1.28, 1.25),

@@ -38,8 +38,6 @@ def test_seeds_side_by_side_need_as_much_each():
         {"hidden_sizes": (64, 64)},
         {"eval_episodes": 100},
         {"estimator": "value-baseline"},
-        {"update": "minibatches", "minibatch_size": 10_000},
-        {"algorithm": "ars", "num_directions": 10_000},
     ],
 )
 def test_more_of_anything_needs_more(more):

@@ -32,9 +32,7 @@ CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, e
 SETTINGS = {
     "all else": {
         "estimator": "value-baseline",
-        "optimizer": "adamw",
-        "one_start": True,
-        "update": "minibatches",
+        "optimizer": "sgd",
         "decay_steps": None,
     },
     "search": {"algorithm": "ars", "hidden_sizes": (), "engine": "vmap"},

@@ -159,7 +159,6 @@ def test_numbers_of_shifts_dampings_and_values_are_traced():
         value_fits=1,
         value_hidden_sizes=(4,),
         value_batch_size=16,
-        natural_iterations=2,
         update="natural-gradient",
         max_kl=1e-2,
         num_episodes=4,

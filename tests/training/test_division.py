@@ -19,19 +19,12 @@ from mjx_reinforce.training.division import ALONE, Division, divide_run
 VARIANTS = {
     "episodes": ("run", {}, {"episodes": 8}),
     "seeds": ("run", {}, {"seeds": 3}),
-    "ars": ("run", {"algorithm": "ars", "engine": "vmap", "num_directions": 2}, {"seeds": 2}),
+    "ars": ("run", {"algorithm": "ars", "engine": "vmap"}, {"seeds": 2}),
     "value": ("step", {"estimator": "value-baseline"}, {"episodes": 8}),
     "natural": ("step", {"update": "natural-gradient", "max_kl": 0.01}, {"episodes": 8}),
-    "minibatches": (
-        "step",
-        {"update": "minibatches", "minibatch_size": 16, "one_start": True, "max_kl": 0.01},
-        {"episodes": 2},
-    ),
-    "vmap": (
-        "step",
-        {"engine": "vmap", "update": "each-step", "standardize": False},
-        {"episodes": 2},
-    ),
+    "minibatches": ("step", {"algorithm": "continuous-cartpole"}, {"episodes": 2}),
+    "one start": ("step", {"algorithm": "gymnasium-tutorial"}, {"episodes": 2}),
+    "vmap": ("step", {"engine": "vmap", "algorithm": "categorical-cartpole"}, {"episodes": 2}),
 }
 
 

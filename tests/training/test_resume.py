@@ -36,7 +36,6 @@ COMMON += ["--hidden-sizes", "4", "--num-episodes", "4", "--decay-steps", "9000"
 def test_a_run_in_two_parts_is_the_run_in_one(run, tmp_path):
     """Also where the first part ends in the middle of a block, or between two checkpoints."""
     more = ["--estimator", "value-baseline", "--value-hidden-sizes", "4", "--value-fits", "2"]
-    more += ["--one-start", "--update", "minibatches", "--minibatch-updates", "3"]
     assert run(*COMMON, *more, "--max-updates", 24, "--output", "whole") == 0
     more += ["--checkpoint-every", 5, "--output", "parts"]
     assert run(*COMMON, *more, "--max-updates", 13) == 0

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from experiments.kit.markdown import table
-from experiments.studies.reproduce.cases import CASES, Case, limit, load_reference
+from experiments.studies.reproduce.cases import CASES, REPAIRS, Case, limit, load_reference
 from experiments.studies.reproduce.mistakes import STALE, stale_starts
 from experiments.studies.reproduce.statistics import LEVEL, compare, compare_repair
 from mjx_reinforce import envs
@@ -65,20 +65,21 @@ def run(settings: Settings) -> dict[str, list[dict[str, Any]]]:
     agreement, repairs = [], []
     for case in chosen:
         print(f"== {case.title}", flush=True)
-        scores = train(settings_of(case, settings.seeds, {}), case.score)
+        scores = train(case, settings_of(case, settings.seeds))
         if case.repair is not None and settings.repairs:
-            repaired = train(settings_of(case, settings.seeds, case.repair[1]), case.score)
+            changes = {"algorithm": f"{REPAIRS}:{case.repair[1]}"}
+            repaired = train(case, settings_of(case, settings.seeds, changes))
             repairs += compare_repair(case, scores, repaired)
         for name in case.references:
             agreement += compare(case, name, reference[name], scores)
         if case.stale and settings.repairs:
-            stale = train(settings_of(case, settings.seeds, {}), case.score, stale=True)
+            stale = train(case, settings_of(case, settings.seeds), stale=True)
             name = case.references[0]
             agreement += compare(case, name, reference[name], stale, f"{case.preset}, {STALE}")
     return {"agreement": agreement, "repairs": repairs}
 
 
-def settings_of(case: Case, num_seeds: int, changes: Mapping[str, Any]) -> Config:
+def settings_of(case: Case, num_seeds: int, changes: Mapping[str, Any] | None = None) -> Config:
     """Returns the settings of a run: evaluated after every update, or as good as never."""
     scored = case.score == "eval_return"
     config = dataclasses.replace(
@@ -86,14 +87,18 @@ def settings_of(case: Case, num_seeds: int, changes: Mapping[str, Any]) -> Confi
     )
     every = 1 if scored else min(50, case.updates)
     episodes = config.eval_episodes if scored else 1
-    return dataclasses.replace(config, eval_every=every, eval_episodes=episodes, **changes)
+    return dataclasses.replace(config, eval_every=every, eval_episodes=episodes, **changes or {})
 
 
-def train(config: Config, score: str, *, stale: bool = False) -> np.ndarray:
-    """Trains all seeds together; returns the score [U, S] of every update."""
+def train(case: Case, config: Config, *, stale: bool = False) -> np.ndarray:
+    """Trains all seeds together; returns the score [U, S] of every update.
+
+    The policy is the program's, also where ``config`` has another algorithm in its place.
+    """
     assert config.max_updates is not None
     env = envs.make(config.env)
-    policy = build_policy(policy_settings(env, config))
+    published = dataclasses.replace(config, algorithm=PRESETS[case.preset][1].algorithm)
+    policy = build_policy(policy_settings(env, published))
     learner, horizon = build(env, config, policy)
     if stale:
         learner = stale_starts(lambda env: build(env, config, policy)[0], env)
@@ -102,10 +107,10 @@ def train(config: Config, score: str, *, stale: bool = False) -> np.ndarray:
     scores, budget = [], budget_of(config)
     for _ in range(-(-config.max_updates // config.eval_every)):
         state, metrics, _ = programs.advance(state, False, budget)
-        if score == "eval_return":
-            scores.append(programs.evaluate(state).measured[score][None])
+        if case.score == "eval_return":
+            scores.append(programs.evaluate(state).measured[case.score][None])
         else:
-            scores.append(np.asarray(metrics[score]))
+            scores.append(np.asarray(metrics[case.score]))
     return np.concatenate(scores)[: config.max_updates]
 
 

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+#: The module of what is put right.
+REPAIRS = "experiments.studies.reproduce.repairs"
+
 
 @dataclasses.dataclass(frozen=True)
 class Case:
@@ -19,7 +22,7 @@ class Case:
     updates: how many are made
     score: "episode_return" while training, or "eval_return"
     changes: settings over the preset's
-    repair: what is put right in a second run of ours, and by which settings
+    repair: what is put right in a second run of ours, and by which function of ``repairs``
     stale: also train with the program's mistake that no setting has, see ``stale_starts``
     """
 
@@ -31,7 +34,7 @@ class Case:
     updates: int
     score: str = "episode_return"
     changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    repair: tuple[str, Mapping[str, Any]] | None = None
+    repair: tuple[str, str] | None = None
     stale: bool = False
 
 
@@ -43,7 +46,7 @@ CASES = (
         ("000",),
         (500, 1500, 2500, 3800),
         3800,
-        repair=("reward to go", {"estimator": "reward-to-go"}),
+        repair=("reward to go", "reward_to_go"),
     ),
     Case(
         "001",
@@ -58,7 +61,7 @@ CASES = (
             "learning_rate": 1e-3,
             "value_learning_rate": 1e-3,
         },
-        repair=("rescaled actions", {"rescale": True, "initial_std": 3.0}),
+        repair=("rescaled actions", "rescaled_actions"),
         stale=True,
     ),
     Case(
@@ -78,7 +81,7 @@ CASES = (
         (1, 5, 10, 20),
         20,
         score="eval_return",
-        repair=("reward to go", {"estimator": "reward-to-go"}),
+        repair=("reward to go", "plain_returns"),
     ),
     Case(
         "002",
@@ -87,7 +90,7 @@ CASES = (
         ("002_ars",),
         (50, 100, 200, 300),
         500,
-        repair=("the paper's update", {"ars_update": "paper"}),
+        repair=("the paper's update", "papers_update"),
     ),
     Case(
         "002",
@@ -96,7 +99,7 @@ CASES = (
         ("002_ars_fixed2",),
         (20, 40, 60, 100),
         100,
-        changes={"ars_update": "paper"},
+        changes={"algorithm": f"{REPAIRS}:papers_update", "num_episodes": 20},
     ),
     Case(
         "003",
@@ -105,7 +108,7 @@ CASES = (
         ("003",),
         (500, 1500, 2500, 3800),
         3800,
-        repair=("fresh starts", {"one_start": False}),
+        repair=("fresh starts", "fresh_starts"),
     ),
     Case(
         "004",
@@ -114,7 +117,7 @@ CASES = (
         ("004",),
         (200, 400, 600, 750),
         950,
-        repair=("one step an episode", {"update": "full-batch"}),
+        repair=("one step an episode", "one_step"),
     ),
 )
 

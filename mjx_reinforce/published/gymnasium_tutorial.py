@@ -1,0 +1,55 @@
+"""Gymnasium's tutorial: REINFORCE from scratch on InvertedPendulum-v4, and its first version.
+
+https://gymnasium.farama.org/tutorials/training_agents/reinforce_invpend_gym_v26; docs/documents.md
+says what is wrong with them. A network's first output is the mean of a Normal distribution, the
+softplus of its second the std; every episode makes one step of AdamW. Every episode of a seed is
+reset with the same seed.
+"""
+
+from typing import Any
+
+import jax
+import optax
+
+import mjx_reinforce as mr
+
+
+def reward_to_go(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
+    """Returns the learner of version 1.2, whose loss is the sum of -log pi times G.
+
+    Args:
+      env: what it learns on.
+      config: the settings; it reads discount, learning_rate and num_episodes.
+      shared: the policy, the horizon and more, as ``mjx_reinforce.reinforce`` takes them.
+    """
+    return with_one_start(learner(env, config, mr.reward_to_go(config.discount), **shared))
+
+
+def mean_log_prob(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
+    """Returns the learner of version 0.26: the mean log-probability times the sum of all G.
+
+    Args: as for ``reward_to_go``.
+    """
+    return with_one_start(learner(env, config, mr.mean_log_prob(config.discount), **shared))
+
+
+def learner(env: mr.Environment, config: Any, estimator: mr.Estimator, **shared: Any) -> mr.Learner:
+    """Returns the learner of an estimator, with a fresh start for every episode."""
+    return mr.reinforce(
+        env,
+        estimator=estimator,
+        optimizer=optax.adamw(config.learning_rate, weight_decay=0.01),
+        num_episodes=config.num_episodes,
+        **shared,
+    )
+
+
+def with_one_start(learner: mr.Learner) -> mr.Learner:
+    """Returns a learner whose state has the key with which a run resets all episodes of a seed."""
+
+    def init(key: jax.Array) -> mr.TrainState:
+        state = learner.init(key)
+        key, start_key = jax.random.split(state.key)
+        return state.replace(key=key, start_key=start_key)
+
+    return learner._replace(init=init)
