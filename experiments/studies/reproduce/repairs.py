@@ -3,7 +3,7 @@
 from typing import Any
 
 import mjx_reinforce as mr
-from mjx_reinforce.engine.base import observation_size
+from mjx_reinforce.engine.base import action_space, observation_size
 from mjx_reinforce.published import (
     baseline_truncated_normal,
     categorical_cartpole,
@@ -24,7 +24,7 @@ def fresh_starts(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
 
 def rescaled_actions(env: mr.Environment, config: Any, policy: Any, **shared: Any) -> mr.Learner:
     """001: an output of 1 is the end of the action's range, and the std as large."""
-    family = mr.truncated_normal(env.action_space, initial_std=3.0, rescale=True)
+    family = mr.truncated_normal(action_space(env), initial_std=3.0, rescale=True)
     size = observation_size(env)
     policy = mr.mlp_policy(size, family, config.hidden_sizes, initializer="torch")
     return baseline_truncated_normal.make(env, config, policy=policy, **shared)

@@ -122,8 +122,8 @@ def measure(directory: Path) -> Task:
     """
     record = read_json(directory / "sweep.json")
     runs = read_arrays(directory / "curves.npz")
-    factors, threshold = record["over"], record["threshold"]
-    factors["estimator"] = [_NAME if x == _OWN else x for x in factors["estimator"]]
+    threshold, factors = record["threshold"], record["over"]
+    factors = {name: [_NAME if x == _OWN else x for x in factors[name]] for name in factors}
     shape = [len(values) for values in factors.values()]
     returns, steps = runs["eval_return"].astype(float), runs["env_steps"]
     finite = np.isfinite(returns)
