@@ -9,7 +9,6 @@ import pytest
 from toys import Toy, ToyState
 
 from experiments.studies.reproduce import __main__ as reproduce
-from experiments.studies.reproduce import repairs
 from experiments.studies.reproduce.cases import CASES, load_reference
 from experiments.studies.reproduce.mistakes import stale_starts
 from experiments.studies.reproduce.statistics import compare, rank_test, reached, windowed
@@ -70,7 +69,7 @@ def test_a_comparison_by_hand():
 def test_a_case_fits_its_record(case):
     reference = load_reference()
     check(reproduce.settings_of(case, 3))
-    assert case.repair is None or callable(getattr(repairs, case.repair[1]))
+    check(reproduce.settings_of(case, 3, case.repair and case.repair[1]))
     assert case.preset in PRESETS
     assert max(case.counts) <= case.updates
     for name in case.references:

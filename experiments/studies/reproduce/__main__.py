@@ -8,7 +8,6 @@ train together. Where a program has a mistake that can be taken out, so do as ma
 """
 
 import dataclasses
-from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -16,7 +15,7 @@ import numpy as np
 import tyro
 
 from experiments.kit.markdown import table
-from experiments.studies.reproduce.cases import CASES, REPAIRS, Case, limit, load_reference
+from experiments.studies.reproduce.cases import CASES, Case, limit, load_reference
 from experiments.studies.reproduce.mistakes import STALE, stale_starts
 from experiments.studies.reproduce.statistics import LEVEL, compare, compare_repair
 from mjx_reinforce import envs
@@ -67,8 +66,7 @@ def run(settings: Settings) -> dict[str, list[dict[str, Any]]]:
         print(f"== {case.title}", flush=True)
         scores = train(case, settings_of(case, settings.seeds))
         if case.repair is not None and settings.repairs:
-            changes = {"algorithm": f"{REPAIRS}:{case.repair[1]}"}
-            repaired = train(case, settings_of(case, settings.seeds, changes))
+            repaired = train(case, settings_of(case, settings.seeds, case.repair[1]))
             repairs += compare_repair(case, scores, repaired)
         for name in case.references:
             agreement += compare(case, name, reference[name], scores)
@@ -79,7 +77,7 @@ def run(settings: Settings) -> dict[str, list[dict[str, Any]]]:
     return {"agreement": agreement, "repairs": repairs}
 
 
-def settings_of(case: Case, num_seeds: int, changes: Mapping[str, Any] | None = None) -> Config:
+def settings_of(case: Case, num_seeds: int, algorithm: str | None = None) -> Config:
     """Returns the settings of a run: evaluated after every update, or as good as never."""
     scored = case.score == "eval_return"
     config = dataclasses.replace(
@@ -87,7 +85,10 @@ def settings_of(case: Case, num_seeds: int, changes: Mapping[str, Any] | None = 
     )
     every = 1 if scored else min(50, case.updates)
     episodes = config.eval_episodes if scored else 1
-    return dataclasses.replace(config, eval_every=every, eval_episodes=episodes, **changes or {})
+    algorithm = algorithm or config.algorithm
+    return dataclasses.replace(
+        config, eval_every=every, eval_episodes=episodes, algorithm=algorithm
+    )
 
 
 def train(case: Case, config: Config, *, stale: bool = False) -> np.ndarray:

@@ -22,7 +22,7 @@ class Case:
     updates: how many are made
     score: "episode_return" while training, or "eval_return"
     changes: settings over the preset's
-    repair: what is put right in a second run of ours, and by which function of ``repairs``
+    repair: what is put right in a second run of ours, and by which --algorithm
     stale: also train with the program's mistake that no setting has, see ``stale_starts``
     """
 
@@ -46,7 +46,7 @@ CASES = (
         ("000",),
         (500, 1500, 2500, 3800),
         3800,
-        repair=("reward to go", "reward_to_go"),
+        repair=("reward to go", "gymnasium-tutorial"),
     ),
     Case(
         "001",
@@ -61,7 +61,7 @@ CASES = (
             "learning_rate": 1e-3,
             "value_learning_rate": 1e-3,
         },
-        repair=("rescaled actions", "rescaled_actions"),
+        repair=("rescaled actions", f"{REPAIRS}:rescaled_actions"),
         stale=True,
     ),
     Case(
@@ -81,7 +81,7 @@ CASES = (
         (1, 5, 10, 20),
         20,
         score="eval_return",
-        repair=("reward to go", "plain_returns"),
+        repair=("reward to go", f"{REPAIRS}:plain_returns"),
     ),
     Case(
         "002",
@@ -90,7 +90,7 @@ CASES = (
         ("002_ars",),
         (50, 100, 200, 300),
         500,
-        repair=("the paper's update", "papers_update"),
+        repair=("the paper's update", f"{REPAIRS}:papers_update"),
     ),
     Case(
         "002",
@@ -108,7 +108,7 @@ CASES = (
         ("003",),
         (500, 1500, 2500, 3800),
         3800,
-        repair=("fresh starts", "fresh_starts"),
+        repair=("fresh starts", f"{REPAIRS}:fresh_starts"),
     ),
     Case(
         "004",
@@ -117,7 +117,7 @@ CASES = (
         ("004",),
         (200, 400, 600, 750),
         950,
-        repair=("one step an episode", "one_step"),
+        repair=("one step an episode", f"{REPAIRS}:one_step"),
     ),
 )
 

@@ -4,17 +4,8 @@ from typing import Any
 
 import mjx_reinforce as mr
 from mjx_reinforce.engine.base import action_space, observation_size
-from mjx_reinforce.published import (
-    baseline_truncated_normal,
-    categorical_cartpole,
-    continuous_cartpole,
-    gymnasium_tutorial,
-)
-
-
-def reward_to_go(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
-    """000: every action is told what came after it alone."""
-    return gymnasium_tutorial.reward_to_go(env, config, **shared)
+from mjx_reinforce.published import baseline_truncated_normal as baseline
+from mjx_reinforce.published import categorical_cartpole, continuous_cartpole, gymnasium_tutorial
 
 
 def fresh_starts(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
@@ -25,15 +16,13 @@ def fresh_starts(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
 def rescaled_actions(env: mr.Environment, config: Any, policy: Any, **shared: Any) -> mr.Learner:
     """001: an output of 1 is the end of the action's range, and the std as large."""
     family = mr.truncated_normal(action_space(env), initial_std=3.0, rescale=True)
-    size = observation_size(env)
-    policy = mr.mlp_policy(size, family, config.hidden_sizes, initializer="torch")
-    return baseline_truncated_normal.make(env, config, policy=policy, **shared)
+    policy = mr.mlp_policy(observation_size(env), family, config.hidden_sizes, initializer="torch")
+    return baseline.make(env, config, policy=policy, **shared)
 
 
 def plain_returns(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
     """002: returns to go as they are."""
-    estimator = mr.reward_to_go(config.discount)
-    return continuous_cartpole.reinforce(env, config, estimator, **shared)
+    return continuous_cartpole.reinforce(env, config, mr.reward_to_go(config.discount), **shared)
 
 
 def papers_update(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
