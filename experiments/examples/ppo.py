@@ -130,7 +130,7 @@ class Training(NamedTuple):
     seen: Moments
     returns: Moments
     running: jax.Array
-    vec_state: Any
+    states: Any
     key: jax.Array
 
 
@@ -142,9 +142,9 @@ def start(settings: Settings, vec: VectorEnv, networks: Networks, optimizer: Any
     one = jnp.full((), 1e-4)
     seen = Moments(one, jnp.zeros(size), jnp.ones(size))
     returns = Moments(one, jnp.zeros(()), jnp.ones(()))
-    vec_state = vec.reset(reset_key)
+    states = vec.reset(reset_key)
     zeros = jnp.zeros(settings.num_envs)
-    return Training(params, optimizer.init(params), seen, returns, zeros, vec_state, key)
+    return Training(params, optimizer.init(params), seen, returns, zeros, states, key)
 
 
 def advantages(settings: Settings, value: Any, seen: Moments, played: Segment, reward: jax.Array):
@@ -170,8 +170,7 @@ def update(settings: Settings, vec: VectorEnv, networks: Networks, optimizer: An
     def act(params, observation):
         return networks.apply(params, t.seen.normalize(observation))[0]
 
-    given = t.vec_state, play_key, settings.num_steps
-    vec_state, played = unroll(vec, act, t.params, family, *given)
+    states, played = unroll(vec, act, t.params, family, t.states, play_key, settings.num_steps)
 
     def discounted(running, row):
         reward, done = row
@@ -209,8 +208,7 @@ def update(settings: Settings, vec: VectorEnv, networks: Networks, optimizer: An
 
     keys = jax.random.split(shuffle_key, settings.epochs)
     (params, state), _ = lax.scan(epoch, (t.params, t.optimizer), keys)
-    seen = t.seen.update(played.observation)
-    return Training(params, state, seen, returns, running, vec_state, key)
+    return Training(params, state, t.seen.update(played.observation), returns, running, states, key)
 
 
 def evaluate(vec: VectorEnv, networks: Networks, t: Training, family: Gaussian, key: jax.Array):
