@@ -15,7 +15,7 @@ from mjx_reinforce import Actor, act, envs, mlp_policy, reinforce
 from mjx_reinforce.engine.base import action_space, observation_size
 from mjx_reinforce.engine.play.choice import ActingPolicy, choose
 from mjx_reinforce.learning import normalize
-from mjx_reinforce.learning.learner import default_distribution
+from mjx_reinforce.learning.distributions import default_distribution
 
 #: Name in the table -> engine, and the solver of the environment's physics.
 ENGINES = {
