@@ -15,7 +15,7 @@ its gradient has another length, and is no longer exactly unbiased. ``mean_log_p
 
 An episode in which the simulation left the finite numbers counts as the worst of the others: at
 each step its G[t] is the least of theirs (``replace_broken``). In ``mean_log_prob`` and
-``normalized_returns``, where an episode is compared with itself, its weight is.
+``normalized_returns``, which compare an episode with itself, its weight is the least of theirs.
 """
 
 import dataclasses

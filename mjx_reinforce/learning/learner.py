@@ -141,7 +141,7 @@ class Learner(NamedTuple):
         return after, metrics
 
     def act(self, actor: Actor, observation: jax.Array) -> jax.Array:
-        """Returns the outputs [..., K] of the policy's distribution; see ``policies.actor.act``."""
+        """Returns the outputs [..., K] of the policy's distribution; see ``policy.act``."""
         return act(self.policy, actor, observation)
 
 

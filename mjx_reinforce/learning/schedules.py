@@ -23,7 +23,8 @@ class Schedule(NamedTuple):
     """An estimator whose numbers change as a run goes on.
 
     Attributes:
-      at: the share [] of the budget that is used -> the estimator; its state is that of the first
+      at: (the used share [] of the budget) -> the estimator. All of them share one state, which
+        the estimator at 0 makes
 
     Examples:
       >>> import mjx_reinforce as mr

@@ -107,11 +107,6 @@ def test_help_has_ten_settings_and_help_all_the_rest(call, name):
     [
         ("--env HumanoidStandup-v5", "update max-kl train-horizon", "learning-rate"),
         ("--env HalfCheetah-v5", "train-horizon", "update"),
-        (
-            "continuous-cartpole-ars",
-            "num-directions step-size noise-std",
-            "estimator learning-rate",
-        ),
     ],
 )
 def test_help_shows_what_makes_the_task(call, words, more, fewer):

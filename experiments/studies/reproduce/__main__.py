@@ -37,8 +37,6 @@ class Settings:
     """Seeds trained together."""
     max_updates: int | None = None
     """Stop early; later counts are left out."""
-    repairs: bool = True
-    """Also train without the programs' mistakes."""
 
 
 def main() -> None:
@@ -65,12 +63,12 @@ def run(settings: Settings) -> dict[str, list[dict[str, Any]]]:
     for case in chosen:
         print(f"== {case.title}", flush=True)
         scores = train(case, settings_of(case, settings.seeds))
-        if case.repair is not None and settings.repairs:
+        if case.repair is not None:
             repaired = train(case, settings_of(case, settings.seeds, case.repair[1]))
             repairs += compare_repair(case, scores, repaired)
         for name in case.references:
             agreement += compare(case, name, reference[name], scores)
-        if case.stale and settings.repairs:
+        if case.stale:
             stale = train(case, settings_of(case, settings.seeds), stale=True)
             name = case.references[0]
             agreement += compare(case, name, reference[name], stale, f"{case.preset}, {STALE}")
@@ -118,11 +116,9 @@ def train(case: Case, config: Config, *, stale: bool = False) -> np.ndarray:
 def _format(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, int):
-        return f"{value:,}"
-    if isinstance(value, float):
-        return f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
-    return str(value)
+    if isinstance(value, int) or (isinstance(value, float) and value >= 1000):
+        return f"{value:,.0f}"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 if __name__ == "__main__":

@@ -7,10 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce import envs
+from mjx_reinforce import Estimator, envs, full_batch_value_baseline
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.files import read_arrays, read_json, write_arrays
+from mjx_reinforce.learning.policy import MLP
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics.survival import time_to_threshold
 from mjx_reinforce.sweeps.design import Design, read_design
@@ -21,7 +22,7 @@ SEED = 20_261_122
 #: A run whose episodes stay so short that this many updates do not use up its env steps ends here.
 MAX_UPDATES = 150
 #: The learned baseline of the study, as ``--estimator`` takes it, and its name on the page.
-_OWN, _NAME = "experiments.studies.seeds.baseline:make", "value-baseline"
+_OWN, _NAME = "experiments.studies.seeds.runs:baseline", "value-baseline"
 #: All combinations of these are trained. The learning rates come last: they share a program.
 FACTORS: dict[str, list[Any]] = {
     "estimator": ["reward-to-go", "leave-one-out", _OWN],
@@ -31,6 +32,11 @@ FACTORS: dict[str, list[Any]] = {
 }
 #: Points in training, evenly spaced in env steps, over which returns are averaged.
 _GRID = 57
+
+
+def baseline(discount: Any) -> Estimator:
+    """Returns a small baseline that reads the observation and is fitted to whole rollouts."""
+    return full_batch_value_baseline(discount, network=MLP((32, 32), 1), num_fits=10)
 
 
 class Task(NamedTuple):
