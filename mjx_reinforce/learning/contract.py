@@ -23,7 +23,7 @@ def check_horizon(env: Environment, horizon: int | None) -> int:
     """Returns the time limit in steps, or raises ValueError."""
     horizon = getattr(env, "max_episode_steps", None) if horizon is None else horizon
     if horizon is None:
-        raise ValueError("this environment declares no max_episode_steps: give a horizon")
+        raise ValueError("the env declares no max_episode_steps: give a horizon (--horizon N)")
     check_type("horizon", horizon, int)
     if horizon < 1:
         raise ValueError(f"the horizon must be at least one step, got {horizon}")
