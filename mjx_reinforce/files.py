@@ -9,9 +9,10 @@ import os
 import secrets
 import sys
 import tempfile
+import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -102,13 +103,19 @@ def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = Fa
     write_bytes(path, content.getvalue())
 
 
-def read_arrays(path: Path) -> Arrays:
+def read_arrays(path: Path, *, stored: bool = False) -> Arrays:
     """Returns the arrays of a NumPy archive by their names; no pickle.
+
+    Args:
+      path: of the archive.
+      stored: refuse what is compressed, see ``check_stored``.
 
     Raises:
       ValueError: it cannot be read, or is damaged.
     """
     try:
+        if stored:
+            check_stored(path)
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return {name: np.asarray(archive[name]) for name in archive.files}
     except OSError as error:
@@ -117,6 +124,13 @@ def read_arrays(path: Path) -> Arrays:
         # NumPy's second sentence proposes to trust a pickle.
         reason = f"{type(error).__name__}: {error}".splitlines()[0].partition(". ")[0]
         raise ValueError(f"{path} is damaged: it is no whole NumPy archive ({reason})") from error
+
+
+def check_stored(archive: Path | IO[bytes]) -> None:
+    """Raises ValueError for an archive with compressed parts: few bytes can ask for gigabytes."""
+    with zipfile.ZipFile(archive) as opened:
+        if packed := [part.filename for part in opened.infolist() if part.compress_type]:
+            raise ValueError(f"{packed[0]!a} is compressed")
 
 
 def finite(value: object) -> Any:

@@ -123,7 +123,7 @@ def read_policy(
       own: "module:name" of a distribution that may be imported; what only a file names is not.
     """
     settings_path, actor_path = Path(directory) / "policy.json", Path(directory) / "actor.npz"
-    settings, arrays = read_json(settings_path), read_arrays(actor_path)
+    settings, arrays = read_json(settings_path), read_arrays(actor_path, stored=True)
     checksum = arrays.pop(_CHECKSUM, None)
     # Files from before there was a checksum have none. It finds damage, not ill will: who changes
     # the files can compute it again.

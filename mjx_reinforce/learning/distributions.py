@@ -84,11 +84,7 @@ def default_distribution(space: Box | Discrete) -> Distribution:
 
 
 def normal(
-    space: Box | Discrete,
-    *,
-    std: str = "parameter",
-    initial_std: float = 0.5,
-    rescale: bool = True,
+    space: Box | Discrete, *, std: str = "parameter", initial_std: float = 0.5, rescale: bool = True
 ) -> Distribution:
     """An independent Normal in each entry, unbounded.
 
@@ -153,11 +149,7 @@ def normal_sigmoid(
 
 
 def clipped_normal(
-    space: Box | Discrete,
-    *,
-    std: str = "parameter",
-    initial_std: float = 0.5,
-    rescale: bool = True,
+    space: Box | Discrete, *, std: str = "parameter", initial_std: float = 0.5, rescale: bool = True
 ) -> Distribution:
     """``normal``, clipped to the action's range, which must be finite.
 
@@ -206,11 +198,7 @@ def _clipped_entropy(mean: jax.Array, std: jax.Array, low: jax.Array, high: jax.
 
 
 def tanh_normal(
-    space: Box | Discrete,
-    *,
-    std: str = "parameter",
-    initial_std: float = 0.5,
-    rescale: bool = True,
+    space: Box | Discrete, *, std: str = "parameter", initial_std: float = 0.5, rescale: bool = True
 ) -> Distribution:
     """``normal`` through a tanh into the action's finite range (Haarnoja et al. 2018, appendix C).
 
@@ -289,11 +277,7 @@ def _log_tanh_slope(z: jax.Array) -> jax.Array:
 
 
 def truncated_normal(
-    space: Box | Discrete,
-    *,
-    std: str = "parameter",
-    initial_std: float = 0.5,
-    rescale: bool = True,
+    space: Box | Discrete, *, std: str = "parameter", initial_std: float = 0.5, rescale: bool = True
 ) -> Distribution:
     """``normal``, restricted to the action's range, which must be finite.
 

@@ -54,11 +54,9 @@ class TrainState(struct.PyTreeNode, kw_only=True):
       >>> import jax
       >>> import mjx_reinforce as mr
       >>> env = mr.envs.make("CartPole-v1")
-      >>> learner = mr.reinforce(env, num_episodes=4, horizon=20)
-      >>> state = learner.init(jax.random.key(0))
-      >>> state, metrics = mr.train_step(learner, state)
-      >>> metrics["episodes"].item(), metrics["episode_return"].shape
-      (4, ())
+      >>> state = mr.reinforce(env).init(jax.random.key(0))
+      >>> state.num_updates.tolist(), state.progress.item()
+      ([0, 0], 0.0)
     """
 
     key: jax.Array
@@ -92,10 +90,9 @@ class Learner(NamedTuple):
       >>> import mjx_reinforce as mr
       >>> env = mr.envs.make("CartPole-v1")
       >>> learner = mr.reinforce(env, num_episodes=4, horizon=20)
-      >>> state = learner.init(jax.random.key(0))
-      >>> state, metrics = mr.train_step(learner, state)
-      >>> metrics["episodes"].item(), metrics["episode_return"].shape
-      (4, ())
+      >>> played = learner.play(learner.init(jax.random.key(0)), jax.random.key(1), True)
+      >>> played.reward.shape
+      (20, 4)
     """
 
     init: Callable[[jax.Array], TrainState]
@@ -118,17 +115,6 @@ class Learner(NamedTuple):
         """
         key, play_key, learn_key = jax.random.split(state.key, 3)
         played = self.play(state, play_key, active)
-        return self.after(state, played, active, (key, learn_key))
-
-    def after(
-        self,
-        state: TrainState,
-        played: Any,
-        active: bool | jax.Array,
-        keys: tuple[jax.Array, jax.Array],
-    ) -> tuple[TrainState, Metrics]:
-        """Learns from what was played; the keys are the next state's, and the one of ``learn``."""
-        key, learn_key = keys
         learned, metrics = self.learn(state, played, learn_key)
         after = dataclasses.replace(
             learned,
@@ -216,11 +202,12 @@ def reinforce(
     if max_kl is not None:
         check_number("max_kl", max_kl, positive=True, finite=False)
     horizon = contract.check_horizon(env, horizon)
-    policy = policy or mlp_policy(size, default_distribution(action_space(env)))
+    if policy is None:
+        policy = mlp_policy(size, default_distribution(action_space(env)))
     contract.check_policy(policy, env, size, likelihood=True)
     optimizer = make_optimizer() if optimizer is None else optimizer
     contract.check_optimizer("optimizer", optimizer)
-    update = update or full_batch()
+    update = full_batch() if update is None else update
     contract.check_update(update)
     estimator = standardize(leave_one_out(), floor=10.0) if estimator is None else estimator
     schedule = estimator if isinstance(estimator, Schedule) else Schedule(lambda _: estimator)
@@ -281,7 +268,7 @@ def _play(
     ) -> Trajectory:
         check_each(num_episodes, active=active)
         return plays.rollout(
-            env,
+            begins_as(env, state.start_key),
             functools.partial(act, policy),
             state.actor,
             policy.distribution,
@@ -293,6 +280,25 @@ def _play(
         )
 
     return play
+
+
+def begins_as(env: Environment, start_key: jax.Array | None) -> Any:
+    """Returns an environment whose every episode starts with a key, if there is one."""
+    return env if start_key is None else _OneStart(env, start_key)
+
+
+class _OneStart:
+    """An environment whose every episode starts with the same key."""
+
+    def __init__(self, env: Environment, key: jax.Array):
+        self._env, self._key = env, key
+
+    def reset(self, rng: jax.Array) -> Any:
+        del rng
+        return self._env.reset(self._key)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)
 
 
 def _learn(

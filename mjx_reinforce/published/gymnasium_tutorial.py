@@ -45,7 +45,7 @@ def learner(env: mr.Environment, config: Any, estimator: mr.Estimator, **shared:
 
 
 def with_one_start(learner: mr.Learner) -> mr.Learner:
-    """Returns a learner whose state has the key with which a run resets all episodes of a seed."""
+    """Returns a learner that resets all episodes of a seed with one key, drawn at ``init``."""
 
     def init(key: jax.Array) -> mr.TrainState:
         state = learner.init(key)

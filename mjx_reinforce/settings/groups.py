@@ -325,7 +325,4 @@ MAIN = (
     *("estimator", "num_episodes", "learning_rate", "hidden_sizes"),
 )
 #: What it shows too where the default of one setting is not the usual one.
-UNUSUAL = {
-    "train_horizon": ("train_horizon",),
-    "update": ("update", "max_kl"),
-}
+UNUSUAL = {"train_horizon": ("train_horizon",), "update": ("update", "max_kl")}

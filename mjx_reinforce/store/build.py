@@ -225,10 +225,7 @@ def _build_optimizer(config: Config) -> "optax.GradientTransformation":
     if config.decay_updates is not None:  # of one optimizer step each
         rate = optax.linear_schedule(rate, final, config.decay_updates)
     optimizer = make_optimizer(
-        config.optimizer,
-        rate,
-        max_grad_norm=config.max_grad_norm,
-        momentum=config.momentum,
+        config.optimizer, rate, max_grad_norm=config.max_grad_norm, momentum=config.momentum
     )
     if config.update == "natural-gradient":
         # Its steps have their length from max_kl; of that a decaying rate leaves a share.

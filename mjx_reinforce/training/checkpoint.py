@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 from mjx_reinforce.engine.base import PyTree, plain, with_keys
-from mjx_reinforce.files import Arrays, write_bytes
+from mjx_reinforce.files import Arrays, check_stored, write_bytes
 
 _KEPT = 2
 _NAME = re.compile(r"\d{6,}-(even-)?[0-9a-f]{16}\.npz")
@@ -137,7 +137,8 @@ def _read(path: Path) -> bytes | None:
     """Returns the contents of a checkpoint, or None if they are not those that were written."""
     try:
         content = path.read_bytes()
-    except OSError:
+        check_stored(io.BytesIO(content))
+    except (OSError, ValueError, zipfile.BadZipFile):
         return None
     return content if _digest(content) == path.stem.rpartition("-")[2] else None
 

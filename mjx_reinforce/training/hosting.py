@@ -1,8 +1,8 @@
 """What is wrapped around a learner where many seeds train: none of it changes the algorithm.
 
 Each function takes a learner and returns one. ``hosted`` lets an evaluation ride with the episodes
-of an update, divides them among devices, and can reset all episodes of a seed alike;
-``short_episodes`` makes updates of many seeds cheap while all episodes are short.
+of an update, and divides them among devices; ``short_episodes`` makes updates of many seeds cheap
+while all episodes are short.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from mjx_reinforce.engine.devices import NONE, RUNS, SECOND, Devices
 from mjx_reinforce.engine.play.episode import CHUNK_STEPS, check_each, episode_keys
 from mjx_reinforce.engine.scalar import any_lane
 from mjx_reinforce.learning.contract import traced
-from mjx_reinforce.learning.learner import Learner, Metrics, TrainState
+from mjx_reinforce.learning.learner import Learner, Metrics, TrainState, begins_as
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.learning.schedules import Cut
 
@@ -128,7 +128,7 @@ class Host:
                 limit = jnp.concatenate([jnp.full(count, self.horizon), own])
             keys = jnp.concatenate([guest_keys, keys])
         played = self.learner.engine.rollout(
-            self.env if start_key is None else _OneStart(self.env, start_key),
+            begins_as(self.env, start_key),
             self.learner.act,
             actor,
             self.learner.policy.distribution,
@@ -150,12 +150,16 @@ def step_with(
     learner: Learner, state: TrainState, active: bool | jax.Array, guests: Guests | None
 ) -> tuple[TrainState, Metrics, Trajectory | None]:
     """Makes one update as ``Learner.step``; also returns the episodes of guests, if any."""
-    key, play_key, learn_key = jax.random.split(state.key, 3)
-    if guests is not None and isinstance(learner.play, Host):
-        played, looked = learner.play.with_guests(state, play_key, active, guests)
-    else:
-        played, looked = learner.play(state, play_key, active), None
-    return *learner.after(state, played, active, (key, learn_key)), looked
+    host, looked = learner.play, []
+    if guests is None or not isinstance(host, Host):
+        return *learner.step(state, active), None
+
+    def play(state: TrainState, key: jax.Array, active: bool | jax.Array) -> Trajectory:
+        own, theirs = host.with_guests(state, key, active, guests)
+        looked.append(theirs)
+        return own
+
+    return *learner._replace(play=play).step(state, active), *looked
 
 
 def short_episodes(learner: Learner, horizon: int, num_seeds: int, cut_steps: int = 0) -> Learner:
@@ -209,20 +213,6 @@ def hosted(
         return learner._replace(play=host.__call__)
     # Elsewhere an episode that is not played still takes its place.
     return learner._replace(play=host if learner.engine.name == "native" else host.__call__)
-
-
-class _OneStart:
-    """An environment whose every episode starts with the same key."""
-
-    def __init__(self, env: Environment, key: jax.Array):
-        self._env, self._key = env, key
-
-    def reset(self, rng: jax.Array) -> Any:
-        del rng
-        return self._env.reset(self._key)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._env, name)
 
 
 def check_learner(name: str, learner: Learner) -> None:

@@ -24,6 +24,8 @@ _PROGRAM = (
     *("packages", "git_commit", "device", "cpu", "cores", "machine_code", "jax_settings"),
     *("x64", "xla_flags"),
 )
+#: Entries that no number depends on.
+_BESIDE = ("python", "num_devices", "cpu_count", "resumed")
 _DEVICES = "--xla_force_host_platform_device_count"
 #: Settings that files of version 0.1 lack; there the default held.
 _LATER = ("env_set", "seeds")
@@ -68,7 +70,9 @@ def read_settings(directory: Path) -> Config:
 
 def as_config(recorded: Mapping[str, Any], path: Path) -> Config:
     """Returns the settings that a file recorded, or raises ValueError, which names the file."""
-    settings = {}
+    settings, names = {}, {field.name for field in dataclasses.fields(Config)}
+    if gone := sorted(recorded.keys() - names - {*_PROGRAM, *_BESIDE}):
+        raise ValueError(f"{path} says {gone[0]}, which is no setting: it is {_OTHER}")
     for field in dataclasses.fields(Config):
         if field.name in PLACES:
             continue

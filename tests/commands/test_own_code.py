@@ -125,8 +125,7 @@ def test_what_is_no_name_is_not_proposed(folder, said):
 
 
 @pytest.mark.parametrize(
-    "command",
-    [pytest.param("report rates", marks=pytest.mark.slow), "export run"],
+    "command", [pytest.param("report rates", marks=pytest.mark.slow), "export run"]
 )
 def test_reports_and_exports_run_no_code(folder, said, command):
     assert said(command)[1] == 0

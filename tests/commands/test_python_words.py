@@ -53,6 +53,8 @@ REFUSED = {
     "entropy_cost must be 0 or more and finite, got nan": {"entropy_cost": NAN},
     "normalize_steps must be 0 or more, got nan": {"normalize_steps": NAN},
     "max_kl must be positive, got 0": {"max_kl": 0},
+    r"policy must be of type Policy, .* got a tuple": {"policy": ()},
+    "update must be such as .* got False": {"update": False},
 }
 
 

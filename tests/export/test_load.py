@@ -140,6 +140,11 @@ def cut(run):
     path.write_bytes(path.read_bytes()[:1000])
 
 
+def pack(run):
+    with np.load(run / NPZ) as archive:
+        np.savez_compressed(run / NPZ, **archive)
+
+
 JSON, NPZ = "policy/policy.json", "policy/actor.npz"
 #: What is done to a run, the file that the message names, and what it says besides.
 DAMAGE = {
@@ -182,6 +187,7 @@ DAMAGE = {
     "nan": (old(arrays(**{KERNEL: lambda x: x * np.nan})), NPZ, "seed 1 has numbers that are not"),
     "other numbers": (arrays(normalizer__mean=lambda x: x + 1), "policy.json", "checksum"),
     "a bit": (flip_a_bit, NPZ, "damaged"),
+    "compressed arrays": (pack, NPZ, "is compressed"),
 }
 
 
@@ -195,8 +201,8 @@ def test_damage_is_named_in_one_line(tmp_path, monkeypatch, capsys, name):
     said = str(caught.value)
     assert file in said
     assert "\n" not in said
-    for main, arguments in ((watch.main, []), (export.main, [])):
-        monkeypatch.setattr(sys, "argv", ["program", str(tmp_path), *arguments])
+    for main in (watch.main, export.main):
+        monkeypatch.setattr(sys, "argv", ["program", str(tmp_path)])
         with pytest.raises(SystemExit, match="2"):
             main()
         assert capsys.readouterr().err == f"error: {said}\n"

@@ -24,11 +24,7 @@ def updated(engine):
     first steps would have the gradient's sign alone.
     """
     learner = reinforce(
-        Drifting(),
-        num_episodes=4,
-        horizon=20,
-        optimizer=optax.sgd(0.01),
-        engine=engine,
+        Drifting(), num_episodes=4, horizon=20, optimizer=optax.sgd(0.01), engine=engine
     )
     before, _ = train_step(learner, jax.jit(learner.init)(jax.random.key(0)))
     start = ravel_pytree(before.actor.params)[0]

@@ -149,12 +149,7 @@ def test_value_baseline_by_hand():
     inputs = np.stack([seen, np.nonzero(MASK)[0] / 4, np.ones_like(seen)], axis=1)
     optimizer = optax.sgd(0.1, momentum=0.5)
     estimator = value_baseline(
-        0.9,
-        horizon=4,
-        network=flax.linen.Dense(1),
-        optimizer=optimizer,
-        num_fits=2,
-        batch_size=5,
+        0.9, horizon=4, network=flax.linen.Dense(1), optimizer=optimizer, num_fits=2, batch_size=5
     )
     critic = estimator.init(jax.random.key(0), 1)
     line = np.append(np.asarray(critic.params["params"]["kernel"])[:, 0], 0.0)

@@ -12,7 +12,7 @@ import pytest
 from brax import envs as brax_envs
 from toys import Drifting, SignedTarget, Survive
 
-from mjx_reinforce import Cut, mlp_policy, normal, reinforce, train_step
+from mjx_reinforce import Cut, ars, mlp_policy, normal, reinforce, train_step
 from mjx_reinforce.engine.play import available
 from mjx_reinforce.learning import counts, estimators, updates
 from mjx_reinforce.learning import learner as learner_module
@@ -129,11 +129,12 @@ class Scattered(Survive):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("one_start", [True, False])
-def test_one_start_is_a_seeds_own_and_stays(one_start):
+@pytest.mark.parametrize(("one_start", "hosted"), [(True, True), (True, False), (False, True)])
+def test_one_start_is_a_seeds_own_and_stays(one_start, hosted):
     learner = reinforce(Scattered(), num_episodes=4)
     learner = with_one_start(learner) if one_start else learner
-    learner = hosting.hosted(learner, Scattered(), 4, Scattered.max_episode_steps)
+    if hosted:
+        learner = hosting.hosted(learner, Scattered(), 4, Scattered.max_episode_steps)
     states = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 3))
     play = jax.jit(jax.vmap(learner.play))
     played = [play(states, jax.random.split(jax.random.key(update), 3)) for update in (1, 2)]
@@ -190,8 +191,7 @@ def test_a_gradient_that_is_not_finite_is_skipped():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("length", "update"),
-    [(51, updates.full_batch()), (50, updates.each_step())],
+    ("length", "update"), [(51, updates.full_batch()), (50, updates.each_step())]
 )
 def test_short_episodes_are_learned_from_in_short(length, update, monkeypatch):
     """Of 400 steps at most, where no episode took more than 50: the same, up to rounding."""
@@ -273,6 +273,9 @@ def test_nonsense_is_refused(settings, said):
 def test_a_cut_that_makes_no_sense_is_refused(cut, said):
     with pytest.raises(ValueError, match=said):
         cut(reinforce(Survive()))
+    for other in (7, ars(Survive())):
+        with pytest.raises(ValueError, match="a cut takes a learner of"):
+            Cut(5, 0.5)(other)
 
 
 @pytest.mark.slow

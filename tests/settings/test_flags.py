@@ -76,13 +76,7 @@ def test_what_cannot_be_read_is_one_line(words, message):
 
 @pytest.mark.parametrize(
     ("words", "brief"),
-    [
-        ("--help", True),
-        ("-h", True),
-        ("--help all", False),
-        ("--rate 1", False),
-        ("-h x", True),
-    ],
+    [("--help", True), ("-h", True), ("--help all", False), ("--rate 1", False), ("-h x", True)],
 )
 def test_the_help_is_brief_unless_all_is_asked_for(words, brief):
     assert asks_brief_help(words.split()) == brief

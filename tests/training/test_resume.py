@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import functools
+import io
 import json
 import os
 import resource
@@ -11,6 +12,7 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_lines import added_environments, run_command
 from saved_runs import assert_same, change
@@ -103,9 +105,14 @@ def test_what_is_damaged_costs_an_interval(run, trained, parts, capsys, damage):
     assert all(words in output for words in said)
 
 
-def test_a_checkpoint_that_is_cut_is_none(trained, tmp_path):
+def test_a_checkpoint_that_is_cut_or_compressed_is_none(trained, tmp_path):
+    """Few bytes can ask for gigabytes; whoever writes such a file can name it by its digest."""
     [*_, newest] = checkpoints(trained)
-    content = newest.read_bytes()
+    content, packed = newest.read_bytes(), io.BytesIO()
+    np.savez_compressed(packed, **np.load(newest))
+    name = f"{newest.name.split('-')[0]}-{checkpoint._digest(packed.getvalue())}.npz"
+    (tmp_path / name).write_bytes(packed.getvalue())
+    assert checkpoint._read(tmp_path / name) is None
     assert checkpoint._read(newest) == content
     for damaged in (content[:-7], b"", content[:-1] + b"!"):
         (tmp_path / newest.name).write_bytes(damaged)
@@ -233,6 +240,7 @@ REFUSED = [
     ("--max-updates 13", {}, "--max-updates 13 is less than the 20"),
     ("", {"device": "TPU"}, "was begun with device TPU"),
     ("", {"packages": {"jax": "0.1"}}, "was begun with jax 0.1"),
+    ("", {"one_start": True}, "says one_start, which is no setting: it is damaged, or of another"),
     ("", {"eval_every": None}, "eval_every is None: it is damaged, or of another version of the"),
     ("", {"engine": "kernel"}, "engine is 'kernel', not one of auto, vmap, native: it is damaged"),
     ("", {"learning_rate": 0.5}, "learning_rate is 0.5, but the run was trained with 0.01"),

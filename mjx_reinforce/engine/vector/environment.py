@@ -8,12 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from mjx_reinforce.engine.base import Box, Discrete, Environment, action_space, null_action
-from mjx_reinforce.engine.checks import (
-    check_count,
-    check_key,
-    check_name,
-    check_type,
-)
+from mjx_reinforce.engine.checks import check_count, check_key, check_name, check_type
 from mjx_reinforce.engine.contract import check_environment, check_shape
 from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.engine.play import episode
