@@ -13,7 +13,7 @@ from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 
 @dataclasses.dataclass(frozen=True)
 class EnvsSettings:
-    """List the tasks, or describe one: sizes, rules, default settings, and how long it takes."""
+    """List the tasks, or describe one: its sizes, its rules and its default settings."""
 
     env: tyro.conf.Positional[str | None] = None
     """The task to describe, an id or module:Class for your own; all are listed if not given."""

@@ -1,4 +1,4 @@
-"""What a task is, for people: its sizes, its rules, its default settings, and how long it takes."""
+"""What a task is, for people: its sizes, its rules, and its default settings."""
 
 import dataclasses
 import inspect
@@ -9,10 +9,9 @@ import numpy as np
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.engine.base import Environment
-from mjx_reinforce.runs.plan import said_time
 from mjx_reinforce.settings import tables
 from mjx_reinforce.settings.config import Config, as_flag, changed, is_read
-from mjx_reinforce.settings.defaults import expected_seconds, of_task
+from mjx_reinforce.settings.defaults import of_task
 
 if TYPE_CHECKING:
     from mjx_reinforce.envs.base import MujocoEnv
@@ -84,11 +83,11 @@ def _action_in_words(env: Environment) -> str:
 
 
 def _how_to_train(config: Config) -> list[str]:
-    """Returns how to train on a task, how long that takes here, and with which settings."""
+    """Returns how to train on a task, and with which settings."""
     said = [
         f"To train {config.num_seeds} seeds for {config.env_steps:,} env steps each:",
         f"  {command('train')} --env {config.env}",
-        f"{said_time(expected_seconds(config))}. --minutes M sets a time.",
+        "--minutes M sets a time in place of a number of env steps.",
     ]
     differing = (name for name in changed(config, Config()) if name not in _SAID)
     names = [name for name in differing if is_read(name, config)]

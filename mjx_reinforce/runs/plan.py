@@ -1,4 +1,4 @@
-"""What a run will do, how long that takes about, and how much memory it needs."""
+"""What a run will do, and how much memory it needs."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.settings import tables
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.defaults import expected_seconds
 from mjx_reinforce.settings.memory import check_fits, needed, num_cores
 from mjx_reinforce.settings.tables import Task
 
@@ -48,22 +47,12 @@ def make_plan(ready: "Ready", config: Config) -> str:
         config = division.of_each(config, config.num_seeds)
     base = task.base_memory if machine.shared else 0.0
     check_fits(config, task, machine.memory, base)
-    time = "The first updates show how many env steps that is"
-    if config.minutes is None:
-        time = said_time(expected_seconds(config))
     memory = gigabytes(base + needed(config, task))
     where = _where(machine, division)
     return (
         f"Training {what} on {where}, with the engine {ready.engine}: "
-        f"{ready.why}. {time}. It needs about {memory} of memory."
+        f"{ready.why}. It needs about {memory} of memory."
     )
-
-
-def said_time(seconds: float | None) -> str:
-    """Returns how long a training takes (s) in words, None where that is not known."""
-    if seconds is None:
-        return "How long this takes here is not known"
-    return f"Training takes about {duration(seconds)}, good to a factor of two"
 
 
 def _where(machine: Hardware, division: "Division") -> str:
@@ -99,15 +88,6 @@ def this_hardware() -> Hardware:
         return Hardware(name, host_memory(), True)
     memory = float((device.memory_stats() or {}).get("bytes_limit", float("inf")))
     return Hardware(f"one {device.device_kind}", memory, False)
-
-
-def duration(seconds: float) -> str:
-    """Returns a time for people, to two digits."""
-    for unit, length in (("s", 1.0), ("min", 60.0), ("h", 3600.0)):
-        number = seconds / length
-        if number < 100 or unit == "h":
-            break
-    return f"{float(f'{max(number, 1):.2g}'):g} {unit}"
 
 
 def _what(config: Config) -> str:

@@ -8,11 +8,10 @@ import dataclasses
 import itertools
 from collections.abc import Sequence
 
-from mjx_reinforce import envs
 from mjx_reinforce.engine.checks import whole_number
 from mjx_reinforce.settings import tables
 from mjx_reinforce.settings.config import Config, spoken
-from mjx_reinforce.settings.memory import cpu_factor, has_gpu, num_parameters
+from mjx_reinforce.settings.memory import cpu_factor, has_gpu
 from mjx_reinforce.settings.own_code import CODE
 
 #: Where a budget is large, it has about so many evaluations.
@@ -103,45 +102,15 @@ def expected_env_steps(seconds: float, config: Config) -> int:
 
     A task that was not measured has those of its default budget.
     """
-    steps = _steps_in(seconds, config)
-    return (config.env_steps or 0) if steps is None else int(float(f"{steps:.2g}"))
-
-
-def expected_seconds(config: Config) -> float | None:
-    """Returns about how long this machine trains a run (s), without compiling and evaluations.
-
-    None where that is not known: of a task or an engine that was not measured, of a value network
-    or a policy larger than the task's own, and of a run that its number of updates ends.
-    """
-    steps = _steps_in(1.0, config)
-    other = config.engine == "vmap" or config.estimator == "value-baseline"
-    if steps is None or other or config.env_steps is None:
-        return None
-    task, own = tables.TASKS[config.env], of_task(config.env, env_steps=1)
-    larger = num_parameters(config, task) > num_parameters(own, task)
-    return None if larger else config.env_steps / steps
-
-
-def _steps_in(seconds: float, config: Config) -> float | None:
-    """Returns about how many env steps of a seed a time gives; None of an unmeasured task."""
     machine = tables.GPU if has_gpu() else tables.CPU
     if config.env not in machine:
-        return None
+        return config.env_steps or 0
     speed, task = machine[config.env], tables.TASKS[config.env]
     useful = 1.0 if speed.engine == "native" else task.useful
     episodes = config.num_seeds * config.episodes_per_update
     each = speed.seconds(config.num_seeds, episodes)  # an env step of every seed
-    return useful * seconds * (1.0 if has_gpu() else cpu_factor()) / each
-
-
-def check_task(env: str) -> None:
-    """Raises ValueError for what is no id of an environment, such as a file may name."""
-    envs.check_id(env)
-
-
-def named_task(arguments: Sequence[str]) -> str:
-    """Returns the environment that a command line names with ``--env``, or the default one."""
-    return flag_value(arguments, "--env") or Config().env
+    steps = useful * seconds * (1.0 if has_gpu() else cpu_factor()) / each
+    return int(float(f"{steps:.2g}"))
 
 
 def named_code(arguments: Sequence[str]) -> dict[str, str | None]:
@@ -170,7 +139,8 @@ def for_arguments(arguments: Sequence[str]) -> Config:
     except ValueError:  # none, or what the parser refuses
         seconds = None
     known = seconds if seconds and 0 < seconds < float("inf") else None
-    return of_task(named_task(arguments), env_steps, num_seeds or Config.num_seeds, known)
+    env = flag_value(arguments, "--env") or Config.env
+    return of_task(env, env_steps, num_seeds or Config.num_seeds, known)
 
 
 def _positive_number(text: str | None) -> int | None:

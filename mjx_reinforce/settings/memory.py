@@ -10,7 +10,6 @@ import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from mjx_reinforce.engine.memory import gigabytes, host_memory
 from mjx_reinforce.registry import PROGRAMS, SEARCHES
@@ -40,19 +39,8 @@ _REPORTED = 20
 _USEFUL_CORES = 4
 
 
-class MemoryPart(NamedTuple):
-    """A part of what a run needs.
-
-    size: bytes
-    lower: the settings that make it smaller
-    """
-
-    size: float
-    lower: str
-
-
-def parts(config: Config, task: Task) -> list[MemoryPart]:
-    """Returns what the arrays of a run need, wherever they lie.
+def parts(config: Config, task: Task) -> dict[str, float]:
+    """Returns what the arrays of a run need (bytes), under the flags that make each part smaller.
 
     Args:
       config: the settings.
@@ -74,22 +62,16 @@ def parts(config: Config, task: Task) -> list[MemoryPart]:
     if critic and config.algorithm not in PROGRAMS:
         fitted = seeds * config.value_batch_size
         valued = seeds * min(horizon, _CHUNK) * episodes
-    return [
-        MemoryPart(
-            _FLOAT * fitted * (config.value_fits + values + _ACTIVATIONS * sum(critic)),
-            "--value-batch-size, --value-fits or --num-seeds",
-        ),
-        MemoryPart(
-            _FLOAT * _EPISODE_COPIES * steps * values, f"--num-seeds, {fewer} or --train-horizon"
-        ),
-        MemoryPart(_FLOAT * network, f"--hidden-sizes, --num-seeds or {fewer}"),
-        MemoryPart(
-            _FLOAT * (_ACTIVATIONS * valued * sum(critic) + critics),
-            "--value-hidden-sizes, --num-seeds or --train-horizon",
-        ),
-        MemoryPart(_EVALUATED * evaluated, "--eval-episodes, --num-seeds or --horizon"),
-        MemoryPart(_FLOAT * _REPORTED * seeds * config.block_length, "--eval-every or --num-seeds"),
-    ]
+    fitting = fitted * (config.value_fits + values + _ACTIVATIONS * sum(critic))
+    valuing = _ACTIVATIONS * valued * sum(critic) + critics
+    return {
+        "--value-batch-size, --value-fits or --num-seeds": _FLOAT * fitting,
+        f"--num-seeds, {fewer} or --train-horizon": _FLOAT * _EPISODE_COPIES * steps * values,
+        f"--hidden-sizes, --num-seeds or {fewer}": _FLOAT * network,
+        "--value-hidden-sizes, --num-seeds or --train-horizon": _FLOAT * valuing,
+        "--eval-episodes, --num-seeds or --horizon": _EVALUATED * evaluated,
+        "--eval-every or --num-seeds": _FLOAT * _REPORTED * seeds * config.block_length,
+    }
 
 
 def num_parameters(config: Config, task: Task) -> int:
@@ -111,7 +93,7 @@ def _num_weights(widths: Sequence[int]) -> int:
 
 def needed(config: Config, task: Task) -> float:
     """Returns the bytes that all arrays of a run need."""
-    return math.fsum(part.size for part in parts(config, task))
+    return math.fsum(parts(config, task).values())
 
 
 def check_fits(config: Config, task: Task, available: float, base: float) -> None:
@@ -126,10 +108,10 @@ def check_fits(config: Config, task: Task, available: float, base: float) -> Non
     total = base + needed(config, task)
     if total <= available:
         return
-    greatest = max(parts(config, task))
+    found = parts(config, task)
     raise ValueError(
         f"this run does not fit into memory: it needs about {gigabytes(total)}, "
-        f"{gigabytes(available)} are here;\nlower {greatest.lower}"
+        f"{gigabytes(available)} are here;\nlower {max(found, key=found.__getitem__)}"
     )
 
 

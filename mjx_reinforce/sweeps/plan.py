@@ -16,10 +16,9 @@ from mjx_reinforce.engine.devices import Devices
 from mjx_reinforce.engine.memory import gigabytes
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.reports.experiment import counted
-from mjx_reinforce.runs.plan import devices_in_words, said_time, task_of, this_hardware
+from mjx_reinforce.runs.plan import devices_in_words, task_of, this_hardware
 from mjx_reinforce.settings.config import Config, marked
 from mjx_reinforce.settings.declare import Mark
-from mjx_reinforce.settings.defaults import expected_seconds
 from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.settings.memory import needed, num_cores
 from mjx_reinforce.settings.tables import Task
@@ -209,20 +208,8 @@ def _describe(parts: Sequence[Part], engine: str, num_devices: int, *, exact: bo
         f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
         f"of {first.env}, on {where}, with the engine {engine}: "
         f"{counted(len(groups), 'compiled program')}, {counted(chunks, 'chunk')} of up to {side:,} "
-        f"runs. {_time(groups, num_devices)}. "
-        f"It needs about {gigabytes(memory)} of memory beside the programs."
+        f"runs. It needs about {gigabytes(memory)} of memory beside the programs."
     )
-
-
-def _time(groups: Sequence[Group], num_devices: int) -> str:
-    """Returns about how long the training takes, where that is known."""
-    total, faster = 0.0, 1 if this_hardware().shared else num_devices
-    for group in groups:
-        seconds = expected_seconds(dataclasses.replace(group.config, num_seeds=group.num_runs))
-        if seconds is None:
-            return said_time(None)
-        total += seconds / faster
-    return said_time(total)
 
 
 class Prepared(NamedTuple):

@@ -158,7 +158,7 @@ def test_a_task_is_described(monkeypatch, capsys):
         "at a return of 950",
         "mjx_reinforce.train --env InvertedPendulum-v5\n",
         "  --max-kl 0.01\n",
-        "Training takes about",
+        "--minutes M sets a time",
     ):
         assert text in said, text
     assert "--env-steps" not in said

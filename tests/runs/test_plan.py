@@ -1,4 +1,4 @@
-"""What a run says before it starts: its defaults, its time, its memory, its signs of life."""
+"""What a run says before it starts: its defaults, its memory, its signs of life."""
 
 import csv
 import dataclasses
@@ -13,10 +13,10 @@ from toys import Survive
 
 from mjx_reinforce import envs
 from mjx_reinforce.runs import command_line, plan
-from mjx_reinforce.settings import defaults, memory, tables
+from mjx_reinforce.settings import memory, tables
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.defaults import expected_seconds, of_task
-from mjx_reinforce.settings.tables import PRESETS, Speed, Task
+from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.settings.tables import PRESETS, Task
 from mjx_reinforce.store import ready
 from mjx_reinforce.training.division import divide_run
 
@@ -151,60 +151,15 @@ def test_an_accelerators_memory_counts_where_there_is_one(monkeypatch):
         plan.make_plan(made, config)
 
 
-# Time.
-
-
-def test_the_time_of_a_run_by_hand(monkeypatch):
-    """A thousand steps of both seeds, 10 episodes at a time, each step of which takes 0.02 s."""
-    monkeypatch.setattr(defaults, "has_gpu", lambda: False)
-    monkeypatch.setattr(defaults, "cpu_factor", lambda: 2.0)
-    monkeypatch.setitem(tables.TASKS, "Survive-v0", Task(4, 1, 100, 0.5, 0.0))
-    monkeypatch.setitem(tables.CPU, "Survive-v0", Speed("native", 0.01, 1000.0))
-    config = Config(env="Survive-v0", num_seeds=2, num_episodes=5, env_steps=1000)
-    assert expected_seconds(config) == pytest.approx(2000 / 10 * 0.02 / 2)
-    for other in (
-        {"engine": "vmap"},
-        {"estimator": "value-baseline"},
-        {"hidden_sizes": (200, 200)},
-        {"env_steps": None, "max_updates": 3},
-        {"env": "own:Task"},
-    ):
-        assert expected_seconds(dataclasses.replace(config, **other)) is None
-
-
-@pytest.mark.parametrize(
-    ("env", "settings", "steps", "seconds"),
-    [
-        ("ContinuousCartPole-v0", {"num_seeds": 32}, 383_715, 0.21),
-        ("Swimmer-v5", {"num_seeds": 4}, 160_000, 0.11),
-    ],
-)
-def test_estimates_are_good_to_a_factor_of_three(monkeypatch, env, settings, steps, seconds):
-    """Env steps of all seeds, and the processor's time that they took (s), on 2026-11-24."""
-    monkeypatch.setattr(defaults, "has_gpu", lambda: False)
-    monkeypatch.setattr(defaults, "cpu_factor", lambda: 1.0)
-    config = dataclasses.replace(of_task(env), **settings)
-    said = expected_seconds(dataclasses.replace(config, env_steps=steps // config.num_seeds))
-    assert seconds / 2 / 3 < said < seconds / 2 * 3
-
-
-def test_durations_are_for_people():
-    said = {0.2: "1 s", 8.44: "8.4 s", 99.9: "100 s", 128: "2.1 min", 9e3: "2.5 h", 4e6: "1100 h"}
-    assert {seconds: plan.duration(seconds) for seconds in said} == said
-
-
 def test_a_plan_says_what_is_known(monkeypatch):
     monkeypatch.setattr(plan, "this_hardware", lambda: plan.Hardware("3 mills", 1e9, True))
     monkeypatch.setitem(tables.TASKS, "Survive-v0", Task(1, 1, 20, 0.5, 5e8))
     config = Config(env="Survive-v0", env_steps=1600, engine="vmap")
     made = ready.made(Survive(), config)
-    for seconds, said in ((None, "is not known"), (90.0, "Training takes about 90 s, good to a")):
-        monkeypatch.setattr(plan, "expected_seconds", lambda config, said=seconds: said)
-        text = plan.make_plan(made, config)
-        assert text.startswith("Training 4 seeds of Survive-v0 by reinforce, 1,600 env steps each")
-        assert "on 3 mills, with the engine" in text
-        assert "0.5 GB of memory" in text
-        assert said in text
+    text = plan.make_plan(made, config)
+    assert text.startswith("Training 4 seeds of Survive-v0 by reinforce, 1,600 env steps each")
+    assert "on 3 mills, with the engine" in text
+    assert "0.5 GB of memory" in text
 
 
 @pytest.mark.parametrize(

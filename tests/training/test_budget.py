@@ -18,6 +18,7 @@ from mjx_reinforce.runs.run import env_steps_in
 from mjx_reinforce.settings import defaults, tables
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.defaults import of_task
+from mjx_reinforce.settings.tables import Speed, Task
 from mjx_reinforce.training import checkpoint, progress
 
 SMALL = ["--env", "ContinuousCartPole-v0", "--num-seeds", "3", "--eval-episodes", "2"]
@@ -99,6 +100,30 @@ def test_a_budget_chooses_the_settings():
         words = ["--env", "Hopper-v5", "--env-steps", str(config.env_steps)]
         assert parse(words) == config
     assert parse(["--env=Hopper-v5", "--env-steps=1000000", "--num-seeds=9"]).num_seeds == 9
+
+
+def test_the_env_steps_of_a_time_by_hand(monkeypatch):
+    """A thousand of both seeds, 10 episodes at a time, each step of which takes 0.02 s."""
+    monkeypatch.setattr(defaults, "has_gpu", lambda: False)
+    monkeypatch.setattr(defaults, "cpu_factor", lambda: 2.0)
+    monkeypatch.setitem(tables.TASKS, "Survive-v0", Task(4, 1, 100, 0.5, 0.0))
+    monkeypatch.setitem(tables.CPU, "Survive-v0", Speed("native", 0.01, 1000.0))
+    config = Config(env="Survive-v0", num_seeds=2, num_episodes=5, env_steps=7)
+    assert defaults.expected_env_steps(2000 / 10 * 0.02 / 2, config) == 1000
+    assert defaults.expected_env_steps(2.0, dataclasses.replace(config, env="own:Task")) == 7
+
+
+@pytest.mark.parametrize(
+    ("env", "num_seeds", "steps", "seconds"),
+    [("ContinuousCartPole-v0", 32, 383_715, 0.21), ("Swimmer-v5", 4, 160_000, 0.11)],
+)
+def test_the_tables_are_good_to_a_factor_of_three(monkeypatch, env, num_seeds, steps, seconds):
+    """Env steps of all seeds, and the processor's time that they took (s), on 2026-11-24."""
+    monkeypatch.setattr(defaults, "has_gpu", lambda: False)
+    monkeypatch.setattr(defaults, "cpu_factor", lambda: 1.0)
+    config = dataclasses.replace(of_task(env), num_seeds=num_seeds)
+    said = num_seeds * defaults.expected_env_steps(seconds / 2, config)
+    assert steps / 3 < said < steps * 3
 
 
 # A budget in time: the env steps that a machine trains in it, from the speed at the start.
