@@ -26,6 +26,7 @@ ESTIMATORS = {
     "total-return": "mjx_reinforce.learning.estimators:total_return",
     "reward-to-go": "mjx_reinforce.learning.estimators:reward_to_go",
     "leave-one-out": "mjx_reinforce.learning.estimators:leave_one_out",
+    "leave-one-out-alive": "mjx_reinforce.learning.estimators:leave_one_out_alive",
     "value-baseline": "mjx_reinforce.learning.value:value_baseline",
     "mean-log-prob": "mjx_reinforce.learning.estimators:mean_log_prob",
     "normalized-returns": "mjx_reinforce.learning.estimators:normalized_returns",

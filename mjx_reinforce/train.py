@@ -97,7 +97,7 @@ def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
         check_writable(config.resume)
         return config.resume, ()
     directory = choose_directory(config.output, config.env)
-    return directory, make_directory(directory, config.overwrite)
+    return directory, make_directory(directory)
 
 
 def _start(

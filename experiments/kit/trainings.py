@@ -12,23 +12,12 @@ from pathlib import Path
 import numpy as np
 
 UPDATES = 600
-RUN = ["--env-steps", "None", "--max-updates", str(UPDATES), "--hidden-sizes", "64", "64"]
-RUN += ["--num-episodes", "2", "--horizon", "20", "--eval-episodes", "1"]
+_EACH = "--env-steps None --num-episodes 2 --horizon 20 --eval-episodes 1 --eval-every 2"
+_EACH += " --checkpoint-every 2 --max-updates"
+RUN = [*_EACH.split(), str(UPDATES), "--hidden-sizes", "64", "64"]
 RUN += ["--estimator", "value-baseline", "--value-hidden-sizes", "8", "--value-fits", "1"]
-RUN += ["--eval-every", "2", "--checkpoint-every", "2"]
-SWEEP = ["--env-steps", "None", "--max-updates", str(UPDATES // 4), "--num-episodes", "2"]
-SWEEP += ["--horizon", "20", "--eval-episodes", "1", "--eval-every", "2", "--checkpoint-every", "2"]
-SWEEP += [
-    "--num-seeds",
-    "2",
-    "--chunk-runs",
-    "2",
-    "--over",
-    "learning-rate",
-    "1e-2",
-    "3e-2",
-    "1e-1",
-]
+SWEEP = [*_EACH.split(), str(UPDATES // 4), "--num-seeds", "2", "--chunk-runs", "2"]
+SWEEP += ["--over", "learning-rate", "1e-2", "3e-2", "1e-1"]
 #: Command -> its arguments.
 COMMANDS = {"train": RUN, "sweep": SWEEP}
 #: Parts of summary.json and sweep.json that a clock decides, or which of two threads was faster.
@@ -39,14 +28,7 @@ CLOCKS += ("statistics_seconds", "command")
 class Training:
     """A process that trains a run or a sweep, and what it has said so far."""
 
-    def __init__(
-        self,
-        run: Path,
-        command: str,
-        env: str,
-        *,
-        cache: Path,
-    ):
+    def __init__(self, run: Path, command: str, env: str, *, cache: Path):
         """Starts a run or sweep, or goes on with it."""
         begun = (run / "config.json").exists() or (run / "sweep.json").exists()
         first = ["--env", env, *COMMANDS[command], "--output", run.name]

@@ -93,33 +93,35 @@ def reward_to_go(discount: float | jax.Array = 0.99) -> Estimator:
     return _stateless(lambda trajectory: _returns(trajectory, discount))
 
 
-def leave_one_out(discount: float | jax.Array = 0.99, *, ended: str = "zero") -> Estimator:
+def leave_one_out(discount: float | jax.Array = 0.99) -> Estimator:
     """Weights an action by G[t] less the mean G[t] of the other episodes.
 
     The others are independent of the action, so the baseline adds no bias
     (Kool et al. 2019, "Buy 4 REINFORCE samples"; the mean over all N episodes
-    would shrink the gradient by (N - 1) / N).
-
-    Args:
-      discount: in [0, 1].
-      ended: "zero" counts an episode that is over as the 0 it will still earn;
-        "skip" averages over the episodes alive at t alone, 0 where there is none.
-
-    Raises:
-      ValueError: ``ended`` is unknown or the discount is not in [0, 1].
+    would shrink the gradient by (N - 1) / N). One that is over counts as the 0 it will still earn.
 
     Examples:
       >>> import mjx_reinforce as mr
       >>> mr.leave_one_out(discount=1.0)
       Estimator(of 2 episodes or more)
     """
+    return _less_others(discount, counts=jnp.ones_like)
+
+
+def leave_one_out_alive(discount: float | jax.Array = 0.99) -> Estimator:
+    """``leave_one_out`` with the mean of those that still run at t alone, 0 where none does."""
+    return _less_others(discount, counts=lambda mask: mask)
+
+
+def _less_others(
+    discount: float | jax.Array, counts: Callable[[jax.Array], jax.Array]
+) -> Estimator:
+    """An estimator of G[t] less the mean of the other episodes that count, from the mask."""
     _check_discount(discount)
-    if ended not in ("zero", "skip"):
-        raise ValueError(f"ended must be 'zero' or 'skip', got {ended!r}")
 
     def update(state, trajectory):
         returns = _returns(trajectory, discount)
-        counted = jnp.ones_like(trajectory.mask) if ended == "zero" else trajectory.mask
+        counted = counts(trajectory.mask)
         others = jnp.sum(counted, axis=1, keepdims=True) - counted
         sums = jnp.sum(jnp.where(counted, returns, 0.0), axis=1, keepdims=True)
         baseline = (sums - jnp.where(counted, returns, 0.0)) / jnp.maximum(others, 1)

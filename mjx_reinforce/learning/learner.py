@@ -32,7 +32,7 @@ from mjx_reinforce.learning.diagnostics import Metrics
 from mjx_reinforce.learning.distributions import default_distribution
 from mjx_reinforce.learning.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy
-from mjx_reinforce.learning.schedules import Clock, Schedule
+from mjx_reinforce.learning.schedules import Clock
 from mjx_reinforce.learning.updates import Problem, Update, full_batch, make_optimizer
 
 
@@ -135,7 +135,7 @@ def reinforce(
     env: Environment,
     *,
     policy: Policy | None = None,
-    estimator: Estimator | Schedule | None = None,
+    estimator: Estimator | None = None,
     optimizer: optax.GradientTransformation | None = None,
     update: Update | None = None,
     num_episodes: int = 16,
@@ -162,8 +162,7 @@ def reinforce(
       env: what is played; any brax-style environment.
       policy: by default an MLP of 32 and 32 tanh units with ``default_distribution``.
       estimator: by default leave-one-out on the return to go (discount 0.99), divided by its
-        standard deviation plus 10; a ``Schedule`` of one where its numbers change as the budget is
-        used.
+        standard deviation plus 10.
       optimizer: by default Adam at 1e-2 with the gradient's norm clipped at 1.
       update: how the gradient is spent, from ``updates``; by default in one optimiser step.
       num_episodes: N, episodes an update.
@@ -210,18 +209,17 @@ def reinforce(
     update = full_batch() if update is None else update
     contract.check_update(update)
     estimator = standardize(leave_one_out(), floor=10.0) if estimator is None else estimator
-    schedule = estimator if isinstance(estimator, Schedule) else Schedule(lambda _: estimator)
-    contract.check_estimator(schedule.at(jnp.zeros(())), env, size, num_episodes)
+    contract.check_estimator(estimator, env, size, num_episodes)
 
     example = jax.eval_shape(functools.partial(_first_actor, policy, size), jax.random.key(0))
     player = choice.ActingPolicy(functools.partial(act, policy), example, policy.distribution)
     plays = choice.choose(engine, env, player, horizon)
     return Learner(
-        init=_init(policy, optimizer, schedule, size),
+        init=_init(policy, optimizer, estimator, size),
         play=_play(env, policy, plays, num_episodes, horizon),
         learn=_learn(
             policy=policy,
-            schedule=schedule,
+            estimator=estimator,
             update=update,
             problem=_problem(policy, optimizer, num_episodes, entropy_cost),
             max_kl=max_kl,
@@ -237,7 +235,7 @@ def _first_actor(policy: Policy, observation_size: int, key: jax.Array) -> Actor
 
 
 def _init(
-    policy: Policy, optimizer: optax.GradientTransformation, schedule: Schedule, size: int
+    policy: Policy, optimizer: optax.GradientTransformation, estimator: Estimator, size: int
 ) -> Callable[[jax.Array], TrainState]:
     """Returns ``Learner.init``."""
 
@@ -249,7 +247,7 @@ def _init(
             key=key,
             actor=actor,
             opt_state=optimizer.init(actor.params),
-            estimator_state=schedule.at(jnp.zeros(())).init(estimator_key, size),
+            estimator_state=estimator.init(estimator_key, size),
         )
 
     return init
@@ -304,7 +302,7 @@ class _OneStart:
 def _learn(
     *,
     policy: Policy,
-    schedule: Schedule,
+    estimator: Estimator,
     update: Update,
     problem: Callable[..., Problem],
     max_kl: float | jax.Array | None,
@@ -318,9 +316,7 @@ def _learn(
         before, visited = state.actor, diagnostics.visited_steps(trajectory)
         # Normalize, weigh, follow the gradient, limit the change, count, keep what is finite.
         seen = normalize.seen(before.normalizer, trajectory)
-        weight, estimator_state, metrics = schedule.at(state.progress).update(
-            state.estimator_state, seen
-        )
+        weight, estimator_state, metrics = estimator.update(state.estimator_state, seen)
         params, opt_state, measured = update(
             problem(state, seen, weight), key, before.params, state.opt_state
         )

@@ -1,4 +1,4 @@
-"""What changes as a run goes on: behind an optimiser, in the discount, in how episodes are cut.
+"""What changes as a run goes on: behind an optimiser, and in how episodes are cut.
 
 Optax transformations go by the share of the budget that is used, which ``updates`` tells the
 optimiser of, or by the env steps played. Counted in env steps, a policy whose episodes are short
@@ -6,7 +6,6 @@ keeps its rate and its noise, and one that has learned to play long ones settles
 """
 
 import inspect
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -18,23 +17,6 @@ from mjx_reinforce.engine.checks import check_count, check_number
 #: The standard deviation shrinks in so many steps. Each is far greater than float32's rounding of
 #: its logarithm, however many updates there are.
 _STEPS = 4096
-
-
-class Schedule(NamedTuple):
-    """An estimator whose numbers change as a run goes on.
-
-    Attributes:
-      at: (the used share [] of the budget) -> the estimator. All of them share one state, which
-        the estimator at 0 makes
-
-    Examples:
-      >>> import mjx_reinforce as mr
-      >>> from mjx_reinforce.learning.schedules import Schedule, look_further
-      >>> changing = Schedule(lambda used: mr.reward_to_go(look_further(0.9, 0.99, used)))
-      >>> learner = mr.reinforce(mr.envs.make("CartPole-v1"), estimator=changing)
-    """
-
-    at: Callable[[jax.Array], Any]
 
 
 class Cut(NamedTuple):
@@ -155,17 +137,3 @@ def shrink_std(
         return Shrunk(jnp.zeros(()))
 
     return optax.GradientTransformationExtraArgs(init, update)
-
-
-def look_further(
-    first: float | jax.Array, last: float | jax.Array, progress: jax.Array
-) -> jax.Array:
-    """Returns the discount [] at a share of the budget: 1 / (1 - discount) changes geometrically.
-
-    Args:
-      first: the discount at the beginning, less than 1.
-      last: the discount at the end, less than 1.
-      progress: [] the share of the budget that is used.
-    """
-    ahead = jnp.log1p(-jnp.asarray(first)), jnp.log1p(-jnp.asarray(last))
-    return -jnp.expm1(ahead[0] + progress * (ahead[1] - ahead[0]))

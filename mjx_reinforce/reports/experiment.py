@@ -85,8 +85,6 @@ def say(value: object) -> str:
     if isinstance(value, list | tuple):
         between = " " if any(isinstance(x, str) for x in value) else "-"
         return between.join(map(say, value)) or "none"
-    if isinstance(value, bool):
-        return "on" if value else "off"
     if isinstance(value, float):
         return f"{value:.4g}"
     return "none" if value is None else str(value)

@@ -17,7 +17,7 @@ from mjx_reinforce.reports.experiment import (
 )
 
 #: Settings that say where and how a run was kept, not what was trained.
-_HOUSEKEEPING = ("output", "overwrite", "resume", "checkpoint_every", "num_seeds", "seeds")
+_HOUSEKEEPING = ("output", "resume", "checkpoint_every", "num_seeds", "seeds")
 #: What should be the same of sources that are compared.
 _COMPARABLE = ("python", "packages", "git_commit", "device", "x64", "engine")
 

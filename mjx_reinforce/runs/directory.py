@@ -27,12 +27,8 @@ def choose_directory(output: Path | None, env: str) -> Path:
     return Path("runs") / f"{env.replace(':', '.')}-{stamp}" if output is None else output
 
 
-def make_directory(directory: Path, overwrite: bool) -> list[Path]:
+def make_directory(directory: Path) -> list[Path]:
     """Makes the run directory.
-
-    Args:
-      directory: where.
-      overwrite: accept a directory that is not empty.
 
     Returns:
       The folders that were made, the innermost first.
@@ -53,10 +49,9 @@ def make_directory(directory: Path, overwrite: bool) -> list[Path]:
                 made.insert(0, folder)
         # Where a run was killed as it wrote its first file, nothing was begun.
         names = [path.name for path in directory.iterdir()]
-        if any(not name.startswith(_FIRST) for name in names) and not overwrite:
+        if any(not name.startswith(_FIRST) for name in names):
             raise ValueError(
-                f"the run directory {directory} is not empty; choose another --output, "
-                "or pass --overwrite to replace the run in it"
+                f"the run directory {directory} is not empty; choose another --output, or delete it"
             )
         _try_to_write(directory)
     except OSError as error:

@@ -253,7 +253,7 @@ def run(
     configure_jax()
     with contextlib.ExitStack() as held:
         if config.output is not None:
-            held.callback(remove_empty, make_directory(config.output, config.overwrite))
+            held.callback(remove_empty, make_directory(config.output))
             held.enter_context(locked(config.output))
         ready = get_ready(config, config, envs.make_set(config.env, config.env_set))
         if config.init_from is not None:

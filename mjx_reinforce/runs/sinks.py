@@ -24,7 +24,7 @@ from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import iqm, iqm_interval
 from mjx_reinforce.training.rows import Cells
 
-#: Settings that need a package, and the package.
+#: The package that each needs.
 _NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}
 
 
@@ -47,13 +47,14 @@ class Sink(Protocol):
 
 def check_installed(config: Config) -> None:
     """Raises ValueError for a sink whose package is missing; imports nothing."""
-    for name, package in _NEEDED.items():
+    for name in config.log:
+        package = _NEEDED[name]
         spec = importlib.util.find_spec(package)
         # A folder of that name, such as W&B leaves, is found too, but has no origin.
-        if getattr(config, name) and (spec is None or spec.origin is None):
+        if spec is None or spec.origin is None:
             raise ValueError(
-                f"--{name} needs the package {package}, which is not installed; "
-                f"pip install {package}, or leave --{name} out"
+                f"--log {name} needs the package {package}, which is not installed; "
+                f"pip install {package}, or leave {name} out"
             )
 
 
@@ -69,9 +70,9 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Sin
       OSError: one of them cannot be written.
     """
     sinks: list[Sink] = []
-    if config.tensorboard:
+    if "tensorboard" in config.log:
         sinks.append(TensorBoard(directory, updates))
-    if config.wandb:
+    if "wandb" in config.log:
         sinks.append(WeightsAndBiases(directory))
     return sinks
 

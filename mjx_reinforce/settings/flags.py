@@ -60,7 +60,7 @@ def _reader(kind: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
         nargs=1,
         metavar=metavar,
         instance_from_str=lambda words: reader(words[0]),
-        is_instance=lambda value: isinstance(value, kind.type) and type(value) is not bool,
+        is_instance=lambda value: isinstance(value, kind.type),
         str_from_instance=lambda value: [str(value)],
     )
 

@@ -47,11 +47,7 @@ class Reader(enum.Enum):
         "--estimator value-baseline",
         lambda c: c.estimator == "value-baseline" or c.algorithm == "baseline-truncated-normal",
     )
-    LEAVE_ONE_OUT = "--estimator leave-one-out", lambda c: c.estimator == "leave-one-out"
     CUT = "--train-horizon N", lambda c: c.train_horizon is not None
-    STANDARDIZE = "--standardize", lambda c: c.standardize
-    DIRECTORY = "--output DIR", lambda c: c.output is not None or c.resume is not None
-    NATURAL_GRADIENT = "--update natural-gradient", lambda c: c.update == "natural-gradient"
     # The natural gradient's step has its length from --max-kl.
     OPTIMIZER = "another --update than natural-gradient", lambda c: c.update != "natural-gradient"
     FIRST_RATE = (
@@ -60,11 +56,7 @@ class Reader(enum.Enum):
     )
     NORMALIZATION = "--normalize-steps N", lambda c: c.normalize_steps != 0
     ADAM = "--optimizer adam", lambda c: c.optimizer == "adam"
-    DECAY = (
-        "--decay-steps N (or --decay-updates N)",
-        lambda c: c.decay_steps is not None or c.decay_updates is not None,
-    )
-    DECAY_STEPS = "--decay-steps N", lambda c: c.decay_steps is not None
+    DECAY = "--decay-steps N", lambda c: c.decay_steps is not None
     FREE_STD = (
         "a --policy whose standard deviation is the same in all states",
         lambda c: c.policy in ("auto", *_FREE_STD),
@@ -126,10 +118,6 @@ class RunSettings:
     run ends early."""
     max_updates: int | None = setting(None, *TOTAL, Mark.BUDGET, Mark.NOT_COMPILED)
     """Stop every seed after this many updates; with --num-episodes 1, as many episodes."""
-    stop_when_solved: bool = setting(
-        False, Mark.BUDGET, once="a run would end when others beside it are solved"
-    )
-    """Stop once every seed's last evaluation reached the environment's reward threshold."""
     num_episodes: int = _for_gradients(16, *COUNT)
     """Episodes that each seed plays for an update."""
     horizon: int | None = setting(None, *COUNT)
@@ -150,8 +138,6 @@ class RunSettings:
     the policy of seed i modulo that run's seeds."""
     output: Path | None = setting(None, Mark.PLACE, once="it has one directory")
     """Directory of the run. If not given, runs/<env>-<time>."""
-    overwrite: bool = setting(False, Reader.DIRECTORY, Mark.PLACE, once="it has one directory")
-    """Write into an output directory that is not empty, replacing a run's files there."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -169,7 +155,7 @@ class PolicySettings:
     initial_std: float = setting(0.5, *POSITIVE, Reader.STD, Mark.TRACED, Mark.LOG)
     """Standard deviation of the actions before training, in the action's unit."""
     final_std: float | None = _for_reinforce(
-        None, *POSITIVE, Reader.DECAY_STEPS, Reader.FREE_STD, Mark.TRACED, Mark.LOG
+        None, *POSITIVE, Reader.DECAY, Reader.FREE_STD, Mark.TRACED, Mark.LOG
     )
     """Target of the standard deviation of the actions, reached over --decay-steps besides what
     is learned. With --max-kl it may stay above. None: learned only."""
@@ -189,27 +175,15 @@ class EstimatorSettings:
 
     estimator: str = _for_reinforce("leave-one-out")
     """What weights the gradient: total-return; reward-to-go; leave-one-out (minus the mean of
-    the other episodes); value-baseline (minus a learned value). mean-log-prob and
-    normalized-returns are published variants; their docstrings explain them. Or module:name."""
-    ended_episodes: Literal["zero", "skip"] = _for_reinforce("zero", Reader.LEAVE_ONE_OUT)
-    """How leave-one-out counts other episodes that are over at a step. zero: as the 0 that they
-    still earn. skip: not at all, which may be less noisy."""
+    the other episodes; one that is over counts as the 0 that it still earns), leave-one-out-alive
+    (minus the mean of those that still run, which may be less noisy); value-baseline (minus a
+    learned value). mean-log-prob and normalized-returns are published variants; their docstrings
+    explain them. Or module:name."""
     discount: float = _for_gradients(0.99, Range.SHARE, Mark.TRACED, Mark.LOG_OF_REST)
     """Discount of rewards, in [0, 1]."""
-    final_discount: float | None = _for_reinforce(None, Range.SHARE, Mark.TRACED)
-    """Discount at the end of the budget. It changes evenly in the logarithm of 1 / (1 -
-    discount), the steps that it looks ahead. None: it is constant."""
-    reward_shift: float = _for_reinforce(0.0, Range.FINITE, Mark.TRACED)
-    """Number subtracted from the reward of every step, in training only, such as the bonus for
-    staying alive (Mania et al. 2018). Reported returns do not change."""
-    discount_weights: bool = _for_reinforce(False)
-    """Multiply the weight at step t by discount^t. Most programs omit this factor."""
-    standardize: bool = _for_reinforce(True)
-    """Divide the weights by their standard deviation plus --standardize-floor."""
-    standardize_floor: float = _for_reinforce(
-        10.0, *NOT_NEGATIVE, Reader.STANDARDIZE, Mark.TRACED, Mark.LOG
-    )
-    """Number added to the standard deviation that divides the weights, in units of return."""
+    standardize_floor: float | None = _for_reinforce(10.0, *NOT_NEGATIVE, Mark.TRACED, Mark.LOG)
+    """The weights are divided by their standard deviation plus this number, in units of return.
+    None: they are not divided."""
     value_learning_rate: float = _for_gradients(
         3e-3, *RATE, Reader.VALUE_BASELINE, Mark.TRACED, Mark.LOG
     )
@@ -229,9 +203,6 @@ class UpdateSettings:
     update: Literal["full-batch", "natural-gradient"] = _for_reinforce("full-batch")
     """How a rollout changes the policy. full-batch: one optimizer step. natural-gradient: one
     step of length --max-kl, which a decay of the learning rate shortens."""
-    natural_damping: float = _for_reinforce(0.1, *POSITIVE, Reader.NATURAL_GRADIENT, Mark.TRACED)
-    """Number added to the diagonal of the Fisher matrix of natural-gradient. It shortens the step
-    along directions in which the policy hardly changes."""
     entropy_cost: float = _for_reinforce(0.0, *NOT_NEGATIVE, Mark.TRACED)
     """Weight of the policy's entropy in the objective."""
     optimizer: Literal["adam", "sgd"] = _for_reinforce("adam", Reader.OPTIMIZER)
@@ -246,9 +217,7 @@ class UpdateSettings:
     """Learning rate after the linear decay. If not given, a tenth of --learning-rate."""
     decay_steps: int | Literal["budget"] | None = _for_reinforce("budget", *TOTAL, Mark.TRACED)
     """Env steps of a seed over which the learning rate decays, and with --final-std also the
-    noise. budget: the length of the run. None: no decay, unless --decay-updates gives one."""
-    decay_updates: int | None = _for_reinforce(None, *COUNT)
-    """Updates over which the learning rate decays. Requires --decay-steps None."""
+    noise. budget: the length of the run. None: no decay."""
     max_grad_norm: float | None = _for_reinforce(
         1.0, *POSITIVE, Reader.OPTIMIZER, Mark.TRACED, Mark.LOG
     )
@@ -271,8 +240,6 @@ class EvaluationSettings:
     test_episodes: int | None = setting(None, *COUNT, once="it has no test")
     """Episodes of the test at the end, from other starts than the evaluations. If not given,
     --eval-episodes. The test plays --eval-episodes at a time."""
-    eval_seed: int = setting(0, Range.SEED, Mark.NOT_COMPILED)
-    """Root of the randomness of evaluations. It is independent of the randomness of training."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -286,8 +253,8 @@ class CheckpointSettings:
     They are written after evaluations."""
     resume: Path | None = setting(None, Mark.PLACE, once="it goes on as a whole")
     """Resume the run in this directory, with its own settings. Only the budget may change:
-    --env-steps, --max-updates, --stop-when-solved, --checkpoint-every. Names of your own code,
-    module:Class or module:name, are to be given again."""
+    --env-steps, --max-updates, --checkpoint-every. Names of your own code, module:Class or
+    module:name, are to be given again."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -299,14 +266,13 @@ class LogSettings:
     or directions; explained_variance a baseline; clipped_gradients --max-grad-norm.
     """
 
-    tensorboard: bool = setting(False, Mark.NOT_COMPILED, once="its rows are in results.csv")
-    """Charts for TensorBoard in RUN/tensorboard: of each column the interquartile mean, quantiles
-    and a histogram over seeds, and the first 16 seeds. To see them: pip install tensorboard, then
-    tensorboard --logdir RUN."""
-    wandb: bool = setting(False, Mark.NOT_COMPILED, once="its rows are in results.csv")
-    """Write the same numbers for Weights & Biases (pip install wandb) to RUN/wandb, offline; wandb
-    sync uploads them. With WANDB_MODE=online in the environment they are uploaded during the
-    run."""
+    log: tuple[Literal["tensorboard", "wandb"], ...] = setting(
+        (), Mark.NOT_COMPILED, once="its rows are in results.csv"
+    )
+    """Of each column the interquartile mean, quantiles and the first 16 seeds. tensorboard: charts
+    in RUN/tensorboard; to see them, pip install tensorboard, then tensorboard --logdir RUN. wandb:
+    Weights & Biases (pip install wandb), written to RUN/wandb; wandb sync uploads it, or
+    WANDB_MODE=online during the run."""
 
 
 #: The groups of --help, in order, under their titles.

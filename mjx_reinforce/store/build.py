@@ -16,7 +16,6 @@ from mjx_reinforce.registry import (
 from mjx_reinforce.settings.config import Config, check_step_count
 
 if TYPE_CHECKING:
-    import jax
     import optax
 
     from mjx_reinforce.engine.base import Environment
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from mjx_reinforce.learning.estimators import Estimator
     from mjx_reinforce.learning.learner import Learner
     from mjx_reinforce.learning.policy import Policy
-    from mjx_reinforce.learning.schedules import Schedule
     from mjx_reinforce.learning.updates import Update
 
 
@@ -55,10 +53,6 @@ def build(
     from mjx_reinforce.learning.contract import check_horizon
 
     check_environment(env)
-    if config.stop_when_solved and getattr(env, "reward_threshold", None) is None:
-        raise ValueError(
-            f"{config.env} names no return at which it is solved: leave --stop-when-solved out"
-        )
     horizon = check_horizon(env, config.horizon)
     check_step_count(config, horizon)
     forever = config.normalize_steps is None
@@ -164,48 +158,30 @@ def _made_by_user(
         raise ValueError(f"cannot build the {kind} {name!r}: {explain(error)}") from error
 
 
-def _build_estimator(config: Config, horizon: int) -> "Estimator | Schedule":
-    """Returns an estimator, or a schedule of one where its discount changes."""
-    from mjx_reinforce.learning.schedules import Schedule, look_further
-
-    first, last = config.discount, config.final_discount
-    if last is None:
-        return _estimator(config, horizon, first)
-    return Schedule(lambda used: _estimator(config, horizon, look_further(first, last, used)))
-
-
-def _estimator(config: Config, horizon: int, discount: "float | jax.Array") -> "Estimator":
-    from mjx_reinforce.engine.checks import known_number
+def _build_estimator(config: Config, horizon: int) -> "Estimator":
     from mjx_reinforce.learning import estimators
 
     if config.estimator == "value-baseline":
-        estimator = _build_value_baseline(config, horizon, discount)
+        estimator = _build_value_baseline(config, horizon)
     elif is_own(config.estimator):
-        estimator = _made_by_user("estimator", config.estimator, ESTIMATORS, discount)
+        estimator = _made_by_user("estimator", config.estimator, ESTIMATORS, config.discount)
         example = "mjx_reinforce.reward_to_go(0.99)"
         check_kind(f"what {config.estimator} returns", estimator, estimators.Estimator, example)
     else:
-        settings = {"ended": config.ended_episodes} if config.estimator == "leave-one-out" else {}
-        estimator = load_definition(ESTIMATORS[config.estimator])(discount, **settings)
-    if known_number(config.reward_shift) != 0:
-        estimator = estimators.shift_rewards(estimator, config.reward_shift)
-    if config.standardize:
-        estimator = estimators.standardize(estimator, floor=config.standardize_floor)
-    if config.discount_weights:
-        estimator = estimators.discount_weights(estimator, discount)
-    return estimator
+        estimator = load_definition(ESTIMATORS[config.estimator])(config.discount)
+    if config.standardize_floor is None:
+        return estimator
+    return estimators.standardize(estimator, floor=config.standardize_floor)
 
 
-def _build_value_baseline(
-    config: Config, horizon: int, discount: "float | jax.Array"
-) -> "Estimator":
+def _build_value_baseline(config: Config, horizon: int) -> "Estimator":
     import optax
 
     from mjx_reinforce.learning.policy import MLP
     from mjx_reinforce.learning.value import value_baseline
 
     return value_baseline(
-        discount,
+        config.discount,
         horizon=horizon,
         network=MLP(config.value_hidden_sizes, 1),
         optimizer=optax.adam(config.value_learning_rate),
@@ -220,10 +196,8 @@ def _build_optimizer(config: Config) -> "optax.GradientTransformation":
     from mjx_reinforce.learning import schedules
     from mjx_reinforce.learning.updates import make_optimizer
 
-    rate: Any = config.learning_rate
+    rate = config.learning_rate
     final = rate / 10 if config.final_learning_rate is None else config.final_learning_rate
-    if config.decay_updates is not None:  # of one optimizer step each
-        rate = optax.linear_schedule(rate, final, config.decay_updates)
     optimizer = make_optimizer(
         config.optimizer, rate, max_grad_norm=config.max_grad_norm, momentum=config.momentum
     )
@@ -247,4 +221,4 @@ def _build_update(config: Config, policy: "Policy") -> "Update":
     if config.update == "full-batch":
         return full_batch()
     assert config.max_kl is not None  # checked
-    return natural_gradient(policy, config.max_kl, damping=config.natural_damping)
+    return natural_gradient(policy, config.max_kl)

@@ -82,7 +82,7 @@ def keep(key: str, facts: dict[str, Any], programs: Programs) -> Programs:
     actor, keys = jax.tree.leaves(like.train_states.actor), jax.eval_shape(plain, like.eval_keys)
     seed, numbers, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), keys.shape[:1], (2,)))
     given = {
-        "begin": (seed, seed, numbers),
+        "begin": (seed, numbers),
         "advance": (leaves, (count,) * len(Budget._fields), jax.ShapeDtypeStruct((), bool)),
         "evaluate": (actor, keys),
     }
@@ -117,8 +117,8 @@ def _on_leaves(programs: Programs) -> dict[str, Callable[..., Any]]:
     """
     like = programs.like
 
-    def begin(seed: jax.Array, eval_seed: jax.Array, numbers: jax.Array) -> Any:
-        first, keys = programs.begin(seed, eval_seed, numbers, {})
+    def begin(seed: jax.Array, numbers: jax.Array) -> Any:
+        first, keys = programs.begin(seed, numbers, {})
         return jax.tree.leaves(plain(first)), plain(keys)
 
     def advance(leaves: list[jax.Array], budget: Sequence[jax.Array], look: jax.Array) -> Any:
@@ -136,7 +136,7 @@ def _on_states(load: Callable[[str], Callable[..., Any]], like: RunState, rides:
     """Returns the programs of which ``load`` returns those on leaves, when they are traced."""
 
     def begin(*given: jax.Array) -> tuple[RunState, jax.Array]:
-        leaves, keys = load("begin")(*given[:3])  # a run has no settings that are traced
+        leaves, keys = load("begin")(*given[:2])  # a run has no settings that are traced
         return restored(leaves, like), jax.random.wrap_key_data(keys)
 
     def advance(before: RunState, budget: Budget, look: jax.Array) -> tuple[RunState, Block]:

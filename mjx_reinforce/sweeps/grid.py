@@ -65,11 +65,6 @@ def grid(over: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
 
 def check_over(base: Config, over: Mapping[str, Sequence[Any]]) -> None:
     """Raises ValueError for settings that cannot be swept, or values that make no choice."""
-    if base.stop_when_solved:
-        raise ValueError(
-            "--stop-when-solved is not for sweeps: a run would end when others beside it are "
-            "solved; leave it out"
-        )
     for field in dataclasses.fields(LogSettings):
         if getattr(base, field.name):
             raise ValueError(
@@ -156,7 +151,7 @@ def _value(name: str, word: str) -> Any:
 
 
 def _kind(kinds: Sequence[Any]) -> str:
-    names = {int: "whole number", float: "number", bool: "True or False", type(None): "None"}
+    names = {int: "whole number", float: "number", type(None): "None"}
     spoken = [
         " or ".join(typing.get_args(kind))
         if typing.get_origin(kind) is Literal

@@ -65,7 +65,7 @@ def perform(
         _finish_again(directory, known)
         return directory, True
     with contextlib.ExitStack() as held:
-        new = make_directory(directory, design.base.overwrite) if design.resume is None else []
+        new = make_directory(directory) if design.resume is None else []
         held.enter_context(locked(directory))  # a folder in which another trains stays
         made += new
         configure_jax()

@@ -84,7 +84,7 @@ class Slot(NamedTuple):
 class SlotPrograms(NamedTuple):
     """The compiled programs of a group. States of runs [R, B] are on the host between them.
 
-    first: (seed, eval_seed, the numbers [W] of the runs' seeds, settings [W] each) -> the first
+    first: (seed, the numbers [W] of the runs' seeds, settings [W] each) -> the first
       states [W, B], where W is the greatest width
     slots: by their width, the widest first; the narrower ones may still be compiling
     rides: as ``Programs.rides``
@@ -115,8 +115,8 @@ class SlotPrograms(NamedTuple):
         for start in range(0, count, width):
             index = np.minimum(np.arange(start, start + width), count - 1)
             put = self._put({name: x[index] for name, x in given.items()})
-            seeds = np.uint32(self.config.seed), np.uint32(self.config.eval_seed)
-            slots.append(self.first(*self.devices.put(seeds, NONE), put.pop("numbers"), put))
+            seed = self.devices.put(np.uint32(self.config.seed), NONE)
+            slots.append(self.first(seed, put.pop("numbers"), put))
         return np.concatenate(jax.device_get(slots))[:count]
 
     def advance(
@@ -235,15 +235,13 @@ def _compile_first(
 ) -> Callable[..., jax.Array]:
     """Compiles ``SlotPrograms.first``."""
 
-    def first(
-        seed: Seed, eval_seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]
-    ) -> jax.Array:
-        return layout.traced_rows(programs.begin(seed, eval_seed, numbers, settings)[0])
+    def first(seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]) -> jax.Array:
+        return layout.traced_rows(programs.begin(seed, numbers, settings)[0])
 
     seed = devices.shapes(jax.ShapeDtypeStruct((), np.uint32), NONE)
     numbers = jax.ShapeDtypeStruct((width,), np.uint32)
     given = devices.shapes((numbers, layout.shapes(width).settings), RUNS)
-    return devices.jit(first, (NONE, NONE, RUNS, RUNS), RUNS).lower(seed, seed, *given).compile()
+    return devices.jit(first, (NONE, RUNS, RUNS), RUNS).lower(seed, *given).compile()
 
 
 def _compile_slot(

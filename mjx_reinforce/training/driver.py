@@ -194,9 +194,8 @@ class Driver:
     def drive(self, interrupted: Callable[[], bool]) -> None:
         """Trains until the budget is used, nothing is finite, or someone asks for the end.
 
-        Policies are evaluated with the updates that follow. Where their returns decide whether any
-        do, they are evaluated before. A block that was interrupted is not evaluated, which may take
-        minutes: the resumed run does that.
+        Policies are evaluated with the updates that follow. A block that was interrupted is not
+        evaluated, which may take minutes: the resumed run does that.
 
         Args:
           interrupted: whether the run is to end soon.
@@ -207,8 +206,6 @@ class Driver:
 
     def over(self) -> bool:
         """Returns whether the budget is used, nothing is finite, or an observer wants the end."""
-        if self.config.stop_when_solved and not self.record.evaluated():
-            self.evaluate()
         return self.ended or self.record.finished() or self.record.hopeless()
 
     def advance(self) -> None:

@@ -33,7 +33,7 @@ class Programs(NamedTuple):
     What differs from sweep to sweep without another program is their input: seeds, budgets, and
     the settings that are traced.
 
-    begin: (seed, eval_seed, the numbers [R] of the runs' seeds, settings [R] each) -> the first
+    begin: (seed, the numbers [R] of the runs' seeds, settings [R] each) -> the first
       ``RunState``, and the keys [K, R] of the last test, which plays the episodes of K evaluations
     advance: (RunState, ``Budget``, whether to evaluate, [] or [R]) -> as ``block_of_updates``
     evaluate: (Actor [R, ...], keys [R], whether to, [R], all by default) -> what
@@ -113,15 +113,15 @@ def programs_of(
 
     # One program, whatever the seeds are: a program for each operation on keys takes longer.
     def begin(
-        seed: Seed, eval_seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]
+        seed: Seed, numbers: jax.Array, settings: dict[str, jax.Array]
     ) -> tuple[RunState, jax.Array]:
         keys = state.seed_keys(seed, numbers)
         states = RunState(
             train_states=jax.vmap(first)(keys, settings),
-            eval_keys=state.eval_keys(eval_seed, numbers),
+            eval_keys=state.eval_keys(numbers),
             settings=settings,
         )
-        return states, state.last_test_keys(eval_seed, numbers, config)
+        return states, state.last_test_keys(numbers, config)
 
     def visit(key: jax.Array, active: jax.Array) -> Guests:
         return guests_of(key, num_episodes=config.eval_episodes, active=active, sampled=sampled)
@@ -137,7 +137,7 @@ def programs_of(
         advance=block_of_updates(build_learner, config.block_length, visit if rides else None),
         evaluate=jax.vmap(look),
         rides=rides,
-        like=jax.eval_shape(begin, np.uint32(0), np.uint32(0), numbers, settings)[0],
+        like=jax.eval_shape(begin, np.uint32(0), numbers, settings)[0],
         division=division,
     )
 
@@ -168,16 +168,16 @@ def compile_run(
         after, block = programs.advance(before, budget, look)
         return after, block.made[None], block.metrics, (_present(before), block.looked)
 
-    beginning = division.jit(programs.begin, (NONE, NONE, RUNS, NONE), (RUNS, SECOND))
+    beginning = division.jit(programs.begin, (NONE, RUNS, NONE), (RUNS, SECOND))
     evaluating = division.jit(programs.evaluate, (RUNS, RUNS), RUNS)
     results = RUNS, RUNS, SECOND, RUNS
     advancing = division.jit(
         advance, (RUNS, NONE, NONE), results, by_episodes=True, donate_argnums=0
     )
-    seeds = place((np.uint32(config.seed), np.uint32(config.eval_seed)), NONE)
+    seed = place(np.uint32(config.seed), NONE)
     nothing = place((Budget.of(0, 0), np.bool_(False)), NONE)
     with ThreadPoolExecutor() as pool:
-        begun = pool.submit(beginning, *seeds, place(numbers), {})
+        begun = pool.submit(beginning, seed, place(numbers), {})
         evaluating, advancing = compiling(
             pool,
             (evaluating, (like.train_states.actor, like.eval_keys)),

@@ -204,17 +204,8 @@ class RunRecord:
         return bool(self._tables["evaluations"].latest(1))
 
     def finished(self) -> bool:
-        """Returns whether the budget is used, or all seeds are solved and that was to end it.
-
-        Raises:
-          KeyError: solved seeds were to end it, and there is no evaluation.
-        """
-        if used(self._config, self.env_steps, self.updates).min() >= 1.0:
-            return True
-        if not self._config.stop_when_solved or self.threshold is None:
-            return False
-        last = self._tables["evaluations"].latest(1, "eval_return")["eval_return"]
-        return bool(np.all(last >= self.threshold))
+        """Returns whether the budget is used."""
+        return bool(used(self._config, self.env_steps, self.updates).min() >= 1.0)
 
     def hopeless(self) -> bool:
         """Returns whether all seeds that still train were broken throughout a block of updates."""

@@ -107,7 +107,7 @@ def check_settings(known: Config, asked: Config) -> None:
       known: the run's settings.
       asked: those that the command line asks for.
     """
-    if asked.output is not None or asked.overwrite:
+    if asked.output is not None:
         raise ValueError("--resume goes on in the run's own directory: leave --output out")
     if asked.like is not None:
         raise ValueError("--resume goes on with the run's own settings: leave --like out")

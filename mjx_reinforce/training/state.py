@@ -69,16 +69,20 @@ def seed_keys(seed: Seed, numbers: jax.Array | np.ndarray) -> jax.Array:
     return _for_each_seed(_root_key(seed, domain=0), numbers)
 
 
-def eval_keys(eval_seed: Seed, numbers: jax.Array | np.ndarray) -> jax.Array:
+def eval_keys(numbers: jax.Array | np.ndarray) -> jax.Array:
     """Returns the keys of every evaluation but the last test, of the seeds [R] numbered so."""
-    return _for_each_seed(_root_key(eval_seed, domain=1), numbers)
+    return _for_each_seed(_root_key(_EVALUATION_ROOT, domain=1), numbers)
 
 
-def last_test_keys(eval_seed: Seed, numbers: jax.Array | np.ndarray, config: Config) -> jax.Array:
+def last_test_keys(numbers: jax.Array | np.ndarray, config: Config) -> jax.Array:
     """Returns the keys [K, R] of the last test, which plays the episodes of K evaluations."""
     rounds = -(-(config.test_episodes or config.eval_episodes) // config.eval_episodes)
-    keys = jax.random.split(_root_key(eval_seed, domain=2), rounds)
+    keys = jax.random.split(_root_key(_EVALUATION_ROOT, domain=2), rounds)
     return jax.vmap(_for_each_seed, in_axes=(0, None))(keys, numbers)
+
+
+#: Policies of all runs are evaluated from the same starts, whatever their root is.
+_EVALUATION_ROOT = 0
 
 
 def _root_key(seed: Seed, domain: int) -> jax.Array:

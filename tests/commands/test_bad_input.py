@@ -55,7 +55,6 @@ NONSENSE = {
     "--max-updates must be at most 2^53": {"max_updates": 2**53 + 1},
     "--horizon must be less than 2^31, got 2147483648": {"horizon": 2**31},
     "--value-fits must be at most 1,000,000, for an update makes": VALUE | {"value_fits": 10**9},
-    "--eval-seed must be in [0, 2^32), got -1": {"eval_seed": -1},
     "--discount must be in [0, 1], got 1.5": {"discount": 1.5},
     "--momentum must be in [0, 1 - 2^-24]": {"momentum": 1.0},
     "positive in every layer, got (32, 0)": {"hidden_sizes": (32, 0)},
@@ -63,7 +62,6 @@ NONSENSE = {
     "at most 100 layers": {"hidden_sizes": (2,) * 101},
     "--max-grad-norm must be positive and finite, got nan": {"max_grad_norm": math.nan},
     "--entropy-cost must be finite and not negative, got -1": {"entropy_cost": -1.0},
-    "--reward-shift must be finite, in float32, got nan": {"reward_shift": math.nan},
     "--learning-rate must be in [1e-12, 1000], for a step moves": {"learning_rate": 1e30},
     "--initial-std must be in [1e-12, 1e+12], for runs compute in float32": {"initial_std": 1e20},
     "--num-seeds must be a whole number, got True": {"num_seeds": True},
@@ -80,9 +78,7 @@ NONSENSE = {
     "nothing would end this run": {"env_steps": None},
     "at least two episodes": {"num_episodes": 1},
     "no log-probability": {"policy": "deterministic"},
-    "one that changes must be less than 1": {"discount": 1.0, "final_discount": 0.9},
     "has the length of its steps from --max-kl, which is None": {"update": "natural-gradient"},
-    "not both: pass --decay-steps None": {"decay_updates": 9},
 }
 
 
@@ -97,17 +93,12 @@ IDLE = {
     Reader.GRADIENT: {"discount": 0.5, "algorithm": "ars"},
     Reader.REINFORCE: {"max_kl": 0.5, "algorithm": "categorical-cartpole"},
     Reader.VALUE_BASELINE: {"value_batch_size": 64},
-    Reader.LEAVE_ONE_OUT: VALUE | {"ended_episodes": "skip"},
     Reader.CUT: {"whole_after": 0.5},
-    Reader.STANDARDIZE: {"standardize": False, "standardize_floor": 1.0},
-    Reader.DIRECTORY: {"overwrite": True},
-    Reader.NATURAL_GRADIENT: {"natural_damping": 0.1},
     Reader.OPTIMIZER: NATURAL | {"optimizer": "sgd"},
     Reader.FIRST_RATE: NATURAL | {"learning_rate": 0.1},
     Reader.DECAY: {"final_learning_rate": 1e-3, "decay_steps": None},
     Reader.NORMALIZATION: {"normalize_steps": 0, "normalize_min_std": 0.1},
     Reader.ADAM: {"optimizer": "sgd", "momentum": 0.5},
-    Reader.DECAY_STEPS: {"final_std": 0.1, "decay_steps": None, "decay_updates": 3},
     Reader.FREE_STD: {"final_std": 0.1, "policy": "normal-softplus"},
     Reader.STD: {"initial_std": 0.3, "algorithm": "ars"},
 }
@@ -142,7 +133,7 @@ def refused(run, monkeypatch, tmp_path, capsys):
 #: What the command line is told: of its words, and of what depends on the environment.
 REFUSED = {
     "--num-seeds 0": "--num-seeds must be at least 1, got 0",
-    "--algorithm ars --max-kl 0.5 --no-standardize": "--no-standardize --max-kl 0.5 would do "
+    "--algorithm ars --max-kl 0.5 --entropy-cost 0.1": "--entropy-cost 0.1 --max-kl 0.5 would do "
     "nothing: only --algorithm reinforce reads that; leave them out, or choose",
     "gymnasium-tutorial --max-kl 0.1": "only --algorithm reinforce reads that",
     "gymnasium-tutorail": "Did you mean 'gymnasium-tutorial'",
@@ -366,7 +357,7 @@ class Watched:
         {},
         {"algorithm": "ars", "hidden_sizes": ()},
         {"algorithm": "baseline-truncated-normal"},
-        {"standardize": False, "estimator": "value-baseline"},
+        {"standardize_floor": None, "estimator": "value-baseline"},
     ],
 )
 def test_the_marks_say_what_is_read(changes):
@@ -472,9 +463,9 @@ def named(*kinds):
 
 
 #: Whole numbers that are not at least 1 and less than 2^31.
-_OTHER_COUNTS = {"seed", "eval_seed", "num_seeds", "normalize_steps"}
+_OTHER_COUNTS = {"seed", "num_seeds", "normalize_steps"}
 _COUNTS = sorted({*named(int, int | None)} - _OTHER_COUNTS)
-_NUMBERS, _SWITCHES = named(float, float | None), named(bool)
+_NUMBERS = named(float, float | None)
 _SIZES = named(tuple[int, ...])
 
 
@@ -484,8 +475,7 @@ def test_every_setting_has_its_bounds_and_type():
         (named(int, int | None), (-1, 1.5, True, "4")),
         (_COUNTS, (0, 2**53 + 1)),
         (_NUMBERS, (math.nan, math.inf, -math.inf, -1e13, "1", True)),
-        (("discount", "final_discount", "momentum", "whole_after"), (-1e-9, 1.001)),
-        (_SWITCHES, (1, "yes", None)),
+        (("discount", "momentum", "whole_after"), (-1e-9, 1.001)),
         (_SIZES, ((0,), (2**31,), (1.5,), 32, "32")),
         (("policy", "estimator", "engine", "env", *_CHOICES), ("", None, 1)),
     ]
@@ -498,19 +488,16 @@ def test_every_setting_has_its_bounds_and_type():
 RIGHT = {
     **{name: st.integers(1, 9) for name in _COUNTS},
     **{name: st.floats(1e-6, 0.999) for name in _NUMBERS},
-    **{name: st.booleans() for name in _SWITCHES},
     **{name: st.lists(st.integers(1, 9), max_size=2).map(tuple) for name in _SIZES},
     **{name: st.sampled_from(typing.get_args(kind)) for name, kind in _CHOICES.items()},
     "num_seeds": st.integers(1, 9),
     "num_episodes": st.integers(2, 9),
     "normalize_steps": st.none() | st.integers(0, 9),
     "decay_steps": st.none() | st.integers(1, 9),
-    "decay_updates": st.none(),
     "minutes": st.none(),
     "algorithm": st.sampled_from(["reinforce", "ars"]),
     "policy": st.sampled_from(["normal-softplus", "normal-sigmoid"]),
     "estimator": st.sampled_from([*ESTIMATORS]),
-    "reward_shift": st.floats(-5.0, 5.0),
 }
 
 

@@ -117,16 +117,9 @@ def test_the_saved_policy_plays_like_the_trained_one(out):
 def test_a_run_is_not_put_into_another(run, tmp_path, capsys, files):
     for name in files:
         (tmp_path / name).write_text("{}")
-    assert run(*ARGUMENTS, "--output", "new/deep", "--overwrite") == 2
+    assert run(*ARGUMENTS, "--output", "new/deep") == 2
     assert f"new/deep would be inside the run {tmp_path}" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
-
-
-def test_solving_needs_a_threshold(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(Survive, "reward_threshold", None)
-    assert run(*ARGUMENTS, "--stop-when-solved", "--output", "out") == 2
-    assert "leave --stop-when-solved out" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 MEMORY = RuntimeError("RESOURCE_EXHAUSTED: 9 GB")

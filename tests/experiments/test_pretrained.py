@@ -68,12 +68,14 @@ def test_the_best_of_several_runs_is_packed(tmp_path):
 
 def test_the_command_gives_the_settings_again():
     config = of_task("CartPole-v1", 7000, 5)
-    written = json.loads(json.dumps(vars(config))) | {"standardize": False, "hidden_sizes": [8, 4]}
+    written = json.loads(json.dumps(vars(config))) | {
+        "standardize_floor": None,
+        "hidden_sizes": [8, 4],
+    }
     line = shlex.split(pretrained.command(written))
     assert line[:3] == ["python", "-m", "mjx_reinforce.train"]
     again = command_line.parse(line[3:])
-    assert vars(again) | {"standardize": True} == vars(config) | {"hidden_sizes": (8, 4)}
-    assert not again.standardize
+    assert vars(again) == vars(config) | {"standardize_floor": None, "hidden_sizes": (8, 4)}
 
 
 def test_no_run_is_refused(tmp_path):

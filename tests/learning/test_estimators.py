@@ -76,16 +76,18 @@ def test_returns_to_go_are_those_of_the_recurrence(horizon, dtype, within):
         np.testing.assert_allclose(got, expected[:-1], rtol=within, atol=within)
 
 
-@pytest.mark.parametrize("ended", ["zero", "skip"])
-def test_leave_one_out_by_hand(ended):
+@pytest.mark.parametrize("make", [est.leave_one_out, est.leave_one_out_alive])
+def test_leave_one_out_by_hand(make):
     returns = returns_by_hand(0.9)
     expected = np.zeros((4, 3))
     for t in range(4):
         for n in range(3):
-            others = [m for m in range(3) if m != n and (ended == "zero" or t < LENGTHS[m])]
+            others = [
+                m for m in range(3) if m != n and (make is est.leave_one_out or t < LENGTHS[m])
+            ]
             baseline = np.mean([returns[t, m] for m in others]) if others else 0.0
             expected[t, n] = returns[t, n] - baseline if t < LENGTHS[n] else 0.0
-    got = weights(est.leave_one_out(0.9, ended=ended), make_trajectory())
+    got = weights(make(0.9), make_trajectory())
     np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
 
 
@@ -190,9 +192,9 @@ def test_equal_returns_leave_nothing_to_explain(level):
     assert np.isnan(explained)
 
 
-@pytest.mark.parametrize("ended", ["zero", "skip"])
-def test_the_variance_that_leave_one_out_explains_by_hand(ended):
-    weight, _, metrics = update(est.leave_one_out(0.9, ended=ended), make_trajectory())
+@pytest.mark.parametrize("make", [est.leave_one_out, est.leave_one_out_alive])
+def test_the_variance_that_leave_one_out_explains_by_hand(make):
+    weight, _, metrics = update(make(0.9), make_trajectory())
     left, returns = np.asarray(weight)[MASK], returns_by_hand(0.9)[MASK]
     expected = 1 - np.var(left) / np.var(returns)
     assert float(metrics["explained_variance"]) == pytest.approx(expected, rel=1e-5)
@@ -284,8 +286,8 @@ def test_nothing_after_the_end_has_any_effect_on_what_is_learned(name):
     every step before it. Not so at discount 0, where G[t] = r[t]: there it may be poisoned too.
     Only a mean that counts ended episodes as the 0 they earn relies on that 0.
     """
-    options = {"ended": "skip"} if name == "leave-one-out" else {}
-    estimator = MAKERS[name](0.0, **options)
+    make = est.leave_one_out_alive if name == "leave-one-out" else MAKERS[name]
+    estimator = make(0.0)
     clean = update(estimator, make_trajectory())
     huge = make_trajectory(observation=1e30, action=np.nan, reward=1e30)
     assert_equal(update(estimator, huge), clean)
@@ -370,8 +372,6 @@ def test_a_discount_lies_between_0_and_1(make):
 
 
 def test_nonsense_is_refused():
-    with pytest.raises(ValueError, match="'zero' or 'skip', got 'alive'"):
-        est.leave_one_out(ended="alive")
     for name in ("horizon", "num_fits", "batch_size"):
         with pytest.raises(ValueError, match=f"{name} must be at least 1, got 0"):
             value_baseline(**{name: 0})  # type: ignore[arg-type]

@@ -162,7 +162,7 @@ CASES = {
     "total return": (est.total_return, of_the_start, 1),
     "reward to go": (est.reward_to_go, of_all_steps, 1),
     "leave one out": (est.leave_one_out, of_all_steps, 3),
-    "of the living": (lambda d: est.leave_one_out(d, ended="skip"), of_all_steps, 3),
+    "of the living": (est.leave_one_out_alive, of_all_steps, 3),
     "value": (lambda d: fitted(value_baseline(d, batch_size=8, **CRITIC)), of_all_steps, 1),
     "full-batch": (lambda d: fitted(full_batch_value_baseline(d, **CRITIC)), of_all_steps, 1),
     "discount^t": (lambda d: est.discount_weights(est.leave_one_out(d), d), of_the_start, 2),

@@ -134,11 +134,8 @@ def test_a_thousand_seeds_are_read_without_a_call_an_entry(tmp_path):
 
 
 def test_values_in_words():
-    settings = {"learning_rate": 0.003, "hidden_sizes": (16, 32), "standardize": True, "x_y": None}
-    assert (
-        settings_in_words(settings)
-        == "learning rate 0.003, hidden sizes 16-32, standardize on, x y none"
-    )
+    settings = {"learning_rate": 0.003, "hidden_sizes": (16, 32), "x_y": None}
+    assert settings_in_words(settings) == "learning rate 0.003, hidden sizes 16-32, x y none"
     assert ordered([0.3, 0.1, 0.3]) == [0.1, 0.3]
     assert ordered(["b", "a", "b"]) == ["b", "a"]
 

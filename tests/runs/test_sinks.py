@@ -136,7 +136,7 @@ def test_what_a_kill_left_of_writing_a_file_is_removed_and_what_is_not_ours_stay
 
 
 def test_tensorboard_has_the_numbers(directory):
-    [charted] = sinks.open_sinks(Config(tensorboard=True), directory, None)
+    [charted] = sinks.open_sinks(Config(log=("tensorboard",)), directory, None)
     for update in (0, 5):
         charted.write(evaluation(update))
     charted.close()
@@ -149,7 +149,7 @@ def test_tensorboard_has_the_numbers(directory):
 
 def test_tensorboard_of_a_resumed_run_shows_no_step_twice(directory):
     """It was killed after 10 updates and went on from 5, then of 3 seeds."""
-    config = Config(tensorboard=True)
+    config = Config(log=("tensorboard",))
     [killed] = sinks.open_sinks(config, directory, None)
     for update in (0, 5, 10):
         killed.write(evaluation(update))
@@ -164,14 +164,14 @@ def test_tensorboard_of_a_resumed_run_shows_no_step_twice(directory):
 
 def test_a_run_that_starts_again_drops_everything(directory):
     for _ in range(2):
-        [charted] = sinks.open_sinks(Config(tensorboard=True), directory, None)
+        [charted] = sinks.open_sinks(Config(log=("tensorboard",)), directory, None)
         charted.write(evaluation(0))
     assert list(events_of(directory / "tensorboard")) == [0]
     assert sum(event.HasField("summary") for event in events(directory / "tensorboard")) == 2
 
 
 def test_a_full_disk_costs_rows_and_leaves_the_others_whole(directory, monkeypatch):
-    [charted] = sinks.open_sinks(Config(tensorboard=True), directory, None)
+    [charted] = sinks.open_sinks(Config(log=("tensorboard",)), directory, None)
 
     def full(path, content):
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -250,7 +250,7 @@ def test_wandb_that_has_no_key_says_what_to_do(directory, monkeypatch):
     monkeypatch.setattr(wandb, "init", init)
     monkeypatch.setenv("WANDB_MODE", "online")
     with pytest.raises(OSError, match="key configured; run wandb login, or unset WANDB_MODE"):
-        sinks.open_sinks(Config(wandb=True), directory, None)
+        sinks.open_sinks(Config(log=("wandb",)), directory, None)
 
 
 def test_a_missing_package_is_named_before_anything_starts(tmp_path, monkeypatch, capsys):
@@ -261,10 +261,10 @@ def test_a_missing_package_is_named_before_anything_starts(tmp_path, monkeypatch
     monkeypatch.delitem(sys.modules, "wandb", raising=False)
     real = [path for path in sys.path if "site-packages" not in path]
     monkeypatch.setattr(sys, "path", real)
-    monkeypatch.setattr(sys, "argv", ["train", "--wandb", "--output", "out"])
+    monkeypatch.setattr(sys, "argv", ["train", "--log", "wandb", "--output", "out"])
     with pytest.raises(SystemExit, match=r"^2$"):
         train_module.main()
-    assert "--wandb needs the package wandb" in capsys.readouterr().err
+    assert "--log wandb needs the package wandb" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
@@ -272,7 +272,7 @@ def test_a_missing_package_is_named_before_anything_starts(tmp_path, monkeypatch
 def test_a_run_with_a_sink_and_its_resumption(run, tmp_path):
     size = ["--num-seeds", "2", "--eval-episodes", "2", "--hidden-sizes", "4"]
     size += ["--env", "Survive-v0", "--env-steps", "None", "--num-episodes", "4"]
-    sinks = ["--tensorboard", "--output", "out"]
+    sinks = ["--log", "tensorboard", "--output", "out"]
     assert run(*size, "--max-updates", "8", *sinks) == 0
     assert run("--resume", "out", "--max-updates", "15") == 0
     out = tmp_path / "out"

@@ -32,13 +32,11 @@ def test_words_become_values_of_the_type_of_their_setting():
         ["learning-rate", "1e-3", "1"],
         ["--hidden-sizes", "8,4", "none"],
         ["max-kl", "None", "0.1"],
-        ["standardize", "True", "false"],
     ]
     assert grid.read_over(given) == {
         "learning_rate": [1e-3, 1.0],
         "hidden_sizes": [(8, 4), ()],
         "max_kl": [None, 0.1],
-        "standardize": [True, False],
     }
 
 

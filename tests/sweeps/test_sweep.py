@@ -166,11 +166,13 @@ def test_numbers_of_shifts_dampings_and_values_are_traced():
         engine="vmap",
     )
     configs = [
-        dataclasses.replace(base, reward_shift=shift, natural_damping=damping)
-        for shift, damping in ((0.0, 0.1), (0.5, 1.0))
+        dataclasses.replace(base, entropy_cost=cost, standardize_floor=floor)
+        for cost, floor in ((0.0, 0.1), (0.5, 1.0))
     ]
-    (group,) = make_groups(configs, ("reward_shift",), exact=True)
-    assert {"reward_shift", "natural_damping", "max_kl", "value_learning_rate"} <= {*group.settings}
+    (group,) = make_groups(configs, ("entropy_cost",), exact=True)
+    assert {"entropy_cost", "standardize_floor", "max_kl", "value_learning_rate"} <= {
+        *group.settings
+    }
     builder, key = learner_builder(Drift(), group.config), jax.random.key(3)
 
     def trained(learner):
@@ -436,9 +438,8 @@ def test_numbers_share_a_program_and_the_rest_does_not():
         ("--over seed 1 2", "cannot go over seed"),
         ("--over value-learning-rate 1e-3 1e-2", "would do nothing"),
         ("--over learning-rate 1e-2 1e-3 --value-fits 3", "--value-fits 3 would do nothing"),
-        ("--over learning-rate 1e-2 1e-3 --stop-when-solved", "not for sweeps"),
         ("--over learning-rate 1e-2 1e-3 --chunk-runs 0", "--chunk-runs must be at least 1"),
-        ("--over learning-rate 1e-2 1e-3 --wandb", "--wandb logs a run"),
+        ("--over learning-rate 1e-2 1e-3 --log wandb", "--log logs a run"),
         ("--update natural-gradient --over max-kl None 0.1", "from --max-kl, which is None"),
         ("--over learning-rate 1 2 --num-seeds 2000000000", "results of 4,000,000,000 runs do not"),
         (
@@ -567,7 +568,7 @@ def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
         evaluate = jax.jit(made.evaluate)
         for seed in known.seeds:
             actor = jax.tree.map(lambda x: x[None], load_seed(known, seed)[0].actor)
-            keys = eval_keys(config.eval_seed, np.array([seed], np.uint32))
+            keys = eval_keys(np.array([seed], np.uint32))
             returns = evaluate(actor, keys)["eval_return"]
             np.testing.assert_array_equal(returns[0], final[seeds == seed][0])
     with pytest.raises(ValueError, match="has the policies of the seeds"):

@@ -133,15 +133,6 @@ def test_an_observer_ends_the_run():
     assert diary.notes[-1] == "evaluated 4"
 
 
-def test_returns_that_decide_are_measured_before_the_next_block():
-    config = Config(**{**vars(CONFIG), "stop_when_solved": True})
-    steps, diary = Steps(returns=lambda updates: [updates, updates]), Diary()
-    driver = driver_of(steps, diary, config=config, threshold=4.0)
-    driver.drive(never)
-    assert steps.looks == [False, False]
-    assert diary.notes == ["evaluated 0", "updated 2", "evaluated 2", "updated 4", "evaluated 4"]
-
-
 def test_a_run_without_a_finite_update_ends():
     config = Config(**{**vars(CONFIG), "max_updates": 100})
     driver = driver_of(Steps(broken=True), config=config)

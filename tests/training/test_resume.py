@@ -306,7 +306,7 @@ def test_a_folder_that_another_process_makes_is_not_ours(tmp_path, monkeypatch):
         return mkdir(folder, *arguments)
 
     monkeypatch.setattr(Path, "mkdir", late)
-    assert make_directory(tmp_path / "a" / "b", False) == []
+    assert make_directory(tmp_path / "a" / "b") == []
     monkeypatch.undo()
     assert make_directory(tmp_path / "c" / "d", False) == [
         tmp_path / "c" / "d",

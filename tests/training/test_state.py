@@ -82,8 +82,8 @@ def test_a_seed_begins_alike_whichever_begin_with_it():
     """So do the seeds that a process has, and those of a slot."""
     config = dataclasses.replace(LUCK, num_seeds=4, test_episodes=6)
     begin = jax.jit(ready.made(Luck(), config).programs.begin)
-    every, all_keys = plain(begin(3, 5, np.arange(4, dtype=np.uint32), {}))
-    some, keys = plain(begin(3, 5, np.array([2, 0], np.uint32), {}))
+    every, all_keys = plain(begin(3, np.arange(4, dtype=np.uint32), {}))
+    some, keys = plain(begin(3, np.array([2, 0], np.uint32), {}))
     jax.tree.map(lambda x, y: np.testing.assert_array_equal(x, y[jnp.array([2, 0])]), some, every)
     assert keys.shape == (3, 2, 2)
     assert np.array_equal(keys, all_keys[:, [2, 0]])
@@ -120,7 +120,6 @@ def test_each_seed_is_evaluated_and_tested_on_starts_of_its_own_whatever_is_trai
     changed = measure(num_seeds=5, seed=7, learning_rate=0.5, hidden_sizes=(3,))
     for one, other in zip(measure(), changed, strict=True):
         assert np.array_equal(one["eval_return"], other["eval_return"][:3])
-    assert not np.isin(test, measure(eval_seed=1)[2]["eval_return"]).any()
 
 
 @pytest.mark.slow

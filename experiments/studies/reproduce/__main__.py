@@ -114,8 +114,6 @@ def train(case: Case, config: Config, *, stale: bool = False) -> np.ndarray:
 
 
 def _format(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
     if isinstance(value, int) or (isinstance(value, float) and value >= 1000):
         return f"{value:,.0f}"
     return f"{value:.3g}" if isinstance(value, float) else str(value)

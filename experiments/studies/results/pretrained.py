@@ -19,13 +19,13 @@ from mjx_reinforce.export.player import Player, load_seed
 from mjx_reinforce.export.policy_files import SavedPolicy, save_policy
 from mjx_reinforce.export.run_files import PROVENANCE_FILE, Run, read_run
 from mjx_reinforce.files import read_json, write_json
-from mjx_reinforce.settings.config import flag
+from mjx_reinforce.settings.config import as_words
 from mjx_reinforce.settings.defaults import of_task
 
 #: Roots of the starts on which policies are compared, and of those on which the best is measured.
 _CHOICE, _MEASURE = 718281828, 314159265
 #: What a run's command need not say.
-_NOT_SAID = {"output", "minutes", "overwrite", "env", "engine", "tensorboard", "wandb"}
+_NOT_SAID = {"output", "minutes", "env", "engine", "log"}
 
 
 class Candidate(NamedTuple):
@@ -149,8 +149,5 @@ def command(written: dict[str, Any]) -> str:
         plain = list(default[name]) if isinstance(default[name], tuple) else default[name]
         if name in _NOT_SAID or (value == plain and not always):
             continue
-        if isinstance(value, bool):
-            words.append(flag(name if value else f"no_{name}"))
-        else:
-            words += [flag(name), *map(str, value if isinstance(value, list) else [value])]
+        words += as_words(name, value)
     return shlex.join(words)

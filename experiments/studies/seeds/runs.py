@@ -1,13 +1,16 @@
 """The sweeps of the seeds study: what is trained, and what is kept of each run."""
 
 import dataclasses
+import functools
 import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import optax
 
-from mjx_reinforce import Estimator, envs, full_batch_value_baseline
+import mjx_reinforce as mr
+from mjx_reinforce import envs
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.files import read_arrays, read_json, write_arrays
@@ -21,22 +24,47 @@ from mjx_reinforce.sweeps.perform import perform
 SEED = 20_261_122
 #: A run whose episodes stay so short that this many updates do not use up its env steps ends here.
 MAX_UPDATES = 150
-#: The learned baseline of the study, as ``--estimator`` takes it, and its name on the page.
-_OWN, _NAME = "experiments.studies.seeds.runs:baseline", "value-baseline"
 #: All combinations of these are trained. The learning rates come last: they share a program.
 FACTORS: dict[str, list[Any]] = {
-    "estimator": ["reward-to-go", "leave-one-out", _OWN],
+    "estimator": ["reward-to-go", "leave-one-out", "value-baseline"],
     "discount_weights": [False, True],
     "standardize": [True, False],
     "learning_rate": [3e-3, 1e-2, 3e-2],
+}
+#: The settings that a sweep goes over for some of them, with their values in the same order.
+_SETTINGS: dict[str, tuple[str, list[Any]]] = {
+    "discount_weights": ("algorithm", [f"{__name__}:{name}" for name in ("plain", "discounted")]),
+    "standardize": ("standardize_floor", [10.0, None]),
 }
 #: Points in training, evenly spaced in env steps, over which returns are averaged.
 _GRID = 57
 
 
-def baseline(discount: Any) -> Estimator:
+def plain(env: Any, config: Config, *, discounted: bool = False, **shared: Any) -> mr.Learner:
+    """Returns the learner of the settings; the learning rate decays over 100 updates."""
+    make = {"reward-to-go": mr.reward_to_go, "leave-one-out": mr.leave_one_out}
+    estimator = make.get(config.estimator, _baseline)(config.discount)
+    if config.standardize_floor is not None:
+        estimator = mr.standardize(estimator, floor=config.standardize_floor)
+    if discounted:
+        estimator = mr.discount_weights(estimator, config.discount)
+    rate = optax.linear_schedule(config.learning_rate, config.learning_rate / 10, 100)
+    return mr.reinforce(
+        env,
+        estimator=estimator,
+        optimizer=mr.make_optimizer("adam", rate),
+        num_episodes=config.num_episodes,
+        **shared,
+    )
+
+
+#: The same, with the weight at step t times discount^t.
+discounted = functools.partial(plain, discounted=True)
+
+
+def _baseline(discount: Any) -> mr.Estimator:
     """Returns a small baseline that reads the observation and is fitted to whole rollouts."""
-    return full_batch_value_baseline(discount, network=MLP((32, 32), 1), num_fits=10)
+    return mr.full_batch_value_baseline(discount, network=MLP((32, 32), 1), num_fits=10)
 
 
 class Task(NamedTuple):
@@ -78,13 +106,11 @@ def base_settings(task: str, num_seeds: int) -> Config:
     return Config(
         env=task,
         hidden_sizes=() if task.startswith("InvertedPendulum-") else (32, 32),
-        decay_steps=None,
-        decay_updates=100,
         num_seeds=num_seeds,
         seed=SEED,
         max_updates=MAX_UPDATES,
         eval_every=2,
-        # As ``baseline`` has them; the page says so.
+        # As ``_baseline`` has them; the page says so.
         value_hidden_sizes=(32, 32),
         value_fits=10,
     )
@@ -112,7 +138,8 @@ def train(base: Config, directory: Path) -> bool:
     if begun:
         design = dataclasses.replace(read_design(directory), resume=directory)
     else:
-        design = Design(base=dataclasses.replace(base, output=directory), over=FACTORS)
+        over = dict(_SETTINGS.get(name, (name, values)) for name, values in FACTORS.items())
+        design = Design(base=dataclasses.replace(base, output=directory), over=over)
     with Interrupt() as interrupt:
         perform(design, interrupt, [])
         ended = interrupt.number is None
@@ -128,8 +155,10 @@ def measure(directory: Path) -> Task:
     """
     record = read_json(directory / "sweep.json")
     runs = read_arrays(directory / "curves.npz")
-    threshold, factors = record["threshold"], record["over"]
-    factors = {name: [_NAME if x == _OWN else x for x in factors[name]] for name in factors}
+    names = {setting: name for name, (setting, _) in _SETTINGS.items()}
+    factors: dict[str, list[Any]] = {}
+    for x, values in record["over"].items():
+        factors |= {names[x]: FACTORS[names[x]]} if x in names else {x: values}
     shape = [len(values) for values in factors.values()]
     returns, steps = runs["eval_return"].astype(float), runs["env_steps"]
     finite = np.isfinite(returns)
@@ -138,7 +167,7 @@ def measure(directory: Path) -> Task:
     budget = record["settings"]["env_steps"]
     grid = np.linspace(0, budget, _GRID)
     curves = np.stack([np.interp(grid, x, y) for x, y in zip(steps.T, returns.T, strict=True)])
-    first, solved = time_to_threshold(returns, steps, threshold)
+    first, solved = time_to_threshold(returns, steps, record["threshold"])
     measured = {
         "final_return": returns[-1],
         "average_return": np.trapezoid(curves, grid, axis=1) / budget,
@@ -148,7 +177,7 @@ def measure(directory: Path) -> Task:
     return Task(
         name=record["env"],
         factors=factors,
-        threshold=threshold,
+        threshold=record["threshold"],
         budget=budget,
         untrained=float(np.mean(returns[0])),
         record=record,
