@@ -211,7 +211,7 @@ def reinforce(
     estimator = standardize(leave_one_out(), floor=10.0) if estimator is None else estimator
     contract.check_estimator(estimator, env, size, num_episodes)
 
-    example = jax.eval_shape(functools.partial(_first_actor, policy, size), jax.random.key(0))
+    example = jax.eval_shape(functools.partial(first_actor, policy, size), jax.random.key(0))
     player = choice.ActingPolicy(functools.partial(act, policy), example, policy.distribution)
     plays = choice.choose(engine, env, player, horizon)
     return Learner(
@@ -230,7 +230,8 @@ def reinforce(
     )
 
 
-def _first_actor(policy: Policy, observation_size: int, key: jax.Array) -> Actor:
+def first_actor(policy: Policy, observation_size: int, key: jax.Array) -> Actor:
+    """Returns the actor before training."""
     return Actor(params=policy.init(key), normalizer=normalize.init(observation_size))
 
 
@@ -242,7 +243,7 @@ def _init(
     def init(key: jax.Array) -> TrainState:
         check_key(key)
         policy_key, estimator_key, key = jax.random.split(key, 3)
-        actor = _first_actor(policy, size, policy_key)
+        actor = first_actor(policy, size, policy_key)
         return TrainState(
             key=key,
             actor=actor,

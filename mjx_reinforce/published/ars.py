@@ -7,18 +7,19 @@ the parameters move along the directions that made a difference:
 
 with sigma the standard deviation of those 2 b returns. An episode in which the simulation left the
 finite numbers counts as the worst of the others; where all did, nothing is learned. No gradient of
-the policy is taken. The learner has the same two functions as ``reinforce``, so whatever drives one
-drives the other.
+the policy is taken. The learner has the same functions as that of ``reinforce``, so whatever drives
+one drives the other.
 """
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
-from jax.typing import ArrayLike
 from optax import Params
 
 from mjx_reinforce.engine.base import (
@@ -28,23 +29,31 @@ from mjx_reinforce.engine.base import (
     action_space,
     observation_size,
 )
-from mjx_reinforce.engine.checks import check_count, check_key, check_number, check_type
+from mjx_reinforce.engine.checks import check_count, check_key, check_number
 from mjx_reinforce.engine.contract import check_environment
 from mjx_reinforce.engine.play import choice
-from mjx_reinforce.engine.play.choice import Engine
 from mjx_reinforce.engine.play.rollouts import episode_returns
-from mjx_reinforce.learning import contract, diagnostics, normalize
+from mjx_reinforce.learning import contract, diagnostics, learner, normalize
 from mjx_reinforce.learning.distributions import categorical, deterministic
 from mjx_reinforce.learning.estimators import replace_broken
-from mjx_reinforce.learning.learner import (
-    Learner,
-    Metrics,
-    TrainState,
-    episode_metrics,
-    keep_finite,
-)
+from mjx_reinforce.learning.learner import Learner, Metrics, TrainState
 from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy
 from mjx_reinforce.learning.updates import signal_to_noise
+
+#: (directions, like the params with a leading axis [D]; returns [2, D] forwards and backwards;
+#: noise_std) -> what the parameters move by, over the step size.
+Increment = Callable[[Any, jax.Array, Any], Any]
+
+
+class Trial(NamedTuple):
+    """What is tried for one update.
+
+    directions: like the params, with a leading axis [D]
+    trajectory: 2 D episodes, an episode a policy; the forward ones first
+    """
+
+    directions: Any
+    trajectory: Trajectory
 
 
 def ars(
@@ -55,11 +64,10 @@ def ars(
     top_directions: int | None = None,
     step_size: float | jax.Array = 0.02,
     noise_std: float | jax.Array = 0.03,
+    increment: Increment | None = None,
     horizon: int | None = None,
     normalize_steps: float = math.inf,
     normalize_min_std: float | jax.Array = 0.0,
-    shared_starts: bool = False,
-    update: str = "paper",
     engine: str = "auto",
 ) -> Learner:
     """Builds augmented random search for an environment.
@@ -73,14 +81,12 @@ def ars(
         (V1-t, V2-t); by default all (V1, V2).
       step_size: alpha.
       noise_std: nu, how far along a direction the policies are.
+      increment: in place of the paper's sum over the b best.
       horizon: T, steps after which an episode ends; by default ``env.max_episode_steps``.
       normalize_steps: scale observations by the mean and std of about the first so many steps;
         inf is V2, 0 is V1.
       normalize_min_std: the least that an observation is divided by, in its own unit.
-      shared_starts: the two episodes of a direction start alike; each has its own start in the
-        paper.
-      update: "paper", or "document" for that of a published notebook: ``document_increment``.
-      engine: "auto" or "vmap", see ``engines.choice``.
+      engine: "auto" or "vmap", see ``engine.play.choice``.
 
     Returns:
       The learner. Where sigma is zero the parameters stay.
@@ -97,142 +103,96 @@ def ars(
       >>> metrics["episodes"].item()  # two a direction
       4
     """
-    search = _RandomSearch(**locals())
-    return Learner(search.init, search.play, search.learn, search.policy, search.plays)
+    check_environment(env)
+    horizon = contract.check_horizon(env, horizon)
+    check_count("num_directions", num_directions)
+    top = num_directions if top_directions is None else top_directions
+    check_count("top_directions", top)
+    if top > num_directions:
+        raise ValueError(f"top_directions must lie in [1, {num_directions}], got {top}")
+    check_number("step_size", step_size, positive=True)
+    check_number("noise_std", noise_std, positive=True)
+    check_number("normalize_steps", normalize_steps, finite=False)
+    check_number("normalize_min_std", normalize_min_std)
+    size = observation_size(env)
+    policy = _zero_policy(env, size) if policy is None else policy
+    contract.check_policy(policy, env, size)
+    plays = choice.choose(engine, env)
 
-
-class Trial(NamedTuple):
-    """What is tried for one update.
-
-    directions: like the params, with a leading axis [D]
-    trajectory: 2 D episodes, an episode a policy; the forward ones first
-    """
-
-    directions: Any
-    trajectory: Trajectory
-
-
-@dataclasses.dataclass(kw_only=True, eq=False)
-class _RandomSearch:
-    """The arguments of ``ars``, checked and completed, and what it does with them."""
-
-    env: Environment
-    policy: Policy
-    num_directions: int
-    top_directions: int
-    step_size: float | jax.Array
-    noise_std: float | jax.Array
-    horizon: int
-    normalize_steps: float
-    normalize_min_std: float | jax.Array
-    shared_starts: bool
-    update: str
-    engine: str
-    observation_size: int = dataclasses.field(init=False)
-    plays: Engine = dataclasses.field(init=False)
-
-    def __post_init__(self):
-        check_environment(self.env)
-        self.horizon = contract.check_horizon(self.env, self.horizon)
-        check_count("num_directions", self.num_directions)
-        check_type("top_directions", self.top_directions, int | None)
-        check_type("shared_starts", self.shared_starts, bool)
-        check_number("normalize_steps", self.normalize_steps, finite=False)
-        check_number("normalize_min_std", self.normalize_min_std)
-        if self.top_directions is None:
-            self.top_directions = self.num_directions
-        if not 1 <= self.top_directions <= self.num_directions:
-            raise ValueError(
-                f"top_directions must lie in [1, {self.num_directions}], got {self.top_directions}"
-            )
-        check_number("step_size", self.step_size, positive=True)
-        check_number("noise_std", self.noise_std, positive=True)
-        if self.update not in ("paper", "document"):
-            raise ValueError(f"update must be 'paper' or 'document', got {self.update!r}")
-        if self.update == "document" and self.top_directions != self.num_directions:
-            raise ValueError("update='document' uses all directions: leave top_directions out")
-        self.observation_size = observation_size(self.env)
-        if self.policy is None:
-            self.policy = _zero_policy(self.env, self.observation_size)
-        else:
-            contract.check_policy(self.policy, self.env, self.observation_size)
-        if self.update == "document":
-            _check_linear(self.policy)
-        self.plays = choice.choose(self.engine, self.env)
-
-    def init(self, key: jax.Array) -> TrainState:
+    def init(key: jax.Array) -> TrainState:
         check_key(key)
         policy_key, key = jax.random.split(key)
-        normalizer = normalize.init(self.observation_size)
-        actor = Actor(params=self.policy.init(policy_key), normalizer=normalizer)
-        return TrainState(key=key, actor=actor)
+        return TrainState(key=key, actor=learner.first_actor(policy, size, policy_key))
 
-    def play(self, state: TrainState, key: jax.Array, active: bool | jax.Array = True) -> Trial:
+    def play(state: TrainState, key: jax.Array, active: bool | jax.Array = True) -> Trial:
         directions_key, episodes_key = jax.random.split(key)
-        keys = jax.random.split(episodes_key)
-        keys = keys[jnp.array([0, 0])] if self.shared_starts else keys
-        directions = _draw_directions(directions_key, state.actor.params, self.num_directions)
-        params = self._perturb(state.actor.params, directions)
+        directions = _draw_directions(directions_key, state.actor.params, num_directions)
+        moves = jax.tree.map(lambda d: jnp.stack([noise_std * d, -noise_std * d]), directions)
 
-        def one_way(params, key):
-            return self.plays.rollout(
-                self.env,
-                self._act_each,
-                Actor(params=params, normalizer=state.actor.normalizer),
-                self.policy.distribution,
+        def one_way(params: Params, key: jax.Array) -> Trajectory:
+            return plays.rollout(
+                env,
+                functools.partial(_act_each, policy),
+                state.actor.replace(params=params),
+                policy.distribution,
                 key,
-                num_episodes=self.num_directions,
+                num_episodes=num_directions,
                 deterministic=True,
-                horizon=self.horizon,
+                horizon=horizon,
                 active=active,
             )
 
-        return Trial(directions, _join_rollouts(jax.vmap(one_way)(params, keys)))
+        params = jax.tree.map(jnp.add, state.actor.params, moves)
+        played = jax.vmap(one_way)(params, jax.random.split(episodes_key))
+        return Trial(directions, _join_rollouts(played))
 
-    def learn(self, state: TrainState, trial: Trial, key: jax.Array) -> tuple[TrainState, Metrics]:
+    def learn(state: TrainState, trial: Trial, key: jax.Array) -> tuple[TrainState, Metrics]:
         del key
-        actor, trajectory = state.actor, trial.trajectory
-        returns = replace_broken(episode_returns(trajectory), trajectory.nonfinite)
-        returns = returns.reshape(2, self.num_directions)
-        if self.update == "paper":
-            increment = paper_increment(trial.directions, returns, self.top_directions)
-        else:
-            increment = document_increment(trial.directions, returns, self.noise_std)
-        moved = jax.tree.map(lambda p, d: p + self.step_size * d, actor.params, increment)
-        counted = trajectory.mask & ~trajectory.nonfinite
-        limits = self.normalize_steps, self.normalize_min_std
-        normalizer = normalize.update(actor.normalizer, trajectory.observation, counted, *limits)
-        learned = Actor(params=self._tie(moved), normalizer=normalizer)
-        actor, skipped = keep_finite(learned, actor)
+        actor, played = state.actor, trial.trajectory
+        returns = replace_broken(episode_returns(played), played.nonfinite)
+        returns = returns.reshape(2, num_directions)
+        step = (increment or functools.partial(_of_the_best, top))(
+            trial.directions, returns, noise_std
+        )
+        params = jax.tree.map(lambda p, d: p + step_size * d, actor.params, step)
+        limits = normalize_steps, normalize_min_std
+        normalizer = normalize.count(actor.normalizer, played, *limits)
+        kept, skipped = learner.keep_finite(Actor(params=params, normalizer=normalizer), actor)
         measured = {
             "entropy": jnp.zeros(()),
-            "gradient_norm": optax.tree.norm(increment),
+            "gradient_norm": optax.tree.norm(step),
             "return_std": jnp.std(returns),
         }
-        if self.num_directions > 1:
+        if num_directions > 1:
             measured["gradient_snr"] = _step_signal_to_noise(trial.directions, returns)
-        sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
-        metrics = episode_metrics(trajectory) | diagnostics.nan_unless(sound, measured)
-        return dataclasses.replace(state, actor=actor), metrics | {"skipped_update": skipped}
+        sound = (skipped == 0) & ~jnp.any(played.nonfinite)
+        metrics = learner.episode_metrics(played) | diagnostics.nan_unless(sound, measured)
+        return dataclasses.replace(state, actor=kept), metrics | {"skipped_update": skipped}
 
-    def _act_each(self, actor: Actor, observation: jax.Array) -> jax.Array:
-        """Returns the outputs [D, K] of D policies for an observation [D, O] of each."""
+    return Learner(init, play, learn, policy, plays)
 
-        def act_one(params, observation):
-            return act(self.policy, dataclasses.replace(actor, params=params), observation)
 
-        return jax.vmap(act_one)(actor.params, observation)
+def _of_the_best(top: int, directions: Params, returns: jax.Array, noise_std: Any) -> Any:
+    """Returns the sum in the module's formula over b sigma; zero where sigma is."""
+    del noise_std
+    best = jnp.argsort(-jnp.max(returns, axis=0))[:top]
+    gain = over_std(returns[0, best] - returns[1, best], returns[:, best]) / top
+    return jax.tree.map(
+        lambda d: jnp.sum(gain.reshape(-1, *(1,) * (d.ndim - 1)) * d[best], axis=0), directions
+    )
 
-    def _tie(self, params: Params) -> Any:
-        """Returns the params as the update ties them; the paper's does not."""
-        return params if self.update == "paper" else overwrite_bias(params)
 
-    def _perturb(self, params: Params, directions: Params) -> Any:
-        """Returns the params of all policies, [2, D, ...], the forward ones first."""
-        moves = jax.tree.map(
-            lambda d: jnp.stack([self.noise_std * d, -self.noise_std * d]), directions
-        )
-        return jax.vmap(jax.vmap(self._tie))(jax.tree.map(jnp.add, params, moves))
+def over_std(x: jax.Array, returns: jax.Array) -> jax.Array:
+    """Returns ``x`` over the standard deviation of all returns, 0 if they are all equal."""
+    std = jnp.std(returns)
+    return jnp.where(std > 0, x / jnp.where(std > 0, std, 1.0), 0.0)
+
+
+def _act_each(policy: Policy, actor: Actor, observation: jax.Array) -> jax.Array:
+    """Returns the outputs [D, K] of D policies for an observation [D, O] of each."""
+    return jax.vmap(lambda params, seen: act(policy, actor.replace(params=params), seen))(
+        actor.params, observation
+    )
 
 
 def _draw_directions(key: jax.Array, params: Params, num_directions: int) -> Any:
@@ -258,18 +218,20 @@ def _step_signal_to_noise(directions: Params, returns: jax.Array) -> jax.Array:
     return signal_to_noise(mean, each, len(difference))
 
 
-def _join_rollouts(trajectory: Trajectory) -> Trajectory:
+def _join_rollouts(played: Trajectory) -> Trajectory:
     """Returns [T, 2 D, ...] from two rollouts stacked [2, T, D, ...]."""
 
-    def join(x):
+    def join(x: jax.Array) -> jax.Array:
         joined = jnp.moveaxis(x, 0, 1)
         return joined.reshape(joined.shape[0], -1, *joined.shape[3:])
 
-    names = "observation", "action", "reward", "mask"
-    return trajectory.replace(
-        **{name: join(getattr(trajectory, name)) for name in names},
-        nonfinite=trajectory.nonfinite.reshape(-1),
-        simulated=jnp.sum(trajectory.simulated),
+    return played.replace(
+        observation=join(played.observation),
+        action=join(played.action),
+        reward=join(played.reward),
+        mask=join(played.mask),
+        nonfinite=played.nonfinite.reshape(-1),
+        simulated=jnp.sum(played.simulated),
     )
 
 
@@ -278,63 +240,4 @@ def _zero_policy(env: Environment, size: int) -> Policy:
     space = action_space(env)
     family = categorical if isinstance(space, Discrete) else deterministic
     policy = mlp_policy(size, family(space), ())
-
-    def init(key):
-        return jax.tree.map(jnp.zeros_like, policy.init(key))
-
-    return policy._replace(init=init)
-
-
-def paper_increment(directions: Params, returns: jax.Array, top: int) -> Any:
-    """Returns the sum in the module's formula over b sigma; zero where sigma is.
-
-    Args:
-      directions: like the params, with a leading axis [D].
-      returns: [2, D] forwards and backwards.
-      top: b.
-    """
-    best = jnp.argsort(-jnp.max(returns, axis=0))[:top]
-    gain = _over_std(returns[0, best] - returns[1, best], returns[:, best]) / top
-    return jax.tree.map(lambda d: _weighted_sum(gain, d[best]), directions)
-
-
-def document_increment(directions: Params, returns: jax.Array, noise_std: ArrayLike) -> Any:
-    """Returns the increment of a published notebook, mistakes included, for reproducing it.
-
-    Its ``np.sum`` without an axis adds up the entries of the direction too, so all parameters move
-    by the same number; it does not divide by how many directions there are, and multiplies by
-    ``noise_std``. The bias is overwritten besides, see ``overwrite_bias``. Not reproduced: where
-    all returns are equal it divides 0 by 0, and its parameters are NaN for good.
-    """
-    totals = sum(jnp.sum(d.reshape(len(d), -1), axis=1) for d in jax.tree.leaves(directions))
-    increment = noise_std * jnp.sum(_over_std(returns[0] - returns[1], returns) * totals)
-    return jax.tree.map(lambda d: jnp.full(d.shape[1:], increment, d.dtype), directions)
-
-
-def overwrite_bias(params: Any) -> Any:
-    """Returns a linear policy's params with the first A weights in place of the bias [A].
-
-    The notebook writes the same first entries of its flat vector into every parameter.
-    """
-    layer = params["network"]["params"]["Dense_0"]
-    # PyTorch stores weights as [A, O], flax as [O, A].
-    bias = layer["kernel"].T.reshape(-1)[: layer["bias"].size]
-    return params | {"network": {"params": {"Dense_0": layer | {"bias": bias}}}}
-
-
-def _check_linear(policy: Policy) -> None:
-    """Raises ValueError for a policy whose bias ``overwrite_bias`` does not find."""
-    params = jax.eval_shape(policy.init, jax.random.key(0))
-    if set(params) != {"network", "constants"} or set(params["network"]["params"]) != {"Dense_0"}:
-        raise ValueError("update='document' is for linear policies: pass one with hidden_sizes=()")
-
-
-def _over_std(x: jax.Array, returns: jax.Array) -> jax.Array:
-    """Returns ``x`` over the standard deviation of all returns, 0 if they are all equal."""
-    std = jnp.std(returns)
-    return jnp.where(std > 0, x / jnp.where(std > 0, std, 1.0), 0.0)
-
-
-def _weighted_sum(weight: jax.Array, x: jax.Array) -> jax.Array:
-    """Returns the sum over the first axis of ``x`` [D, ...] times ``weight`` [D]."""
-    return jnp.sum(weight.reshape(-1, *(1,) * (x.ndim - 1)) * x, axis=0)
+    return policy._replace(init=lambda key: jax.tree.map(jnp.zeros_like, policy.init(key)))

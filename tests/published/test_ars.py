@@ -12,7 +12,9 @@ from mjx_reinforce.engine.base import Discrete
 from mjx_reinforce.learning import counts, normalize
 from mjx_reinforce.learning.distributions import deterministic
 from mjx_reinforce.published import ars as ars_module
-from mjx_reinforce.published.ars import ars, document_increment
+from mjx_reinforce.published.ars import ars
+from mjx_reinforce.published.continuous_cartpole import increment, random_search
+from mjx_reinforce.settings.config import Config
 
 
 def by_hand(directions, plus, minus, top):
@@ -65,11 +67,12 @@ def test_the_documents_update_by_hand():
     """One increment for all parameters; the bias is a copy of the first weight."""
     directions = {"kernel": jnp.array([[[1.0], [2.0]], [[0.5], [-1.0]]]), "bias": jnp.ones((2, 1))}
     returns = jnp.array([[5.0, 2.0], [3.0, 6.0]])
-    increment = document_increment(directions, returns, 0.1)
+    step = increment(directions, returns, 0.1)
     expected = 0.1 * (2.0 * 4.0 - 4.0 * 0.5) / np.std([5.0, 2.0, 3.0, 6.0])
-    for leaf in jax.tree.leaves(increment):
+    for leaf in jax.tree.leaves(step):
         np.testing.assert_allclose(leaf, expected, rtol=1e-6)
-    learner = ars(Target(), num_directions=4, update="document", step_size=1.0, noise_std=0.5)
+    policy = mlp_policy(1, deterministic(Target.action_space), ())
+    learner = random_search(Target(), Config(hidden_sizes=()), policy=policy)
     state, _ = train_step(learner, jax.jit(learner.init)(jax.random.key(0)))
     layer = state.actor.params["network"]["params"]["Dense_0"]
     assert float(layer["kernel"][0, 0]) == float(layer["bias"][0]) != 0.0
@@ -85,10 +88,10 @@ class Hopeless(Tempting):
         return super().step(state, jnp.ones(1))
 
 
-@pytest.mark.parametrize("update", ["paper", "document"])
+@pytest.mark.parametrize("increment", [None, increment])
 @pytest.mark.parametrize(("env", "broken"), [(Constant(), 0), (Hopeless(), 16)])
-def test_equal_returns_and_episodes_that_all_broke_teach_nothing(env, broken, update):
-    learner = ars(env, update=update, engine="vmap")
+def test_equal_returns_and_episodes_that_all_broke_teach_nothing(env, broken, increment):
+    learner = ars(env, increment=increment, engine="vmap")
     state = jax.jit(learner.init)(jax.random.key(0))
     after, metrics = train_step(learner, state)
     jax.tree.map(np.testing.assert_array_equal, after.actor.params, state.actor.params)
@@ -126,19 +129,6 @@ def test_discrete_actions():
 
     _, _, metrics = train(DiscreteChain(), 100, step_size=0.1, noise_std=0.3, engine="vmap")
     assert float(metrics["episode_return_max"][-1]) == pytest.approx(1.0 + 0.7 + 3.0)
-
-
-@pytest.mark.slow
-def test_shared_starts():
-    """Two episodes of a direction then see the same observation, else they need not."""
-    seen = {}
-    for shared in (False, True):
-        learner = ars(SignedTarget(), num_directions=16, noise_std=1e-9, shared_starts=shared)
-        state, _ = train_step(learner, jax.jit(learner.init)(jax.random.key(0)))
-        seen[shared] = state.actor.normalizer
-    assert int(seen[True].count) == int(seen[False].count) == 32
-    # With 16 starts twice, the mean observation is a multiple of 1/8.
-    assert float(seen[True].mean[0]) * 8 == pytest.approx(round(float(seen[True].mean[0]) * 8))
 
 
 @pytest.mark.slow
@@ -189,12 +179,6 @@ def test_observations_may_stay_as_they_are():
         ({"top_directions": 9}, r"top_directions must lie in \[1, 8\]"),
         ({"step_size": 0.0}, "step_size must be positive"),
         ({"noise_std": -1.0}, "noise_std must be positive"),
-        ({"update": "book"}, "'paper' or 'document'"),
-        ({"update": "document", "top_directions": 2}, "leave top_directions out"),
-        (
-            {"update": "document", "policy": mlp_policy(1, deterministic(Target.action_space))},
-            "linear policies",
-        ),
     ],
 )
 def test_nonsense_is_refused(settings, message):

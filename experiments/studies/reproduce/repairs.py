@@ -27,7 +27,7 @@ def plain_returns(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner
 
 def papers_update(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
     """002: random search as Mania et al. have it."""
-    return continuous_cartpole.random_search(env, config, update="paper", **shared)
+    return continuous_cartpole.corrected_search(env, config, **shared)
 
 
 def one_step(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
