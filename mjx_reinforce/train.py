@@ -9,7 +9,6 @@ import contextlib
 import dataclasses
 import gc
 import sys
-import threading
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,12 +18,7 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import accept_everything, heartbeat, silence_alarms, to_screen
 from mjx_reinforce.runs.command_line import parse, refuse, refuse_full, start
-from mjx_reinforce.runs.directory import (
-    check_writable,
-    choose_directory,
-    make_directory,
-    remove_empty,
-)
+from mjx_reinforce.runs.directory import own_directory
 from mjx_reinforce.runs.plan import make_plan
 from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
@@ -53,19 +47,13 @@ def main() -> None:
 
 def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitStack) -> int:
     """Returns the exit status of a command line; ``held`` keeps what is released at its end."""
-    from mjx_reinforce.runs.directory import locked
-
-    made: Sequence[Path] = ()
     try:
         with _collection_paused():
             config = parse(arguments)
             check(config)
             check_memory(config)
             check_installed(config)
-            directory, new = _directory(config)
-            held.enter_context(locked(directory))  # a folder in which another trains stays
-            made = new
-            interrupt.on_exit(lambda: remove_empty(made))
+            directory = held.enter_context(own_directory(config, config.resume, interrupt))
             # A module of the user's is imported before JAX starts, which it may set up.
             env = None if envs.is_ours(config.env) else envs.make_set(config.env, config.env_set)
             configure_jax()
@@ -78,26 +66,17 @@ def _main(arguments: Sequence[str], interrupt: Interrupt, held: contextlib.ExitS
                 last_actors(config, ready.policy)  # refused before anything is compiled
             plan = make_plan(ready, config)
     except ValueError as error:
-        refuse(str(error), made)
+        refuse(str(error))
     except (ImportError, MemoryError) as error:
         remedy = "see pip check, and ulimit -v where memory is short"
-        refuse(f"cannot load what this package needs ({error}); {remedy}", made)
+        refuse(f"cannot load what this package needs ({error}); {remedy}")
     try:
         return train(ready, found, config, plan, directory, interrupt)
     except (RuntimeError, OSError) as error:
         begun = (directory / "config.json").exists()
         resumed = f"go on with --resume {directory}{code_flags(vars(config))}"
         again = resumed if begun else "try again"
-        refuse_full(error, "this run", "this run", "--num-seeds", again, made)
-
-
-def _directory(config: Config) -> tuple[Path, Sequence[Path]]:
-    """Returns the run directory, and the folders that were made for it."""
-    if config.resume is not None:
-        check_writable(config.resume)
-        return config.resume, ()
-    directory = choose_directory(config.output, config.env)
-    return directory, make_directory(directory)
+        refuse_full(error, "this run", "this run", "--num-seeds", again)
 
 
 def _start(
@@ -142,50 +121,28 @@ def train(
     directory: Path,
     interrupt: Interrupt,
 ) -> int:
-    """Trains to the budget, a signal, or until nothing is finite, and writes the run's files.
-
-    Args:
-      ready: the run.
-      found: the checkpoint from which the run goes on, if any.
-      config: the settings of the run.
-      plan: what is said of it beforehand.
-      directory: where the files go.
-      interrupt: what listens to signals.
+    """Trains, and says what was learned; see ``runs.run.train_run``.
 
     Returns:
       The exit status, see ``main``.
     """
     with _collection_paused():
         from mjx_reinforce.runs.display import Display, print_summary
+        from mjx_reinforce.runs.run import train_run
 
-    with Display() as display:
-        interrupt.restore_screen(display.console.show_cursor)
-        display.say(plan)
-        with display.compiling(), _collection_paused():
-            from mjx_reinforce.reports.curves import load_libraries
-            from mjx_reinforce.runs.observers import RunFiles, RunLog, Screen
-            from mjx_reinforce.runs.run import compile_driver, draw, summary_of
-
-            loading = threading.Thread(target=load_libraries, daemon=True)
-            driver, seconds = compile_driver(ready, config, found, display.say, loading.start)
-        # Not before: a run killed while it compiles leaves nothing that would refuse the next.
-        interrupt.defer(display.say)
-        files = RunFiles(RunLog(directory), ready.policy, display.say)
-        files.begin(driver, found)
-        driver.observers += [files, Screen(display)]
-        display.start(seconds)
-        driver.drive(lambda: interrupt.number is not None)
-    files.end(driver)
-    # A signal after that changes nothing: what is left takes a second or two.
-    test = driver.test(lambda: interrupt.number is not None)
-    summary = summary_of(driver, ready.engine, seconds, test)
-    files.finish(driver, draw(driver), summary)
+    display = Display()
+    display.say(plan)
+    _, summary = train_run(
+        *(ready, config, display, directory, interrupt),
+        found=found,
+        compiling=_collection_paused(),
+    )
     with contextlib.suppress(OSError):  # as ``Display.say``
         print_summary(display.console, summary, directory)
     if summary["status"] == "stopped":
         display.say(f"stopped: {summary['reason']}", "red")
         return 1
-    return 0 if interrupt.number is None or test else 128 + interrupt.number
+    return 0 if summary["status"] == "finished" else 128 + (interrupt.number or 0)
 
 
 @contextlib.contextmanager

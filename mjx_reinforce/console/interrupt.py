@@ -45,6 +45,10 @@ class Interrupt:
         signal.set_wakeup_fd(self._descriptor)
         self._told.close()  # which ends the thread
 
+    def heard(self) -> bool:
+        """Returns whether a signal asks the run to stop."""
+        return self.number is not None
+
     def on_exit(self, action: Callable[[], Any]) -> None:
         """Adds what is done before a signal ends the process, however long that takes.
 

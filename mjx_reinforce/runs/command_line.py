@@ -11,7 +11,6 @@ from typing import Any, NoReturn
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import say_error
-from mjx_reinforce.runs.directory import remove_empty
 from mjx_reinforce.settings.config import Config, changed, check_read, is_read, read_seeds
 from mjx_reinforce.settings.defaults import flag_value, for_arguments, named_code
 from mjx_reinforce.settings.flags import about_word, asks_brief_help, read_command_line
@@ -192,7 +191,7 @@ def _names() -> str:
 
 
 def refuse_full(
-    error: RuntimeError | OSError, what: str, part: str, flag: str, again: str, made: Sequence[Path]
+    error: RuntimeError | OSError, what: str, part: str, flag: str, again: str
 ) -> NoReturn:
     """Refuses what met a full memory or disk, as ``refuse``; raises any other error again.
 
@@ -202,22 +201,20 @@ def refuse_full(
       part: what has to fit into memory.
       flag: makes that part smaller.
       again: what to do once there is room on the disk.
-      made: the folders that were made.
     """
     if isinstance(error, OSError):
         room = "make room, then" if error.errno else "then"  # W&B's have no number
         message = f"cannot write the files of {what} ({error}); {room} {again}"
-        refuse(message, made, status=1)
+        refuse(message, status=1)
     if "RESOURCE_EXHAUSTED" not in str(error):
         raise error
     flags = f"{flag}, --num-episodes, --eval-episodes or --horizon"
     if os.environ.get("XLA_PYTHON_CLIENT_PREALLOCATE", "").lower() in ("false", "0"):
         flags += "; or unset XLA_PYTHON_CLIENT_PREALLOCATE, with which memory is in pieces"
-    refuse(f"{part} does not fit into memory ({error}); lower {flags}", made)
+    refuse(f"{part} does not fit into memory ({error}); lower {flags}")
 
 
-def refuse(message: str, made: Sequence[Path], status: int = 2) -> NoReturn:
-    """Says in one line what is wrong, removes the empty folders that were made, and exits."""
-    remove_empty(made)
+def refuse(message: str, status: int = 2) -> NoReturn:
+    """Says in one line what is wrong, and exits."""
     say_error(message)
     sys.exit(status)

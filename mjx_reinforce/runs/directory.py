@@ -15,6 +15,9 @@ except ImportError as error:
         "(wsl --install)"
     ) from error
 
+from mjx_reinforce.console.interrupt import Interrupt
+from mjx_reinforce.settings.config import Config
+
 #: What a kill leaves of the first file of a run or a sweep, which then was not begun.
 _FIRST = (".config.json.", ".sweep.json.")
 #: A disk with less room (bytes) is full: the files of a small run take about as much.
@@ -107,6 +110,33 @@ def remove_empty(folders: Sequence[Path]) -> None:
     for folder in folders:
         with contextlib.suppress(OSError):
             folder.rmdir()
+
+
+@contextlib.contextmanager
+def own_directory(config: Config, resumed: Path | None, interrupt: Interrupt) -> Iterator[Path]:
+    """Makes the directory of a run or sweep, and keeps other processes out of it.
+
+    Folders that were made and stay empty are removed at the end.
+
+    Args:
+      config: the settings, which say where it is.
+      resumed: the directory in which it goes on, if it does.
+      interrupt: also removes them.
+
+    Raises:
+      ValueError: see ``make_directory``, ``check_writable`` and ``locked``.
+    """
+    directory, made = resumed or choose_directory(config.output, config.env), []
+    if resumed is None:
+        made = make_directory(directory)
+    else:
+        check_writable(directory)
+    with locked(directory):  # a folder in which another trains stays
+        interrupt.on_exit(lambda: remove_empty(made))
+        try:
+            yield directory
+        finally:
+            remove_empty(made)
 
 
 @contextlib.contextmanager

@@ -18,9 +18,12 @@ from rich.text import Text
 
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import heartbeat
+from mjx_reinforce.files import Arrays
 from mjx_reinforce.settings.own_code import env_flag
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import progress
+from mjx_reinforce.training.driver import Driver, Evaluation, Observer
+from mjx_reinforce.training.rows import Cells
 
 
 class _Bar(Progress):
@@ -43,12 +46,13 @@ class _Screen(Console):
         self.quiet = True
 
 
-class Display:
+class Display(Observer):
     """A progress bar on a terminal, one line an evaluation elsewhere."""
 
-    def __init__(self):
+    def __init__(self, *, quiet: bool = False):
+        """Takes the terminal, on which it shows nothing if it is to be quiet."""
         # What users name is printed as it is: "[bold]" and ":smile:" are no commands.
-        self.console = _Screen(markup=False, emoji=False)
+        self.console = _Screen(markup=False, emoji=False, quiet=quiet)
         self._bar = _Bar(
             SpinnerColumn("line" if self.console.options.ascii_only else "dots"),
             TextColumn("{task.description}"),
@@ -105,10 +109,14 @@ class Display:
                 f"{_returns_and_speed(now)}  {done}  {left}".rstrip()
             )
 
-    def show_nonfinite(self, updates: dict[str, np.ndarray], num_seeds: int) -> None:
+    def updated(self, driver: Driver, met: Arrays) -> None:
         """Says in a line which updates of a block met numbers that are not finite, if any did."""
-        if len(updates["seed"]):
-            self.say(progress.describe_nonfinite(updates, num_seeds), "yellow")
+        if len(met["seed"]):
+            self.say(progress.describe_nonfinite(met, driver.config.num_seeds), "yellow")
+
+    def evaluated(self, driver: Driver, evaluation: Evaluation, rows: Cells) -> None:
+        """Shows how far the run is and how well it does."""
+        self.show_progress(driver.record.progress())
 
 
 def _returns_and_speed(now: progress.Progress) -> str:

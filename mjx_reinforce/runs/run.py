@@ -2,8 +2,10 @@
 
 import contextlib
 import dataclasses
+import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce import envs
+from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.export.player import Player
@@ -19,17 +22,17 @@ from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.export.run_files import Which
 from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.policy import Actor, Policy
-from mjx_reinforce.reports.curves import draw_learning_curve
-from mjx_reinforce.runs.directory import locked, make_directory, remove_empty
+from mjx_reinforce.reports.curves import load_libraries
+from mjx_reinforce.runs.directory import own_directory
 from mjx_reinforce.runs.display import Display
-from mjx_reinforce.runs.observers import Callbacks, RunFiles, RunLog, Screen
+from mjx_reinforce.runs.observers import Callbacks, RunFiles
 from mjx_reinforce.runs.plan import make_plan
 from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
 from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.statistics import worst_if_not_finite
 from mjx_reinforce.store.ready import get_ready
-from mjx_reinforce.training.driver import Driver, Evaluation, first_best
+from mjx_reinforce.training.driver import Driver, Evaluation, Observer, first_best
 from mjx_reinforce.training.programs import RunPrograms, compile_run
 from mjx_reinforce.training.progress import HOPELESS
 from mjx_reinforce.training.record import RunRecord
@@ -92,12 +95,57 @@ def summary_of(
     }
 
 
-def draw(driver: Driver) -> bytes:
-    """Returns the contents of learning_curve.png."""
-    config, record = driver.config, driver.record
-    axis = "episodes" if config.env_steps is None else "env_steps"
-    history, training = record.history(), record.training()
-    return draw_learning_curve(history, training, config.env, record.threshold, axis)
+def train_run(
+    ready: "Ready",
+    config: Config,
+    display: Display,
+    directory: Path | None,
+    interrupt: Interrupt,
+    observers: Sequence[Observer] = (),
+    *,
+    found: "Checkpoint | None" = None,
+    compiling: AbstractContextManager[None] | None = None,
+) -> tuple[Driver, dict[str, Any]]:
+    """Trains to the budget, a signal, or until nothing is finite, and writes the run's files.
+
+    Args:
+      ready: the run.
+      config: its settings.
+      display: where it is shown.
+      directory: where its files go, if anywhere.
+      interrupt: what listens to signals.
+      observers: who sees it, besides its files and the display.
+      found: the checkpoint from which it goes on, if any.
+      compiling: a block around all that is compiled.
+
+    Returns:
+      The run at its end, and the contents of summary.json.
+
+    Raises:
+      OSError: the first or the last files cannot be written.
+    """
+    loading = threading.Thread(target=load_libraries, daemon=True)
+    with display:
+        interrupt.restore_screen(display.console.show_cursor)
+        with display.compiling(), compiling or nullcontext():
+            driver, seconds = compile_driver(ready, config, found, display.say, loading.start)
+        # Not before: a run killed while it compiles leaves nothing that would refuse the next.
+        interrupt.defer(display.say)
+        if directory is not None:
+            files = RunFiles(directory, ready.policy, display.say)
+            files.begin(driver, found)
+            driver.observers.append(files)
+        driver.observers += [display, *observers]
+        display.start(seconds)
+        driver.drive(interrupt.heard)
+    for observer in driver.observers:
+        observer.ended(driver)
+    # A signal after that changes nothing: what is left takes a second or two.
+    test = driver.test(interrupt.heard)
+    summary = summary_of(driver, ready.engine, seconds, test)
+    for observer in driver.observers:
+        observer.finished(driver, summary)
+    return driver, summary
 
 
 #: The part of the time in which its speed is measured; what is trained in it is trained again.
@@ -251,34 +299,16 @@ def run(
     check_memory(config)
     check_installed(config)
     configure_jax()
+    interrupt = Interrupt()  # that hears nothing: signals are the caller's
     with contextlib.ExitStack() as held:
         if config.output is not None:
-            held.callback(remove_empty, make_directory(config.output))
-            held.enter_context(locked(config.output))
+            held.enter_context(own_directory(config, None, interrupt))
         ready = get_ready(config, config, envs.make_set(config.env, config.env_set))
         if config.init_from is not None:
             last_actors(config, ready.policy)  # refused before anything is compiled
-        plan = make_plan(ready, config)
-        display = Display()
-        display.console.quiet = quiet
-        held.enter_context(display)
-        display.say(plan)
-        with display.compiling():
-            driver, seconds = compile_driver(ready, config, say=display.say)
-        files = None
-        if config.output is not None:
-            files = RunFiles(RunLog(config.output), ready.policy, display.say)
-            files.begin(driver, None)
-            driver.observers.append(files)
-        driver.observers += [Screen(display), Callbacks(observers)]
-        display.start(seconds)
-        driver.drive(lambda: False)
-        if files is not None:
-            files.end(driver)
-        test = driver.test(lambda: False)
-        summary = summary_of(driver, ready.engine, seconds, test)
-        if files is not None:
-            files.finish(driver, draw(driver), summary)
+        display, functions = Display(quiet=quiet), Callbacks(observers)
+        display.say(make_plan(ready, config))
+        driver, summary = train_run(ready, config, display, config.output, interrupt, [functions])
     return _results_of(driver, build_policy(ready.policy), summary)
 
 

@@ -17,7 +17,6 @@ from mjx_reinforce.runs.command_line import (
     refuse_full,
     start,
 )
-from mjx_reinforce.runs.directory import remove_empty
 from mjx_reinforce.settings.config import Config, changed
 from mjx_reinforce.settings.groups import GROUPS
 from mjx_reinforce.sweeps import grid
@@ -97,13 +96,10 @@ def main() -> None:
 
 def _sweep(arguments: Sequence[str], interrupt: Interrupt) -> int:
     """Returns the exit status of a command line."""
-    made: list[Path] = []
-    interrupt.on_exit(lambda: remove_empty(made))
     try:
-        _, ended = perform(parse_design(arguments), interrupt, made)
+        _, ended = perform(parse_design(arguments), interrupt)
     except ValueError as error:
-        refuse(str(error), made)
+        refuse(str(error))
     except (RuntimeError, OSError) as error:
-        again = "go on with --resume"
-        refuse_full(error, "this sweep", "a chunk", "--chunk-runs", again, made)
+        refuse_full(error, "this sweep", "a chunk", "--chunk-runs", "go on with --resume")
     return 0 if ended or interrupt.number is None else 128 + interrupt.number

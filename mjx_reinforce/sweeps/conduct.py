@@ -58,7 +58,7 @@ class Conductor:
         design: Design,
         files: SweepFiles,
         display: Display,
-        interrupt: Interrupt | None,
+        interrupt: Interrupt,
         ready: Callable[[float], None],
     ):
         """Takes what the sweep is made of.
@@ -68,7 +68,7 @@ class Conductor:
           design: what it is to do.
           files: of the sweep.
           display: its screen.
-          interrupt: what listens to signals, if anything does.
+          interrupt: what listens to signals.
           ready: is called once, when the first program has been compiled, with how long that
             took (s), or when there is nothing to compile.
         """
@@ -147,7 +147,7 @@ class Conductor:
         observers = [show, lambda: saver.save_if_due(states, history)]
         most = (config.checkpoint_every or MAX_COUNT) // config.eval_every
         chunk = chunks.Chunk(programs, states, history, observers, most)
-        if not drive(chunk, self._interrupted):
+        if not drive(chunk, self._interrupt.heard):
             saver.save(states, history)
             return False
         self._files.keep_policies(runs, history, layout.states(states).train_states.actor)
@@ -167,9 +167,6 @@ class Conductor:
             said.append(f"{setting_in_words(name)} {', '.join(values)}")
         count = f"{counted(len(here), 'configuration')} of {len(every):,}"
         return f"{'; '.join(said)} ({count}, {counted(len(runs.seed), 'run')})"
-
-    def _interrupted(self) -> bool:
-        return self._interrupt is not None and self._interrupt.number is not None
 
     def _part_done(self, more: float = 0.0) -> float:
         """Returns the part of the whole sweep that is done.

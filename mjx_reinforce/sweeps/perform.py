@@ -16,7 +16,7 @@ from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import heartbeat, to_screen
 from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.files import read_arrays, read_json, write_json
-from mjx_reinforce.runs.directory import choose_directory, locked, make_directory
+from mjx_reinforce.runs.directory import locked, own_directory
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.own_code import code_flags
 from mjx_reinforce.sweeps.design import Design, as_record, check_design
@@ -35,19 +35,13 @@ _PLAIN_QUOTES = dict.fromkeys(
 
 
 def perform(
-    design: Design,
-    interrupt: Interrupt | None,
-    made: list[Path],
-    *,
-    report: bool = True,
-    quiet: bool = False,
+    design: Design, interrupt: Interrupt, *, report: bool = True, quiet: bool = False
 ) -> tuple[Path, bool]:
     """Trains all runs of a sweep, or goes on with it, and writes its files.
 
     Args:
       design: of the sweep.
-      interrupt: what listens to signals, if anything does.
-      made: takes in the folders that are made for it.
+      interrupt: what listens to signals.
       report: whether its page is written at its end.
       quiet: show no progress.
 
@@ -59,15 +53,11 @@ def perform(
       OSError: a file cannot be written.
     """
     check_design(design)
-    directory = design.resume or choose_directory(design.base.output, design.base.env)
-    known = {} if design.resume is None else read_json(directory / "sweep.json")
-    if known.get("status") == "finished":
-        _finish_again(directory, known)
-        return directory, True
-    with contextlib.ExitStack() as held:
-        new = make_directory(directory) if design.resume is None else []
-        held.enter_context(locked(directory))  # a folder in which another trains stays
-        made += new
+    known = {} if design.resume is None else read_json(design.resume / "sweep.json")
+    if design.resume is not None and known.get("status") == "finished":
+        _finish_again(design.resume, known)
+        return design.resume, True
+    with own_directory(design.base, design.resume, interrupt) as directory:
         configure_jax()
         return directory, _perform(design, directory, known, interrupt, report, quiet)
 
@@ -85,7 +75,7 @@ def _perform(
     design: Design,
     directory: Path,
     known: Mapping[str, Any],
-    interrupt: Interrupt | None,
+    interrupt: Interrupt,
     report: bool,
     quiet: bool,
 ) -> bool:
@@ -102,8 +92,7 @@ def _perform(
         _check_same_sweep(directory, known, contents)
     configurations, threshold = prepared.configurations, contents["threshold"]
     files = SweepFiles(directory, configurations, threshold, going_on=bool(known))
-    with Display() as display, contextlib.ExitStack() as compiling:
-        display.console.quiet = quiet
+    with Display(quiet=quiet) as display, contextlib.ExitStack() as compiling:
         display.say(prepared.plan)
         compiling.enter_context(display.compiling())
 
@@ -111,12 +100,10 @@ def _perform(
             """Begins the files; not before there is a program, see ``train``."""
             compiling.close()
             display.start(seconds)
-            if interrupt is not None:
-                interrupt.defer(display.say)
+            interrupt.defer(display.say)
             files.open(contents)
 
-        if interrupt is not None:
-            interrupt.restore_screen(display.console.show_cursor)
+        interrupt.restore_screen(display.console.show_cursor)
         conductor = Conductor(prepared, design, files, display, interrupt, ready)
         ended = conductor.conduct()
         contents["status"] = "finished" if ended else "interrupted"
@@ -312,7 +299,7 @@ def sweep(
             place = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="sweep-")))
         base = dataclasses.replace(base, output=place)
         design = Design(base=base, over=over, exact=exact, chunk_runs=chunk_runs)
-        perform(design, None, [], report=report and asked is not None, quiet=quiet)
+        perform(design, Interrupt(), report=report and asked is not None, quiet=quiet)
         return read_results(place)._replace(directory=asked)
 
 

@@ -100,8 +100,8 @@ class Evaluation(NamedTuple):
     train_states: TrainState
 
 
-class Observer(Protocol):
-    """Sees a run go on; it changes nothing of it."""
+class Observer:
+    """Sees a run go on, and changes nothing of it; what a subclass leaves out does nothing."""
 
     def updated(self, driver: "Driver", met: Arrays) -> None:
         """Called after each block of updates.
@@ -111,11 +111,15 @@ class Observer(Protocol):
           met: the updates in it that met numbers which are not finite, as
             ``Record.add_updates`` returns them.
         """
-        ...
 
     def evaluated(self, driver: "Driver", evaluation: Evaluation, rows: Cells) -> None:
         """Called after each evaluation, with what it measured and its rows in metrics.csv."""
-        ...
+
+    def ended(self, driver: "Driver") -> None:
+        """Called after the last block of updates and its evaluation, before the last test."""
+
+    def finished(self, driver: "Driver", summary: dict[str, Any]) -> None:
+        """Called after the last test, with the contents of summary.json."""
 
 
 class Training(Protocol):

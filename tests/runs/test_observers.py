@@ -6,63 +6,60 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from mjx_reinforce.runs.observers import Callbacks, RunFiles, Screen
+from mjx_reinforce.runs import observers
+from mjx_reinforce.runs.display import Display
+from mjx_reinforce.runs.observers import Callbacks, RunFiles
 from mjx_reinforce.settings.config import Config
-
-
-class Log:
-    """Notes what is written; what is in ``full`` cannot be."""
-
-    def __init__(self, directory):
-        self.directory, self.written, self.full = directory, [], set()
-
-    def __getattr__(self, name):
-        def write(*arguments, **keywords):
-            if name in self.full:
-                raise OSError(errno.ENOSPC, "No space left on device")
-            self.written.append(name)
-
-        return write
-
-    def metrics_bytes(self):
-        return 7
-
-    def save_checkpoint(self, content, *, even):
-        if "save_checkpoint" in self.full:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        self.written.append(f"checkpoint of {content.record['updates'][0]}")
 
 
 class Run:
     """A driver of a run that has made so many updates."""
 
-    def __init__(self, folder, **settings):
-        self.config = Config(num_seeds=2, output=folder, checkpoint_every=4, **settings)
+    def __init__(self):
+        self.config = Config(num_seeds=2, checkpoint_every=4)
         self.made, self.finished, self.ended = 0, False, False
         self.state = SimpleNamespace(train_states=SimpleNamespace(actor="last"))
         self.best = SimpleNamespace(actor="best")
         self.record = SimpleNamespace(
             finished=lambda: self.finished,
-            env_steps=np.array([self.made, self.made]),
+            env_steps=np.zeros(2, int),
             arrays=lambda: {"updates": np.array([self.made, self.made])},
+            training=dict,
         )
 
     def updates(self):
         return self.made
 
-    def seconds(self):
-        return 1.0
+    seconds = updates
 
 
 @pytest.fixture
-def watched(tmp_path):
-    """The files of a run that has begun, its log, what it said, and the run."""
-    said, log, run = [], Log(tmp_path), Run(tmp_path)
-    files = RunFiles(log, {"policy": "normal"}, said.append)
+def watched(tmp_path, monkeypatch):
+    """The files of a run that has begun, what is written, what cannot be, what it said, the run."""
+    written, full, said, run = [], set(), [], Run()
+    files = RunFiles(tmp_path, {"policy": "normal"}, said.append)
     files.begin(run, None)
-    assert log.written == ["begin"]
-    log.written.clear()
-    return files, log, said, run
+    assert {path.name for path in tmp_path.iterdir()} == {"config.json", "metrics.csv"}
+
+    def write(name):
+        if name in full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        written.append(name)
+
+    for owner, name, what in (
+        (observers, "write_json", lambda path, _: path.name),
+        (observers, "save_policy", lambda folder, actor, settings: f"{actor} policies"),
+        (observers.files, "append", lambda path, _: path.name),
+        (observers.checkpoint, "save", lambda _, x, even: f"checkpoint of {x.seconds}"),
+    ):
+        monkeypatch.setattr(owner, name, lambda *x, what=what, **more: write(what(*x, **more)))
+    monkeypatch.setattr(observers, "draw", lambda driver: b"png")
+    return files, written, full, said, run
+
+
+def saved(updates):
+    policies = ["last policies", "best policies"]
+    return ["metrics.csv", f"checkpoint of {updates}", *policies, "summary.json"]
 
 
 def go_on(files, run, updates):
@@ -71,62 +68,62 @@ def go_on(files, run, updates):
 
 
 def test_a_checkpoint_is_written_once_there_were_enough_updates(watched):
-    files, log, _, run = watched
+    files, written, _, _, run = watched
     for updates in (2, 3):
         go_on(files, run, updates)
-    assert log.written == []
-    go_on(files, run, 4)
-    assert log.written == ["checkpoint of 4", "save_policies", "say_running"]
-    go_on(files, run, 7)
-    assert len(log.written) == 3
+    assert written == []
+    for updates in (4, 7):
+        go_on(files, run, updates)
+    assert written == saved(4)
 
 
 def test_the_last_state_is_saved_once_and_with_its_evaluation(watched):
-    files, log, _, run = watched
+    files, written, _, _, run = watched
     run.finished = True
     go_on(files, run, 9)
-    assert log.written == []
-    files.end(run)
-    files.end(run)
-    assert log.written == ["checkpoint of 9", "save_policies", "say_running"]
+    assert written == []
+    files.ended(run)
+    files.ended(run)
+    assert written == saved(9)
 
 
 def test_a_full_disk_is_a_warning_once_and_is_tried_again(watched):
-    files, log, said, run = watched
-    log.full = {"save_checkpoint", "say_running"}
+    files, written, full, said, run = watched
+    full |= {"checkpoint of 4", "checkpoint of 8", "summary.json"}
     for updates in (4, 8):
         go_on(files, run, updates)
-    assert log.written == ["save_policies"] * 2
+    assert written == ["metrics.csv", "last policies", "best policies"] * 2
     assert said == [
         f"warning: cannot write {what} (No space left on device); training goes on and tries again"
         for what in ("a checkpoint", "summary.json")
     ]
-    log.full = set()
-    files.end(run)
-    assert "checkpoint of 8" in log.written
+    full.clear()
+    files.ended(run)
+    assert "checkpoint of 8" in written
 
 
 def test_rows_go_to_the_table_and_to_each_sink(watched):
-    files, log, said, run = watched
+    files, written, full, said, run = watched
     sunk = []
     files._sinks = [SimpleNamespace(name="tensorboard/", write=sunk.append, close=lambda: None)]
-    log.full = {"add_rows"}
+    full.add("metrics.csv")
     files.evaluated(run, None, {"seed": ["0"]})
     assert sunk == [{"seed": ["0"]}]
     assert said == [
         "warning: cannot write metrics.csv (No space left on device); training goes on and tries "
         "again"
     ]
+    full.clear()
+    files.evaluated(run, None, {"seed": ["1"]})
+    assert written == ["metrics.csv"]
 
 
-def test_the_end_closes_the_sinks(watched):
-    files, log, _, run = watched
-    closed = []
-    files._sinks = [SimpleNamespace(name="tensorboard/", close=lambda: closed.append(True))]
-    run.record.training = dict
-    files.finish(run, b"png", {})
-    assert log.written == ["save_policies", "finish"]
-    assert closed == [True]
+def test_the_summary_is_last_and_the_end_closes_the_sinks(watched):
+    files, written, _, _, run = watched
+    files._sinks = [SimpleNamespace(name="a sink", close=lambda: written.append("a sink"))]
+    files.finished(run, {})
+    policies = ["last policies", "best policies"]
+    assert written == [*policies, "metrics.csv", "summary.json", "a sink"]
 
 
 def test_a_function_that_returns_true_ends_the_run():
@@ -140,16 +137,16 @@ def test_a_function_that_returns_true_ends_the_run():
     assert seen == ["poor", "poor", "solved", "solved"]
 
 
-def test_the_screen_shows_progress_and_what_is_not_finite():
-    shown = []
-    display = SimpleNamespace(
-        show_progress=shown.append,
-        show_nonfinite=lambda met, num_seeds: shown.append((met, num_seeds)),
-    )
-    screen = Screen(display)
+def test_the_screen_shows_progress_and_what_is_not_finite(monkeypatch):
+    display, shown = Display(), []
+    monkeypatch.setattr(display, "show_progress", shown.append)
+    monkeypatch.setattr(display, "say", lambda text, style: shown.append(text))
     run = SimpleNamespace(
         config=Config(num_seeds=3), record=SimpleNamespace(progress=lambda: "half")
     )
-    screen.evaluated(run, None, {})
-    screen.updated(run, {"seed": []})
-    assert shown == ["half", ({"seed": []}, 3)]
+    display.evaluated(run, None, {})
+    none = {name: np.zeros(0, int) for name in ("seed", "update", "episodes", "skipped")}
+    display.updated(run, none)
+    display.updated(run, {name: np.ones(1, int) for name in none})
+    assert shown[0] == "half"
+    assert [text.partition(" seeds")[0] for text in shown[1:]] == ["update 1: 1 of 3"]

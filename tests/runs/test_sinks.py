@@ -2,10 +2,9 @@
 
 import csv
 import errno
-import json
 import struct
-import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from hypothesis import strategies as st
 from mjx_reinforce import files
 from mjx_reinforce import train as train_module
 from mjx_reinforce.runs import sinks
-from mjx_reinforce.runs.observers import RunLog
+from mjx_reinforce.runs.observers import RunFiles
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import iqm, iqm_interval
 from mjx_reinforce.training import rows
@@ -36,6 +35,12 @@ def evaluation(update, num_seeds=20, first=False):
     return rows.of_evaluation(
         measured, {} if first else last, updates, 4 * updates, 40 * updates, 0.1 * update
     )
+
+
+def begin(directory, config):
+    """Begins a run in a directory, or goes on without a checkpoint."""
+    run = SimpleNamespace(config=config)
+    RunFiles(directory, {}, lambda text: None).begin(run, None)
 
 
 @pytest.fixture
@@ -126,11 +131,10 @@ def test_what_a_kill_left_of_writing_a_file_is_removed_and_what_is_not_ours_stay
     (directory / "mine.txt").write_text("mine")
     written = [directory / name for name in ("wandb/mjx_reinforce.json", "config.json")]
     parts = [path.with_name(f".{path.name}.0a1b") for path in written]
-    log = RunLog(directory)
-    for start in (lambda: log.begin({}), lambda: log.resume({}, {}, None)):
+    for config in (Config(), Config(resume=directory)):
         for part in parts:
             part.touch()
-        start()
+        begin(directory, config)
         assert not any(part.exists() for part in parts)
     assert (directory / "mine.txt").read_text() == "mine"
 
@@ -185,69 +189,41 @@ def test_a_full_disk_costs_rows_and_leaves_the_others_whole(directory, monkeypat
     assert list(events_of(directory / "tensorboard")) == [0, 10]
 
 
-def wandb_records(content):
-    """The records of a file of W&B: LevelDB's log format after a header of 7 bytes."""
-    at, data = 7, b""
-    while at + 7 <= len(content):
-        if (left := 2**15 - at % 2**15) < 7:  # no room for another in this block
-            at += left
-            continue
-        _, length, kind = struct.unpack("<IHB", content[at : at + 7])
-        data += content[at + 7 : at + 7 + length]
-        at += 7 + length
-        if kind in (1, 4):  # whole, or its last part
-            yield data
-            data = b""
+@pytest.fixture
+def wandb(monkeypatch):
+    """Stands for W&B; notes how runs begin, and the rows that they log."""
+    begun, logged = [], []
 
+    def init(**given):
+        begun.append(given)
+        log = {"log": lambda row, step: logged.append((step, row)), "finish": lambda: None}
+        return SimpleNamespace(id=given["id"] or "first", **log)
 
-def wandb_rows(directory):
-    """Steps and values in the files that `wandb sync` uploads."""
-    from wandb.proto.wandb_internal_pb2 import Record
-
-    found, ids = [], set()
-    for path in sorted((directory / "wandb").glob("offline-run-*/*.wandb")):
-        for record in map(Record.FromString, wandb_records(path.read_bytes())):
-            if record.HasField("run"):
-                ids.add(record.run.run_id)
-            if record.HasField("history"):
-                items = {"/".join(x.nested_key) or x.key: x for x in record.history.item}
-                found.append({name: json.loads(x.value_json) for name, x in items.items()})
-    return found, ids
-
-
-WANDB_PROGRAM = """
-import json, pathlib, sys
-from mjx_reinforce.runs.sinks import WeightsAndBiases
-sink = WeightsAndBiases(pathlib.Path("."))
-for rows in json.load(sys.stdin):
-    sink.write(rows)
-sink.close()
-"""
-
-
-@pytest.mark.slow
-def test_wandb_is_offline_and_goes_on(directory, monkeypatch):
-    """No step is logged twice; both parts are of one run, and nothing is outside its folder."""
-    pytest.importorskip("wandb")
+    module = SimpleNamespace(init=init, Settings=dict, Error=RuntimeError)
+    monkeypatch.setitem(sys.modules, "wandb", module)
     monkeypatch.delenv("WANDB_MODE", raising=False)
+    return module, begun, logged
+
+
+def test_wandb_is_offline_and_goes_on(directory, wandb):
+    """No step is logged twice, and both parts are of one run."""
+    _, begun, logged = wandb
     for updates in ((0, 5), (5, 10)):
-        given = json.dumps([evaluation(update) for update in updates])
-        command = [sys.executable, "-c", WANDB_PROGRAM]
-        subprocess.run(command, input=given, check=True, cwd=directory, text=True)
-    found, ids = wandb_rows(directory)
-    assert [row["_step"] for row in found] == [0, 5, 10]
-    assert found[1]["eval_return/iqm"] == sinks.scalars(evaluation(5))["eval_return/iqm"]
-    assert len(ids) == 1
-    assert {path.name for path in directory.iterdir()} == {"metrics.csv", "config.json", "wandb"}
+        sink = sinks.WeightsAndBiases(directory)
+        for update in updates:
+            sink.write(evaluation(update))
+        sink.close()
+    assert [step for step, _ in logged] == [0, 5, 10]
+    assert logged[1][1]["eval_return/iqm"] == sinks.scalars(evaluation(5))["eval_return/iqm"]
+    assert [given["id"] for given in begun] == [None, "first"]
+    assert {(given["mode"], given["dir"]) for given in begun} == {("offline", directory)}
 
 
-def test_wandb_that_has_no_key_says_what_to_do(directory, monkeypatch):
-    wandb = pytest.importorskip("wandb")
-
+def test_wandb_that_has_no_key_says_what_to_do(directory, wandb, monkeypatch):
     def init(**_):
-        raise wandb.Error("No API key configured.")
+        raise RuntimeError("No API key configured.")
 
-    monkeypatch.setattr(wandb, "init", init)
+    monkeypatch.setattr(wandb[0], "init", init)
     monkeypatch.setenv("WANDB_MODE", "online")
     with pytest.raises(OSError, match="key configured; run wandb login, or unset WANDB_MODE"):
         sinks.open_sinks(Config(log=("wandb",)), directory, None)
@@ -282,5 +258,5 @@ def test_a_run_with_a_sink_and_its_resumption(run, tmp_path):
     last = [row for row in table if row["update"] == 15]
     for name in ("eval_return", "kl", "policy_std", "gradient_snr", "explained_variance"):
         assert shown[15][f"{name}/seed_1"] == pytest.approx(last[1][name], rel=1e-6)
-    RunLog(out).begin({})
+    begin(out, Config())
     assert not list((out / "tensorboard").iterdir())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce import envs
-from mjx_reinforce.runs import run
+from mjx_reinforce.runs import observers, run
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store.ready import made
 
@@ -57,10 +57,10 @@ def test_a_summary_says_how_the_run_ended(driver, monkeypatch):
 
 def test_a_curve_is_drawn_over_the_budget_that_the_run_has(driver, monkeypatch):
     drawn = []
-    monkeypatch.setattr(run, "draw_learning_curve", lambda *args: drawn.append(args))
-    run.draw(driver)
+    monkeypatch.setattr(observers, "draw_learning_curve", lambda *args: drawn.append(args))
+    observers.draw(driver)
     driver.config = dataclasses.replace(driver.config, env_steps=100)
-    run.draw(driver)
+    observers.draw(driver)
     assert [args[-1] for args in drawn] == ["episodes", "env_steps"]
     assert drawn[0][0]["eval_return"].shape == (3, 2)
     assert drawn[0][2] == CONFIG.env

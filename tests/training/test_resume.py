@@ -22,7 +22,7 @@ from mjx_reinforce import files as export_files
 from mjx_reinforce import train as train_module
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.runs.directory import locked, make_directory
-from mjx_reinforce.runs.observers import RunLog
+from mjx_reinforce.runs.observers import RunFiles
 from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.driver import Driver
 from mjx_reinforce.training.record import RunRecord
@@ -183,7 +183,7 @@ def signalled(method, when):
 @pytest.mark.parametrize(
     ("owner", "name", "when", "status", "rows"),
     [
-        (RunLog, "begin", 1, 143, 1),
+        (RunFiles, "begin", 1, 143, 1),
         (Driver, "advance", 2, 143, 2),  # whose evaluation is left to the run that goes on
         (RunRecord, "add_test", 1, 143, 5),
         (RunRecord, "add_test", 2, 0, 5),  # nothing is left to stop

@@ -141,7 +141,7 @@ def train(base: Config, directory: Path) -> bool:
         over = dict(_SETTINGS.get(name, (name, values)) for name, values in FACTORS.items())
         design = Design(base=dataclasses.replace(base, output=directory), over=over)
     with Interrupt() as interrupt:
-        perform(design, interrupt, [])
+        perform(design, interrupt)
         ended = interrupt.number is None
     if ended:
         save(measure(directory), directory)
