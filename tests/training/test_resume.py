@@ -308,7 +308,7 @@ def test_a_folder_that_another_process_makes_is_not_ours(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "mkdir", late)
     assert make_directory(tmp_path / "a" / "b") == []
     monkeypatch.undo()
-    assert make_directory(tmp_path / "c" / "d", False) == [
+    assert make_directory(tmp_path / "c" / "d") == [
         tmp_path / "c" / "d",
         tmp_path / "c",
     ]
