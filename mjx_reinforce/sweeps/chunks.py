@@ -1,5 +1,6 @@
 """Chunks: as many runs of a group as are under way at once."""
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -7,14 +8,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.settings.config import Config
+from mjx_reinforce.learning.policy import Actor
+from mjx_reinforce.settings.config import MAX_COUNT
 from mjx_reinforce.sweeps.history import History, Measured
-from mjx_reinforce.sweeps.layout import StateRows
 from mjx_reinforce.sweeps.plan import Group
 from mjx_reinforce.sweeps.programs import SlotPrograms
 from mjx_reinforce.training import checkpoint
 from mjx_reinforce.training.checkpoint import Attempts, Checkpoint, SaveDue
-from mjx_reinforce.training.state import RunState
 
 #: The host need not look at a sweep more often than this. Between short blocks the devices would
 #: wait for it.
@@ -58,117 +58,94 @@ def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
     ]
 
 
-def initial_states(programs: SlotPrograms, group: Group, runs: Runs) -> np.ndarray:
-    """Returns the states [R, B] of the runs of a chunk before their first update."""
-    settings = {name: values[runs.place] for name, values in group.settings.items()}
-    return programs.begin(runs.seed, settings)
-
-
-class Saver:
-    """Keeps a chunk in progress in checkpoints, and finds it again."""
-
-    def __init__(self, folder: Path, config: Config, layout: StateRows, say: Callable[[str], None]):
-        """Takes what a chunk is kept in.
-
-        Args:
-          folder: of the chunk's checkpoints.
-          config: the settings of its group.
-          layout: of its group's states.
-          say: shows a line to the user.
-        """
-        self._folder, self._config, self._layout, self._say = folder, config, layout, say
-        self._due = SaveDue(config.checkpoint_every)
-        self._attempt = Attempts(say).attempt
-
-    def save_if_due(self, states: np.ndarray, history: History) -> None:
-        """Saves once there were enough updates, or about a minute, since the last time.
-
-        A checkpoint that cannot be written is a warning, and is tried again when one is due.
-        """
-        if not self._due.is_due(_updates(history)):
-            return
-        if not self._attempt("a checkpoint", lambda: self.save(states, history)):
-            self._due.saved(_updates(history))
-
-    def save(self, states: np.ndarray, history: History) -> None:
-        """Writes a checkpoint, or raises OSError."""
-        content = Checkpoint(
-            state=self._layout.states(states),
-            record=history.arrays(),
-            seconds=history.seconds,
-            metrics_bytes=0,
-            env_steps=self._config.env_steps,
-            max_updates=self._config.max_updates,
-        )
-        checkpoint.save(self._folder, content, even=False)
-        self._due.saved(_updates(history))
-
-    def find(self, like: RunState, history: History) -> np.ndarray | None:
-        """Returns the newest states that were saved, with their history restored, or None.
-
-        ``like`` has the shapes of the states.
-        """
-        for found in checkpoint.read_checkpoints(self._folder, like, self._say):
-            history.restore(found.record)
-            self._due.saved(_updates(history))
-            return self._layout.rows(found.state)
-        return None
-
-    def remove(self) -> None:
-        """Removes the checkpoints."""
-        checkpoint.remove_checkpoints(self._folder)
-
-
-def _updates(history: History) -> int:
-    """Returns how many updates the run with the most has made."""
-    return int(history.now["updates"].max())
-
-
 class Chunk:
-    """A chunk as it goes on, for ``training.driver.drive``."""
+    """The runs of a chunk as they go on, for ``training.driver.drive``, and its checkpoints.
+
+    history: what they have measured
+    """
 
     def __init__(
         self,
         programs: SlotPrograms,
-        states: np.ndarray,
-        history: History,
-        observers: Sequence[Callable[[], None]],
-        most: int,
+        group: Group,
+        runs: Runs,
+        folder: Path,
+        say: Callable[[str], None],
+        show: Callable[[History], None],
     ):
-        """Takes what a chunk is made of.
+        """Begins, or goes on from the newest checkpoint that is there.
 
         Args:
-          programs: of its group.
-          states: [R, B] of its runs, before the first update or from a checkpoint; changed.
-          history: of its runs; changed.
-          observers: are called after every evaluation, or where these take milliseconds after
-            several.
-          most: evaluations between two calls at most.
+          programs: of the group.
+          group: of which the runs are.
+          runs: the chunk's.
+          folder: of its checkpoints.
+          say: shows a line to the user.
+          show: shows how far the chunk is, after each block of updates.
         """
-        self._programs, self._states, self._history = programs, states, history
-        self._observers, self._most = observers, most
-        self._began = time.perf_counter() - history.seconds
+        config = dataclasses.replace(group.config, num_seeds=len(runs.seed))
+        self._programs, self._config, self._folder = programs, config, folder
+        self._show, self._attempt = show, Attempts(say).attempt
+        self._due, self.history = SaveDue(config.checkpoint_every), History(config)
+        like = programs.layout.shapes(len(runs.seed))
+        found = next(checkpoint.read_checkpoints(folder, like, say), None)
+        if found is None:
+            settings = {name: values[runs.place] for name, values in group.settings.items()}
+            self._states = programs.begin(runs.seed, settings)
+        else:
+            self._states = programs.layout.rows(found.state)
+            self.history.restore(found.record)
+            self._due.saved(self._updates())
+        self._began = time.perf_counter() - self.history.seconds
+        #: How many blocks are made before the host looks at the runs again.
         self._blocks = 1
 
     def over(self) -> bool:
         """Returns whether all runs used their budgets; then evaluates the last policies."""
-        if self._history.training().any():
+        if self.history.training().any():
             return False
-        if not self._history.evaluated():
+        if not self.history.evaluated():
             self._keep([self._programs.evaluate(self._states)])
         return True
 
     def advance(self) -> None:
-        """Evaluates the runs that still train and makes a block of updates, or several blocks."""
-        history, last = self._history, self._history.seconds
+        """Evaluates the runs that still train and makes a block of updates, or several blocks.
+
+        A checkpoint that is due then and cannot be written is a warning; it is tried again when
+        the next one is due.
+        """
+        history, last = self.history, self.history.seconds
         lengths = history.now["eval_steps"]
         measured = self._programs.advance(self._states, history.training(), lengths, self._blocks)
         assert measured, "runs that have not used their budgets made no update"
         self._keep(measured)
         enough = len(measured) * _SECONDS / (history.seconds - last)
-        self._blocks = max(1, min(int(enough), 2 * len(measured), self._most))
-        for observer in self._observers:
-            observer()
+        most = (self._config.checkpoint_every or MAX_COUNT) // self._config.eval_every
+        self._blocks = max(1, min(int(enough), 2 * len(measured), most))
+        self._show(history)
+        if self._due.is_due(self._updates()):
+            self._attempt("a checkpoint", self.save)
+            self._due.saved(self._updates())
+
+    def save(self) -> None:
+        """Writes a checkpoint, or raises OSError."""
+        content = Checkpoint(
+            state=self._programs.layout.states(self._states),
+            record=self.history.arrays(),
+            seconds=self.history.seconds,
+            metrics_bytes=0,
+            env_steps=self._config.env_steps,
+            max_updates=self._config.max_updates,
+        )
+        checkpoint.save(self._folder, content, even=False)
+
+    def actors(self) -> Actor:
+        """Returns the present policies [R, ...]."""
+        return self._programs.layout.states(self._states).train_states.actor
 
     def _keep(self, measured: Sequence[Measured]) -> None:
-        self._history.keep(measured, time.perf_counter() - self._began)
+        self.history.keep(measured, time.perf_counter() - self._began)
+
+    def _updates(self) -> int:
+        """Returns how many updates the run with the most has made."""
+        return int(self.history.now["updates"].max())

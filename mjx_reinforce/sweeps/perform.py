@@ -92,19 +92,15 @@ def _perform(
         _check_same_sweep(directory, known, contents)
     configurations, threshold = prepared.configurations, contents["threshold"]
     files = SweepFiles(directory, configurations, threshold, going_on=bool(known))
-    with Display(quiet=quiet) as display, contextlib.ExitStack() as compiling:
-        display.say(prepared.plan)
-        compiling.enter_context(display.compiling())
-
-        def ready(seconds: float) -> None:
-            """Begins the files; not before there is a program, see ``train``."""
-            compiling.close()
-            display.start(seconds)
-            interrupt.defer(display.say)
-            files.open(contents)
-
+    with Display(quiet=quiet) as display:
         interrupt.restore_screen(display.console.show_cursor)
-        conductor = Conductor(prepared, design, files, display, interrupt, ready)
+        display.say(prepared.plan)
+        conductor = Conductor(prepared, files, display, interrupt)
+        with display.compiling():
+            conductor.compile_first()
+        display.start(conductor.clock.compiling)
+        interrupt.defer(display.say)  # not before there is a program, see ``train_run``
+        files.open(contents)
         ended = conductor.conduct()
         contents["status"] = "finished" if ended else "interrupted"
         contents["compile_seconds"] += prepared.engine_seconds + conductor.clock.compiling

@@ -52,12 +52,16 @@ class Part(NamedTuple):
     env: what they train on
     horizon: the time limit of an episode in steps
     limit: how many of its runs a chunk may have
+    num_chunks: in which they are, of about the same size
+    widths: runs that a compiled program moves at once, the most first
     """
 
     group: Group
     env: Environment
     horizon: int
     limit: int
+    num_chunks: int
+    widths: tuple[int, ...]
 
 
 def make_groups(configs: Sequence[Config], swept: Collection[str], *, exact: bool) -> list[Group]:
@@ -133,19 +137,10 @@ _CPU_EPISODES = (128,)
 _GPU_EPISODES = (65_536, 8_192)
 
 
-class GroupPlan(NamedTuple):
-    """How the runs of a group are divided.
-
-    num_chunks: of about the same size
-    widths: runs that a compiled program moves at once, the most first
-    """
-
-    num_chunks: int
-    widths: tuple[int, ...]
-
-
-def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> GroupPlan:
-    """Returns how the runs of a group are divided.
+def divide(
+    group: Group, limit: int, num_devices: int, *, exact: bool
+) -> tuple[int, tuple[int, ...]]:
+    """Returns ``num_chunks`` and ``widths`` of a part.
 
     Args:
       group: whose configurations have ``group.config.num_seeds`` runs each.
@@ -156,11 +151,11 @@ def divide(group: Group, limit: int, num_devices: int, *, exact: bool) -> GroupP
     total = group.num_runs
     num_chunks = -(-total // limit)
     if exact:
-        return GroupPlan(num_chunks, (num_devices,))
+        return num_chunks, (num_devices,)
     most = -(-total // (num_chunks * num_devices))
     side = _CPU_EPISODES if this_hardware().shared else _GPU_EPISODES
     each = {min(most, -(-count // group.config.episodes_per_update)) for count in side}
-    return GroupPlan(num_chunks, tuple(num_devices * width for width in sorted(each, reverse=True)))
+    return num_chunks, tuple(num_devices * width for width in sorted(each, reverse=True))
 
 
 def _capacity(group: Group, task: Task, num_devices: int) -> int:
@@ -184,25 +179,24 @@ def _task(env: Environment, horizon: int, config: Config) -> Task:
     return task_of(policy_settings(env, config), horizon, config)
 
 
-def _describe(parts: Sequence[Part], engine: str, num_devices: int, *, exact: bool) -> str:
+def _describe(parts: Sequence[Part], engine: str, num_devices: int) -> str:
     """Returns a paragraph on what a sweep will do.
 
     Args:
       parts: its groups.
       engine: the name of what plays the episodes.
       num_devices: on which they are.
-      exact: one run a slot.
     """
     groups, machine = [part.group for part in parts], this_hardware()
     first, at_once = groups[0].config, num_cores() if machine.shared else 1  # slots
-    plans = [divide(part.group, part.limit, num_devices, exact=exact) for part in parts]
     configurations = sum(len(group.members) for group in groups)
-    runs, chunks = sum(group.num_runs for group in groups), sum(plan.num_chunks for plan in plans)
+    runs, chunks = sum(group.num_runs for group in groups), sum(part.num_chunks for part in parts)
     side, memory = 0, 0.0
-    for (group, env, horizon, _), plan in zip(parts, plans, strict=True):
-        side = max(side, -(-group.num_runs // plan.num_chunks))
-        together = dataclasses.replace(group.config, num_seeds=at_once * plan.widths[0])
-        memory = max(memory, needed(together, _task(env, horizon, group.config)))
+    for part in parts:
+        config = part.group.config
+        side = max(side, -(-part.group.num_runs // part.num_chunks))
+        together = dataclasses.replace(config, num_seeds=at_once * part.widths[0])
+        memory = max(memory, needed(together, _task(part.env, part.horizon, config)))
     where = machine.name if num_devices == 1 else devices_in_words(num_devices, machine)
     return (
         f"Sweeping {configurations:,} configurations of {first.num_seeds:,} seeds, {runs:,} runs "
@@ -255,7 +249,8 @@ def prepare_sweep(design: Design, limits: Sequence[int] | None) -> Prepared:
             limit = _capacity(group, _task(env, horizon, group.config), devices.count)
         if limits is None:
             limit = min(limit, group.num_runs)
-        parts.append(Part(group, env, horizon, limit))
+        division = divide(group, limit, devices.count, exact=design.exact)
+        parts.append(Part(group, env, horizon, limit, *division))
     engine, seconds = engines[0].name, sum(each.seconds for each in engines)
-    plan = _describe(parts, engine, devices.count, exact=design.exact)
+    plan = _describe(parts, engine, devices.count)
     return Prepared(parts, devices, configurations, engine, seconds, plan)

@@ -44,14 +44,16 @@ class Stopwatch:
         return program
 
 
-def one_ahead(tasks: Sequence[Callable[[], Any]]) -> Iterator[Any]:
+def one_ahead(tasks: Sequence[Callable[[], Any]], clock: Stopwatch) -> Iterator[Any]:
     """Yields the results of tasks in order; each begins when the one before is handed out."""
-    waiting = [started(tasks[0])] if tasks else []
-    for following in (*tasks[1:], None):
-        result = waiting.pop().result()
-        if following is not None:
-            waiting.append(started(following))
+    if not tasks:
+        return
+    ahead = started(tasks[0])
+    for task in tasks[1:]:
+        result = clock.wait(ahead)
+        ahead = started(task)
         yield result
+    yield clock.wait(ahead)
 
 
 def started(task: Callable[[], Any]) -> Future:

@@ -16,83 +16,9 @@ from mjx_reinforce.export.policy_files import actor_of, arrays_of, save_policy
 from mjx_reinforce.files import Arrays, read_arrays, write_arrays, write_bytes, write_json
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.statistics import steps_to_solve
-from mjx_reinforce.sweeps import results
 from mjx_reinforce.sweeps.chunks import Runs
 from mjx_reinforce.sweeps.history import History
 from mjx_reinforce.training import checkpoint
-
-#: Arrays of a part beside those of the actors.
-_FACTS = ("configuration", "seed", "final_return")
-
-
-def write_part(parts: Path, runs: Runs, final: np.ndarray, actors: Actor) -> None:
-    """Keeps the best and the worst policies of a chunk; raises OSError if that fails.
-
-    Args:
-      parts: the folder of the parts.
-      runs: R of them, the chunk's.
-      final: [R] their returns at the end.
-      actors: [R, ...] their policies then.
-    """
-    facts = (runs.configuration, runs.seed, np.asarray(final, np.float64))
-    known: Arrays = dict(zip(_FACTS, facts, strict=True))
-    arrays = known | {f"actor/{k}": np.asarray(x) for k, x in arrays_of(actors).items()}
-    write_arrays(_part_path(parts, runs.name), _ends(arrays))
-
-
-def gather(
-    directory: Path, parts: Path, settings: Callable[[int], tuple[dict[str, Any], dict[str, Any]]]
-) -> None:
-    """Writes DIR/policies from the parts; raises OSError if that fails.
-
-    Args:
-      directory: of the sweep.
-      parts: the folder of its parts.
-      settings: the number of a configuration -> those of its policy, and what config.json says
-        beside its seeds.
-    """
-    shutil.rmtree(directory / "policies", ignore_errors=True)
-    kept = [read_arrays(path) for path in sorted(parts.glob("policies-[0-9]*.npz"))]
-    for number in np.unique(np.concatenate([part["configuration"] for part in kept])).tolist():
-        place = directory / "policies" / f"{number:03d}"
-        _write_policies(place, _ends(_parts_of(kept, number)), *settings(number))
-
-
-def _write_policies(
-    place: Path, arrays: Arrays, settings: dict[str, Any], run: dict[str, Any]
-) -> None:
-    """Writes the policies of one configuration, as a run directory."""
-    actors = {k.removeprefix("actor/"): x for k, x in arrays.items() if k not in _FACTS}
-    save_policy(place / "policy", actor_of(actors), settings)
-    seeds, returns = arrays["seed"].tolist(), arrays["final_return"].tolist()
-    write_json(place / "summary.json", {"status": "finished", "final_returns": returns})
-    write_json(place / "config.json", run | {"seeds": seeds})
-
-
-def _ends(arrays: Arrays) -> Arrays:
-    """Returns the worst and the best run of each configuration, in the order of their seeds."""
-    values = np.nan_to_num(arrays["final_return"], nan=-np.inf)
-    chosen = set()
-    for number in np.unique(arrays["configuration"]):
-        runs = np.flatnonzero(arrays["configuration"] == number)
-        runs = runs[np.argsort(arrays["seed"][runs])]
-        chosen |= {int(runs[values[runs].argmin()]), int(runs[values[runs].argmax()])}
-    index = sorted(chosen, key=lambda i: (arrays["configuration"][i], arrays["seed"][i]))
-    return {name: x[index] for name, x in arrays.items()}
-
-
-def _parts_of(parts: Sequence[Arrays], number: int) -> Arrays:
-    """Returns what several parts have of one configuration."""
-    parts = [part for part in parts if np.any(part["configuration"] == number)]
-    return {
-        name: np.concatenate([part[name][part["configuration"] == number] for part in parts])
-        for name in parts[0]
-    }
-
-
-def _part_path(parts: Path, chunk: str) -> Path:
-    return parts / f"policies-{chunk}.npz"
-
 
 _MEASURED = (
     *("seed", "final_return", "best_return", "env_steps_to_solve"),
@@ -170,12 +96,18 @@ class SweepFiles:
         """Returns the folder of a chunk's checkpoints."""
         return self.parts / chunk
 
-    def keep_policies(self, runs: Runs, history: History, actors: Actor) -> None:
-        """Keeps the best and the worst policies of a chunk [R, ...], before its part."""
-        results.write_part(self.parts, runs, history.now["eval_return"], actors)
+    def add(self, runs: Runs, history: History, actors: Actor) -> None:
+        """Writes the part of a chunk, after its policies, and appends its rows to results.csv.
 
-    def add(self, runs: Runs, history: History) -> None:
-        """Writes the part of a chunk, and appends its rows to results.csv."""
+        Args:
+          runs: R of them, the chunk's.
+          history: what they measured.
+          actors: [R, ...] their last policies, of which the best and the worst are kept.
+        """
+        final = history.now["eval_return"].astype(np.float64)
+        facts = {"configuration": runs.configuration, "seed": runs.seed, "final_return": final}
+        policies = {f"actor/{name}": np.asarray(x) for name, x in arrays_of(actors).items()}
+        write_arrays(self.parts / f"policies-{runs.name}.npz", _ends(facts | policies))
         curves = history.curves()
         part = {
             "configuration": runs.configuration.astype(np.int32),
@@ -197,8 +129,23 @@ class SweepFiles:
     def gather_policies(
         self, settings: Callable[[int], tuple[dict[str, Any], dict[str, Any]]]
     ) -> None:
-        """Writes the folder ``policies`` of a sweep that ended, see ``results.gather``."""
-        results.gather(self.directory, self.parts, settings)
+        """Writes the folder ``policies`` of a sweep that ended.
+
+        Args:
+          settings: the number of a configuration -> those of its policy, and what config.json
+            says beside its seeds.
+        """
+        shutil.rmtree(self.directory / "policies", ignore_errors=True)
+        kept = [read_arrays(path) for path in sorted(self.parts.glob("policies-[0-9]*.npz"))]
+        for number in np.unique(np.concatenate([part["configuration"] for part in kept])).tolist():
+            place = self.directory / "policies" / f"{number:03d}"
+            arrays = _ends(_parts_of(kept, number))
+            actors = {k.removeprefix("actor/"): x for k, x in arrays.items() if "/" in k}
+            policy, run = settings(number)
+            save_policy(place / "policy", actor_of(actors), policy)
+            returns = arrays["final_return"].tolist()
+            write_json(place / "summary.json", {"status": "finished", "final_returns": returns})
+            write_json(place / "config.json", run | {"seeds": arrays["seed"].tolist()})
 
     def remove_states(self) -> None:
         """Removes what a sweep needs only while it goes on."""
@@ -235,6 +182,27 @@ class SweepFiles:
             {"configuration": number, **self._configurations[number], **row}
             for number, row in zip(part["configuration"].tolist(), rows, strict=True)
         ]
+
+
+def _ends(arrays: Arrays) -> Arrays:
+    """Returns the worst and the best run of each configuration, in the order of their seeds."""
+    values = np.nan_to_num(arrays["final_return"], nan=-np.inf)
+    chosen = set()
+    for number in np.unique(arrays["configuration"]):
+        runs = np.flatnonzero(arrays["configuration"] == number)
+        runs = runs[np.argsort(arrays["seed"][runs])]
+        chosen |= {int(runs[values[runs].argmin()]), int(runs[values[runs].argmax()])}
+    index = sorted(chosen, key=lambda i: (arrays["configuration"][i], arrays["seed"][i]))
+    return {name: x[index] for name, x in arrays.items()}
+
+
+def _parts_of(parts: Sequence[Arrays], number: int) -> Arrays:
+    """Returns what several parts have of one configuration."""
+    parts = [part for part in parts if np.any(part["configuration"] == number)]
+    return {
+        name: np.concatenate([part[name][part["configuration"] == number] for part in parts])
+        for name in parts[0]
+    }
 
 
 def join_parts(parts: Sequence[Arrays]) -> Arrays:

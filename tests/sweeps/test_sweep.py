@@ -277,15 +277,15 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     """
     monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
     drive, driven, ended, tried = conduct.drive, [], [], []
-    add, save, write = conduct.SweepFiles.add, conduct.Saver.save, chunks.checkpoint.save
+    add, save, write = conduct.SweepFiles.add, conduct.Chunk.save, chunks.checkpoint.save
 
     def interrupted(chunk, asked):
         driven.append(None)
         return len(driven) == 1 and drive(chunk, asked)
 
-    def crash_among_ended(self, states, history):
-        save(self, states, history)
-        ended.append((history.now["env_steps"] >= 300).sum())
+    def crash_among_ended(self):
+        save(self)
+        ended.append((self.history.now["env_steps"] >= 300).sum())
         if 0 < ended[-1] < 4:
             raise CrashError
 
@@ -304,7 +304,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
         assert run(f"{CHUNKS} --output parts") == 0
     assert json.loads(Path("parts/sweep.json").read_text())["status"] == "interrupted"
     for owner, name, crash in (
-        (conduct.Saver, "save", crash_among_ended),
+        (conduct.Chunk, "save", crash_among_ended),
         (conduct.SweepFiles, "add", crash_after_chunk),
     ):
         with monkeypatch.context() as patch:
@@ -338,15 +338,15 @@ def test_a_chunk_that_goes_on_saves_when_it_is_due(run, monkeypatch):
     """Not at its first look: the checkpoint that it was found in counts."""
     monkeypatch.setattr(chunks, "_SECONDS", 0.0)
     command = f"{SMALL} --num-seeds 2 --eval-every 1 --checkpoint-every 2 {RATES}"
-    save, saved = conduct.Saver.save, []
+    save, saved = conduct.Chunk.save, []
 
-    def crash(self, states, history):
-        save(self, states, history)
-        saved.append(int(history.now["updates"].max()))
+    def crash(self):
+        save(self)
+        saved.append(int(self.history.now["updates"].max()))
         if saved == [2]:
             raise CrashError
 
-    monkeypatch.setattr(conduct.Saver, "save", crash)
+    monkeypatch.setattr(conduct.Chunk, "save", crash)
     with pytest.raises(CrashError):
         run(f"{command} --max-updates 5 --output crashed")
     assert run("--resume crashed") == 0
