@@ -47,8 +47,8 @@ from mjx_reinforce.statistics.comparisons import (
 )
 from mjx_reinforce.statistics.survival import kaplan_meier, log_rank
 from mjx_reinforce.sweeps.perform import SweepResults, sweep
+from mjx_reinforce.training.block import evaluate
 from mjx_reinforce.training.driver import Evaluation
-from mjx_reinforce.training.evaluation import evaluate
 
 from . import console as console
 from . import engine as engine

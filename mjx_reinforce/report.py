@@ -11,7 +11,7 @@ from typing import NamedTuple
 import tyro
 
 from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.streams import accept_everything, say_error
+from mjx_reinforce.console.streams import accept_everything
 from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.files import check_folder, write_bytes
 from mjx_reinforce.reports import sources
@@ -21,7 +21,7 @@ from mjx_reinforce.reports.page import columns, document, words
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.over_time import worst_seeds
 from mjx_reinforce.reports.page.vega import render_chart
-from mjx_reinforce.settings.flags import read_command_line
+from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 from mjx_reinforce.settings.own_code import env_flag
 from mjx_reinforce.store.provenance import version
 
@@ -50,7 +50,7 @@ class ReportSettings:
 def main() -> None:
     """Reads the command line, writes the report, and exits: 0 done, 2 bad input, 130 stopped."""
     accept_everything()
-    try:
+    with one_line_errors():
         settings = read_command_line(ReportSettings, sys.argv[1:], command("report"), _ABOUT)
         if settings.output is not None:
             check_output(settings.output, settings.overwrite)
@@ -59,11 +59,6 @@ def main() -> None:
         output = settings.output or _default_output(settings.sources)
         check_output(output, settings.overwrite)
         seconds = _write(experiment, output).seconds
-    except (ValueError, OSError) as error:
-        say_error(str(error))
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
     size = output.stat().st_size / 1e6
     took = f"{size:.1f} MB, {seconds:.1f} s"
     print(f"{output} ({took}), pictures and tables in {_beside(output)}")

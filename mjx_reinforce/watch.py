@@ -13,8 +13,8 @@ from rich.progress import track
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.console.streams import accept_everything, heartbeat, say_error, silence_alarms
-from mjx_reinforce.export.films import Renderer, gif, import_mujoco, with_sky
+from mjx_reinforce.console.streams import accept_everything, heartbeat, silence_alarms
+from mjx_reinforce.export.films import Renderer, Take, gif, import_mujoco, side_by_side, with_sky
 from mjx_reinforce.export.run_files import (
     Run,
     SeedChoice,
@@ -25,7 +25,7 @@ from mjx_reinforce.export.run_files import (
     read_run,
 )
 from mjx_reinforce.files import check_folder, write_bytes
-from mjx_reinforce.settings.flags import read_command_line
+from mjx_reinforce.settings.flags import one_line_errors, read_command_line
 from mjx_reinforce.settings.own_code import check_named
 
 if TYPE_CHECKING:
@@ -81,16 +81,11 @@ def main() -> None:
     """Reads the command line, films, and exits: 0 done, 2 bad input, 130 interrupted."""
     accept_everything()
     silence_alarms()
-    try:
+    with one_line_errors():
         settings = read_command_line(
             WatchSettings, sys.argv[1:], command("watch"), WatchSettings.__doc__ or ""
         )
         film(dataclasses.replace(settings, run=choose_run(settings.run)))
-    except (ValueError, OSError) as error:
-        say_error(str(error))
-        sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
 
 
 class Role(NamedTuple):
@@ -122,8 +117,6 @@ def film(settings: WatchSettings) -> None:
     output = film_path(settings, run)
     import_mujoco()
     configure_jax()
-    from mjx_reinforce.export.takes import Take, side_by_side
-
     roles = cast(settings, run)
     env = envs.make_set(env_id, run.env_set if run else ())
     if run:

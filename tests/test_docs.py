@@ -16,7 +16,7 @@ from saved_runs import make_run
 import mjx_reinforce
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import COMMANDS
-from mjx_reinforce.training.rows import COLUMNS
+from mjx_reinforce.training.record import COLUMNS
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"

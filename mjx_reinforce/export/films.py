@@ -1,18 +1,19 @@
-"""Films of episodes: MuJoCo's renderer, and the GIF that its pictures become."""
+"""Films of episodes: MuJoCo's pictures of them, side by side, and the GIF that these become."""
 
 import ctypes.util
+import functools
 import io
+import math
 import os
 import warnings
 import weakref
-from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import MjModel, MjSpec
-
 #: Colours of a .gif, beside the one that is transparent.
 _COLORS = 255
 #: What MuJoCo's backends need that are not EGL.
@@ -120,6 +121,121 @@ def _no_drawing(error: Exception) -> ValueError:
         f"MuJoCo cannot draw here ({error}); install EGL (Debian: apt install libegl1) "
         "or set MUJOCO_GL to egl, osmesa or glfw, whichever this machine has"
     )
+
+
+#: Frames a second at most: what a film shows, and what GIF viewers play.
+MAX_RATE = 30
+#: Heights of the strip that the words stand in, and of the words, in heights of the picture.
+_STRIP, _WORDS, _LEAST = 1 / 13, 1 / 19, 10
+_INK, _PAPER = (235, 240, 245), (28, 38, 48)
+
+
+class Take(NamedTuple):
+    """An episode to be filmed.
+
+    label: what is seen
+    model: what is drawn, an ``MjModel``
+    dt: the duration of an env step (s)
+    qpos: [L, nq] generalised positions (m, rad), the start's first
+    rewards: [T] of each env step
+    """
+
+    label: str
+    model: Any
+    dt: float
+    qpos: np.ndarray
+    rewards: np.ndarray
+
+
+class Film(NamedTuple):
+    """Pictures that are drawn when they are asked for.
+
+    rate: frames a second
+    length: how many frames
+    samples: numbers of frames that together show its colours
+    draw: number of the frame -> picture [height, width, 3] uint8
+    """
+
+    rate: float
+    length: int
+    samples: Sequence[int]
+    draw: Callable[[int], np.ndarray]
+
+
+def side_by_side(
+    takes: Sequence[Take],
+    width: int,
+    height: int,
+    *,
+    seconds: float,
+    max_rate: float = MAX_RATE,
+    renderer: Renderer | None = None,
+) -> Film:
+    """Returns a film of several takes that begin together; one that ends earlier stands still.
+
+    Args:
+      takes: one or more, of any models.
+      width: of each take (pixels).
+      height: of each take (pixels).
+      seconds: length at most (simulated s); it ends with the longest take.
+      max_rate: frames a second at most.
+      renderer: of the last take's model, where it is open already.
+
+    Raises:
+      ValueError: there is no take, or no OpenGL.
+    """
+    if not takes:
+        raise ValueError("a film needs at least one take")
+    dt = max(take.dt for take in takes)
+    interval = dt * max(1, math.ceil(1 / (dt * max_rate) - 1e-9))
+    lasting = max(min(len(take.qpos) * take.dt, seconds) for take in takes)
+    renderers = [Renderer(take.model, width, height) for take in takes[:-1]]
+    renderers.append(renderer or Renderer(takes[-1].model, width, height))
+
+    def draw(frame: int) -> np.ndarray:
+        pictures = [
+            _picture(take, renderer, frame * interval)
+            for take, renderer in zip(takes, renderers, strict=True)
+        ]
+        return np.concatenate(pictures, axis=1)
+
+    length = max(1, math.ceil(lasting / interval - 1e-6))
+    samples = [*range(0, length, -(-length // SAMPLES))]
+    return Film(1 / interval, length, samples, draw)
+
+
+def _picture(take: Take, renderer: Renderer, seconds: float) -> np.ndarray:
+    """Returns a take's picture at a time (s)."""
+    step = min(int(seconds / take.dt + 1e-6), len(take.qpos) - 1)
+    picture = renderer.draw(take.qpos[step])
+    total, time = np.sum(take.rewards[:step]), step * take.dt
+    earned = f"{total:,.0f}" if abs(total) >= 100 else f"{total:.1f}"
+    return caption(picture, take.label, f"return {earned}   {time:4.1f} s")
+
+
+def caption(picture: np.ndarray, left: str, right: str) -> np.ndarray:
+    """Returns a picture [H, W, 3] uint8 with a strip below it that says two things."""
+    from PIL import Image, ImageDraw
+
+    height, width = picture.shape[:2]
+    strip = max(_LEAST + 2, 2 * round(height * _STRIP / 2))
+    font, small = (_font(max(_LEAST, round(height * x))) for x in (_WORDS, _WORDS * 0.8))
+    image = Image.new("RGB", (width, height + strip), _PAPER)
+    image.paste(Image.fromarray(picture))
+    draw = ImageDraw.Draw(image)
+    if draw.textlength(left + right, font) > width - 3 * strip // 2:
+        font = small
+    middle = height + strip // 2
+    draw.text((strip // 3, middle), left, fill=_INK, font=font, anchor="lm")
+    draw.text((width - strip // 3, middle), right, fill=_INK, font=font, anchor="rm")
+    return np.asarray(image)
+
+
+@functools.cache
+def _font(size: int) -> Any:
+    from PIL import ImageFont
+
+    return ImageFont.load_default(size)
 
 
 def gif(

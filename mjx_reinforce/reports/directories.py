@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from mjx_reinforce.files import read_arrays, read_json
 from mjx_reinforce.reports.experiment import Configuration, Source, settings_in_words
@@ -164,19 +163,19 @@ def _swept(content: dict[str, Any], path: Path) -> dict[int, dict[str, Any]]:
 def _read_curves(path: Path) -> dict[str, np.ndarray]:
     """Returns the arrays of curves.npz."""
     arrays = read_arrays(path)
-    for name in sorted(arrays.keys() - _CURVES.keys()):
-        raise ValueError(f"{path} is damaged: {name!a} is not an array of a sweep")
-    for name in _CURVES:
-        if name not in arrays:
-            raise ValueError(f"{path} is damaged: it has no array {name}")
-        if not np.issubdtype(arrays[name].dtype, np.number):
-            raise ValueError(f"{path} is damaged: {name} holds no numbers")
+    if arrays.keys() != _CURVES.keys():
+        raise ValueError(
+            f"{path} is damaged: it has the arrays {', '.join(map(ascii, arrays))}, and should "
+            f"have {', '.join(_CURVES)}"
+        )
     shape = arrays["eval_return"].shape
     for name, axes in _CURVES.items():
-        wanted = shape[-axes:]
-        if len(shape) != 2 or shape[0] < 1 or arrays[name].shape != wanted:
+        array, wanted = arrays[name], shape[-axes:]
+        numbers = np.issubdtype(array.dtype, np.number)
+        if not numbers or len(shape) != 2 or shape[0] < 1 or array.shape != wanted:
             raise ValueError(
-                f"{path} is damaged: {name} has the shape {arrays[name].shape}, not {wanted}"
+                f"{path} is damaged: {name} must be numbers of the shape {wanted}, got "
+                f"{array.dtype} {array.shape}"
             )
     return arrays
 
@@ -191,12 +190,12 @@ def _nonfinite(path: Path, curves: dict[str, np.ndarray]) -> np.ndarray:
     keys = zip(columns["configuration"].tolist(), columns["seed"].tolist(), strict=True)
     found = dict(zip(keys, columns["nonfinite"].tolist(), strict=True))
     wanted = list(zip(curves["configuration"].tolist(), curves["seed"].tolist(), strict=True))
-    for configuration, seed in wanted:
-        if (configuration, seed) not in found:
-            raise ValueError(
-                f"{path} is damaged: it has no row of configuration {configuration}, seed {seed}, "
-                "whose curve is in curves.npz"
-            )
+    if missing := [key for key in wanted if key not in found]:
+        configuration, seed = missing[0]
+        raise ValueError(
+            f"{path} is damaged: it has no row of configuration {configuration}, seed {seed}, "
+            "whose curve is in curves.npz"
+        )
     return np.array([found[key] for key in wanted], np.int64)
 
 
@@ -255,20 +254,8 @@ def read_columns(path: Path, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
     found = {}
     for name, kind in kinds.items():
         column = header.index(name)
-        texts = [row[column] for row in rows]
         try:
-            found[name] = np.array(texts, dtype=kind)
-        except ValueError:
-            wrong = next(i for i, text in enumerate(texts) if not _reads_as(kind, text))
-            raise ValueError(
-                f"{path} is damaged: {name} in line {wrong + 2} is {texts[wrong]!r}"
-            ) from None
+            found[name] = np.array([row[column] for row in rows], dtype=kind)
+        except ValueError as error:  # it has the text
+            raise ValueError(f"{path} is damaged: in the column {name}, {error}") from None
     return found
-
-
-def _reads_as(kind: DTypeLike, text: str) -> bool:
-    try:
-        np.array([text], dtype=kind)
-    except ValueError:
-        return False
-    return True

@@ -95,6 +95,11 @@ def counted(number: int, noun: str) -> str:
     return f"{number:,} {noun}" + ("" if number == 1 else "s")
 
 
+def lengthened(curves: np.ndarray, length: int) -> np.ndarray:
+    """Returns curves [E, R] with the last row repeated up to ``length``."""
+    return np.concatenate([curves, np.repeat(curves[-1:], length - len(curves), axis=0)])
+
+
 def ordered(values: Sequence[Any]) -> list[Any]:
     """Returns the different values of a setting: numbers by size, others as they come."""
     different = list({repr(value): value for value in values}.values())

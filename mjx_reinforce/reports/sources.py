@@ -13,6 +13,7 @@ from mjx_reinforce.reports.experiment import (
     Experiment,
     Source,
     counted,
+    lengthened,
     settings_in_words,
 )
 
@@ -106,8 +107,7 @@ def _join_parts(parts: Sequence[Configuration]) -> Configuration:
     length = max(len(part.eval_return) for part in parts)
 
     def together(name: str) -> np.ndarray:
-        each = [getattr(part, name) for part in parts]
-        each = [np.concatenate([x, np.repeat(x[-1:], length - len(x), axis=0)]) for x in each]
+        each = [lengthened(getattr(part, name), length) for part in parts]
         return np.concatenate(each, axis=1)[:, order]
 
     seed = np.concatenate([part.seed for part in parts])

@@ -23,7 +23,7 @@ from mjx_reinforce.settings.own_code import env_flag
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import progress
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer
-from mjx_reinforce.training.rows import Cells
+from mjx_reinforce.training.record import Cells
 
 
 class _Bar(Progress):

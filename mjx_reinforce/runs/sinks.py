@@ -22,7 +22,7 @@ import numpy as np
 from mjx_reinforce.files import append, read_json, write_json
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import iqm, iqm_interval
-from mjx_reinforce.training.rows import Cells
+from mjx_reinforce.training.record import Cells
 
 #: The package that each needs.
 _NEEDED = {"tensorboard": "tensorboardX", "wandb": "wandb"}

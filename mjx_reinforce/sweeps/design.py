@@ -10,12 +10,11 @@ import numpy as np
 import tyro
 
 from mjx_reinforce.engine.memory import gigabytes, host_memory
-from mjx_reinforce.files import read_json
 from mjx_reinforce.settings.config import Config, check_each, flag, marked, spoken
 from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.sweeps.grid import check_over, configure, grid
-from mjx_reinforce.training.resume import PLACES, as_config
+from mjx_reinforce.training.resume import PLACES, as_config, read_record
 
 #: What writing results.csv and curves.npz needs for a run with two evaluations (bytes).
 _RESULT = 760
@@ -90,21 +89,7 @@ def read_design(directory: Path) -> Design:
     Raises:
       ValueError: there is none, or its sweep.json is damaged or of another version.
     """
-    path = directory / "sweep.json"
-    try:
-        record = read_json(path)
-    except ValueError as error:
-        if not isinstance(error.__cause__, FileNotFoundError):
-            raise
-        if (directory / "config.json").is_file():
-            raise ValueError(
-                f"{directory} is a run: python -m mjx_reinforce.train --resume {directory} goes on "
-                "with it"
-            ) from error
-        raise ValueError(
-            f"cannot resume {directory}: there is no {path}, so no sweep was begun there; start "
-            "one with --output"
-        ) from error
+    path, record = directory / "sweep.json", read_record(directory, "sweep.json")
     try:
         over = {
             name: [tuple(x) if isinstance(x, list) else x for x in values]

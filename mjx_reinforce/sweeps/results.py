@@ -15,6 +15,7 @@ from mjx_reinforce import files
 from mjx_reinforce.export.policy_files import actor_of, arrays_of, save_policy
 from mjx_reinforce.files import Arrays, read_arrays, write_arrays, write_bytes, write_json
 from mjx_reinforce.learning.policy import Actor
+from mjx_reinforce.reports.experiment import lengthened
 from mjx_reinforce.statistics import steps_to_solve
 from mjx_reinforce.sweeps.chunks import Runs
 from mjx_reinforce.sweeps.history import History
@@ -211,17 +212,13 @@ def join_parts(parts: Sequence[Arrays]) -> Arrays:
     A run whose evaluations ended earlier repeats its last.
     """
     length = max(len(part["eval_return"]) for part in parts)
-    filled = [
-        {name: x if x.ndim == 1 else _fill(x, length) for name, x in part.items()} for part in parts
-    ]
-    joined = {name: np.concatenate([p[name] for p in filled], axis=-1) for name in filled[0]}
-    order = np.lexsort((joined["seed"], joined["configuration"]))
-    return {name: x[..., order] for name, x in joined.items()}
 
+    def joined(name: str) -> np.ndarray:
+        each = [part[name] for part in parts]
+        return np.concatenate([lengthened(x, length) if x.ndim > 1 else x for x in each], axis=-1)
 
-def _fill(curves: np.ndarray, length: int) -> np.ndarray:
-    """Returns curves [E, R] with the last row repeated up to ``length``."""
-    return np.concatenate([curves, np.repeat(curves[-1:], length - len(curves), axis=0)])
+    order = np.lexsort((joined("seed"), joined("configuration")))
+    return {name: joined(name)[..., order] for name in parts[0]}
 
 
 def _spelled(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,8 +16,7 @@ from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.checkpoint import Checkpoint
 from mjx_reinforce.training.programs import Looked, RunPrograms
-from mjx_reinforce.training.record import RunRecord
-from mjx_reinforce.training.rows import Cells
+from mjx_reinforce.training.record import Cells, RunRecord
 from mjx_reinforce.training.state import RunState, budget_of
 
 

@@ -20,9 +20,14 @@ from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training import state
-from mjx_reinforce.training.block import Block, BuildLearner, block_of_updates
+from mjx_reinforce.training.block import (
+    Block,
+    BuildLearner,
+    block_of_updates,
+    evaluate,
+    guests_of,
+)
 from mjx_reinforce.training.division import ALONE, Division
-from mjx_reinforce.training.evaluation import evaluate, guests_of
 from mjx_reinforce.training.hosting import Guests, Host
 from mjx_reinforce.training.state import Budget, RunState, Seed
 
@@ -37,7 +42,7 @@ class Programs(NamedTuple):
       ``RunState``, and the keys [K, R] of the last test, which plays the episodes of K evaluations
     advance: (RunState, ``Budget``, whether to evaluate, [] or [R]) -> as ``block_of_updates``
     evaluate: (Actor [R, ...], keys [R], whether to, [R], all by default) -> what
-      ``evaluation.evaluate`` returns, [R] each
+      ``block.evaluate`` returns, [R] each
     rides: whether ``advance`` evaluates; else ``evaluate`` does, before it
     like: the shapes of a ``RunState``
     division: among which devices the runs are divided; R are those of one device
@@ -56,7 +61,7 @@ class Looked(NamedTuple):
 
     actor: [S, ...] the policies
     num_updates: [S, 2] how many updates had made them
-    measured: [S] each, what ``evaluation.evaluate`` returns
+    measured: [S] each, what ``block.evaluate`` returns
     """
 
     actor: Actor
@@ -102,7 +107,7 @@ def programs_of(
       config: the settings, in which those that are traced stand for any value.
       num_runs: R, of the shapes; those of one device.
       traced: the names of the settings that differ from run to run.
-      sampled: as for ``evaluation.evaluate``.
+      sampled: as for ``block.evaluate``.
       division: among which devices the runs are divided.
     """
     learner = build_learner({})  # policies and engines are those of any

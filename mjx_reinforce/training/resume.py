@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from mjx_reinforce.engine.checks import fits
+from mjx_reinforce.files import read_json
 from mjx_reinforce.settings.config import Config, flag, marked
 from mjx_reinforce.settings.declare import Mark
 
@@ -32,30 +33,32 @@ _LATER = ("env_set", "seeds")
 _OTHER = "damaged, or of another version of the program; resume with the version that wrote it"
 
 
-def read_record(directory: Path) -> dict[str, Any]:
-    """Returns what config.json of a run says.
+#: The first file of what can go on -> what that is, and the command that goes on with it.
+_BEGUN = {"config.json": ("run", "train"), "sweep.json": ("sweep", "sweep")}
+
+
+def read_record(directory: Path, name: str = "config.json") -> dict[str, Any]:
+    """Returns what the first file of a run or a sweep says.
 
     Raises:
-      ValueError: there is no such run, or the file is damaged.
+      ValueError: it is not there, or it is damaged.
     """
-    path = directory / "config.json"
+    path = directory / name
     try:
-        recorded = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        if isinstance(error, FileNotFoundError) and (directory / "sweep.json").is_file():
-            raise ValueError(
-                f"{directory} is a sweep: python -m mjx_reinforce.sweep --resume {directory} goes "
-                "on with it"
-            ) from error
+        return read_json(path)
+    except ValueError as error:
+        if not isinstance(error.__cause__, FileNotFoundError):
+            raise
+        for other, (kind, command) in _BEGUN.items():
+            if (directory / other).is_file():
+                raise ValueError(
+                    f"{directory} is a {kind}: python -m mjx_reinforce.{command} --resume "
+                    f"{directory} goes on with it"
+                ) from error
         raise ValueError(
-            f"cannot resume {directory}: there is no {path} ({error.strerror}), so nothing was "
-            "begun there; start it anew with --output"
+            f"cannot resume {directory}: there is no {path}, so nothing was begun there; start it "
+            "anew with --output"
         ) from error
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    if not isinstance(recorded, dict):
-        raise ValueError(f"{path} is damaged: it is no object of names and values")
-    return recorded
 
 
 def read_settings(directory: Path) -> Config:
@@ -131,13 +134,12 @@ def is_done(known: Config, asked: Config) -> bool:
     if any(getattr(known, name) != getattr(asked, name) for name in ends):
         return False
     try:
-        summary = json.loads((known.resume / "summary.json").read_text(encoding="utf-8"))
-        status = summary["status"]
-    except (OSError, ValueError, KeyError, TypeError):
+        summary = read_json(known.resume / "summary.json")
+    except ValueError:
         return False
-    if status == "stopped":
+    if summary.get("status") == "stopped":
         raise ValueError(f"{known.resume} was stopped and would be again: {summary.get('reason')}")
-    return status == "finished"
+    return summary.get("status") == "finished"
 
 
 def check_same_program(

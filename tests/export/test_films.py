@@ -12,7 +12,7 @@ from saved_runs import make_run
 
 from mjx_reinforce import envs, load, pretrained
 from mjx_reinforce.envs import models
-from mjx_reinforce.export import films, takes
+from mjx_reinforce.export import films
 from mjx_reinforce.export.run_files import FOLDER
 
 ASSETS = sorted(path.name for path in (FOLDER.parents[2] / "envs" / "assets").glob("*.xml"))
@@ -138,29 +138,29 @@ def test_takes_stand_side_by_side(monkeypatch):
         def draw(self, qpos):
             return np.full(self.shape, qpos[0], np.uint8)
 
-    monkeypatch.setattr(takes, "Renderer", Flat)
-    slow = takes.Take("slow", None, 0.1, np.arange(11.0)[:, None], np.ones(10))
-    quick = takes.Take("quick", None, 0.05, 50 + np.arange(9.0)[:, None], np.ones(8))
-    film = takes.side_by_side([slow, quick], 40, 30, seconds=5.0)
+    monkeypatch.setattr(films, "Renderer", Flat)
+    slow = films.Take("slow", None, 0.1, np.arange(11.0)[:, None], np.ones(10))
+    quick = films.Take("quick", None, 0.05, 50 + np.arange(9.0)[:, None], np.ones(8))
+    film = films.side_by_side([slow, quick], 40, 30, seconds=5.0)
     assert (film.rate, film.length) == (pytest.approx(10.0), 11)
     shades = [[film.draw(i)[0, x] for x in (0, 40)] for i in range(film.length)]
     assert [int(left[0]) for left, _ in shades] == [*range(11)]
     # It ends after 0.4 s, and then stands still.
     assert [int(right[0]) for _, right in shades] == [50, 52, 54, 56, *[58] * 7]
     assert film.draw(0).shape == (30 + 12, 80, 3)  # with their words below
-    assert takes.side_by_side([slow], 40, 30, seconds=0.5).length == 5
+    assert films.side_by_side([slow], 40, 30, seconds=0.5).length == 5
     assert set(film.samples) >= {0, 3}
     with pytest.raises(ValueError, match="at least one take"):
-        takes.side_by_side([], 40, 30, seconds=1.0)
+        films.side_by_side([], 40, 30, seconds=1.0)
 
 
 def test_return_and_time_stand_in_the_picture(monkeypatch):
     said = []
-    monkeypatch.setattr(takes, "caption", lambda picture, *words: said.append(words) or picture)
-    monkeypatch.setattr(takes, "Renderer", lambda *_: type("", (), {"draw": lambda *_: None})())
-    take = takes.Take("mine", None, 0.5, np.zeros((5, 1)), np.array([1.0, 2.0, 400.0, 1000.0]))
+    monkeypatch.setattr(films, "caption", lambda picture, *words: said.append(words) or picture)
+    monkeypatch.setattr(films, "Renderer", lambda *_: type("", (), {"draw": lambda *_: None})())
+    take = films.Take("mine", None, 0.5, np.zeros((5, 1)), np.array([1.0, 2.0, 400.0, 1000.0]))
     for step in range(5):
-        takes._picture(take, takes.Renderer(), 0.5 * step)
+        films._picture(take, films.Renderer(), 0.5 * step)
     assert said[0] == ("mine", "return 0.0    0.0 s")
     assert said[3:] == [("mine", "return 403    1.5 s"), ("mine", "return 1,403    2.0 s")]
 

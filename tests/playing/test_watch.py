@@ -17,7 +17,7 @@ from toys import Survive
 
 from mjx_reinforce import act, envs, load_policy, playing, watch
 from mjx_reinforce.engine.play.rollouts import rollout
-from mjx_reinforce.export import films, takes
+from mjx_reinforce.export import films
 from mjx_reinforce.export.run_files import read_run
 
 
@@ -246,7 +246,7 @@ def test_wrapped_environments_are_filmed(tmp_path, monkeypatch):
     """By a wrapper of brax's, which hands on all attributes, and by one's own, which has few."""
     (tmp_path / "wraps.py").write_text(WRAPPERS)
     monkeypatch.syspath_prepend(tmp_path)
-    for module in (watch, takes):
+    for module in (watch, films):
         monkeypatch.setattr(module, "Renderer", Blank)
     run = make_run(tmp_path)
     change_arrays(run / "policy" / "actor.npz", checksum=None)

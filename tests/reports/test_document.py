@@ -42,12 +42,12 @@ def test_provenance_is_in_words():
         ("last commit of the package's files", "abc"),
         ("packages", "jax 0.10.2; my own 1"),
         ("devices", "cpu, gpu"),
-        ("x64", "off"),
+        ("x64", "False"),
     ]
     assert rows["settings"] == [
         ("learning rate", "0.01"),
         ("hidden sizes", "32-32"),
-        ("antithetic", "on"),
+        ("antithetic", "True"),
     ]
 
 

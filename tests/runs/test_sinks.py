@@ -17,7 +17,7 @@ from mjx_reinforce.runs import sinks
 from mjx_reinforce.runs.observers import RunFiles
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.statistics import iqm, iqm_interval
-from mjx_reinforce.training import rows
+from mjx_reinforce.training import record
 
 
 def evaluation(update, num_seeds=20, first=False):
@@ -32,7 +32,7 @@ def evaluation(update, num_seeds=20, first=False):
     metrics = ("episode_return", "episode_length", "entropy", "gradient_norm")
     counts = ("nonfinite_episodes", "skipped_update")
     last = dict.fromkeys(metrics, values) | dict.fromkeys(counts, updates)
-    return rows.of_evaluation(
+    return record.of_evaluation(
         measured, {} if first else last, updates, 4 * updates, 40 * updates, 0.1 * update
     )
 
@@ -46,7 +46,7 @@ def begin(directory, config):
 @pytest.fixture
 def directory(tmp_path):
     """A run's directory with its metrics.csv, and settings, as sinks find it."""
-    files.create_csv(tmp_path / "metrics.csv", rows.COLUMNS)
+    files.create_csv(tmp_path / "metrics.csv", record.COLUMNS)
     (tmp_path / "config.json").write_text('{"env": "Survive-v0", "learning_rate": 0.01}')
     return tmp_path
 
@@ -119,7 +119,7 @@ def test_before_the_first_update_its_columns_are_not_shown():
 def test_cells_come_back_to_the_last_bit(dtype, data):
     floats = st.floats(width=np.finfo(dtype).bits)
     values = np.array(data.draw(st.lists(floats, min_size=1)), dtype)
-    back = np.array([*map(float, rows._cells(values))], dtype)
+    back = np.array([*map(float, record._cells(values))], dtype)
     np.testing.assert_array_equal(back, values)
     number = ~np.isnan(values)  # of NaN, text keeps no sign
     np.testing.assert_array_equal(np.signbit(back[number]), np.signbit(values[number]))

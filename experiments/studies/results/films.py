@@ -7,8 +7,7 @@ import numpy as np
 
 from mjx_reinforce import Player, envs, load
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.export.films import SAMPLES, gif, import_mujoco
-from mjx_reinforce.export.takes import Film, Take, side_by_side
+from mjx_reinforce.export.films import SAMPLES, Film, Take, gif, import_mujoco, side_by_side
 from mjx_reinforce.files import write_bytes
 from mjx_reinforce.watch import scene
 
