@@ -6,9 +6,8 @@ import sys
 import tyro
 
 from mjx_reinforce import envs
-from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.streams import accept_everything, for_stream
-from mjx_reinforce.settings.flags import one_line_errors, read_command_line
+from mjx_reinforce.console.streams import for_stream
+from mjx_reinforce.settings.flags import run_command
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,20 +20,20 @@ class EnvsSettings:
 
 def main() -> None:
     """Reads the command line, prints, and exits: 0 done, 2 bad input, 130 interrupted."""
-    accept_everything()
-    with one_line_errors():
-        settings = read_command_line(
-            EnvsSettings, sys.argv[1:], command("envs"), EnvsSettings.__doc__ or ""
-        )
-        if settings.env is None:
-            print("\n".join(envs.names()))
-            return
-        envs.check_id(settings.env)
-        from mjx_reinforce.console.jax_setup import configure_jax
-        from mjx_reinforce.runs.about_task import about_task
+    run_command(EnvsSettings, "envs", _print)
 
-        configure_jax()
-        print(for_stream(about_task(settings.env), sys.stdout))
+
+def _print(settings: EnvsSettings) -> None:
+    """Prints what is asked for."""
+    if settings.env is None:
+        print("\n".join(envs.names()))
+        return
+    envs.check_id(settings.env)
+    from mjx_reinforce.console.jax_setup import configure_jax
+    from mjx_reinforce.runs.about_task import about_task
+
+    configure_jax()
+    print(for_stream(about_task(settings.env), sys.stdout))
 
 
 if __name__ == "__main__":

@@ -46,6 +46,21 @@ def check_folder(folder: Path) -> None:
         raise ValueError(f"cannot write to {folder}{missing}; choose another --output") from error
 
 
+def check_output(path: Path, overwrite: bool, *endings: str) -> None:
+    """Raises ValueError if a file cannot be written, or would replace one unasked.
+
+    Args:
+      path: of the file.
+      overwrite: whether it may replace one.
+      endings: one of which its name has.
+    """
+    if path.suffix.lower() not in endings:
+        raise ValueError(f"--output must end in {' or '.join(endings)}, got {path}")
+    check_folder(path.parent)
+    if path.is_dir() or (path.exists() and not overwrite):
+        raise ValueError(f"{path} exists; pass --overwrite or another --output")
+
+
 def check_module(path: Path, example: str) -> None:
     """Raises ValueError for a file that Python cannot import, or that hides another.
 

@@ -3,16 +3,14 @@
 import dataclasses
 import json
 import re
-import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from mjx_reinforce.console.streams import accept_everything
-from mjx_reinforce.files import check_module, write_bytes
-from mjx_reinforce.settings.flags import one_line_errors, read_command_line
+from mjx_reinforce.files import check_module, check_output, write_bytes
+from mjx_reinforce.settings.flags import run_command
 
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import MjModel
@@ -36,27 +34,13 @@ class NewSettings:
     """Replace a file that exists."""
 
 
-def main(argv: Sequence[str] | None = None) -> None:
-    """Reads the command line, writes, and exits: 0 done, 2 bad input, 130 interrupted.
-
-    Args:
-      argv: what follows the command's name; by default what the program was started with.
-    """
-    accept_everything()
-    with one_line_errors():
-        arguments = sys.argv[1:] if argv is None else argv
-        output = write_class(
-            read_command_line(
-                NewSettings, arguments, "mjx-reinforce new", NewSettings.__doc__ or ""
-            )
-        )
-        module = output.stem
-        command = f"mjx-reinforce train --env {module}:{_title(module)} --output {module}_run"
-        print(f"{output}: write its reward, then, in its folder: {command}")
+def main() -> None:
+    """Reads the command line, writes, and exits: 0 done, 2 bad input, 130 interrupted."""
+    run_command(NewSettings, "new", write_class)
 
 
-def write_class(settings: NewSettings) -> Path:
-    """Writes the file and returns its name.
+def write_class(settings: NewSettings) -> None:
+    """Writes the file, and says what to do with it.
 
     Raises:
       ValueError: there is no such model, MuJoCo or MJX cannot run it, or the file's name does not
@@ -69,15 +53,16 @@ def write_class(settings: NewSettings) -> Path:
     check_module(output, "my_robot.py")
     if output.parent.resolve() != xml.parent.resolve():
         raise ValueError(f"{output} must be in the folder of {xml}, where it looks for the model")
-    if output.exists() and not settings.overwrite:
-        raise ValueError(f"{output} exists; pass --overwrite or another --output")
+    check_output(output, settings.overwrite, ".py")
     from mjx_reinforce.envs import models
 
     path = str(xml if xml.parent != Path() else Path.cwd() / xml)
     model = models.load_model(path)
     models.to_mjx(model, path)
     write_bytes(output, class_source(model, xml.name, output.stem).encode())
-    return output
+    module = output.stem
+    train = f"mjx-reinforce train --env {module}:{_title(module)} --output {module}_run"
+    print(f"{output}: write its reward, then, in its folder: {train}")
 
 
 def class_source(model: "MjModel", xml: str, module: str) -> str:

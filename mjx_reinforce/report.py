@@ -2,7 +2,6 @@
 
 import dataclasses
 import shlex
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,10 +9,8 @@ from typing import NamedTuple
 
 import tyro
 
-from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.streams import accept_everything
 from mjx_reinforce.export.run_files import seeds_in
-from mjx_reinforce.files import check_folder, write_bytes
+from mjx_reinforce.files import check_output, write_bytes
 from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import Experiment, relabel
 from mjx_reinforce.reports.findings import Findings, compute_findings
@@ -21,19 +18,17 @@ from mjx_reinforce.reports.page import columns, document, words
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.over_time import worst_seeds
 from mjx_reinforce.reports.page.vega import render_chart
-from mjx_reinforce.settings.flags import one_line_errors, read_command_line
+from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.settings.own_code import env_flag
 from mjx_reinforce.store.provenance import version
-
-_ABOUT = (
-    "Report on trained runs and sweeps: one HTML page that works offline, with its pictures (PNG, "
-    "SVG) and tables (CSV) in a folder beside it."
-)
 
 
 @dataclasses.dataclass(frozen=True)
 class ReportSettings:
-    """What is reported on, and where the page goes."""
+    """Report on trained runs and sweeps: one HTML page that works offline.
+
+    Its pictures (PNG, SVG) and tables (CSV) go into a folder beside it.
+    """
 
     sources: tyro.conf.Positional[tuple[Path, ...]]
     """Run or sweep directories of one task, which are compared."""
@@ -49,18 +44,19 @@ class ReportSettings:
 
 def main() -> None:
     """Reads the command line, writes the report, and exits: 0 done, 2 bad input, 130 stopped."""
-    accept_everything()
-    with one_line_errors():
-        settings = read_command_line(ReportSettings, sys.argv[1:], command("report"), _ABOUT)
-        if settings.output is not None:
-            check_output(settings.output, settings.overwrite)
-        names = _new_names(settings.labels)
-        experiment = relabel(sources.read_experiment(settings.sources), names)
-        output = settings.output or _default_output(settings.sources)
-        check_output(output, settings.overwrite)
-        seconds = _write(experiment, output).seconds
-    size = output.stat().st_size / 1e6
-    took = f"{size:.1f} MB, {seconds:.1f} s"
+    run_command(ReportSettings, "report", _report)
+
+
+def _report(settings: ReportSettings) -> None:
+    """Writes a report, and says where it is."""
+    if settings.output is not None:
+        check_page(settings.output, settings.overwrite)
+    names = _new_names(settings.labels)
+    experiment = relabel(sources.read_experiment(settings.sources), names)
+    output = settings.output or _default_output(settings.sources)
+    check_page(output, settings.overwrite)
+    seconds = _write(experiment, output).seconds
+    took = f"{output.stat().st_size / 1e6:.1f} MB, {seconds:.1f} s"
     print(f"{output} ({took}), pictures and tables in {_beside(output)}")
 
 
@@ -79,20 +75,14 @@ def _default_output(chosen: Sequence[Path]) -> Path:
     return (chosen[0] if alone else Path()) / "report.html"
 
 
-def check_output(output: Path, overwrite: bool) -> None:
+def check_page(output: Path, overwrite: bool) -> None:
     """Raises ValueError if the report cannot be written there, or would replace files unasked."""
-    if output.suffix.lower() not in (".html", ".htm"):
-        raise ValueError(f"{output} is no page; end --output in .html")
-    check_folder(output.parent)
-    if output.is_dir() or output.is_symlink():
-        raise ValueError(f"{output} is a directory or a link; choose another --output")
+    check_output(output, overwrite, ".html", ".htm")
     beside = _beside(output)
     if beside.exists() and not beside.is_dir():
         raise ValueError(f"{beside} is in the way of the pictures; choose another --output")
-    for path in (output, beside):
-        there = path.is_file() or (path.is_dir() and any(path.iterdir()))
-        if there and not overwrite:
-            raise ValueError(f"{path} exists; pass --overwrite or another --output")
+    if beside.is_dir() and any(beside.iterdir()) and not overwrite:
+        raise ValueError(f"{beside} exists; pass --overwrite or another --output")
 
 
 class WrittenReport(NamedTuple):
@@ -111,7 +101,7 @@ class WrittenReport(NamedTuple):
 def write_report(chosen: Sequence[Path], output: Path) -> WrittenReport:
     """Writes the page, and its pictures and tables beside it.
 
-    Replaces what is there; ``check_output`` refuses that.
+    Replaces what is there; ``check_page`` refuses that.
 
     Args:
       chosen: run and sweep directories, see ``sources.read_experiment``.

@@ -1,7 +1,6 @@
 """``python -m mjx_reinforce.watch RUN`` plays a trained policy and makes a film of it."""
 
 import dataclasses
-import sys
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
@@ -13,7 +12,7 @@ from rich.progress import track
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.console.streams import accept_everything, heartbeat, silence_alarms
+from mjx_reinforce.console.streams import heartbeat, silence_alarms
 from mjx_reinforce.export.films import Renderer, Take, gif, import_mujoco, side_by_side, with_sky
 from mjx_reinforce.export.run_files import (
     Run,
@@ -24,8 +23,8 @@ from mjx_reinforce.export.run_files import (
     provenance_of,
     read_run,
 )
-from mjx_reinforce.files import check_folder, write_bytes
-from mjx_reinforce.settings.flags import one_line_errors, read_command_line
+from mjx_reinforce.files import check_output, write_bytes
+from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.settings.own_code import check_named
 
 if TYPE_CHECKING:
@@ -79,13 +78,8 @@ class WatchSettings:
 
 def main() -> None:
     """Reads the command line, films, and exits: 0 done, 2 bad input, 130 interrupted."""
-    accept_everything()
     silence_alarms()
-    with one_line_errors():
-        settings = read_command_line(
-            WatchSettings, sys.argv[1:], command("watch"), WatchSettings.__doc__ or ""
-        )
-        film(dataclasses.replace(settings, run=choose_run(settings.run)))
+    run_command(WatchSettings, "watch", film)
 
 
 class Role(NamedTuple):
@@ -108,6 +102,7 @@ def film(settings: WatchSettings) -> None:
       ValueError: a setting is out of range, or the run is damaged, or nothing can be drawn here.
       OSError: a file cannot be read or written.
     """
+    settings = dataclasses.replace(settings, run=choose_run(settings.run))
     run = None if is_pretrained(settings.run) else read_run(settings.run)
     env_id = run.env if run else str(settings.run)
     horizon = run.horizon if run else provenance_of(env_id)["horizon"]
@@ -188,11 +183,7 @@ def film_path(settings: WatchSettings, run: Run | None) -> Path:
             )
         by_default = Path(f"{settings.run}.gif")
     output = settings.output or by_default
-    if output.suffix.lower() != ".gif":
-        raise ValueError(f"{output} is no film that watch writes; end --output in .gif")
-    check_folder(output.parent)
-    if output.is_dir() or (output.exists() and not settings.overwrite):
-        raise ValueError(f"{output} exists; pass --overwrite or another --output")
+    check_output(output, settings.overwrite, ".gif")
     return output
 
 

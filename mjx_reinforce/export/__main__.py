@@ -1,16 +1,13 @@
 """``python -m mjx_reinforce.export RUN`` takes a trained policy out of the program."""
 
 import dataclasses
-import sys
 from pathlib import Path
 
 import tyro
 
-from mjx_reinforce.console.commands import command
-from mjx_reinforce.console.streams import accept_everything
 from mjx_reinforce.export.run_files import SeedChoice, Which, is_pretrained, read_run
-from mjx_reinforce.files import check_folder, check_module
-from mjx_reinforce.settings.flags import one_line_errors, read_command_line
+from mjx_reinforce.files import check_module, check_output
+from mjx_reinforce.settings.flags import run_command
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -32,13 +29,7 @@ class ExportSettings:
 
 def main() -> None:
     """Reads the command line, exports, and exits: 0 done, 2 bad input, 130 interrupted."""
-    accept_everything()
-    prog = command("export")
-    with one_line_errors():
-        settings = read_command_line(
-            ExportSettings, sys.argv[1:], prog, ExportSettings.__doc__ or ""
-        )
-        print("\n".join(map(str, export(settings))))
+    run_command(ExportSettings, "export", lambda settings: print(*export(settings), sep="\n"))
 
 
 def export(settings: ExportSettings) -> list[Path]:
@@ -72,15 +63,11 @@ def output_files(settings: ExportSettings, seed: int) -> list[Path]:
     in_run = settings.run / f"seed_{seed}.npz"
     of_package = Path(str(settings.run).replace("-", "_") + ".npz")
     output = settings.output or (of_package if is_pretrained(settings.run) else in_run)
-    if output.suffix != ".npz":
-        raise ValueError(f"export writes .npz, got --output {output}")
-    check_folder(output.parent)
-    check_module(output.with_suffix(".py"), "policy.npz")
-    outputs = [output, output.with_suffix(".py")]
-    for path in outputs:
-        if path.is_dir() or (path.exists() and not settings.overwrite):
-            raise ValueError(f"{path} exists; pass --overwrite or another --output")
-    return outputs
+    module = output.with_suffix(".py")
+    check_output(output, settings.overwrite, ".npz")
+    check_module(module, "policy.npz")
+    check_output(module, settings.overwrite, ".py")
+    return [output, module]
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.engine.checks import nearest
+from mjx_reinforce.engine.checks import fits, nearest
 from mjx_reinforce.files import read_json
 from mjx_reinforce.settings.config import read_seeds
 
@@ -80,12 +80,10 @@ def read_run(directory: str | Path) -> Run:
     seeds = settings.get("seeds")
     if isinstance(seeds, str):  # a share of a run; where a sweep kept a few it is a list
         seeds = [*read_seeds(seeds)]
-    if seeds is not None and not (
-        isinstance(seeds, list) and all(type(seed) is int for seed in seeds)
-    ):
+    if not fits(seeds, tuple[int, ...] | None):
         raise ValueError(f"{path} is damaged: seeds must be whole numbers, got {seeds!r}")
     env_set = settings.get("env_set", [])  # runs from before --env-set have none
-    if not (isinstance(env_set, list) and all(isinstance(word, str) for word in env_set)):
+    if not fits(env_set, tuple[str, ...]):
         raise ValueError(f"{path} is damaged: env_set must be a list of texts, got {env_set!r}")
     kept = None if seeds is None else tuple(seeds)
     return Run(directory, env_id, horizon, kept, tuple(env_set))

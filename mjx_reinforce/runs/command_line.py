@@ -49,19 +49,15 @@ def parse(arguments: Sequence[str]) -> Config:
         given would do nothing, or the run to resume is not there, has other settings, was stopped,
         or is of the user's own environment, which is to be named again.
     """
-    default, preset, flags, prog = start(arguments, command("train"))
+    default, flags, prog = start(arguments, command("train"))
     config = _read_config(flags, default, prog)
     if config.minutes is not None and flag_value(flags, "--env-steps"):
         raise ValueError(
             f"--minutes {config.minutes:g} and --env-steps {config.env_steps} both say when the "
             "run ends; leave one out"
         )
-    if preset is not None and config.like is not None:
-        raise ValueError(f"--like has all settings of a run: leave the preset {preset} out")
     if config.resume is None:
         return config
-    if preset is not None:
-        raise ValueError(f"--resume has the run's own settings: leave the preset {preset} out")
     known = resume.read_settings(config.resume)
     asked = _read_config(flags, known, prog)
     resume.check_settings(known, asked)
@@ -71,22 +67,11 @@ def parse(arguments: Sequence[str]) -> Config:
             "--minutes"
         )
         sys.exit(0)
-    check_resumed(known, arguments, config.resume)
+    check_named(vars(known), named_code(arguments), config.resume)
     return asked
 
 
-def check_resumed(known: Config, arguments: Sequence[str], directory: Path) -> None:
-    """Raises ValueError if going on would run code that the command line does not name.
-
-    Args:
-      known: the settings of the run or sweep that is resumed.
-      arguments: the command line.
-      directory: of the run or sweep that is resumed.
-    """
-    check_named(vars(known), named_code(arguments), directory)
-
-
-def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequence[str], str]:
+def start(arguments: Sequence[str], prog: str) -> tuple[Config, Sequence[str], str]:
     """Reads the preset of a command line.
 
     Args:
@@ -94,17 +79,20 @@ def start(arguments: Sequence[str], prog: str) -> tuple[Config, str | None, Sequ
       prog: the name of the program, for --help.
 
     Returns:
-      The default settings, the preset's name or None, the flags, and the program with its preset.
+      The default settings, the flags, and the program with its preset.
 
     Raises:
-      ValueError: there is no such preset.
+      ValueError: there is no such preset, or it stands beside a run that has all settings.
     """
     if not arguments or arguments[0].startswith("-"):
-        return _default(arguments), None, arguments, f"{prog} [PRESET]"
+        return _default(arguments), arguments, f"{prog} [PRESET]"
     preset, *flags = arguments
     if preset not in PRESETS:
         raise ValueError(about_word(preset))
-    return PRESETS[preset][1], preset, flags, f"{prog} {preset}"
+    for name in ("--resume", "--like"):
+        if flag_value(flags, name):
+            raise ValueError(f"{name} has settings of its own: leave the preset {preset} out")
+    return PRESETS[preset][1], flags, f"{prog} {preset}"
 
 
 def _default(arguments: Sequence[str]) -> Config:
@@ -114,15 +102,14 @@ def _default(arguments: Sequence[str]) -> Config:
     if not (Path(like) / "config.json").is_file():
         raise ValueError(f"--like {like}: there is no run, for it has no config.json")
     known = resume.read_settings(Path(like))
-    check_resumed(known, arguments, Path(like))
+    check_named(vars(known), named_code(arguments), Path(like))
     return dataclasses.replace(known, resume=None)
 
 
 def _read_config(arguments: Sequence[str], default: Config, prog: str) -> Config:
     """Returns the settings that flags ask for, with others as given; --help exits."""
     said = _DESCRIPTION if asks_brief_help(arguments) else f"{_DESCRIPTION}\n\n{_names()}"
-    parsed = read_groups(GROUPS, arguments, default, prog, said, _main_settings(default))
-    config = join_groups(parsed, arguments)
+    config, _ = read_groups(GROUPS, arguments, default, prog, said, _main_settings(default))
     check_read(config, changed(config, default))
     return config
 
@@ -141,8 +128,10 @@ def read_groups(
     prog: str,
     description: str,
     main: Sequence[str],
-) -> dict[str, Any]:
-    """Returns each group of settings as flags ask for it; --help exits.
+) -> tuple[Config, dict[str, Any]]:
+    """Returns the settings of a run as flags ask for them, and those that are no run's, by name.
+
+    --help exits.
 
     Args:
       groups: dataclasses under their titles.
@@ -153,7 +142,8 @@ def read_groups(
       main: the settings that --help alone shows.
 
     Raises:
-      ValueError: see ``flags.read_command_line``.
+      ValueError: see ``flags.read_command_line``; or the flags say by --seeds and by --num-seeds
+        how many seeds there are.
     """
     known = vars(default)
     forms = [
@@ -161,23 +151,16 @@ def read_groups(
         for title, group in groups.items()
     ]
     form = dataclasses.make_dataclass("Arguments", forms, frozen=True)
-    return dict(vars(read_command_line(form, arguments, prog, description, main)))
-
-
-def join_groups(groups: Mapping[str, Any], flags: Sequence[str]) -> Config:
-    """Returns the settings of a run from their groups, which ``read_groups`` returned.
-
-    Raises:
-      ValueError: the flags say by --seeds and by --num-seeds how many seeds there are.
-    """
-    config = Config(**{name: x for group in groups.values() for name, x in vars(group).items()})
-    if config.seeds is None:
-        return config
-    if flag_value(flags, "--num-seeds"):
-        raise ValueError(
-            f"--seeds {config.seeds} says how many seeds there are: leave --num-seeds out"
-        )
-    return dataclasses.replace(config, num_seeds=len(read_seeds(config.seeds)))
+    parsed = vars(read_command_line(form, arguments, prog, description, main))
+    found = {name: x for group in parsed.values() for name, x in vars(group).items()}
+    config = Config(**{name: found.pop(name) for name in known})
+    if config.seeds is not None:
+        if flag_value(arguments, "--num-seeds"):
+            raise ValueError(
+                f"--seeds {config.seeds} says how many seeds there are: leave --num-seeds out"
+            )
+        config = dataclasses.replace(config, num_seeds=len(read_seeds(config.seeds)))
+    return config, found
 
 
 def _names() -> str:

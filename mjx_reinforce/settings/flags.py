@@ -2,12 +2,13 @@
 
 import contextlib
 import dataclasses
+import inspect
 import io
 import os
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TextIO, TypeVar, get_args, get_type_hints
 
@@ -17,7 +18,7 @@ from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, Pri
 
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import COMMANDS, command
-from mjx_reinforce.console.streams import columns_of, say_error, wrapped
+from mjx_reinforce.console.streams import accept_everything, columns_of, say_error, wrapped
 from mjx_reinforce.engine.checks import nearest, whole_number
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.settings.config import flag, spoken
@@ -268,11 +269,20 @@ def about_word(word: str) -> str:
     return f"no flag or command takes {word!r}.{hint} (See --help.)"
 
 
-@contextlib.contextmanager
-def one_line_errors() -> Iterator[None]:
-    """Ends the program with one line and status 2 for bad input, with 130 after Ctrl-C."""
+def run_command(form: type[Form], name: str, do: Callable[[Form], object]) -> None:
+    """Reads the command line of a command, does what it says, and exits if that fails.
+
+    Bad input is one line and status 2, and Ctrl-C ends with 130.
+
+    Args:
+      form: the dataclass that is filled in; its docstring is the description.
+      name: of the command.
+      do: what it does.
+    """
+    accept_everything()
     try:
-        yield
+        about = inspect.cleandoc(form.__doc__ or "")
+        do(read_command_line(form, sys.argv[1:], command(name), about))
     except (ValueError, OSError) as error:
         say_error(str(error))
         sys.exit(2)

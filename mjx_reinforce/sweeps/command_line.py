@@ -5,20 +5,16 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, silence_alarms
-from mjx_reinforce.runs.command_line import (
-    check_resumed,
-    join_groups,
-    read_groups,
-    refuse,
-    refuse_full,
-    start,
-)
+from mjx_reinforce.runs.command_line import read_groups, refuse, refuse_full, start
 from mjx_reinforce.settings.config import Config, changed
+from mjx_reinforce.settings.defaults import named_code
 from mjx_reinforce.settings.groups import GROUPS
+from mjx_reinforce.settings.own_code import check_named
 from mjx_reinforce.sweeps import grid
 from mjx_reinforce.sweeps.design import Design, SweepSettings, read_design
 from mjx_reinforce.sweeps.perform import perform
@@ -47,38 +43,27 @@ def parse_design(arguments: Sequence[str]) -> Design:
     Raises:
       ValueError: see ``runs.command_line.parse`` and ``grid.read_over``.
     """
-    default, preset, flags, prog = start(arguments, command("sweep"))
+    default, flags, prog = start(arguments, command("sweep"))
     base, settings = _read_flags(flags, default, prog)
-    if base.resume is None:
-        return Design(
-            base=base,
-            given=changed(base, default),
-            over=grid.read_over(settings.over),
-            search=settings.search,
-            budget=settings.budget,
-            exact=settings.exact,
-            chunk_runs=settings.chunk_runs,
-        )
-    if preset is not None:
-        raise ValueError(f"--resume has the sweep's own settings: leave the preset {preset} out")
-    return _resumed(flags, base.resume, prog)
+    if base.resume is not None:
+        return _resumed(flags, base.resume, prog)
+    over = grid.read_over(settings.pop("over"))
+    return Design(base=base, given=changed(base, default), over=over, **settings)
 
 
-def _read_flags(flags: Sequence[str], default: Config, prog: str) -> tuple[Config, SweepSettings]:
-    """Returns the settings of the runs and of the sweep; --help exits."""
+def _read_flags(flags: Sequence[str], default: Config, prog: str) -> tuple[Config, dict[str, Any]]:
+    """Returns the settings of the runs, and those of the sweep by name; --help exits."""
     groups = {"sweep": SweepSettings, **GROUPS}
-    parsed = read_groups(groups, flags, default, prog, _ABOUT_SWEEPS, _MAIN)
-    settings = parsed.pop("sweep")
-    return join_groups(parsed, flags), settings
+    return read_groups(groups, flags, default, prog, _ABOUT_SWEEPS, _MAIN)
 
 
 def _resumed(flags: Sequence[str], directory: Path, prog: str) -> Design:
     """Returns the sweep in a directory; raises ValueError if flags would change it."""
     design = read_design(directory)
     base, settings = _read_flags(flags, design.base, prog)
-    if dataclasses.replace(base, resume=None) != design.base or settings != SweepSettings():
+    if dataclasses.replace(base, resume=None) != design.base or settings != vars(SweepSettings()):
         raise ValueError(f"the sweep in {directory} goes on as it is: give --resume alone")
-    check_resumed(base, flags, directory)
+    check_named(vars(base), named_code(flags), directory)
     return dataclasses.replace(design, resume=directory)
 
 

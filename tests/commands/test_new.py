@@ -52,10 +52,15 @@ def lint(file):
         subprocess.run([sys.executable, "-m", "ruff", *check, *options], check=True)
 
 
+def write(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["new", *arguments])
+    new.main()
+
+
 def test_a_model_becomes_a_class_that_plays(tmp_path, monkeypatch, capsys):
     shutil.copy(EXAMPLES / "my_arm.xml", tmp_path / "my_robot-2.xml")
     monkeypatch.chdir(tmp_path)
-    new.main(["my_robot-2.xml"])
+    write(monkeypatch, "my_robot-2.xml")
     said = capsys.readouterr().out
     assert "mjx-reinforce train --env my_robot_2:MyRobot2 --output my_robot_2_run" in said
     monkeypatch.syspath_prepend(tmp_path)
@@ -73,7 +78,7 @@ def test_a_model_becomes_a_class_that_plays(tmp_path, monkeypatch, capsys):
 def test_names_of_a_model_cannot_break_the_class(tmp_path, monkeypatch):
     (tmp_path / "sensed.xml").write_text(SENSED.replace("<joint axis", '<joint name="j" axis'))
     monkeypatch.chdir(tmp_path)
-    new.main(["sensed.xml"])
+    write(monkeypatch, "sensed.xml")
     monkeypatch.syspath_prepend(tmp_path)
     env = envs.make("sensed:Sensed")
     assert env.dt == pytest.approx(0.04)
@@ -88,7 +93,7 @@ def test_a_walker_starts_in_its_key_frame(tmp_path, monkeypatch):
     text = SENSED.replace("<joint axis", '<joint name="j" range="-120 -30" axis')
     (tmp_path / "kept.xml").write_text(text.replace("</mujoco>", key))
     monkeypatch.chdir(tmp_path)
-    new.main(["kept.xml"])
+    write(monkeypatch, "kept.xml")
     monkeypatch.syspath_prepend(tmp_path)
     env, home = envs.make("kept:Kept"), np.array([0, 0, 0.2, 0.6, 0, 0.8, 0, -1])
     qpos, qvel = env.initial(jax.random.key(0))
@@ -130,7 +135,7 @@ def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments):
     (tmp_path / "there.py").write_text("")
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit, match="2"):
-        new.main(arguments.split())
+        write(monkeypatch, *arguments.split())
     error = capsys.readouterr().err
     assert WRONG[arguments] in error
     assert error.count("\n") == 1

@@ -132,7 +132,7 @@ def test_a_policy_of_the_package_can_be_exported(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--output", "policy.onnx"], "export writes .npz, got --output policy.onnx"),
+        (["--output", "policy.onnx"], "--output must end in .npz, got policy.onnx"),
         (["--output", "my-policy.npz"], "cannot import 'my-policy.py'"),
         (["--output", "class.npz"], "cannot import 'class.py'"),
         (["--output", "numpy.npz"], "numpy.py would hide Python's or NumPy's numpy"),

@@ -146,8 +146,8 @@ def test_the_compilation_cache_is_that_of_training(tmp_path):
         (["--output", "nowhere/film.gif"], "cannot write to nowhere"),
         (["--output", "/proc/film.gif"], "cannot write to /proc; choose another --output"),
         (["--output", "policy.gif", "--overwrite"], "policy.gif exists"),
-        (["--output", "config.json", "--overwrite"], "config.json is no film that"),
-        (["--output", "film.mp4"], "is no film that watch writes; end --output in .gif"),
+        (["--output", "config.json", "--overwrite"], "must end in .gif, got config.json"),
+        (["--output", "film.mp4"], "--output must end in .gif, got film.mp4"),
     ],
 )
 def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):

@@ -311,7 +311,7 @@ def test_outputs_that_cannot_be_are_refused(tmp_path, name):
     (tmp_path / "page").mkdir()
     (tmp_path / "page" / "notes.txt").write_text("mine")
     with pytest.raises(ValueError, match=name.partition("/")[0].partition(".")[0]):
-        report.check_output(tmp_path / name, overwrite=False)
+        report.check_page(tmp_path / name, overwrite=False)
 
 
 @pytest.mark.parametrize(

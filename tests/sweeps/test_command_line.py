@@ -23,7 +23,7 @@ def resumed(monkeypatch, tmp_path):
     """Parses flags beside --resume; the directory has the sweep of ``FLAGS``."""
     design = command_line.parse_design(FLAGS)
     monkeypatch.setattr(command_line, "read_design", lambda directory: design)
-    monkeypatch.setattr(command_line, "check_resumed", lambda *given: None)
+    monkeypatch.setattr(command_line, "check_named", lambda *given: None)
 
     def parse(*flags) -> tuple[Design, Design]:
         return design, command_line.parse_design([*flags, "--resume", str(tmp_path)])
@@ -46,10 +46,3 @@ def test_a_run_that_goes_on_is_no_sweep(tmp_path):
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(ValueError, match="is a run: "):
         command_line.parse_design(["--resume", str(tmp_path)])
-
-
-def test_a_sweep_that_goes_on_takes_no_preset(resumed):
-    with pytest.raises(
-        ValueError, match="has the sweep's own settings: leave the preset continuous-cartpole"
-    ):
-        resumed("continuous-cartpole")
