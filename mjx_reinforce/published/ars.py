@@ -119,10 +119,27 @@ def ars(
     contract.check_policy(policy, env, size)
     plays = choice.choose(engine, env)
 
+    make_step = functools.partial(_of_the_best, top) if increment is None else increment
+
     def init(key: jax.Array) -> TrainState:
         check_key(key)
         policy_key, key = jax.random.split(key)
         return TrainState(key=key, actor=learner.first_actor(policy, size, policy_key))
+
+    play = _play(env, policy, plays, num_directions, noise_std, horizon)
+    learn = _learn(make_step, step_size, noise_std, (normalize_steps, normalize_min_std))
+    return Learner(init, play, learn, policy, plays)
+
+
+def _play(
+    env: Environment,
+    policy: Policy,
+    plays: choice.Engine,
+    num_directions: int,
+    noise_std: float | jax.Array,
+    horizon: int,
+) -> Callable[..., Trial]:
+    """Returns ``Learner.play``."""
 
     def play(state: TrainState, key: jax.Array, active: bool | jax.Array = True) -> Trial:
         directions_key, episodes_key = jax.random.split(key)
@@ -146,30 +163,37 @@ def ars(
         played = jax.vmap(one_way)(params, jax.random.split(episodes_key))
         return Trial(directions, _join_rollouts(played))
 
+    return play
+
+
+def _learn(
+    increment: Increment,
+    step_size: float | jax.Array,
+    noise_std: float | jax.Array,
+    normalize_limits: tuple[float, float | jax.Array],
+) -> Callable[[TrainState, Trial, jax.Array], tuple[TrainState, Metrics]]:
+    """Returns ``Learner.learn``."""
+
     def learn(state: TrainState, trial: Trial, key: jax.Array) -> tuple[TrainState, Metrics]:
         del key
         actor, played = state.actor, trial.trajectory
-        returns = replace_broken(episode_returns(played), played.nonfinite)
-        returns = returns.reshape(2, num_directions)
-        step = (increment or functools.partial(_of_the_best, top))(
-            trial.directions, returns, noise_std
-        )
+        returns = replace_broken(episode_returns(played), played.nonfinite).reshape(2, -1)
+        step = increment(trial.directions, returns, noise_std)
         params = jax.tree.map(lambda p, d: p + step_size * d, actor.params, step)
-        limits = normalize_steps, normalize_min_std
-        normalizer = normalize.count(actor.normalizer, played, *limits)
+        normalizer = normalize.count(actor.normalizer, played, *normalize_limits)
         kept, skipped = learner.keep_finite(Actor(params=params, normalizer=normalizer), actor)
         measured = {
             "entropy": jnp.zeros(()),
             "gradient_norm": optax.tree.norm(step),
             "return_std": jnp.std(returns),
         }
-        if num_directions > 1:
+        if returns.shape[1] > 1:
             measured["gradient_snr"] = _step_signal_to_noise(trial.directions, returns)
         sound = (skipped == 0) & ~jnp.any(played.nonfinite)
         metrics = learner.episode_metrics(played) | diagnostics.nan_unless(sound, measured)
         return dataclasses.replace(state, actor=kept), metrics | {"skipped_update": skipped}
 
-    return Learner(init, play, learn, policy, plays)
+    return learn
 
 
 def _of_the_best(top: int, directions: Params, returns: jax.Array, noise_std: Any) -> Any:
