@@ -10,7 +10,7 @@ import secrets
 import sys
 import tempfile
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -159,19 +159,11 @@ def finite(value: object) -> Any:
     return value
 
 
-def create_csv(path: Path, columns: Sequence[str]) -> None:
-    """Writes a CSV file that has the names of its columns and no rows yet."""
-    write_bytes(path, csv_bytes(columns, []))
-
-
-def csv_bytes(columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> bytes:
-    """Returns a whole CSV file: the names of its columns, then its rows."""
-    return _lines([dict(zip(columns, columns, strict=True)), *rows], columns)
-
-
-def append_csv(path: Path, columns: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> None:
-    """Adds rows to a file of ``create_csv``; a row is whole once its line has ended."""
-    append(path, _lines(rows, columns))
+def csv_text(rows: Iterable[Iterable[Any]]) -> str:
+    """Returns rows as the lines of a CSV file."""
+    text = io.StringIO(newline="")
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
 
 
 def append(path: Path, content: bytes) -> None:
@@ -194,11 +186,3 @@ def cut(path: Path, length: int) -> None:
     """Cuts a file back to a length in bytes."""
     with path.open("r+b") as file:
         file.truncate(length)
-
-
-def _lines(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> bytes:
-    """Returns rows as the lines of a CSV file."""
-    text = io.StringIO(newline="")
-    values = ([row.get(name, "") for name in columns] for row in rows)
-    csv.writer(text, lineterminator="\n").writerows(values)
-    return text.getvalue().encode()

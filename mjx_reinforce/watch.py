@@ -14,15 +14,7 @@ from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import heartbeat, silence_alarms
 from mjx_reinforce.export.films import Renderer, Take, gif, import_mujoco, side_by_side, with_sky
-from mjx_reinforce.export.run_files import (
-    Run,
-    SeedChoice,
-    Which,
-    choose_seed,
-    is_pretrained,
-    provenance_of,
-    read_run,
-)
+from mjx_reinforce.export.run_files import Run, SeedChoice, Which, choose_seed, read_run
 from mjx_reinforce.files import check_output, write_bytes
 from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.settings.own_code import check_named
@@ -102,30 +94,26 @@ def film(settings: WatchSettings) -> None:
       ValueError: a setting is out of range, or the run is damaged, or nothing can be drawn here.
       OSError: a file cannot be read or written.
     """
-    settings = dataclasses.replace(settings, run=choose_run(settings.run))
-    run = None if is_pretrained(settings.run) else read_run(settings.run)
-    env_id = run.env if run else str(settings.run)
-    horizon = run.horizon if run else provenance_of(env_id)["horizon"]
-    if settings.env not in (None, env_id):
-        raise ValueError(f"--env is {settings.env}, but {settings.run} was trained on {env_id}")
-    check_named({"env": env_id}, {"env": settings.env}, settings.run)
+    run = read_run(choose_run(settings.run))
+    if settings.env not in (None, run.env):
+        raise ValueError(f"--env is {settings.env}, but {run.directory} was trained on {run.env}")
+    check_named({"env": run.env}, {"env": settings.env}, run.directory)
     output = film_path(settings, run)
     import_mujoco()
     configure_jax()
     roles = cast(settings, run)
-    env = envs.make_set(env_id, run.env_set if run else ())
-    if run:
-        _check_observations(env, roles[-1].player, run)
+    env = envs.make_set(run.env, run.env_set)
+    _check_observations(env, roles[-1].player, run)
     model = scene(env)
     size = settings.width, settings.height
     renderer = Renderer(model, *size)  # raises before anything is compiled
     takes = []
     for role in roles:
-        name, play = _simulator(settings.backend, env, role.player, horizon, packaged=run is None)
+        name, play = _simulator(settings.backend, env, role.player, run)
         with _waiting("compiling and playing"):
             episode = play(settings.episode, settings.noise)
         steps = f"{len(episode.rewards)} steps in {name}"
-        print(f"{env_id}, {role.name}: return {episode.total:.1f} in {steps}")
+        print(f"{run.env}, {role.name}: return {episode.total:.1f} in {steps}")
         takes.append(Take(role.label, model, _within(env, "dt").dt, *episode))
     shown = side_by_side(takes, *size, seconds=settings.seconds, renderer=renderer)
     samples = [*map(shown.draw, shown.samples)]
@@ -155,12 +143,12 @@ def choose_run(directory: Path) -> Path:
     return directory
 
 
-def film_path(settings: WatchSettings, run: Run | None) -> Path:
+def film_path(settings: WatchSettings, run: Run) -> Path:
     """Returns the film's path.
 
     Args:
       settings: of the film.
-      run: whose policy plays; None for a policy of the package.
+      run: whose policy plays.
 
     Raises:
       ValueError: a setting is out of range, the run has no such seed, or the film exists or cannot
@@ -172,37 +160,29 @@ def film_path(settings: WatchSettings, run: Run | None) -> Path:
         value = getattr(settings, name)
         if not least <= value <= most:
             raise ValueError(f"--{name} must be in [{least}, {most}], got {value}")
-    if run:
-        by_default = run.directory / f"seed-{choose_seed(run, settings.seed, settings.which)}.gif"
-    else:
-        beside = settings.beside not in (None, "untrained")
-        if settings.seed != "best" or settings.which != "last" or beside:
-            raise ValueError(
-                f"the package has one policy for {settings.run}; leave --seed, --which and "
-                "--beside out (but for --beside untrained), or give a run directory"
-            )
-        by_default = Path(f"{settings.run}.gif")
+    seed = choose_seed(run, settings.seed, settings.which)
+    by_default = Path(f"{run.env}.gif") if run.packaged else run.directory / f"seed-{seed}.gif"
     output = settings.output or by_default
     check_output(output, settings.overwrite, ".gif")
     return output
 
 
-def cast(settings: WatchSettings, run: Run | None) -> list[Role]:
+def cast(settings: WatchSettings, run: Run) -> list[Role]:
     """Returns the policies that play, from left to right; the last is the one asked for.
 
     Args:
       settings: of the film.
-      run: that of the settings; None for a policy of the package.
+      run: that of the settings.
 
     Raises:
       ValueError: the run has no such seed, or a file is damaged.
     """
-    from mjx_reinforce.export.player import load
+    from mjx_reinforce.export.player import load_seed
 
     def role(seed: SeedChoice) -> Role:
-        player = load(settings.run, seed, which=settings.which, policy=settings.policy)
+        player, _ = load_seed(run, seed, settings.which, settings.policy)
         rank = f" ({seed})" if isinstance(seed, str) else ""
-        name = f"seed {player.seed}" if run else "the package's policy"
+        name = "the package's policy" if run.packaged else f"seed {player.seed}"
         return Role(f"seed {player.seed}{rank}", name, player)
 
     main = role(settings.seed)
@@ -238,16 +218,16 @@ def _check_observations(env: "Environment", player: "Player", run: Run) -> None:
 
 
 def _simulator(
-    backend: str | None, env: "Environment", player: "Player", horizon: int, *, packaged: bool
+    backend: str | None, env: "Environment", player: "Player", run: Run
 ) -> tuple[str, Any]:
     """Returns the name of the simulation that plays, and a ``playing.Simulator``."""
     from mjx_reinforce import playing
     from mjx_reinforce.envs.base import MujocoEnv
 
     if backend is None:
-        backend = "mujoco" if packaged and isinstance(env, MujocoEnv) else "mjx"
+        backend = "mujoco" if run.packaged and isinstance(env, MujocoEnv) else "mjx"
     play = playing.mujoco_simulator if backend == "mujoco" else playing.simulator
-    return backend, play(env, player, horizon)
+    return backend, play(env, player, run.horizon)
 
 
 def _waiting(what: str) -> AbstractContextManager[Any]:

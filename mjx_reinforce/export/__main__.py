@@ -5,7 +5,7 @@ from pathlib import Path
 
 import tyro
 
-from mjx_reinforce.export.run_files import SeedChoice, Which, is_pretrained, read_run
+from mjx_reinforce.export.run_files import Run, SeedChoice, Which, read_run
 from mjx_reinforce.files import check_module, check_output
 from mjx_reinforce.settings.flags import run_command
 
@@ -39,14 +39,13 @@ def export(settings: ExportSettings) -> list[Path]:
       ValueError: a setting is out of range, or the run is damaged.
       OSError: a file cannot be written.
     """
-    if not is_pretrained(settings.run):
-        read_run(settings.run)
+    run = read_run(settings.run)
     from mjx_reinforce.export.arithmetic import arithmetic, numpy_source
-    from mjx_reinforce.export.player import load_saved
+    from mjx_reinforce.export.player import load_seed
     from mjx_reinforce.files import write_arrays, write_bytes
 
-    player, saved = load_saved(settings.run, settings.seed, settings.which)
-    outputs = output_files(settings, player.seed)
+    player, saved = load_seed(run, settings.seed, settings.which)
+    outputs = output_files(settings, run, player.seed)
     plain = arithmetic(saved)
     write_arrays(outputs[0], plain.arrays)
     source = numpy_source(plain, outputs[0].stem, player.env, player.seed)
@@ -54,15 +53,16 @@ def export(settings: ExportSettings) -> list[Path]:
     return outputs
 
 
-def output_files(settings: ExportSettings, seed: int) -> list[Path]:
+def output_files(settings: ExportSettings, run: Run, seed: int) -> list[Path]:
     """Returns the files that are to be written.
 
     Raises:
       ValueError: their name does not fit, they exist, or they cannot be written.
     """
-    in_run = settings.run / f"seed_{seed}.npz"
-    of_package = Path(str(settings.run).replace("-", "_") + ".npz")
-    output = settings.output or (of_package if is_pretrained(settings.run) else in_run)
+    by_default = run.directory / f"seed_{seed}.npz"
+    if run.packaged:
+        by_default = Path(f"{run.env.replace('-', '_')}.npz")
+    output = settings.output or by_default
     module = output.with_suffix(".py")
     check_output(output, settings.overwrite, ".npz")
     check_module(module, "policy.npz")

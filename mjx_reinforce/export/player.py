@@ -10,14 +10,11 @@ import numpy as np
 from mjx_reinforce.engine.checks import check_type
 from mjx_reinforce.export.policy_files import SavedPolicy, read_policy
 from mjx_reinforce.export.run_files import (
-    FOLDER,
     Run,
     SeedChoice,
     Which,
     choose_seed,
-    is_pretrained,
     policy_folder,
-    provenance_of,
     read_run,
 )
 from mjx_reinforce.learning.policy import Actor, Policy, act
@@ -108,24 +105,8 @@ def load(
       >>> player.env, player.act(np.zeros(17)).shape, player.act(np.zeros((5, 17))).shape
       ('HalfCheetah-v5', (6,), (5, 6))
     """
-    return load_saved(run, seed, which, policy)[0]
-
-
-def load_saved(
-    run: str | Path, seed: SeedChoice = "best", which: Which = "last", policy: str | None = None
-) -> tuple[Player, SavedPolicy]:
-    """Loads a policy, as ``load``, with what its files say."""
     check_type("run", run, str | Path)
-    if not is_pretrained(run):
-        return load_seed(read_run(run), seed, which, policy)
-    name = str(run)
-    if (seed, which) != ("best", "last"):
-        raise ValueError(
-            f"the package has one policy for {name}, of the best seed; leave seed and which out, "
-            "or give a run directory"
-        )
-    saved = read_policy(FOLDER / name, 0)
-    return Player(name, provenance_of(name)["seed"], saved.policy, saved.actor), saved
+    return load_seed(read_run(run), seed, which, policy)[0]
 
 
 def load_seed(

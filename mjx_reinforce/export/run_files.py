@@ -24,13 +24,14 @@ _NOT_YET = "its training goes on, or was killed, and then train --resume goes on
 
 
 class Run(NamedTuple):
-    """A run directory.
+    """A run directory, or a folder of the package with the policy of one seed.
 
     directory: where it is
     env: the id of its environment
     horizon: the time limit in env steps
     seeds: the numbers of the seeds whose policies are here, where these are not 0, 1, ...
     env_set: settings of the environment, NAME=VALUE each
+    packaged: whether it comes with the package
     """
 
     directory: Path
@@ -38,6 +39,7 @@ class Run(NamedTuple):
     horizon: int
     seeds: tuple[int, ...] | None = None
     env_set: tuple[str, ...] = ()
+    packaged: bool = False
 
     def place(self, seed: int) -> int:
         """Returns where among the policies that of a seed is; ValueError if it was not kept."""
@@ -50,12 +52,15 @@ class Run(NamedTuple):
 
 
 def read_run(directory: str | Path) -> Run:
-    """Reads the config.json of a run directory.
+    """Reads the config.json of a run directory; the id of a task is its run of the package.
 
     Raises:
       ValueError: it is no run directory, or it has no policy yet.
     """
     directory = Path(directory)
+    if str(directory) in pretrained() and not directory.exists():
+        name, facts = str(directory), provenance_of(str(directory))
+        return Run(FOLDER / name, name, facts["horizon"], (facts["seed"],), packaged=True)
     path = directory / "config.json"
     if not path.is_file():
         if (directory / "sweep.json").is_file():
@@ -112,7 +117,7 @@ def policy_folder(run: Run, which: Which) -> Path:
     """
     if which not in _PLACES:
         raise ValueError(f"which must be one of {', '.join(_PLACES)}, got {which!r}")
-    folder = run.directory / _PLACES[which][0]
+    folder = run.directory if run.packaged else run.directory / _PLACES[which][0]
     if not folder.is_dir():
         raise ValueError(f"{run.directory} has no {_PLACES[which][0]}: it kept the last policies")
     return folder
@@ -133,6 +138,13 @@ def choose_seed(run: Run, seed: SeedChoice, which: Which = "last") -> int:
         these.
     """
     policy_folder(run, which)
+    if run.packaged and run.seeds is not None:
+        if (seed, which) == ("best", "last"):
+            return run.seeds[0]
+        raise ValueError(
+            f"the package has one policy for {run.env}, of the best seed; leave other choices out, "
+            "or give a run directory"
+        )
     if isinstance(seed, int | np.integer):
         return int(seed)
     if seed not in ("best", "worst", "median"):
@@ -197,11 +209,6 @@ def pretrained() -> dict[str, dict[str, Any]]:
       True
     """
     return {path.name: provenance_of(path.name) for path in sorted(FOLDER.glob("*-v*"))}
-
-
-def is_pretrained(name: str | Path) -> bool:
-    """Returns whether there is a policy for a task of this id, and no folder here of this name."""
-    return str(name) in {path.name for path in FOLDER.glob("*-v*")} and not Path(name).exists()
 
 
 def provenance_of(name: str) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from mjx_reinforce.store.provenance import provenance
 from mjx_reinforce.training import checkpoint, resume
 from mjx_reinforce.training.checkpoint import Attempts, Checkpoint, SaveDue
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer
-from mjx_reinforce.training.record import COLUMNS, Cells, lines
+from mjx_reinforce.training.record import HEADER, Cells, lines
 
 #: The files of a run, besides those in ``checkpoint/``.
 _POLICY = ("policy/actor.npz", "policy/policy.json")
@@ -89,7 +89,7 @@ class RunFiles(Observer):
         settings = dataclasses.asdict(config) | {"output": str(self._directory)}
         del settings["resume"]
         self._write_json("config.json", settings | provenance())
-        files.create_csv(self._metrics, COLUMNS)
+        write_bytes(self._metrics, HEADER)
 
     def _take_back(self, config: Config, directory: Path, found: Checkpoint | None) -> None:
         """Takes the files back to a checkpoint, and says in config.json that the run goes on.
@@ -109,7 +109,7 @@ class RunFiles(Observer):
         self._write_json("summary.json", {"status": "running", **moment})
         checkpoint.remove_checkpoints(self._checkpoints, after=found.number if found else 0)
         if found is None:
-            files.create_csv(self._metrics, COLUMNS)
+            write_bytes(self._metrics, HEADER)
         else:
             files.cut(self._metrics, found.metrics_bytes)
 

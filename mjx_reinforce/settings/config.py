@@ -19,7 +19,6 @@ from mjx_reinforce.registry import (
     ESTIMATORS,
     SEARCHES,
     check_choice,
-    is_own,
 )
 from mjx_reinforce.settings.declare import MAX_COUNT, MAX_OF_UPDATE, Range
 from mjx_reinforce.settings.groups import (
@@ -147,11 +146,6 @@ def check_each(config: Config) -> None:
         )
     envs.check_id(config.env)
     split_words(config.env_set)
-    if config.algorithm not in ALGORITHMS and not is_own(config.algorithm):
-        raise ValueError(
-            f"--algorithm must be {' or '.join(sorted(ALGORITHMS))}, or module:name for your own, "
-            f"got {config.algorithm!r}"
-        )
     check_choice("algorithm", config.algorithm, ALGORITHMS)
     check_choice("policy", config.policy, {"auto": None} | DISTRIBUTIONS)
     check_choice("estimator", config.estimator, ESTIMATORS)

@@ -52,7 +52,6 @@ class Range(enum.Enum):
     FEW_LAYERS = f"at most {_MAX_LAYERS} layers", lambda x: len(x) <= _MAX_LAYERS
     POSITIVE = "positive and finite", lambda x: math.isfinite(x) and x > 0
     NOT_NEGATIVE = "finite and not negative", lambda x: math.isfinite(x) and x >= 0
-    FINITE = "finite, in float32", lambda x: math.isfinite(x) and abs(x) <= _MAX_SIZE
     # Weights are about 1, and most optimisers move each of them by about the rate.
     RATE = (
         f"in [{1 / _MAX_SIZE:g}, {_MAX_RATE}], for a step moves a weight by about that",

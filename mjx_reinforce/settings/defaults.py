@@ -6,7 +6,8 @@ them, and all that comes later sees plain settings. Presets have their own.
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from mjx_reinforce.engine.checks import whole_number
 from mjx_reinforce.settings import tables
@@ -130,23 +131,16 @@ def flag_value(arguments: Sequence[str], flag: str) -> str | None:
 
 def for_arguments(arguments: Sequence[str]) -> Config:
     """Returns the default settings for what a command line names: the task, seeds and budget."""
-    env_steps, num_seeds = (
-        _positive_number(flag_value(arguments, f)) for f in ("--env-steps", "--num-seeds")
-    )
-    minutes = flag_value(arguments, "--minutes") or ""
-    try:
-        seconds = 60 * float(minutes)
-    except ValueError:  # none, or what the parser refuses
-        seconds = None
-    known = seconds if seconds and 0 < seconds < float("inf") else None
-    env = flag_value(arguments, "--env") or Config.env
-    return of_task(env, env_steps, num_seeds or Config.num_seeds, known)
 
+    def given(flag: str, read: Callable[[str], Any]) -> Any:
+        """Returns a positive number, or None, also for what the parser refuses."""
+        try:
+            number = read(flag_value(arguments, flag) or "")
+        except ValueError:
+            return None
+        return number if 0 < number < float("inf") else None
 
-def _positive_number(text: str | None) -> int | None:
-    """Returns a number from a command line; None for none, and for what the parser refuses."""
-    try:
-        number = whole_number(text or "")
-    except ValueError:
-        return None
-    return number if number > 0 else None
+    env, minutes = flag_value(arguments, "--env") or Config.env, given("--minutes", float)
+    num_seeds = given("--num-seeds", whole_number) or Config.num_seeds
+    seconds = None if minutes is None else 60 * minutes
+    return of_task(env, given("--env-steps", whole_number), num_seeds, seconds)

@@ -20,7 +20,7 @@ def provenance() -> dict[str, Any]:
 
     return {
         "python": platform.python_version(),
-        "packages": versions(),
+        "packages": {name: version(name) for name in _RECORDED},
         "git_commit": _git_commit(),
         "device": str(jax.local_devices()[0].device_kind),
         **available.known_by(),
@@ -31,11 +31,6 @@ def provenance() -> dict[str, Any]:
         "x64": jax.numpy.zeros(()).dtype == "float64",
         "xla_flags": os.environ.get("XLA_FLAGS", ""),
     }
-
-
-def versions() -> dict[str, str | None]:
-    """Returns the versions of the packages that compute."""
-    return {name: version(name) for name in _RECORDED}
 
 
 def version(package: str) -> str | None:

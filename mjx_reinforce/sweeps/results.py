@@ -49,7 +49,7 @@ class SweepFiles:
         """
         self._going_on = going_on
         self.directory, self.parts = directory, directory / "parts"
-        self._configurations = [_spelled(values) for values in configurations]
+        self._configurations = [[*map(_spelled, x.values())] for x in configurations]
         self._threshold = threshold
         self._columns = ("configuration", *configurations[0], *_MEASURED)
 
@@ -80,10 +80,8 @@ class SweepFiles:
         for folder, names in ((self.directory, _RESULT_FILES), (self.parts, ("*.npz",))):
             for path in (path for name in names for path in folder.glob(f".{name}.*")):
                 path.unlink()
-        if measured := self._all():
-            self._write_rows(self._rows(measured))
-        else:
-            files.create_csv(self.directory / "results.csv", self._columns)
+        measured = self._all()
+        self._write_rows(self._rows(measured) if measured else [])
 
     def write(self, contents: Mapping[str, Any]) -> None:
         """Writes sweep.json."""
@@ -118,7 +116,7 @@ class SweepFiles:
             "nonfinite": history.now["nonfinite"].astype(np.int32),
         }
         write_arrays(self._path(runs.name), part)
-        files.append_csv(self.directory / "results.csv", self._columns, self._rows(part))
+        files.append(self.directory / "results.csv", files.csv_text(self._rows(part)).encode())
 
     def finish(self) -> None:
         """Joins the parts so far to results.csv and curves.npz, sorted by configuration."""
@@ -163,25 +161,25 @@ class SweepFiles:
         paths = sorted(self.parts.glob("[0-9]*.npz"))
         return join_parts([*map(read_arrays, paths)]) if paths else {}
 
-    def _write_rows(self, rows: Sequence[Mapping[str, Any]]) -> None:
+    def _write_rows(self, rows: Sequence[Sequence[Any]]) -> None:
         """Replaces results.csv at once."""
-        write_bytes(self.directory / "results.csv", files.csv_bytes(self._columns, rows))
+        text = files.csv_text([self._columns, *rows])
+        write_bytes(self.directory / "results.csv", text.encode())
 
-    def _rows(self, part: Arrays) -> list[dict[str, Any]]:
+    def _rows(self, part: Arrays) -> list[list[Any]]:
         """Returns the rows of results.csv of a part."""
         returns, env_steps = part["eval_return"], part["env_steps"]
-        columns = {
-            "seed": part["seed"].tolist(),
-            "final_return": returns[-1].tolist(),
-            "best_return": np.fmax.reduce(returns).tolist(),
-            "env_steps_to_solve": steps_to_solve(returns, env_steps, self._threshold),
-            "env_steps": env_steps[-1].tolist(),
-            "nonfinite": part["nonfinite"].tolist(),
-        }
-        rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        measured = (  # as in ``_MEASURED``
+            part["seed"].tolist(),
+            returns[-1].tolist(),
+            np.fmax.reduce(returns).tolist(),
+            steps_to_solve(returns, env_steps, self._threshold),
+            env_steps[-1].tolist(),
+            part["nonfinite"].tolist(),
+        )
         return [
-            {"configuration": number, **self._configurations[number], **row}
-            for number, row in zip(part["configuration"].tolist(), rows, strict=True)
+            [number, *self._configurations[number], *row]
+            for number, *row in zip(part["configuration"].tolist(), *measured, strict=True)
         ]
 
 
@@ -221,13 +219,8 @@ def join_parts(parts: Sequence[Arrays]) -> Arrays:
     return {name: joined(name)[..., order] for name in parts[0]}
 
 
-def _spelled(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns values for a CSV file: lists as on the command line, None as such."""
-    return {
-        name: ",".join(map(str, x)) or "none"
-        if isinstance(x, tuple)
-        else "None"
-        if x is None
-        else x
-        for name, x in values.items()
-    }
+def _spelled(value: Any) -> Any:
+    """Returns a value for a CSV file: lists as on the command line, None as such."""
+    if isinstance(value, tuple):
+        return ",".join(map(str, value)) or "none"
+    return "None" if value is None else value

@@ -24,6 +24,7 @@ COLUMNS = (
     *("entropy", "gradient_norm", "nonfinite_episodes", "skipped_update"),
     *("kl", "policy_std", "explained_variance", "gradient_snr", "clipped_gradients"),
 )
+HEADER = (",".join(COLUMNS) + "\n").encode()
 #: Columns that an evaluation measures.
 _EVALUATION = ("eval_return", "eval_return_stochastic", "eval_length")
 #: Columns that the last update measured, and the names of its metrics: the same, but for two.

@@ -116,12 +116,12 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
       ValueError: there is no such run, it has no policies, or they are of another form.
     """
     from mjx_reinforce.export.policy_files import read_policy
-    from mjx_reinforce.export.run_files import read_run
+    from mjx_reinforce.export.run_files import policy_folder, read_run
 
     assert config.init_from is not None
     directory = Path(config.init_from)
     run = read_run(directory)
-    saved = read_policy(directory / "policy", own=config.policy)
+    saved = read_policy(policy_folder(run, "last"), own=config.policy)
     settings = {field.name for field in dataclasses.fields(Config)}
     for name in sorted(policy, key=lambda name: name in settings):  # what no flag sets goes first
         value, old = policy[name], saved.settings.get(name, policy[name])

@@ -69,7 +69,7 @@ NONSENSE = {
     "--learning-rate must be a number, got None": {"learning_rate": None},
     "--output must be Path or None, got 'out'": {"output": "out"},
     "--optimizer must be one of 'adam', 'sgd', got 'rms'": {"optimizer": "rms"},
-    "or reinforce, or module:name for your own, got 'ppo'": {"algorithm": "ppo"},
+    "unknown algorithm 'ppo'. Known: ars,": {"algorithm": "ppo"},
     "unknown policy 'gaussian'": {"policy": "gaussian"},
     "Did you mean 'leave-one-out'": {"estimator": "leave-one"},
     "Did you mean 'InvertedPendulum-v5'": {"env": "InvertedPendulm-v5"},

@@ -16,7 +16,7 @@ from toys import Survive
 
 from mjx_reinforce import load, load_policy
 from mjx_reinforce import train as train_module
-from mjx_reinforce.files import append_csv, create_csv
+from mjx_reinforce.files import append, csv_text
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, check_step_count
 from mjx_reinforce.statistics import smooth
@@ -217,26 +217,24 @@ def test_a_ready_policy_may_be_trained():
 
 def test_a_csv_file_grows_by_whole_rows(tmp_path):
     path = tmp_path / "table.csv"
-    create_csv(path, ["a", "b"])
-    append_csv(path, ["a", "b"], [{"a": 1, "b": 0.1}, {"b": "", "a": "x,y"}])
-    append_csv(path, ["a", "b"], [{"a": 2, "b": 1e-30}])
+    for rows in ([["a", "b"]], [[1, 0.1], ["x,y", None]], [[2, 1e-30]]):
+        append(path, csv_text(rows).encode())
     assert path.read_bytes() == b'a,b\n1,0.1\n"x,y",\n2,1e-30\n'
 
 
 def test_a_full_disk_leaves_no_half_row(tmp_path):
     """A limit on the size of files fails as a full disk does: after a part was written."""
     path = tmp_path / "table.csv"
-    create_csv(path, ["a"])
-    append_csv(path, ["a"], [{"a": 1}])
+    append(path, b"a\n1\n")
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (7, hard))
     try:
         with pytest.raises(OSError, match="too large"):
-            append_csv(path, ["a"], [{"a": 23456}])
+            append(path, b"23456\n")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == b"a\n1\n"
-    append_csv(path, ["a"], [{"a": 23456}])
+    append(path, b"23456\n")
     assert path.read_bytes() == b"a\n1\n23456\n"
 
 

@@ -18,7 +18,7 @@ from toys import Survive
 from mjx_reinforce import act, envs, load_policy, playing, watch
 from mjx_reinforce.engine.play.rollouts import rollout
 from mjx_reinforce.export import films
-from mjx_reinforce.export.run_files import read_run
+from mjx_reinforce.export.run_files import Run, read_run
 
 
 def watch_run(monkeypatch, *arguments):
@@ -33,14 +33,13 @@ def run(tmp_path_factory):
 
 
 def roles(run, **settings):
-    place = run.directory if run else Path("Hopper-v5")
-    return watch.cast(watch.WatchSettings(place, **settings), run)
+    return watch.cast(watch.WatchSettings(**settings), run)
 
 
 def test_who_plays_is_named_where_there_are_two(run):
     (alone,) = roles(run, seed=2)
     assert (alone.label, alone.name, alone.player.seed) == ("CartPole-v1", "seed 2", 2)
-    (alone,) = roles(None)
+    (alone,) = roles(read_run("Hopper-v5"))
     assert (alone.label, alone.name) == ("Hopper-v5", "the package's policy")
     both = roles(run, beside="worst")
     assert [x.label for x in both] == ["seed 0 (worst)", "seed 1 (best)"]
@@ -79,7 +78,8 @@ def test_which_simulation_plays(monkeypatch, asked):
         (Pole(), True, "mujoco"),
         (Pole(), False, "mjx"),
     ):
-        found = watch._simulator(asked, env, None, 9, packaged=packaged)  # pyright: ignore
+        run = Run(Path(), "Pole-v0", 9, packaged=packaged)
+        found = watch._simulator(asked, env, None, run)  # pyright: ignore
         assert found == plays[asked or unasked]
 
 

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mjx_reinforce import files
 from mjx_reinforce import train as train_module
 from mjx_reinforce.runs import sinks
 from mjx_reinforce.runs.observers import RunFiles
@@ -46,7 +45,7 @@ def begin(directory, config):
 @pytest.fixture
 def directory(tmp_path):
     """A run's directory with its metrics.csv, and settings, as sinks find it."""
-    files.create_csv(tmp_path / "metrics.csv", record.COLUMNS)
+    (tmp_path / "metrics.csv").write_bytes(record.HEADER)
     (tmp_path / "config.json").write_text('{"env": "Survive-v0", "learning_rate": 0.01}')
     return tmp_path
 

@@ -18,7 +18,7 @@ import numpy as np
 from experiments.kit.rows import read
 from experiments.studies.results.runs import ended
 from experiments.studies.results.tasks import Task
-from mjx_reinforce.files import csv_bytes, read_json, write_bytes, write_json
+from mjx_reinforce.files import csv_text, read_json, write_bytes, write_json
 from mjx_reinforce.reports.directories import PROVENANCE, read_columns, read_metrics
 from mjx_reinforce.statistics import steps_to_solve
 from mjx_reinforce.statistics.aggregates import interval
@@ -98,8 +98,8 @@ def gather_tasks(tasks: Iterable[Task], directory: Path, folder: Path) -> None:
         solved = [math.inf if x is None else x for x in solved]
         test, best = summary["final_test_returns"], np.fmax.reduce(returns)
         seeds = zip(range(len(test)), steps[-1], test, returns[-1], best, solved, strict=True)
-        rows = [dict(zip(_SEED, (f"{x:.9g}" for x in row), strict=True)) for row in seeds]
-        write_bytes(folder / f"{task.name}-seeds.csv", csv_bytes(_SEED, rows))
+        rows = [[f"{x:.9g}" for x in row] for row in seeds]
+        write_bytes(folder / f"{task.name}-seeds.csv", csv_text([_SEED, *rows]).encode())
         names = ("status", "threshold", "engine", "num_seeds", "compile_seconds", "run_seconds")
         facts = {k: summary[k] for k in names} | {k: config[k] for k in PROVENANCE if k in config}
         facts["settings"] = {k: v for k, v in config.items() if k not in (*PROVENANCE, "output")}
@@ -188,7 +188,8 @@ def _replace(path: Path, names: Sequence[str], rows: list[dict[str, Any]]) -> No
         for row in rows
     ]
     everything = sorted([*kept, *texts], key=lambda row: (row["task"], row["device"]))
-    write_bytes(path, csv_bytes(tuple(names), everything))
+    lines = [[row.get(name, "") for name in names] for row in everything]
+    write_bytes(path, csv_text([names, *lines]).encode())
 
 
 def _read(path: Path) -> list[dict[str, str]]:
@@ -232,7 +233,8 @@ def played(folder: Path) -> dict[str, Columns]:
 def write_played(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Writes the returns of episodes; the columns are ``policy``, ``seed``, ``simulation``, ..."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_bytes(path, csv_bytes(tuple(_EPISODE), rows))
+    lines = [[row[name] for name in _EPISODE] for row in rows]
+    write_bytes(path, csv_text([_EPISODE, *lines]).encode())
 
 
 def peers(path: Path) -> dict[tuple[str, str, str], dict[float, list[float]]]:

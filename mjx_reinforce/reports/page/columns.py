@@ -1,7 +1,5 @@
 """Tables by columns, as the page embeds them, and as CSV files."""
 
-import csv
-import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -9,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mjx_reinforce.files import csv_text
 from mjx_reinforce.reports.experiment import say
 from mjx_reinforce.reports.findings import Findings, swept
 
@@ -64,19 +63,17 @@ def results_csv(findings: Findings) -> str:
             solved = int(solving.steps[s]) if solving and solving.solved[s] else ""
             values = (seed, final[s], best[s], solved, end[s], int(part.nonfinite[s]))
             lines.append((place + 1, *settings, *values))
-    return _csv(lines)
+    return csv_text(map(_no_formulas, lines))
 
 
 def table_csv(table: Table, labels: Sequence[str]) -> str:
     """Returns a table as a CSV file."""
     listed = rows(table, labels)
-    return _csv([list(table), *(list(row.values()) for row in listed)])
+    return csv_text(map(_no_formulas, [table, *(row.values() for row in listed)]))
 
 
-def _csv(lines: Sequence[Sequence[Any]]) -> str:
-    text = io.StringIO(newline="")
-    csv.writer(text, lineterminator="\n").writerows([map(_no_formula, line) for line in lines])
-    return text.getvalue()
+def _no_formulas(cells: Iterable[Any]) -> list[Any]:
+    return [*map(_no_formula, cells)]
 
 
 def _no_formula(cell: object) -> Any:
