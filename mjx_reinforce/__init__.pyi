@@ -9,21 +9,12 @@ from mjx_reinforce.envs import make_vec
 from mjx_reinforce.export.player import Player, load
 from mjx_reinforce.export.policy_files import load_policy, save_policy
 from mjx_reinforce.export.run_files import pretrained
-from mjx_reinforce.learning.distributions import (
-    Distribution,
-    categorical,
-    clipped_normal,
-    deterministic,
-    normal,
-    tanh_normal,
-    truncated_normal,
-)
+from mjx_reinforce.learning.bounded import clipped_normal, tanh_normal, truncated_normal
+from mjx_reinforce.learning.distributions import Distribution, categorical, deterministic, normal
 from mjx_reinforce.learning.estimators import (
     Estimator,
     discount_weights,
     leave_one_out,
-    mean_log_prob,
-    normalized_returns,
     reward_to_go,
     shift_rewards,
     standardize,
@@ -33,9 +24,15 @@ from mjx_reinforce.learning.learner import Learner, TrainState, reinforce, train
 from mjx_reinforce.learning.natural_gradient import natural_gradient
 from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy
 from mjx_reinforce.learning.schedules import Cut
-from mjx_reinforce.learning.updates import each_step, full_batch, make_optimizer, minibatches
+from mjx_reinforce.learning.updates import full_batch, make_optimizer
 from mjx_reinforce.learning.value import full_batch_value_baseline, value_baseline
 from mjx_reinforce.published.ars import ars
+from mjx_reinforce.published.variants import (
+    each_step,
+    mean_log_prob,
+    minibatches,
+    normalized_returns,
+)
 from mjx_reinforce.runs.run import RunResults, run
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import of_task

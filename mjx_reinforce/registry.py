@@ -14,9 +14,9 @@ DISTRIBUTIONS = {
     "normal": "mjx_reinforce.learning.distributions:normal",
     "normal-softplus": "mjx_reinforce.learning.distributions:normal_softplus",
     "normal-sigmoid": "mjx_reinforce.learning.distributions:normal_sigmoid",
-    "truncated-normal": "mjx_reinforce.learning.distributions:truncated_normal",
-    "clipped-normal": "mjx_reinforce.learning.distributions:clipped_normal",
-    "tanh-normal": "mjx_reinforce.learning.distributions:tanh_normal",
+    "truncated-normal": "mjx_reinforce.learning.bounded:truncated_normal",
+    "clipped-normal": "mjx_reinforce.learning.bounded:clipped_normal",
+    "tanh-normal": "mjx_reinforce.learning.bounded:tanh_normal",
     "deterministic": "mjx_reinforce.learning.distributions:deterministic",
     "categorical": "mjx_reinforce.learning.distributions:categorical",
 }
@@ -28,8 +28,8 @@ ESTIMATORS = {
     "leave-one-out": "mjx_reinforce.learning.estimators:leave_one_out",
     "leave-one-out-alive": "mjx_reinforce.learning.estimators:leave_one_out_alive",
     "value-baseline": "mjx_reinforce.learning.value:value_baseline",
-    "mean-log-prob": "mjx_reinforce.learning.estimators:mean_log_prob",
-    "normalized-returns": "mjx_reinforce.learning.estimators:normalized_returns",
+    "mean-log-prob": "mjx_reinforce.published.variants:mean_log_prob",
+    "normalized-returns": "mjx_reinforce.published.variants:normalized_returns",
 }
 
 #: Programs of published documents: name -> "module:function" of an environment and the settings.

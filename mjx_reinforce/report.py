@@ -18,8 +18,8 @@ from mjx_reinforce.reports.page import columns, document, words
 from mjx_reinforce.reports.page.document import Watch, encoded
 from mjx_reinforce.reports.page.over_time import worst_seeds
 from mjx_reinforce.reports.page.vega import render_chart
+from mjx_reinforce.settings.config import env_flag
 from mjx_reinforce.settings.flags import run_command
-from mjx_reinforce.settings.own_code import env_flag
 from mjx_reinforce.store.provenance import version
 
 

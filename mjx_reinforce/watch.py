@@ -16,8 +16,8 @@ from mjx_reinforce.console.streams import heartbeat, silence_alarms
 from mjx_reinforce.export.films import Renderer, Take, gif, import_mujoco, side_by_side, with_sky
 from mjx_reinforce.export.run_files import Run, SeedChoice, Which, choose_seed, read_run
 from mjx_reinforce.files import check_output, write_bytes
+from mjx_reinforce.settings.config import check_named
 from mjx_reinforce.settings.flags import run_command
-from mjx_reinforce.settings.own_code import check_named
 
 if TYPE_CHECKING:
     from mjx_reinforce.engine.base import Environment

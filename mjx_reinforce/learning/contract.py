@@ -1,5 +1,6 @@
 """Do the parts of a learner fit together? Found from shapes: nothing is compiled."""
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -12,7 +13,6 @@ from mjx_reinforce.engine.checks import check_kind, check_type, explain
 from mjx_reinforce.learning import updates
 from mjx_reinforce.learning.distributions import Distribution
 from mjx_reinforce.learning.estimators import Estimator
-from mjx_reinforce.learning.natural_gradient import natural_gradient
 from mjx_reinforce.learning.policy import Policy
 
 #: Steps and episodes of the trajectory that an estimator is tried on: no two axes have one size.
@@ -80,10 +80,11 @@ def check_optimizer(name: str, value: optax.GradientTransformation) -> None:
 
 def check_update(update: updates.Update) -> None:
     """Raises ValueError for what is no update, or a function that makes one."""
-    makers = updates.full_batch, updates.minibatches, updates.each_step, natural_gradient
-    if update in makers or not callable(update):
-        got = f"{update.__name__}, which is to be called" if update in makers else repr(update)
-        raise ValueError(f"update must be such as mjx_reinforce.full_batch(), got {got}")
+    try:
+        inspect.signature(update).bind("problem", "key", "params", "opt_state")
+    except (TypeError, ValueError):
+        got = f"{update.__name__}, which is to be called" if callable(update) else repr(update)
+        raise ValueError(f"update must be such as mjx_reinforce.full_batch(), got {got}") from None
 
 
 def check_estimator(

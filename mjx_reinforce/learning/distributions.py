@@ -10,10 +10,10 @@ training, in the action's unit) and ``rescale`` (whether the network's output is
 action's range). It raises ValueError for a space that it does not support.
 
 All Gaussian families are one: an independent Normal in each entry of the action, and what is done
-to a sample of it. ``normal`` leaves it, ``clipped_normal``, ``tanh_normal`` and
-``truncated_normal`` keep it within the action's range.
+to a sample of it. ``normal`` leaves it; those of ``bounded`` keep it within the action's range.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -25,13 +25,9 @@ from jax.typing import ArrayLike
 
 from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.engine.checks import check_number, known_number
-from mjx_reinforce.learning import normal_integrals
-from mjx_reinforce.learning.normal_integrals import LOG_SQRT_2PI, log_tail
 
+LOG_SQRT_2PI = 0.5 * math.log(2.0 * math.pi)
 _MIN_STD = 1e-6
-# float32 cannot recover a z much beyond the first number from tanh(z). Samples beyond it are all
-# recorded as the second.
-_SATURATED, _SATURATION = 5.0, 6.0
 
 
 class Distribution(NamedTuple):
@@ -146,174 +142,6 @@ def normal_sigmoid(
 ) -> Distribution:
     """``normal`` with a state-dependent sigmoid standard deviation, below 1."""
     return normal(space, std="sigmoid", initial_std=initial_std, rescale=rescale)
-
-
-def clipped_normal(
-    space: Box | Discrete, *, std: str = "parameter", initial_std: float = 0.5, rescale: bool = True
-) -> Distribution:
-    """``normal``, clipped to the action's range, which must be finite.
-
-    The environment sees only the clipped action, so ``log_prob`` is the log of that
-    action's probability: the Normal's density inside the range, and at a bound the
-    probability of everything that is clipped to it. The gradient has the same mean as
-    that of ``normal`` and less variance (Fujita and Maeda 2018, arXiv:1802.07564,
-    equation 8). ``entropy`` is that of the clipped action, -E[log_prob].
-
-    Examples:
-      >>> import numpy as np
-      >>> import mjx_reinforce as mr
-      >>> mr.clipped_normal(mr.Box(-np.ones(2), np.ones(2)))
-      Distribution(2 outputs, 2 constants)
-    """
-    layout = gaussian_outputs("clipped-normal", space, std, initial_std, rescale, bounded=True)
-
-    def log_density(action, mean, std):
-        low, high = layout.bounds(mean)
-        inside = normal_log_density(action, mean, std)
-        below, above = log_tail((mean - low) / std), log_tail((high - mean) / std)
-        return jnp.where(action <= low, below, jnp.where(action >= high, above, inside))
-
-    return layout.family(
-        sample=lambda noise, mean, std: jnp.clip(mean + std * noise, *layout.bounds(mean)),
-        mode=lambda mean: jnp.clip(mean, *layout.bounds(mean)),
-        log_density=log_density,
-        entropy=lambda mean, std: _clipped_entropy(mean, std, *layout.bounds(mean)),
-    )
-
-
-def _clipped_entropy(mean: jax.Array, std: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-    """Returns the entropy [...] of a clipped Normal in nats, entry by entry.
-
-    Inside the range -log_prob is x^2 / 2 + log(std sqrt(2 pi)) with x = (action - mean) / std.
-    With a and b the bounds in this unit, phi the standard Normal's density and P the probability
-    of [a, b], the integral of x^2 phi(x) from a to b is P + a phi(a) - b phi(b). Each bound adds
-    -p log p, with p the probability of what is clipped to it.
-    """
-    a, b = (low - mean) / std, (high - mean) / std
-    log_below, log_above = log_tail(-a), log_tail(b)
-    below, above = jnp.exp(log_below), jnp.exp(log_above)
-    edges = b * jnp.exp(-0.5 * b**2 - LOG_SQRT_2PI) - a * jnp.exp(-0.5 * a**2 - LOG_SQRT_2PI)
-    inside = (1.0 - below - above) * normal_entropy(std) - 0.5 * edges
-    return inside - below * log_below - above * log_above
-
-
-def tanh_normal(
-    space: Box | Discrete, *, std: str = "parameter", initial_std: float = 0.5, rescale: bool = True
-) -> Distribution:
-    """``normal`` through a tanh into the action's finite range (Haarnoja et al. 2018, appendix C).
-
-    The action is middle + half tanh(z), where middle + half z is a sample of ``normal``:
-    a small deviation from the middle is hardly changed. ``log_prob`` recovers z from the
-    action, to a thousandth of a standard unit up to |z| = 5, which is within 5e-5 of the
-    range from a bound. Samples beyond are all recorded as z = 6 or -6 and counted with
-    the probability of that whole tail, so the expected score is zero however far the
-    policy saturates.
-
-    ``mode`` is the tanh of the mean: the median, as is usual, not the densest point.
-    ``entropy`` is exact to 1e-7 nats up to a standard deviation of 1 in z, 3e-3 at 3.
-
-    Examples:
-      >>> import numpy as np
-      >>> import mjx_reinforce as mr
-      >>> mr.tanh_normal(mr.Box(-np.ones(2), np.ones(2)))
-      Distribution(2 outputs, 2 constants)
-    """
-    layout = gaussian_outputs("tanh-normal", space, std, initial_std, rescale, bounded=True)
-    middle, half = middle_and_half_range(layout.box)
-
-    def of_z(mean, std):
-        return (mean - middle) / half, std / half
-
-    def sample(noise, mean, std):
-        mean, std = of_z(mean, std)
-        z = mean + std * noise
-        return middle + half * jnp.tanh(
-            jnp.where(jnp.abs(z) < _SATURATED, z, jnp.sign(z) * _SATURATION)
-        )
-
-    return layout.family(
-        sample=sample,
-        mode=lambda mean: middle + half * jnp.tanh((mean - middle) / half),
-        log_density=lambda action, mean, std: _tanh_log_density(
-            (action - middle) / half, *of_z(mean, std), half
-        ),
-        entropy=lambda mean, std: _tanh_entropy(*of_z(mean, std), half),
-    )
-
-
-def _tanh_log_density(
-    squashed: jax.Array, mean: jax.Array, std: jax.Array, half: np.ndarray
-) -> jax.Array:
-    """Returns the log-probability [..., A] of half tanh(z), where z is Normal.
-
-    Args:
-      squashed: [..., A] tanh(z).
-      mean: [..., A] of z.
-      std: [..., A] of z.
-      half: [A] half the width of the action's range.
-    """
-    saturated = jnp.abs(squashed) > 0.5 * (np.tanh(_SATURATED) + np.tanh(_SATURATION))
-    z = jnp.arctanh(jnp.where(saturated, 0.0, squashed))
-    inside = normal_log_density(z, mean, std) - _log_tanh_slope(z) - np.log(half)
-    beyond = log_tail((_SATURATED - jnp.sign(squashed) * mean) / std)
-    return jnp.where(saturated, beyond, inside)
-
-
-def _tanh_entropy(mean: jax.Array, std: jax.Array, half: np.ndarray) -> jax.Array:
-    """Returns the differential entropy [..., A] in nats of half tanh(z), arguments as above.
-
-    It is the entropy of z plus E[log(1 - tanh(z)^2)] + log(half), the expectation by
-    Gauss-Hermite quadrature.
-    """
-    nodes, weights = np.polynomial.hermite_e.hermegauss(32)
-    rule = zip(nodes.tolist(), (weights / np.sum(weights)).tolist(), strict=True)
-    slopes = [weight * _log_tanh_slope(mean + std * node) for node, weight in rule]
-    return normal_entropy(std) + sum(slopes) + np.log(half)
-
-
-def _log_tanh_slope(z: jax.Array) -> jax.Array:
-    """Returns log(1 - tanh(z)^2) [...] without cancellation."""
-    return 2.0 * (float(np.log(2.0)) - z - jax.nn.softplus(-2.0 * z))
-
-
-def truncated_normal(
-    space: Box | Discrete, *, std: str = "parameter", initial_std: float = 0.5, rescale: bool = True
-) -> Distribution:
-    """``normal``, restricted to the action's range, which must be finite.
-
-    Density, entropy and their gradients stay exact when the mean is far outside the range, and so
-    does the sampling, by the inverse distribution function; see ``normal_integrals``. The noise is
-    uniform in (0, 1).
-
-    Examples:
-      >>> import numpy as np
-      >>> import mjx_reinforce as mr
-      >>> mr.truncated_normal(mr.Box(-np.ones(2), np.ones(2)))
-      Distribution(2 outputs, 2 constants)
-    """
-    layout = gaussian_outputs("truncated-normal", space, std, initial_std, rescale, bounded=True)
-
-    def restricted(function):
-        """Returns a function that is given the bounds after its other arguments."""
-        return lambda *given: function(*given, *layout.bounds(given[-1]))
-
-    return layout.family(
-        sample=restricted(normal_integrals.transform),
-        mode=restricted(jnp.clip),
-        log_density=restricted(normal_integrals.log_density),
-        entropy=restricted(normal_integrals.entropy),
-        noise=_open_uniform,
-    )
-
-
-def _open_uniform(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    """Returns uniform noise that is never 0 or 1.
-
-    The generator returns multiples of the dtype's epsilon, 0 among them; half an
-    epsilon is added.
-    """
-    noise = jax.random.uniform(key, shape)
-    return noise + 0.5 * jnp.finfo(noise.dtype).eps
 
 
 def deterministic(

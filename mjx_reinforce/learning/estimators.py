@@ -10,12 +10,11 @@ most estimators here are unbiased for the same gradient, that of a step's own ac
 worth from there, and differ in variance. ``total_return`` is for the gradient of the discounted
 return from the start, in which step t counts discount^t: the same only without a discount.
 ``standardize`` divides the weights of an update by a number that it computes from them, so that
-its gradient has another length, and is no longer exactly unbiased. ``mean_log_prob`` and
-``normalized_returns`` come from published programs, and say what they follow instead.
+its gradient has another length, and is no longer exactly unbiased. ``published.variants`` has two
+of published programs, which follow something else.
 
 An episode in which the simulation left the finite numbers counts as the worst of the others: at
-each step its G[t] is the least of theirs (``replace_broken``). In ``mean_log_prob`` and
-``normalized_returns``, which compare an episode with itself, its weight is the least of theirs.
+each step its G[t] is the least of theirs (``replace_broken``).
 """
 
 import dataclasses
@@ -72,13 +71,13 @@ def total_return(discount: float | jax.Array = 0.99) -> Estimator:
       >>> mr.total_return(discount=1.0)
       Estimator(of 1 episodes or more)
     """
-    _check_discount(discount)
+    check_discount(discount)
 
     def weigh(trajectory):
         returns = _returns(trajectory, discount)
         return jnp.broadcast_to(returns[0], returns.shape)
 
-    return _stateless(weigh)
+    return stateless(weigh)
 
 
 def reward_to_go(discount: float | jax.Array = 0.99) -> Estimator:
@@ -89,8 +88,8 @@ def reward_to_go(discount: float | jax.Array = 0.99) -> Estimator:
       >>> mr.reward_to_go(discount=1.0)
       Estimator(of 1 episodes or more)
     """
-    _check_discount(discount)
-    return _stateless(lambda trajectory: _returns(trajectory, discount))
+    check_discount(discount)
+    return stateless(lambda trajectory: _returns(trajectory, discount))
 
 
 def leave_one_out(discount: float | jax.Array = 0.99) -> Estimator:
@@ -117,7 +116,7 @@ def _less_others(
     discount: float | jax.Array, counts: Callable[[jax.Array], jax.Array]
 ) -> Estimator:
     """An estimator of G[t] less the mean of the other episodes that count, from the mask."""
-    _check_discount(discount)
+    check_discount(discount)
 
     def update(state, trajectory):
         returns = _returns(trajectory, discount)
@@ -131,59 +130,6 @@ def _less_others(
         return weight, state, {"explained_variance": explained}
 
     return Estimator(lambda key, observation_size: (), update, min_episodes=2)
-
-
-def mean_log_prob(discount: float | jax.Array = 0.99) -> Estimator:
-    """Weights every action of an episode of L steps by sum_t G[t] / L.
-
-    That is what the loss ``-sum(mean(log_probs) * returns)`` of Gymnasium's first
-    REINFORCE tutorial comes to, though its comment promises the sum of the
-    products log pi[t] G[t]: the mean over log-probabilities is taken before the
-    product. Its gradient is unbiased, except for E[sum_t G[t] / L], which counts a
-    reward the more often the later it comes. It is also noisy, because the weight of an action
-    contains the rewards from before that action.
-
-    Examples:
-      >>> import mjx_reinforce as mr
-      >>> mr.mean_log_prob(discount=1.0)
-      Estimator(of 1 episodes or more)
-    """
-    _check_discount(discount)
-
-    def weigh(trajectory):
-        returns = discounted_returns(trajectory.reward, discount)
-        mean = _episode_mean(returns, trajectory.mask)
-        return jnp.broadcast_to(replace_broken(mean, trajectory.nonfinite), returns.shape)
-
-    return _stateless(weigh)
-
-
-def normalized_returns(discount: float | jax.Array = 0.99) -> Estimator:
-    """Weights an action by G[t], normalised within its episode.
-
-    The weight is ``(G[t] - mean) / (std + 1.19e-7)``, with the mean and the
-    unbiased standard deviation over the steps of the episode, and 0 in an episode
-    of one step. It is biased. The mean depends on the action. Every episode is scaled to the same
-    spread, so that a long episode counts no more than a short one. Where each step earns the
-    same, the weight depends on the remaining time alone: it is positive for early actions and
-    negative for late ones.
-
-    Examples:
-      >>> import mjx_reinforce as mr
-      >>> mr.normalized_returns(discount=1.0)
-      Estimator(of 1 episodes or more)
-    """
-    _check_discount(discount)
-
-    def weigh(trajectory):
-        mask = trajectory.mask
-        returns = discounted_returns(trajectory.reward, discount)
-        centred = jnp.where(mask, returns - _episode_mean(returns, mask), 0.0)
-        variance = jnp.sum(centred**2, axis=0) / jnp.maximum(jnp.sum(mask, axis=0) - 1, 1)
-        normalized = centred / (jnp.sqrt(variance) + float(jnp.finfo(jnp.float32).eps))
-        return replace_broken(normalized, trajectory.nonfinite)
-
-    return _stateless(weigh)
 
 
 def standardize(
@@ -238,7 +184,7 @@ def discount_weights(estimator: Estimator, discount: float | jax.Array = 0.99) -
       Estimator(of 1 episodes or more)
     """
     check_kind("estimator", estimator, Estimator, "mjx_reinforce.reward_to_go(0.99)")
-    _check_discount(discount)
+    check_discount(discount)
 
     def update(state, trajectory):
         weight, state, metrics = estimator.update(state, trajectory)
@@ -287,18 +233,13 @@ def _returns(trajectory: Trajectory, discount: float | jax.Array) -> jax.Array:
     return replace_broken(returns, trajectory.nonfinite)
 
 
-def _stateless(weigh: Callable[[Trajectory], jax.Array]) -> Estimator:
+def stateless(weigh: Callable[[Trajectory], jax.Array]) -> Estimator:
     """An estimator that learns nothing, from its weights [T, N]."""
 
     def update(state, trajectory):
         return jnp.where(trajectory.mask, weigh(trajectory), 0.0), state, {}
 
     return Estimator(lambda key, observation_size: (), update)
-
-
-def _episode_mean(x: jax.Array, mask: jax.Array) -> jax.Array:
-    """Returns the mean [N] of ``x`` [T, N] over the steps of every episode."""
-    return jnp.sum(jnp.where(mask, x, 0.0), axis=0) / jnp.maximum(jnp.sum(mask, axis=0), 1)
 
 
 def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array) -> jax.Array:
@@ -325,7 +266,7 @@ def explained_variance(residual: jax.Array, returns: jax.Array, mask: jax.Array)
     return jnp.where(varies, 1.0 - variance(residual) / jnp.where(varies, total, 1.0), jnp.nan)
 
 
-def _check_discount(discount: float | jax.Array) -> None:
+def check_discount(discount: float | jax.Array) -> None:
     """Raises ValueError for a discount outside [0, 1]; a traced one is taken on trust."""
     number = known_number(discount)
     if not (number is None or 0.0 <= number <= 1.0):

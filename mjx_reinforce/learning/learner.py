@@ -32,8 +32,7 @@ from mjx_reinforce.learning.diagnostics import Metrics
 from mjx_reinforce.learning.distributions import default_distribution
 from mjx_reinforce.learning.estimators import Estimator, leave_one_out, standardize
 from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy
-from mjx_reinforce.learning.schedules import Clock
-from mjx_reinforce.learning.updates import Problem, Update, full_batch, make_optimizer
+from mjx_reinforce.learning.updates import Clock, Problem, Update, full_batch, make_optimizer
 
 
 class TrainState(struct.PyTreeNode, kw_only=True):

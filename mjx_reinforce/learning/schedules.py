@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from mjx_reinforce.engine.checks import check_count, check_number
+from mjx_reinforce.learning.updates import Clock
 
 #: The standard deviation shrinks in so many steps. Each is far greater than float32's rounding of
 #: its logarithm, however many updates there are.
@@ -64,17 +65,6 @@ class Cut(NamedTuple):
     def limit(self, progress: jax.Array) -> jax.Array:
         """Returns the most steps [] of an episode where this share [] of the budget is used."""
         return jnp.where(progress < self.until, self.steps, jnp.iinfo(jnp.int32).max)
-
-
-class Clock(NamedTuple):
-    """How far a run was before a rollout.
-
-    progress: [] the share of its budget that was used
-    env_steps: [] float, how many the seed had played
-    """
-
-    progress: jax.Array
-    env_steps: jax.Array
 
 
 class Shrunk(NamedTuple):

@@ -1,9 +1,7 @@
 """Updates: how the weights of one rollout become changes of the parameters.
 
-All of them follow the gradient that ``reinforce`` states. They differ in the number of optimiser
-steps for one rollout. From the second step on, the parameters are no longer those that played the
-episodes. No update corrects for that (there are no importance weights), and neither do the
-published programs that these updates follow.
+``full_batch`` makes one optimizer step on the gradient that ``reinforce`` states. The step of the
+natural gradient is in ``natural_gradient``; ``published.variants`` has updates of several steps.
 """
 
 from collections.abc import Callable
@@ -15,9 +13,8 @@ import optax
 from jax import lax
 from optax import Params
 
-from mjx_reinforce.engine.checks import check_count, check_name, check_number
+from mjx_reinforce.engine.checks import check_name, check_number
 from mjx_reinforce.engine.play.episode import largest_divisor, while_any
-from mjx_reinforce.learning.schedules import Clock
 
 #: Optimizers by name.
 OPTIMIZERS = ("adam", "adamw", "sgd")
@@ -27,6 +24,17 @@ MAX_SAMPLES = 2**18
 GPU_FACTOR = 4
 #: Steps a chunk covers at most, so that short episodes cost little.
 MAX_STEPS = 128
+
+
+class Clock(NamedTuple):
+    """How far a run was before a rollout.
+
+    progress: [] the share of its budget that was used
+    env_steps: [] float, how many the seed had played
+    """
+
+    progress: jax.Array
+    env_steps: jax.Array
 
 
 class Problem(NamedTuple):
@@ -88,7 +96,7 @@ def whole_rollout(turn: Turn) -> Update:
         if mask.shape[1] > 1:
             metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
         metrics["entropy"] = sums["entropy"] / jnp.maximum(jnp.sum(mask), 1)
-        params, opt_state, step = _descend(
+        params, opt_state, step = descend(
             problem,
             grads,
             problem.divisor,
@@ -115,112 +123,7 @@ def _signal_to_noise(problem: Problem, params: Params, grads: Params) -> jax.Arr
     return signal_to_noise(mean, each, num_episodes)
 
 
-def minibatches(num_updates: int, batch_size: int) -> Update:
-    """Several optimiser steps, each on steps drawn with replacement from all episodes.
-
-    The loss is the mean over the minibatch, whatever the problem's divisor. From the second step
-    on the samples are those of an older policy.
-
-    Args:
-      num_updates: optimiser steps a rollout.
-      batch_size: steps of the episodes a minibatch.
-
-    Raises:
-      ValueError: a number is less than one.
-
-    Examples:
-      >>> import jax
-      >>> import mjx_reinforce as mr
-      >>> env = mr.envs.make("CartPole-v1")
-      >>> update = mr.minibatches(num_updates=2, batch_size=16)
-      >>> learner = mr.reinforce(env, update=update, num_episodes=4, horizon=20)
-      >>> state, metrics = mr.train_step(learner, learner.init(jax.random.key(0)))
-      >>> metrics["gradient_norm"].shape
-      ()
-    """
-    for name, value in (("num_updates", num_updates), ("batch_size", batch_size)):
-        check_count(name, value)
-
-    def update(problem, key, params, opt_state):
-        mask = problem.samples[-1].reshape(-1)
-        flat = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), problem.samples)
-        indices = draw_steps(key, mask, (num_updates, batch_size))
-
-        def one(carry, index):
-            params, opt_state = carry
-            batch = jax.tree.map(lambda x: x[index], flat)
-            grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, batch)
-            params, opt_state, step = _descend(problem, grads, batch_size, params, opt_state)
-            return (params, opt_state), step | {"entropy": sums["entropy"] / batch_size}
-
-        (params, opt_state), steps = lax.scan(one, (params, opt_state), indices)
-        return params, opt_state, {name: jnp.mean(x) for name, x in steps.items()}
-
-    return update
-
-
-def each_step() -> Update:
-    """One optimiser step for every time step, in order, after all episodes are over.
-
-    Step t follows its own share of the full gradient, the terms of all episodes at t, at the
-    parameters that steps 0 to t - 1 have moved (Sutton and Barto 2018, section 13.3, has
-    discount^t besides: see ``estimators.discount_weights``).
-
-    Examples:
-      >>> import jax
-      >>> import mjx_reinforce as mr
-      >>> env = mr.envs.make("CartPole-v1")
-      >>> learner = mr.reinforce(env, update=mr.each_step(), num_episodes=4, horizon=20)
-      >>> state, metrics = mr.train_step(learner, learner.init(jax.random.key(0)))
-      >>> metrics["gradient_norm"].shape
-      ()
-    """
-
-    def update(problem, key, params, opt_state):
-        del key
-        mask = problem.samples[-1]
-        more = while_needed(jnp.any(mask, axis=1))
-
-        def one(t, params, opt_state):
-            now = jax.tree.map(
-                lambda x: lax.dynamic_index_in_dim(x, t, keepdims=False), problem.samples
-            )
-            grads, sums = jax.grad(problem.surrogate, has_aux=True)(params, now)
-            params, opt_state, step = _descend(problem, grads, problem.divisor, params, opt_state)
-            return params, opt_state, step | sums
-
-        def body(carry):
-            t, params, opt_state, sums = carry
-            moved, moved_state, measured = one(t, params, opt_state)
-            after = t + 1, moved, moved_state, jax.tree.map(jnp.add, sums, measured)
-            # Vmapped over seeds, the loop goes on until the seed with the longest episode is done.
-            return jax.tree.map(lambda new, old: jnp.where(more(carry), new, old), after, carry)
-
-        start = jnp.zeros((), jnp.int32)
-        measured = jax.eval_shape(one, start, params, opt_state)[2]
-        zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), measured)
-        t, params, opt_state, sums = while_any(more, body, (start, params, opt_state, zeros))
-        entropy = sums.pop("entropy") / jnp.maximum(jnp.sum(mask), 1)
-        means = {name: x / jnp.maximum(t, 1) for name, x in sums.items()}
-        return params, opt_state, means | {"entropy": entropy}
-
-    return update
-
-
-def per_step(update: Update) -> Update:
-    """An update whose sums are divided by the steps played in place of N.
-
-    The gradient then does not grow with the episodes. (A minibatch always is a mean over steps.)
-    """
-
-    def averaged(problem, key, params, opt_state):
-        steps = jnp.maximum(jnp.sum(problem.samples[-1]), 1)
-        return update(problem._replace(divisor=steps), key, params, opt_state)
-
-    return averaged
-
-
-def _descend(
+def descend(
     problem: Problem,
     grads: Params,
     divisor: int | jax.Array,

@@ -11,7 +11,7 @@ import optax
 
 import mjx_reinforce as mr
 from mjx_reinforce.learning.policy import MLP
-from mjx_reinforce.learning.updates import per_step
+from mjx_reinforce.published.variants import per_step
 
 
 def make(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:

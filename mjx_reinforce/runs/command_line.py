@@ -11,11 +11,17 @@ from typing import Any, NoReturn
 from mjx_reinforce import envs
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import say_error
-from mjx_reinforce.settings.config import Config, changed, check_read, is_read, read_seeds
+from mjx_reinforce.settings.config import (
+    Config,
+    changed,
+    check_named,
+    check_read,
+    is_read,
+    read_seeds,
+)
 from mjx_reinforce.settings.defaults import flag_value, for_arguments, named_code
 from mjx_reinforce.settings.flags import about_word, asks_brief_help, read_command_line
 from mjx_reinforce.settings.groups import GROUPS, MAIN, UNUSUAL
-from mjx_reinforce.settings.own_code import check_named
 from mjx_reinforce.settings.tables import PRESETS
 from mjx_reinforce.training import resume
 

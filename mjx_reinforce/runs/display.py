@@ -19,7 +19,7 @@ from rich.text import Text
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.streams import heartbeat
 from mjx_reinforce.files import Arrays
-from mjx_reinforce.settings.own_code import env_flag
+from mjx_reinforce.settings.config import env_flag
 from mjx_reinforce.statistics import enough, iqm
 from mjx_reinforce.training import progress
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer

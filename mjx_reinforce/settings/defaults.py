@@ -11,9 +11,8 @@ from typing import Any
 
 from mjx_reinforce.engine.checks import whole_number
 from mjx_reinforce.settings import tables
-from mjx_reinforce.settings.config import Config, spoken
+from mjx_reinforce.settings.config import CODE, Config, spoken
 from mjx_reinforce.settings.memory import cpu_factor, has_gpu
-from mjx_reinforce.settings.own_code import CODE
 
 #: Where a budget is large, it has about so many evaluations.
 _EVALUATIONS = 50

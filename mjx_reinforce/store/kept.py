@@ -22,9 +22,8 @@ from mjx_reinforce.engine.cache import Cache
 from mjx_reinforce.envs.settings import split_words
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.registry import is_own
-from mjx_reinforce.settings.config import Config, marked
+from mjx_reinforce.settings.config import CODE, Config, marked
 from mjx_reinforce.settings.declare import Mark
-from mjx_reinforce.settings.own_code import CODE
 from mjx_reinforce.store.provenance import provenance, version
 from mjx_reinforce.training.block import Block
 from mjx_reinforce.training.programs import Programs

@@ -11,10 +11,9 @@ from mjx_reinforce.console.commands import command
 from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.console.streams import accept_everything, silence_alarms
 from mjx_reinforce.runs.command_line import read_groups, refuse, refuse_full, start
-from mjx_reinforce.settings.config import Config, changed
+from mjx_reinforce.settings.config import Config, changed, check_named
 from mjx_reinforce.settings.defaults import named_code
 from mjx_reinforce.settings.groups import GROUPS
-from mjx_reinforce.settings.own_code import check_named
 from mjx_reinforce.sweeps import grid
 from mjx_reinforce.sweeps.design import Design, SweepSettings, read_design
 from mjx_reinforce.sweeps.perform import perform

@@ -17,8 +17,7 @@ from mjx_reinforce.console.streams import heartbeat, to_screen
 from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.files import read_arrays, read_json, write_json
 from mjx_reinforce.runs.directory import locked, own_directory
-from mjx_reinforce.settings.config import Config
-from mjx_reinforce.settings.own_code import code_flags
+from mjx_reinforce.settings.config import Config, code_flags
 from mjx_reinforce.sweeps.design import Design, as_record, check_design
 from mjx_reinforce.training.resume import check_same_program
 

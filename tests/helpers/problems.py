@@ -3,8 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.learning import schedules
-from mjx_reinforce.learning.updates import Problem
+from mjx_reinforce.learning.updates import Clock, Problem
 
 LENGTHS = np.array([4, 1, 3])
 
@@ -16,7 +15,7 @@ PARAMS = {"w": jnp.array(0.7), "b": jnp.array(-0.4)}
 
 
 #: Before the first update.
-START = schedules.Clock(jnp.zeros(()), jnp.zeros(()))
+START = Clock(jnp.zeros(()), jnp.zeros(()))
 
 
 def surrogate(params, samples):

@@ -15,6 +15,7 @@ from toys import Survive, Target, categorical
 from mjx_reinforce import Box, Trajectory, mlp_policy, normal, reinforce, train_step
 from mjx_reinforce.learning import diagnostics, normalize, updates
 from mjx_reinforce.learning.policy import Actor
+from mjx_reinforce.published import variants
 from mjx_reinforce.published.ars import ars
 
 BOX = Box(np.array([-1.0, -2.0]), np.array([1.0, 2.0]))
@@ -115,7 +116,7 @@ def test_the_noise_is_that_of_some_episodes_beside_the_mean_of_all():
 
 @pytest.mark.parametrize(("bound", "share"), [(1e-6, 1.0), (1e6, 0.0)])
 @pytest.mark.parametrize(
-    "update", [updates.full_batch(), updates.each_step(), updates.minibatches(3, 4)]
+    "update", [updates.full_batch(), variants.each_step(), variants.minibatches(3, 4)]
 )
 def test_all_gradients_are_clipped_or_none(update, bound, share):
     problem = make_problem(updates.make_optimizer(max_grad_norm=bound))
@@ -127,7 +128,7 @@ def test_the_share_of_clipped_gradients_is_that_of_the_steps():
     """A rate of 0 keeps the parameters, so that a step's gradient is that of its time alone."""
     problem = make_problem(optax.chain(updates.clip_by_norm(0.3), optax.sgd(0.0)))
     state = problem.optimizer.init(PARAMS)
-    _, _, metrics = updates.each_step()(problem, jax.random.key(0), PARAMS, state)
+    _, _, metrics = variants.each_step()(problem, jax.random.key(0), PARAMS, state)
     norms = []
     for t in range(MASK.sum(axis=0).max()):
         grads = jax.grad(lambda p, t=t: problem.surrogate(p, [x[t] for x in problem.samples])[0])

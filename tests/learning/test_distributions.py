@@ -12,7 +12,7 @@ from scipy import integrate, special, stats
 from mjx_reinforce import Box
 from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.base import Discrete
-from mjx_reinforce.learning import normal_integrals
+from mjx_reinforce.learning import bounded
 from mjx_reinforce.learning.distributions import normal
 from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
 
@@ -20,11 +20,11 @@ LOW, HIGH = -3.0, 1.0
 SPACE, ARMS = Box(np.array([LOW]), np.array([HIGH])), Discrete(4)
 UNBOUNDED = Box(np.array([-np.inf]), np.array([1.0]))
 NUM_SAMPLES = 200_000
-TRANSFORM = jax.jit(normal_integrals.transform)
-LOG_DENSITY = jax.jit(normal_integrals.log_density)
-HALF_LINE = jax.jit(normal_integrals.half_line, static_argnums=0)
-SEGMENT = jax.jit(normal_integrals.segment, static_argnums=0)
-ENTROPY = jax.jit(normal_integrals.entropy)
+TRANSFORM = jax.jit(bounded.truncated_sample)
+LOG_DENSITY = jax.jit(bounded.truncated_log_density)
+HALF_LINE = jax.jit(bounded.half_line, static_argnums=0)
+SEGMENT = jax.jit(bounded.segment, static_argnums=0)
+ENTROPY = jax.jit(bounded.truncated_entropy)
 
 
 def build(name, space=SPACE, **settings):
@@ -226,7 +226,7 @@ def test_truncated_normal_far_out_is_exponential(distance, dtype):
         tolerance = 4 / distance**2 + (1e-10 if dtype == np.float64 else 5e-6)
 
         def log_density(mean, log_std, action):
-            return normal_integrals.log_density(action, mean, jnp.exp(log_std), *settings[2:])
+            return bounded.truncated_log_density(action, mean, jnp.exp(log_std), *settings[2:])
 
         scored = jax.jit(jax.value_and_grad(log_density, (0, 1)))
         for uniform in (0.02, 0.5, 0.9):
@@ -242,7 +242,7 @@ def test_truncated_normal_far_out_is_exponential(distance, dtype):
                 sign * (t / scale - 1.0), abs=tolerance
             )
             assert float(score[1]) == pytest.approx(2.0 * (t / scale - 1.0), abs=10 * tolerance)
-        entropy, slope = jax.jit(jax.value_and_grad(normal_integrals.entropy))(*settings)
+        entropy, slope = jax.jit(jax.value_and_grad(bounded.truncated_entropy))(*settings)
         assert float(entropy) == pytest.approx(1.0 + np.log(0.5 * scale), abs=tolerance)
         assert abs(float(slope)) * 0.5 == pytest.approx(scale, rel=tolerance)
 
@@ -273,9 +273,9 @@ def test_integrals_by_quadrature(order, dtype):
 def test_log_tail_against_scipy():
     with jax.enable_x64(True):
         x = np.array([-40.0, -3.0, -1e-3, 0.0, 0.5, 8.0, 200.0])
-        got = normal_integrals.log_tail(jnp.asarray(x))
+        got = bounded.log_tail(jnp.asarray(x))
         np.testing.assert_allclose(got, special.log_ndtr(-x), rtol=1e-12, atol=1e-300)
-        slope = jax.vmap(jax.grad(normal_integrals.log_tail))(jnp.asarray(x))
+        slope = jax.vmap(jax.grad(bounded.log_tail))(jnp.asarray(x))
         hazard = np.exp(stats.norm.logpdf(x) - special.log_ndtr(-x))
         np.testing.assert_allclose(-slope, hazard, rtol=1e-9)
 

@@ -17,6 +17,7 @@ from mjx_reinforce import Trajectory, reinforce
 from mjx_reinforce.learning import estimators as est
 from mjx_reinforce.learning.policy import MLP
 from mjx_reinforce.learning.value import full_batch_value_baseline, value_baseline
+from mjx_reinforce.published import variants
 
 #: How likely each state, or the end, follows a state and an action; and what these earn.
 NEXT = np.array(
@@ -171,8 +172,8 @@ CASES = {
         lambda limit, discount: of_all_steps(limit, discount, REWARD - 0.5),
         2,
     ),
-    "mean log-prob": (est.mean_log_prob, of_mean_to_go, 1),
-    "normalized": (est.normalized_returns, of_weights(normalized), 1),
+    "mean log-prob": (variants.mean_log_prob, of_mean_to_go, 1),
+    "normalized": (variants.normalized_returns, of_weights(normalized), 1),
     "standardized": (
         lambda d: est.standardize(est.reward_to_go(d), floor=0.5, center=True),
         of_weights(standardized),

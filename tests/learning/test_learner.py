@@ -18,6 +18,7 @@ from mjx_reinforce.learning import counts, estimators, updates
 from mjx_reinforce.learning import learner as learner_module
 from mjx_reinforce.learning.estimators import discounted_returns
 from mjx_reinforce.learning.value import value_baseline
+from mjx_reinforce.published import variants
 from mjx_reinforce.published.gymnasium_tutorial import with_one_start
 from mjx_reinforce.training import hosting
 
@@ -112,7 +113,7 @@ def test_no_key_is_used_twice():
             Survive(),
             num_episodes=4,
             estimator=value_baseline(0.5),
-            update=updates.minibatches(2, 8),
+            update=variants.minibatches(2, 8),
         )
         learner = with_one_start(learner)
         learner = hosting.hosted(learner, Survive(), 4, Survive.max_episode_steps)
@@ -191,7 +192,7 @@ def test_a_gradient_that_is_not_finite_is_skipped():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("length", "update"), [(51, updates.full_batch()), (50, updates.each_step())]
+    ("length", "update"), [(51, updates.full_batch()), (50, variants.each_step())]
 )
 def test_short_episodes_are_learned_from_in_short(length, update, monkeypatch):
     """Of 400 steps at most, where no episode took more than 50: the same, up to rounding."""

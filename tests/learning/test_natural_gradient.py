@@ -15,9 +15,10 @@ from mjx_reinforce import mlp_policy, natural_gradient, reinforce
 from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.learning import natural_gradient as module
 from mjx_reinforce.learning import schedules
-from mjx_reinforce.learning.distributions import categorical, normal, tanh_normal
+from mjx_reinforce.learning.bounded import tanh_normal
+from mjx_reinforce.learning.distributions import categorical, normal
 from mjx_reinforce.learning.learner import _surrogate
-from mjx_reinforce.learning.updates import Problem, full_batch
+from mjx_reinforce.learning.updates import Clock, Problem, full_batch
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.store.build import _build_optimizer
 
@@ -32,7 +33,7 @@ FAMILIES = {
 DAMPING, MAX_KL = 1e-2, 1e-3
 
 #: Before the first update.
-START = schedules.Clock(jnp.zeros(()), jnp.zeros(()))
+START = Clock(jnp.zeros(()), jnp.zeros(()))
 
 
 def make(name, seed=0):
@@ -207,7 +208,7 @@ def test_settings_become_the_update():
         optimizer = _build_optimizer(dataclasses.replace(natural, **settings))
         state = optimizer.init(jnp.ones(2))
         for played, share in ((0.0, 1.0), (8.0, last)):
-            clock = schedules.Clock(jnp.zeros(()), jnp.asarray(played))
+            clock = Clock(jnp.zeros(()), jnp.asarray(played))
             change, _ = optimizer.update(jnp.ones(2), state, jnp.ones(2), clock=clock)
             np.testing.assert_allclose(change, -share, rtol=1e-5)
 

@@ -13,6 +13,7 @@ from toys import Survive
 from mjx_reinforce import reinforce
 from mjx_reinforce.learning import counts, schedules, updates
 from mjx_reinforce.learning.updates import Problem
+from mjx_reinforce.published import variants
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store.build import _build_optimizer
 
@@ -48,7 +49,7 @@ def test_full_batch_is_one_step():
     assert float(metrics["entropy"]) == pytest.approx(expected[3] / MASK.sum(), rel=1e-5)
 
 
-@pytest.mark.parametrize("update", [updates.full_batch(), updates.each_step()])
+@pytest.mark.parametrize("update", [updates.full_batch(), variants.each_step()])
 def test_metrics_of_a_single_step_and_of_none(update):
     """A mean over one step divides by one; nothing played measures nothing, and is finite."""
     one = np.zeros((5, 3), bool)
@@ -80,7 +81,7 @@ def test_each_step_is_a_loop_over_time(longest):
     """Up to the end of the longest episode, which may be the horizon of 5."""
     mask = np.arange(5)[:, None] < np.minimum([longest, 1, 3], longest)
     problem = make_problem(ADAMW, mask=mask)
-    assert_close(run(updates.each_step(), problem), each_step_by_hand(problem))
+    assert_close(run(variants.each_step(), problem), each_step_by_hand(problem))
 
 
 def test_each_step_of_one_seed_ends_with_its_own_episodes():
@@ -90,7 +91,7 @@ def test_each_step_of_one_seed_ends_with_its_own_episodes():
     samples = jax.tree.map(lambda *x: jnp.stack(x), *[p.samples for p in problems])
 
     def update(samples):
-        return run(updates.each_step(), Problem(surrogate, optimizer, samples, 3, START))
+        return run(variants.each_step(), Problem(surrogate, optimizer, samples, 3, START))
 
     together = jax.vmap(update)(samples)
     for s, problem in enumerate(problems):
@@ -100,7 +101,7 @@ def test_each_step_of_one_seed_ends_with_its_own_episodes():
 
 def test_minibatches_are_steps_on_drawn_samples():
     problem, key = make_problem(ADAMW), jax.random.key(5)
-    got = run(updates.minibatches(3, 4), problem, key)
+    got = run(variants.minibatches(3, 4), problem, key)
     drawn = jax.random.randint(key, (3, 4), 1, MASK.sum() + 1)
     flat = [x.reshape(-1, *x.shape[2:]) for x in problem.samples]
     params, opt_state, norms, entropy = PARAMS, problem.optimizer.init(PARAMS), [], []
@@ -115,7 +116,7 @@ def test_minibatches_are_steps_on_drawn_samples():
 def test_minibatches_of_nothing_stay_in_bounds():
     """A seed that stands still draws too; what it draws is thrown away, and must be finite."""
     params, _, metrics = run(
-        updates.minibatches(2, 3), make_problem(optax.adam(0.1), mask=np.zeros((5, 3), bool))
+        variants.minibatches(2, 3), make_problem(optax.adam(0.1), mask=np.zeros((5, 3), bool))
     )
     assert all(np.isfinite(x) for x in jax.tree.leaves((params, metrics)))
 
@@ -128,7 +129,9 @@ def test_minibatches_draw_every_played_step_alike_and_no_other():
         samples = tuple(map(jnp.asarray, (number, MASK)))
         total = lambda w, s: (w * jnp.sum(s[0]), {"entropy": 0.0})  # noqa: E731
         linear = Problem(total, optax.sgd(1.0), samples, 1, START)
-        return -updates.minibatches(1, 1)(linear, key, jnp.zeros(()), linear.optimizer.init(0.0))[0]
+        return -variants.minibatches(1, 1)(linear, key, jnp.zeros(()), linear.optimizer.init(0.0))[
+            0
+        ]
 
     drawn = np.asarray(jax.vmap(which)(jax.random.split(jax.random.key(0), 8000))).round()
     counts = np.bincount(drawn.astype(int), minlength=MASK.size).reshape(MASK.shape)
@@ -138,7 +141,7 @@ def test_minibatches_draw_every_played_step_alike_and_no_other():
 
 @pytest.mark.slow
 def test_a_seed_that_stands_still_stays_as_it_is():
-    learner = reinforce(Survive(), num_episodes=4, update=updates.each_step())
+    learner = reinforce(Survive(), num_episodes=4, update=variants.each_step())
     states = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 2))
     after, metrics = jax.jit(jax.vmap(learner.step))(states, jnp.array([True, False]))
     assert int(metrics["env_steps"][1]) == 0
@@ -193,13 +196,13 @@ def test_an_optimizer_is_a_chain_of_optax(given, settings, expected):
 
 UPDATES = {
     "full-batch": updates.full_batch(),
-    "minibatches": updates.minibatches(3, 4),
-    "each-step": updates.each_step(),
+    "minibatches": variants.minibatches(3, 4),
+    "each-step": variants.each_step(),
 }
 
 
 def clock(progress=0.0, env_steps=0.0):
-    return schedules.Clock(jnp.asarray(progress), jnp.asarray(env_steps))
+    return updates.Clock(jnp.asarray(progress), jnp.asarray(env_steps))
 
 
 @pytest.mark.parametrize("name", UPDATES)
@@ -248,7 +251,7 @@ def test_schedules_are_exact_for_budgets_of_any_size(budget):
 
     for used in (0, 1, budget // 3, 2**31 - 1, 2**31, 2**32, 2**32 + 7, budget - 1, budget):
         if used <= budget:
-            now = schedules.Clock(share_of(counts.from_int(used)), jnp.zeros(()))
+            now = updates.Clock(share_of(counts.from_int(used)), jnp.zeros(()))
             factor = rate.update(jnp.ones(()), (), clock=now)[0]
             assert float(factor) == pytest.approx(1 - used / budget, abs=2e-7)
 
@@ -257,7 +260,7 @@ def test_schedules_are_exact_for_budgets_of_any_size(budget):
 
     def one(carry, _):
         state, log_std, count = carry
-        now = schedules.Clock(share_of(count), jnp.zeros(()))
+        now = updates.Clock(share_of(count), jnp.zeros(()))
         change, state = shrink.update({"constants": jnp.zeros(1)}, state, None, clock=now)
         count = jax.lax.fori_loop(0, each // 2**30, lambda _, c: counts.plus(c, 2**30), count)
         count = counts.plus(count, each % 2**30)
@@ -302,8 +305,8 @@ def test_a_policy_without_an_std_of_its_own_has_nothing_to_shrink():
 
 def test_nonsense_is_refused():
     with pytest.raises(ValueError, match="num_updates must be at least 1, got 0"):
-        updates.minibatches(0, 8)
+        variants.minibatches(0, 8)
     with pytest.raises(ValueError, match="batch_size must be at least 1, got -1"):
-        updates.minibatches(1, -1)
+        variants.minibatches(1, -1)
     with pytest.raises(ValueError, match=r"unknown optimizer 'adamww'\. Did you mean 'adamw'"):
         updates.make_optimizer("adamww")
