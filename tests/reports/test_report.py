@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 import vl_convert
-from browser import CHROMIUM, opened_browser
+from browser import CHROMIUM, in_browser
 from fake_sweeps import GRID, make_sweep
 from measured_runs import ONE, make_measured_run
 from pages import CUT, change_curves, content, findings_of, run_report, visible
@@ -380,18 +380,20 @@ def test_charts_are_whole_at_any_width_and_on_paper(tmp_path):
     )
     page = directory / "report.html"
     report.write_report([directory], page)
-    with opened_browser() as browser:
-        for width in (1280, 700, 390):
-            browser.open(page, width=width)
-            assert browser.run(OVERFLOW) == []
-            browser.run("dispatchEvent(new Event('beforeprint'))")
-            assert browser.run(OVERFLOW) == []
-            drawn = "document.querySelector('#chart-curves svg').getAttribute('width')"
-            assert browser.run(drawn) == "780"
-            browser.run("dispatchEvent(new Event('afterprint'))")
-            whole = browser.run("document.querySelector('figure').clientWidth")
-            assert browser.run(drawn) == str(whole)
-        assert browser.errors == []
+    script = """const found = [];
+      const drawn = () => document.querySelector('#chart-curves svg').getAttribute('width');
+      for (const width of [1280, 700, 390]) {
+        await resize(width);
+        found.push(OVERFLOW);
+        dispatchEvent(new Event('beforeprint'));
+        await until(() => drawn() === '780');
+        found.push(OVERFLOW);
+        dispatchEvent(new Event('afterprint'));
+        const whole = String(document.querySelector('figure').clientWidth);
+        await until(() => drawn() === whole);
+      }
+      return found"""
+    assert in_browser(page, script.replace("OVERFLOW", OVERFLOW)) == [[]] * 6
 
 
 #: Cells of table 1 whose words are not seen.
@@ -399,6 +401,7 @@ HIDDEN = """[...document.querySelectorAll('.results td, .results tbody th')].fil
   const box = cell.getBoundingClientRect();
   return !box.width || box.left < 0 || box.right > innerWidth;
 }).map((cell) => cell.textContent)"""
+WIDTHS = [360, 390, 480, 640, 768, 831, 832, 833, 900, 1024, 1280, 1920]
 
 
 @pytest.mark.usefixtures("no_pictures")
@@ -411,17 +414,17 @@ def test_no_column_is_cut_at_any_width(tmp_path, over):
     change_curves(directory, lambda x: x.update(eval_return=-1234.5678 * x["eval_return"]))
     page = directory / "report.html"
     report.write_report([directory], page)
-    with opened_browser() as browser:
-        browser.open(page, width=360)
-        browser.run("document.querySelectorAll('details.data').forEach((x) => { x.open = true })")
-        filled = "[...document.querySelectorAll('.numbers')].every((x) => x.innerText)"
-        browser.wait_for(filled)
-        for width in (360, 390, 480, 640, 768, 831, 832, 833, 900, 1024, 1280, 1920):
-            browser.resize(width)
-            assert browser.run(CUT) == [], width
-            assert browser.run(HIDDEN) == [], width
-            assert browser.run("document.documentElement.scrollWidth") <= width
-        assert browser.errors == []
+    script = f"""const found = [];
+      document.querySelectorAll('details.data').forEach((x) => {{ x.open = true }});
+      await until(() => [...document.querySelectorAll('.numbers')].every((x) => x.innerText));
+      for (const width of {WIDTHS}) {{
+        await resize(width);
+        const wide = document.documentElement.scrollWidth > width;
+        found.push([{CUT}, {HIDDEN}, wide]);
+      }}
+      return found"""
+    found = in_browser(page, script, width=360)
+    assert dict(zip(WIDTHS, found, strict=True)) == {width: [[], [], False] for width in WIDTHS}
 
 
 @pytest.mark.usefixtures("no_pictures")
@@ -431,16 +434,12 @@ def test_tables_of_a_figure_are_no_formulas_either(tmp_path):
     """What the page itself writes when a button is pressed."""
     runs = [make_measured_run(tmp_path / name, offset=-150.5) for name in FORMULAS]
     report.write_report(runs, tmp_path / "page.html")
-    with opened_browser() as browser:
-        browser.open(tmp_path / "page.html")
-        browser.run(
-            "window.saved = []; URL.createObjectURL = (blob) => {"
-            "blob.text().then((text) => saved.push(text)); return '#'; }"
-        )
-        browser.run("document.querySelectorAll('[data-csv]').forEach((x) => x.click())")
-        buttons = browser.run("document.querySelectorAll('[data-csv]').length")
-        browser.wait_for(f"saved.length === {buttons}")
-        texts = browser.run("saved")
+    script = """const saved = [], buttons = document.querySelectorAll('[data-csv]');
+      URL.createObjectURL = (blob) => { blob.text().then((text) => saved.push(text)); return '#'; };
+      buttons.forEach((x) => x.click());
+      await until(() => saved.length === buttons.length);
+      return saved"""
+    texts = in_browser(tmp_path / "page.html", script)
     listed = [
         cell for text in texts for row in list(csv.reader(text.splitlines()))[1:] for cell in row
     ]
@@ -452,32 +451,35 @@ def test_tables_of_a_figure_are_no_formulas_either(tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
 def test_in_a_browser(written):
-    """No error, no request, nothing wider than a phone; the keyboard moves the slider."""
-    with opened_browser() as browser:
-        browser.open(written[1])
-        assert browser.run("document.querySelectorAll('.chart svg').length") == 7
-        rows = "document.querySelectorAll('#chart-distribution .mark-text.role-mark text').length"
-        before = browser.run("document.getElementById('chart-distribution').textContent")
-        browser.run("document.getElementById('moment').focus()")
-        browser.press("ArrowLeft")
-        browser.press("Home")
-        browser.wait_for("document.getElementById('moment-said').textContent.startsWith('0 env')")
-        after = "document.getElementById('chart-distribution').textContent"
-        browser.wait_for(f"{after} !== {json.dumps(before)}")
-        assert browser.run(rows) == 4
-        visible = "document.querySelector('#vg-tooltip-element.visible') !== null"
-        browser.hover("#chart-curves svg", until=visible)
-        told = browser.run("document.getElementById('vg-tooltip-element').innerText")
-        assert any(label in told for label in content(written[1])["labels"])
-        browser.run("document.querySelector('[data-choose=\"1\"]').focus()")
-        browser.press(" ", "Space")
-        browser.wait_for(f"{rows} === 1")
-        browser.run("document.getElementById('log-x').click()")
-        browser.run("document.getElementById('log-y').click()")
-        browser.run("document.querySelector('details.data summary').click()")
-        browser.wait_for("document.querySelectorAll('details.data[open] tbody tr').length > 20")
-        assert browser.print().startswith(b"%PDF")
-        browser.open(written[1], width=390, height=844)
-        assert browser.run("document.documentElement.scrollWidth") == 390
-        assert browser.errors == []
-        assert not [r for r in browser.requests if not r.startswith(("file:", "data:", "blob:"))]
+    """The slider moves the histograms, a curve says what it is, and choices show what is chosen."""
+    script = """const at = (id) => document.getElementById(id);
+      const rows = () =>
+        document.querySelectorAll('#chart-distribution .mark-text.role-mark text').length;
+      const charts = document.querySelectorAll('.chart svg').length;
+      const before = at('chart-distribution').textContent;
+      at('moment').value = 0;
+      at('moment').dispatchEvent(new Event('input', {bubbles: true}));
+      await until(() => at('moment-said').textContent.startsWith('0 env'));
+      await until(() => at('chart-distribution').textContent !== before);
+      const shown = rows(), svg = document.querySelector('#chart-curves svg');
+      svg.scrollIntoView({block: 'center', behavior: 'instant'});
+      const box = svg.getBoundingClientRect();
+      const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
+      await until(() => {
+        for (const type of ['pointerover', 'pointermove', 'mouseover', 'mousemove'])
+          document.elementFromPoint(x, y).dispatchEvent(
+            new PointerEvent(type, {bubbles: true, clientX: x, clientY: y}));
+        return document.querySelector('#vg-tooltip-element.visible');
+      });
+      const told = at('vg-tooltip-element').innerText;
+      document.querySelector('[data-choose="1"]').click();
+      await until(() => rows() === 1);
+      at('log-x').click();
+      at('log-y').click();
+      document.querySelector('details.data summary').click();
+      await until(() => document.querySelectorAll('details.data[open] tbody tr').length > 20);
+      await resize(390);
+      return [charts, shown, told, document.documentElement.scrollWidth]"""
+    charts, shown, told, width = in_browser(written[1], script)
+    assert (charts, shown, width) == (7, 4, 390)
+    assert any(label in told for label in content(written[1])["labels"])
