@@ -20,6 +20,7 @@ from mjx_reinforce.registry import (
     ESTIMATORS,
     SEARCHES,
     check_choice,
+    is_own,
 )
 from mjx_reinforce.settings.declare import MAX_COUNT, MAX_OF_UPDATE, Range
 from mjx_reinforce.settings.groups import (
