@@ -173,7 +173,7 @@ def test_the_engine_stands_by_itself():
     assert (instant, others, ours) == ("False", "[]", "[]")
 
 
-@pytest.mark.parametrize("command", ["train", "sweeps.grid", "export.__main__", "new"])
+@pytest.mark.parametrize("command", ["train", "sweeps.design", "export.__main__", "new"])
 def test_what_reads_a_command_line_is_light(command):
     """So that --help, and what is refused, take no second."""
     loaded = run(f"import sys, mjx_reinforce.{command}\nprint('jax' in sys.modules)")

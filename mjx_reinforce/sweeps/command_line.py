@@ -14,8 +14,7 @@ from mjx_reinforce.runs.command_line import read_groups, refuse, refuse_full, st
 from mjx_reinforce.settings.config import Config, changed, check_named
 from mjx_reinforce.settings.defaults import named_code
 from mjx_reinforce.settings.groups import GROUPS
-from mjx_reinforce.sweeps import grid
-from mjx_reinforce.sweeps.design import Design, SweepSettings, read_design
+from mjx_reinforce.sweeps.design import Design, SweepSettings, read_design, read_over
 from mjx_reinforce.sweeps.perform import perform
 
 _ABOUT_SWEEPS = (
@@ -40,13 +39,13 @@ def parse_design(arguments: Sequence[str]) -> Design:
       arguments: a preset's name, if any, then flags.
 
     Raises:
-      ValueError: see ``runs.command_line.parse`` and ``grid.read_over``.
+      ValueError: see ``runs.command_line.parse`` and ``design.read_over``.
     """
     default, flags, prog = start(arguments, command("sweep"))
     base, settings = _read_flags(flags, default, prog)
     if base.resume is not None:
         return _resumed(flags, base.resume, prog)
-    over = grid.read_over(settings.pop("over"))
+    over = read_over(settings.pop("over"))
     return Design(base=base, given=changed(base, default), over=over, **settings)
 
 

@@ -9,8 +9,7 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.reports.experiment import counted, say, setting_in_words
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.sweeps import chunks
-from mjx_reinforce.sweeps.chunks import Chunk, Runs
-from mjx_reinforce.sweeps.history import History
+from mjx_reinforce.sweeps.chunks import Chunk, History, Runs
 from mjx_reinforce.sweeps.plan import Part, Prepared, learner_builder
 from mjx_reinforce.sweeps.programs import SlotPrograms, Stopwatch, compile_programs, one_ahead
 from mjx_reinforce.sweeps.results import SweepFiles

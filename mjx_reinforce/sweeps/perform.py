@@ -18,7 +18,7 @@ from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.files import read_arrays, read_json, write_json
 from mjx_reinforce.runs.directory import locked, own_directory
 from mjx_reinforce.settings.config import Config, code_flags
-from mjx_reinforce.sweeps.design import Design, as_record, check_design
+from mjx_reinforce.sweeps.design import Design, as_record, check_design, configure
 from mjx_reinforce.training.resume import check_same_program
 
 if TYPE_CHECKING:
@@ -135,7 +135,6 @@ def _finish(
 ) -> None:
     """Writes the last files of a sweep, or those of one that was interrupted."""
     from mjx_reinforce.store.build import policy_settings
-    from mjx_reinforce.sweeps.grid import configure
 
     def settings(number: int) -> tuple[dict[str, Any], dict[str, Any]]:
         [config] = configure(design.base, [prepared.configurations[number]])

@@ -23,8 +23,7 @@ from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.settings.memory import needed, num_cores
 from mjx_reinforce.settings.tables import Task
 from mjx_reinforce.store.build import build, policy_settings
-from mjx_reinforce.sweeps.design import Design
-from mjx_reinforce.sweeps.grid import configure
+from mjx_reinforce.sweeps.design import Design, configure
 
 
 class Group(NamedTuple):

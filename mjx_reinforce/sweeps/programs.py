@@ -18,7 +18,6 @@ from mjx_reinforce.files import Arrays
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.settings.memory import num_cores
-from mjx_reinforce.sweeps.history import Measured
 from mjx_reinforce.sweeps.layout import StateRows, pack_slots
 from mjx_reinforce.training.block import BuildLearner
 from mjx_reinforce.training.programs import Programs, compiling, programs_of
@@ -64,7 +63,20 @@ def started(task: Callable[[], Any]) -> Future:
     return ThreadPoolExecutor(1).submit(task)
 
 
-#: What ``history.Measured`` has of a run's counts since the start.
+class Measured(NamedTuple):
+    """One evaluation of some runs, and the block of updates after it.
+
+    runs: [n] their numbers
+    values: [n] each: ``eval_return``, and ``eval_steps``, those of all its episodes; of runs that
+      then made updates also ``updates`` and ``env_steps`` since the start, and ``nonfinite``, how
+      many updates of the block met numbers that are not finite
+    """
+
+    runs: np.ndarray
+    values: Arrays
+
+
+#: What ``Measured`` has of a run's counts since the start.
 _COUNTS = ("updates", "env_steps")
 #: And of an evaluation.
 _LOOKED = ("eval_return", "eval_steps")
@@ -74,9 +86,9 @@ class Slot(NamedTuple):
     """The compiled programs of one slot. States are rows of bytes, see ``layout.StateRows``.
 
     advance: (states [W, B], budget, which lanes have a run [W]) -> (states [W, B], which runs made
-      an update [W], and what ``history.Measured`` has of updates [W], and of evaluations where
+      an update [W], and what ``Measured`` has of updates [W], and of evaluations where
       these ride), as ``Programs.advance``
-    evaluate: (states [W, B], which [W]) -> what ``history.Measured`` has of evaluations [W]
+    evaluate: (states [W, B], which [W]) -> what ``Measured`` has of evaluations [W]
     """
 
     advance: Callable[..., tuple[jax.Array, jax.Array, dict[str, jax.Array]]]
@@ -286,12 +298,12 @@ def _compile_slot(
 
 
 def _seen(measured: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Returns what ``history.Measured`` has of an evaluation."""
+    """Returns what ``Measured`` has of an evaluation."""
     return {name: measured[name] for name in _LOOKED if name in measured}
 
 
 def _counts(after: RunState, metrics: dict[str, jax.Array]) -> dict[str, jax.Array]:
-    """Returns what a block of updates counted, as ``history.Measured`` has it."""
+    """Returns what a block of updates counted, as ``Measured`` has it."""
     broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
     return {
         "updates": after.train_states.num_updates,

@@ -17,8 +17,7 @@ from mjx_reinforce.files import Arrays, read_arrays, write_arrays, write_bytes, 
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.reports.experiment import lengthened
 from mjx_reinforce.statistics import steps_to_solve
-from mjx_reinforce.sweeps.chunks import Runs
-from mjx_reinforce.sweeps.history import History
+from mjx_reinforce.sweeps.chunks import History, Runs
 from mjx_reinforce.training import checkpoint
 
 _MEASURED = (

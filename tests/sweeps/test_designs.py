@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.sweeps import chunks, design, grid, plan
+from mjx_reinforce.sweeps import chunks, design, plan
 from mjx_reinforce.sweeps.design import Design
 from mjx_reinforce.sweeps.plan import Group, make_groups, prepare_sweep
 
@@ -23,7 +23,7 @@ def group(members=(0, 1, 2, 3, 4), **changes):
 
 def test_a_grid_has_every_combination_and_the_last_changes_fastest():
     over = {"discount": [0.9, 0.99], "num_episodes": [4, 8]}
-    values = [tuple(entry.values()) for entry in grid.grid(over)]
+    values = [tuple(entry.values()) for entry in design.grid(over)]
     assert values == [(0.9, 4), (0.9, 8), (0.99, 4), (0.99, 8)]
 
 
@@ -33,7 +33,7 @@ def test_words_become_values_of_the_type_of_their_setting():
         ["--hidden-sizes", "8,4", "none"],
         ["max-kl", "None", "0.1"],
     ]
-    assert grid.read_over(given) == {
+    assert design.read_over(given) == {
         "learning_rate": [1e-3, 1.0],
         "hidden_sizes": [(8, 4), ()],
         "max_kl": [None, 0.1],
@@ -52,7 +52,7 @@ def test_words_become_values_of_the_type_of_their_setting():
 )
 def test_words_that_are_no_values_are_refused(given, said):
     with pytest.raises(ValueError, match=said):
-        grid.read_over(given)
+        design.read_over(given)
 
 
 # The search.
@@ -113,11 +113,11 @@ def test_every_run_is_in_one_chunk_and_every_chunk_has_its_share(num_chunks):
 
 
 def test_settings_of_the_environment_are_swept_as_words():
-    over = grid.read_over([("env-set.frame_skip", "2", "1e1"), ("env-set.solver", "mjx", "fast")])
+    over = design.read_over([("env-set.frame_skip", "2", "1e1"), ("env-set.solver", "mjx", "fast")])
     assert over == {"env_set.frame_skip": [2, 10], "env_set.solver": ["mjx", "fast"]}
     base = Config(env="Hopper-v5", env_set=("reset_noise_scale=0.1", "frame_skip=4"))
-    grid.check_over(base, over)
-    configs = grid.configure(base, grid.grid(over))
+    design.check_over(base, over)
+    configs = design.configure(base, design.grid(over))
     kept = "reset_noise_scale=0.1"
     assert configs[1].env_set == (kept, "frame_skip=2", "solver=fast")
     assert configs[2].env_set == (kept, "frame_skip=10", "solver=mjx")
@@ -135,7 +135,7 @@ def test_settings_of_the_environment_are_swept_as_words():
 )
 def test_a_setting_of_the_environment_that_cannot_be_swept_is_refused(over, said):
     with pytest.raises(ValueError, match=said):
-        grid.check_over(Config(), over)
+        design.check_over(Config(), over)
 
 
 # From a design to groups, chunks and a plan, without a program.

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.sweeps.history import History, Measured
+from mjx_reinforce.sweeps.chunks import History
+from mjx_reinforce.sweeps.programs import Measured
 
 CONFIG = Config(num_seeds=4, env_steps=100, max_updates=10)
 

@@ -27,8 +27,7 @@ from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.store.build import build
 from mjx_reinforce.sweeps import chunks, conduct, design, perform, plan, programs
 from mjx_reinforce.sweeps import command_line as sweep_command
-from mjx_reinforce.sweeps.design import Design, check_design, read_design
-from mjx_reinforce.sweeps.grid import configure, grid
+from mjx_reinforce.sweeps.design import Design, check_design, configure, grid, read_design
 from mjx_reinforce.sweeps.layout import pack_slots
 from mjx_reinforce.sweeps.perform import read_results
 from mjx_reinforce.sweeps.plan import learner_builder, make_groups
