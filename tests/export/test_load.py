@@ -152,7 +152,6 @@ DAMAGE = {
     "config is no JSON": (content("config.json", b"["), "config.json", "is damaged"),
     "config is a list": (content("config.json", b"[]"), "config.json", "holds no JSON object"),
     "no horizon": (entries("config.json", horizon=...), "config.json", "horizon must be"),
-    "endless horizon": (entries("config.json", horizon=1e999), "config.json", "got inf"),
     "huge horizon": (entries("config.json", horizon=10**12), "config.json", "from 1 to 2^31 - 1"),
     "horizon of text": (entries("config.json", horizon="60"), "config.json", "got '60'"),
     "env is no text": (entries("config.json", env=None), "config.json", "env must be text"),
@@ -174,13 +173,10 @@ DAMAGE = {
     "no sizes": (old(entries(JSON, hidden_sizes=...)), JSON, "hidden_sizes is missing"),
     "a size of text": (old(entries(JSON, observation_size="4")), JSON, "is damaged"),
     "other hidden sizes": (old(entries(JSON, hidden_sizes=[8, 9])), NPZ, "it should be (3, 9)"),
-    "more layers": (old(entries(JSON, hidden_sizes=[8, 8, 8])), NPZ, "Dense_2/bias has the shape"),
     "another trunk": (old(entries(JSON, shared_trunk=False)), JSON, "must come from the state"),
     "another scaling": (entries(JSON, rescale=False), "policy.json", "checksum"),
     "no arrays": (remove(NPZ), NPZ, "cannot read"),
     "no archive": (content(NPZ, b"PK"), NPZ, "no whole NumPy archive"),
-    "text for arrays": (content(NPZ, b"hello"), NPZ, "no whole NumPy archive"),
-    "an empty archive": (content(NPZ, b""), NPZ, "no whole NumPy archive"),
     "half an archive": (cut, NPZ, "no whole NumPy archive"),
     "a wrong shape": (old(arrays(**{KERNEL: lambda x: x[:, :3]})), NPZ, "should be (3, 4, 8)"),
     "objects": (arrays(normalizer__mean=lambda x: x.astype(object)), NPZ, "no whole NumPy archive"),
@@ -222,14 +218,6 @@ def test_the_damage_of_one_seed_leaves_the_others(tmp_path):
         load(tmp_path, 0)
     with pytest.raises(ValueError, match="of seed 0 has numbers that are not finite"):
         load_policy(tmp_path / "policy")
-
-
-def test_a_family_with_the_same_shapes_is_not_taken_for_another(tmp_path):
-    make_run(tmp_path, "InvertedPendulum-v5")
-    for family in ("tanh-normal", "truncated-normal", "clipped-normal"):
-        change(tmp_path / "policy" / "policy.json", policy=family)
-        with pytest.raises(ValueError, match="do not belong together"):
-            load(tmp_path)
 
 
 @pytest.mark.parametrize(

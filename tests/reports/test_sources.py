@@ -12,22 +12,6 @@ from mjx_reinforce.reports import sources
 from mjx_reinforce.reports.experiment import ordered, settings_in_words
 
 
-def test_a_run(tmp_path):
-    events = [{"seed": 1, "update": 3}, {"seed": 1, "update": 4}]
-    found = sources.read_experiment(
-        [make_measured_run(tmp_path / "a", summary={"nonfinite": events})]
-    )
-    (part,) = found.configurations
-    np.testing.assert_array_equal(part.eval_return[:, 2], [200, 210, 220, 230])
-    np.testing.assert_array_equal(part.env_steps[:, 0], [0, 50, 100, 150])
-    assert part.nonfinite.tolist() == [0, 2, 0]
-    assert found.threshold == 195.0
-    assert found.timings == {"compile_seconds": 2.0}
-    assert found.provenance["device"] == "cpu"
-    assert found.settings["learning_rate"] == 0.01
-    assert found.unfinished == []
-
-
 def test_runs_are_told_apart_by_what_differs(tmp_path):
     first = make_measured_run(tmp_path / "a")
     second = make_measured_run(
@@ -107,20 +91,6 @@ def test_a_run_that_goes_on_is_read_so_far(tmp_path):
     assert found.configurations[0].eval_return.shape == (3, 3)
 
 
-def test_a_sweep(tmp_path):
-    found = sources.read_experiment([make_sweep(tmp_path / "sweep", num_seeds=6)])
-    assert len(found.configurations) == 16
-    part = found.configurations[5]
-    assert part.label == "learning rate 0.003, discount 0.98"
-    assert part.settings == {"learning_rate": 0.003, "discount": 0.98}
-    assert part.eval_return.shape == part.env_steps.shape == (20, 6)
-    assert part.seed.tolist() == list(range(6))
-    broken = np.isnan(part.eval_return).sum(axis=0)
-    np.testing.assert_array_equal(part.nonfinite, broken)
-    assert found.provenance["git_commit"].startswith("0123")
-    assert found.timings["run_seconds"] == 63.0
-
-
 def test_a_thousand_seeds_are_read_without_a_call_an_entry(tmp_path):
     """Counts calls in place of seconds: the same number on a busy machine."""
     directory = make_measured_run(tmp_path / "a", num_seeds=1000, evaluations=60)
@@ -138,18 +108,6 @@ def test_values_in_words():
     assert settings_in_words(settings) == "learning rate 0.003, hidden sizes 16-32, x y none"
     assert ordered([0.3, 0.1, 0.3]) == [0.1, 0.3]
     assert ordered(["b", "a", "b"]) == ["b", "a"]
-
-
-def test_curves_that_are_no_archive_or_of_others_are_named(tmp_path):
-    directory = make_sweep(tmp_path / "sweep", num_seeds=5, over=ONE)
-    with np.load(directory / "curves.npz") as archive:
-        arrays = dict(archive) | {"configuration": np.full(10, 7)}
-    np.savez(directory / "curves.npz", **arrays)
-    with pytest.raises(ValueError, match="no row of configuration 7"):
-        sources.read_experiment([directory])
-    (directory / "curves.npz").write_bytes(b"x")
-    with pytest.raises(ValueError, match=r"curves.npz is damaged: it is no whole"):
-        sources.read_experiment([directory])
 
 
 def test_what_cannot_be_compared_is_refused(tmp_path):
