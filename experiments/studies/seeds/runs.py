@@ -22,8 +22,6 @@ from mjx_reinforce.sweeps.perform import perform
 
 #: Root of all randomness of the study; no figure elsewhere in this repository uses it.
 SEED = 20_261_122
-#: A run whose episodes stay so short that this many updates do not use up its env steps ends here.
-MAX_UPDATES = 150
 #: All combinations of these are trained. The learning rates come last: they share a program.
 FACTORS: dict[str, list[Any]] = {
     "estimator": ["reward-to-go", "leave-one-out", "value-baseline"],
@@ -36,8 +34,6 @@ _SETTINGS: dict[str, tuple[str, list[Any]]] = {
     "discount_weights": ("algorithm", [f"{__name__}:{name}" for name in ("plain", "discounted")]),
     "standardize": ("standardize_floor", [10.0, None]),
 }
-#: Points in training, evenly spaced in env steps, over which returns are averaged.
-_GRID = 57
 
 
 def plain(env: Any, config: Config, *, discounted: bool = False, **shared: Any) -> mr.Learner:
@@ -108,7 +104,7 @@ def base_settings(task: str, num_seeds: int) -> Config:
         hidden_sizes=() if task.startswith("InvertedPendulum-") else (32, 32),
         num_seeds=num_seeds,
         seed=SEED,
-        max_updates=MAX_UPDATES,
+        max_updates=150,  # a run whose episodes stay short ends here
         eval_every=2,
         # As ``_baseline`` has them; the page says so.
         value_hidden_sizes=(32, 32),
@@ -165,7 +161,7 @@ def measure(directory: Path) -> Task:
     record["nonfinite_runs"] = int(np.sum(~finite.all(axis=0)))
     returns = np.where(finite, returns, returns[finite].min())
     budget = record["settings"]["env_steps"]
-    grid = np.linspace(0, budget, _GRID)
+    grid = np.linspace(0, budget, 57)  # over which returns are averaged
     curves = np.stack([np.interp(grid, x, y) for x, y in zip(steps.T, returns.T, strict=True)])
     first, solved = time_to_threshold(returns, steps, record["threshold"])
     measured = {
