@@ -14,15 +14,16 @@ from flax import struct
 from mujoco import mjMAXVAL, mjx  # pyright: ignore[reportAttributeAccessIssue] (a C extension)
 
 from mjx_reinforce.engine.base import Box, MjModel
-from mjx_reinforce.engine.checks import changed_fields, check_name
+from mjx_reinforce.engine.checks import changed_fields, check_count, check_name, check_number
+from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.physics import mjx_internals
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.engine.scalar import prune
 from mjx_reinforce.envs import models
-from mjx_reinforce.envs.outcomes import check_episode, check_outcome, check_shape, check_start
+from mjx_reinforce.envs.outcomes import check_episode, check_outcome, check_start
 from mjx_reinforce.envs.parts import Named, View
-from mjx_reinforce.envs.settings import EpisodeSettings, build_settings, check_positive
+from mjx_reinforce.envs.settings import EpisodeSettings, build_settings
 
 SOLVERS = ("exact", "mjx", "fast")
 
@@ -111,7 +112,7 @@ class MujocoEnv(Env):
             """Raises ValueError for a value that is out of its range."""
             super().__post_init__()
             check_name("solver", self.solver, dict.fromkeys(SOLVERS))
-            check_positive("frame_skip", self.frame_skip)
+            check_count("frame_skip", self.frame_skip)
 
     settings: Settings
     #: Fields of mjData that ``outcome`` reads of ``before`` besides time, qpos, qvel and act. What
@@ -220,7 +221,7 @@ class MujocoEnv(Env):
 
     def _physics_of(self, episode: dict[str, jax.Array]) -> tuple[Any, Any]:
         """Returns the forward pass and the step of the model as it is in an episode."""
-        fields = {name: value for name, value in episode.items() if name in models.RANDOM}
+        fields = models.replaced(episode)
         if not fields:
             return self._forward, self._physics_step
         model = self.model.replace(**fields)
@@ -259,8 +260,8 @@ class MujocoEnv(Env):
         start = start.replace(ctrl=jnp.asarray(action, start.ctrl.dtype))
         data, sound = jax.lax.fori_loop(0, self.frame_skip, advance, (start, jnp.array(True)))
         if self.contact_forces:
-            fields = {k: v for k, v in before.episode.items() if k in models.RANDOM}
-            data = mjx.rne_postconstraint(self.model.replace(**fields), data)
+            model = self.model.replace(**models.replaced(before.episode))
+            data = mjx.rne_postconstraint(model, data)
         view = View(data, self.mj_model, before.episode)
         reward, terminated, terms = self._outcome(before, start, view, action)
         dtype = state.reward.dtype
@@ -329,10 +330,7 @@ class NearPose(MujocoEnv):
         def __post_init__(self):
             """Raises ValueError for a value that is out of its range."""
             super().__post_init__()
-            if self.reset_noise_scale < 0:
-                raise ValueError(
-                    f"reset_noise_scale must be 0 or more, got {self.reset_noise_scale}"
-                )
+            check_number("reset_noise_scale", self.reset_noise_scale)
 
     settings: Settings
     #: Whether the starting velocities are normal; otherwise they are uniform.

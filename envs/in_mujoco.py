@@ -12,7 +12,7 @@ from mjx_reinforce.engine.base import Environment, MjModel
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.base import Before, MujocoEnv
-from mjx_reinforce.envs.parts import Named, View
+from mjx_reinforce.envs.parts import View
 
 #: MuJoCo's own names; it is a C extension without stubs.
 _C: Any = mujoco
@@ -39,16 +39,6 @@ class _Recorder(View):
             raise ValueError(f"the task reads {name}, which is no array of mjData; {_LEAVE_OUT}")
         self.read.add(name)
         return jnp.zeros(shape.shape, shape.dtype)
-
-
-class _Fields(Named):
-    """Some fields of mjData, as attributes."""
-
-    def __init__(self, fields: dict[str, Any], mj_model: MjModel, episode: dict[str, Any]):
-        vars(self).update(fields, mj_model=mj_model, episode=episode)
-
-    def __getattr__(self, name: str) -> Any:  # for type checkers
-        raise AttributeError(name)
 
 
 class InMujoco:
@@ -82,21 +72,23 @@ class InMujoco:
 
         def read(before, episode, action):
             recorder.episode = episode
-            outcome = env.outcome(Before(before, env.mj_model, episode), recorder, action)
+            outcome = env.outcome(self._view(before, episode), recorder, action)
             return outcome, env.observe(recorder)
 
         jax.eval_shape(read, self._kept(), self._episode, jnp.zeros(env.action_size))
         self._read = sorted(recorder.read)
         self._fields()  # raises for those of another size
         self._start = jax.jit(env.draw)
-        self._observe = jax.jit(lambda fields, episode: env.observe(self._view(fields, episode)))
+        self._observe = jax.jit(lambda *given: env.observe(self._view(*given)))
         self._advance = jax.jit(self._outcome)
 
     def reset(self, rng: jax.Array) -> np.ndarray:
         """Begins an episode and returns its first observation [O]; consumes the key."""
         self._episode, (qpos, qvel) = self._start(rng)
-        self.model = _with_fields(self.env.mj_model, self._episode)
-        model, data = self.model, _C.MjData(self.model)
+        self.model = model = copy.copy(self.env.mj_model)
+        for name, value in models.replaced(self._episode).items():
+            getattr(model, name)[:] = value
+        data = _C.MjData(model)
         data.qpos[:], data.qvel[:] = qpos, qvel
         _C.mj_forward(model, data)
         self.data = data
@@ -121,13 +113,13 @@ class InMujoco:
         return np.asarray(observation), reward, bool(ended)
 
     def _outcome(self, before, fields, episode, action):
-        data, before = self._view(fields, episode), Before(before, self.env.mj_model, episode)
+        data, before = self._view(fields, episode), self._view(before, episode)
         reward, ended, _ = self.env.outcome(before, data, action)
         return self.env.observe(data), reward, ended
 
     def _view(self, fields: dict[str, Any], episode: dict[str, Any]) -> Any:
         """Returns fields of mjData as the task reads them."""
-        return _Fields(fields, self.env.mj_model, episode)
+        return Before(fields, self.env.mj_model, episode)
 
     def _fields(self) -> dict[str, np.ndarray]:
         """Returns what the task reads of the simulation, in the shapes that MJX has."""
@@ -146,14 +138,3 @@ class InMujoco:
                 f"{_LEAVE_OUT}"
             )
         return value.reshape(shape.shape).astype(shape.dtype)
-
-
-def _with_fields(model: MjModel, episode: dict[str, jax.Array]) -> Any:
-    """Returns a model with the fields that an episode replaces."""
-    fields = {name: value for name, value in episode.items() if name in models.RANDOM}
-    if not fields:
-        return model
-    model = copy.copy(model)
-    for name, value in fields.items():
-        getattr(model, name)[:] = value
-    return model

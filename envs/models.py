@@ -21,8 +21,6 @@ _C: Any = mujoco
 #: Everything that MuJoCo carries from a step to the next, by its names in mjData; mjdata.h lists it
 #: as mjtState. Here is what an env step hands to the next.
 CARRIED = ("time", "qpos", "qvel", "act", "qacc_warmstart")
-#: What the action sets for all physics steps of an env step.
-GIVEN = ("ctrl",)
 #: What stays as the model has it, since no task changes it.
 CONSTANT = ("qfrc_applied", "xfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "userdata")
 #: Fields of a model that ``MujocoEnv.randomize`` may replace in an episode.
@@ -108,16 +106,11 @@ def load_model(xml_file: ModelSource) -> Any:
     """
     if isinstance(xml_file, MjModel):
         model = copy.copy(xml_file)
-    elif isinstance(xml_file, MjSpec):
-        model = _compile_model(lambda spec: spec.copy().compile(), xml_file, xml_file)
-    elif is_own(xml_file):
-        model = _compile_model(MjModel.from_xml_path, xml_file, xml_file)
     else:
         with warnings.catch_warnings():
             # HalfCheetah's total mass is given as Gymnasium gives it, which MuJoCo deprecates.
             warnings.filterwarnings("ignore", ".*'settotalmass' is deprecated")
-            text = _asset(xml_file)
-            model = _compile_model(lambda text: MjSpec.from_string(text).compile(), text, xml_file)
+            model = _compile_model(MjSpec.compile, spec(xml_file), xml_file)
     if not model.nu:
         raise ValueError(f"{_name(xml_file)} has no actuators; add an <actuator> element")
     model.opt.enableflags &= ~_ONLY_REPORTS
@@ -171,6 +164,11 @@ def _compile_model(
         return compiler(source)
     except Exception as error:  # mujoco.FatalError is no ValueError
         raise ValueError(f"MuJoCo cannot compile {_name(xml_file)}: {explain(error)}") from error
+
+
+def replaced(episode: dict[str, Any]) -> dict[str, Any]:
+    """Returns the fields of the model that an episode replaces, see ``MujocoEnv.randomize``."""
+    return {name: value for name, value in episode.items() if name in RANDOM}
 
 
 def make_data(model: "mjx.Model") -> mjx.Data:

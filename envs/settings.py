@@ -9,7 +9,14 @@ import typing
 from collections.abc import Sequence
 from typing import Any
 
-from mjx_reinforce.engine.checks import check_name, check_type, is_nan, read_as, spoken_kind
+from mjx_reinforce.engine.checks import (
+    check_count,
+    check_name,
+    check_type,
+    is_nan,
+    read_as,
+    spoken_kind,
+)
 
 #: A range (low, high), of which ``EpisodeSettings`` checks that it contains something.
 Interval = tuple[float, float]
@@ -26,7 +33,7 @@ class EpisodeSettings:
 
     def __post_init__(self):
         """Raises ValueError for a value that is out of its range."""
-        check_positive("max_episode_steps", self.max_episode_steps)
+        check_count("max_episode_steps", self.max_episode_steps)
         for field in dataclasses.fields(self):
             # The same object: other pairs of numbers may be of any order.
             if field.type is Interval:
@@ -51,14 +58,16 @@ def build_settings(env: Any, arguments: dict[str, Any]) -> Any:
     known = {field.name: field for field in dataclasses.fields(env.Settings) if field.init}
     for name in arguments:
         check_name(f"argument of {task}", name, known)
-    missing = [name for name, field in known.items() if _needed(field) and name not in arguments]
+    none = dataclasses.MISSING
+    needed = [x.name for x in known.values() if x.default is x.default_factory is none]
+    missing = [name for name in needed if name not in arguments]
     if missing:
         raise ValueError(
             f"{task} needs {', '.join(missing)}: pass them, or give them defaults in its Settings"
         )
     for name, field in known.items():
         value = arguments.get(name, field.default)
-        if value is not dataclasses.MISSING:
+        if value is not none:
             check_type(f"{name} of {task}", value, field.type)
         if is_nan(value):
             raise ValueError(f"{name} of {task} must be a number, got nan")
@@ -116,14 +125,3 @@ def read_settings(task: object, words: Sequence[str]) -> dict[str, Any]:
             said = spoken_kind(known[name])
             raise ValueError(f"--env-set {name} of {called} must be {said}, got {text!r}") from None
     return read
-
-
-def _needed(field: dataclasses.Field[Any]) -> bool:
-    """Returns whether an argument has no default."""
-    return field.default is field.default_factory is dataclasses.MISSING
-
-
-def check_positive(name: str, value: int) -> None:
-    """Raises ValueError for a number below 1."""
-    if value < 1:
-        raise ValueError(f"{name} must be 1 or more, got {value}")

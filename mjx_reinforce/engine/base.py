@@ -133,6 +133,10 @@ class Acts(Protocol):
         ...
 
 
+#: The fields of a trajectory that have an entry for each step, [T, N, ...].
+_OF_STEPS = ("observation", "action", "reward", "mask")
+
+
 class Trajectory(Arrays):
     """N complete episodes, time first.
 
@@ -171,22 +175,12 @@ class Trajectory(Arrays):
 
     def first(self, steps: int) -> "Trajectory":
         """Returns the first so many steps of every episode."""
-        return self.replace(
-            observation=self.observation[:steps],
-            action=self.action[:steps],
-            reward=self.reward[:steps],
-            mask=self.mask[:steps],
-        )
+        return self.replace(**{name: getattr(self, name)[:steps] for name in _OF_STEPS})
 
     def episodes(self, part: slice) -> "Trajectory":
         """Returns a part of the episodes; ``simulated`` remains that of all."""
-        return self.replace(
-            observation=self.observation[:, part],
-            action=self.action[:, part],
-            reward=self.reward[:, part],
-            mask=self.mask[:, part],
-            nonfinite=self.nonfinite[part],
-        )
+        of_steps = {name: getattr(self, name)[:, part] for name in _OF_STEPS}
+        return self.replace(**of_steps, nonfinite=self.nonfinite[part])
 
 
 def action_space(env: Environment) -> Box | Discrete:

@@ -37,10 +37,21 @@ _KINDS: dict[Any, tuple[Any, str]] = {
     str: (str, "text"),
     type(None): (type(None), "None"),
 }
+#: How people write the values of kinds that have few.
+_WORDS: dict[Any, dict[str, Any]] = {
+    type(None): {"none": None},
+    bool: {"true": True, "false": False},
+}
 
 
 class BadEnvironmentError(ValueError):
     """An environment's code does not do what an environment must."""
+
+
+def require(holds: object, message: str) -> None:
+    """Raises BadEnvironmentError unless something holds."""
+    if not holds:
+        raise BadEnvironmentError(message)
 
 
 def explain(error: BaseException) -> str:
@@ -125,21 +136,18 @@ def read_as(kind: Any, word: str) -> Any:
             with contextlib.suppress(ValueError):
                 return read_as(each, word)
         raise ValueError(word)
-    if kind is type(None):
-        return {"none": None}[word.lower()] if word.lower() == "none" else _no(word)
-    if kind is bool:
-        words = {"true": True, "false": False}
-        return words[word.lower()] if word.lower() in words else _no(word)
-    if typing.get_origin(kind) is typing.Literal:
-        return word if word in typing.get_args(kind) else _no(word)
     if typing.get_origin(kind) is tuple:
         inner = typing.get_args(kind)[0]
         return tuple(read_as(inner, part) for part in word.split(",")) if word != "none" else ()
-    return whole_number(word) if kind is int else kind(word)
-
-
-def _no(word: str) -> Any:
-    raise ValueError(word)
+    if typing.get_origin(kind) is typing.Literal:
+        words = {name: name for name in typing.get_args(kind)}
+    elif kind in _WORDS:
+        words, word = _WORDS[kind], word.lower()
+    else:
+        return whole_number(word) if kind is int else kind(word)
+    if word not in words:
+        raise ValueError(word)
+    return words[word]
 
 
 def check_kind(name: str, value: object, kind: type, example: str) -> None:
@@ -196,11 +204,8 @@ def check_parts(env: object) -> None:
         missing = [part for part in _PARTS if not hasattr(env, part)]
     except Exception as error:  # action_size may be a property, the user's code
         raise BadEnvironmentError(f"{name}.action_size fails: {explain(error)}") from error
-    if missing:
-        raise BadEnvironmentError(
-            f"{name} is no environment: it has no {', '.join(missing)}; "
-            "mjx_reinforce.Environment says what one has"
-        )
+    lacks = f"{name} is no environment: it has no {', '.join(missing)}"
+    require(not missing, f"{lacks}; mjx_reinforce.Environment says what one has")
 
 
 def known_number(value: Any) -> float | None:

@@ -7,10 +7,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 
 from mjx_reinforce.engine.base import Act, Acts, Box, Discrete, Environment, PyTree, action_space
-from mjx_reinforce.engine.checks import BadEnvironmentError, check_parts, explain, is_nan
+from mjx_reinforce.engine.checks import (
+    BadEnvironmentError,
+    check_parts,
+    explain,
+    is_nan,
+    require,
+)
 
 #: What JAX raises where Python or NumPy asks for the value of a traced array.
 _NEED_VALUES = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
@@ -42,49 +47,43 @@ def _check_wrappers(env: object) -> None:
     wrapper: Any = env
     while wrapper is not None:
         name = type(wrapper).__name__
-        if name.endswith(_NOT_HERE):
-            raise BadEnvironmentError(
-                f"{name} does what is done here: give the environment that it wraps, its env, "
-                "as brax.envs.create(..., auto_reset=False) makes it"
-            )
+        require(
+            not name.endswith(_NOT_HERE),
+            f"{name} does what is done here: give the environment that it wraps, its env, "
+            "as brax.envs.create(..., auto_reset=False) makes it",
+        )
         wrapper = getattr(wrapper, "__dict__", {}).get("env")
 
 
 def _check_limits(name: str, env: object) -> None:
     """Raises ValueError for a time limit or threshold that is none."""
-    limit = _declared(name, env, "max_episode_steps")
-    if limit is not None and not _is_count(limit):
-        raise BadEnvironmentError(
-            f"{name}.max_episode_steps must be a whole number, 1 or more, got {limit!r}"
-        )
-    threshold = _declared(name, env, "reward_threshold")
-    if threshold is not None and (not isinstance(threshold, numbers.Real) or is_nan(threshold)):
-        raise BadEnvironmentError(
-            f"{name}.reward_threshold must be a number or None, got {threshold!r}"
-        )
+    limit, threshold = (_declared(name, env, x) for x in ("max_episode_steps", "reward_threshold"))
+    if limit is not None:
+        _require_count(f"{name}.max_episode_steps", limit)
+    is_number = isinstance(threshold, numbers.Real) and not is_nan(threshold)
+    said = f"{name}.reward_threshold must be a number or None, got {threshold!r}"
+    require(threshold is None or is_number, said)
 
 
 def _check_action_space(name: str, env: Environment) -> None:
     """Raises ValueError for actions that cannot be drawn."""
     size, declared = env.action_size, _declared(name, env, "action_space")
-    if not _is_count(size):
-        raise BadEnvironmentError(
-            f"{name}.action_size must be a whole number, 1 or more, got {size!r}"
+    _require_count(f"{name}.action_size", size)
+    if isinstance(declared, Discrete):
+        count = f"{declared.num_actions} actions"
+        said = f"{name}.action_size is {size}, but its action_space has {count}"
+        require(declared.num_actions == size, said)
+    elif isinstance(declared, Box):
+        require(
+            _are_bounds(declared, size),
+            f"{name}.action_space must have low < high, of {size} entries each as action_size "
+            f"says, got low {declared.low} and high {declared.high}",
         )
-    if isinstance(declared, Discrete) and declared.num_actions != size:
-        raise BadEnvironmentError(
-            f"{name}.action_size is {size}, but its action_space has {declared.num_actions} actions"
-        )
-    if isinstance(declared, Box):
-        if not _are_bounds(declared, size):
-            raise BadEnvironmentError(
-                f"{name}.action_space must have low < high, of {size} entries each as action_size "
-                f"says, got low {declared.low} and high {declared.high}"
-            )
-    elif declared is not None and not isinstance(declared, Discrete):
-        raise BadEnvironmentError(
+    else:
+        require(
+            declared is None,
             f"{name}.action_space is a {type(declared).__module__}.{type(declared).__name__}; "
-            "make it a mjx_reinforce.Box(low, high) or mjx_reinforce.Discrete(num_actions)"
+            "make it a mjx_reinforce.Box(low, high) or mjx_reinforce.Discrete(num_actions)",
         )
 
 
@@ -96,9 +95,10 @@ def _declared(name: str, env: object, what: str) -> Any:
         raise BadEnvironmentError(f"{name}.{what} fails: {explain(error)}") from error
 
 
-def _is_count(value: object) -> bool:
-    """Returns whether a value is a whole number, 1 or more; True is none."""
-    return isinstance(value, numbers.Integral) and not isinstance(value, bool) and int(value) >= 1
+def _require_count(name: str, value: object) -> None:
+    """Raises ValueError for what is no whole number, 1 or more; True is none."""
+    is_count = isinstance(value, numbers.Integral) and not isinstance(value, bool) and value >= 1
+    require(is_count, f"{name} must be a whole number, 1 or more, got {value!r}")
 
 
 def _are_bounds(space: Box, size: int) -> bool:
@@ -135,50 +135,40 @@ def _check_state(name: str, start: PyTree) -> None:
         ("done", 0, "a scalar []", "reduce it, as with jnp.any"),
     ):
         value: Any = getattr(start, field, None)
-        if not hasattr(value, "shape"):
-            got = f"there is no {field}" if value is None else f"it is {_described(value)}"
-            raise BadEnvironmentError(
-                f"{name}.reset must return a state whose {field} is {shape}, and {got}; "
-                "brax.envs.State has all that is needed"
-            )
-        if len(value.shape) != axes or 0 in value.shape:
-            raise BadEnvironmentError(
-                f"the {field} of {name}.reset must be {shape}, its shape is "
-                f"{list(value.shape)}; {remedy}"
-            )
-        if not jnp.isrealobj(value):
-            raise BadEnvironmentError(
-                f"the {field} of {name}.reset must hold real numbers, it holds {value.dtype}"
-            )
+        got = f"there is no {field}" if value is None else f"it is {_described(value)}"
+        said = f"{name}.reset must return a state whose {field} is {shape}, and {got}; "
+        require(hasattr(value, "shape"), f"{said}brax.envs.State has all that is needed")
+        the_field, found = f"the {field} of {name}.reset must", list(value.shape)
+        said = f"{the_field} be {shape}, its shape is {found}; {remedy}"
+        require(len(found) == axes and 0 not in found, said)
+        said = f"{the_field} hold real numbers, it holds {value.dtype}"
+        require(jnp.isrealobj(value), said)
 
 
 def _check_same(name: str, start: PyTree, after: PyTree) -> None:
     """Raises ValueError if ``step`` returns a state of another kind than ``reset``."""
-    if jax.tree.structure(start) != jax.tree.structure(after):
-        before, now = _paths(start), _paths(after)
-        only = [f"{path} only after reset" for path in before if path not in now]
-        only += [f"{path} only after step" for path in now if path not in before]
-        raise BadEnvironmentError(
-            f"{name}.step must return a state with the entries that reset's has"
-            f"{': ' if only else ''}{', '.join(only[:4])}"
+    before, now = _paths(start), _paths(after)
+    only = [f"{path} only after reset" for path in before if path not in now]
+    only += [f"{path} only after step" for path in now if path not in before]
+    require(
+        jax.tree.structure(start) == jax.tree.structure(after),
+        f"{name}.step must return a state with the entries that reset's has"
+        f"{': ' if only else ''}{', '.join(only[:4])}",
+    )
+    for (path, old), new in zip(before.items(), now.values(), strict=True):
+        # May a new value be kept in place of an old one, as ``hold`` does?
+        holds = old.dtype == new.dtype or jnp.promote_types(old.dtype, new.dtype) == old.dtype
+        require(
+            old.shape == new.shape and holds,
+            f"{name}.step must return a state like reset's: {path} is {_described(old)} after "
+            f"reset, and {_described(new)} after step",
         )
-    for (path, old), new in zip(_paths(start).items(), jax.tree.leaves(after), strict=True):
-        if old.shape != new.shape or not _holds(old.dtype, new.dtype):
-            raise BadEnvironmentError(
-                f"{name}.step must return a state like reset's: {path} is {_described(old)} after "
-                f"reset, and {_described(new)} after step"
-            )
 
 
 def _paths(tree: PyTree) -> dict[str, Any]:
     """Returns the leaves by where they are."""
     leaves = jax.tree_util.tree_flatten_with_path(tree)[0]
     return {jax.tree_util.keystr(path).lstrip("."): leaf for path, leaf in leaves}
-
-
-def _holds(old: PyTree, new: PyTree) -> bool:
-    """Returns whether a new value may be kept in place of an old one, as ``hold`` does."""
-    return old == new or jnp.promote_types(old, new) == old
 
 
 def _described(value: jax.Array) -> str:
@@ -207,10 +197,8 @@ def check_policy(
         )
     found = jax.eval_shape(act, params, observation).shape
     of_network = getattr(distribution, "num_outputs", None)
-    if of_network is None:
-        return
     constants = len(getattr(distribution, "constants", ()))
-    if found != (of_network + constants,):
+    if of_network is not None and found != (of_network + constants,):
         behind = f", and behind them {constants} that no observation changes" if constants else ""
         raise ValueError(
             f"act must return [{of_network + constants}] outputs of one observation: {of_network} "
@@ -219,7 +207,7 @@ def check_policy(
         )
 
 
-def check_shape(name: str, value: ArrayLike, *shapes: tuple[int, ...], remedy: str = "") -> None:
+def check_shape(name: str, value: object, *shapes: tuple[int, ...], remedy: str = "") -> None:
     """Raises ValueError for an array whose shape is none of those it may have.
 
     Args:
@@ -228,7 +216,21 @@ def check_shape(name: str, value: ArrayLike, *shapes: tuple[int, ...], remedy: s
       *shapes: those that it may have.
       remedy: what to do instead, for the message.
     """
-    if jnp.shape(value) not in shapes:
+    if shape_of(value) not in shapes:
         expected = " or ".join(str(list(shape)) for shape in shapes)
-        got = list(jnp.shape(value))
-        raise ValueError(f"{name} must be {expected}, got the shape {got}{remedy}")
+        raise ValueError(f"{name} must be {expected}, got {in_words(value)}{remedy}")
+
+
+def shape_of(value: Any) -> tuple[int, ...] | None:
+    """Returns the shape of a number or an array, or None for what is neither."""
+    if isinstance(value, bool | int | float):
+        return ()
+    return tuple(value.shape) if hasattr(value, "shape") else None
+
+
+def in_words(value: object) -> str:
+    """Returns the shape of what was given, for a message, or what it is instead of an array."""
+    if isinstance(value, tuple | list):
+        return f"a {type(value).__name__} of {len(value)}"
+    shape = shape_of(value)
+    return f"{value!r}"[:80] if shape is None else f"the shape {list(shape)}"

@@ -63,7 +63,7 @@ def test_what_has_no_settings_is_refused():
 
 
 def test_a_value_out_of_its_range_is_refused_as_by_make():
-    with pytest.raises(ValueError, match="frame_skip must be 1 or more, got 0"):
+    with pytest.raises(ValueError, match="frame_skip must be at least 1, got 0"):
         envs.make_set("InvertedPendulum-v5", ["frame_skip=0"])
     with pytest.raises(ValueError, match=r"healthy_z_range of Hopper must be .* got \(0.2, "):
         envs.make_set("Hopper-v5", ["healthy_z_range=0.2,1,3"])

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 
 from mjx_reinforce.engine.checks import BadEnvironmentError
-from mjx_reinforce.envs.outcomes import check_outcome, check_shape, check_start
+from mjx_reinforce.engine.contract import check_shape
+from mjx_reinforce.envs.outcomes import check_outcome, check_start
 
 SIZES = (3, 2)
 

@@ -4,6 +4,7 @@ All here is for one environment of N, and is mapped over them. The reset of an e
 the environment's own key alone, so what one plays does not depend on N.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -67,21 +68,7 @@ class VectorState(Arrays):
 
 def blank(env: Environment) -> VectorState:
     """Returns the shapes of one environment's entry of a ``VectorState``."""
-    start = jax.eval_shape(env.reset, jax.random.key(0))
-    shape: Any = jax.ShapeDtypeStruct
-    flag, number = shape((), bool), shape(start.reward.shape, start.reward.dtype)
-    return VectorState(
-        simulation=start,
-        reward=number,
-        terminated=flag,
-        truncated=flag,
-        nonfinite=flag,
-        final_obs=shape(start.obs.shape, start.obs.dtype),
-        metrics=dict(getattr(start, "metrics", {})),
-        episode_return=number,
-        episode_length=shape((), jnp.int32),
-        keys=shape((2,), jnp.uint32),
-    )
+    return jax.eval_shape(functools.partial(_begin, env), jax.ShapeDtypeStruct((2,), jnp.uint32))
 
 
 def advance_function(env: Environment, limit: int | None, autoreset: str) -> Callable[..., Any]:
@@ -98,20 +85,21 @@ def advance_function(env: Environment, limit: int | None, autoreset: str) -> Cal
     def advance(state: VectorState, action: PyTree, begins: jax.Array) -> VectorState:
         if autoreset == "same_step":
             after = _play(env, limit, state, action)
-            start = lax.cond(begins | after.done, lambda: _begin(env, state), lambda: after)
+            start = lax.cond(begins | after.done, lambda: _begin(env, state.keys), lambda: after)
             kept = after.replace(simulation=start.simulation, keys=start.keys)
             return jax.tree.map(lambda x, y: jnp.where(begins, x, y), start, kept)
         over = begins | (state.done if autoreset == "next_step" else False)
-        return lax.cond(over, lambda: _begin(env, state), lambda: _play(env, limit, state, action))
+        begin, play = (lambda: _begin(env, state.keys)), (lambda: _play(env, limit, state, action))
+        return lax.cond(over, begin, play)
 
     return advance
 
 
-def _begin(env: Environment, state: VectorState) -> VectorState:
-    """Returns an environment at the start of its next episode."""
-    key, reset_key = jax.random.split(key_of(state.keys))
+def _begin(env: Environment, keys: jax.Array) -> VectorState:
+    """Returns an environment at the start of its next episode, of keys as of ``VectorState``."""
+    key, reset_key = jax.random.split(key_of(keys))
     start = env.reset(reset_key)
-    none, zero = jnp.zeros((), bool), jnp.zeros_like(state.reward)
+    none, zero = jnp.zeros((), bool), jnp.zeros_like(start.reward)
     return VectorState(
         simulation=start,
         reward=zero,
