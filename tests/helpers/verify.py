@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from mjx_reinforce.engine.scalar.backend import Backend
-from mjx_reinforce.engine.scalar.nodes import BOOL, Captured, Node, Scalar
-from mjx_reinforce.engine.scalar.ops import FACTS, Op
+from mjx_reinforce.engine.scalar.nodes import BOOL, FACTS, Captured, Node, Op, Scalar
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop
 from mjx_reinforce.engine.scalar.rules.iterate import varies
 from mjx_reinforce.engine.scalar.scalarized import Scalarized

@@ -20,7 +20,7 @@ from mjx_reinforce.engine.gpu.lockstep import (
     some_of_block,
 )
 from mjx_reinforce.engine.llvm.emit import Input
-from mjx_reinforce.engine.play.native_step import NOT_PLAYED
+from mjx_reinforce.engine.play.episode import NOT_PLAYED
 from mjx_reinforce.engine.scalar import scalarized
 
 _INT = np.dtype(np.int32)
@@ -72,7 +72,7 @@ def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
     it waits for others in its block as simulated for the seed it played last, if there is one.
 
     Args:
-      step: of ``step.step_function`` where an episode is running, written out.
+      step: of ``program.step_function`` where an episode is running, written out.
       num_actor: how many leaves of its arguments are the actor's.
     """
     return _Kernel(step, num_actor).write()

@@ -13,10 +13,15 @@ from mjx_reinforce.engine.llvm.operations import OPERATIONS
 from mjx_reinforce.engine.llvm.text import Text, literal
 from mjx_reinforce.engine.scalar.backend import Backend
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
-from mjx_reinforce.engine.scalar.nodes import Captured, Node, Scalar, is_constant
-from mjx_reinforce.engine.scalar.ops import Op
-from mjx_reinforce.engine.scalar.passes.accumulators import accumulators, reads, unread
-from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
+from mjx_reinforce.engine.scalar.nodes import Captured, Node, Op, Scalar, is_constant
+from mjx_reinforce.engine.scalar.passes.liveness import (
+    LiveGate,
+    LiveLoop,
+    Schedule,
+    accumulators,
+    reads,
+    unread,
+)
 
 
 class Memory(NamedTuple):

@@ -9,7 +9,7 @@ from mjx_reinforce.engine.llvm import math
 from mjx_reinforce.engine.llvm.lanes import INFINITY, Lanes
 from mjx_reinforce.engine.llvm.text import scalar_type
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
-from mjx_reinforce.engine.scalar.ops import FACTS, Op
+from mjx_reinforce.engine.scalar.nodes import FACTS, Op
 
 #: (operation, dtype of the result, operands) -> the result
 Emit = Callable[..., Lanes]

@@ -17,7 +17,7 @@ from jax import lax
 from mujoco import mjx
 
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_contact
-from mjx_reinforce.engine.physics.newton_in_loops import solve_in_loops
+from mjx_reinforce.engine.physics.newton import solve_in_loops
 from mjx_reinforce.engine.physics.rows import make_constraint
 from mjx_reinforce.engine.scalar import by_engine
 
@@ -34,9 +34,9 @@ _AT_ONCE = 8
 def solve_touching(solver: Solver, model: mjx.Model, data: mjx.Data) -> Solution:
     """Solves with the contacts that touch, or with all where more touch than there is room for.
 
-    The latter is so rare that ``newton_in_loops`` does it, in little code. Where those that there
-    is room for have more than half of the rows, it is not worth the branches (Pusher on an H200:
-    0.8 of the speed, 0.7 with a trained policy), and ``solver`` takes all.
+    The latter is so rare that ``newton.solve_in_loops`` does it, in little code. Where those that
+    there is room for have more than half of the rows, it is not worth the branches (Pusher on an
+    H200: 0.8 of the speed, 0.7 with a trained policy), and ``solver`` takes all.
 
     Args:
       solver: what solves; it takes fewer contacts than the model has.

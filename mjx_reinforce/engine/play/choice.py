@@ -18,7 +18,7 @@ from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.base import Acts, Environment, PyTree, Trajectory, observation_size
 from mjx_reinforce.engine.checks import check_name
 from mjx_reinforce.engine.play import available, native, program
-from mjx_reinforce.engine.play.mapping import machine_map
+from mjx_reinforce.engine.play.program import machine_map
 from mjx_reinforce.engine.play.rollouts import rollout
 from mjx_reinforce.engine.scalar import jaxprs, size
 from mjx_reinforce.engine.scalar.vmap import MAX_OPERATIONS

@@ -21,6 +21,8 @@ from mjx_reinforce.engine.scalar import any_lane
 LoopState = TypeVar("LoopState")
 #: Noise is drawn for so many steps at once, and only then is it seen whether all episodes are over.
 CHUNK_STEPS = 50
+#: What machine code is told of an episode that is not played; see ``plays``.
+NOT_PLAYED = 0
 
 
 class Step(NamedTuple):
@@ -46,6 +48,18 @@ def check_each(num_episodes: int, **arguments: ArrayLike) -> None:
     """Raises ValueError for an argument that is neither one for all [] nor one an episode [N]."""
     for name, value in arguments.items():
         check_shape(name, value, (), (num_episodes,), remedy="; play several seeds by jax.vmap")
+
+
+def plays(
+    active: bool | jax.Array, deterministic: bool | jax.Array, limit: int | jax.Array
+) -> jax.Array:
+    """Returns what machine code is told of episodes, as int32: their steps and their actions.
+
+    It is n > 0 for at most n steps by samples, -n for at most n steps by the distribution's mode,
+    and 0 for an episode that is not played, as one with a limit of 0 is.
+    """
+    steps = jnp.maximum(jnp.asarray(limit, jnp.int32), 0)
+    return jnp.where(active, jnp.where(deterministic, -steps, steps), NOT_PLAYED)
 
 
 def episode_keys(key: jax.Array, num_episodes: int) -> jax.Array:

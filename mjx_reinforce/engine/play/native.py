@@ -18,8 +18,7 @@ from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.cpu import seam as cpu
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.play import available, episode
-from mjx_reinforce.engine.play.native_step import plays, stored
-from mjx_reinforce.engine.play.program import NativeProgram, build_program, refusal
+from mjx_reinforce.engine.play.program import NativeProgram, build_program, refusal, stored
 from mjx_reinforce.engine.scalar import TooLarge, UnsupportedPrimitive
 
 _REMEDY = f'make keys with jax.random.key(seed, impl="{available.GENERATOR}"), or choose auto'
@@ -60,8 +59,9 @@ def rollout(
         raise ValueError(f"the native engine cannot play this: {error}") from error
     begin = functools.partial(episode.begin, env)
     state, keys = jax.vmap(begin)(episode.episode_keys(key, num_episodes))
+    plays = episode.plays(active, deterministic, jnp.minimum(steps, horizon))
     given = (
-        jnp.broadcast_to(plays(active, deterministic, jnp.minimum(steps, horizon)), num_episodes),
+        jnp.broadcast_to(plays, num_episodes),
         jax.random.key_data(keys),
         *(x.reshape(-1) for x in jax.tree.leaves(actor) if x.size),
         *(stored(x).reshape(num_episodes, -1) for x in jax.tree.leaves(state) if x.size),

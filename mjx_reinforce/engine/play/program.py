@@ -7,24 +7,117 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 
 from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, observation_size
-from mjx_reinforce.engine.cpu import handler, kernel, lanes, machine
+from mjx_reinforce.engine.cpu import handler, kernel, machine, mapping
+from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import kernel as gpu_kernel
 from mjx_reinforce.engine.gpu import lockstep, ptx
+from mjx_reinforce.engine.gpu import mapping as gpu_mapping
 from mjx_reinforce.engine.gpu import seam as gpu_seam
-from mjx_reinforce.engine.play import available, native_step, objects
-from mjx_reinforce.engine.play.native_step import StepResult
+from mjx_reinforce.engine.play import available, episode, objects, units
+from mjx_reinforce.engine.play.counter import at_counter, split
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
 from mjx_reinforce.engine.scalar.graph import Limits
 
+#: A branch of more scalar operations is skipped where no lane needs it.
+BRANCH_COST = 40
 #: Loops stay loops: the Runge-Kutta stages too, which are a scan of four.
 LOOPS = Limits(scans=1, unrollable=1)
 #: On GPUs a loop over few contacts is written out: an array that a loop reads is in memory there.
 GPU_LOOPS = LOOPS._replace(unrollable=lockstep.WRITTEN_OUT)
 #: The folders whose files decide what is written for a step.
 _WRITERS = ("mjx_reinforce.engine",)
+
+
+class Carried(NamedTuple):
+    """What an episode carries from step to step.
+
+    state: the leaves of the environment's state, bools as int32
+    keys: [2, 2] uint32: the episode's key, and the key of the noise of its present chunk
+    """
+
+    state: list[Any]
+    keys: Any
+
+
+class StepResult(NamedTuple):
+    """What a step returns.
+
+    record: observation [O], action [A] or [], reward []
+    alive: [] int32, 1 where the episode goes on
+    broken: [] int32, 1 where it left the finite numbers
+    carried: what the next step reads
+    """
+
+    record: list[Any]
+    alive: Any
+    broken: Any
+    carried: Carried
+
+
+def step_function(
+    env: Environment, act: Act, distribution: Acts, length: int
+) -> Callable[..., StepResult]:
+    """Returns (actor, carried, t, deterministic, alive) -> ``StepResult``, for one episode.
+
+    Args:
+      env: what is played.
+      act: (actor, observation [O]) -> outputs of the distribution.
+      distribution: the family whose parameters the outputs are.
+      length: steps whose noise is drawn with one key, as ``chunks.play_chunks`` does.
+    """
+    shapes = jax.eval_shape(env.reset, jax.random.key(0))
+    leaves, tree = jax.tree.flatten(shapes)
+    words = _words_per_step(distribution)
+
+    def step(actor, carried, t, deterministic, alive):
+        state = [
+            (x != 0) if leaf.dtype == bool else x
+            for x, leaf in zip(carried.state, leaves, strict=True)
+        ]
+        state, alive = tree.unflatten(state), alive != 0
+        at = t % length
+        keys = lax.cond(at == 0, lambda keys: split(keys[0]), lambda keys: keys, carried.keys)
+        offset = (at * words).astype(jnp.uint32)
+        noise = distribution.noise(at_counter(keys[1], offset), ())
+        with units.one_at_a_time():
+            played = episode.step(
+                env.step, act, distribution, actor, state, noise, alive, deterministic != 0
+            )
+        after = jax.tree.leaves(episode.hold(alive, played.state, state))
+        return StepResult(
+            record=[played.observation, played.action, played.reward],
+            alive=played.alive.astype(jnp.int32),
+            broken=played.broken.astype(jnp.int32),
+            carried=Carried([stored(x) for x in after], keys),
+        )
+
+    return step
+
+
+def stored(x: jax.Array) -> jax.Array:
+    """Returns a leaf of the state as it is kept between steps: bools as int32."""
+    return x.astype(jnp.int32) if x.dtype == bool else x
+
+
+def step_shapes(env: Environment, actor: PyTree) -> tuple[Any, ...]:
+    """Returns the shapes of the arguments of a step."""
+    shape = jax.ShapeDtypeStruct
+    state = jax.eval_shape(
+        lambda: [stored(x) for x in jax.tree.leaves(env.reset(jax.random.key(0)))]
+    )
+    flag = shape((), jnp.int32)
+    actor = jax.tree.map(lambda x: shape(x.shape, x.dtype), actor)
+    return actor, Carried(state, shape((2, 2), jnp.uint32)), flag, flag, flag
+
+
+def _words_per_step(distribution: Acts) -> int:
+    """Returns how many random words the noise of a step takes."""
+    noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
+    return int(np.prod(noise.shape, dtype=int))
 
 
 class NativeProgram(NamedTuple):
@@ -54,8 +147,8 @@ def build_program(
       TooLarge: writing the step out would take minutes.
       UnsupportedPrimitive: the step has an operation that cannot be written.
     """
-    examples = native_step.examples(env, actor)
-    function = native_step.step_function(env, act, distribution, length)
+    examples = step_shapes(env, actor)
+    function = step_function(env, act, distribution, length)
     if available.platform() != "cpu":  # a thread without an episode does not play
         function, examples = while_running(function), examples[:-1]
     num_actor = len(jax.tree.leaves(actor))
@@ -63,11 +156,11 @@ def build_program(
 
     def write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
         buffers = [x for x in jax.tree.leaves((actor, examples[1].state)) if np.prod(x.shape)]
-        sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals[: lanes.NUM_RECORDS]]
-        num_args = lanes.NUM_CONTROLS + len(buffers)
-        entry = handler.handler_text(num_args, [*sizes, 4, 4, 4], target.lanes)
+        sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals[: kernel.NUM_RECORDS]]
+        num_args = kernel.NUM_CONTROLS + len(buffers)
+        entry = handler.handler_text(num_args, [*sizes, 4, 4, 4], target.kernel)
         flush = handler.flush(target.triple)
-        return entry + kernel.player_text(written, num_actor, target.lanes, flush)
+        return entry + kernel.player_text(written, num_actor, target.kernel, flush)
 
     def write_gpu(written: scalarized.Scalarized) -> str:
         return gpu_kernel.kernel_text(written, num_actor)
@@ -106,7 +199,7 @@ def load(
     def write() -> str:
         check(traced)
         varying, limits = [True] * len(jax.tree.leaves(examples)), LOOPS if target else GPU_LOOPS
-        written = scalarized.build(function, examples, varying, native_step.BRANCH_COST, limits)
+        written = scalarized.build(function, examples, varying, BRANCH_COST, limits)
         title = f"; {name}, {lockstep.operations(written.schedule):,} scalar operations\n"
         return title + (write_cpu(written, target) if target else write_gpu(written))
 
@@ -114,6 +207,75 @@ def load(
         return machine.load_module(source, write, handler.NAMES, target, objects.folder()), shapes
     capability = gpu_seam.compute_capability()
     return ptx.load_kernel(source, write, capability, objects.folder()), shapes
+
+
+def machine_map(
+    function: Callable[..., Any],
+    *examples: PyTree,
+    check: Callable[[jaxprs.Program], None] = lambda traced: None,
+    name: str = "a function",
+) -> Callable[..., Any]:
+    """Returns a function of a batch, compiled unless memory or disk has it.
+
+    What it returns is as ``jax.vmap(function)`` up to rounding. All threads that XLA has compute
+    it, or those of the GPU. Call it inside of any transformation except differentiation; vmapped,
+    it remains one call.
+
+    Args:
+      function: of one example; pytrees of numbers of 32 or 64 bits and bools, in and out.
+      *examples: its arguments, or their shapes.
+      check: raises TooLarge where writing it out and compiling it takes too long.
+      name: of the function, for people.
+
+    Raises:
+      TooLarge: writing it out would take minutes.
+      UnsupportedPrimitive: it has an operation that cannot be written.
+      TypeError: numbers of another size.
+    """
+    leaves, tree = jax.tree.flatten(examples)
+    given = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in leaves]
+
+    def flat(*values: jax.Array) -> list[Any]:
+        whole = [x != 0 if leaf.dtype == bool else x for x, leaf in zip(values, given, strict=True)]
+        return [stored(x) for x in jax.tree.leaves(function(*tree.unflatten(whole)))]
+
+    out = jax.eval_shape(function, *examples)
+    results, out_tree = jax.tree.flatten(out)
+    kept = [jax.eval_shape(stored, x) for x in given]
+    for leaf in (*kept, *map(jax.eval_shape, [stored] * len(results), results)):
+        if np.dtype(leaf.dtype).itemsize not in (4, 8):
+            raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
+    code, _ = load("map", name, flat, kept, check, _write_cpu, gpu_mapping.mapping_text)
+
+    def mapped(*args: PyTree) -> Any:
+        values = jax.tree.leaves(args)
+        num = values[0].shape[0]
+        rows = [stored(x).reshape(num, -1) for x in values if x.size]
+        shapes = [
+            jax.ShapeDtypeStruct((num, x.size), jnp.int32 if x.dtype == bool else x.dtype)
+            for x in results
+            if x.size
+        ]
+        if isinstance(code, machine.Code):
+            made = iter(cpu_seam.call(code, shapes, jnp.int32(0), *rows))
+        else:
+            made = iter(gpu_seam.launch_map(code, shapes, *rows))
+        return out_tree.unflatten(
+            next(made).reshape(num, *x.shape).astype(x.dtype)
+            if x.size
+            else jnp.zeros((num, *x.shape), x.dtype)
+            for x in results
+        )
+
+    return mapped
+
+
+def _write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
+    """Writes a function, and all around it, as LLVM IR."""
+    num_args = 1 + sum(bool(np.prod(x.shape)) for x in written.in_avals)
+    sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals if np.prod(x.shape)]
+    entry = handler.handler_text(num_args, sizes, target.kernel, mapping.POSITIONS, zeroed=False)
+    return entry + mapping.mapping_text(written, target.kernel, handler.flush(target.triple))
 
 
 def name_of(env: Any) -> str:

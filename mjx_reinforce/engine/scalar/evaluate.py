@@ -8,21 +8,11 @@ import numpy as np
 from mjx_reinforce.engine.base import is_key
 from mjx_reinforce.engine.scalar import arrays, jaxprs
 from mjx_reinforce.engine.scalar.graph import Graph
-from mjx_reinforce.engine.scalar.rules import (
-    branches,
-    elementwise,
-    indexing,
-    linear,
-    loops,
-    reductions,
-    structural,
-)
+from mjx_reinforce.engine.scalar.rules import indexing, loops, reductions, structural
 
 _ARRAY_RULES = {
     **structural.RULES,
-    **elementwise.RULES,
     **reductions.RULES,
-    **linear.RULES,
     **indexing.RULES,
 }
 #: What makes keys of words and words of keys.
@@ -30,9 +20,9 @@ _KEYS_TO_WORDS = ("random_wrap", "random_unwrap")
 _CONTROL = {
     "while": loops.while_rule,
     "scan": loops.scan_rule,
-    "cond": branches.cond_rule,
-    "skippable": branches.skippable_rule,
-    "by_engine": branches.by_engine_rule,
+    "cond": loops.cond_rule,
+    "skippable": loops.skippable_rule,
+    "by_engine": loops.by_engine_rule,
 }
 
 

@@ -20,7 +20,7 @@ from jax.extend import core
 from jax.interpreters import partial_eval
 
 from mjx_reinforce.engine.base import PyTree, is_key
-from mjx_reinforce.engine.scalar.ops import FACTS
+from mjx_reinforce.engine.scalar.nodes import FACTS
 
 # The parameter under which a call-like primitive keeps the jaxpr that it calls.
 _CALLEE_PARAMS = ("jaxpr", "call_jaxpr", "fun_jaxpr")

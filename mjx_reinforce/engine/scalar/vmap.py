@@ -1,9 +1,12 @@
-"""``vmap``: a drop-in for ``jax.vmap`` that leaves only elementwise work."""
+"""``vmap``: a drop-in for ``jax.vmap`` that leaves only elementwise work.
+
+``XLA`` turns the scalar graph back into JAX: one elementwise operation for each node.
+"""
 
 import functools
 import warnings
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +15,11 @@ from jax import lax
 
 from mjx_reinforce.engine.base import PyTree
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
-from mjx_reinforce.engine.scalar.xla import XLA
+from mjx_reinforce.engine.scalar.backend import Backend
+from mjx_reinforce.engine.scalar.jaxprs import operation
+from mjx_reinforce.engine.scalar.nodes import Captured, Node, Op, Scalar, is_constant
+from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop
+from mjx_reinforce.engine.scalar.primitives import any_lane
 
 #: XLA takes minutes to compile more operations, and what it makes of them is slow.
 MAX_OPERATIONS = 20_000
@@ -175,3 +182,112 @@ def _assemble(scalars: list[Any], aval: jaxprs.Shape, axis: int | None, batch: i
         return stacked.reshape(aval.shape)
     ndim = len(aval.shape) + 1
     return jnp.moveaxis(stacked.reshape((*aval.shape, batch)), -1, _axis(axis, ndim))
+
+
+Values = dict[Node, Any]
+
+
+class XLA(Backend[Any]):
+    """Emits JAX operations; a value is a lane, a value that all lanes share, or a constant."""
+
+    def __init__(self, read: Callable[[tuple[int, int]], Any], batch_shape: tuple[int, ...]):
+        """Says where the program runs.
+
+        Args:
+          read: returns the lane of an input from (number of the argument, position in it).
+          batch_shape: the shape of one lane.
+        """
+        self._read = read
+        self._batch_shape = batch_shape
+
+    def constant(self, number: Any) -> Any:
+        """A constant stays a NumPy scalar."""
+        return number
+
+    def leaf(self, node: Node) -> Any:
+        """Reads an input, or an element of a captured array in row-major order."""
+        if isinstance(node.owner, Captured):
+            array = node.owner.array
+            return lax.index_in_dim(
+                lax.reshape(array, (array.size,)), node.position, keepdims=False
+            )
+        return self._read(node.position)
+
+    def node(self, node: Node, operands: list[Any]) -> Any:
+        """Emits one operation."""
+        op = cast(Op, node.op)  # leaves are not scheduled
+        mixes = op.name != "select_n"  # alone in taking no NumPy scalars beside lanes
+        values = [
+            value if is_constant(arg) and mixes else self._spread(value, node.varying)
+            for arg, value in zip(node.args, operands, strict=True)
+        ]
+        return operation(op.name)(*values, **dict(op.params))
+
+    def gate(self, gate: LiveGate, values: Values) -> Sequence[Any]:
+        """Emits a ``cond``."""
+        predicate = self._any_of(self.value(gate.predicate, values))
+        before = dict(values)
+        cold = [self._materialize(out.cold, out.leaf.varying, before) for out in gate.outs]
+
+        def hot() -> list[Any]:
+            inner = self.inside(gate.body, values)
+            return [self._materialize(out.hot, out.leaf.varying, inner) for out in gate.outs]
+
+        return lax.cond(predicate, hot, lambda: cold)
+
+    def loop(self, loop: LiveLoop, values: Values) -> tuple[list[Any], list[Any]]:
+        """Emits a ``fori_loop``, a ``scan`` or a ``while_loop``."""
+        init = [self._materialize(c.init, c.out.varying, values) for c in loop.carries]
+        body = functools.partial(self._iteration, loop, values)
+        if loop.records or loop.elements:
+            rows = [
+                jax.numpy.stack([self._materialize(x, e.leaf.varying, values) for x in e.values])
+                for e in loop.elements
+            ]
+            final, stacked = lax.scan(body, init, rows, length=loop.length)
+            return final, [
+                [kept[t] for t in range(len(record.outs))]
+                for record, kept in zip(loop.records, stacked, strict=True)
+            ]
+        return self._repeat(loop, body, init), []
+
+    def _iteration(
+        self, loop: LiveLoop, values: Values, carry: list[Any], row: Sequence[Any] = ()
+    ) -> tuple[list[Any], list[Any]]:
+        """Emits a loop's body; returns the next carry and what is kept."""
+        known = dict(zip((c.leaf for c in loop.carries), carry, strict=True))
+        known.update(zip((e.leaf for e in loop.elements), row, strict=True))
+        inner = self.inside(loop.body, values, known)
+        nexts = [self._materialize(c.next, c.out.varying, inner) for c in loop.carries]
+        return nexts, [self.value(record.value, inner) for record in loop.records]
+
+    def _repeat(self, loop: LiveLoop, body: Callable, init: list[Any]) -> list[Any]:
+        """Emits a loop that reads no elements and keeps no records."""
+        if loop.active is None:
+            return lax.fori_loop(0, loop.length, lambda _, carry: body(carry)[0], init)
+        switch = loop.active
+        if loop.length is None:
+            return lax.while_loop(
+                lambda carry: self._any_of(carry[switch]), lambda carry: body(carry)[0], init
+            )
+
+        def goes_on(state: tuple[Any, list]) -> Any:
+            count, carry = state
+            return (count < loop.length) & self._any_of(carry[switch])
+
+        start = (np.int32(0), init)
+        step = lambda state: (state[0] + 1, body(state[1])[0])  # noqa: E731
+        return lax.while_loop(goes_on, step, start)[1]
+
+    def _any_of(self, predicate: Any) -> Any:
+        """Returns whether a predicate holds in any lane; one that all lanes share is the answer."""
+        return any_lane(predicate) if np.ndim(predicate) else predicate
+
+    def _spread(self, value: Any, varying: bool) -> Any:
+        """Gives a constant or a shared value the shape of a lane."""
+        if varying and np.shape(value) != self._batch_shape:
+            return lax.broadcast(value, self._batch_shape)
+        return value
+
+    def _materialize(self, scalar: Scalar, varying: bool, values: Values) -> Any:
+        return self._spread(self.value(scalar, values), varying)

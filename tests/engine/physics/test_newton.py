@@ -10,7 +10,7 @@ import pytest
 from mujoco import mjx
 
 from mjx_reinforce import envs
-from mjx_reinforce.engine.physics import contact_rows, newton, newton_in_loops
+from mjx_reinforce.engine.physics import contact_rows, newton
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields, with_fields
 
@@ -111,7 +111,7 @@ def test_in_loops_it_finds_the_same(problems, solve):
     """As for more contacts than there is room for."""
     model, ready = problems
     with jax.enable_x64(True):
-        found = jax.jit(jax.vmap(functools.partial(newton_in_loops.solve_in_loops, model)))(ready)
+        found = jax.jit(jax.vmap(functools.partial(newton.solve_in_loops, model)))(ready)
     assert_same_solutions(found, solve(ready), 1e-11)
 
 

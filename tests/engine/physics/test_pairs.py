@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.engine.physics import pairs
+from mjx_reinforce.engine.physics import contacts
 
 GEOMS = np.array([[0, 1], [1, 2], [3, 0], [2, 3]])
 #: Geoms 0 and 1 overlap, 2 is within its margin of 1, 3 is apart from all but 2.
@@ -46,11 +46,11 @@ def data_of(places=PLACES):
 
 @pytest.fixture(autouse=True)
 def in_turn(monkeypatch):
-    monkeypatch.setattr(pairs, "by_engine", lambda one, many, *rows, may_unroll: one(*rows))
+    monkeypatch.setattr(contacts, "by_engine", lambda one, many, *rows, may_unroll: one(*rows))
 
 
 def test_contacts_near_are_those_of_all_at_once_and_others_are_apart():
-    one, model, data = pairs.one_by_one(collide), model_of(), data_of()
+    one, model, data = contacts.one_by_one(collide), model_of(), data_of()
     assert one.ncon == 2  # pyright: ignore[reportFunctionMemberAccess]
     got, want = one(model, data, None, GEOMS), collide(model, data, None, GEOMS)
     near = np.array([True, True, True, True, False, False, False, False])
@@ -66,7 +66,7 @@ def test_a_geom_within_its_margin_is_collided():
     """And with a smaller margin it is not."""
     gap = {}
     for margins in ((0.0, 0.0, 0.2, 0.0), (0.0, 0.2, 0.0, 0.0), (0.0, 0.05, 0.05, 0.0)):
-        got = pairs.one_by_one(collide)(model_of(margins=margins), data_of(), None, GEOMS[1:2])
+        got = contacts.one_by_one(collide)(model_of(margins=margins), data_of(), None, GEOMS[1:2])
         gap[margins] = float(np.abs(got[1]).max())
     first, second, none = gap.values()
     assert first == second > 0 == none
@@ -75,14 +75,14 @@ def test_a_geom_within_its_margin_is_collided():
 def test_a_nan_reaches_the_contacts():
     places = PLACES.copy()
     places[0] = np.nan
-    dist, *_ = pairs.one_by_one(collide)(model_of(), data_of(places), None, GEOMS)
+    dist, *_ = contacts.one_by_one(collide)(model_of(), data_of(places), None, GEOMS)
     np.testing.assert_array_equal(
         np.isnan(dist), [True] * 2 + [False] * 2 + [True] * 2 + [False] * 2
     )
 
 
 def test_pairs_with_margins_of_their_own_go_to_mjx(monkeypatch):
-    monkeypatch.setattr(pairs, "by_engine", lambda *_, **__: pytest.fail("one after the other"))
+    monkeypatch.setattr(contacts, "by_engine", lambda *_, **__: pytest.fail("one after the other"))
     model, data = model_of(num_pairs=1), data_of()
-    got = pairs.one_by_one(collide)(model, data, None, GEOMS)
+    got = contacts.one_by_one(collide)(model, data, None, GEOMS)
     jax.tree.map(np.testing.assert_array_equal, got, collide(model, data, None, GEOMS))

@@ -9,7 +9,7 @@ from players import actor_and_act, played
 from toys import Drifting
 
 from mjx_reinforce.engine.cpu import handler, kernel, machine
-from mjx_reinforce.engine.play import available, native, native_step, program
+from mjx_reinforce.engine.play import available, native, program
 from mjx_reinforce.engine.scalar import scalarized
 
 if reason := available.unavailable():
@@ -22,10 +22,10 @@ def text():
     """(lanes, flush) -> the program that plays a small task."""
     env = Drifting()
     actor, act, distribution = actor_and_act(env, ())
-    examples = native_step.examples(env, actor)
-    function = native_step.step_function(env, act, distribution, 4)
+    examples = program.step_shapes(env, actor)
+    function = program.step_function(env, act, distribution, 4)
     varying = [True] * len(jax.tree.leaves(examples))
-    built = scalarized.build(function, examples, varying, native_step.BRANCH_COST, program.LOOPS)
+    built = scalarized.build(function, examples, varying, program.BRANCH_COST, program.LOOPS)
     num_actor = len(jax.tree.leaves(actor))
     return lambda lanes, flush: kernel.player_text(built, num_actor, lanes, flush)
 

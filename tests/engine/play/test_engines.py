@@ -11,7 +11,7 @@ from toys import Drifting
 
 from mjx_reinforce import envs
 from mjx_reinforce.engine.play import choice as engines
-from mjx_reinforce.engine.play.mapping import machine_map
+from mjx_reinforce.engine.play.program import machine_map
 
 NUM_STATES = 10_000
 

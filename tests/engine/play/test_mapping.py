@@ -10,7 +10,7 @@ from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.cpu.handler import Flush, flush
 from mjx_reinforce.engine.cpu.machine import this_machine
 from mjx_reinforce.engine.play import program
-from mjx_reinforce.engine.play.mapping import machine_map
+from mjx_reinforce.engine.play.program import machine_map
 
 pytest.importorskip("llvmlite", reason="machine code is written by llvmlite")
 pytestmark = pytest.mark.cpu

@@ -15,7 +15,7 @@ from toys import Bytes, Drifting
 
 from mjx_reinforce import Box
 from mjx_reinforce.engine.base import Discrete
-from mjx_reinforce.engine.cpu import lanes, machine
+from mjx_reinforce.engine.cpu import kernel, machine
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.play import available, choice, native, objects, program, rollouts
 from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
@@ -147,13 +147,13 @@ def test_vectors_begin_at_multiples_of_their_size():
     kinds = np.float32, np.float64, np.int32, np.int64
     leaves = [jax.ShapeDtypeStruct((3,), x) for x in (*kinds, *kinds)]
     for count in (1, 4, 8, 16):
-        places = lanes.layout(leaves, 1, count)
+        places = kernel.layout(leaves, 1, count)
         fields = [*places.inputs, places.broken, places.seed, places.episode]
         for field, after in itertools.pairwise(fields):
             assert after.offset >= field.offset + field.entries * field.dtype.itemsize * count
         for field in fields:
             vector = field.dtype.itemsize * count
-            assert field.offset % vector == lanes.ALIGNMENT % vector == 0
+            assert field.offset % vector == kernel.ALIGNMENT % vector == 0
 
 
 @pytest.mark.cpu

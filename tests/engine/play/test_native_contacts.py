@@ -9,7 +9,7 @@ from scenes import FEET, Scene
 from mjx_reinforce.engine.physics import touching
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields
 from mjx_reinforce.engine.play import available
-from mjx_reinforce.engine.play.mapping import machine_map
+from mjx_reinforce.engine.play.program import machine_map
 
 if reason := available.unavailable():
     pytest.skip(reason, allow_module_level=True)

@@ -17,7 +17,7 @@ from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.gpu import kernel as kernels
 from mjx_reinforce.engine.gpu import lockstep, ptx, seam
 from mjx_reinforce.engine.physics import touching
-from mjx_reinforce.engine.play import available, native, native_step, objects, program, rollouts
+from mjx_reinforce.engine.play import available, native, objects, program, rollouts
 from mjx_reinforce.engine.scalar import scalarized
 
 if reason := available.unavailable():
@@ -144,13 +144,13 @@ def test_each_thread_has_words_of_its_own():
 
 
 def kernel_text(env, actor, act, distribution):
-    examples = native_step.examples(env, actor)[:-1]
-    function = native_step.step_function(env, act, distribution, 50)
+    examples = program.step_shapes(env, actor)[:-1]
+    function = program.step_function(env, act, distribution, 50)
     written = scalarized.build(
         lambda *args: function(*args, jnp.int32(1)),
         examples,
         [True] * len(jax.tree.leaves(examples)),
-        native_step.BRANCH_COST,
+        program.BRANCH_COST,
         program.GPU_LOOPS,
     )
     return kernels.kernel_text(written, len(jax.tree.leaves(actor)))

@@ -8,10 +8,9 @@ from jax import lax
 
 from mjx_reinforce.engine.llvm.emit import LLVM
 from mjx_reinforce.engine.play import program
-from mjx_reinforce.engine.play.mapping import machine_map
+from mjx_reinforce.engine.play.program import machine_map
 from mjx_reinforce.engine.scalar import scalarized, skippable
-from mjx_reinforce.engine.scalar.passes.accumulators import accumulators, unread
-from mjx_reinforce.engine.scalar.passes.liveness import LiveLoop
+from mjx_reinforce.engine.scalar.passes.liveness import LiveLoop, accumulators, unread
 
 pytestmark = pytest.mark.cpu
 #: Entries of a matrix, more than stay in registers.

@@ -17,7 +17,7 @@ from mjx_reinforce.engine.llvm.lanes import Lanes
 from mjx_reinforce.engine.llvm.math import FUNCTIONS, RARE
 from mjx_reinforce.engine.llvm.operations import OPERATIONS
 from mjx_reinforce.engine.llvm.text import Text
-from mjx_reinforce.engine.scalar.ops import Op
+from mjx_reinforce.engine.scalar.nodes import Op
 
 llvm = pytest.importorskip("llvmlite.binding", reason="machine code is written by llvmlite")
 

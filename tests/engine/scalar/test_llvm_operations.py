@@ -8,7 +8,7 @@ from lane_code import call, engine
 from mjx_reinforce.engine.llvm.lanes import Lanes
 from mjx_reinforce.engine.llvm.operations import OPERATIONS
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
-from mjx_reinforce.engine.scalar.ops import Op
+from mjx_reinforce.engine.scalar.nodes import Op
 
 pytest.importorskip("llvmlite", reason="machine code is written by llvmlite")
 

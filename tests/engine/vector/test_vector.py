@@ -14,7 +14,7 @@ from experiments.checks.vector_parity import GymnasiumSide, compare
 from mjx_reinforce import Box, envs, make_vec
 from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.play.counter import key_of
-from mjx_reinforce.engine.play.mapping import machine_map
+from mjx_reinforce.engine.play.program import machine_map
 from mjx_reinforce.engine.vector.episodes import AUTORESETS
 
 SPACE = Box(np.array([-3.0]), np.array([1.0]))

@@ -16,8 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mjx_reinforce.engine.scalar import jaxprs
-from mjx_reinforce.engine.scalar.nodes import Node, Scalar, is_constant, same
-from mjx_reinforce.engine.scalar.ops import FACTS, Op
+from mjx_reinforce.engine.scalar.nodes import FACTS, Node, Op, Scalar, is_constant, same
 
 # Greater powers are not faster as products than as ``pow``.
 _LARGEST_POWER = 8

@@ -1,11 +1,12 @@
-"""Rules that move elements about without computing anything."""
+"""Rules that move elements about, and those that work on each element alone."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mjx_reinforce.engine.scalar import arrays, jaxprs
+from mjx_reinforce.engine.scalar import arrays, jaxprs, nodes
 from mjx_reinforce.engine.scalar.graph import Graph
+from mjx_reinforce.engine.scalar.passes import simplify
 
 
 def _slice(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
@@ -72,6 +73,65 @@ _IDENTITIES = (
     *("copy", "copy_p", "device_put", "name", "optimization_barrier", "pvary", "random_wrap"),
     *("random_unwrap", "reshard", "sharding_constraint", "stop_gradient"),
 )
+
+
+def _elementwise(graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray) -> list[np.ndarray]:
+    """The general rule: the operation has the primitive's name."""
+    name = eqn.primitive.name
+    params = tuple(sorted(eqn.params.items())) if nodes.FACTS[name].has_params else ()
+    return [_map_op(graph, nodes.Op(name, params), eqn.outvars[0].aval, operands)]
+
+
+def _map_op(
+    graph: Graph, op: nodes.Op, aval: jaxprs.Shape, operands: Sequence[np.ndarray]
+) -> np.ndarray:
+    if all(map(arrays.is_numeric, operands)):
+        return np.asarray(simplify.fold(op, operands, aval.dtype))
+    apply, dtype = graph.apply, np.dtype(aval.dtype)
+    return arrays.map_elements(lambda *args: apply(op, args, dtype), aval.shape, dtype, *operands)
+
+
+def _convert(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+    aval = eqn.outvars[0].aval
+    if eqn.invars[0].aval.dtype == aval.dtype:
+        return [x]
+    return [_map_op(graph, nodes.conversion(np.dtype(aval.dtype)), aval, (x,))]
+
+
+def _bitcast(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+    if x.shape != eqn.outvars[0].aval.shape:
+        raise jaxprs.no_rule("bitcast_convert_type to another size", graph.source(eqn))
+    return _elementwise(graph, eqn, x)
+
+
+def _as(name: str) -> Callable[..., list[np.ndarray]]:
+    """Returns the rule of an operation under another name."""
+    return lambda graph, eqn, *xs: [_map_op(graph, nodes.Op(name), eqn.outvars[0].aval, xs)]
+
+
+def _clamp(
+    graph: Graph, eqn: jaxprs.Equation, low: np.ndarray, x: np.ndarray, high: np.ndarray
+) -> list[np.ndarray]:
+    aval = eqn.outvars[0].aval
+    raised = _map_op(graph, nodes.Op("max"), aval, (x, low))
+    return [_map_op(graph, nodes.Op("min"), aval, (raised, high))]
+
+
+def _integer_pow(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+    aval = eqn.outvars[0].aval
+    return [
+        arrays.map_elements(
+            lambda base: simplify.power(graph, base, eqn.params["y"]), aval.shape, aval.dtype, x
+        )
+    ]
+
+
+def _pow_rule(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+    """An exponent may be an integer under a float base."""
+    exponent = y if y.dtype in (object, x.dtype) else y.astype(eqn.outvars[0].aval.dtype)
+    return [_map_op(graph, nodes.Op("pow"), eqn.outvars[0].aval, (x, exponent))]
+
+
 RULES = {
     **dict.fromkeys(_IDENTITIES, lambda graph, eqn, *operands: list(operands)),
     **dict.fromkeys(
@@ -92,4 +152,14 @@ RULES = {
     "iota": _iota,
     "empty": _moved(lambda _, aval: arrays.zeros(aval)),
     "platform_index": _platform_index,
+    **dict.fromkeys(nodes.FACTS, _elementwise),
+    "convert_element_type": _convert,
+    "bitcast_convert_type": _bitcast,
+    "add_any": lambda graph, eqn, x, y: [
+        _map_op(graph, nodes.Op("add"), eqn.outvars[0].aval, (x, y))
+    ],
+    "square": lambda graph, eqn, x: [_map_op(graph, nodes.Op("mul"), eqn.outvars[0].aval, (x, x))],
+    "clamp": _clamp,
+    "integer_pow": _integer_pow,
+    "pow": _pow_rule,
 }
