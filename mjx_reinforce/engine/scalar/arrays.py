@@ -9,18 +9,23 @@ from numpy.typing import DTypeLike
 
 from mjx_reinforce.engine.scalar.nodes import is_constant
 
+#: Numbers and nodes, see the module.
+Array = np.ndarray
+#: What a rule returns: the arrays of an equation's results.
+Results = list[Array]
 
-def is_numeric(array: np.ndarray) -> bool:
+
+def is_numeric(array: Array) -> bool:
     """Returns whether every element is a constant."""
     return array.dtype != object
 
 
-def elements(array: np.ndarray) -> list[Any]:
+def elements(array: Array) -> list[Any]:
     """Returns the scalars in row-major order."""
     return list(array.flat)
 
 
-def pack(scalars: Iterable[Any], shape: Sequence[int], dtype: DTypeLike) -> np.ndarray:
+def pack(scalars: Iterable[Any], shape: Sequence[int], dtype: DTypeLike) -> Array:
     """Returns the array of these scalars."""
     scalars = list(scalars)
     if dtype is not object and all(map(is_constant, scalars)):
@@ -28,7 +33,7 @@ def pack(scalars: Iterable[Any], shape: Sequence[int], dtype: DTypeLike) -> np.n
     return np.fromiter(scalars, object, len(scalars)).reshape(shape)
 
 
-def lift(array: np.ndarray) -> np.ndarray:
+def lift(array: Array) -> Array:
     """Returns the array with dtype object."""
     if not is_numeric(array):
         return array
@@ -36,26 +41,24 @@ def lift(array: np.ndarray) -> np.ndarray:
     return np.fromiter(array.flat, object, array.size).reshape(array.shape)
 
 
-def settle(array: np.ndarray, dtype: DTypeLike) -> np.ndarray:
+def settle(array: Array, dtype: DTypeLike) -> Array:
     """Returns the array as a numeric one if every element is a constant."""
     return array if is_numeric(array) else pack(array.flat, array.shape, dtype)
 
 
-def together(arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+def together(arrays: Sequence[Array]) -> list[Array]:
     """Returns arrays of which either all are numeric or all have dtype object."""
     if all(map(is_numeric, arrays)):
         return list(arrays)
     return [lift(array) for array in arrays]
 
 
-def zeros(aval: Any) -> np.ndarray:
+def zeros(aval: Any) -> Array:
     """Returns zeros of an abstract value's shape and dtype."""
     return np.zeros(aval.shape, aval.dtype)
 
 
-def map_elements(
-    function: Callable, shape: Sequence[int], dtype: DTypeLike, *arrays: Any
-) -> np.ndarray:
+def map_elements(function: Callable, shape: Sequence[int], dtype: DTypeLike, *arrays: Any) -> Array:
     """Applies a scalar function element by element; axes of size 1 are shared."""
     columns = [elements(np.broadcast_to(array, shape)) for array in arrays]
     return pack(map(function, *columns), shape, dtype)
@@ -68,7 +71,7 @@ class Layout:
         self._avals = list(avals)
         self._sizes = [math.prod(aval.shape) for aval in self._avals]
 
-    def pack(self, scalars: Sequence[Any]) -> list[np.ndarray]:
+    def pack(self, scalars: Sequence[Any]) -> list[Array]:
         """Makes the arrays of these scalars."""
         values, packed = iter(scalars), []
         for aval, size in zip(self._avals, self._sizes, strict=True):
@@ -80,6 +83,6 @@ class Layout:
         each = zip(facts, self._sizes, strict=True)
         return [fact for fact, size in each for _ in range(size)]
 
-    def unpack(self, packed: Sequence[np.ndarray]) -> list[Any]:
+    def unpack(self, packed: Sequence[Array]) -> list[Any]:
         """Lists the scalars of these arrays."""
         return [scalar for array in packed for scalar in elements(array)]

@@ -12,8 +12,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.engine.scalar import arrays, jaxprs
+from mjx_reinforce.engine.scalar import arrays
+from mjx_reinforce.engine.scalar.arrays import Array, Results
 from mjx_reinforce.engine.scalar.graph import Graph
+from mjx_reinforce.engine.scalar.jaxprs import Equation
 from mjx_reinforce.engine.scalar.nodes import is_constant
 
 
@@ -38,7 +40,7 @@ class Window(NamedTuple):
     inside: whether the constant starts keep it inside the operand.
     """
 
-    positions: np.ndarray
+    positions: Array
     unknowns: list[Unknown]
     inside: bool
 
@@ -61,9 +63,7 @@ def _window(shape: Sequence[int], sizes: Sequence[int], starts: Sequence[Any]) -
     return Window(positions, unknowns, inside)
 
 
-def _read_window(
-    graph: Graph, flat: np.ndarray, positions: np.ndarray, unknowns: list
-) -> np.ndarray:
+def _read_window(graph: Graph, flat: Array, positions: Array, unknowns: list) -> Array:
     """Reads a window; an unknown start outside counts as the nearest inside."""
     if not unknowns:
         return arrays.lift(flat[positions.reshape(-1)].reshape(positions.shape))
@@ -78,7 +78,7 @@ def _read_window(
 
 
 def _write_window(
-    graph: Graph, flat: np.ndarray, window: Window, updates: np.ndarray, combine: Callable
+    graph: Graph, flat: Array, window: Window, updates: Array, combine: Callable
 ) -> None:
     """Combines updates into a window, in place; a start outside changes nothing."""
     for ks in itertools.product(*(range(unknown.num_starts) for unknown in window.unknowns)):
@@ -92,7 +92,7 @@ def _write_window(
 
 
 def _starts(
-    indices: np.ndarray, rank: int, index_dims: Any, batching_dims: Any, indices_batching_dims: Any
+    indices: Array, rank: int, index_dims: Any, batching_dims: Any, indices_batching_dims: Any
 ) -> Iterator[list[Any]]:
     """Yields where each window starts, one entry for each axis of the operand."""
     for place in np.ndindex(*indices.shape[:-1]):
@@ -104,14 +104,12 @@ def _starts(
         yield start
 
 
-def _outside_mode(eqn: jaxprs.Equation) -> str:
+def _outside_mode(eqn: Equation) -> str:
     """Returns what happens to a window outside: 'drop' or 'clip'."""
     return "drop" if "FILL" in str(eqn.params["mode"]) else "clip"
 
 
-def _gather_rule(
-    graph: Graph, eqn: jaxprs.Equation, operand: np.ndarray, indices: np.ndarray
-) -> list[np.ndarray]:
+def _gather_rule(graph: Graph, eqn: Equation, operand: Array, indices: Array) -> Results:
     dims, sizes = eqn.params["dimension_numbers"], eqn.params["slice_sizes"]
     aval, flat = eqn.outvars[0].aval, operand.reshape(-1)
     hidden = {*dims.collapsed_slice_dims, *dims.operand_batching_dims}
@@ -133,9 +131,7 @@ def _gather_rule(
     return [arrays.settle(gathered, aval.dtype)]
 
 
-def _fill_outside(
-    graph: Graph, eqn: jaxprs.Equation, values: np.ndarray, window: Window
-) -> np.ndarray:
+def _fill_outside(graph: Graph, eqn: Equation, values: Array, window: Window) -> Array:
     """Replaces the values of a window that is outside by the fill value."""
     dtype = np.dtype(eqn.outvars[0].aval.dtype)
     inside = np.bool_(window.inside)
@@ -158,9 +154,7 @@ def _default_fill(dtype: np.dtype) -> Any:
     return True if dtype == np.bool_ else np.nan
 
 
-def _scatter(
-    graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray, combine: Callable
-) -> list[np.ndarray]:
+def _scatter(graph: Graph, eqn: Equation, *operands: Array, combine: Callable) -> Results:
     operand, indices, updates = operands
     dims = eqn.params["dimension_numbers"]
     hidden = {*dims.inserted_window_dims, *dims.operand_batching_dims}
@@ -194,9 +188,7 @@ def _clip(graph: Graph, starts: Sequence[Any], shape: Sequence[int], sizes: Sequ
     return clipped
 
 
-def _dynamic_slice(
-    graph: Graph, eqn: jaxprs.Equation, operand: np.ndarray, *starts: np.ndarray
-) -> list[np.ndarray]:
+def _dynamic_slice(graph: Graph, eqn: Equation, operand: Array, *starts: Array) -> Results:
     aval = eqn.outvars[0].aval
     window = _window(operand.shape, eqn.params["slice_sizes"], [s[()] for s in starts])
     values = _read_window(graph, operand.reshape(-1), window.positions, window.unknowns)
@@ -204,8 +196,8 @@ def _dynamic_slice(
 
 
 def _dynamic_update_slice(
-    graph: Graph, eqn: jaxprs.Equation, operand: np.ndarray, update: np.ndarray, *starts: np.ndarray
-) -> list[np.ndarray]:
+    graph: Graph, eqn: Equation, operand: Array, update: Array, *starts: Array
+) -> Results:
     clipped = _clip(graph, [s[()] for s in starts], operand.shape, update.shape)
     flat = arrays.lift(operand).reshape(-1).copy()
     _write_window(graph, flat, _window(operand.shape, update.shape, clipped), update, _replace)

@@ -11,15 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.engine.scalar import arrays, jaxprs
+from mjx_reinforce.engine.scalar.arrays import Array, Results
 from mjx_reinforce.engine.scalar.graph import Graph
+from mjx_reinforce.engine.scalar.jaxprs import Equation
 from mjx_reinforce.engine.scalar.nodes import Gate, Loop, Node, Scalar, Scope, is_constant, same
 from mjx_reinforce.engine.scalar.rules import iterate
 from mjx_reinforce.engine.scalar.rules.iterate import Assumption, Iteration, varies
 
 
-def while_rule(
-    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: Any, *operands: np.ndarray
-) -> list:
+def while_rule(graph: Graph, run: Callable, eqn: Equation, used: Any, *operands: Array) -> Results:
     """Makes a loop; a lane that is done keeps its values while others go on."""
     num_cond, num_body = eqn.params["cond_nconsts"], eqn.params["body_nconsts"]
     cond_consts, body_consts = operands[:num_cond], operands[num_cond : num_cond + num_body]
@@ -59,9 +59,7 @@ def while_rule(
     return carry.pack(loop.results()[0][1:])
 
 
-def scan_rule(
-    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: Any, *operands: np.ndarray
-) -> list:
+def scan_rule(graph: Graph, run: Callable, eqn: Equation, used: Any, *operands: Array) -> Results:
     """Writes a short scan out; makes a loop of a longer one, which may end early."""
     length, (num_consts, num_carry) = eqn.params["length"], jaxprs.scan_parts(eqn)
     body = jaxprs.program(eqn.params["jaxpr"])
@@ -100,7 +98,7 @@ def scan_rule(
     return [*carry.pack(final), *ys]
 
 
-def _varying(operands: Sequence[np.ndarray]) -> list[bool]:
+def _varying(operands: Sequence[Array]) -> list[bool]:
     """Returns which arrays have elements that differ from lane to lane."""
     return [any(map(varies, operand.flat)) for operand in operands]
 
@@ -179,8 +177,8 @@ class _Body(NamedTuple):
 
 
 def cond_rule(
-    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: list[bool], *operands: np.ndarray
-) -> list[np.ndarray]:
+    graph: Graph, run: Callable, eqn: Equation, used: list[bool], *operands: Array
+) -> Results:
     """Evaluates the branches that lanes may take and picks each lane's own.
 
     Args:
@@ -205,8 +203,8 @@ def cond_rule(
 
 
 def skippable_rule(
-    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: list[bool], *operands: np.ndarray
-) -> list[np.ndarray]:
+    graph: Graph, run: Callable, eqn: Equation, used: list[bool], *operands: Array
+) -> Results:
     """Skips a computation that no lane needs, if it is expensive; see ``skippable``."""
     count, (needed, *others) = eqn.params["num_results"], operands
     otherwise, consts = others[:count], others[count:]
@@ -225,8 +223,8 @@ def skippable_rule(
 
 
 def by_engine_rule(
-    graph: Graph, run: Callable, eqn: jaxprs.Equation, used: list[bool], *operands: np.ndarray
-) -> list[np.ndarray]:
+    graph: Graph, run: Callable, eqn: Equation, used: list[bool], *operands: Array
+) -> Results:
     """Takes the program for an engine that writes out; see ``by_engine``."""
     program = jaxprs.program(eqn.params["one"])
     return run(program, list(operands), used, may_unroll=eqn.params["may_unroll"])

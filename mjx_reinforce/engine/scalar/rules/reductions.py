@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from mjx_reinforce.engine.scalar import arrays, jaxprs, nodes
+from mjx_reinforce.engine.scalar.arrays import Array, Results
 from mjx_reinforce.engine.scalar.graph import Graph
+from mjx_reinforce.engine.scalar.jaxprs import Equation
 
 
-def _reduce(
-    graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, *, combine: str, empty: float
-) -> list:
+def _reduce(graph: Graph, eqn: Equation, x: Array, *, combine: str, empty: float) -> list:
     """Combines the elements along some axes, from the first to the last."""
     axes, aval = tuple(eqn.params["axes"]), eqn.outvars[0].aval
     if x.size == 0:
@@ -26,7 +26,7 @@ def _reduce(
     return [arrays.pack(reduced, aval.shape, aval.dtype)]
 
 
-def _cumulate(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, *, combine: str) -> list:
+def _cumulate(graph: Graph, eqn: Equation, x: Array, *, combine: str) -> list:
     """Combines each element with all before it (after it, if reversed)."""
     step = -1 if eqn.params["reverse"] else 1
     lines = np.moveaxis(arrays.lift(x), eqn.params["axis"], -1)[..., ::step].copy()
@@ -37,9 +37,7 @@ def _cumulate(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, *, combine: str
     return [arrays.settle(lines, eqn.outvars[0].aval.dtype)]
 
 
-def _arg_extreme(
-    graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, *, better: str
-) -> list[np.ndarray]:
+def _arg_extreme(graph: Graph, eqn: Equation, x: Array, *, better: str) -> Results:
     """The position of the first extreme element; the first NaN counts as extreme."""
     (axis,), aval = eqn.params["axes"], eqn.outvars[0].aval
     rows = np.moveaxis(x, axis, -1).reshape(-1, x.shape[axis])
@@ -57,7 +55,7 @@ def _first_extreme(graph: Graph, row: list, better: str, dtype: np.dtype) -> Any
     return where
 
 
-def _sort(graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray) -> list[np.ndarray]:
+def _sort(graph: Graph, eqn: Equation, *operands: Array) -> Results:
     """Sorts short arrays by exchanging neighbours, which is stable; NaN comes last."""
     axis, num_keys = eqn.params["dimension"], eqn.params["num_keys"]
     columns = [np.moveaxis(arrays.lift(x), axis, -1).copy() for x in operands]
@@ -90,7 +88,7 @@ def _precedes(graph: Graph, x: Any, y: Any) -> Any:
     return graph.call("or", graph.call("lt", x, y), graph.call("and", number, nan))
 
 
-def _top_k(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+def _top_k(graph: Graph, eqn: Equation, x: Array) -> Results:
     """The k largest elements, the first of equal ones first, and where they are.
 
     The list of the k largest so far is in order, and each element in turn is put into it, behind
@@ -144,9 +142,7 @@ def _reducer(combine: str, empty: float) -> Callable:
     return functools.partial(_reduce, combine=combine, empty=empty)
 
 
-def _dot_general(
-    graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, y: np.ndarray
-) -> list[np.ndarray]:
+def _dot_general(graph: Graph, eqn: Equation, x: Array, y: Array) -> Results:
     (x_sum, y_sum), (x_batch, y_batch) = eqn.params["dimension_numbers"]
     aval = eqn.outvars[0].aval
     x_rows = _as_matrices(_cast(graph, eqn.invars[0].aval, x, aval.dtype), x_batch, x_sum)
@@ -160,13 +156,13 @@ def _dot_general(
     return [arrays.pack(products, aval.shape, aval.dtype)]
 
 
-def _cast(graph: Graph, aval: jaxprs.Shape, x: np.ndarray, dtype: DTypeLike) -> np.ndarray:
+def _cast(graph: Graph, aval: jaxprs.Shape, x: Array, dtype: DTypeLike) -> Array:
     if aval.dtype == dtype:
         return x
     return arrays.map_elements(lambda value: graph.convert(value, dtype), x.shape, dtype, x)
 
 
-def _as_matrices(x: np.ndarray, batch: tuple, contracted: tuple) -> np.ndarray:
+def _as_matrices(x: Array, batch: tuple, contracted: tuple) -> Array:
     """Returns x as [batch, free, contracted]."""
     free = [axis for axis in range(x.ndim) if axis not in (*batch, *contracted)]
     groups = [[x.shape[axis] for axis in axes] for axes in (batch, free, contracted)]
@@ -186,7 +182,7 @@ def _minus_dot(graph: Graph, start: Any, left: list, right: list) -> Any:
     return start
 
 
-def _cholesky(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+def _cholesky(graph: Graph, eqn: Equation, x: Array) -> Results:
     """The lower factor; NaN where the matrix is not positive definite."""
     size, dtype = x.shape[-1], eqn.outvars[0].aval.dtype
     factors = [
@@ -195,7 +191,7 @@ def _cholesky(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndar
     return [arrays.settle(np.stack(factors).reshape(x.shape), dtype)]
 
 
-def _factor(graph: Graph, matrix: np.ndarray, size: int, dtype: DTypeLike) -> np.ndarray:
+def _factor(graph: Graph, matrix: Array, size: int, dtype: DTypeLike) -> Array:
     lower = arrays.lift(np.zeros((size, size), dtype))
     for j in range(size):
         row = list(lower[j, :j])
@@ -211,9 +207,7 @@ def _divided(graph: Graph, value: Any, pivot: Any) -> Any:
     return graph.call("mul", value, graph.call("div", value.dtype.type(1), pivot))
 
 
-def _triangular_solve(
-    graph: Graph, eqn: jaxprs.Equation, a: np.ndarray, b: np.ndarray
-) -> list[np.ndarray]:
+def _triangular_solve(graph: Graph, eqn: Equation, a: Array, b: Array) -> Results:
     """Solves op(a) x = b, or x op(a) = b, matrix by matrix."""
     params, aval = eqn.params, eqn.outvars[0].aval
     lower = params["lower"] != params["transpose_a"]
@@ -232,7 +226,7 @@ def _triangular_solve(
     return [np.swapaxes(x, -1, -2) if params["left_side"] else x]
 
 
-def _substitute(graph: Graph, matrix: np.ndarray, rhs: Any, lower: bool, unit: bool) -> list:
+def _substitute(graph: Graph, matrix: Array, rhs: Any, lower: bool, unit: bool) -> list:
     """Solves one triangular system by substitution."""
     matrix, solution = arrays.lift(matrix), arrays.elements(rhs)
     size = len(solution)

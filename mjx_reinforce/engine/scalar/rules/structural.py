@@ -5,18 +5,20 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from mjx_reinforce.engine.scalar import arrays, jaxprs, nodes
+from mjx_reinforce.engine.scalar.arrays import Array, Results
 from mjx_reinforce.engine.scalar.graph import Graph
+from mjx_reinforce.engine.scalar.jaxprs import Equation
 from mjx_reinforce.engine.scalar.passes import simplify
 
 
-def _slice(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+def _slice(graph: Graph, eqn: Equation, x: Array) -> Results:
     params = eqn.params
     strides = params["strides"] or (1,) * x.ndim
     bounds = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
     return [x[tuple(slice(*bound) for bound in bounds)]]
 
 
-def _broadcast_in_dim(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+def _broadcast_in_dim(graph: Graph, eqn: Equation, x: Array) -> Results:
     shape = eqn.params["shape"]
     aligned = [1] * len(shape)
     for axis, target in enumerate(eqn.params["broadcast_dimensions"]):
@@ -24,17 +26,17 @@ def _broadcast_in_dim(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list
     return [np.broadcast_to(x.reshape(aligned), shape)]
 
 
-def _unstack(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+def _unstack(graph: Graph, eqn: Equation, x: Array) -> Results:
     axis = eqn.params["axis"]
     return [x.take([i], axis).squeeze(axis) for i in range(x.shape[axis])]
 
 
-def _split(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+def _split(graph: Graph, eqn: Equation, x: Array) -> Results:
     ends = np.cumsum(eqn.params["sizes"])[:-1]
     return list(np.split(x, ends, eqn.params["axis"]))
 
 
-def _pad(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, value: np.ndarray) -> list[np.ndarray]:
+def _pad(graph: Graph, eqn: Equation, x: Array, value: Array) -> Results:
     x, value = arrays.together([x, value])
     shape = eqn.outvars[0].aval.shape
     padded = np.broadcast_to(value, shape).copy()
@@ -50,21 +52,21 @@ def _pad(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, value: np.ndarray) -
     return [padded]
 
 
-def _iota(graph: Graph, eqn: jaxprs.Equation) -> list[np.ndarray]:
+def _iota(graph: Graph, eqn: Equation) -> Results:
     aval, axis = eqn.outvars[0].aval, eqn.params["dimension"]
     line = np.arange(aval.shape[axis]).astype(aval.dtype)
     aligned = [-1 if i == axis else 1 for i in range(len(aval.shape))]
     return [np.broadcast_to(line.reshape(aligned), aval.shape)]
 
 
-def _platform_index(graph: Graph, eqn: jaxprs.Equation) -> list[np.ndarray]:
+def _platform_index(graph: Graph, eqn: Equation) -> Results:
     default = jaxprs.default_platform(eqn)
     if default is None:
         raise jaxprs.no_rule("platform_dependent without a default", graph.source(eqn))
     return [np.asarray(default, eqn.outvars[0].aval.dtype)]
 
 
-def _moved(move: Callable[..., np.ndarray]) -> Callable[..., list[np.ndarray]]:
+def _moved(move: Callable[..., Array]) -> Callable[..., Results]:
     """Returns a rule: (parameters, shape of the result, operands) -> the result."""
     return lambda graph, eqn, *operands: [move(eqn.params, eqn.outvars[0].aval, *operands)]
 
@@ -75,49 +77,45 @@ _IDENTITIES = (
 )
 
 
-def _elementwise(graph: Graph, eqn: jaxprs.Equation, *operands: np.ndarray) -> list[np.ndarray]:
+def _elementwise(graph: Graph, eqn: Equation, *operands: Array) -> Results:
     """The general rule: the operation has the primitive's name."""
     name = eqn.primitive.name
     params = tuple(sorted(eqn.params.items())) if nodes.FACTS[name].has_params else ()
     return [_map_op(graph, nodes.Op(name, params), eqn.outvars[0].aval, operands)]
 
 
-def _map_op(
-    graph: Graph, op: nodes.Op, aval: jaxprs.Shape, operands: Sequence[np.ndarray]
-) -> np.ndarray:
+def _map_op(graph: Graph, op: nodes.Op, aval: jaxprs.Shape, operands: Sequence[Array]) -> Array:
     if all(map(arrays.is_numeric, operands)):
         return np.asarray(simplify.fold(op, operands, aval.dtype))
     apply, dtype = graph.apply, np.dtype(aval.dtype)
     return arrays.map_elements(lambda *args: apply(op, args, dtype), aval.shape, dtype, *operands)
 
 
-def _convert(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+def _convert(graph: Graph, eqn: Equation, x: Array) -> Results:
     aval = eqn.outvars[0].aval
     if eqn.invars[0].aval.dtype == aval.dtype:
         return [x]
     return [_map_op(graph, nodes.conversion(np.dtype(aval.dtype)), aval, (x,))]
 
 
-def _bitcast(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+def _bitcast(graph: Graph, eqn: Equation, x: Array) -> Results:
     if x.shape != eqn.outvars[0].aval.shape:
         raise jaxprs.no_rule("bitcast_convert_type to another size", graph.source(eqn))
     return _elementwise(graph, eqn, x)
 
 
-def _as(name: str) -> Callable[..., list[np.ndarray]]:
+def _as(name: str) -> Callable[..., Results]:
     """Returns the rule of an operation under another name."""
     return lambda graph, eqn, *xs: [_map_op(graph, nodes.Op(name), eqn.outvars[0].aval, xs)]
 
 
-def _clamp(
-    graph: Graph, eqn: jaxprs.Equation, low: np.ndarray, x: np.ndarray, high: np.ndarray
-) -> list[np.ndarray]:
+def _clamp(graph: Graph, eqn: Equation, low: Array, x: Array, high: Array) -> Results:
     aval = eqn.outvars[0].aval
     raised = _map_op(graph, nodes.Op("max"), aval, (x, low))
     return [_map_op(graph, nodes.Op("min"), aval, (raised, high))]
 
 
-def _integer_pow(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.ndarray]:
+def _integer_pow(graph: Graph, eqn: Equation, x: Array) -> Results:
     aval = eqn.outvars[0].aval
     return [
         arrays.map_elements(
@@ -126,7 +124,7 @@ def _integer_pow(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray) -> list[np.n
     ]
 
 
-def _pow_rule(graph: Graph, eqn: jaxprs.Equation, x: np.ndarray, y: np.ndarray) -> list[np.ndarray]:
+def _pow_rule(graph: Graph, eqn: Equation, x: Array, y: Array) -> Results:
     """An exponent may be an integer under a float base."""
     exponent = y if y.dtype in (object, x.dtype) else y.astype(eqn.outvars[0].aval.dtype)
     return [_map_op(graph, nodes.Op("pow"), eqn.outvars[0].aval, (x, exponent))]
