@@ -15,14 +15,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce.engine.gpu import launcher, ptx
+from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu.lockstep import WARP
 from mjx_reinforce.engine.play import objects
 
 #: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
 _OLDEST = (22,)
 #: What may assemble a kernel, what is preferred first.
-Assemblers = tuple[launcher.Assembler, ...]
+Assemblers = tuple[ptx.Assembler, ...]
 #: XLA's names of the handlers that it knows.
 _HANDLERS: set[str] = set()
 _LOCK = threading.Lock()
@@ -53,7 +53,7 @@ def _assemblers() -> tuple[Assemblers, str | None]:
     capabilities = {getattr(x, "compute_capability", "") for x in jax.local_devices()}
     if len(capabilities) > 1:
         return (), f"its kernels are for GPUs of one kind, not {' and '.join(sorted(capabilities))}"
-    found = launcher.assemblers(compute_capability())
+    found = ptx.assemblers(compute_capability())
     return found, None if found else "NVIDIA's driver, libcuda.so.1, is not found"
 
 
@@ -88,11 +88,11 @@ def _handler(kernel: ptx.Kernel, assemblers: Assemblers) -> str:
     name = _target(kernel.key)
     with _LOCK:
         if name not in _HANDLERS:
-            handler, slot = launcher.launcher(kernel.key)
+            handler, slot = ptx.launcher(kernel.key)
             address = jax.ffi.pycapsule(ctypes.c_void_p(handler))
             jax.ffi.register_ffi_target(name, address, platform="CUDA")
             given = (slot, kernel, assemblers, objects.folder())
-            threading.Thread(target=launcher.fill, args=given, daemon=True).start()
+            threading.Thread(target=ptx.fill, args=given, daemon=True).start()
             _HANDLERS.add(name)
     return name
 

@@ -1,13 +1,14 @@
 """The transcendental operations of the scalar graph in LLVM IR.
 
 Those of float32 lanes are ours, but for rare ones; those of float64 lanes, which CPUs alone have,
-are the C library's: right before fast.
+are the C library's: right before fast. Results of float32 below the smallest normal number are
+zero, as they are in XLA's threads, and an operand below it counts as zero in ``log``.
 """
 
+import math
 from collections.abc import Callable
 
-from mjx_reinforce.engine.llvm import exponential, trigonometry
-from mjx_reinforce.engine.llvm.lanes import INFINITY, Lanes
+from mjx_reinforce.engine.llvm.lanes import INFINITY, ROUND, Lanes
 
 #: What no task and no policy of ours computes with: the C library does, in double precision.
 RARE = ("acosh", "asinh", "atanh", "cbrt", "cosh", "erfc", "exp2", "sinh")
@@ -16,6 +17,345 @@ _LIBRARY = (
     *("acos", "acosh", "asin", "asinh", "atan", "atan2", "atanh", "cbrt", "cos", "cosh", "erf"),
     *("erfc", "exp", "exp2", "expm1", "log", "log1p", "pow", "sin", "sinh", "tan", "tanh"),
 )
+#: The logarithm of 2 in two parts; the first has 9 bits, so that its product with 15 is exact.
+_LN2 = (0.693359375, -2.12194440e-4)
+#: Beyond these, exp is below 2^-126 and above 2^128.
+_LEAST, _GREATEST = -87.33654, 88.72283
+#: From here on tanh rounds to 1.
+_TANH_IS_1 = 9.02
+#: The smallest normal number, and the bits of sqrt(1 / 2).
+_SMALLEST, _SQRT_HALF = 2.0**-126, 0x3F3504F3
+#: In float64: as ROUND, and the bits of 1 and of sqrt(1 / 2).
+_ROUND_64, _ONE_64, _SQRT_HALF_64 = 1.5 * 2.0**52, 1023 << 52, 0x3FE6A09E667F3BCD
+
+
+def _reduced(x: Lanes) -> tuple[Lanes, Lanes]:
+    """Returns x - n ln 2, within ln 2 / 2, and integers whose last bits are those of n."""
+    rounded = x * (1 / math.log(2)) + ROUND
+    n = rounded - ROUND
+    return x - n * _LN2[0] - n * _LN2[1], rounded.bits()
+
+
+def _exp_less_1(x: Lanes) -> Lanes:
+    """Returns exp(x) - 1 for |x| < 0.4. Coefficients: Cephes, expf.c."""
+    higher = x.polynomial(
+        *(1.9875691500e-4, 1.3981999507e-3, 8.3334519073e-3),
+        *(4.1665795894e-2, 1.6666665459e-1, 5.0000001201e-1),
+    )
+    return higher * (x * x) + x
+
+
+def _power_of_2(n: Lanes, offset: int = 0) -> Lanes:
+    """Returns 2^(n + offset) where it is a normal number; only the last bits of n count."""
+    return ((n << 23) + (127 + offset << 23)).bits()
+
+
+def _times_power_of_2(x: Lanes, n: Lanes) -> Lanes:
+    """Returns x 2^n where both are normal numbers; only the last bits of n count."""
+    return (x.bits() + (n << 23)).bits()
+
+
+def exp(x: Lanes, less: Lanes | None = None) -> Lanes:
+    """Returns the exponential of x, or of x - less, where |less| < 0.05."""
+    rest, n = _reduced(x)
+    rest = rest if less is None else rest - less
+    result = _times_power_of_2(_exp_less_1(rest) + 1, n)
+    result = (x < _LEAST).where(0.0, result)
+    return (x <= _GREATEST).where(result, x * INFINITY)  # infinity or NaN
+
+
+def _quarter_of_expm1(x: Lanes) -> Lanes:
+    """Returns (exp(x) - 1) / 4, which overflows later."""
+    rest, n = _reduced(x)
+    scale = _power_of_2(n, offset=-2)
+    return _exp_less_1(rest) * scale + (scale - 0.25)
+
+
+def expm1(x: Lanes) -> Lanes:
+    """Returns exp(x) - 1."""
+    result = _quarter_of_expm1((x < -18.0).where(-18.0, x)) * 4
+    return (x <= _GREATEST).where(result, x * INFINITY).call("copysign", x)
+
+
+def logistic(x: Lanes) -> Lanes:
+    """Returns 1 / (1 + exp(-x))."""
+    return 1 / (exp(-x) + 1)
+
+
+def tanh(x: Lanes) -> Lanes:
+    """Returns the hyperbolic tangent: of y = exp(|2 x|) - 1 it is y / (y + 2)."""
+    size = (abs(x) > _TANH_IS_1).where(_TANH_IS_1, abs(x))
+    rest, n = _reduced(size * 2)
+    scale = _power_of_2(n)
+    higher = _exp_less_1(rest) * scale
+    return ((higher + (scale - 1)) / (higher + (scale + 1))).call("copysign", x)
+
+
+def _log_of_parts(less_1: Lanes, exponent: Lanes) -> Lanes:
+    """Returns log((less_1 + 1) 2^exponent), sqrt(1 / 2) <= less_1 + 1 < sqrt(2).
+
+    Coefficients: Cephes, logf.c.
+    """
+    square = less_1 * less_1
+    higher = less_1.polynomial(
+        *(7.0376836292e-2, -1.1514610310e-1, 1.1676998740e-1, -1.2420140846e-1, 1.4249322787e-1),
+        *(-1.6668057665e-1, 2.0000714765e-1, -2.4999993993e-1, 3.3333331174e-1),
+    )
+    exponent = exponent.convert("sitofp", "float32")
+    higher = higher * (square * less_1) + exponent * _LN2[1]
+    return square * -0.5 + higher + less_1 + exponent * _LN2[0]
+
+
+def log(x: Lanes) -> Lanes:
+    """Returns the natural logarithm."""
+    exponent = (x.bits() - _SQRT_HALF) >> 23
+    result = _log_of_parts((x.bits() - (exponent << 23)).bits() - 1, exponent)
+    result = (x < INFINITY).where(result, x)
+    return (x < _SMALLEST).where((x <= -_SMALLEST).where(x.like(math.nan), -INFINITY), result)
+
+
+def log1p(x: Lanes) -> Lanes:
+    """Returns log(1 + x)."""
+    exponent = ((x + 1).bits() - _SQRT_HALF) >> 23
+    scale = (0x40800000 - (exponent << 23)).bits()  # 4 / 2^exponent
+    less_1 = (x.bits() - (exponent << 23)).bits() + (scale * 0.25 - 1)
+    result = (x < INFINITY).where(_log_of_parts(less_1, exponent), x)
+    result = (x > -1.0).where(result, (x < -1.0).where(math.nan, x * INFINITY))
+    return result.call("copysign", x)
+
+
+def _erf_near_0(x: Lanes) -> Lanes:
+    """Returns the error function for |x| < 1 / 2. Coefficients: minimax, fitted by us to 1.4e-9."""
+    higher = (x * x).polynomial(
+        *(0.0047179897799228826, -0.026757184144224241, 0.11282822808591147),
+        *(-0.37612608572861744, 0.1283791655673648),
+    )
+    return higher * x + x
+
+
+def _erfc_of_greater(x: Lanes) -> Lanes:
+    """Returns 1 - erf(x) for x > 1 / 2: exp(-x^2) by a rational function, fitted by us to 1e-9."""
+    x = (x > 10.1).where(10.1, x)
+    above = x.polynomial(
+        *(0.043689161344163209, 0.27346242694504136, 0.81809309172995566),
+        *(1.3140095917051087, 1.0000099372629862),
+    )
+    below = x.polynomial(
+        *(0.077436738058146783, 0.48471147468597858, 1.488531496149020),
+        *(2.5737118139924751, 2.4424857004448279, 1),
+    )
+    high = (x.bits() & ~0xFFF).bits()  # its square is exact
+    return exp(-high * high, less=(x - high) * (x + high)) * (above / below)
+
+
+def erf(x: Lanes) -> Lanes:
+    """Returns the error function."""
+    size = abs(x)
+    far = (1 - _erfc_of_greater(size)).call("copysign", x)
+    return (size < 0.5).where(_erf_near_0(x), far)
+
+
+def erf_inv(x: Lanes) -> Lanes:
+    """Returns the inverse of the error function.
+
+    Coefficients: M. Giles, Approximating the erfinv function (2012), as in XLA.
+    """
+    w = -log1p(x * -x)
+    central = (w - 2.5).polynomial(
+        *(2.81022636e-08, 3.43273939e-07, -3.5233877e-06, -4.39150654e-06, 0.00021858087),
+        *(-0.00125372503, -0.00417768164, 0.246640727, 1.50140941),
+    )
+    tail = (w.call("sqrt") - 3).polynomial(
+        *(-0.000200214257, 0.000100950558, 0.00134934322, -0.00367342844, 0.00573950773),
+        *(-0.0076224613, 0.00943887047, 1.00167406, 2.83297682),
+    )
+    result = (w < 5).where(central, tail) * x
+    return abs(x).compare("eq", 1).where(x * INFINITY, result)
+
+
+def _log2(x: Lanes) -> Lanes:
+    """Returns the logarithm to base 2 of x >= 0, float64, to 1e-12; the series of atanh."""
+    above = x.bits() + (_ONE_64 - _SQRT_HALF_64)
+    biased = above.write("lshr", 52)
+    y = (x.bits() - (biased << 52) + _ONE_64).bits()
+    ratio = (y - 1) / (y + 1)
+    series = (ratio * ratio).polynomial(*(2 / math.log(2) / k for k in range(17, 0, -2)))
+    exponent = (biased | 0x4330000000000000).bits() - (2.0**52 + 1023)  # 2^52 + biased
+    result = series * ratio + exponent
+    result = x.compare("eq", 0).where(-INFINITY, result)
+    return (x < INFINITY).where(result, x)
+
+
+def _exp2(x: Lanes) -> Lanes:
+    """Returns 2^x of |x| <= 300, float64, to 1e-12; the series."""
+    rounded = x + _ROUND_64
+    rest = x - (rounded - _ROUND_64)
+    series = rest.polynomial(*(math.log(2) ** k / math.factorial(k) for k in range(10, -1, -1)))
+    return series * ((rounded.bits() + 1023) << 52).bits()
+
+
+def pow(x: Lanes, y: Lanes) -> Lanes:
+    """Returns x^y, as C does, through float64."""
+    size = abs(x)
+    log = _log2(size.convert("fpext", "float64"))
+    product = size.compare("eq", 1).where(0.0, log * y.convert("fpext", "float64"))
+    product = (product > 300.0).where(300.0, product)
+    product = (product < -300.0).where(-300.0, product)
+    result = _exp2(product).convert("fptrunc", "float32")
+    whole, half = y.call("floor").compare("eq", y), y * 0.5
+    is_odd = whole & half.call("floor").compare("ne", half)
+    result = is_odd.where(result.call("copysign", x), result)
+    result = ((x < 0.0) & (x > -INFINITY) & whole.compare("eq", False)).where(math.nan, result)
+    return (y.compare("eq", 0) | x.compare("eq", 1)).where(1.0, result)
+
+
+#: pi / 2 in three parts; the first has 8 bits, so that its product with 16 bits is exact.
+_HALF_PI = (1.5703125, 0.0004838267923332751, 2.5633440682570896e-12)
+#: Up to here the three parts leave an error below 1e-6, with fused operations below 1e-9.
+_LARGE_ANGLE = 1e5
+_SIGN = -(2**31)
+#: The first 192 binary digits of 2^-8 / (2 pi).
+_TURN = (0x0028BE60DB939105, 0x4A7F09D5F47D4D37, 0x7036D8A5664F10E4)
+#: pi / 2 less its float32.
+_HALF_PI_LOW = -4.371139000186241e-08
+
+
+def _large(x: Lanes) -> tuple[Lanes, Lanes]:
+    """Returns x - n pi / 2 within pi / 4 and the last bits of the integer n, for x > _LARGE_ANGLE.
+
+    After Payne and Hanek: x is an integer of 24 bits times 2^e, and of its product with
+    1 / (2 pi) what is not a whole turn is in the 64 digits that start at digit e.
+    """
+    bits = x.bits()
+    integer = ((bits & 0x7FFFFF) | 0x800000).convert("zext", "int64")
+    start = ((bits >> 23) - (127 + 23 - 8)).convert("zext", "int64")
+    low, middle, high = (start.like(digits) for digits in _TURN)
+    first = start < 64
+    turn = integer * first.where(low, middle).call("fshl", first.where(middle, high), start)
+    n = (turn + 2**61) >> 62
+    rest = ((turn - (n << 62)) >> 32).convert("trunc", "int32").convert("sitofp", "float32")
+    rest = (x < float("inf")).where(rest * (6.283185307179586 / 2**32), float("nan"))
+    return rest, n.convert("trunc", "int32")
+
+
+def _reduce_angle(x: Lanes) -> tuple[Lanes, Lanes]:
+    """Returns x - n pi / 2 within pi / 4 and the last bits of the integer n, for x >= 0."""
+    rounded = x * (2 / 3.141592653589793) + ROUND
+    n = rounded - ROUND
+    small = x - n * _HALF_PI[0] - n * _HALF_PI[1] - n * _HALF_PI[2], rounded.bits()
+    is_large = x > _LARGE_ANGLE
+    before = x.text.block
+    with x.text.unless_none(is_large.name):
+        large = [is_large.where(*pair) for pair in zip(_large(x), small, strict=True)]
+        inside = x.text.block
+    rest, n = (
+        a.named(x.text.phi(a.dtype, {before: a.name, inside: b.name}))
+        for a, b in zip(small, large, strict=True)
+    )
+    return rest, n
+
+
+def _sine_and_cosine(x: Lanes) -> tuple[Lanes, Lanes, Lanes]:
+    """Returns sine and cosine of |x| - n pi / 2, within pi / 4, and the last bits of n."""
+
+    def write() -> tuple[Lanes, Lanes, Lanes]:
+        rest, n = _reduce_angle(abs(x))
+        square = rest * rest
+        # Cephes, sinf.c and cosf.c.
+        sine = square.polynomial(-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1)
+        cosine = square.polynomial(
+            2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2
+        )
+        sine = sine * (square * rest) + rest
+        return sine, cosine * (square * square) + (square * -0.5 + 1), n
+
+    return x.text.once(("sine and cosine", x.name), write)
+
+
+def sin(x: Lanes) -> Lanes:
+    """Returns the sine."""
+    sine, cosine, n = _sine_and_cosine(x)
+    size = ((n & 1).compare("eq", 0)).where(sine, cosine)
+    return (size.bits() ^ ((x.bits() ^ (n << 30)) & _SIGN)).bits()
+
+
+def cos(x: Lanes) -> Lanes:
+    """Returns the cosine."""
+    sine, cosine, n = _sine_and_cosine(x)
+    size = ((n & 1).compare("eq", 0)).where(cosine, sine)
+    return (size.bits() ^ (((n + 1) << 30) & _SIGN)).bits()
+
+
+def tan(x: Lanes) -> Lanes:
+    """Returns the tangent."""
+    sine, cosine, n = _sine_and_cosine(x)
+    is_even = (n & 1).compare("eq", 0)
+    size = is_even.where(sine, cosine) / is_even.where(cosine, sine)
+    return (size.bits() ^ ((x.bits() ^ (n << 31)) & _SIGN)).bits()
+
+
+def _quarter_less(arc: Lanes) -> Lanes:
+    """Returns pi / 2 - arc."""
+    return math.pi / 2 - arc + _HALF_PI_LOW
+
+
+def _atan_to_1(x: Lanes) -> Lanes:
+    """Returns the arctangent of 0 <= x <= 1. Coefficients: SLEEF, atanf_u35."""
+    square = x * x
+    higher = square.polynomial(
+        *(0.00282363896258175373, -0.0159569028764963150, 0.0425049886107444763),
+        *(-0.0748900920152664185, 0.106347933411598206, -0.142027363181114197),
+        *(0.199926957488059998, -0.333331018686294556),
+    )
+    return higher * (square * x) + x
+
+
+def atan(x: Lanes) -> Lanes:
+    """Returns the arctangent."""
+    size = abs(x)
+    is_above_1 = size > 1.0
+    arc = _atan_to_1(is_above_1.where(1 / size, size))
+    return is_above_1.where(_quarter_less(arc), arc).call("copysign", x)
+
+
+def atan2(y: Lanes, x: Lanes) -> Lanes:
+    """Returns the angle of the point (x, y), as C does."""
+    height, width = abs(y), abs(x)
+    is_steep = height > width
+    less, more = is_steep.where(width, height), is_steep.where(height, width)
+    ratio = less.compare("eq", more).where(1.0, less / more)
+    ratio = less.compare("eq", 0).where(0.0, ratio)
+    arc = _atan_to_1(ratio)
+    arc = is_steep.where(_quarter_less(arc), arc)
+    arc = (x.bits() < 0).where(math.pi - arc, arc).call("copysign", y)
+    return (height + width).compare("eq", height + width).where(arc, math.nan)
+
+
+def _asin_parts(x: Lanes) -> tuple[Lanes, Lanes]:
+    """Returns for x >= 0 whether x > 1 / 2, and asin(x), there asin(sqrt((1 - x) / 2)).
+
+    Coefficients: Cephes, asinf.c.
+    """
+    is_great = x > 0.5
+    square = is_great.where((1 - x) * 0.5, x * x)
+    root = is_great.where(square.call("sqrt"), x)
+    higher = square.polynomial(
+        *(4.2163199048e-2, 2.4181311049e-2, 4.5470025998e-2, 7.4953002686e-2, 1.6666752422e-1)
+    )
+    return is_great, higher * (square * root) + root
+
+
+def asin(x: Lanes) -> Lanes:
+    """Returns the arcsine."""
+    is_great, arc = _asin_parts(abs(x))
+    return is_great.where(_quarter_less(arc * 2), arc).call("copysign", x)
+
+
+def acos(x: Lanes) -> Lanes:
+    """Returns the arccosine."""
+    is_great, arc = _asin_parts(abs(x))
+    far = (x < 0.0).where(math.pi - arc * 2, arc * 2)
+    return is_great.where(far, math.pi / 2 - arc.call("copysign", x))
 
 
 def _library(name: str) -> Callable[..., Lanes]:
@@ -89,14 +429,16 @@ def _erf_inv(x: Lanes) -> Lanes:
     return abs(x).compare("eq", 1).where(x * INFINITY, result)
 
 
-_TRIGONOMETRY = ("acos", "asin", "atan", "atan2", "cos", "sin", "tan")
-_EXPONENTIAL = ("erf", "erf_inv", "exp", "expm1", "log", "log1p", "logistic", "pow", "tanh")
+#: Those of float32 lanes that are ours.
+_OURS: tuple[Callable[..., Lanes], ...] = (
+    *(acos, asin, atan, atan2, cos, sin, tan),
+    *(erf, erf_inv, exp, expm1, log, log1p, logistic, pow, tanh),
+)
 #: dtype -> name of the operation -> (operands) -> the result
 FUNCTIONS: dict[str, dict[str, Callable[..., Lanes]]] = {
     "float32": {
         **{name: _rounded(name) for name in RARE},
-        **{name: getattr(trigonometry, name) for name in _TRIGONOMETRY},
-        **{name: getattr(exponential, name) for name in _EXPONENTIAL},
+        **{function.__name__: function for function in _OURS},
     },
     "float64": {
         **{name: _library(name) for name in _LIBRARY},

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.engine.llvm import math
 from mjx_reinforce.engine.llvm.lanes import INFINITY, Lanes
+from mjx_reinforce.engine.llvm.math import FUNCTIONS
 from mjx_reinforce.engine.llvm.text import scalar_type
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
 from mjx_reinforce.engine.scalar.nodes import FACTS, Op
@@ -149,7 +149,7 @@ def _reinterpret(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
 
 
 def _math(op: Op, dtype: np.dtype, *operands: Lanes) -> Lanes:
-    return math.FUNCTIONS[dtype.name][op.name](*operands)
+    return FUNCTIONS[dtype.name][op.name](*operands)
 
 
 def _absent(op: Op, *_: Any) -> Lanes:
@@ -158,7 +158,7 @@ def _absent(op: Op, *_: Any) -> Lanes:
 
 OPERATIONS: dict[str, Emit] = {
     **dict.fromkeys(FACTS, _absent),
-    **dict.fromkeys(math.FUNCTIONS["float32"], _math),
+    **dict.fromkeys(FUNCTIONS["float32"], _math),
     **dict.fromkeys(_COMPARISONS, _compare),
     **dict.fromkeys(("max", "min"), _extreme),
     **dict.fromkeys(("div", "rem"), _divide),

@@ -12,8 +12,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike
 
-from mjx_reinforce.engine.scalar import arrays, jaxprs, nodes
-from mjx_reinforce.engine.scalar.nodes import BOOL, Captured, Node, Scalar, Scope, identity
+from mjx_reinforce.engine.scalar import arrays, jaxprs
+from mjx_reinforce.engine.scalar.nodes import (
+    BOOL,
+    FACTS,
+    SELECT,
+    Captured,
+    Node,
+    Op,
+    Scalar,
+    Scope,
+    conversion,
+    identity,
+)
 from mjx_reinforce.engine.scalar.passes import simplify
 from mjx_reinforce.engine.scalar.size import MAX_SCALARS, TooLarge
 
@@ -155,19 +166,19 @@ class Graph:
 
     def call(self, name: str, *args: Scalar) -> Scalar:
         """Applies one of the named operations to scalars."""
-        predicate = nodes.FACTS[name].is_predicate
-        return self.apply(nodes.Op(name), args, BOOL if predicate else args[-1].dtype)
+        predicate = FACTS[name].is_predicate
+        return self.apply(Op(name), args, BOOL if predicate else args[-1].dtype)
 
     def convert(self, value: Scalar, dtype: DTypeLike) -> Scalar:
         """Converts a scalar to another dtype."""
         dtype = np.dtype(dtype)
-        return self.apply(nodes.conversion(dtype), (value,), dtype)
+        return self.apply(conversion(dtype), (value,), dtype)
 
     def select(self, predicate: Scalar, on_true: Scalar, on_false: Scalar) -> Scalar:
         """Returns on_true where the predicate holds, else on_false."""
-        return self.apply(nodes.SELECT, (predicate, on_false, on_true), on_true.dtype)
+        return self.apply(SELECT, (predicate, on_false, on_true), on_true.dtype)
 
-    def apply(self, op: nodes.Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar:
+    def apply(self, op: Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar:
         """Applies an operation: a constant, an existing node, a simpler one or a new one."""
         nodes = [arg for arg in args if isinstance(arg, Node)]
         if not nodes:
@@ -178,11 +189,9 @@ class Graph:
         simpler = simplify.simplify(self, op, args, dtype)
         return self._share(op, args, nodes, dtype) if simpler is None else simpler
 
-    def _share(
-        self, op: nodes.Op, args: tuple[Scalar, ...], nodes: list[Node], dtype: np.dtype
-    ) -> Node:
+    def _share(self, op: Op, args: tuple[Scalar, ...], nodes: list[Node], dtype: np.dtype) -> Node:
         keys = [arg if isinstance(arg, Node) else identity(arg) for arg in args]
-        key = (op, frozenset(keys) if nodes.FACTS[op.name].commutes else tuple(keys))
+        key = (op, frozenset(keys) if FACTS[op.name].commutes else tuple(keys))
         least = max([node.scope.depth for node in nodes])  # no node of these is further outside
         depth = max(self.scope.floor, least)
         for k in range(depth, least - 1, -1):

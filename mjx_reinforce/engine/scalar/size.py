@@ -8,7 +8,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from mjx_reinforce.engine.scalar import jaxprs, nodes
+from mjx_reinforce.engine.scalar import jaxprs
+from mjx_reinforce.engine.scalar.nodes import FACTS
 
 #: What is larger takes minutes to write, and longer to compile.
 MAX_SCALARS = 4_000_000
@@ -16,7 +17,7 @@ MAX_SCALARS = 4_000_000
 _LOOP = 2
 #: The program that is written out of a primitive of ours, among its parameters.
 _CARRIES = {"by_engine": "one", "skippable": "computation"}
-_ELEMENTWISE = {*nodes.FACTS, "integer_pow", "square", "add_any", "clamp"}
+_ELEMENTWISE = {*FACTS, "integer_pow", "square", "add_any", "clamp"}
 
 
 class TooLarge(NotImplementedError):  # noqa: N818 (reads as what it is)

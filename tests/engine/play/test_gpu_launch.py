@@ -14,8 +14,8 @@ import pytest
 from jax import export
 
 from mjx_reinforce.engine.cpu import handler, machine
-from mjx_reinforce.engine.gpu import launcher, ptx, seam
-from mjx_reinforce.engine.gpu.launcher import Assembler
+from mjx_reinforce.engine.gpu import ptx, seam
+from mjx_reinforce.engine.gpu.ptx import Assembler
 from mjx_reinforce.engine.play import available, objects
 
 if reason := available.unavailable():
@@ -64,14 +64,14 @@ class Driver:
 @pytest.fixture
 def driver(monkeypatch):
     made = Driver()
-    monkeypatch.setattr(launcher.ctypes, "CDLL", lambda name: made)
+    monkeypatch.setattr(ptx.ctypes, "CDLL", lambda name: made)
     return made
 
 
 def handler_of_a_cpu(name):
     """Registers a handler that XLA's CPU runtime calls, which has no stream; returns its slot."""
     stream = "call ptr %get(ptr %asking)"
-    text = handler.with_entry(launcher._TEXT, {})
+    text = handler.with_entry(ptx._TEXT, {})
     assert stream in text
     text = text.replace(stream, "getelementptr i8, ptr null, i64 0")
     names = ("handler", "slot")
@@ -111,7 +111,7 @@ def test_a_launch_waits_for_its_kernel(driver):
     slot = handler_of_a_cpu("waits")
     assembling = threading.Event()
     slow = Assembler("slow", lambda text: (assembling.wait(60) and "", text.encode()))
-    threading.Thread(target=launcher.fill, args=(slot, KERNEL, (slow,), None)).start()
+    threading.Thread(target=ptx.fill, args=(slot, KERNEL, (slow,), None)).start()
     threading.Timer(0.2, assembling.set).start()
     began = time.monotonic()
     assert launched("waits", 7, times=3) == 21
@@ -122,7 +122,7 @@ def test_a_launch_waits_for_its_kernel(driver):
 
 def test_what_the_driver_does_not_launch_is_an_error(driver):
     slot = handler_of_a_cpu("is_an_error")
-    launcher.fill(slot, KERNEL, (by("ptxas"),), None)
+    ptx.fill(slot, KERNEL, (by("ptxas"),), None)
     assert launched("is_an_error", 1) == 1
     driver.status = 719
     with pytest.raises((RuntimeError, ValueError), match="cuLaunchKernel returned 719"):
@@ -141,7 +141,7 @@ def test_the_next_assembler_is_tried(driver, monkeypatch, capfd):
         (None, None, None),
     ):
         driver.images.clear()
-        launcher.fill(ctypes.addressof(slot), KERNEL, (by("new", new), by("old", old)), None)
+        ptx.fill(ctypes.addressof(slot), KERNEL, (by("new", new), by("old", old)), None)
         launch, found = (POINTER * 2).from_address(slot.value)
         assert launch == ctypes.cast(driver.cuLaunchKernel, POINTER).value
         assert found == kernel
@@ -156,7 +156,7 @@ def test_machine_code_is_kept_for_what_assembled_it(driver, tmp_path):
     calls, slot = [], POINTER()
 
     def fill(name, kernel=KERNEL):
-        launcher.fill(ctypes.addressof(slot), kernel, (by(name, b"code", calls),), tmp_path)
+        ptx.fill(ctypes.addressof(slot), kernel, (by(name, b"code", calls),), tmp_path)
         return len(calls)
 
     assert [fill("ptxas 1"), fill("ptxas 1")] == [1, 1]
@@ -180,10 +180,10 @@ def test_pips_assembler_comes_first(tmp_path, monkeypatch):
         program(tmp_path / place / "bin" / "ptxas", f"Copyright\n{place}", echo)
     (tmp_path / "broken" / "bin" / "ptxas").write_text("#!/nowhere\n")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(launcher.ctypes, "CDLL", lambda name: None)
+    monkeypatch.setattr(ptx.ctypes, "CDLL", lambda name: None)
     monkeypatch.setenv("PATH", f"{tmp_path / 'path' / 'bin'}:{os.environ['PATH']}")
     monkeypatch.setenv("CUDA_HOME", str(tmp_path / "home"))
-    found = launcher.assemblers("9.0")
+    found = ptx.assemblers("9.0")
     ours = [x for x in found if "nvidia" in x.name or x.name in ("ptxas, path", "ptxas, home")]
     assert [x.name for x in ours] == [
         *("ptxas, nvidia/cu13", "ptxas, nvidia/cuda_nvcc", "ptxas, path", "ptxas, home")
@@ -192,34 +192,34 @@ def test_pips_assembler_comes_first(tmp_path, monkeypatch):
     assert found[-1].assemble("text") == ("", b"text\0")
     assert found[0].assemble("text") == ("Used 8 registers for -arch=sm_90\n", b"text")
     monkeypatch.setenv("CUDA_HOME", str(tmp_path / "broken"))
-    assert "ptxas, home" not in [x.name for x in launcher.assemblers("9.0")]
+    assert "ptxas, home" not in [x.name for x in ptx.assemblers("9.0")]
 
 
 def test_there_is_none_without_a_driver_and_one_that_fails_says_why(tmp_path, monkeypatch):
     program(tmp_path / "nvidia" / "cu13" / "bin" / "ptxas", "1", "echo no such GPU >&2; exit 3")
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.setattr(launcher.ctypes, "CDLL", lambda name: None)
+    monkeypatch.setattr(ptx.ctypes, "CDLL", lambda name: None)
     with pytest.raises(RuntimeError, match="ptxas returned 3: no such GPU"):
-        launcher.assemblers("99.0")[0].assemble("text")
+        ptx.assemblers("99.0")[0].assemble("text")
 
     def lost(name):
         raise OSError(f"{name}: cannot open")
 
-    monkeypatch.setattr(launcher.ctypes, "CDLL", lost)
-    assert launcher.assemblers("9.0") == ()
+    monkeypatch.setattr(ptx.ctypes, "CDLL", lost)
+    assert ptx.assemblers("9.0") == ()
 
 
 def test_there_is_none_where_gpus_differ(monkeypatch):
     """Machine code is for one of them."""
     found = tuple(map(by, ("new", "driver")))
-    monkeypatch.setattr(launcher, "assemblers", lambda capability: found)
+    monkeypatch.setattr(ptx, "assemblers", lambda capability: found)
     assemblers = seam._assemblers.__wrapped__
     gpus = [type("GPU", (), {"compute_capability": x}) for x in ("9.0", "8.0")]
     monkeypatch.setattr(jax, "local_devices", lambda: gpus)
     assert assemblers() == ((), "its kernels are for GPUs of one kind, not 8.0 and 9.0")
     monkeypatch.setattr(jax, "local_devices", lambda: gpus[:1] * 2)
     assert assemblers() == (found, None)
-    monkeypatch.setattr(launcher, "assemblers", lambda capability: ())
+    monkeypatch.setattr(ptx, "assemblers", lambda capability: ())
     assert assemblers() == ((), "NVIDIA's driver, libcuda.so.1, is not found")
 
 
@@ -229,7 +229,7 @@ def in_memory(monkeypatch, tmp_path):
     monkeypatch.setattr(seam, "_HANDLERS", set())
     monkeypatch.setattr(objects, "folder", lambda: tmp_path)
     filled, registered = [], []
-    monkeypatch.setattr(launcher, "fill", lambda slot, *given: filled.append(given))
+    monkeypatch.setattr(ptx, "fill", lambda slot, *given: filled.append(given))
     monkeypatch.setattr(
         jax.ffi,
         "register_ffi_target",

@@ -12,10 +12,10 @@ from jax import lax
 from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.llvm.emit import LLVM, Input
 from mjx_reinforce.engine.llvm.text import Text
-from mjx_reinforce.engine.scalar import nodes, scalarized
+from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.engine.scalar.backend import Backend
 from mjx_reinforce.engine.scalar.graph import Graph, Limits
-from mjx_reinforce.engine.scalar.nodes import is_constant
+from mjx_reinforce.engine.scalar.nodes import FACTS, Op, conversion, is_constant
 from mjx_reinforce.engine.scalar.passes import simplify
 from mjx_reinforce.engine.scalar.vmap import XLA
 
@@ -36,7 +36,7 @@ PARAMS = {
 
 def operands_of(name):
     values = BITS if name in ON_BITS else FLOATS
-    operands = list(values[: nodes.FACTS[name].arity])
+    operands = list(values[: FACTS[name].arity])
     if name == "select_n":
         operands[0] = np.True_
     if name == "acosh":
@@ -47,12 +47,12 @@ def operands_of(name):
 def dtype_of(op, operands):
     if "new_dtype" in dict(op.params):
         return dict(op.params)["new_dtype"]
-    return np.dtype(bool) if nodes.FACTS[op.name].is_predicate else operands[-1].dtype
+    return np.dtype(bool) if FACTS[op.name].is_predicate else operands[-1].dtype
 
 
 def test_a_backend_with_a_table_knows_every_operation():
     for backend in (XLA, LLVM):
-        assert set(backend.OPERATIONS or nodes.FACTS) == set(nodes.FACTS)
+        assert set(backend.OPERATIONS or FACTS) == set(FACTS)
 
 
 def test_a_backend_walks_loops_and_gates():
@@ -91,7 +91,7 @@ def test_a_load_says_how_its_place_is_aligned(align):
 
 def folded_and_computed(name):
     """Returns [mixes, 2] what XLA computes of constants and lanes in every order, and the fold."""
-    op = nodes.Op(name, tuple(sorted(PARAMS.get(name, {}).items())))
+    op = Op(name, tuple(sorted(PARAMS.get(name, {}).items())))
     operands = operands_of(name)
     dtype = dtype_of(op, operands)
     folded = simplify.fold(op, operands, dtype)
@@ -112,7 +112,7 @@ def folded_and_computed(name):
 @pytest.mark.slow
 def test_constants_fold_to_what_jax_computes():
     """The same operation on constants, on lanes, and on both, in every order."""
-    for name in nodes.FACTS:
+    for name in FACTS:
         computed, folded = folded_and_computed(name)
         want = np.full((len(computed), 2), folded)
         np.testing.assert_allclose(computed, want, rtol=1e-5, err_msg=name)
@@ -120,14 +120,14 @@ def test_constants_fold_to_what_jax_computes():
 
 def test_operations_that_commute_are_shared():
     graph = Graph(0, Limits())
-    for name in (n for n, facts in nodes.FACTS.items() if facts.commutes):
+    for name in (n for n, facts in FACTS.items() if facts.commutes):
         x, y = (graph.leaf(operands_of(name)[0].dtype, True) for _ in range(2))
         assert graph.call(name, x, y) is graph.call(name, y, x), name
 
 
 def test_equal_operations_are_equal():
     float32, int32 = np.dtype(np.float32), np.dtype(np.int32)
-    assert len({nodes.conversion(float32), nodes.conversion(float32), nodes.conversion(int32)}) == 2
+    assert len({conversion(float32), conversion(float32), conversion(int32)}) == 2
 
 
 class Listing(Backend[str]):

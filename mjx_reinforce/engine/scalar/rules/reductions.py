@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from mjx_reinforce.engine.scalar import arrays, jaxprs, nodes
+from mjx_reinforce.engine.scalar import arrays, jaxprs
 from mjx_reinforce.engine.scalar.arrays import Array, Results
 from mjx_reinforce.engine.scalar.graph import Graph
 from mjx_reinforce.engine.scalar.jaxprs import Equation
+from mjx_reinforce.engine.scalar.nodes import Op
 
 
 def _reduce(graph: Graph, eqn: Equation, x: Array, *, combine: str, empty: float) -> list:
@@ -131,7 +132,7 @@ def _ordered(graph: Graph, value: Any) -> Any:
     if value.dtype.kind in "biu":
         return value
     integer = np.dtype(f"int{8 * value.dtype.itemsize}")
-    op = nodes.Op("bitcast_convert_type", (("new_dtype", integer),))
+    op = Op("bitcast_convert_type", (("new_dtype", integer),))
     bits = graph.apply(op, (value,), integer)
     negative = graph.call("lt", bits, integer.type(0))
     flipped = graph.call("xor", bits, integer.type(np.iinfo(integer).max))

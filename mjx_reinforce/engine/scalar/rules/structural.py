@@ -4,10 +4,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mjx_reinforce.engine.scalar import arrays, jaxprs, nodes
+from mjx_reinforce.engine.scalar import arrays, jaxprs
 from mjx_reinforce.engine.scalar.arrays import Array, Results
 from mjx_reinforce.engine.scalar.graph import Graph
 from mjx_reinforce.engine.scalar.jaxprs import Equation
+from mjx_reinforce.engine.scalar.nodes import FACTS, Op, conversion
 from mjx_reinforce.engine.scalar.passes import simplify
 
 
@@ -80,11 +81,11 @@ _IDENTITIES = (
 def _elementwise(graph: Graph, eqn: Equation, *operands: Array) -> Results:
     """The general rule: the operation has the primitive's name."""
     name = eqn.primitive.name
-    params = tuple(sorted(eqn.params.items())) if nodes.FACTS[name].has_params else ()
-    return [_map_op(graph, nodes.Op(name, params), eqn.outvars[0].aval, operands)]
+    params = tuple(sorted(eqn.params.items())) if FACTS[name].has_params else ()
+    return [_map_op(graph, Op(name, params), eqn.outvars[0].aval, operands)]
 
 
-def _map_op(graph: Graph, op: nodes.Op, aval: jaxprs.Shape, operands: Sequence[Array]) -> Array:
+def _map_op(graph: Graph, op: Op, aval: jaxprs.Shape, operands: Sequence[Array]) -> Array:
     if all(map(arrays.is_numeric, operands)):
         return np.asarray(simplify.fold(op, operands, aval.dtype))
     apply, dtype = graph.apply, np.dtype(aval.dtype)
@@ -95,7 +96,7 @@ def _convert(graph: Graph, eqn: Equation, x: Array) -> Results:
     aval = eqn.outvars[0].aval
     if eqn.invars[0].aval.dtype == aval.dtype:
         return [x]
-    return [_map_op(graph, nodes.conversion(np.dtype(aval.dtype)), aval, (x,))]
+    return [_map_op(graph, conversion(np.dtype(aval.dtype)), aval, (x,))]
 
 
 def _bitcast(graph: Graph, eqn: Equation, x: Array) -> Results:
@@ -106,13 +107,13 @@ def _bitcast(graph: Graph, eqn: Equation, x: Array) -> Results:
 
 def _as(name: str) -> Callable[..., Results]:
     """Returns the rule of an operation under another name."""
-    return lambda graph, eqn, *xs: [_map_op(graph, nodes.Op(name), eqn.outvars[0].aval, xs)]
+    return lambda graph, eqn, *xs: [_map_op(graph, Op(name), eqn.outvars[0].aval, xs)]
 
 
 def _clamp(graph: Graph, eqn: Equation, low: Array, x: Array, high: Array) -> Results:
     aval = eqn.outvars[0].aval
-    raised = _map_op(graph, nodes.Op("max"), aval, (x, low))
-    return [_map_op(graph, nodes.Op("min"), aval, (raised, high))]
+    raised = _map_op(graph, Op("max"), aval, (x, low))
+    return [_map_op(graph, Op("min"), aval, (raised, high))]
 
 
 def _integer_pow(graph: Graph, eqn: Equation, x: Array) -> Results:
@@ -127,7 +128,7 @@ def _integer_pow(graph: Graph, eqn: Equation, x: Array) -> Results:
 def _pow_rule(graph: Graph, eqn: Equation, x: Array, y: Array) -> Results:
     """An exponent may be an integer under a float base."""
     exponent = y if y.dtype in (object, x.dtype) else y.astype(eqn.outvars[0].aval.dtype)
-    return [_map_op(graph, nodes.Op("pow"), eqn.outvars[0].aval, (x, exponent))]
+    return [_map_op(graph, Op("pow"), eqn.outvars[0].aval, (x, exponent))]
 
 
 RULES = {
@@ -150,13 +151,11 @@ RULES = {
     "iota": _iota,
     "empty": _moved(lambda _, aval: arrays.zeros(aval)),
     "platform_index": _platform_index,
-    **dict.fromkeys(nodes.FACTS, _elementwise),
+    **dict.fromkeys(FACTS, _elementwise),
     "convert_element_type": _convert,
     "bitcast_convert_type": _bitcast,
-    "add_any": lambda graph, eqn, x, y: [
-        _map_op(graph, nodes.Op("add"), eqn.outvars[0].aval, (x, y))
-    ],
-    "square": lambda graph, eqn, x: [_map_op(graph, nodes.Op("mul"), eqn.outvars[0].aval, (x, x))],
+    "add_any": lambda graph, eqn, x, y: [_map_op(graph, Op("add"), eqn.outvars[0].aval, (x, y))],
+    "square": lambda graph, eqn, x: [_map_op(graph, Op("mul"), eqn.outvars[0].aval, (x, x))],
     "clamp": _clamp,
     "integer_pow": _integer_pow,
     "pow": _pow_rule,
