@@ -10,13 +10,8 @@ import re
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
-from mjx_reinforce.engine.checks import (
-    BadEnvironmentError,
-    check_name,
-    check_parts,
-    explain,
-    nearest,
-)
+from mjx_reinforce.engine import checks
+from mjx_reinforce.engine.checks import BadEnvironmentError
 from mjx_reinforce.engine.physics import silence_mjx
 from mjx_reinforce.registry import load_ours, load_own
 
@@ -91,8 +86,8 @@ def make(id: str, /, **kwargs: object) -> "MujocoEnv":
     except (Exception, SystemExit) as error:  # the user's code may raise anything
         if isinstance(error, ValueError) and ":" not in id:
             raise
-        raise ValueError(f"cannot build the environment {id!r}: {explain(error)}") from error
-    check_parts(env)
+        raise ValueError(f"cannot build the environment {id!r}: {checks.explain(error)}") from error
+    checks.check_parts(env)
     return env
 
 
@@ -155,7 +150,7 @@ def make_vec(
         if made is env and settings:
             raise ValueError(f"{sorted(settings)} are for an id; this environment is made already")
     except ValueError as error:
-        meant = [own for own in (nearest(name, _OF_MAKE_VEC) for name in settings) if own]
+        meant = [own for own in (checks.nearest(name, _OF_MAKE_VEC) for name in settings) if own]
         if not meant:
             raise
         hint = f"make_vec itself takes {meant[0]!r}"
@@ -180,7 +175,7 @@ def check_id(id: str) -> None:
         )
     if ":" not in id:
         try:
-            check_name("environment", id, _TABLE)
+            checks.check_name("environment", id, _TABLE)
         except ValueError as error:
             raise ValueError(f"{error} Your own is named module:Class.") from None
     elif not re.fullmatch(r"\w+(\.\w+)*:\w+", id):

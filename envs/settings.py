@@ -9,14 +9,7 @@ import typing
 from collections.abc import Sequence
 from typing import Any
 
-from mjx_reinforce.engine.checks import (
-    check_count,
-    check_name,
-    check_type,
-    is_nan,
-    read_as,
-    spoken_kind,
-)
+from mjx_reinforce.engine import checks
 
 #: A range (low, high), of which ``EpisodeSettings`` checks that it contains something.
 Interval = tuple[float, float]
@@ -33,7 +26,7 @@ class EpisodeSettings:
 
     def __post_init__(self):
         """Raises ValueError for a value that is out of its range."""
-        check_count("max_episode_steps", self.max_episode_steps)
+        checks.check_count("max_episode_steps", self.max_episode_steps)
         for field in dataclasses.fields(self):
             # The same object: other pairs of numbers may be of any order.
             if field.type is Interval:
@@ -57,7 +50,7 @@ def build_settings(env: Any, arguments: dict[str, Any]) -> Any:
     task = type(env).__name__
     known = {field.name: field for field in dataclasses.fields(env.Settings) if field.init}
     for name in arguments:
-        check_name(f"argument of {task}", name, known)
+        checks.check_name(f"argument of {task}", name, known)
     none = dataclasses.MISSING
     needed = [x.name for x in known.values() if x.default is x.default_factory is none]
     missing = [name for name in needed if name not in arguments]
@@ -68,8 +61,8 @@ def build_settings(env: Any, arguments: dict[str, Any]) -> Any:
     for name, field in known.items():
         value = arguments.get(name, field.default)
         if value is not none:
-            check_type(f"{name} of {task}", value, field.type)
-        if is_nan(value):
+            checks.check_type(f"{name} of {task}", value, field.type)
+        if checks.is_nan(value):
             raise ValueError(f"{name} of {task} must be a number, got nan")
     return env.Settings(**arguments)
 
@@ -116,12 +109,12 @@ def read_settings(task: object, words: Sequence[str]) -> dict[str, Any]:
     kinds = typing.get_type_hints(form)
     known = {field.name: kinds[field.name] for field in dataclasses.fields(form) if field.init}
     for name in texts:
-        check_name(f"setting of {called}", name, known)
+        checks.check_name(f"setting of {called}", name, known)
     read = {}
     for name, text in texts.items():
         try:
-            read[name] = read_as(known[name], text)
+            read[name] = checks.read_as(known[name], text)
         except (ValueError, TypeError):
-            said = spoken_kind(known[name])
+            said = checks.spoken_kind(known[name])
             raise ValueError(f"--env-set {name} of {called} must be {said}, got {text!r}") from None
     return read

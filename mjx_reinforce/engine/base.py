@@ -5,16 +5,9 @@ entries, A action entries.
 """
 
 import dataclasses
+import typing
 from collections.abc import Callable
-from typing import (
-    Any,
-    NamedTuple,
-    Protocol,
-    Self,
-    TypeAlias,
-    dataclass_transform,
-    runtime_checkable,
-)
+from typing import Any, NamedTuple, Protocol, Self, TypeAlias
 
 import jax
 import numpy as np
@@ -29,7 +22,7 @@ MjSpec: TypeAlias = Any
 Act: TypeAlias = Callable[[Any, jax.Array], jax.Array]
 
 
-@dataclass_transform(frozen_default=True, kw_only_default=True)
+@typing.dataclass_transform(frozen_default=True, kw_only_default=True)
 class Arrays:
     """A frozen dataclass of arrays, or of pytrees of them, that is a pytree in field order."""
 
@@ -74,7 +67,7 @@ class Discrete(NamedTuple):
     num_actions: int
 
 
-@runtime_checkable
+@typing.runtime_checkable
 class Environment(Protocol):
     """What the trainer reads of an environment; brax and Playground environments satisfy it.
 
@@ -103,7 +96,7 @@ class Environment(Protocol):
         ...
 
 
-@runtime_checkable
+@typing.runtime_checkable
 class Acts(Protocol):
     """A family of distributions over actions: all that is asked of one to play.
 

@@ -8,14 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from mjx_reinforce.engine import checks
 from mjx_reinforce.engine.base import Act, Acts, Box, Discrete, Environment, PyTree, action_space
-from mjx_reinforce.engine.checks import (
-    BadEnvironmentError,
-    check_parts,
-    explain,
-    is_nan,
-    require,
-)
+from mjx_reinforce.engine.checks import BadEnvironmentError, require
 
 #: What JAX raises where Python or NumPy asks for the value of a traced array.
 _NEED_VALUES = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
@@ -32,7 +27,7 @@ def check_environment(env: Environment) -> None:
       env: what a user gave. Its ``reset`` and ``step`` are traced, and nothing is compiled.
     """
     name = type(env).__name__
-    check_parts(env)
+    checks.check_parts(env)
     _check_wrappers(env)
     _check_limits(name, env)
     _check_action_space(name, env)
@@ -60,7 +55,7 @@ def _check_limits(name: str, env: object) -> None:
     limit, threshold = (_declared(name, env, x) for x in ("max_episode_steps", "reward_threshold"))
     if limit is not None:
         _require_count(f"{name}.max_episode_steps", limit)
-    is_number = isinstance(threshold, numbers.Real) and not is_nan(threshold)
+    is_number = isinstance(threshold, numbers.Real) and not checks.is_nan(threshold)
     said = f"{name}.reward_threshold must be a number or None, got {threshold!r}"
     require(threshold is None or is_number, said)
 
@@ -92,7 +87,7 @@ def _declared(name: str, env: object, what: str) -> Any:
     try:
         return getattr(env, what, None)
     except Exception as error:  # it may be a property, the user's code
-        raise BadEnvironmentError(f"{name}.{what} fails: {explain(error)}") from error
+        raise BadEnvironmentError(f"{name}.{what} fails: {checks.explain(error)}") from error
 
 
 def _require_count(name: str, value: object) -> None:
@@ -118,7 +113,9 @@ def _shapes(name: str, what: str, function: Callable[..., Any], *arguments: PyTr
         raise
     except (Exception, SystemExit) as error:  # it is the user's code, which may raise anything
         remedy = _TRACED if isinstance(error, _NEED_VALUES) else ""
-        raise BadEnvironmentError(f"{name}.{what} fails: {explain(error)}{remedy}") from error
+        raise BadEnvironmentError(
+            f"{name}.{what} fails: {checks.explain(error)}{remedy}"
+        ) from error
 
 
 def _action_shape(env: Environment) -> jax.ShapeDtypeStruct:

@@ -11,14 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.engine.gpu.lockstep import (
-    LONG,
-    LOOP_FACTS,
-    Lockstep,
-    ScratchText,
-    operations,
-    some_of_block,
-)
+from mjx_reinforce.engine.gpu import lockstep
+from mjx_reinforce.engine.gpu.lockstep import Lockstep, ScratchText, operations, some_of_block
 from mjx_reinforce.engine.llvm.emit import Input
 from mjx_reinforce.engine.play.episode import NOT_PLAYED
 from mjx_reinforce.engine.scalar import scalarized
@@ -46,9 +40,9 @@ _ATTRIBUTES = """attributes #0 = {{ "denormal-fp-math-f32"="preserve-sign"
 def entry_text(text: ScratchText, parameters: Sequence[str], written: scalarized.Scalarized) -> str:
     """Returns the kernel of a body, with the bounds of its threads."""
     parameters = [*parameters, *(["ptr noalias %scratch"] if text.words else [])]
-    blocks = _LONG_BLOCKS if operations(written.schedule) > LONG else _SHORT_BLOCKS
+    blocks = _LONG_BLOCKS if operations(written.schedule) > lockstep.LONG else _SHORT_BLOCKS
     kernel = text.function(f"ptx_kernel void @{ENTRY}({', '.join(parameters)}) #0")
-    return kernel + _ATTRIBUTES.format(*blocks) + LOOP_FACTS
+    return kernel + _ATTRIBUTES.format(*blocks) + lockstep.LOOP_FACTS
 
 
 class _Leaf(NamedTuple):

@@ -14,14 +14,8 @@ from mjx_reinforce.engine.llvm.text import Text, literal
 from mjx_reinforce.engine.scalar.backend import Backend
 from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
 from mjx_reinforce.engine.scalar.nodes import Captured, Node, Op, Scalar, is_constant
-from mjx_reinforce.engine.scalar.passes.liveness import (
-    LiveGate,
-    LiveLoop,
-    Schedule,
-    accumulators,
-    reads,
-    unread,
-)
+from mjx_reinforce.engine.scalar.passes import liveness
+from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
 
 
 class Memory(NamedTuple):
@@ -82,7 +76,7 @@ class LLVM(Backend[Value]):
 
     def compile(self, schedule: Schedule, outputs: list[list[Scalar]]) -> Any:
         """Writes a whole program; returns the value of each element of each output."""
-        self._reads = reads(schedule)
+        self._reads = liveness.reads(schedule)
         self._reads.update(x for leaf in outputs for x in leaf if isinstance(x, Node))
         return super().compile(schedule, outputs)
 
@@ -162,7 +156,7 @@ class LLVM(Backend[Value]):
         text = self._text
         known = self._in_place(loop, values)
         at_least_once = bool(loop.length) and loop.active is None
-        idle = known.keys() | (unread(loop) if at_least_once else set())
+        idle = known.keys() | (liveness.unread(loop) if at_least_once else set())
         carries = [carry for carry in loop.carries if carry.leaf not in idle]
         inits = [self.value(carry.init, values) for carry in carries]
         readers = [self._reader(e.leaf, e.values, values) for e in loop.elements]
@@ -218,7 +212,7 @@ class LLVM(Backend[Value]):
         Few carries stay in registers. What only this loop reads of such a loop before it in the
         same body stays where it is.
         """
-        changed = accumulators(loop)
+        changed = liveness.accumulators(loop)
         if len(changed) < self.MANY:
             return {}
         places: dict[Node, Value] = {}

@@ -40,15 +40,8 @@ import numpy as np
 from jax import lax
 from mujoco import mjx
 
-from mjx_reinforce.engine.physics import inertia
-from mjx_reinforce.engine.physics.mjx_internals import (
-    Collision,
-    GeomInfo,
-    collider,
-    collision_with,
-    geom_pairs,
-    make_frame,
-)
+from mjx_reinforce.engine.physics import inertia, mjx_internals
+from mjx_reinforce.engine.physics.mjx_internals import Collision, GeomInfo, collider, make_frame
 from mjx_reinforce.engine.physics.rows import make_constraint
 from mjx_reinforce.engine.scalar import by_engine
 
@@ -318,7 +311,7 @@ def one_by_one(collide: Collide) -> Collide:
 
 def advice(model: Any) -> str:
     """Returns how to make contacts of a MuJoCo model fewer; empty where no geoms can meet."""
-    pairs = [pair[:2] for pair in geom_pairs(model)]
+    pairs = [pair[:2] for pair in mjx_internals.geom_pairs(model)]
     if not pairs:
         return ""
     bodies = Counter(int(body) for pair in pairs for body in {*model.geom_bodyid[list(pair)]})
@@ -351,7 +344,7 @@ UNLIKE_C = {
     (mjx.GeomType.CYLINDER, mjx.GeomType.CYLINDER),
 }
 _ROUND_GEOMS = {mjx.GeomType.SPHERE, mjx.GeomType.CAPSULE, mjx.GeomType.CYLINDER}
-_collision = collision_with(
+_collision = mjx_internals.collision_with(
     lambda table: {
         pair: one_by_one(function) if set(pair) <= _ROUND_GEOMS else function
         for pair, function in (table | _OURS).items()

@@ -11,13 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from mujoco import mjx
 
-from mjx_reinforce.engine.physics.mjx_internals import (
-    advance,
-    jax_fields,
-    muscle_gain,
-    solve_m,
-    with_fields,
-)
+from mjx_reinforce.engine.physics import mjx_internals
+from mjx_reinforce.engine.physics.mjx_internals import advance, jax_fields, with_fields
 from mjx_reinforce.engine.scalar import by_engine
 
 
@@ -49,7 +44,8 @@ def inverse_times(model: mjx.Model, data: mjx.Data, force: jax.Array) -> jax.Arr
       force: [nv]
     """
     return by_engine(
-        lambda: _from_leaves(mjx.full_m(model, data), force), lambda: solve_m(model, data, force)
+        lambda: _from_leaves(mjx.full_m(model, data), force),
+        lambda: mjx_internals.solve_m(model, data, force),
     )
 
 
@@ -108,7 +104,7 @@ def _velocity_derivative(model: mjx.Model, data: mjx.Data) -> jax.Array:
     gain = jnp.where(affine, model.actuator_gainprm[:, 2], 0)
     muscles = np.flatnonzero(model.actuator_gaintype == mjx.GainType.MUSCLE)
     if muscles.size:
-        by_speed = jax.vmap(jax.grad(muscle_gain, argnums=1))(
+        by_speed = jax.vmap(jax.grad(mjx_internals.muscle_gain, argnums=1))(
             data.actuator_length[muscles],
             fields.actuator_velocity[muscles],
             jnp.asarray(model.actuator_lengthrange)[muscles],

@@ -15,13 +15,8 @@ import numpy as np
 from jax import lax
 from mujoco import mjx
 
-from mjx_reinforce.engine.physics.mjx_internals import (
-    jax_fields,
-    quat_mul_axis,
-    rows_of,
-    with_contact,
-    with_rows,
-)
+from mjx_reinforce.engine.physics import mjx_internals
+from mjx_reinforce.engine.physics.mjx_internals import jax_fields, rows_of, with_contact, with_rows
 from mjx_reinforce.engine.scalar import by_engine
 
 _NO_OTHERS = mjx.DisableBit.EQUALITY | mjx.DisableBit.FRICTIONLOSS | mjx.DisableBit.LIMIT
@@ -83,7 +78,7 @@ def _rate(model: mjx.Model, data: mjx.Data) -> jax.Array:
             rates.append(data.qvel[dof : dof + 3])
             qpos, dof = qpos + 3, dof + 3
         turn = data.qvel[dof : dof + 3]
-        rates.append(quat_mul_axis(data.qpos[qpos : qpos + 4], turn) / 2)
+        rates.append(mjx_internals.quat_mul_axis(data.qpos[qpos : qpos + 4], turn) / 2)
     return jnp.concatenate(rates)
 
 

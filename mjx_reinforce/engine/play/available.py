@@ -117,9 +117,7 @@ def check_seconds(env: Environment, traced: jaxprs.Program, entries: int) -> Non
         cause = f"of an observation of {entries:,} entries" if wide else "of its size"
         remedy = ""
         if not wide and model is not None:
-            from mjx_reinforce.engine.physics.contacts import (
-                advice,  # imports MJX, which takes a second
-            )
+            from mjx_reinforce.engine.physics.contacts import advice  # imports MJX: a second
 
             remedy = f"; {advice(model)}"
         raise TooLarge(

@@ -158,9 +158,9 @@ def build_program(
         buffers = [x for x in jax.tree.leaves((actor, examples[1].state)) if np.prod(x.shape)]
         sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals[: kernel.NUM_RECORDS]]
         num_args = kernel.NUM_CONTROLS + len(buffers)
-        entry = handler.handler_text(num_args, [*sizes, 4, 4, 4], target.kernel)
+        entry = handler.handler_text(num_args, [*sizes, 4, 4, 4], target.lanes)
         flush = handler.flush(target.triple)
-        return entry + kernel.player_text(written, num_actor, target.kernel, flush)
+        return entry + kernel.player_text(written, num_actor, target.lanes, flush)
 
     def write_gpu(written: scalarized.Scalarized) -> str:
         return gpu_kernel.kernel_text(written, num_actor)
@@ -274,8 +274,8 @@ def _write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
     """Writes a function, and all around it, as LLVM IR."""
     num_args = 1 + sum(bool(np.prod(x.shape)) for x in written.in_avals)
     sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals if np.prod(x.shape)]
-    entry = handler.handler_text(num_args, sizes, target.kernel, mapping.POSITIONS, zeroed=False)
-    return entry + mapping.mapping_text(written, target.kernel, handler.flush(target.triple))
+    entry = handler.handler_text(num_args, sizes, target.lanes, mapping.POSITIONS, zeroed=False)
+    return entry + mapping.mapping_text(written, target.lanes, handler.flush(target.triple))
 
 
 def name_of(env: Any) -> str:

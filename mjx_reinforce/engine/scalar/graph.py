@@ -12,19 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike
 
-from mjx_reinforce.engine.scalar import arrays, jaxprs
-from mjx_reinforce.engine.scalar.nodes import (
-    BOOL,
-    FACTS,
-    SELECT,
-    Captured,
-    Node,
-    Op,
-    Scalar,
-    Scope,
-    conversion,
-    identity,
-)
+from mjx_reinforce.engine.scalar import arrays, jaxprs, nodes
+from mjx_reinforce.engine.scalar.nodes import Node, Op, Scalar, Scope
 from mjx_reinforce.engine.scalar.passes import simplify
 from mjx_reinforce.engine.scalar.size import MAX_SCALARS, TooLarge
 
@@ -72,7 +61,7 @@ class Graph:
         self.certain: set[Node] = set()
         self._scopes = [Scope(depth=0, floor=0)]
         self._count = self._applied = 0
-        self.captured: dict[int, tuple[Captured, np.ndarray]] = {}
+        self.captured: dict[int, tuple[nodes.Captured, np.ndarray]] = {}
 
     @property
     def scope(self) -> Scope:
@@ -151,7 +140,7 @@ class Graph:
         if known is not None:
             return known
         if id(value) not in self.captured:
-            source = Captured(value)
+            source = nodes.Captured(value)
             leaves = [
                 Node(value.dtype, False, self._scopes[0], self.number(), owner=source, position=i)
                 for i in range(value.size)
@@ -166,40 +155,42 @@ class Graph:
 
     def call(self, name: str, *args: Scalar) -> Scalar:
         """Applies one of the named operations to scalars."""
-        predicate = FACTS[name].is_predicate
-        return self.apply(Op(name), args, BOOL if predicate else args[-1].dtype)
+        predicate = nodes.FACTS[name].is_predicate
+        return self.apply(Op(name), args, nodes.BOOL if predicate else args[-1].dtype)
 
     def convert(self, value: Scalar, dtype: DTypeLike) -> Scalar:
         """Converts a scalar to another dtype."""
         dtype = np.dtype(dtype)
-        return self.apply(conversion(dtype), (value,), dtype)
+        return self.apply(nodes.conversion(dtype), (value,), dtype)
 
     def select(self, predicate: Scalar, on_true: Scalar, on_false: Scalar) -> Scalar:
         """Returns on_true where the predicate holds, else on_false."""
-        return self.apply(SELECT, (predicate, on_false, on_true), on_true.dtype)
+        return self.apply(nodes.SELECT, (predicate, on_false, on_true), on_true.dtype)
 
     def apply(self, op: Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar:
         """Applies an operation: a constant, an existing node, a simpler one or a new one."""
-        nodes = [arg for arg in args if isinstance(arg, Node)]
-        if not nodes:
+        operands = [arg for arg in args if isinstance(arg, Node)]
+        if not operands:
             return simplify.fold(op, args, dtype)
         self._applied += 1
         if self._applied > _MOST:
             raise TooLarge(f"written out it is more than {_MOST:,} scalar operations")
         simpler = simplify.simplify(self, op, args, dtype)
-        return self._share(op, args, nodes, dtype) if simpler is None else simpler
+        return self._share(op, args, operands, dtype) if simpler is None else simpler
 
-    def _share(self, op: Op, args: tuple[Scalar, ...], nodes: list[Node], dtype: np.dtype) -> Node:
-        keys = [arg if isinstance(arg, Node) else identity(arg) for arg in args]
-        key = (op, frozenset(keys) if FACTS[op.name].commutes else tuple(keys))
-        least = max([node.scope.depth for node in nodes])  # no node of these is further outside
+    def _share(
+        self, op: Op, args: tuple[Scalar, ...], operands: list[Node], dtype: np.dtype
+    ) -> Node:
+        keys = [arg if isinstance(arg, Node) else nodes.identity(arg) for arg in args]
+        key = (op, frozenset(keys) if nodes.FACTS[op.name].commutes else tuple(keys))
+        least = max([node.scope.depth for node in operands])  # no node of these is further outside
         depth = max(self.scope.floor, least)
         for k in range(depth, least - 1, -1):
             known = self._scopes[k].known.get(key)
             if known is not None:
                 return known
         scope = self._scopes[depth]
-        varying = any(node.varying for node in nodes)
+        varying = any(node.varying for node in operands)
         node = Node(dtype, varying, scope, self.number(), op=op, args=args)
         scope.known[key] = node
         scope.cost += 1
