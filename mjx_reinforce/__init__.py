@@ -5,18 +5,13 @@ and ``python -m mjx_reinforce.train --help`` stay quick: neither MJX nor brax
 is loaded before an environment is made. ``__init__.pyi`` says where each is.
 """
 
-import ast
 import importlib
-from pathlib import Path
 from typing import Any
 
+from mjx_reinforce.engine.lazy import homes
+
 #: Public name -> the module that has it.
-_HOME = {
-    alias.name: node.module
-    for node in ast.parse(Path(__file__).with_suffix(".pyi").read_text("utf-8")).body
-    if isinstance(node, ast.ImportFrom) and node.module
-    for alias in node.names
-}
+_HOME = homes(__file__)
 #: Folders and files that are attributes too, also imported on first use.
 _MODULES = (
     *("console", "engine", "envs", "export", "files", "learning", "playing", "published"),

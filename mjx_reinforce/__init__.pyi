@@ -1,7 +1,7 @@
 """The public names and their homes: what type checkers read, and ``__init__.py`` too."""
 
 from mjx_reinforce.engine.base import Box, Discrete, Environment, Trajectory
-from mjx_reinforce.engine.play.any_policy import rollout
+from mjx_reinforce.engine.play.choice import rollout
 from mjx_reinforce.engine.vector.environment import VectorEnv
 from mjx_reinforce.engine.vector.episodes import VectorState
 from mjx_reinforce.engine.vector.segments import Segment, unroll

@@ -13,13 +13,14 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
-from mjx_reinforce.engine import scalar
-from mjx_reinforce.engine.base import Acts, Environment, PyTree, Trajectory, observation_size
-from mjx_reinforce.engine.checks import check_name
-from mjx_reinforce.engine.play import available, native, program
-from mjx_reinforce.engine.play.program import machine_map
-from mjx_reinforce.engine.play.rollouts import rollout
+from mjx_reinforce.engine import base, scalar
+from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
+from mjx_reinforce.engine.checks import check_count, check_key, check_name, check_parts
+from mjx_reinforce.engine.contract import check_policy
+from mjx_reinforce.engine.play import available, native, program, rollouts
 from mjx_reinforce.engine.scalar import jaxprs, size
 from mjx_reinforce.engine.scalar.vmap import MAX_OPERATIONS
 
@@ -95,7 +96,7 @@ def choose(
         play = _from_any_key if name == "auto" else native.rollout
         return native.unsupported(env, *player, horizon) or play
 
-    return Engine(*pick(name, in_machine_code, rollout), time.perf_counter() - began)
+    return Engine(*pick(name, in_machine_code, rollouts.rollout), time.perf_counter() - began)
 
 
 def pick(
@@ -141,7 +142,7 @@ def _from_any_key(*given: Any, **options: Any) -> Trajectory:
     against = native.against_key(given[4])
     if against:
         warnings.warn(f"machine code cannot play this: {against}; vmap plays it", stacklevel=2)
-    return (rollout if against else native.rollout)(*given, **options)
+    return (rollouts.rollout if against else native.rollout)(*given, **options)
 
 
 class MapEngine(NamedTuple):
@@ -214,9 +215,113 @@ def machine_code(
     """
     if against := available.unavailable():
         return against
-    check = functools.partial(available.check_seconds, env, entries=observation_size(env))
+    check = functools.partial(available.check_seconds, env, entries=base.observation_size(env))
     name = f"{getattr(function, '__name__', 'a function')} of {program.name_of(env)}"
     try:
-        return machine_map(function, *examples, check=check, name=name)
+        return program.machine_map(function, *examples, check=check, name=name)
     except Exception as error:  # whatever it is, another engine may play this
         return program.refusal(error)
+
+
+#: A policy of more parameters than about 64-64 is computed for all episodes together, by XLA: each
+#: lane of machine code would read all parameters in each step.
+_MOST_PARAMETERS = 8_000
+
+
+def rollout(
+    env: Environment,
+    act: Act,
+    actor: PyTree,
+    distribution: Acts,
+    key: jax.Array,
+    *,
+    num_episodes: int,
+    horizon: int,
+    engine: str = "auto",
+    deterministic: bool | jax.Array = False,
+    active: bool | jax.Array = True,
+) -> Trajectory:
+    """Plays N episodes from fresh resets, each to its end or to the horizon.
+
+    An episode's reset and noise come from its own key alone, whatever N is and whichever engine
+    plays. Call this under ``jax.jit``: outside of it, what is played is traced again each time.
+
+    Args:
+      env: what is played.
+      act: (actor, observation [O]) -> outputs [K] of the distribution: any function that JAX can
+        trace, of one observation. Of a flax.linen module it is ``module.apply``; of others see
+        docs/vector.md.
+      actor: what ``act`` reads, a pytree of arrays, such as the parameters of a network.
+      distribution: the family whose parameters the outputs are, ours or your own.
+      key: consumed; [N] the episodes' own, or [] and that of episode i is this one folded with i.
+      num_episodes: N.
+      horizon: T, the time limit in steps; reaching it ends an episode.
+      engine: "auto"; "native" or "vmap". With "auto" a small policy is played in
+        machine code, policy and all; a larger one by XLA, with the env step in machine code.
+      deterministic: [] or [N] whether an episode takes the mode.
+      active: [] or [N] whether an episode is played: else it has no step, and zeros stand for it.
+
+    Returns:
+      The episodes. A non-finite observation, reward or ``done`` ends its episode, with reward 0 for
+      that step, and shows in ``nonfinite``.
+
+    Raises:
+      ValueError: an argument makes no sense, or the engine cannot play this.
+
+    Examples:
+      >>> import jax
+      >>> import mjx_reinforce as mr
+      >>> env = mr.envs.make("CartPole-v1")
+      >>> family = mr.categorical(env.action_space)
+      >>> policy = mr.mlp_policy(env.observation_size, family)
+      >>> episodes = mr.rollout(
+      ...     env, policy.apply, policy.init(jax.random.key(0)), family, jax.random.key(1),
+      ...     num_episodes=8, horizon=20,
+      ... )
+      >>> episodes.reward.shape
+      (20, 8)
+    """
+    if hasattr(env, "num_envs"):
+        raise ValueError("rollout takes one environment, and this is many: pass its env, vec.env")
+    check_parts(env)
+    check_key(key)
+    check_count("num_episodes", num_episodes)
+    check_count("horizon", horizon)
+    check_policy(act, actor, distribution, jax.eval_shape(env.reset, jax.random.key(0)).obs)
+    policy = ActingPolicy(act, actor, distribution)
+    play = _player(engine, env, policy, horizon)
+    options: dict[str, Any] = {"deterministic": deterministic, "active": active}
+    given = env, _of_any_batch(act), actor, distribution, key
+    return play(*given, num_episodes=num_episodes, horizon=horizon, **options)
+
+
+def _player(engine: str, env: Environment, policy: ActingPolicy, horizon: int) -> Rollout:
+    """Returns what plays."""
+    large = sum(np.size(x) for x in jax.tree.leaves(policy.actor)) > _MOST_PARAMETERS
+    if engine == "auto" and large and available.platform() == "cpu":
+        examples = jax.eval_shape(env.reset, jax.random.key(0)), base.null_action(env)
+        step = machine_code(env, env.step, *examples)
+        if not isinstance(step, str):
+            return functools.partial(rollouts.rollout, env_step=_episodes_last(step))
+    shapes = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, policy.actor))
+    return choose(engine, env, policy._replace(actor=shapes), horizon).rollout
+
+
+def _of_any_batch(act: Act) -> Act:
+    """Returns a policy of one observation [O] as one of [O] or [N, O]."""
+
+    def batched(params: PyTree, observation: jax.Array) -> jax.Array:
+        mapped = act if observation.ndim == 1 else jax.vmap(act, (None, 0))
+        return mapped(params, observation)
+
+    return batched
+
+
+def _episodes_last(step: Callable[[Any, jax.Array], Any]) -> Callable[[Any, jax.Array], Any]:
+    """Returns a step of N environments, the first axis of every array, with N as the last axis."""
+
+    def turned(state: PyTree, action: jax.Array) -> Any:
+        first = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), (state, action))
+        return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), step(*first))
+
+    return turned

@@ -10,7 +10,7 @@ from flax import linen, nnx
 from toys import Drifting
 
 from mjx_reinforce import Box, Discrete, make_vec, normal, rollout, unroll
-from mjx_reinforce.engine.play import any_policy, choice
+from mjx_reinforce.engine.play import choice
 from mjx_reinforce.learning.distributions import categorical
 
 KEY = jax.random.key(0)
@@ -124,7 +124,7 @@ def test_bad_arguments(change, message):
         "horizon": 2,
     }
     with pytest.raises(ValueError, match=message):
-        any_policy.rollout(env, **(right | change))
+        choice.rollout(env, **(right | change))
 
 
 def test_outputs_that_are_not_the_distributions():
