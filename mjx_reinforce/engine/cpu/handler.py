@@ -146,49 +146,16 @@ class JobText:
         return self.text.let(f"load ptr, ptr {place}")
 
 
-class Flush(NamedTuple):
-    """LLVM IR for one architecture, by which numbers too small for full precision count as zero.
+#: The architectures of which it is known.
+_FLUSHES = ("x86_64", "aarch64")
+
+
+def flush(triple: str) -> str:
+    """Returns the IR of ``@flush``, by which numbers too small for full precision count as zero.
 
     XLA's own threads do so too. All threads of a job do the same, so that an episode is the same on
-    any of them.
-
-    declarations: the intrinsics
-    begin: what takes such numbers as zero from now on
-    end: what undoes it
+    any of them. ``@unflush`` undoes it, with what ``@flush`` returned.
     """
-
-    declarations: str = ""
-    begin: str = ""
-    end: str = ""
-
-
-_FLUSHES = {
-    "x86_64": Flush(  # MXCSR: flush to zero, and denormals are zero
-        """declare void @llvm.x86.sse.stmxcsr(ptr)
-declare void @llvm.x86.sse.ldmxcsr(ptr)
-""",
-        """%control = alloca [2 x i32]
-  call void @llvm.x86.sse.stmxcsr(ptr %control)
-  %control.old = load i32, ptr %control
-  %control.new = or i32 %control.old, 32832
-  %control.at = getelementptr inbounds i32, ptr %control, i64 1
-  store i32 %control.new, ptr %control.at
-  call void @llvm.x86.sse.ldmxcsr(ptr %control.at)""",
-        "call void @llvm.x86.sse.ldmxcsr(ptr %control)",
-    ),
-    "aarch64": Flush(  # FPCR: flush to zero
-        """declare i64 @llvm.aarch64.get.fpcr()
-declare void @llvm.aarch64.set.fpcr(i64)
-""",
-        """%control.old = call i64 @llvm.aarch64.get.fpcr()
-  %control.new = or i64 %control.old, 16777216
-  call void @llvm.aarch64.set.fpcr(i64 %control.new)""",
-        "call void @llvm.aarch64.set.fpcr(i64 %control.old)",
-    ),
-}
-
-
-def flush(triple: str) -> Flush:
-    """Returns what flushes on a machine; nothing where that is not known."""
     architecture = triple.partition("-")[0].replace("arm64", "aarch64")
-    return _FLUSHES.get(architecture, Flush())
+    known = architecture if architecture in _FLUSHES else "unknown"
+    return Path(__file__).with_name(f"flush_{known}.ll").read_text("utf-8")

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from mjx_reinforce.engine.cpu import handler
-from mjx_reinforce.engine.cpu.handler import Flush
 from mjx_reinforce.engine.llvm.emit import LLVM, Input
 from mjx_reinforce.engine.llvm.text import Text
 from mjx_reinforce.engine.play.episode import NOT_PLAYED
@@ -179,18 +178,16 @@ def _copy(name: str, field: Field, buffer: int, row: str) -> str:
 _INT, _LONG = np.dtype(np.int32), np.dtype(np.int64)
 
 
-def player_text(step: scalarized.Scalarized, num_actor: int, lanes: int, flush: Flush) -> str:
+def player_text(step: scalarized.Scalarized, num_actor: int, lanes: int) -> str:
     """Returns the LLVM IR of ``@work(job)``.
 
     Args:
       step: of ``program.step_function``, written out.
       num_actor: how many leaves of its arguments are the actor's.
       lanes: how many lanes a vector has.
-      flush: what makes all threads round alike.
     """
     places = layout(step.in_avals, num_actor, lanes)
-    work = _Work(Text(lanes), places, num_actor).write(step, flush)
-    return flush.declarations + queue_text(places, lanes) + work
+    return queue_text(places, lanes) + _Work(Text(lanes), places, num_actor).write(step)
 
 
 class _Work(handler.JobText):
@@ -209,10 +206,10 @@ class _Work(handler.JobText):
         data = self.job("data", "ptr")
         self.records = [self.element(data, first + k) for k in range(NUM_RECORDS)]
 
-    def write(self, step: scalarized.Scalarized, flush: Flush) -> str:
+    def write(self, step: scalarized.Scalarized) -> str:
         """Returns the function that plays with a step."""
         text, memory = self.text, self.memory
-        text.line(flush.begin)
+        text.line("%control = call i64 @flush()")
         text.store(text.constant(np.int64(-1)), self.seed, _LONG)  # a lane's first seed is new
         for lane in range(text.lanes):
             text.line(f"call void @begin(ptr %job, ptr {memory}, i64 {lane})")
@@ -231,7 +228,7 @@ class _Work(handler.JobText):
         for lane in range(text.lanes):
             lane_of = f"ptr %job, ptr {memory}, i64 {lane}"
             text.line(f"call void @settle({lane_of}, i64 {iterations.name})")
-        text.line(flush.end)
+        text.line("call void @unflush(i64 %control)")
         text.line(f"call void @free(ptr {self.room})")
         text.line("ret void")
         return text.function("void @work(ptr %job)")

@@ -7,7 +7,6 @@ no example compute the last one again, and leave nothing.
 import numpy as np
 
 from mjx_reinforce.engine.cpu import handler
-from mjx_reinforce.engine.cpu.handler import Flush
 from mjx_reinforce.engine.llvm.emit import LLVM, Input
 from mjx_reinforce.engine.llvm.text import Text
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
@@ -17,7 +16,7 @@ _LONG = np.dtype(np.int64)
 POSITIONS = handler.Positions(threads=0, items=1, steps=0)
 
 
-def mapping_text(written: scalarized.Scalarized, lanes: int, flush: Flush) -> str:
+def mapping_text(written: scalarized.Scalarized, lanes: int) -> str:
     """Returns the LLVM IR of ``@work(job)``.
 
     Its arguments are the threads [] int32 and the leaves [N, ...] of the function's arguments that
@@ -26,9 +25,8 @@ def mapping_text(written: scalarized.Scalarized, lanes: int, flush: Flush) -> st
     Args:
       written: the function.
       lanes: how many lanes a vector has.
-      flush: what makes all threads round alike.
     """
-    return flush.declarations + _Work(Text(lanes), written).write(flush)
+    return _Work(Text(lanes), written).write()
 
 
 class _Work(handler.JobText):
@@ -38,10 +36,10 @@ class _Work(handler.JobText):
         super().__init__(text)
         self.written, self.inputs = written, written.in_avals
 
-    def write(self, flush: Flush) -> str:
+    def write(self) -> str:
         """Returns the function."""
         text, lanes = self.text, self.text.lanes
-        text.line(flush.begin)
+        text.line("%control = call i64 @flush()")
         total, data = self.job("total", "i64"), self.job("data", "ptr")
         next_at = self.field("next")
         given = [x for x in self.inputs if _size(x)]
@@ -70,7 +68,7 @@ class _Work(handler.JobText):
                 text.scatter(value, target, index, mask, aval.dtype)
         text.line(f"br label %{head}")
         text.start(end)
-        text.line(flush.end)
+        text.line("call void @unflush(i64 %control)")
         text.line("ret void")
         return text.function("void @work(ptr %job)")
 

@@ -1,4 +1,4 @@
-; How a lane begins and ends an episode; queue.py fills in what stands after a dollar sign.
+; How a lane begins and ends an episode; kernel.py fills in what stands after a dollar sign.
 
 ; Copies numbers into a lane's column: the vectors of all lanes lie one after the other.
 define internal void @copy4(ptr %to, ptr %from, i64 %count) {

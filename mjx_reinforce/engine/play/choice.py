@@ -151,13 +151,11 @@ class MapEngine(NamedTuple):
     name: "vmap" or "native"; "fused" where XLA has the function written out in scalars
     why: the reason it was chosen, for people
     call: the function of a batch, whose first axis of every array is N
-    seconds: wall time that making it took, most of it for machine code
     """
 
     name: str
     why: str
     call: MappedFunction
-    seconds: float = 0.0
 
     def __repr__(self) -> str:
         return f"MapEngine({self.name})"
@@ -177,12 +175,9 @@ def map_function(
     Raises:
       ValueError: the name is unknown, or the engine does not support the function.
     """
-    began = time.perf_counter()
     made = _in_scalars(function, *examples) if name == "auto" else None
-    if made is None:
-        in_machine_code = functools.partial(machine_code, env, function, *examples)
-        made = pick(name, in_machine_code, jax.vmap(function))
-    return MapEngine(*made, time.perf_counter() - began)
+    in_machine_code = functools.partial(machine_code, env, function, *examples)
+    return MapEngine(*(made or pick(name, in_machine_code, jax.vmap(function))))
 
 
 def _in_scalars(

@@ -159,8 +159,8 @@ def build_program(
         sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals[: kernel.NUM_RECORDS]]
         num_args = kernel.NUM_CONTROLS + len(buffers)
         entry = handler.handler_text(num_args, [*sizes, 4, 4, 4], target.lanes)
-        flush = handler.flush(target.triple)
-        return entry + kernel.player_text(written, num_actor, target.lanes, flush)
+        entry += handler.flush(target.triple)
+        return entry + kernel.player_text(written, num_actor, target.lanes)
 
     def write_gpu(written: scalarized.Scalarized) -> str:
         return gpu_kernel.kernel_text(written, num_actor)
@@ -275,7 +275,7 @@ def _write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
     num_args = 1 + sum(bool(np.prod(x.shape)) for x in written.in_avals)
     sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals if np.prod(x.shape)]
     entry = handler.handler_text(num_args, sizes, target.lanes, mapping.POSITIONS, zeroed=False)
-    return entry + mapping.mapping_text(written, target.lanes, handler.flush(target.triple))
+    return entry + handler.flush(target.triple) + mapping.mapping_text(written, target.lanes)
 
 
 def name_of(env: Any) -> str:

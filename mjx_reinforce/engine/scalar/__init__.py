@@ -38,21 +38,13 @@ All exceptions of floating-point arithmetic, where 0 and the exponent are consta
 So ``(x - x) == 0`` is true for every x; ``jnp.isfinite`` is what tells whether x is finite.
 """
 
-from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive, prune
-from mjx_reinforce.engine.scalar.primitives import any_lane, by_engine, skippable
-from mjx_reinforce.engine.scalar.scalarized import Scalarized, refusal, scalarize
-from mjx_reinforce.engine.scalar.size import TooLarge
-from mjx_reinforce.engine.scalar.vmap import vmap
-
-__all__ = [
-    "Scalarized",
-    "TooLarge",
-    "UnsupportedPrimitive",
-    "any_lane",
-    "by_engine",
-    "prune",
-    "refusal",
-    "scalarize",
-    "skippable",
-    "vmap",
-]
+from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive as UnsupportedPrimitive
+from mjx_reinforce.engine.scalar.jaxprs import prune as prune
+from mjx_reinforce.engine.scalar.primitives import any_lane as any_lane
+from mjx_reinforce.engine.scalar.primitives import by_engine as by_engine
+from mjx_reinforce.engine.scalar.primitives import skippable as skippable
+from mjx_reinforce.engine.scalar.scalarized import Scalarized as Scalarized
+from mjx_reinforce.engine.scalar.scalarized import refusal as refusal
+from mjx_reinforce.engine.scalar.scalarized import scalarize as scalarize
+from mjx_reinforce.engine.scalar.size import TooLarge as TooLarge
+from mjx_reinforce.engine.scalar.vmap import vmap as vmap

@@ -38,13 +38,13 @@ def vmap(
     Args:
       fn: a function of one example; pytrees in and out.
       in_axes: for each argument an axis, None for one that all lanes share, or a pytree prefix.
-      out_axes: the same for the result; None only for what does not depend on the lane.
+      out_axes: an axis for each part of the result.
       branch_cost: a branch of ``cond`` with more scalar operations than this, or with a loop, is
         skipped where no lane needs it; others are computed for every lane. XLA's CPU backend
         computes shared values again in each fusion, and a real branch also stops that.
 
     Returns:
-      The mapped function. Keyword arguments are mapped over their first axis.
+      The mapped function, of positional arguments.
 
     Raises:
       ValueError: if no argument is mapped, the mapped sizes differ, or an axis does not fit.
@@ -65,10 +65,10 @@ class Mapped:
         self._branch_cost = branch_cost
         self._written: dict[Any, scalarized.Scalarized] = {}
 
-    def __call__(self, *args: PyTree, **kwargs: PyTree) -> Any:
+    def __call__(self, *args: PyTree) -> Any:
         """Evaluates the function for every example of a batch."""
-        args, kwargs = jax.tree.map(jnp.asarray, (args, kwargs))
-        written, axes = self._write(args, kwargs)
+        args = jax.tree.map(jnp.asarray, args)
+        written, axes = self._write(args)
         count = sum(written.operations.values())
         if count > MAX_OPERATIONS:
             warnings.warn(
@@ -76,7 +76,7 @@ class Mapped:
                 f"to compile more than {MAX_OPERATIONS:,}; use jax.vmap for it",
                 stacklevel=2,
             )
-        leaves = jax.tree.leaves((args, kwargs))
+        leaves = jax.tree.leaves(args)
         batch = _batch_size(leaves, axes)
         rows = [_rows(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
 
@@ -93,28 +93,22 @@ class Mapped:
         ]
         return jax.tree.unflatten(out_tree, outputs)
 
-    def write(self, *args: PyTree, **kwargs: PyTree) -> scalarized.Scalarized:
+    def write(self, *args: PyTree) -> scalarized.Scalarized:
         """Returns what is evaluated for these arguments, of which the shapes are enough."""
-        return self._write(args, kwargs)[0]
+        return self._write(args)[0]
 
-    def _write(
-        self, args: tuple, kwargs: dict[str, Any]
-    ) -> tuple[scalarized.Scalarized, list[int | None]]:
+    def _write(self, args: tuple) -> tuple[scalarized.Scalarized, list[int | None]]:
         """Returns the function written out for these arguments, and the axis of each leaf."""
-        axes = [*_axes(self._in_axes, args), *_axes(0, kwargs)]
-        leaves, in_tree = jax.tree.flatten((args, kwargs))
-        axes = [
-            None if axis is None else _axis(axis, leaf.ndim)
-            for axis, leaf in zip(axes, leaves, strict=True)
-        ]
+        leaves, in_tree = jax.tree.flatten(args)
+        mapped = [*zip(_axes(self._in_axes, args), leaves, strict=True)]
+        axes = [None if axis is None else _axis(axis, leaf.ndim) for axis, leaf in mapped]
         examples = [_example(leaf, axis) for leaf, axis in zip(leaves, axes, strict=True)]
         varying = tuple(axis is not None for axis in axes)
         precision = jnp.result_type(float)  # constants inside depend on it
         key = (in_tree, tuple((x.shape, x.dtype) for x in examples), varying, precision)
 
         def flat_fn(*flat: PyTree) -> Any:
-            args, kwargs = jax.tree.unflatten(in_tree, flat)
-            return self._fn(*args, **kwargs)
+            return self._fn(*jax.tree.unflatten(in_tree, flat))
 
         written = self._written.get(key)
         if written is None:  # writing it out takes about a second
@@ -137,10 +131,10 @@ def _axes(prefix: PyTree, tree: PyTree) -> list[Any]:
     return axes
 
 
-def _axis(axis: int, ndim: int) -> int:
+def _axis(axis: int | None, ndim: int) -> int:
     """Returns a mapped axis counted from the front."""
-    if not -ndim <= axis < ndim:
-        raise ValueError(f"axis {axis} does not exist in an argument of {ndim} dimensions")
+    if axis is None or not -ndim <= axis < ndim:
+        raise ValueError(f"axis {axis} does not exist in an array of {ndim} dimensions")
     return axis % ndim
 
 
@@ -168,20 +162,10 @@ def _rows(x: jax.Array, axis: int | None) -> jax.Array:
 
 def _assemble(scalars: list[Any], aval: jaxprs.Shape, axis: int | None, batch: int) -> jax.Array:
     """Puts one leaf of the result together."""
-    shared = all(np.ndim(scalar) == 0 for scalar in scalars)
-    if axis is None and not shared:
-        raise ValueError("out_axes is None for a result that differs from lane to lane")
-    if not scalars:
-        stacked = jnp.zeros((0,) if axis is None else (0, batch), aval.dtype)
-    elif axis is None:
-        stacked = jnp.stack([jnp.asarray(scalar, aval.dtype) for scalar in scalars])
-    else:
-        lanes = [x if np.ndim(x) else lax.broadcast(x, (batch,)) for x in scalars]
-        stacked = jnp.stack(lanes)
-    if axis is None:
-        return stacked.reshape(aval.shape)
-    ndim = len(aval.shape) + 1
-    return jnp.moveaxis(stacked.reshape((*aval.shape, batch)), -1, _axis(axis, ndim))
+    lanes = [x if np.ndim(x) else lax.broadcast(x, (batch,)) for x in scalars]
+    stacked = jnp.stack(lanes) if lanes else jnp.zeros((0, batch), aval.dtype)
+    shaped = stacked.reshape((*aval.shape, batch))
+    return jnp.moveaxis(shaped, -1, _axis(axis, shaped.ndim))
 
 
 Values = dict[Node, Any]

@@ -169,7 +169,6 @@ def test_ptx(busy, long, tmp_path, monkeypatch):
     """It is one kernel that calls nothing; NVIDIA's assembler takes it, where there is one."""
     env, player = busy
     if long:
-        monkeypatch.setattr(kernels, "LONG", 10)
         monkeypatch.setattr(lockstep, "LONG", 4)
         monkeypatch.setattr(lockstep, "WRITTEN_OUT", 4)
     text = kernel_text(env, *player)

@@ -28,7 +28,7 @@ def test_axes_of_pytrees_and_shared_arguments():
 
     tree = {"a": batch_of(3).T, "b": batch_of(3)}
     axes = ({"a": -1, "b": 0}, None)
-    out = {"scaled": 1, "shared": None, "b": 0}
+    out = {"scaled": 1, "shared": 0, "b": 0}
     assert_same(fn, tree, {"s": jnp.arange(3.0)}, in_axes=axes, out_axes=out)
 
 
@@ -37,7 +37,7 @@ def test_wrong_axes_are_refused():
         (jnp.add, (jnp.ones(3), jnp.ones(4)), {}, "one size"),
         (jnp.add, (jnp.ones(3), jnp.ones(3)), {"in_axes": None}, "one size"),
         (jnp.sin, (jnp.ones(3),), {"in_axes": 2}, "axis 2"),
-        (jnp.sin, (jnp.ones(3),), {"out_axes": None}, "out_axes"),
+        (jnp.sin, (jnp.ones(3),), {"out_axes": None}, "axis None"),
     ]:
         with pytest.raises(ValueError, match=message):
             scalar.vmap(fn, **axes)(*args)
