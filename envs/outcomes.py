@@ -72,7 +72,7 @@ def check_outcome(name: str, outcome: object) -> tuple[Any, Any, dict[str, Any]]
     Raises:
       ValueError: it is something else.
     """
-    three = outcome if isinstance(outcome, tuple | list) else ()
+    three: Any = outcome if isinstance(outcome, tuple | list) else ()
     require(
         len(three) == 3,
         f"{name}.outcome must return three values, the reward, whether the episode ended, and "

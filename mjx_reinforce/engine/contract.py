@@ -92,7 +92,9 @@ def _declared(name: str, env: object, what: str) -> Any:
 
 def _require_count(name: str, value: object) -> None:
     """Raises ValueError for what is no whole number, 1 or more; True is none."""
-    is_count = isinstance(value, numbers.Integral) and not isinstance(value, bool) and value >= 1
+    is_count = (
+        isinstance(value, numbers.Integral) and not isinstance(value, bool) and int(value) >= 1
+    )
     require(is_count, f"{name} must be a whole number, 1 or more, got {value!r}")
 
 
@@ -131,15 +133,16 @@ def _check_state(name: str, start: PyTree) -> None:
         ("reward", 0, "a scalar []", "sum it, or take an entry"),
         ("done", 0, "a scalar []", "reduce it, as with jnp.any"),
     ):
-        value: Any = getattr(start, field, None)
+        value = getattr(start, field, None)
         got = f"there is no {field}" if value is None else f"it is {_described(value)}"
         said = f"{name}.reset must return a state whose {field} is {shape}, and {got}; "
         require(hasattr(value, "shape"), f"{said}brax.envs.State has all that is needed")
-        the_field, found = f"the {field} of {name}.reset must", list(value.shape)
+        array: Any = value
+        the_field, found = f"the {field} of {name}.reset must", list(array.shape)
         said = f"{the_field} be {shape}, its shape is {found}; {remedy}"
         require(len(found) == axes and 0 not in found, said)
-        said = f"{the_field} hold real numbers, it holds {value.dtype}"
-        require(jnp.isrealobj(value), said)
+        said = f"{the_field} hold real numbers, it holds {array.dtype}"
+        require(jnp.isrealobj(array), said)
 
 
 def _check_same(name: str, start: PyTree, after: PyTree) -> None:

@@ -18,6 +18,7 @@ from mjx_reinforce.engine.base import Discrete
 from mjx_reinforce.engine.cpu import kernel, machine
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.play import available, choice, native, objects, program, rollouts
+from mjx_reinforce.engine.scalar import scalarized
 from mjx_reinforce.registry import DISTRIBUTIONS, load_definition
 
 if reason := available.unavailable():
@@ -101,17 +102,6 @@ def test_steps_are_counted_for_the_seed_that_a_lane_played():
     many = played(native.rollout, env, actor_and_act(env, ()), num_episodes=200)
     assert many.simulated.sum() % machine.this_machine().lanes == 0
     assert np.all(many.simulated >= many.mask.sum((1, 2)))
-
-
-def test_the_number_of_threads_changes_nothing():
-    player = actor_and_act(Drifting(), (5,))
-    options = {"num_episodes": 40, "horizon": 60}
-    want = played(native.rollout, Drifting(), player, **options)
-    for threads in (1, 2, 0):
-        play = functools.partial(native.rollout, threads=threads)
-        got = played(play, Drifting(), player, **options)
-        for name in ("observation", "action", "reward", "mask", "nonfinite"):
-            np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
 
 
 def test_a_nan_stays_in_its_lane():
@@ -199,36 +189,34 @@ def test_constants_are_part_of_the_code():
     assert len(keys) == 2
 
 
-def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
-    env = Drifting()
-    actor, act, distribution = actor_and_act(env, ())
-    player = choice.ActingPolicy(act, actor, distribution)
-    assert choice.choose("auto", env, player, 500).name == "native"
-    assert choice.choose("auto", env).name == "vmap"
+def chosen(env, name="auto"):
+    actor, act, distribution = actor_and_act(env, (4,))
+    return choice.choose(name, env, choice.ActingPolicy(act, actor, distribution), 20)
 
+
+def test_auto_takes_it_and_says_what_it_cannot_play(monkeypatch):
     class Gamma(Drifting):
         def step(self, state, action):
             after = super().step(state, action)
             return after.replace(reward=jax.lax.lgamma(after.reward + 5.0))
 
-    gamma = Gamma()
-    actor, act, distribution = actor_and_act(gamma, ())
-    player = choice.ActingPolicy(act, actor, distribution)
-    assert choice.choose("auto", gamma, player, 500).name == "vmap"
+    assert chosen(Drifting()).name == "native"
+    assert chosen(Gamma()).name == "vmap"
+    assert "every episode has a policy of its own" in choice.choose("auto", Drifting()).why
+    with pytest.raises(ValueError, match=r"a policy of its own.*choose auto"):
+        choice.choose("native", Drifting())
     with pytest.raises(ValueError, match=r"native engine cannot play this: .*lgamma.*choose auto"):
-        choice.choose("native", gamma, player, 500)
+        chosen(Gamma(), "native")
     monkeypatch.setattr(available, "unavailable", lambda: "llvmlite is not installed")
     with pytest.raises(ValueError, match="llvmlite is not installed; choose auto"):
-        choice.choose("native", env, player, 500)
+        chosen(Drifting(), "native")
 
 
 @pytest.mark.cpu
 def test_lanes_have_no_numbers_of_8_bits():
-    env = Bytes()
-    actor, act, distribution = actor_and_act(env, ())
-    chosen = choice.choose("auto", env, choice.ActingPolicy(act, actor, distribution), 500)
-    assert chosen.name == "vmap"
-    assert "machine code cannot play this: its state has numbers of int8" in chosen.why
+    engine = chosen(Bytes())
+    assert engine.name == "vmap"
+    assert "machine code cannot play this: its state has numbers of int8" in engine.why
 
 
 def test_keys_of_another_generator():
@@ -236,7 +224,7 @@ def test_keys_of_another_generator():
     env = Drifting()
     actor, act, distribution = actor_and_act(env, (4,))
     key = jax.random.key(1, impl="rbg")
-    engine = choice.choose("auto", env, choice.ActingPolicy(act, actor, distribution), 20)
+    engine = chosen(env)
     assert engine.name == "native"
 
     def play(engine):
@@ -247,11 +235,6 @@ def test_keys_of_another_generator():
     assert_same_episodes(got, play(rollouts.rollout), rounding=0)
     with pytest.raises(ValueError, match=r'of rbg; make .*impl="threefry2x32"'):
         play(native.rollout)
-
-
-def chosen(env, name="auto"):
-    actor, act, distribution = actor_and_act(env, (4,))
-    return choice.choose(name, env, choice.ActingPolicy(act, actor, distribution), 20)
 
 
 @pytest.mark.cpu
@@ -304,3 +287,37 @@ def test_large_models_are_not_for_machine_code(monkeypatch):
     assert engine.name == "vmap"
     assert "more than 1e-09 s, because of its size; its geoms can meet in" in engine.why
     assert re.search(r"bodies 'world' \(\d+\), .* the feet alone, by contype", engine.why)
+
+
+# -------------------------------------------------------------------------------------------------
+# The program of a CPU's threads: its text, and that an episode is the same in any lane.
+
+
+@pytest.mark.cpu
+def test_what_it_takes_it_frees_and_what_it_flushes_it_undoes():
+    env = Drifting()
+    actor, act, distribution = actor_and_act(env, ())
+    examples = program.step_shapes(env, actor)
+    function = program.step_function(env, act, distribution, 4)
+    varying = [True] * len(jax.tree.leaves(examples))
+    built = scalarized.build(function, examples, varying, program.BRANCH_COST, program.LOOPS)
+    work = kernel.player_text(built, len(jax.tree.leaves(actor)), 2).partition("@work(")[2]
+    assert work.count("call ptr @malloc") == work.count("call void @free") == 1
+    order = "call i64 @flush", "phi i64 [0, ", "call void @unflush", "call void @free"
+    assert sorted(order, key=work.index) == list(order)
+
+
+@pytest.mark.cpu
+def test_the_number_of_lanes_and_threads_changes_nothing(monkeypatch):
+    """More episodes than lanes, and fewer; they end at different steps."""
+    env, here = Drifting(), machine.this_machine()
+    player, options = actor_and_act(env, ()), {"num_episodes": 7, "horizon": 40}
+    want = played(native.rollout, env, player, **options)
+    assert len(np.unique(want.mask.sum(axis=1))) > 3
+    for lanes, threads in ((here.lanes, 1), (here.lanes, 2), (2, 0)):
+        monkeypatch.setattr(machine, "this_machine", lambda lanes=lanes: here._replace(lanes=lanes))
+        play = functools.partial(native.rollout, threads=threads)
+        got = played(play, env, player, **options)
+        for name in ("observation", "action", "reward", "mask", "nonfinite"):
+            np.testing.assert_array_equal(getattr(got, name), getattr(want, name), err_msg=name)
+    assert got.simulated.sum() < want.simulated.sum() or here.lanes <= 2

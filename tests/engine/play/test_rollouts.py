@@ -1,6 +1,8 @@
 """Rollouts against a loop by hand, on a task that counts its steps."""
 
 import functools
+import types
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,18 +11,20 @@ import pytest
 from players import only_active
 from toys import Chain, Toy, ToyState, categorical
 
-from mjx_reinforce import Distribution
-from mjx_reinforce.engine.play import episode, rollouts
+from mjx_reinforce.engine.play import counter, episode, rollouts
+from mjx_reinforce.engine.play.episode import (
+    CHUNK_STEPS,
+    chunk_length,
+    largest_divisor,
+    play_chunks,
+    while_any,
+)
 
 #: Two entries of an action, noise added; the mode is what the network says.
-PLAIN = Distribution(
-    num_outputs=2,
-    constants=(),
+PLAIN = types.SimpleNamespace(
     noise=lambda key, shape: jax.random.normal(key, (*shape, 2)),
     sample=lambda outputs, noise: outputs + noise,
     mode=lambda outputs: outputs,
-    log_prob=lambda outputs, action: jnp.zeros(action.shape[:-1]),
-    entropy=lambda outputs: jnp.zeros(outputs.shape[:-1]),
 )
 
 
@@ -238,3 +242,119 @@ def test_discrete_actions_have_no_last_axis():
     np.testing.assert_array_equal(trajectory.action, np.array([[0], [1], [0]]).repeat(5, axis=1))
     earned = Chain.rewards[[0, 1, 2], [0, 1, 0]]
     np.testing.assert_allclose(trajectory.reward, earned[:, None].repeat(5, axis=1), rtol=1e-6)
+
+
+# -------------------------------------------------------------------------------------------------
+# Loops over time in chunks: how long they run, alone and vmapped over seeds.
+
+NOISY = types.SimpleNamespace(noise=lambda key, shape: jax.random.uniform(key, (*shape, 1)))
+HORIZON = 3 * CHUNK_STEPS
+
+
+class Lives(NamedTuple):
+    """Episodes that live for so many steps; ``alive`` [N]."""
+
+    lives: jax.Array
+    steps: jax.Array
+    alive: jax.Array
+
+
+def record_noise(noise, progress):
+    """Records the noise of each step in which an episode was alive."""
+    times = progress.steps[0] + jnp.arange(len(noise))
+    alive = times[:, None] < progress.lives
+    records = jnp.where(alive, noise[..., 0], 0.0)
+    steps = progress.steps + len(noise)
+    return Lives(progress.lives, steps, steps < progress.lives), records
+
+
+def played(lives, seed=0):
+    lives = jnp.asarray(lives)
+    keys = jax.random.split(jax.random.key(seed), len(lives))
+    begun = Lives(lives, jnp.zeros_like(lives), lives > 0)
+    return play_chunks(record_noise, NOISY, keys, begun, jnp.zeros((HORIZON, len(lives))))
+
+
+def test_the_largest_divisor_and_a_chunk_divides_the_horizon():
+    cases = (1000, 50, 50), (12, 5, 4), (7, 6, 1), (7, 7, 7), (7, 100, 7), (1, 1, 1)
+    for number, at_most, expected in cases:
+        assert largest_divisor(number, at_most) == expected
+    assert [chunk_length(horizon) for horizon in (1000, 37, 53, 200)] == [50, 37, 1, 50]
+
+
+@pytest.mark.parametrize(("lives", "chunks"), [([0, 0], 0), ([3, 50], 1), ([1, 51], 2), ([999], 3)])
+def test_chunks_are_played_until_every_episode_is_over_or_the_time_is_up(lives, chunks):
+    progress, records, simulated = played(lives)
+    assert simulated == chunks * CHUNK_STEPS * len(lives)
+    assert progress.steps.tolist() == [chunks * CHUNK_STEPS] * len(lives)
+    for number, life in enumerate(lives):
+        np.testing.assert_array_equal(records[:, number] != 0, np.arange(HORIZON) < life)
+
+
+def test_each_step_has_noise_of_its_own():
+    _, records, _ = played([HORIZON, HORIZON])
+    assert len(np.unique(records)) == 2 * HORIZON
+
+
+def test_vmapped_seeds_play_as_long_as_one_of_them_needs():
+    """And what each plays is what it would have played alone."""
+    lives = jnp.array([[3, 9], [60, 2]])
+    together = jax.vmap(played)(lives)
+    assert together[2].tolist() == [2 * CHUNK_STEPS * 2] * 2
+    for seed in range(2):
+        np.testing.assert_array_equal(together[1][seed], played(lives[seed])[1])
+
+
+def test_a_loop_runs_while_any_seed_needs_it():
+    def count(limit):
+        return while_any(lambda n: n < limit, lambda n: n + 1, jnp.zeros((), jnp.int32))
+
+    assert count(3) == 3
+    assert jax.vmap(count)(jnp.array([2, 5, 1])).tolist() == [5, 5, 5]  # the body's own affair
+
+
+# -------------------------------------------------------------------------------------------------
+# JAX's random numbers from any count on: Threefry's known answers, and JAX's own numbers.
+
+KEY = jax.random.key(7)
+WORDS = jax.random.key_data(KEY)
+
+
+def test_the_known_answer():
+    """Of the authors' test vectors, that of zeros."""
+    zeros = jnp.zeros(2, jnp.uint32)
+    assert [hex(x) for x in counter.hash_pair(zeros, zeros[0])] == ["0x6b200159", "0x99ba4efe"]
+
+
+def test_keys_split_as_jax_splits_them():
+    np.testing.assert_array_equal(counter.split(WORDS), jax.random.key_data(jax.random.split(KEY)))
+
+
+def test_numbers_from_a_count_on_are_those_of_a_longer_draw():
+    whole = jax.random.normal(KEY, (12,))
+    for first in (0, 3, 10):
+        from_there = counter.at_counter(WORDS, jnp.uint32(first))
+        np.testing.assert_array_equal(jax.random.normal(from_there, (2,)), whole[first : first + 2])
+
+
+def test_bits_of_any_width_and_shape_and_doubles():
+    for dtype in (np.uint8, np.uint16, np.uint32):
+        ours = jax.random.bits(counter.key_of(WORDS), (2, 3), dtype)
+        np.testing.assert_array_equal(ours, jax.random.bits(KEY, (2, 3), dtype))
+        assert ours.dtype == dtype
+    with jax.enable_x64(True):
+        ours = jax.random.normal(counter.key_of(WORDS), (4,), np.float64)
+        np.testing.assert_array_equal(ours, jax.random.normal(KEY, (4,), np.float64))
+
+
+def test_keys_made_of_keys():
+    ours, theirs = counter.key_of(WORDS), KEY
+    for _ in range(2):
+        ours, theirs = jax.random.split(ours, 3)[2], jax.random.split(theirs, 3)[2]
+        ours, theirs = jax.random.fold_in(ours, 5), jax.random.fold_in(theirs, 5)
+    np.testing.assert_array_equal(jax.random.key_data(ours), jax.random.key_data(theirs))
+
+
+def test_a_key_that_skips_numbers_is_not_split():
+    with pytest.raises(NotImplementedError, match="more than one key"):
+        jax.random.split(counter.at_counter(WORDS, jnp.uint32(1)))

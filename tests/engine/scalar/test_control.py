@@ -10,10 +10,11 @@ from jax import lax
 from mapped import assert_same, batch_of, collatz, count, heavy, line_search, primitives
 
 from mjx_reinforce.engine import scalar
-from mjx_reinforce.engine.scalar import scalarized
-from mjx_reinforce.engine.scalar.graph import Limits
+from mjx_reinforce.engine.scalar import jaxprs, scalarize, scalarized, size
+from mjx_reinforce.engine.scalar.graph import Graph, Limits
 from mjx_reinforce.engine.scalar.nodes import Node
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop
+from mjx_reinforce.engine.scalar.rules import iterate
 
 LOOPS = [
     lambda x: lax.fori_loop(0, 20, lambda i, y: 0.9 * y + i, x),
@@ -196,3 +197,373 @@ def test_a_gate_computes_what_its_results_need():
     gate = only(LiveGate, schedule(function, 1.0))
     assert len(gate.outs) == 1
     assert names(gate.body) == ["cos", "sin", "select_n"]
+
+
+# -------------------------------------------------------------------------------------------------
+# The carry of a loop: what changes, what differs from lane to lane, what is foreseen.
+
+ONE = np.float32(1)
+
+
+@pytest.fixture
+def graph():
+    return Graph(0, Limits())
+
+
+def build(graph, step, inits, **options):
+    return iterate.iterate(graph, lambda state, row: (step(*state, *row), []), inits, **options)
+
+
+def test_what_never_changes_is_not_carried(graph):
+    """Also where that shows only after another was found to change."""
+    x = graph.leaf(np.float32, True)
+
+    def step(a, b, c):
+        return [a, graph.call("add", b, a), graph.call("mul", c, ONE)]
+
+    loop = build(graph, step, [x, x, ONE], length=9)
+    assert [carry is None for carry in loop.carries] == [True, False, True]
+    assert loop.results()[0][0] is x
+    assert loop.results()[0][2] == ONE
+
+
+def test_a_change_is_handed_on_from_carry_to_carry(graph):
+    loop = build(graph, lambda a, b, c: [graph.call("neg", c), a, b], [ONE] * 3, length=9)
+    assert None not in loop.carries
+
+
+def test_lanes_differ_as_soon_as_what_is_added_does(graph):
+    """The first carry is shared at first, and differs once the second one has been added."""
+    x, shared = graph.leaf(np.float32, True), graph.leaf(np.float32, False)
+    for reads_other in (False, True):
+
+        def step(a, b, reads_other=reads_other):
+            added = b if reads_other else shared
+            return [graph.call("add", a, added), graph.call("mul", b, x)]
+
+        loop = build(graph, step, [ONE, ONE], length=9)
+        assert [iterate.varies(out) for out in loop.outs] == [reads_other, True]
+
+
+def test_an_element_that_is_the_same_throughout_is_not_read(graph):
+    x = graph.leaf(np.float32, True)
+    loop = build(
+        graph, lambda a, y, z: [graph.call("add", a, z)], [ONE], length=2, xs=[[x, x], [x, ONE]]
+    )
+    assert [element is None for element in loop.elements] == [True, False]
+
+
+def test_what_depends_on_nothing_inside_is_computed_before(graph):
+    x = graph.leaf(np.float32, True)
+    step = lambda a: [graph.call("add", a, graph.call("sin", x))]  # noqa: E731
+    loop = build(graph, step, [ONE], length=9)
+    sine = next(arg for arg in loop.nexts[0].args if arg.op is not None)
+    assert sine.scope is graph.scope
+    assert loop.nexts[0].scope is loop.body
+
+
+def test_inside_of_a_loop_some_lane_goes_on(graph):
+    """So a branch on the loop's own predicate needs no test."""
+    x = graph.leaf(np.float32, True)
+    known = []
+
+    def step(active, a):
+        known.append(active in graph.certain)
+        return [graph.call("lt", a, x), graph.call("add", a, ONE)]
+
+    build(graph, step, [graph.call("lt", ONE, x), ONE], active=0)
+    assert known[-1]
+    assert not graph.certain
+
+
+ROW = jnp.ones(3)
+
+
+def scanned(a, b):
+    return lax.scan(lambda c, _: ((c[0], c[1] + c[0]), None), (a, b), length=3)[0]
+
+
+KEPT = {
+    "itself": lambda a, b: (a, b + 1),
+    "jit": jax.jit(lambda a, b: (a, b + 1)),
+    "checkpoint": jax.checkpoint(lambda a, b: (a, b * a)),
+    "scan": scanned,
+    "while": lambda a, b: lax.while_loop(lambda c: c[1][0] < 9, lambda c: (c[0], c[1] + 1), (a, b)),
+    "cond": lambda a, b: lax.cond(b[0] > 0, lambda: (a, b), lambda: (a, b + 1)),
+}
+CHANGED = {
+    "exchanged": lambda a, b: (b, a),
+    "exchanged in a branch": lambda a, b: lax.cond(a[0] > 0, lambda: (a, b), lambda: (b, a)),
+    "computed": lambda a, b: (jnp.zeros(3), b + 0),
+}
+
+
+def test_what_is_handed_on_through_calls_is_kept():
+    steps = KEPT | CHANGED
+    kept = {name: iterate.keeps(jaxprs.trace(f, ROW, ROW)[0], 0, 2) for name, f in steps.items()}
+    assert kept == {name: [name in KEPT, False] for name in steps}
+
+
+def test_the_carry_may_begin_behind_constants():
+    program, _ = jaxprs.trace(lambda const, a, b: (a + const, b), ROW, ROW, ROW)
+    assert iterate.keeps(program, 1, 2) == [False, True]
+
+
+def test_lanes_differ_where_something_that_differs_arrives_in_the_end():
+    def step(varying):
+        a, b, c, d = varying
+        return [a, a or b, b or c, d]
+
+    assert iterate.spread(step, [True, False, False, False]) == [True, True, True, False]
+
+
+def test_loops_are_found_in_calls_too():
+    for function, expected in (
+        (lambda x: x + 1, False),
+        (lambda x: lax.fori_loop(0, 9, lambda _, y: y + 1, x), True),
+        (jax.jit(lambda x: lax.while_loop(lambda y: y[0] < 9, lambda y: y + 1, x)), True),
+        (lambda x: lax.cond(x[0] > 0, lambda: lax.cumsum(x), lambda: x), False),
+    ):
+        assert iterate.has_loops(jaxprs.trace(function, ROW)[0]) is expected
+
+
+@pytest.mark.parametrize("outer", ["scan", "while"])
+def test_a_body_with_a_loop_is_written_once(outer, monkeypatch):
+    """And what all lanes share stays shared."""
+    written = []
+    original = iterate._trace_body
+
+    def count(graph, plan, fixed, varying):
+        written.append(plan)
+        return original(graph, plan, fixed, varying)
+
+    monkeypatch.setattr(iterate, "_trace_body", count)
+
+    def body(state):
+        number, x = state
+        return number + 1, lax.fori_loop(0, 50, lambda _, y: y * 0.5 + number, x) + x
+
+    def function(x):
+        start = jnp.int32(0), x
+        if outer == "scan":
+            return lax.scan(lambda state, _: (body(state), None), start, length=40)[0]
+        return lax.while_loop(lambda state: state[0] < 40, body, start)
+
+    ((number,), (x,)) = scalarize(function, jnp.float32(3)).outputs
+    loop = x.owner
+    assert [loop.outs[-2], loop.outs[-1]] == [number, x]
+    assert [number.varying, x.varying] == [False, True]
+    assert sum(plan.inits == loop.inits for plan in written) == 1
+
+
+# -------------------------------------------------------------------------------------------------
+# What a function says to be written out as: the choice by engine, and what may be skipped.
+
+
+def choice(x, scale=1.0):
+    """Tells which of the two was computed: x + 1 is `one`, 2 x is `many`."""
+    return scalar.by_engine(lambda y: scale * (y + 1), lambda y: scale * (2 * y), x)
+
+
+X = jnp.arange(3.0)
+
+
+def test_xla_computes_many():
+    for transformed in (
+        choice,
+        jax.jit(choice),
+        jax.vmap(choice),
+        jax.jit(jax.vmap(jax.vmap(choice, in_axes=0), in_axes=None, axis_size=1)),
+        lambda x: jax.vmap(choice, in_axes=(0, None))(x, 1.0),
+        jax.checkpoint(choice),
+        lambda x: lax.map(choice, x),
+        lambda x: lax.cond(x[0] < 9, choice, jnp.sin, x),
+        scalar.prune(lambda x: (choice(x), jnp.sort(x))[0]),
+    ):
+        np.testing.assert_array_equal(np.squeeze(transformed(X)), 2 * X)
+
+
+def test_one_is_written_out():
+    for function in (
+        choice,
+        jax.jit(choice),
+        lambda x: lax.cond(x < 9, choice, jnp.sin, x),
+        jax.checkpoint(choice),
+    ):
+        np.testing.assert_array_equal(scalar.vmap(function)(X), X + 1)
+
+
+def test_xla_does_not_read_what_is_written_out(monkeypatch):
+    """To map it takes as long as to map what XLA compiles."""
+    read = property(lambda _: pytest.fail("the program was read"))
+    monkeypatch.setattr(scalar.primitives._Mapped, "_traced", read)
+    twice = jax.jit(jax.vmap(jax.vmap(choice)))
+    np.testing.assert_array_equal(twice(jnp.ones((2, 3))), 2 * jnp.ones((2, 3)))
+    with pytest.raises(pytest.fail.Exception, match="was read"):
+        scalar.vmap(jax.vmap(choice))(jnp.ones((2, 3)))
+    monkeypatch.undo()
+    x = jnp.ones((2, 3))
+    np.testing.assert_array_equal(scalar.vmap(jax.vmap(choice))(x), x + 1)
+
+
+def test_a_mapped_program_is_part_of_the_fingerprint():
+    """Its constants too, and those of programs in it."""
+
+    def mapped(offset):
+        offset = np.full(3, offset, np.float32)
+        return jax.vmap(lambda x: scalar.by_engine(lambda y: y + offset, lambda y: y, x))
+
+    prints = [jaxprs.fingerprint(jaxprs.trace(mapped(k), jnp.ones((2, 3)))[0]) for k in (1, 1, 2)]
+    assert prints[0] == prints[1] != prints[2]
+
+
+def test_derivatives_are_those_of_many():
+    """For all engines, forwards and in reverse, with respect to what is closed over too."""
+    for mapped in (jax.vmap, scalar.vmap):
+        np.testing.assert_array_equal(mapped(jax.grad(choice))(X), [2.0, 2.0, 2.0])
+        np.testing.assert_array_equal(mapped(jax.grad(choice, 1), (0, None))(X, 1.0), 2 * X)
+        np.testing.assert_array_equal(mapped(jax.jacfwd(choice))(X), [2.0, 2.0, 2.0])
+
+
+def test_derivatives_pass_integers_by():
+    pick = lambda x, i: scalar.by_engine(lambda x, i: x[i], lambda x, i: x[i] * 2, x, i)  # noqa: E731
+    np.testing.assert_array_equal(jax.grad(pick)(X, 1), [0.0, 2.0, 0.0])
+
+
+def test_a_result_of_nothing_mapped_stays_one():
+    """As of `lax.cond`: what XLA computes for all lanes together is not computed for each."""
+
+    def fn(x, y):
+        return scalar.by_engine(lambda x, y: (x, y + 1), lambda x, y: (x, y + 2), x, y)
+
+    out = jax.jit(jax.vmap(fn, in_axes=(0, None), out_axes=(0, None)))(X, 1.0)
+    assert out[1].shape == ()
+    np.testing.assert_array_equal(out[1], 3.0)
+
+
+def test_the_size_is_that_of_one():
+    traced, _ = jaxprs.trace(
+        lambda x: scalar.by_engine(lambda x: x + 1, lambda x: jnp.sin(jnp.cos(x)), x), X
+    )
+    assert size.num_scalars(traced) == 3
+
+
+def test_what_is_not_traced_is_computed_at_once():
+    """Without a look at ``one``; programs that have been traced are computed without it too."""
+    scalar.by_engine(pytest.fail, lambda x: x, X)
+    jaxpr = jax.make_jaxpr(choice)(X)
+    assert "by_engine" in str(jaxpr)
+    np.testing.assert_array_equal(jax.core.eval_jaxpr(jaxpr.jaxpr, jaxpr.consts, X)[0], 2 * X)
+
+
+@pytest.mark.parametrize("other", [lambda x: (x,), lambda x: x[:1], lambda x: x > 0])
+def test_results_that_differ_are_refused(other):
+    with pytest.raises(TypeError, match="by_engine got two different results"):
+        jax.jit(lambda x: scalar.by_engine(lambda x: x, other, x))(X)
+
+
+def total(x, **options):
+    step = lambda carry, row: (carry + jnp.sin(row), None)  # noqa: E731
+    return lax.scan(step, 0.0, x, **options)[0]
+
+
+def sines(fn, unrollable, length=7):
+    limits = Limits(1, unrollable)
+    return scalarized.build(fn, (jnp.ones(length),), [True], 400, limits).operations["sin"]
+
+
+def chosen(may_unroll, inner=total):
+    return lambda x: scalar.by_engine(inner, lambda x: x[0], x, may_unroll=may_unroll)
+
+
+def test_scans_that_may_be_written_out_are_up_to_a_length():
+    counts = [sines(chosen(may), most) for may, most in ((False, 7), (True, 6), (True, 7))]
+    assert counts == [1, 1, 7]
+
+
+def test_scans_inside_loops_are_not_what_may_be_written_out():
+    def nested(x):
+        return lax.fori_loop(0, 9, lambda _, y: y + total(x), 0.0)
+
+    assert sines(chosen(True, nested), 7) == 1
+    # Jitted functions are no loops, and what comes behind the mark is not marked.
+    assert sines(lambda x: chosen(True, jax.jit(total))(x) + total(2 * x), 7) == 7 + 1
+
+
+def test_the_unroll_of_a_scan_means_what_it_means_to_jax():
+    """Only a scan that JAX would write out whole is written out."""
+    each = (1, 2, 6, 7, True)
+    assert [sines(lambda x, n=n: total(x, unroll=n), 7) for n in each] == [1, 1, 1, 7, 7]
+
+
+def test_platform_dependent_takes_its_default():
+    """Documented: what is written out does not depend on where it will run."""
+
+    def fn(x):
+        return lax.platform_dependent(x, cpu=lambda x: x + 1, cuda=jnp.sin, default=lambda x: x + 2)
+
+    np.testing.assert_array_equal(scalar.vmap(fn)(X), X + 2)
+
+
+def test_platform_dependent_without_a_default_is_refused_by_name():
+    def fn(x):
+        return lax.platform_dependent(x, cpu=lambda x: x + 1, cuda=jnp.sin)
+
+    with pytest.raises(scalar.UnsupportedPrimitive, match=r"without a default.*test_control\.py"):
+        scalar.vmap(fn)(X)
+
+
+def plus_sine(x):
+    """Adds the sine, of which that of 0 changes nothing."""
+    return scalar.skippable(x != 0, lambda: {"y": x + jnp.sin(x)}, {"y": x})["y"]
+
+
+NUMBERS = jnp.array([0.0, 1.0, -2.0])
+
+
+def test_results():
+    """By JAX, and written out with a branch and without one; of one example too."""
+    for transformed in (
+        jax.vmap(plus_sine),
+        jax.jit(jax.vmap(plus_sine)),
+        scalar.vmap(plus_sine, branch_cost=0),
+        scalar.vmap(plus_sine, branch_cost=10_000),
+    ):
+        np.testing.assert_allclose(transformed(NUMBERS), NUMBERS + jnp.sin(NUMBERS), rtol=1e-6)
+    assert plus_sine(jnp.float32(2)) == 2 + jnp.sin(jnp.float32(2))
+    assert jax.jit(plus_sine)(jnp.float32(0)) == 0
+
+
+def test_where_it_is_known_whether_it_is_needed():
+    for needed in (True, False):
+        both = scalar.vmap(lambda x, n=needed: scalar.skippable(jnp.array(n), lambda: x * 2, x))
+        np.testing.assert_array_equal(both(jnp.ones(3)), [1.0 + needed] * 3)
+
+
+def test_nothing_is_selected():
+    """Of ``lax.cond`` each lane's own result is."""
+
+    def sines(x):
+        return sum(jnp.sin(x * k) for k in range(1, 9))
+
+    def skipping(x):
+        return scalar.skippable(x != 0, lambda: sines(x), jnp.zeros(()))
+
+    def choosing(x):
+        return jax.lax.cond(x != 0, lambda: sines(x), lambda: jnp.zeros(()))
+
+    written = [scalar.scalarize(f, jnp.ones(()), branch_cost=3) for f in (skipping, choosing)]
+    assert [x.operations["select_n"] for x in written] == [0, 1]
+    results = [jax.jit(scalar.vmap(f, branch_cost=3))(NUMBERS) for f in (skipping, choosing)]
+    np.testing.assert_array_equal(*results)
+
+
+def test_results_must_be_of_the_structure_of_what_is_skipped_to():
+    with pytest.raises((TypeError, ValueError)):
+        scalar.skippable(jnp.array(True), lambda: (NUMBERS, NUMBERS), NUMBERS)
+
+
+def test_its_size_is_that_of_the_computation():
+    traced = jaxprs.trace(plus_sine, jnp.ones(()))[0]
+    alone = jaxprs.trace(lambda x: x + jnp.sin(x), jnp.ones(()))[0]
+    assert size.num_scalars(traced) == size.num_scalars(alone) + 1  # and the comparison
