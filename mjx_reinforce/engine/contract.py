@@ -92,10 +92,8 @@ def _declared(name: str, env: object, what: str) -> Any:
 
 def _require_count(name: str, value: object) -> None:
     """Raises ValueError for what is no whole number, 1 or more; True is none."""
-    is_count = (
-        isinstance(value, numbers.Integral) and not isinstance(value, bool) and int(value) >= 1
-    )
-    require(is_count, f"{name} must be a whole number, 1 or more, got {value!r}")
+    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    require(whole and int(value) >= 1, f"{name} must be a whole number, 1 or more, got {value!r}")
 
 
 def _are_bounds(space: Box, size: int) -> bool:

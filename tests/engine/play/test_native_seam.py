@@ -1,6 +1,7 @@
 """Machine code made at run time, called from compiled JAX on whatever threads."""
 
 import ctypes
+import itertools
 import os
 import re
 import subprocess
@@ -13,6 +14,7 @@ import native_items as items
 import numpy as np
 import pytest
 from jax import lax
+from native_items import N, T
 from places import PYTHONPATH
 
 from mjx_reinforce.engine.cpu import handler, machine, seam
@@ -435,3 +437,53 @@ def test_offsets_are_those_of_jaxs_header():
     for path, offset in handler.OFFSETS.items():
         struct, _, member = path.partition(".")
         assert layout(struct)[1][member] == offset, path
+
+
+# -------------------------------------------------------------------------------------------------
+# By which name XLA knows machine kept_code, and how a program on disk finds it again.
+
+#: XLA takes one handler of a name, so that each test has kept_code of its own.
+NUMBERS = itertools.count(20)
+
+
+@pytest.fixture
+def kept_code(tmp_path, monkeypatch):
+    """Code that is on disk, of which this process forgets how it is called."""
+    monkeypatch.setattr(objects, "folder", lambda: tmp_path)
+    monkeypatch.setattr(seam, "_KNOWN", set())
+    monkeypatch.setattr(machine, "_LOADED", {})
+    return items.load(tmp_path, lanes=next(NUMBERS))
+
+
+def test_the_name_of_a_handler_is_that_of_its_code(kept_code):
+    assert seam.targets() == [f"mjx_reinforce_{kept_code.key}"]
+    assert len(kept_code.key) == 64
+
+
+def test_a_program_on_disk_finds_its_code(kept_code, monkeypatch):
+    program = b"... mjx_reinforce_" + kept_code.key.encode() + b" ..."
+    assert seam.restore(program)
+    monkeypatch.setattr(machine, "_LOADED", {})
+    assert seam.restore(program * 2)
+    assert seam.targets() == [f"mjx_reinforce_{kept_code.key}"]
+
+
+def test_a_program_without_handlers_needs_none(kept_code, monkeypatch):
+    monkeypatch.setattr(objects, "folder", lambda: None)
+    assert seam.restore(b"a program")
+    assert not seam.restore(b"mjx_reinforce_" + b"0" * 64)
+
+
+def test_code_that_is_gone_is_not_restored(kept_code, tmp_path, monkeypatch):
+    assert not seam.restore(b"mjx_reinforce_" + b"0" * 64)
+    monkeypatch.setattr(machine, "_LOADED", {})
+    for path in tmp_path.iterdir():
+        path.unlink()
+    assert not seam.restore(seam._target(kept_code.key).encode())
+
+
+def test_xla_is_told_once(kept_code, monkeypatch):
+    seam.register(kept_code)
+    monkeypatch.setattr(seam.jax.ffi, "register_ffi_target", pytest.fail)
+    seam.register(kept_code)
+    assert [x.shape for x in items.play(kept_code, [1, 1])][:2] == [(2, T, N, 2), (2, T, N, 1)]

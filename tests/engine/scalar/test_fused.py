@@ -184,8 +184,8 @@ def test_pruned_functions_keep_only_what_they_return():
 # Random programs: ``scalar.vmap`` computes, bit by bit, what ``jax.vmap`` computes.
 #
 # A program is a list of steps, each of which reads values that are there and adds one. All floats
-# are multiples of 1/8 within 8, so that no order of operations rounds, and the results must be equal
-# also behind comparisons and conversions.
+# are multiples of 1/8 within 8, so that no order of operations rounds, and the results must be
+# equal also behind comparisons and conversions.
 
 #: Of the examples at least so many must reach the comparison.
 FLOOR = 0.8
