@@ -2,8 +2,7 @@
 
 from mjx_reinforce.engine.base import Box, Discrete, Environment, Trajectory
 from mjx_reinforce.engine.play.choice import rollout
-from mjx_reinforce.engine.vector.environment import VectorEnv
-from mjx_reinforce.engine.vector.episodes import VectorState
+from mjx_reinforce.engine.vector.environment import VectorEnv, VectorState
 from mjx_reinforce.engine.vector.segments import Segment, unroll
 from mjx_reinforce.envs import make_vec
 from mjx_reinforce.export.player import Player, load

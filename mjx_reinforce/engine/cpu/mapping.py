@@ -9,7 +9,8 @@ import numpy as np
 from mjx_reinforce.engine.cpu import handler
 from mjx_reinforce.engine.llvm.emit import LLVM, Input
 from mjx_reinforce.engine.llvm.text import Text
-from mjx_reinforce.engine.scalar import jaxprs, scalarized
+from mjx_reinforce.engine.scalar import scalarized
+from mjx_reinforce.engine.scalar.jaxprs import num_entries
 
 _LONG = np.dtype(np.int64)
 #: The number of threads comes first, then the leaves.
@@ -42,11 +43,13 @@ class _Work(handler.JobText):
         text.line("%control = call i64 @flush()")
         total, data = self.job("total", "i64"), self.job("data", "ptr")
         next_at = self.field("next")
-        given = [x for x in self.inputs if _size(x)]
-        made = [x for x in self.written.out_avals if _size(x)]
+        given = [x for x in self.inputs if num_entries(x)]
+        made = [x for x in self.written.out_avals if num_entries(x)]
         buffers = [self.element(data, k) for k in range(1 + len(given) + len(made))]
         arguments, results = buffers[1 : 1 + len(given)], buffers[1 + len(given) :]
-        columns = [text.reserve(x.dtype, _size(x)) if _size(x) else "null" for x in self.inputs]
+        columns = [
+            text.reserve(x.dtype, num_entries(x)) if num_entries(x) else "null" for x in self.inputs
+        ]
         head, body, end = text.label(), text.label(), text.label()
         text.line(f"br label %{head}")
         text.start(head)
@@ -58,13 +61,13 @@ class _Work(handler.JobText):
         for aval, source, column in zip(
             given, arguments, (x for x in columns if x != "null"), strict=True
         ):
-            for k, index in enumerate(self._indices(item, _size(aval))):
+            for k, index in enumerate(self._indices(item, num_entries(aval))):
                 value = text.gather(source, index, aval.dtype)
                 text.store(value, text.at(column, aval.dtype, k), aval.dtype)
         emit = LLVM(text, lambda k: Input(columns[k], np.dtype(self.inputs[k].dtype)))
         outputs = emit.compile(self.written.schedule, self.written.outputs)
         for aval, target, values in zip(made, results, (x for x in outputs if x), strict=True):
-            for value, index in zip(values, self._indices(item, _size(aval)), strict=True):
+            for value, index in zip(values, self._indices(item, num_entries(aval)), strict=True):
                 text.scatter(value, target, index, mask, aval.dtype)
         text.line(f"br label %{head}")
         text.start(end)
@@ -89,7 +92,3 @@ class _Work(handler.JobText):
         text, kind = self.text, self.text.type(_LONG)
         first = text.let(f"mul {kind} {item}, {text.constant(np.int64(size))}")
         return [text.let(f"add {kind} {first}, {text.constant(np.int64(k))}") for k in range(size)]
-
-
-def _size(leaf: jaxprs.Shape) -> int:
-    return int(np.prod(leaf.shape, dtype=int))

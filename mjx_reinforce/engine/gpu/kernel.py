@@ -1,4 +1,4 @@
-"""The kernel that every thread of a GPU runs: a thread plays one episode after the other.
+"""The kernels that every thread of a GPU runs, to play one episode after the other, or to map.
 
 A thread whose episode is over takes the next one, of whatever seed, so few threads wait for longer
 episodes beside theirs. What a thread computes depends on its episode alone: results are the same
@@ -16,6 +16,7 @@ from mjx_reinforce.engine.gpu.lockstep import Lockstep, ScratchText, operations,
 from mjx_reinforce.engine.llvm.emit import Input
 from mjx_reinforce.engine.play.episode import NOT_PLAYED
 from mjx_reinforce.engine.scalar import scalarized
+from mjx_reinforce.engine.scalar.jaxprs import num_entries
 
 _INT = np.dtype(np.int32)
 #: The kernel's name. Its attributes are #0.
@@ -77,7 +78,7 @@ class _Kernel:
 
     def __init__(self, step: scalarized.Scalarized, num_actor: int):
         self.text, self.step = ScratchText(), step
-        avals = [(np.dtype(x.dtype), int(np.prod(x.shape, dtype=int))) for x in step.in_avals]
+        avals = [(np.dtype(x.dtype), num_entries(x)) for x in step.in_avals]
         actor, own = avals[:num_actor], avals[num_actor:]
         state = own[: len(own) - _NUM_OTHERS]
         self.given = {  # no argument is empty
@@ -251,3 +252,61 @@ class _Kernel:
 
     def _wide(self, number: str) -> str:
         return self.text.let(f"zext i32 {number} to i64")
+
+
+def mapping_text(written: scalarized.Scalarized) -> str:
+    """Returns the LLVM IR of ``@play``, without a target.
+
+    Its arguments are pointers to: sizes [2] int32 (examples N, threads in all), the leaves [N, ...]
+    of the function's arguments that are not empty; as many again as there are results, which it
+    does not read; and the results, the leaves of the function's result that are not empty; and, if
+    there are long arrays, the buffer of ``ScratchText``. Thread k computes the examples k,
+    k + threads and so on.
+
+    Args:
+      written: the function.
+    """
+    text = ScratchText()
+    given = [k for k, leaf in enumerate(written.in_avals) if num_entries(leaf)]
+    made = [k for k, leaf in enumerate(written.out_avals) if num_entries(leaf)]
+    own = [
+        text.reserve(x.dtype, num_entries(x)) if num_entries(x) else "null"
+        for x in written.in_avals
+    ]
+    in_block, block, threads = (text.let(text.asked(x)) for x in ("tid", "ctaid", "ntid"))
+    number = text.let(f"add i32 {text.let(f'mul i32 {block}, {threads}')}, {in_block}")
+    total, stride = (text.load(text.at("%sizes", _INT, k), _INT) for k in range(2))
+    before, head, body, end = text.block, text.label(), text.label(), text.label()
+    text.line(f"br label %{head}")
+    text.start(head)
+    item = text.hole()
+    running = text.let(f"icmp ult i32 {item.name}, {total}")
+    text.line(f"br i1 {some_of_block(text, running)}, label %{body}, label %{end}")
+    text.start(body)
+    row = text.let(f"select i1 {running}, i32 {item.name}, i32 0")  # waits with another's numbers
+    row = text.let(f"zext i32 {row} to i64")
+    for k in given:
+        leaf = written.in_avals[k]
+        start = text.at(f"%given{k}", leaf.dtype, text.let(f"mul i64 {row}, {num_entries(leaf)}"))
+        for entry in range(num_entries(leaf)):
+            value = text.load(text.at(start, leaf.dtype, entry), leaf.dtype)
+            text.store(value, text.at(own[k], leaf.dtype, entry), leaf.dtype)
+    emit = Lockstep(text, lambda k: Input(own[k], np.dtype(written.in_avals[k].dtype)))
+    results = emit.compile(written.schedule, written.outputs)
+    with text.when(running):
+        for k in made:
+            leaf = written.out_avals[k]
+            start = text.at(
+                f"%made{k}", leaf.dtype, text.let(f"mul i64 {row}, {num_entries(leaf)}")
+            )
+            for entry, value in enumerate(results[k]):
+                text.store(value, text.at(start, leaf.dtype, entry), leaf.dtype)
+    following = text.let(f"add i32 {item.name}, {stride}")
+    text.fill(item, f"phi i32 [{number}, %{before}], [{following}, %{text.block}]")
+    text.line(f"br label %{head}")
+    text.start(end)
+    text.line("ret void")
+    parameters = ["ptr noalias readonly %sizes"]
+    parameters += [f"ptr noalias readonly %given{k}" for k in given]
+    parameters += [*(f"ptr %zero{k}" for k in made), *(f"ptr %made{k}" for k in made)]
+    return entry_text(text, parameters, written)

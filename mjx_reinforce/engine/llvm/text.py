@@ -28,20 +28,17 @@ _LEAST_ALIGN = 64
 Written = TypeVar("Written")
 
 
+@functools.cache
 def scalar_type(dtype: DTypeLike) -> str:
     """Returns the LLVM type of one value.
 
     Raises:
       TypeError: the dtype has none here.
     """
-    return _scalar_type(np.dtype(dtype))
-
-
-@functools.cache
-def _scalar_type(dtype: np.dtype) -> str:
-    if dtype.name not in _SCALARS:
-        raise TypeError(f"machine code is not written for values of {dtype.name}")
-    return _SCALARS[dtype.name]
+    name = np.dtype(dtype).name
+    if name not in _SCALARS:
+        raise TypeError(f"machine code is not written for values of {name}")
+    return _SCALARS[name]
 
 
 def literal(number: Any) -> str:

@@ -11,11 +11,10 @@ from jax import lax
 
 from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, observation_size
-from mjx_reinforce.engine.cpu import handler, kernel, machine, mapping
+from mjx_reinforce.engine.cpu import handler, kernel, machine
 from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import kernel as gpu_kernel
 from mjx_reinforce.engine.gpu import lockstep, ptx
-from mjx_reinforce.engine.gpu import mapping as gpu_mapping
 from mjx_reinforce.engine.gpu import seam as gpu_seam
 from mjx_reinforce.engine.play import available, episode, objects, units
 from mjx_reinforce.engine.play.counter import at_counter, split
@@ -71,7 +70,8 @@ def step_function(
     """
     shapes = jax.eval_shape(env.reset, jax.random.key(0))
     leaves, tree = jax.tree.flatten(shapes)
-    words = _words_per_step(distribution)
+    drawn = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
+    words = int(np.prod(drawn.shape, dtype=int))  # random ones that the noise of a step takes
 
     def step(actor, carried, t, deterministic, alive):
         state = [
@@ -112,12 +112,6 @@ def step_shapes(env: Environment, actor: PyTree) -> tuple[Any, ...]:
     flag = shape((), jnp.int32)
     actor = jax.tree.map(lambda x: shape(x.shape, x.dtype), actor)
     return actor, Carried(state, shape((2, 2), jnp.uint32)), flag, flag, flag
-
-
-def _words_per_step(distribution: Acts) -> int:
-    """Returns how many random words the noise of a step takes."""
-    noise = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
-    return int(np.prod(noise.shape, dtype=int))
 
 
 class NativeProgram(NamedTuple):
@@ -245,7 +239,7 @@ def machine_map(
     for leaf in (*kept, *map(jax.eval_shape, [stored] * len(results), results)):
         if np.dtype(leaf.dtype).itemsize not in (4, 8):
             raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
-    code, _ = load("map", name, flat, kept, check, _write_cpu, gpu_mapping.mapping_text)
+    code, _ = load("map", name, flat, kept, check, _write_cpu, gpu_kernel.mapping_text)
 
     def mapped(*args: PyTree) -> Any:
         values = jax.tree.leaves(args)
@@ -274,8 +268,8 @@ def _write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
     """Writes a function, and all around it, as LLVM IR."""
     num_args = 1 + sum(bool(np.prod(x.shape)) for x in written.in_avals)
     sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals if np.prod(x.shape)]
-    entry = handler.handler_text(num_args, sizes, target.lanes, mapping.POSITIONS, zeroed=False)
-    return entry + handler.flush(target.triple) + mapping.mapping_text(written, target.lanes)
+    entry = handler.handler_text(num_args, sizes, target.lanes, kernel.POSITIONS, zeroed=False)
+    return entry + handler.flush(target.triple) + kernel.mapping_text(written, target.lanes)
 
 
 def name_of(env: Any) -> str:

@@ -6,6 +6,7 @@ moves something, it moves here.
 
 import functools
 import hashlib
+import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -67,6 +68,11 @@ class Shape(Protocol):
 
     shape: tuple[int, ...]
     dtype: np.dtype
+
+
+def num_entries(leaf: Shape) -> int:
+    """Returns how many numbers an array of a shape has."""
+    return math.prod(leaf.shape)
 
 
 class Atom(Protocol):

@@ -17,8 +17,7 @@ import numpy as np
 from brax.envs.base import Env, State
 
 from mjx_reinforce.engine.base import Box
-from mjx_reinforce.engine.vector.environment import VectorEnv
-from mjx_reinforce.engine.vector.episodes import VectorState
+from mjx_reinforce.engine.vector.environment import VectorEnv, VectorState
 
 
 class BraxVectorEnv(Env):

@@ -13,8 +13,7 @@ from gymnasium.vector import AutoresetMode
 from mjx_reinforce.engine.base import Discrete, PyTree
 from mjx_reinforce.engine.checks import check_name
 from mjx_reinforce.engine.play.available import GENERATOR
-from mjx_reinforce.engine.vector.environment import VectorEnv
-from mjx_reinforce.engine.vector.episodes import VectorState
+from mjx_reinforce.engine.vector.environment import VectorEnv, VectorState
 
 #: A seed of all environments, or one for each.
 Seeds: TypeAlias = int | Sequence[int | None] | None

@@ -10,8 +10,7 @@ from jax import lax
 from mjx_reinforce.engine.base import Act, Acts, Arrays, PyTree
 from mjx_reinforce.engine.checks import check_count, check_key, check_kind
 from mjx_reinforce.engine.contract import check_policy
-from mjx_reinforce.engine.vector.environment import VectorEnv
-from mjx_reinforce.engine.vector.episodes import VectorState
+from mjx_reinforce.engine.vector.environment import VectorEnv, VectorState
 
 
 @runtime_checkable

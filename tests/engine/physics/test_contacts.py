@@ -148,7 +148,7 @@ def theirs(all_pairs):
 @pytest.mark.parametrize("pair", RIGHT, ids="-".join)
 def test_contacts_are_those_of_mujoco(all_pairs, theirs, pair):
     number, found, touching = RIGHT.index(pair), all_pairs.found, 0
-    for i, rows in enumerate(theirs):
+    for i, found_by_c in enumerate(theirs):
         near = np.inf if pair in ROUND else 0
         own = found.geom[i, :, 0] % len(RIGHT) == number
         touches = np.flatnonzero((found.dist[i] < near) & own)
@@ -156,7 +156,7 @@ def test_contacts_are_those_of_mujoco(all_pairs, theirs, pair):
             np.concatenate([found.dist[i, k, None], found.pos[i, k], found.frame[i, k].ravel()])
             for k in touches
         ]
-        exact = [row for of, row in rows if of == number]
+        exact = [row for of, row in found_by_c if of == number]
         assert len(ours) == len(exact), (i, ours, exact)
         touching += bool(ours)
         key = lambda row: tuple(np.round(row[:4], 4) + 0.0)  # noqa: E731

@@ -16,7 +16,7 @@ from mjx_reinforce import Box, Discrete, envs, make_vec
 from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.play.counter import key_of
 from mjx_reinforce.engine.play.program import machine_map
-from mjx_reinforce.engine.vector.episodes import AUTORESETS
+from mjx_reinforce.engine.vector.environment import AUTORESETS
 from mjx_reinforce.engine.vector.for_brax import BraxVectorEnv
 
 SPACE = Box(np.array([-3.0]), np.array([1.0]))
