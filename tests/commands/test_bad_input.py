@@ -181,7 +181,7 @@ SURVIVE, POLE = "class Mine(Survive):\n    ", "class Mine(Pole):\n    "
 INIT, STEP = SURVIVE + "def __init__(self{}): {}", SURVIVE + "def step(self, state, action): {}"
 RESET = SURVIVE + "def reset(self, rng): return {}"
 OUTCOME = POLE + "def outcome(self, before, data, action): return {}"
-#: What a module has that is wrong, and what must be said. The rest is in engines/test_contract.py.
+#: What a module has that is wrong, and what must be said. The rest is in test_contract.py.
 WRONG_MODULES = [
     ("raise RuntimeError('the robot\\n\\nis off')", "RuntimeError: the robot is off"),
     ("class Broken(:", "SyntaxError"),

@@ -28,7 +28,7 @@ def weigh(update):
     return m.reward_to_go()._replace(update=update)
 
 
-#: What is given to ``reinforce``, and what it must say; engines/test_contract.py has the rest.
+#: What is given to ``reinforce``, and what it must say; engine/play/test_contract.py has the rest.
 REFUSED = {
     r"must return \[2, 2\]: .* then distribution.constants \[2, 1\], as parameters; got \[2, 1": {
         "policy": matrix(1)

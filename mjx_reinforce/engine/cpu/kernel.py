@@ -274,7 +274,7 @@ class _Work(handler.JobText):
     def _finish(self, ended: str) -> None:
         """Writes what is done for the lanes whose episode has ended."""
         text = self.text
-        with text.unless_none(ended):
+        with text.when(text.any(ended)):
             mask = text.mask(ended)
             for lane in range(text.lanes):
                 with text.when(text.bit(mask, lane)):

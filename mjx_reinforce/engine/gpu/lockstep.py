@@ -102,23 +102,21 @@ class ScratchText(Text):
 
     def _place_of_thread(self) -> list[str]:
         """Returns what finds the first word of the thread, ``%own``."""
-        return [
-            f"  {line}"
-            for line in (
-                f"%thread = {self.asked('tid')}",
-                f"%block = {self.asked('ctaid')}",
-                f"%threads = {self.asked('ntid')}",
-                "%before = mul i32 %block, %threads",
-                "%number = add i32 %before, %thread",
-                f"%lane = and i32 %number, {WARP - 1}",
-                "%others = sub i32 %number, %lane",
-                "%others.wide = zext i32 %others to i64",
-                "%lane.wide = zext i32 %lane to i64",
-                f"%warp.first = mul i64 %others.wide, {self.words}",
-                "%first = add i64 %warp.first, %lane.wide",
-                "%own = getelementptr inbounds i32, ptr %scratch, i64 %first",
-            )
-        ]
+        lines = (
+            f"%thread = {self.asked('tid')}",
+            f"%block = {self.asked('ctaid')}",
+            f"%threads = {self.asked('ntid')}",
+            "%before = mul i32 %block, %threads",
+            "%number = add i32 %before, %thread",
+            f"%lane = and i32 %number, {WARP - 1}",
+            "%others = sub i32 %number, %lane",
+            "%others.wide = zext i32 %others to i64",
+            "%lane.wide = zext i32 %lane to i64",
+            f"%warp.first = mul i64 %others.wide, {self.words}",
+            "%first = add i64 %warp.first, %lane.wide",
+            "%own = getelementptr inbounds i32, ptr %scratch, i64 %first",
+        )
+        return [f"  {line}" for line in lines]
 
 
 class Lockstep(LLVM):

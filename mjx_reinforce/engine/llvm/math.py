@@ -245,7 +245,7 @@ def _reduce_angle(x: Lanes) -> tuple[Lanes, Lanes]:
     small = x - n * _HALF_PI[0] - n * _HALF_PI[1] - n * _HALF_PI[2], rounded.bits()
     is_large = x > _LARGE_ANGLE
     before = x.text.block
-    with x.text.unless_none(is_large.name):
+    with x.text.when(x.text.any(is_large.name)):
         large = [is_large.where(*pair) for pair in zip(_large(x), small, strict=True)]
         inside = x.text.block
     rest, n = (

@@ -22,10 +22,6 @@ def is_constant_text(operand: str) -> bool:
     return not operand.startswith("%")
 
 
-def _compare(op: Op, _: np.dtype, x: Lanes, y: Lanes) -> Lanes:
-    return x.compare(op.name, y)
-
-
 def _extreme(op: Op, dtype: np.dtype, x: Lanes, y: Lanes) -> Lanes:
     """The greater or the lesser; NaN where either is NaN."""
     if dtype == np.bool_:
@@ -85,16 +81,8 @@ def _shift(instruction: str) -> Emit:
     return emit
 
 
-def _negate(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
-    return -x if dtype.kind == "f" else 0 - x
-
-
 def _invert(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
     return x ^ x.like(True if dtype == np.bool_ else ~dtype.type(0))
-
-
-def _absolute(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
-    return abs(x) if dtype.kind == "f" else _extreme(Op("max"), dtype, x, 0 - x)
 
 
 def _sign(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
@@ -144,10 +132,6 @@ def _convert(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
     return x if scalar_type(dtype) == scalar_type(before) else x.convert("trunc", dtype)
 
 
-def _reinterpret(op: Op, dtype: np.dtype, x: Lanes) -> Lanes:
-    return x if scalar_type(dtype) == scalar_type(x.dtype) else x.convert("bitcast", dtype)
-
-
 def _math(op: Op, dtype: np.dtype, *operands: Lanes) -> Lanes:
     return FUNCTIONS[dtype.name][op.name](*operands)
 
@@ -159,7 +143,7 @@ def _absent(op: Op, *_: Any) -> Lanes:
 OPERATIONS: dict[str, Emit] = {
     **dict.fromkeys(FACTS, _absent),
     **dict.fromkeys(FUNCTIONS["float32"], _math),
-    **dict.fromkeys(_COMPARISONS, _compare),
+    **dict.fromkeys(_COMPARISONS, lambda op, _, x, y: x.compare(op.name, y)),
     **dict.fromkeys(("max", "min"), _extreme),
     **dict.fromkeys(("div", "rem"), _divide),
     **{name: _unary(name) for name in ("floor", "ceil", "sqrt")},
@@ -173,9 +157,11 @@ OPERATIONS: dict[str, Emit] = {
     "shift_left": _shift("shl"),
     "shift_right_logical": _shift("lshr"),
     "shift_right_arithmetic": _shift("ashr"),
-    "neg": _negate,
+    "neg": lambda op, dtype, x: -x if dtype.kind == "f" else 0 - x,
     "not": _invert,
-    "abs": _absolute,
+    "abs": lambda op, dtype, x: (
+        abs(x) if dtype.kind == "f" else _extreme(Op("max"), dtype, x, 0 - x)
+    ),
     "sign": _sign,
     "is_finite": _is_finite,
     "rsqrt": lambda op, dtype, x: x.like(1).write("fdiv", x.call("sqrt")),
@@ -183,5 +169,7 @@ OPERATIONS: dict[str, Emit] = {
     "clz": _count_zeros,
     "population_count": _unary("ctpop"),
     "convert_element_type": _convert,
-    "bitcast_convert_type": _reinterpret,
+    "bitcast_convert_type": lambda op, dtype, x: (
+        x if scalar_type(dtype) == scalar_type(x.dtype) else x.convert("bitcast", dtype)
+    ),
 }

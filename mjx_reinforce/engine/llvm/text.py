@@ -3,7 +3,7 @@
 import functools
 import struct
 from collections.abc import Callable, Hashable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -139,16 +139,11 @@ class Text:
     def once(self, key: Hashable, write: Callable[[], Written]) -> Written:
         """Returns what was written under a key where it is known to have been, or writes it.
 
-        It is known until the next ``start``, but that what is done ``unless_none`` ends no
-        knowledge.
+        It is known until the next ``start``, but that what is done ``when`` ends no knowledge.
         """
         if key not in self._known:
             self._known[key] = write()
         return self._known[key]
-
-    def unless_none(self, mask: str) -> AbstractContextManager[None]:
-        """Writes what is done only if some lane of a mask is set."""
-        return self.when(self.any(mask))
 
     def phi(self, dtype: DTypeLike, values: dict[str, str]) -> str:
         """Returns at the start of a basic block the value of the block from which it is entered."""

@@ -10,6 +10,7 @@ fewer vectors, with which machine code computes. And it leaves out the degrees o
 contact can couple, such as two legs of Ant, of which each touches the floor alone.
 """
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -126,21 +127,20 @@ def with_bases(division: Blocks, rows: jax.Array, touching: jax.Array) -> Jacobi
             for group in division.groups
         ]
 
+    def of_group(group: Group, edges: jax.Array, touching: jax.Array) -> jax.Array:
+        pyramid = group.pyramid
+        inverse = jnp.asarray(pyramid.T / np.sum(pyramid**2, 0)[:, None], rows.dtype)
+
+        def basis(_: None, one: tuple) -> tuple[None, jax.Array]:
+            edges, touches = one
+            zeros = jnp.zeros((len(inverse), edges.shape[1]), edges.dtype)
+            return None, skippable(touches, lambda: inverse @ edges, zeros)
+
+        return lax.scan(basis, None, (edges, touching))[1]
+
     def by_contact(rows: jax.Array, touching: jax.Array) -> list[jax.Array]:
-        made, first = [], 0
-        for group, edges in zip(division.groups, by_group(division, rows), strict=True):
-            pyramid = group.pyramid
-            inverse = jnp.asarray(pyramid.T / np.sum(pyramid**2, 0)[:, None], rows.dtype)
-
-            def basis(_: None, one: tuple, inverse: jax.Array = inverse) -> tuple[None, jax.Array]:
-                edges, touches = one
-                zeros = jnp.zeros((len(inverse), edges.shape[1]), edges.dtype)
-                return None, skippable(touches, lambda: inverse @ edges, zeros)
-
-            touches = touching[first : first + group.contacts]
-            made.append(lax.scan(basis, None, (edges, touches))[1])
-            first += group.contacts
-        return made
+        parts = by_group(division, rows), _of_groups(division, touching)
+        return [of_group(*each) for each in zip(division.groups, *parts, strict=True)]
 
     bases = by_engine(by_contact, whole, rows, touching, may_unroll=division.may_unroll)
     return Jacobian(rows, bases)
@@ -209,21 +209,19 @@ def along(
         return jacobian.rows @ direction
 
     def by_contact(jacobian: Jacobian, direction: jax.Array, touching: jax.Array) -> jax.Array:
-        parts, first = [jacobian.rows[: division.others] @ direction], 0
-        for group, basis in zip(division.groups, jacobian.bases, strict=True):
+        def of_group(group: Group, basis: jax.Array, touching: jax.Array) -> jax.Array:
             pyramid = jnp.asarray(group.pyramid, direction.dtype)
 
-            def product(
-                _: None, one: tuple, pyramid: jax.Array = pyramid
-            ) -> tuple[None, jax.Array]:
+            def product(_: None, one: tuple) -> tuple[None, jax.Array]:
                 basis, touches = one
                 zeros = jnp.zeros(len(pyramid), pyramid.dtype)
                 return None, skippable(touches, lambda: pyramid @ (basis @ direction), zeros)
 
-            touches = touching[first : first + group.contacts]
-            parts.append(lax.scan(product, None, (basis, touches))[1].reshape(-1))
-            first += group.contacts
-        return jnp.concatenate(parts)
+            return lax.scan(product, None, (basis, touching))[1].reshape(-1)
+
+        others, parts = jacobian.rows[: division.others], _of_groups(division, touching)
+        each = zip(division.groups, jacobian.bases, parts, strict=True)
+        return jnp.concatenate([others @ direction, *(of_group(*one) for one in each)])
 
     operands = jacobian, direction, touching
     return by_engine(by_contact, whole, *operands, may_unroll=division.may_unroll)
@@ -238,6 +236,12 @@ def _plus_product(start: jax.Array, left: jax.Array, right: jax.Array) -> jax.Ar
     terms = jnp.concatenate([start[..., None], left], -1)
     factors = jnp.concatenate([jnp.ones_like(start)[..., None], right], -1)
     return jnp.einsum("...k,...k->...", terms, factors)
+
+
+def _of_groups(division: Blocks, touching: jax.Array) -> list[jax.Array]:
+    """Divides an array [C] into the groups' [contacts]."""
+    ends = np.cumsum([0, *(group.contacts for group in division.groups)])
+    return [touching[first:last] for first, last in itertools.pairwise(ends)]
 
 
 def by_group(division: Blocks, rows: jax.Array) -> list[jax.Array]:

@@ -11,7 +11,7 @@ from jax import lax
 
 from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, observation_size
-from mjx_reinforce.engine.cpu import handler, kernel, machine
+from mjx_reinforce.engine.cpu import handler, kernel, machine, mapping
 from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import kernel as gpu_kernel
 from mjx_reinforce.engine.gpu import lockstep, ptx
@@ -268,8 +268,8 @@ def _write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
     """Writes a function, and all around it, as LLVM IR."""
     num_args = 1 + sum(bool(np.prod(x.shape)) for x in written.in_avals)
     sizes = [np.dtype(x.dtype).itemsize for x in written.out_avals if np.prod(x.shape)]
-    entry = handler.handler_text(num_args, sizes, target.lanes, kernel.POSITIONS, zeroed=False)
-    return entry + handler.flush(target.triple) + kernel.mapping_text(written, target.lanes)
+    entry = handler.handler_text(num_args, sizes, target.lanes, mapping.POSITIONS, zeroed=False)
+    return entry + handler.flush(target.triple) + mapping.mapping_text(written, target.lanes)
 
 
 def name_of(env: Any) -> str:
