@@ -14,7 +14,7 @@ from mujoco import mjx
 from scipy.spatial.transform import Rotation
 
 from mjx_reinforce.engine import scalar
-from mjx_reinforce.engine.physics import contacts, runge_kutta
+from mjx_reinforce.engine.physics import contacts
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import jax_fields
 
@@ -271,7 +271,7 @@ def test_rotation_rate_at_every_angle():
     for double, tolerance in ((False, 1e-6), (True, 1e-14)):
         with jax.enable_x64(double):
             rate = jax.vmap(
-                lambda x: runge_kutta._rotation_rate(x * jnp.array(axis), jnp.array(velocity))
+                lambda x: physics._rotation_rate(x * jnp.array(axis), jnp.array(velocity))
             )
             found = jax.jit(rate)(jnp.array(angles))
         np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance)

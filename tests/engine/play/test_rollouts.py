@@ -12,13 +12,7 @@ from players import only_active
 from toys import Chain, Toy, ToyState, categorical
 
 from mjx_reinforce.engine.play import counter, episode, rollouts
-from mjx_reinforce.engine.play.episode import (
-    CHUNK_STEPS,
-    chunk_length,
-    largest_divisor,
-    play_chunks,
-    while_any,
-)
+from mjx_reinforce.engine.play.episode import CHUNK_STEPS
 
 #: Two entries of an action, noise added; the mode is what the network says.
 PLAIN = types.SimpleNamespace(
@@ -272,14 +266,14 @@ def played(lives, seed=0):
     lives = jnp.asarray(lives)
     keys = jax.random.split(jax.random.key(seed), len(lives))
     begun = Lives(lives, jnp.zeros_like(lives), lives > 0)
-    return play_chunks(record_noise, NOISY, keys, begun, jnp.zeros((HORIZON, len(lives))))
+    return episode.play_chunks(record_noise, NOISY, keys, begun, jnp.zeros((HORIZON, len(lives))))
 
 
 def test_the_largest_divisor_and_a_chunk_divides_the_horizon():
     cases = (1000, 50, 50), (12, 5, 4), (7, 6, 1), (7, 7, 7), (7, 100, 7), (1, 1, 1)
     for number, at_most, expected in cases:
-        assert largest_divisor(number, at_most) == expected
-    assert [chunk_length(horizon) for horizon in (1000, 37, 53, 200)] == [50, 37, 1, 50]
+        assert episode.largest_divisor(number, at_most) == expected
+    assert [episode.chunk_length(horizon) for horizon in (1000, 37, 53, 200)] == [50, 37, 1, 50]
 
 
 @pytest.mark.parametrize(("lives", "chunks"), [([0, 0], 0), ([3, 50], 1), ([1, 51], 2), ([999], 3)])
@@ -307,7 +301,7 @@ def test_vmapped_seeds_play_as_long_as_one_of_them_needs():
 
 def test_a_loop_runs_while_any_seed_needs_it():
     def count(limit):
-        return while_any(lambda n: n < limit, lambda n: n + 1, jnp.zeros((), jnp.int32))
+        return episode.while_any(lambda n: n < limit, lambda n: n + 1, jnp.zeros((), jnp.int32))
 
     assert count(3) == 3
     assert jax.vmap(count)(jnp.array([2, 5, 1])).tolist() == [5, 5, 5]  # the body's own affair

@@ -5,7 +5,6 @@ with loops inside that takes most of the time, and the variables of its jaxpr sa
 stands after ``iterate`` foresees it.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -30,8 +29,7 @@ class Assumption(NamedTuple):
     varying: list[bool]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Plan:
+class _Plan(NamedTuple):
     """What is to be repeated; the fields as in ``iterate``."""
 
     step: Iteration
