@@ -90,7 +90,7 @@ def _declared(name: str, env: object, what: str) -> Any:
         raise BadEnvironmentError(f"{name}.{what} fails: {checks.explain(error)}") from error
 
 
-def _require_count(name: str, value: object) -> None:
+def _require_count(name: str, value: Any) -> None:
     """Raises ValueError for what is no whole number, 1 or more; True is none."""
     whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
     require(whole and int(value) >= 1, f"{name} must be a whole number, 1 or more, got {value!r}")

@@ -28,17 +28,20 @@ _LEAST_ALIGN = 64
 Written = TypeVar("Written")
 
 
-@functools.cache
 def scalar_type(dtype: DTypeLike) -> str:
     """Returns the LLVM type of one value.
 
     Raises:
       TypeError: the dtype has none here.
     """
-    name = np.dtype(dtype).name
-    if name not in _SCALARS:
-        raise TypeError(f"machine code is not written for values of {name}")
-    return _SCALARS[name]
+    return _scalar_type(np.dtype(dtype))
+
+
+@functools.cache
+def _scalar_type(dtype: np.dtype) -> str:
+    if dtype.name not in _SCALARS:
+        raise TypeError(f"machine code is not written for values of {dtype.name}")
+    return _SCALARS[dtype.name]
 
 
 def literal(number: Any) -> str:

@@ -1,7 +1,7 @@
 """Products with the Jacobian of the constraint rows, where few contacts touch.
 
 A contact that does not touch has rows of zeros, and of those that touch not all push. Machine code
-for one episode (``fused``) skips such a contact by a branch. Where XLA computes many episodes at
+for one episode (``scalar``) skips such a contact by a branch. Where XLA computes many episodes at
 once both sides of a branch would be computed, and there these are products of whole matrices.
 
 The rows of a contact with friction are the edges n + t_i and n - t_i of a pyramid (MuJoCo's

@@ -36,7 +36,6 @@ _SMALL = 100_000
 #: What an engine plays with: a rollout, or a function of many environments.
 Made = TypeVar("Made")
 Rollout: TypeAlias = Callable[..., Trajectory]
-MappedFunction: TypeAlias = Callable[..., Any]
 
 
 class ActingPolicy(NamedTuple):
@@ -155,7 +154,7 @@ class MapEngine(NamedTuple):
 
     name: str
     why: str
-    call: MappedFunction
+    call: Callable[..., Any]
 
     def __repr__(self) -> str:
         return f"MapEngine({self.name})"
@@ -182,7 +181,7 @@ def map_function(
 
 def _in_scalars(
     function: Callable[..., Any], *examples: PyTree
-) -> tuple[str, str, MappedFunction] | None:
+) -> tuple[str, str, Callable[..., Any]] | None:
     """Returns a function that is small enough for XLA's kernels on a GPU, written out for them."""
     if (
         available.platform() != "gpu"
@@ -203,7 +202,7 @@ def _in_scalars(
 
 def machine_code(
     env: Environment, function: Callable[..., Any], *examples: PyTree
-) -> MappedFunction | str:
+) -> Callable[..., Any] | str:
     """Returns the function of many environments in machine code, or why that is not possible.
 
     Arguments are those of ``map_function``.

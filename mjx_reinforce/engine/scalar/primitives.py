@@ -1,10 +1,10 @@
 """What a function says to be written out as: ``by_engine``, ``skippable``, ``any_lane``.
 
 ``by_engine`` has one result computed in two ways. The choice is a primitive of our own, which
-carries both programs. XLA compiles ``many`` and never sees ``one``; ``fused`` writes ``one`` out.
+carries both programs. XLA compiles ``many`` and never sees ``one``; ``scalar`` writes ``one`` out.
 No other code chooses between the two.
 
-``skippable`` is a computation that changes nothing where it is not needed. ``fused`` writes it out
+``skippable`` is a computation that changes nothing where it is not needed. ``scalar`` writes it out
 as a branch that is skipped if no lane needs it. Of ``jax.lax.cond`` it also selects each lane's own
 result, which costs an operation for each number; a skippable computation gives the same where a
 lane does not need it.
@@ -30,7 +30,7 @@ _CHOICE.multiple_results = True
 
 
 def by_engine(one: Callable, many: Callable, *args: PyTree, may_unroll: bool = False) -> Any:
-    """Computes ``many`` where XLA compiles it, and ``one`` where ``fused`` writes it out.
+    """Computes ``many`` where XLA compiles it, and ``one`` where ``scalar`` writes it out.
 
     The derivative is that of ``many``, for all engines.
 

@@ -105,11 +105,6 @@ def _bitcast(graph: Graph, eqn: Equation, x: Array) -> Results:
     return _elementwise(graph, eqn, x)
 
 
-def _as(name: str) -> Callable[..., Results]:
-    """Returns the rule of an operation under another name."""
-    return lambda graph, eqn, *xs: [_map_op(graph, Op(name), eqn.outvars[0].aval, xs)]
-
-
 def _clamp(graph: Graph, eqn: Equation, low: Array, x: Array, high: Array) -> Results:
     aval = eqn.outvars[0].aval
     raised = _map_op(graph, Op("max"), aval, (x, low))
