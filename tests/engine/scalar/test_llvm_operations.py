@@ -427,7 +427,7 @@ def test_nothing_is_shared_out_of_a_branch():
     text = Text(8)
     x = text.let(f"load {text.type('float32')}, ptr %in0")
     mask = text.let(f"fcmp ogt {text.type('float32')} {x}, {text.constant(np.float32(0))}")
-    with text.unless_none(mask):
+    with text.when(text.any(mask)):
         write("sin", text, np.float32, x)
     result = write("cos", text, np.float32, x)
     text.line(f"store {text.type('float32')} {result}, ptr %out")
