@@ -14,12 +14,13 @@ from toys import Chain, Toy, ToyState, categorical
 from mjx_reinforce.engine.play import counter, episode, rollouts
 from mjx_reinforce.engine.play.episode import CHUNK_STEPS
 
-#: Two entries of an action, noise added; the mode is what the network says.
-PLAIN = types.SimpleNamespace(
-    noise=lambda key, shape: jax.random.normal(key, (*shape, 2)),
-    sample=lambda outputs, noise: outputs + noise,
-    mode=lambda outputs: outputs,
-)
+
+class Plain:
+    """Two entries of an action, noise added; the mode is what the network says."""
+
+    noise = staticmethod(lambda key, shape: jax.random.normal(key, (*shape, 2)))
+    sample = staticmethod(lambda outputs, noise: outputs + noise)
+    mode = staticmethod(lambda outputs: outputs)
 
 
 class Counter(Toy):
@@ -49,7 +50,7 @@ def act(actor, observation):
     return actor * observation
 
 
-def play(env, key=None, *, num_episodes=4, horizon=6, distribution=PLAIN, act=act, **options):
+def play(env, key=None, *, num_episodes=4, horizon=6, distribution=Plain, act=act, **options):
     options = {"num_episodes": num_episodes, "horizon": horizon} | options
     key = jax.random.key(0) if key is None else key
     roll = jax.jit(functools.partial(rollouts.rollout, env, act, **options), static_argnums=1)
@@ -69,7 +70,7 @@ def by_hand(env, key, num_episodes, horizon, chunk, deterministic=False, limit=N
         for t in range(limit[n]):
             if t % chunk == 0:
                 noise_key, draw_key = jax.random.split(noise_key)
-                noise = PLAIN.noise(draw_key, (chunk,))
+                noise = Plain.noise(draw_key, (chunk,))
             outputs = act(jnp.array([0.1, 2.0]), state.obs)
             chosen = outputs if deterministic[n] else outputs + noise[t % chunk]
             observation[t, n], action[t, n], mask[t, n] = state.obs, chosen, True
@@ -125,7 +126,7 @@ def test_episodes_of_given_keys():
 def test_only_active_episodes_are_played():
     """Seeds side by side, each with a choice of its own."""
     chosen = np.array([[True, False, True, False], [False] * 4, [True] * 4])
-    player = jnp.array([0.1, 2.0]), act, PLAIN
+    player = jnp.array([0.1, 2.0]), act, Plain
     only_active(rollouts.rollout, Counter(length=8), player, chosen, horizon=100)
     none = play(Counter(length=8), active=False)
     assert not any(np.any(x) for x in jax.tree.leaves(none))
@@ -212,7 +213,7 @@ def test_seeds_side_by_side_are_each_its_own():
 
     def roll(key, active):
         return rollouts.rollout(
-            env, act, actor, PLAIN, key, num_episodes=2, horizon=100, active=active
+            env, act, actor, Plain, key, num_episodes=2, horizon=100, active=active
         )
 
     together = jax.vmap(roll)(keys, jnp.array([True, False, True]))
