@@ -201,7 +201,7 @@ def test_what_machine_code_cannot_play():
 
     play = functools.partial(rollout, env, act, 1.0, distribution, KEY, num_episodes=2, horizon=4)
     assert play().mask.shape == (4, 2)
-    with pytest.raises(ValueError, match=r"fft.*test_any_policy.py"):
+    with pytest.raises(ValueError, match=r"fft.*test_engines.py"):
         play(engine="native")
 
 
