@@ -11,5 +11,9 @@ def homes(package: str) -> dict[str, str]:
       package: its ``__file__``; beside it ``__init__.pyi`` has the imports that type checkers read.
     """
     stub = ast.parse(Path(package).with_suffix(".pyi").read_text("utf-8"))
-    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
-    return {alias.name: str(node.module) for node in imports for alias in node.names}
+    return {
+        alias.name: node.module
+        for node in stub.body
+        if isinstance(node, ast.ImportFrom) and node.module
+        for alias in node.names
+    }
