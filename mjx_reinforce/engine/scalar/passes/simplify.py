@@ -11,18 +11,25 @@ A division by a constant becomes a product only where the reciprocal is exact.
 """
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from mjx_reinforce.engine.scalar import jaxprs
 from mjx_reinforce.engine.scalar.nodes import FACTS, Node, Op, Scalar, is_constant, same
 
-if TYPE_CHECKING:
-    from mjx_reinforce.engine.scalar.graph import Graph
-
 # Greater powers are not faster as products than as ``pow``.
 _LARGEST_POWER = 8
+
+
+class Builder(Protocol):
+    """What is asked of the graph here: to make a simpler scalar."""
+
+    def call(self, name: str, *args: Scalar) -> Scalar:
+        """Applies one of the named operations to scalars."""
+
+    def select(self, predicate: Scalar, on_true: Scalar, on_false: Scalar) -> Scalar:
+        """Returns on_true where the predicate holds, else on_false."""
 
 
 def fold(op: Op, operands: Sequence[Any], dtype: np.dtype) -> Any:
@@ -94,7 +101,7 @@ _EXCEPTIONS: dict[str, Callable[..., Any]] = {
 }
 
 
-def simplify(graph: "Graph", op: Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar | None:
+def simplify(graph: Builder, op: Op, args: tuple[Scalar, ...], dtype: np.dtype) -> Scalar | None:
     """Returns a simpler scalar equal to op(*args), or None; at least one operand is a node."""
     rule = _RULES.get(op.name)
     simpler = rule(graph, *args) if rule else None
@@ -103,7 +110,7 @@ def simplify(graph: "Graph", op: Op, args: tuple[Scalar, ...], dtype: np.dtype) 
     return simpler
 
 
-def power(graph: "Graph", base: Scalar, exponent: int) -> Scalar:
+def power(graph: Builder, base: Scalar, exponent: int) -> Scalar:
     """Returns an integer power by repeated multiplication."""
     one = base.dtype.type(1)
     if exponent < 0:
@@ -135,7 +142,7 @@ def _negated(value: Scalar) -> Scalar | None:
     return operands[0] if operands else None
 
 
-def _add(graph: "Graph", x: Scalar, y: Scalar) -> Scalar | None:
+def _add(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     for left, right in ((x, y), (y, x)):
         if _is(right, 0):
             return left
@@ -144,7 +151,7 @@ def _add(graph: "Graph", x: Scalar, y: Scalar) -> Scalar | None:
     return None
 
 
-def _sub(graph: "Graph", x: Scalar, y: Scalar) -> Scalar | None:
+def _sub(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     if _is(y, 0):
         return x
     if x is y:
@@ -156,7 +163,7 @@ def _sub(graph: "Graph", x: Scalar, y: Scalar) -> Scalar | None:
     return None
 
 
-def _mul(graph: "Graph", x: Scalar, y: Scalar) -> Scalar | None:
+def _mul(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     for left, right in ((x, y), (y, x)):
         if _is(right, 0):
             return right.dtype.type(0)
@@ -174,7 +181,7 @@ def _mul(graph: "Graph", x: Scalar, y: Scalar) -> Scalar | None:
     return None
 
 
-def _mask(graph: "Graph", mask: Scalar, value: Scalar) -> Scalar | None:
+def _mask(graph: Builder, mask: Scalar, value: Scalar) -> Scalar | None:
     """Turns a product with a bool's 1 or 0 into a selection."""
     operands = _args(mask, "select_n")
     if operands and not is_constant(value):
@@ -187,7 +194,7 @@ def _mask(graph: "Graph", mask: Scalar, value: Scalar) -> Scalar | None:
     return None
 
 
-def _div(graph: "Graph", x: Scalar, y: Scalar) -> Scalar | None:
+def _div(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     if _is(x, 0) and np.issubdtype(x.dtype, np.floating):  # an integer 0 / 0 is -1
         return x
     if is_constant(y) and np.issubdtype(y.dtype, np.floating):
@@ -197,20 +204,20 @@ def _div(graph: "Graph", x: Scalar, y: Scalar) -> Scalar | None:
     return x if _is(y, 1) else None
 
 
-def _pow(graph: "Graph", x: Scalar, y: Scalar) -> Scalar | None:
+def _pow(graph: Builder, x: Scalar, y: Scalar) -> Scalar | None:
     if is_constant(y) and float(y).is_integer() and abs(y) <= _LARGEST_POWER:
         return power(graph, x, int(y))
     return None
 
 
-def _neg(graph: "Graph", x: Scalar) -> Scalar | None:
+def _neg(graph: Builder, x: Scalar) -> Scalar | None:
     if _negated(x) is not None:
         return _negated(x)
     operands = _args(x, "sub")
     return graph.call("sub", operands[1], operands[0]) if operands else None
 
 
-def _abs(graph: "Graph", x: Scalar) -> Scalar | None:
+def _abs(graph: Builder, x: Scalar) -> Scalar | None:
     return graph.call("abs", _negated(x)) if _negated(x) is not None else None
 
 
@@ -230,12 +237,12 @@ def _bitwise(x: Scalar, y: Scalar, absorbing: bool) -> Scalar | None:
     return x if x is y else None
 
 
-def _not(graph: "Graph", x: Scalar) -> Scalar | None:
+def _not(graph: Builder, x: Scalar) -> Scalar | None:
     operands = _args(x, "not")
     return operands[0] if operands else None
 
 
-def _select(graph: "Graph", predicate: Scalar, *cases: Scalar) -> Scalar | None:
+def _select(graph: Builder, predicate: Scalar, *cases: Scalar) -> Scalar | None:
     if len(cases) != 2:
         return cases[int(predicate)] if is_constant(predicate) else None
     on_false, on_true = cases
@@ -254,7 +261,7 @@ def _select(graph: "Graph", predicate: Scalar, *cases: Scalar) -> Scalar | None:
 
 
 def _select_bool(
-    graph: "Graph", predicate: Scalar, on_true: Scalar, on_false: Scalar
+    graph: Builder, predicate: Scalar, on_true: Scalar, on_false: Scalar
 ) -> Scalar | None:
     if _is(on_true, True):
         return predicate if _is(on_false, False) else graph.call("or", predicate, on_false)
@@ -269,7 +276,7 @@ def _select_bool(
 
 
 def _select_again(
-    graph: "Graph", predicate: Scalar, on_true: Scalar, on_false: Scalar
+    graph: Builder, predicate: Scalar, on_true: Scalar, on_false: Scalar
 ) -> Scalar | None:
     """Drops the case of an inner selection that the same predicate rules out."""
     inner = _args(on_true, "select_n")
@@ -282,7 +289,7 @@ def _select_again(
 
 
 def _through_select(
-    graph: "Graph", op: Op, args: tuple[Scalar, ...], dtype: np.dtype
+    graph: Builder, op: Op, args: tuple[Scalar, ...], dtype: np.dtype
 ) -> Scalar | None:
     """Folds an operation whose operands are constants and selections among constants."""
     nodes = [arg for arg in args if isinstance(arg, Node)]
