@@ -150,10 +150,10 @@ def test_a_full_disk_costs_no_training(run, trained, tmp_path, monkeypatch, caps
 
 @pytest.mark.slow
 def test_a_run_that_cannot_end_is_resumed(run, trained, tmp_path, monkeypatch, capsys):
-    def full(path, content):
+    def full(path, content, compressed):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr("mjx_reinforce.runs.observers.write_bytes", full)
+    monkeypatch.setattr("mjx_reinforce.runs.observers.write_arrays", full)
     arguments = ["--max-updates", 20, "--checkpoint-every", 5, "--output", "full"]
     assert run(*COMMON, *arguments) == 1
     assert "then go on with --resume full" in capsys.readouterr().err

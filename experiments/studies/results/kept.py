@@ -188,8 +188,7 @@ def _replace(path: Path, names: Sequence[str], rows: list[dict[str, Any]]) -> No
         for row in rows
     ]
     everything = sorted([*kept, *texts], key=lambda row: (row["task"], row["device"]))
-    lines = [[row.get(name, "") for name in names] for row in everything]
-    write_bytes(path, csv_text([names, *lines]).encode())
+    write_bytes(path, csv_text([names, *(map(row.get, names) for row in everything)]).encode())
 
 
 def _read(path: Path) -> list[dict[str, str]]:
@@ -233,8 +232,7 @@ def played(folder: Path) -> dict[str, Columns]:
 def write_played(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Writes the returns of episodes; the columns are ``policy``, ``seed``, ``simulation``, ..."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    lines = [[row[name] for name in _EPISODE] for row in rows]
-    write_bytes(path, csv_text([_EPISODE, *lines]).encode())
+    write_bytes(path, csv_text([_EPISODE, *(map(row.get, _EPISODE) for row in rows)]).encode())
 
 
 def peers(path: Path) -> dict[tuple[str, str, str], dict[float, list[float]]]:
