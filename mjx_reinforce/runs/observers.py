@@ -23,8 +23,8 @@ from mjx_reinforce.training.record import HEADER, Cells, lines
 #: The files of a run, besides those in ``checkpoint/``.
 _POLICY = ("policy/actor.npz", "policy/policy.json")
 _BEST = ("policy/best/actor.npz", "policy/best/policy.json")
-_RESULTS = ("summary.json", "learning_curve.png", "returns.npz", *_POLICY, *_BEST)
-_FILES = ("config.json", "metrics.csv", *_RESULTS)
+_RESULTS = ("summary.json", "learning_curve.png", "returns.npz")
+_FILES = ("config.json", "metrics.csv", *_RESULTS, *_POLICY, *_BEST)
 
 
 class RunFiles(Observer):
@@ -81,11 +81,7 @@ class RunFiles(Observer):
         self._sinks = open_sinks(config, self._directory, reached)
 
     def _write_first(self, config: Config) -> None:
-        """Writes config.json, and a metrics.csv that has no rows yet; removes an older run."""
-        for name in _RESULTS:
-            (self._directory / name).unlink(missing_ok=True)
-        checkpoint.remove_checkpoints(self._checkpoints)
-        sinks.remove_outputs(self._directory)
+        """Writes config.json, and a metrics.csv that has no rows yet."""
         settings = dataclasses.asdict(config) | {"output": str(self._directory)}
         del settings["resume"]
         self._write_json("config.json", settings | provenance())

@@ -77,12 +77,6 @@ def open_sinks(config: Config, directory: Path, updates: int | None) -> list[Sin
     return sinks
 
 
-def remove_outputs(directory: Path) -> None:
-    """Removes what the sinks of an older run left; W&B keeps its runs apart itself."""
-    for path in (directory / WANDB_RUN, *(directory / TENSORBOARD).glob(EVENTS)):
-        path.unlink(missing_ok=True)
-
-
 #: Seeds that are shown one by one, the first ones: each is a curve for every column.
 MAX_SINGLE_SEEDS = 16
 #: Columns that say when an evaluation was; what is shown is their mean.

@@ -90,7 +90,7 @@ def _perform(
     if known:
         _check_same_sweep(directory, known, contents)
     configurations, threshold = prepared.configurations, contents["threshold"]
-    files = SweepFiles(directory, configurations, threshold, going_on=bool(known))
+    files = SweepFiles(directory, configurations, threshold)
     with Display(quiet=quiet) as display:
         interrupt.restore_screen(display.console.show_cursor)
         display.say(prepared.plan)

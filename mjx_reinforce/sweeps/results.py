@@ -35,8 +35,6 @@ class SweepFiles:
         directory: Path,
         configurations: Sequence[Mapping[str, Any]],
         threshold: float | None,
-        *,
-        going_on: bool,
     ):
         """Takes what the rows of results.csv are made of.
 
@@ -44,9 +42,7 @@ class SweepFiles:
           directory: where.
           configurations: the values of what is swept, in each.
           threshold: the return that counts as solved, if any.
-          going_on: whether what is in the directory is of this sweep.
         """
-        self._going_on = going_on
         self.directory, self.parts = directory, directory / "parts"
         self._configurations = [[*map(_spelled, x.values())] for x in configurations]
         self._threshold = threshold
@@ -60,18 +56,8 @@ class SweepFiles:
         Args:
           contents: of sweep.json.
         """
-        if not self._going_on:
-            self._remove_older()
         self.write(contents)
         self._take_back()
-
-    def _remove_older(self) -> None:
-        """Removes an older sweep in the directory, all but its report, which is replaced."""
-        for path in [*self.parts.glob("*.npz"), *self.parts.glob("*/*.npz")]:
-            path.unlink()
-        shutil.rmtree(self.directory / "policies", ignore_errors=True)
-        for name in _RESULT_FILES[1:]:
-            (self.directory / name).unlink(missing_ok=True)
 
     def _take_back(self) -> None:
         """Takes results.csv back to the parts that are there, and removes what a crash left."""
@@ -88,7 +74,7 @@ class SweepFiles:
 
     def has(self, chunk: str) -> bool:
         """Returns whether a chunk has ended."""
-        return self._going_on and self._path(chunk).exists()
+        return self._path(chunk).exists()
 
     def checkpoints(self, chunk: str) -> Path:
         """Returns the folder of a chunk's checkpoints."""

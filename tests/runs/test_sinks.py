@@ -257,5 +257,3 @@ def test_a_run_with_a_sink_and_its_resumption(run, tmp_path):
     last = [row for row in table if row["update"] == 15]
     for name in ("eval_return", "kl", "policy_std", "gradient_snr", "explained_variance"):
         assert shown[15][f"{name}/seed_1"] == pytest.approx(last[1][name], rel=1e-6)
-    begin(out, Config())
-    assert not list((out / "tensorboard").iterdir())
