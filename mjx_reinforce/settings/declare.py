@@ -77,8 +77,6 @@ class Mark(enum.Enum):
     """What else a setting may be."""
 
     TRACED = "a sweep may hand it to a program as an argument"
-    LOG = "a search draws it evenly in its logarithm"
-    LOG_OF_REST = "a search draws it evenly in the logarithm of 1 - x"
     BUDGET = "it may change when a run goes on"
     PLACE = "it says where a run is, not what it does"
     NOT_COMPILED = "no program on disk depends on it: it is an input, or of no concern"

@@ -152,19 +152,17 @@ class PolicySettings:
     hidden_sizes: tuple[int, ...] = setting((32, 32), *LAYERS)
     """Units of each tanh layer of the policy network. The flag without a number makes the policy
     linear."""
-    initial_std: float = setting(0.5, *POSITIVE, Reader.STD, Mark.TRACED, Mark.LOG)
+    initial_std: float = setting(0.5, *POSITIVE, Reader.STD, Mark.TRACED)
     """Standard deviation of the actions before training, in the action's unit."""
     final_std: float | None = _for_reinforce(
-        None, *POSITIVE, Reader.DECAY, Reader.FREE_STD, Mark.TRACED, Mark.LOG
+        None, *POSITIVE, Reader.DECAY, Reader.FREE_STD, Mark.TRACED
     )
     """Target of the standard deviation of the actions, reached over --decay-steps besides what
     is learned. With --max-kl it may stay above. None: learned only."""
     normalize_steps: int | None = setting(1000, Range.AT_LEAST_0, Range.INT32)
     """Scale observations by their mean and standard deviation over about this many first steps. 0:
     do not scale. None: update the statistics throughout training."""
-    normalize_min_std: float = setting(
-        0.0, *NOT_NEGATIVE, Reader.NORMALIZATION, Mark.TRACED, Mark.LOG
-    )
+    normalize_min_std: float = setting(0.0, *NOT_NEGATIVE, Reader.NORMALIZATION, Mark.TRACED)
     """Lower bound on the std that scales observations, in the observation's unit: an entry that
     barely varies in the first steps would be magnified."""
 
@@ -179,14 +177,12 @@ class EstimatorSettings:
     (minus the mean of those that still run, which may be less noisy); value-baseline (minus a
     learned value). mean-log-prob and normalized-returns are published variants; their docstrings
     explain them. Or module:name."""
-    discount: float = _for_gradients(0.99, Range.SHARE, Mark.TRACED, Mark.LOG_OF_REST)
+    discount: float = _for_gradients(0.99, Range.SHARE, Mark.TRACED)
     """Discount of rewards, in [0, 1]."""
-    standardize_floor: float | None = _for_reinforce(10.0, *NOT_NEGATIVE, Mark.TRACED, Mark.LOG)
+    standardize_floor: float | None = _for_reinforce(10.0, *NOT_NEGATIVE, Mark.TRACED)
     """The weights are divided by their standard deviation plus this number, in units of return.
     None: they are not divided."""
-    value_learning_rate: float = _for_gradients(
-        3e-3, *RATE, Reader.VALUE_BASELINE, Mark.TRACED, Mark.LOG
-    )
+    value_learning_rate: float = _for_gradients(3e-3, *RATE, Reader.VALUE_BASELINE, Mark.TRACED)
     """Adam's learning rate for the value network of value-baseline."""
     value_fits: int = _for_reinforce(32, *STEPS, Reader.VALUE_BASELINE)
     """Gradient steps of the value network in each update, on the squared error."""
@@ -207,23 +203,19 @@ class UpdateSettings:
     """Weight of the policy's entropy in the objective."""
     optimizer: Literal["adam", "sgd"] = _for_reinforce("adam", Reader.OPTIMIZER)
     """The rule that turns a gradient into a step."""
-    learning_rate: float = _for_gradients(1e-2, *RATE, Reader.FIRST_RATE, Mark.TRACED, Mark.LOG)
+    learning_rate: float = _for_gradients(1e-2, *RATE, Reader.FIRST_RATE, Mark.TRACED)
     """Learning rate of the optimizer at the start of training."""
     momentum: float = _for_reinforce(0.9, Range.BELOW_1, Reader.OPTIMIZER, Reader.ADAM, Mark.TRACED)
     """b1 of adam: the share of the last mean gradient that the next one keeps."""
-    final_learning_rate: float | None = _for_reinforce(
-        None, *RATE, Reader.DECAY, Mark.TRACED, Mark.LOG
-    )
+    final_learning_rate: float | None = _for_reinforce(None, *RATE, Reader.DECAY, Mark.TRACED)
     """Learning rate after the linear decay. If not given, a tenth of --learning-rate."""
     decay_steps: int | Literal["budget"] | None = _for_reinforce("budget", *TOTAL, Mark.TRACED)
     """Env steps of a seed over which the learning rate decays, and with --final-std also the
     noise. budget: the length of the run. None: no decay."""
-    max_grad_norm: float | None = _for_reinforce(
-        1.0, *POSITIVE, Reader.OPTIMIZER, Mark.TRACED, Mark.LOG
-    )
+    max_grad_norm: float | None = _for_reinforce(1.0, *POSITIVE, Reader.OPTIMIZER, Mark.TRACED)
     """Maximum Euclidean norm of the gradient; a longer gradient is scaled down. None: no
     maximum."""
-    max_kl: float | None = _for_reinforce(None, *POSITIVE, Mark.TRACED, Mark.LOG)
+    max_kl: float | None = _for_reinforce(None, *POSITIVE, Mark.TRACED)
     """Approximate maximum of the mean KL divergence, in nats, between the policies before and
     after an update, over the visited steps. A larger change is shortened. None: no maximum."""
 

@@ -27,7 +27,7 @@ _ABOUT_SWEEPS = (
 
 #: What --help alone shows.
 _MAIN = (
-    *("over", "search", "budget", "chunk_runs", "exact"),
+    *("over", "chunk_runs", "exact"),
     *("env", "env_steps", "num_seeds", "output", "resume"),
 )
 

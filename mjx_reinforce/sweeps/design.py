@@ -1,4 +1,4 @@
-"""What a sweep is to do: the settings of all runs, and what it goes over: a grid, or draws."""
+"""What a sweep is to do: the settings of all runs, and the grid of values that it goes over."""
 
 import contextlib
 import dataclasses
@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
 import tyro
 
 from mjx_reinforce.console.commands import command
@@ -21,10 +20,8 @@ from mjx_reinforce.settings.config import (
     check_each,
     check_read,
     flag,
-    marked,
     spoken,
 )
-from mjx_reinforce.settings.declare import Mark
 from mjx_reinforce.settings.groups import LogSettings
 from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.training.resume import PLACES, as_config, read_record
@@ -40,11 +37,6 @@ class SweepSettings:
     over: tyro.conf.UseAppendAction[tuple[tuple[str, ...], ...]] = ()
     """A setting and its values, such as `learning-rate 1e-3 3e-3`; again for further settings: all
     combinations are trained. Layers are written 32,32 (none: no layer)."""
-    search: Literal["grid", "random"] = "grid"
-    """grid: all combinations of the values. random: --budget of them, drawn: two numbers are the
-    ends of a range; names, and three values or more, are choices."""
-    budget: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
-    """How many configurations random draws."""
     chunk_runs: Annotated[int | None, tyro.conf.arg(metavar="N")] = None
     """Runs that are under way at once at most; as many as memory holds if not given."""
     exact: bool = False
@@ -58,8 +50,6 @@ class Design:
 
     base: the settings of all runs but those that are swept, and where its directory is
     over: the values of each setting that is swept
-    search: "grid" or "random"
-    budget: how many configurations are drawn, None for a grid
     given: other settings that the user chose; at least one configuration must read each
     exact: see ``SweepSettings``
     chunk_runs: see ``SweepSettings``
@@ -68,8 +58,6 @@ class Design:
 
     base: Config
     over: Mapping[str, Sequence[Any]]
-    search: str = "grid"
-    budget: int | None = None
     given: Sequence[str] = ()
     exact: bool = False
     chunk_runs: int | None = None
@@ -77,13 +65,11 @@ class Design:
 
     def count(self) -> int:
         """Returns how many configurations it has."""
-        return self.budget or math.prod(map(len, self.over.values()))
+        return math.prod(map(len, self.over.values()))
 
     def configurations(self) -> list[dict[str, Any]]:
         """Returns the values of what is swept, in each configuration."""
-        if self.budget is None:
-            return grid(self.over)
-        return draw_configurations(self.over, self.budget, self.base.seed)
+        return grid(self.over)
 
 
 def as_record(design: Design) -> dict[str, Any]:
@@ -92,8 +78,7 @@ def as_record(design: Design) -> dict[str, Any]:
     for name in PLACES:
         del settings[name]
     over = {name: list(values) for name, values in design.over.items()}
-    names = ("exact", "search", "budget")
-    return {"settings": settings, "over": over, **{name: getattr(design, name) for name in names}}
+    return {"settings": settings, "over": over, "exact": design.exact}
 
 
 def read_design(directory: Path) -> Design:
@@ -108,9 +93,8 @@ def read_design(directory: Path) -> Design:
             name: [tuple(x) if isinstance(x, list) else x for x in values]
             for name, values in record["over"].items()
         }
-        names = ("exact", "search", "budget")
-        chosen = {name: record[name] for name in names}
-        return Design(base=as_config(record["settings"], path), over=over, **chosen)
+        base = as_config(record["settings"], path)
+        return Design(base=base, over=over, exact=record["exact"])
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} is damaged: {error!r}") from error
 
@@ -124,7 +108,6 @@ def check_design(design: Design) -> None:
     if design.chunk_runs is not None and design.chunk_runs < 1:
         raise ValueError(f"--chunk-runs must be at least 1, got {design.chunk_runs}")
     check_over(design.base, design.over)
-    _check_search(design)
     _check_results(design)
     configs = configure(design.base, design.configurations(), design.given)
     for config in configs:
@@ -138,97 +121,8 @@ def _check_results(design: Design) -> None:
         raise ValueError(
             f"the results of {runs:,} runs do not fit into memory: they need about "
             f"{gigabytes(runs * _RESULT)}, {gigabytes(host_memory())} are here; lower --num-seeds "
-            f"or {'--budget' if design.budget else 'the number of values after --over'}"
+            "or the number of values after --over"
         )
-
-
-def _check_search(design: Design) -> None:
-    """Raises ValueError where the search and its budget do not go together."""
-    if design.search == "grid":
-        if design.budget is not None:
-            raise ValueError("--budget is of --search random: leave it out, or add that")
-    elif design.search != "random":
-        raise ValueError(f"--search must be grid or random, got {design.search!r}")
-    elif design.budget is None:
-        raise ValueError("--search random needs --budget, the number of configurations")
-    elif design.budget < 2:
-        raise ValueError(f"--budget must be at least 2, got {design.budget}")
-
-
-#: Digits that are kept of what is drawn.
-_DIGITS = 4
-#: So many times as many draws as configurations are made to find different ones.
-_DRAWS_EACH = 100
-
-
-def draw_configurations(
-    over: Mapping[str, Sequence[Any]], count: int, seed: int
-) -> list[dict[str, Any]]:
-    """Returns different configurations, drawn at random.
-
-    Two numbers are the ends of a range: of rates, standard deviations, floors and norms evenly in
-    the logarithm, of the discount evenly in that of 1 - x, of others evenly. Other values, and
-    three or more, are choices.
-
-    Args:
-      over: the values of each setting.
-      count: how many configurations.
-      seed: of the draws.
-
-    Raises:
-      ValueError: a range has no logarithm, or there are too few configurations.
-    """
-    generator = np.random.default_rng(seed)
-    for name, values in over.items():
-        _check_range(name, values)
-    drawn: dict[tuple[Any, ...], None] = {}
-    for _ in range(_DRAWS_EACH * count):
-        values = [_draw(name, values, generator) for name, values in over.items()]
-        drawn.setdefault(tuple(values))
-        if len(drawn) == count:
-            return [dict(zip(over, values, strict=True)) for values in drawn]
-    raise ValueError(
-        f"only {len(drawn)} different configurations were found for --budget {count}: lower it, "
-        "or use --search grid"
-    )
-
-
-def is_range(values: Sequence[Any]) -> bool:
-    """Returns whether values are the ends of a range."""
-    numbers = all(isinstance(x, int | float) and not isinstance(x, bool) for x in values)
-    return len(values) == 2 and numbers
-
-
-def _check_range(name: str, values: Sequence[Any]) -> None:
-    if not is_range(values):
-        return
-    if values[0] > values[1]:
-        raise ValueError(f"--over {spoken(name)} {values[0]} {values[1]}: give the lower end first")
-    if name in marked(Mark.LOG_OF_REST) and values[1] >= 1:
-        raise ValueError(
-            f"--over {spoken(name)}: a range ends below 1, got {values[1]}; try 0.9999"
-        )
-    if name in marked(Mark.LOG) and values[0] <= 0:
-        raise ValueError(f"--over {spoken(name)}: a range begins above 0, got {values[0]}")
-
-
-def _draw(name: str, values: Sequence[Any], generator: np.random.Generator) -> Any:
-    """Returns one value."""
-    if not is_range(values):
-        return values[int(generator.integers(len(values)))]
-    low, high = values
-    if isinstance(low, int) and isinstance(high, int):
-        return int(generator.integers(low, high + 1))
-    if name in marked(Mark.LOG_OF_REST):
-        rest = math.exp(generator.uniform(math.log(1 - high), math.log(1 - low)))
-        return round(1 - _round_digits(rest), 12)
-    if name in marked(Mark.LOG):
-        return _round_digits(math.exp(generator.uniform(math.log(low), math.log(high))))
-    return _round_digits(generator.uniform(low, high))
-
-
-def _round_digits(x: float) -> float:
-    return float(f"{x:.{_DIGITS}g}")
 
 
 _FIELDS = {field.name: field for field in dataclasses.fields(Config)}
@@ -359,7 +253,7 @@ def _not_read(config: Config, name: str) -> ValueError | None:
 def _value(name: str, word: str) -> Any:
     """Returns a word of the command line as a value of a setting's type.
 
-    The environment reads its own settings; a range needs numbers.
+    The environment reads its own settings.
     """
     kind = (int | float | str) if _of_env(name) else _FIELDS[name].type
     with contextlib.suppress(ValueError):

@@ -48,7 +48,6 @@ def make_sweep(directory, *, num_seeds=12, evaluations=20, over=GRID, **changes)
         "threshold": THRESHOLD,
         "settings": {"env": "InvertedPendulum-v5", "num_seeds": num_seeds, "seed": 0},
         "over": over,
-        "search": "grid",
         "num_seeds": num_seeds,
         "configurations": numbered,
         "compile_seconds": 21.4,

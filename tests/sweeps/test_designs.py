@@ -1,4 +1,4 @@
-"""The design of a sweep: its grid, its draws, its groups in chunks."""
+"""The design of a sweep: its grid, its groups in chunks."""
 
 import dataclasses
 
@@ -53,30 +53,6 @@ def test_words_become_values_of_the_type_of_their_setting():
 def test_words_that_are_no_values_are_refused(given, said):
     with pytest.raises(ValueError, match=said):
         design.read_over(given)
-
-
-# The search.
-
-
-@pytest.mark.parametrize(
-    ("over", "said"),
-    [
-        ({"learning_rate": [0.1, 0.01]}, "give the lower end first"),
-        ({"discount": [0.9, 1.0]}, "ends below 1"),
-        ({"learning_rate": [0.0, 1.0]}, "begins above 0"),
-    ],
-)
-def test_a_range_without_a_scale_is_refused(over, said):
-    with pytest.raises(ValueError, match=said):
-        design.draw_configurations(over, 2, seed=0)
-
-
-@pytest.mark.parametrize(
-    ("values", "answer"),
-    [([1, 2], True), ([1, 2, 3], False), ([True, False], False), (["a", "b"], False)],
-)
-def test_two_numbers_are_a_range(values, answer):
-    assert design.is_range(values) == answer
 
 
 # The plan and its chunks.
