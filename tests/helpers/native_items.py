@@ -1,4 +1,4 @@
-"""A player that plays nothing: each item says which it is. For tests of the way to it."""
+"""A kernel that plays nothing: each item says which it is. For tests of the way to it."""
 
 import ctypes
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +23,7 @@ entry:
   %horizon = load i64, ptr %horizon.at
   %data.at = getelementptr %Job, ptr %job, i32 0, i32 DATA
   %data = load ptr, ptr %data.at
-  %plays = load ptr, ptr %data
+  %limits = load ptr, ptr %data
   %expected.at = getelementptr ptr, ptr %data, i64 3
   %expected.data = load ptr, ptr %expected.at
   %expected = load i32, ptr %expected.data
@@ -40,8 +40,8 @@ fetch:
   %some = icmp ult i64 %k, %total
   br i1 %some, label %look, label %done
 look:
-  %play.at = getelementptr i32, ptr %plays, i64 %k
-  %flag = load i32, ptr %play.at
+  %limit.at = getelementptr i32, ptr %limits, i64 %k
+  %flag = load i32, ptr %limit.at
   %skipped = icmp eq i32 %flag, 0
   br i1 %skipped, label %fetch, label %wait
 wait:
@@ -79,7 +79,7 @@ done:
 
 
 def text(lanes=1):
-    """A module whose player says item + 1 as its length and, in its last step, as its reward.
+    """A module whose kernel says item + 1 as its length and, in its last step, as its reward.
 
     The steps simulated for the first seed are the threads that took part. An item waits until there
     are as many as argument 3 says, or for some time.
@@ -108,8 +108,8 @@ def play(code, active, threads=0, expected=0):
     """Calls the code for seeds [*B], of which some are active."""
     active = jnp.asarray(active, jnp.int32)
     same = lambda value: jnp.full_like(active, value)  # noqa: E731
-    plays = jnp.repeat(active[..., None], N, -1)
-    args = (plays, same(threads), jnp.zeros((*plays.shape, 2), jnp.uint32), same(expected))
+    limits = jnp.repeat(active[..., None], N, -1)
+    args = (limits, same(threads), jnp.zeros((*limits.shape, 2), jnp.uint32), same(expected))
     return seam.call(code, shapes(active.shape), *args)
 
 

@@ -74,8 +74,8 @@ def rollout_of(
     actor = Actor(params=network.init(jax.random.key(0)), normalizer=normalize.init(size))
     play_act = functools.partial(act, network)
     began = time.perf_counter()
-    player = ActingPolicy(play_act, actor, network.distribution)
-    engine = choose(engine_name, env, player, steps)
+    policy = ActingPolicy(play_act, actor, network.distribution)
+    engine = choose(engine_name, env, policy, steps)
     choosing = time.perf_counter() - began  # machine code is made here
 
     def of(batch: int) -> Candidate:

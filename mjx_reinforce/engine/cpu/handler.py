@@ -1,6 +1,6 @@
-"""The way from XLA to the player, in LLVM IR: a handler of XLA's FFI, and the threads of a job.
+"""The way from XLA to the kernel, in LLVM IR: a handler of XLA's FFI, and the threads of a job.
 
-The player defines ``@work(ptr %job)``. All threads of a job call it once; it fetches items by
+The kernel defines ``@work(ptr %job)``. All threads of a job call it once; it fetches items by
 adding 1 to ``next``, atomically, until that is ``total`` or more. Item k is episode
 k % ``episodes`` of seed k / ``episodes``. All results are zero when it starts, unless it writes
 each entry itself; arrays are aligned to 16 bytes.
@@ -34,7 +34,7 @@ FIELDS = (
 )
 _POINTERS = ("data", "bytes")
 #: The arguments and results that mean something here.
-PLAYS, THREADS, KEYS = range(3)
+LIMITS, THREADS, KEYS = range(3)
 REWARD, SIMULATED = 2, 5
 
 
@@ -85,8 +85,8 @@ def handler_text(
     ``@share``, and ends it by ``@close`` when these have returned.
 
     Args:
-      num_args: the number of arguments: plays [*B, N] int32 (of ``native.plays``), threads [*B]
-      int32 (at most so many, 0 for all), keys [*B, N, 2] uint32, and the player's.
+      num_args: the number of arguments: limits [*B, N] int32 (of ``episode.signed_limits``),
+      threads [*B] int32 (at most so many, 0 for all), keys [*B, N, 2] uint32, and the kernel's.
       result_bytes: the bytes of an element of each result: observation [*B, T, N, O],
       action [*B, T, N, A], reward [*B, T, N], length [*B, N], broken [*B, N],
       simulated [*B] int32.

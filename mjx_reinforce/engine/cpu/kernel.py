@@ -132,7 +132,7 @@ def queue_text(places: VectorLayout, lanes: int) -> str:
         "broken_at": _lane("%broken.at", places.broken),
         "counted_at": _lane("%counted.at", places.counted),
         "deterministic_at": _lane("%mode.lane", places.deterministic),
-        "plays_arg": str(handler.PLAYS),
+        "limits_arg": str(handler.LIMITS),
         "not_played": str(NOT_PLAYED),
         "length_data": str(first_result + _LENGTH),
         "broken_data": str(first_result + _BROKEN),
@@ -178,7 +178,7 @@ def _copy(name: str, field: Field, buffer: int, row: str) -> str:
 _INT, _LONG = np.dtype(np.int32), np.dtype(np.int64)
 
 
-def player_text(step: scalarized.Scalarized, num_actor: int, lanes: int) -> str:
+def kernel_text(step: scalarized.Scalarized, num_actor: int, lanes: int) -> str:
     """Returns the LLVM IR of ``@work(job)``.
 
     Args:

@@ -49,8 +49,8 @@ entry:
   %total = load i64, ptr %total.at
   %data.at = getelementptr inbounds %Job, ptr %job, $data
   %data = load ptr, ptr %data.at
-  %plays.at = getelementptr inbounds ptr, ptr %data, i64 $plays_arg
-  %plays = load ptr, ptr %plays.at
+  %limits.at = getelementptr inbounds ptr, ptr %data, i64 $limits_arg
+  %limits = load ptr, ptr %limits.at
   ${alive_at}
   ${seed_at}
   %old = load i64, ptr %seed.at
@@ -60,9 +60,9 @@ fetch:
   %some = icmp ult i64 %number, %total
   br i1 %some, label %look, label %none
 look:
-  %play.at = getelementptr inbounds i32, ptr %plays, i64 %number
-  %play = load i32, ptr %play.at
-  %skipped = icmp eq i32 %play, $not_played
+  %signed.at = getelementptr inbounds i32, ptr %limits, i64 %number
+  %signed = load i32, ptr %signed.at
+  %skipped = icmp eq i32 %signed, $not_played
   br i1 %skipped, label %fetch, label %fill
 none:
   store i32 0, ptr %alive.at
@@ -73,7 +73,7 @@ none:
 fill:
   ; A lane without an episode has the values of one, so that it computes nothing unheard of.
   %item = phi i64 [%number, %look], [0, %none]
-  %kind = phi i32 [%play, %look], [$not_played, %none]
+  %kind = phi i32 [%signed, %look], [$not_played, %none]
   %runs = icmp ne i32 %kind, $not_played
   %alive = zext i1 %runs to i32
   store i32 %alive, ptr %alive.at

@@ -22,7 +22,7 @@ _INT = np.dtype(np.int32)
 #: The kernel's name. Its attributes are #0.
 ENTRY = "play"
 #: What a kernel reads before the actor and the state, by name; see ``kernel_text``.
-CONTROLS = ("sizes", "plays", "keys")
+CONTROLS = ("sizes", "limits", "keys")
 #: What it writes.
 RESULTS = ("observation", "action", "reward", "length", "broken", "simulated", "next")
 #: The arguments of a step behind the actor and the state: keys, t, deterministic.
@@ -57,10 +57,10 @@ class _Leaf(NamedTuple):
 def kernel_text(step: scalarized.Scalarized, num_actor: int) -> str:
     """Returns the LLVM IR of ``@play``, without a target.
 
-    Its arguments are pointers to: sizes [3] int32 (seeds S, episodes N, steps T), plays [S, N]
-    int32 (of ``native.plays``), keys [S, N, 2] uint32, the leaves of the actor [S, ...] and of the
-    state [S, N, ...] that are not empty; as many again as there are results, which it does not
-    read; and the results, which are zero when it starts: observation [S, T, O, N], action
+    Its arguments are pointers to: sizes [3] int32 (seeds S, episodes N, steps T), limits [S, N]
+    int32 (of ``episode.signed_limits``), keys [S, N, 2] uint32, the leaves of the actor [S, ...]
+    and of the state [S, N, ...] that are not empty; as many again as there are results, which it
+    does not read; and the results, which are zero when it starts: observation [S, T, O, N], action
     [S, T, A, N], reward [S, T, N], length [S, N] int32, broken [S, N] int32, simulated [S] int32
     and next [1] int32, the item to be fetched next; and, if there are long arrays, the buffer of
     ``ScratchText``. Item k is episode k % N of seed k / N. A thread counts the steps that
@@ -149,13 +149,13 @@ class _Kernel:
         text.store("0", self.asks, _INT)
         text.line(f"br label %{end}")
         text.start(look)
-        plays = text.load(text.at("%plays", _INT, self._wide(item)), _INT)
-        is_played = text.let(f"icmp ne i32 {plays}, {NOT_PLAYED}")
+        signed = text.load(text.at("%limits", _INT, self._wide(item)), _INT)
+        is_played = text.let(f"icmp ne i32 {signed}, {NOT_PLAYED}")
         text.line(f"br i1 {is_played}, label %{fill}, label %{head}")
         text.start(fill)
-        is_mode = text.let(f"icmp slt i32 {plays}, 0")
-        negated = text.let(f"sub i32 0, {plays}")
-        limit = text.let(f"select i1 {is_mode}, i32 {negated}, i32 {plays}")
+        is_mode = text.let(f"icmp slt i32 {signed}, 0")
+        negated = text.let(f"sub i32 0, {signed}")
+        limit = text.let(f"select i1 {is_mode}, i32 {negated}, i32 {signed}")
         self._begin(item, text.let(f"zext i1 {is_mode} to i32"), limit, "1")
         text.line(f"br label %{end}")
         text.start(end)

@@ -117,7 +117,8 @@ def launch(
       kernel: of ``kernel.kernel_text``.
       record: shape and dtype of the observation, the action and the reward of a step.
       horizon: T, the steps of an episode at most.
-      args: plays [N], keys [N, 2], and the leaves of the actor [...] and of the state [N, ...].
+      args: signed limits [N], keys [N, 2], and the leaves of the actor [...] and of the state
+        [N, ...].
 
     Returns:
       What the kernel does, without the seeds' axis.

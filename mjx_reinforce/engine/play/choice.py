@@ -73,15 +73,15 @@ ENGINES = ("auto", "vmap", "native")
 
 
 def choose(
-    name: str, env: Environment, player: ActingPolicy | None = None, horizon: int | None = None
+    name: str, env: Environment, policy: ActingPolicy | None = None, horizon: int | None = None
 ) -> Engine:
     """Returns an engine by name; "auto" is the fastest that supports the environment.
 
     Args:
       name: one of ``ENGINES``.
       env: what is played.
-      player: who plays it; None where every episode has parameters of its own, which
-      machine code cannot hold.
+      policy: who plays it; None where every episode has parameters of its own, which
+        machine code cannot hold.
       horizon: T, the time limit in steps, for machine code.
 
     Raises:
@@ -90,10 +90,10 @@ def choose(
     began = time.perf_counter()
 
     def in_machine_code() -> Rollout | str:
-        if player is None or horizon is None:
+        if policy is None or horizon is None:
             return "every episode has a policy of its own"
         play = _from_any_key if name == "auto" else native.rollout
-        return native.unsupported(env, *player, horizon) or play
+        return native.unsupported(env, *policy, horizon) or play
 
     return Engine(*pick(name, in_machine_code, rollouts.rollout), time.perf_counter() - began)
 
@@ -283,14 +283,14 @@ def rollout(
     check_count("horizon", horizon)
     check_policy(act, actor, distribution, jax.eval_shape(env.reset, jax.random.key(0)).obs)
     policy = ActingPolicy(act, actor, distribution)
-    play = _player(engine, env, policy, horizon)
+    play = _rollout_of(engine, env, policy, horizon)
     options: dict[str, Any] = {"deterministic": deterministic, "active": active}
     given = env, _of_any_batch(act), actor, distribution, key
     return play(*given, num_episodes=num_episodes, horizon=horizon, **options)
 
 
-def _player(engine: str, env: Environment, policy: ActingPolicy, horizon: int) -> Rollout:
-    """Returns what plays."""
+def _rollout_of(engine: str, env: Environment, policy: ActingPolicy, horizon: int) -> Rollout:
+    """Returns the rollout of an engine."""
     large = sum(np.size(x) for x in jax.tree.leaves(policy.actor)) > _MOST_PARAMETERS
     if engine == "auto" and large and available.platform() == "cpu":
         examples = jax.eval_shape(env.reset, jax.random.key(0)), base.null_action(env)

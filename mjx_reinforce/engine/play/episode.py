@@ -21,7 +21,7 @@ from mjx_reinforce.engine.scalar import any_lane
 LoopState = TypeVar("LoopState")
 #: Noise is drawn for so many steps at once, and only then is it seen whether all episodes are over.
 CHUNK_STEPS = 50
-#: What machine code is told of an episode that is not played; see ``plays``.
+#: What machine code is told of an episode that is not played; see ``signed_limits``.
 NOT_PLAYED = 0
 
 
@@ -50,7 +50,7 @@ def check_each(num_episodes: int, **arguments: ArrayLike) -> None:
         check_shape(name, value, (), (num_episodes,), remedy="; play several seeds by jax.vmap")
 
 
-def plays(
+def signed_limits(
     active: bool | jax.Array, deterministic: bool | jax.Array, limit: int | jax.Array
 ) -> jax.Array:
     """Returns what machine code is told of episodes, as int32: their steps and their actions.

@@ -59,9 +59,9 @@ def rollout(
         raise ValueError(f"the native engine cannot play this: {error}") from error
     begin = functools.partial(episode.begin, env)
     state, keys = jax.vmap(begin)(episode.episode_keys(key, num_episodes))
-    plays = episode.plays(active, deterministic, jnp.minimum(steps, horizon))
+    limits = episode.signed_limits(active, deterministic, jnp.minimum(steps, horizon))
     given = (
-        jnp.broadcast_to(plays, num_episodes),
+        jnp.broadcast_to(limits, num_episodes),
         jax.random.key_data(keys),
         *(x.reshape(-1) for x in jax.tree.leaves(actor) if x.size),
         *(stored(x).reshape(num_episodes, -1) for x in jax.tree.leaves(state) if x.size),

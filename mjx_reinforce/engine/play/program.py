@@ -154,7 +154,7 @@ def build_program(
         num_args = kernel.NUM_CONTROLS + len(buffers)
         entry = handler.handler_text(num_args, [*sizes, 4, 4, 4], target.lanes)
         entry += handler.flush(target.triple)
-        return entry + kernel.player_text(written, num_actor, target.lanes)
+        return entry + kernel.kernel_text(written, num_actor, target.lanes)
 
     def write_gpu(written: scalarized.Scalarized) -> str:
         return gpu_kernel.kernel_text(written, num_actor)

@@ -73,13 +73,13 @@ def test_a_jax_that_multiplies_wrongly_is_told(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     env = Drifting()
     actor, act, distribution = actor_and_act(env, ())
-    player = engines.ActingPolicy(act, actor, distribution)
+    policy = engines.ActingPolicy(act, actor, distribution)
     cases = ("vmap", "0.10.2", True), ("native", "0.10.2", False), ("vmap", "0.11.2", False)
     for name, version, told in cases:
         monkeypatch.setattr(jax, "__version__", version)
         with warnings.catch_warnings(record=True) as met:
             warnings.simplefilter("always")
-            engines.choose(name, env, player, 2)
+            engines.choose(name, env, policy, 2)
         assert [str(x.message)[:10] for x in met] == ["JAX 0.10.2"] * told
 
 

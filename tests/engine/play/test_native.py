@@ -242,7 +242,7 @@ def test_auto_falls_back_whatever_the_writer_raises(monkeypatch):
     def write(*_):
         raise error
 
-    monkeypatch.setattr(program.kernel, "player_text", write)
+    monkeypatch.setattr(program.kernel, "kernel_text", write)
     monkeypatch.setattr(machine, "_LOADED", {})
     monkeypatch.setattr(objects, "folder", lambda: None)
     for error in (KeyError("lost"), ValueError("cannot reshape"), RecursionError("deep")):
@@ -301,7 +301,7 @@ def test_what_it_takes_it_frees_and_what_it_flushes_it_undoes():
     function = program.step_function(env, act, distribution, 4)
     varying = [True] * len(jax.tree.leaves(examples))
     built = scalarized.build(function, examples, varying, program.BRANCH_COST, program.LOOPS)
-    work = kernel.player_text(built, len(jax.tree.leaves(actor)), 2).partition("@work(")[2]
+    work = kernel.kernel_text(built, len(jax.tree.leaves(actor)), 2).partition("@work(")[2]
     assert work.count("call ptr @malloc") == work.count("call void @free") == 1
     order = "call i64 @flush", "phi i64 [0, ", "call void @unflush", "call void @free"
     assert sorted(order, key=work.index) == list(order)

@@ -26,7 +26,7 @@ ACTIVE = [1, 0, 1, 1, 0, 7]
 
 @pytest.fixture
 def code():
-    """The test player."""
+    """The test kernel."""
     return items.load()
 
 
@@ -64,8 +64,8 @@ def test_vmapped_and_vmapped_again(code):
 
 def test_derivatives_are_refused_by_jax(code):
     def total(x):
-        plays, keys = jnp.ones((2, items.N), jnp.int32), jnp.zeros((2, items.N, 2), jnp.uint32)
-        args = (plays, jnp.zeros(2, jnp.int32), keys, x)
+        limits, keys = jnp.ones((2, items.N), jnp.int32), jnp.zeros((2, items.N, 2), jnp.uint32)
+        args = (limits, jnp.zeros(2, jnp.int32), keys, x)
         return seam.call(code, items.shapes((2,)), *args)[2].sum()
 
     with pytest.raises(ValueError, match=r"differentiat|JVP"):
@@ -73,7 +73,7 @@ def test_derivatives_are_refused_by_jax(code):
 
 
 def run(program, **environment):
-    """Runs a program in a process of its own, beside the test player; returns what it prints."""
+    """Runs a program in a process of its own, beside the test kernel; returns what it prints."""
     program = f"import jax, sys\nimport native_items as items\n{program}"
     done = subprocess.run(
         [sys.executable, "-c", program],
@@ -216,8 +216,8 @@ class Frame:
 
     def __init__(self, api_bytes=200, count_refused=False, schedules=9, limit=0, late=False):
         self.destroyed, self.scheduled, self.kept, self.tasks = [], 0, [], []
-        plays, ones = np.ones((2, items.N), np.int32), np.ones(2, np.int32)
-        given = [plays, ones * limit, np.zeros((2, items.N, 2), np.uint32), ones * 0]
+        limits, ones = np.ones((2, items.N), np.int32), np.ones(2, np.int32)
+        given = [limits, ones * limit, np.zeros((2, items.N, 2), np.uint32), ones * 0]
         self.results = [np.full(x.shape, 7, x.dtype) for x in items.shapes((2,))]
         error = 1234
 
