@@ -10,11 +10,13 @@ import secrets
 import sys
 import tempfile
 import zipfile
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+
+from mjx_reinforce.engine.checks import explain
 
 #: Named arrays, as an archive (.npz) holds them.
 Arrays = dict[str, np.ndarray]
@@ -108,6 +110,19 @@ def read_json(path: Path) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ValueError(f"{path} is damaged: it holds no JSON object")
     return value
+
+
+@contextlib.contextmanager
+def naming_damage(path: Path) -> Iterator[None]:
+    """Names a file in what a block raises that looks for something in its content."""
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"{path} is damaged: {error.args[0]} is missing") from error
+    except ValueError as error:
+        raise ValueError(f"{path} is damaged: {error}") from error
+    except Exception as error:  # what first meets an entry of another kind has no common class
+        raise ValueError(f"{path} is damaged: {explain(error)}") from error
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], *, compressed: bool = False) -> None:

@@ -1,26 +1,29 @@
 """``python -m mjx_reinforce.report RUN_OR_SWEEP`` makes a page of what runs and sweeps found."""
 
 import dataclasses
+import math
 import shlex
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numpy as np
 import tyro
 
 from mjx_reinforce.export.run_files import seeds_in
-from mjx_reinforce.files import check_output, write_bytes
-from mjx_reinforce.reports import sources
-from mjx_reinforce.reports.experiment import Experiment, relabel
-from mjx_reinforce.reports.findings import Findings, compute_findings
-from mjx_reinforce.reports.page import columns, document, words
-from mjx_reinforce.reports.page.document import Watch, encoded
-from mjx_reinforce.reports.page.over_time import worst_seeds
-from mjx_reinforce.reports.page.vega import render_chart
+from mjx_reinforce.files import check_output, csv_text, write_bytes
+from mjx_reinforce.reports import document, sources, words
+from mjx_reinforce.reports.document import Watch, encoded
+from mjx_reinforce.reports.experiment import Experiment, relabel, say
+from mjx_reinforce.reports.findings import Findings, compute_findings, swept, worst_seeds
+from mjx_reinforce.reports.vega import Table, render_chart, rows, short
 from mjx_reinforce.settings.config import env_flag
 from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.store.provenance import version
+
+#: With these a spreadsheet's formula begins. page.js has them, too.
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,11 +122,11 @@ def _write(experiment: Experiment, output: Path) -> WrittenReport:
     findings = compute_findings(experiment)
     drawn, labels, beside = document.charts(findings), findings.labels, _beside(output)
     beside.mkdir(exist_ok=True)
-    results = columns.results_csv(findings)
+    results = results_csv(findings)
     write_bytes(beside / "results.csv", encoded(results))
     for chart in drawn:
         for name, table in chart.data.items():
-            write_bytes(beside / f"{name}.csv", encoded(columns.table_csv(table, labels)))
+            write_bytes(beside / f"{name}.csv", encoded(table_csv(table, labels)))
         for ending, picture in render_chart(chart, labels, experiment.title).items():
             write_bytes(beside / f"{chart.name}.{ending}", picture)
     seconds = time.perf_counter() - started
@@ -136,6 +139,46 @@ def _write(experiment: Experiment, output: Path) -> WrittenReport:
 def _beside(output: Path) -> Path:
     """Returns the folder for a page's pictures and tables."""
     return output.with_suffix("")
+
+
+def results_csv(findings: Findings) -> str:
+    """Returns a row for each configuration and seed, as ``results.csv`` of a sweep."""
+    names = swept(findings)
+    header = ("configuration", *names, "seed", "final_return", "best_return")
+    lines: list[Sequence[Any]] = [(*header, "env_steps_to_solve", "env_steps", "nonfinite")]
+    for place, result in enumerate(findings.results):
+        part, solving = result.configuration, result.solving
+        settings = [say(part.settings.get(name)) for name in names]
+        best = short(np.fmax.reduce(part.eval_return, axis=0), 7)
+        final, end = short(result.final, 7), part.env_steps[-1].tolist()
+        for s, seed in enumerate(part.seed.tolist()):
+            solved = int(solving.steps[s]) if solving and solving.solved[s] else ""
+            values = (seed, final[s], best[s], solved, end[s], int(part.nonfinite[s]))
+            lines.append((place + 1, *settings, *values))
+    return csv_text(map(_no_formulas, lines))
+
+
+def table_csv(table: Table, labels: Sequence[str]) -> str:
+    """Returns a table as a CSV file."""
+    listed = rows(table, labels)
+    return csv_text(map(_no_formulas, [table, *(row.values() for row in listed)]))
+
+
+def _no_formulas(cells: Iterable[Any]) -> list[Any]:
+    return [*map(_no_formula, cells)]
+
+
+def _no_formula(cell: object) -> Any:
+    """Returns a cell with an apostrophe before a name that a spreadsheet would compute.
+
+    Run directories may be called "=HYPERLINK(1)". Numbers stay, also those that are texts.
+    """
+    if not isinstance(cell, str) or not cell.startswith(_FORMULA):
+        return cell
+    try:
+        return cell if math.isfinite(float(cell)) else f"'{cell}"
+    except ValueError:
+        return f"'{cell}"
 
 
 def how_to_watch(experiment: Experiment, findings: Findings) -> Watch:

@@ -19,10 +19,9 @@ from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.console.streams import accept_everything, heartbeat, silence_alarms, to_screen
 from mjx_reinforce.runs.command_line import parse, refuse, refuse_full, start
 from mjx_reinforce.runs.directory import own_directory
-from mjx_reinforce.runs.plan import make_plan
+from mjx_reinforce.runs.plan import check_memory, make_plan
 from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check, code_flags
-from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.training import resume
 
 if TYPE_CHECKING:

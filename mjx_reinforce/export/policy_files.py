@@ -1,9 +1,8 @@
 """Trained policies on disk: a NumPy archive and a JSON file, never pickle."""
 
-import contextlib
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +13,15 @@ from flax import serialization, traverse_util
 
 from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.engine.checks import check_kind, explain
-from mjx_reinforce.files import Arrays, finite, read_arrays, read_json, write_arrays, write_json
+from mjx_reinforce.files import (
+    Arrays,
+    finite,
+    naming_damage,
+    read_arrays,
+    read_json,
+    write_arrays,
+    write_json,
+)
 from mjx_reinforce.learning import normalize
 from mjx_reinforce.learning.distributions import Distribution
 from mjx_reinforce.learning.policy import Actor, Policy, mlp_policy
@@ -132,7 +139,7 @@ def read_policy(
             f"{settings_path} is damaged, or actor.npz beside it: they do not belong together "
             "(their checksum differs), so one of them was changed or is another run's"
         )
-    with _naming_damage(settings_path):
+    with naming_damage(settings_path):
         check_choice("policy", settings["policy"], DISTRIBUTIONS)
     if is_own(settings["policy"]) and settings["policy"] != own:
         raise ValueError(
@@ -140,31 +147,18 @@ def read_policy(
             f"code; if you trust it, add --policy {settings['policy']} to watch, or give "
             f"mjx_reinforce.load(..., policy={settings['policy']!r})"
         )
-    with _naming_damage(settings_path):
+    with naming_damage(settings_path):
         policy = build_policy(settings)
         shapes = _array_shapes(policy, settings["observation_size"])
-    with _naming_damage(actor_path):
+    with naming_damage(actor_path):
         num_seeds = _check_arrays(arrays, shapes)
     if seed is not None and not 0 <= seed < num_seeds:
         seeds = f"its seeds are 0 to {num_seeds - 1}" if num_seeds > 1 else "it has seed 0 alone"
         raise ValueError(f"{directory} has no seed {seed}: {seeds}")
-    with _naming_damage(actor_path):
+    with naming_damage(actor_path):
         _check_finite(arrays, seed)
     actor = jax.tree.map(lambda x: jnp.asarray(x if seed is None else x[seed]), actor_of(arrays))
     return SavedPolicy(policy, actor, settings, num_seeds)
-
-
-@contextlib.contextmanager
-def _naming_damage(path: Path) -> Iterator[None]:
-    """Names the file in what a block raises."""
-    try:
-        yield
-    except KeyError as error:
-        raise ValueError(f"{path} is damaged: {error.args[0]} is missing") from error
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    except Exception as error:  # what first reads an entry of another kind has no common class
-        raise ValueError(f"{path} is damaged: {explain(error)}") from error
 
 
 def _check_arrays(arrays: Arrays, expected: Mapping[str, tuple[int, ...]]) -> int:

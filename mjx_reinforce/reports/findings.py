@@ -1,5 +1,6 @@
 """The figures of a report: what an experiment's numbers say, best configuration first."""
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -8,14 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mjx_reinforce.reports.curves import on_grid
-from mjx_reinforce.reports.experiment import (
-    COMPARED,
-    Configuration,
-    Experiment,
-    Result,
-    Solving,
-    shared_seeds,
-)
+from mjx_reinforce.reports.experiment import Configuration, Experiment
 from mjx_reinforce.statistics import Estimate, iqm, iqm_interval
 from mjx_reinforce.statistics.aggregates import interval, wilson
 from mjx_reinforce.statistics.comparisons import (
@@ -34,12 +28,65 @@ from mjx_reinforce.statistics.survival import (
     time_to_threshold,
 )
 
+#: So many configurations are compared pair by pair: the best.
+COMPARED = 16
 #: Env steps at which curves are read off.
 _GRID_POINTS = 60
 #: Ends that are so close are those of one budget.
 _SAME_BUDGET = 0.9
+#: How many of the worst seeds are named, and what share of all, at most.
+_WORST, _WORST_SHARE = 10, 0.25
 #: Seeds with which people compare, and of which the page says how often they err.
 FEW = (3, 5, 10)
+
+
+class Solving(NamedTuple):
+    """How the seeds of a configuration reached the threshold, and whether they kept it.
+
+    at_end, ever: how many seeds did
+    rate: the share at the end, Wilson's interval
+    fell: [S] who reached it and was below it at the end
+    steps: [S] env steps until the first time, or all of them
+    solved: [S] who ever did
+    median, mean: env steps until half of the seeds have; on average, each counted up to the
+      shortest training of any seed of the experiment
+    """
+
+    at_end: int
+    ever: int
+    rate: Estimate
+    fell: np.ndarray
+    steps: np.ndarray
+    solved: np.ndarray
+    median: Estimate
+    mean: Estimate
+
+
+class Result(NamedTuple):
+    """What a configuration's final returns [S] say.
+
+    final: the last evaluation of each seed, NaN where not finite
+    scores: the same, with the worst finite one of the experiment in place of those
+    mean, tail: of the scores; the tail is the mean of the worst tenth
+    iqm: of the final returns, see ``statistics.iqm``
+    band: the interquartile mean over ``Findings.grid``, arrays [K]; NaN beyond its budget
+    seeds: [K, S] the curves on the grid
+    areas, area: [S] the mean return over the training of each seed, which is the area under the
+      seed's learning curve by the env steps, and the mean over seeds
+    solving: None where the task has no threshold
+    """
+
+    configuration: Configuration
+    final: np.ndarray
+    scores: np.ndarray
+    mean: Estimate
+    tail: Estimate
+    iqm: Estimate
+    band: Estimate
+    seeds: np.ndarray
+    areas: np.ndarray
+    area: Estimate
+    solving: Solving | None
 
 
 class Few(NamedTuple):
@@ -262,3 +309,18 @@ def swept(findings: Findings) -> list[str]:
 def values_of(findings: Findings, name: str) -> list[Any]:
     """Returns the value of a setting in each result."""
     return [each.configuration.settings.get(name) for each in findings.results]
+
+
+def shared_seeds(results: Sequence[Result]) -> np.ndarray:
+    """Returns the numbers of the seeds that all configurations have, ascending."""
+    return functools.reduce(np.intersect1d, [each.configuration.seed for each in results])
+
+
+def worst_seeds(result: Result) -> np.ndarray:
+    """Returns the places of the worst seeds of a configuration, the worst first: at least one."""
+    return from_the_worst(result)[: min(_WORST, math.ceil(_WORST_SHARE * len(result.final)))]
+
+
+def from_the_worst(result: Result) -> np.ndarray:
+    """Returns the places of all seeds, ordered by the return at the end; not finite is worst."""
+    return np.argsort(np.nan_to_num(result.final, nan=-np.inf), kind="stable")

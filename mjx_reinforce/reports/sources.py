@@ -1,5 +1,9 @@
-"""What a report is drawn from: runs and sweeps, read into one experiment."""
+"""What a report is drawn from: the directories of runs and sweeps, read into one experiment.
 
+They may go on, or have been interrupted.
+"""
+
+import csv
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -7,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.reports.directories import read_directory
+from mjx_reinforce.files import naming_damage, read_arrays, read_json
 from mjx_reinforce.reports.experiment import (
     Configuration,
     Experiment,
@@ -16,7 +20,30 @@ from mjx_reinforce.reports.experiment import (
     lengthened,
     settings_in_words,
 )
+from mjx_reinforce.settings.config import read_seeds
 
+#: What config.json says besides the settings.
+PROVENANCE = (
+    *("python", "packages", "git_commit", "device", "cpu", "machine_code", "jax_settings"),
+    *("num_devices", "num_processes", "cpu_count", "cores", "x64", "xla_flags", "resumed"),
+)
+#: What sweep.json says of the sweep itself; all else is its provenance.
+_OWN = (
+    *("status", "env", "threshold", "settings", "configurations"),
+    *("compile_seconds", "run_seconds", "statistics_seconds"),
+)
+_TIMINGS = ("compile_seconds", "run_seconds", "statistics_seconds")
+#: The columns and arrays that are read, and their types.
+_METRICS = {"seed": np.int64, "env_steps": np.int64, "eval_return": np.float64}
+_RESULTS = {"configuration": np.int64, "seed": np.int64, "nonfinite": np.int64}
+_CURVES = {
+    "configuration": np.int64,
+    "seed": np.int64,
+    "eval_return": np.float64,
+    "env_steps": np.int64,
+}
+#: Those of a configuration.
+_COLUMNS = ("seed", "eval_return", "env_steps", "nonfinite")
 #: Settings that say where and how a run was kept, not what was trained.
 _HOUSEKEEPING = ("output", "resume", "checkpoint_every", "num_seeds", "seeds")
 #: What should be the same of sources that are compared.
@@ -191,3 +218,175 @@ def _merge_provenance(sources: Sequence[Source]) -> tuple[dict[str, Any], list[s
 def _path_in_words(path: Path | str) -> str:
     """Returns a path for people, with escapes for bytes that a locale of ASCII cannot read."""
     return str(path).encode(errors="backslashreplace").decode()
+
+
+def read_directory(directory: Path) -> Source:
+    """Reads a run or a sweep.
+
+    Raises:
+      ValueError: it is neither, or a file is missing or damaged: which, and what is wrong.
+    """
+    if (directory / "sweep.json").is_file():
+        return read_sweep(directory)
+    if (directory / "config.json").is_file():
+        return read_run(directory)
+    if not directory.is_dir():
+        raise ValueError(f"there is no directory {directory}; name that of a run or a sweep")
+    raise ValueError(
+        f"{directory} is neither a run nor a sweep: it has no config.json and no sweep.json"
+    )
+
+
+def read_run(directory: Path) -> Source:
+    """Reads a run; raises as ``read_directory``."""
+    path, summary_path = directory / "config.json", directory / "summary.json"
+    config = read_json(path)
+    summary = read_json(summary_path) if summary_path.exists() else {"status": "running"}
+    seeds = config.get("seeds")
+    first = read_seeds(seeds).start if isinstance(seeds, str) else 0
+    columns = read_metrics(directory / "metrics.csv", first)
+    seed = columns["seed"]
+    with naming_damage(summary_path):
+        events = np.array([event["seed"] for event in summary.get("nonfinite", [])], np.int64)
+        nonfinite = np.bincount(events - first, minlength=len(seed))[: len(seed)]
+        outcome = _outcome(summary)
+    where = [directory] * len(seed)
+    part = Configuration(directory.name, {}, nonfinite=nonfinite, where=where, **columns)
+    kept = {name: value for name, value in config.items() if name in PROVENANCE}
+    with naming_damage(path):
+        return Source(
+            directory=directory,
+            env=_env(config),
+            configurations=[part],
+            settings={name: value for name, value in config.items() if name not in PROVENANCE},
+            provenance=kept | {"engine": summary.get("engine", config.get("engine"))},
+            **outcome,
+        )
+
+
+def read_sweep(directory: Path) -> Source:
+    """Reads a sweep; raises as ``read_directory``."""
+    path = directory / "sweep.json"
+    content = read_json(path)
+    found = _read_curves(directory)
+    if not len(found["seed"]):
+        raise ValueError(f"{directory} has no results yet; wait for the first, or --resume it")
+    parts = []
+    with naming_damage(path):
+        swept = {
+            f"configuration {each.pop('configuration')}": each for each in content["configurations"]
+        }
+        for number in np.unique(found["configuration"]):
+            runs, settings = found["configuration"] == number, swept[f"configuration {number}"]
+            columns = {name: found[name][..., runs] for name in _COLUMNS}
+            where = [directory] * int(runs.sum())
+            parts.append(
+                Configuration(settings_in_words(settings), settings, where=where, **columns)
+            )
+        return Source(
+            directory=directory,
+            env=_env(content),
+            configurations=parts,
+            settings=content.get("settings", {}),
+            provenance={name: x for name, x in content.items() if name not in _OWN},
+            **_outcome(content),
+        )
+
+
+def _env(content: Mapping[str, Any]) -> str:
+    """Returns the id of the environment that a file names."""
+    if not isinstance(content["env"], str):
+        raise ValueError(f"env is {content['env']!r}")
+    return content["env"]
+
+
+def _outcome(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns what a file says of ``threshold``, ``timings`` and ``status``."""
+    names = ("threshold", *_TIMINGS)
+    numbers = {name: float(content[name]) for name in names if content.get(name) is not None}
+    threshold = numbers.pop("threshold", None)
+    return {
+        "threshold": threshold,
+        "timings": numbers,
+        "status": content.get("status", "finished"),
+    }
+
+
+def _read_curves(directory: Path) -> dict[str, np.ndarray]:
+    """Returns the arrays of curves.npz, [R] or [E, R] of R runs, and ``nonfinite`` [R] of them."""
+    path = directory / "curves.npz"
+    arrays, rows = read_arrays(path), read_columns(directory / "results.csv", _RESULTS)
+    with naming_damage(path):
+        found = {name: arrays[name].astype(kind) for name, kind in _CURVES.items()}
+        shapes = {name: x.shape[-1:] for name, x in found.items()}
+        if len({*shapes.values()}) > 1 or len(found["eval_return"]) != len(found["env_steps"]):
+            raise ValueError(f"its arrays are of different runs: {shapes}")
+    named = [
+        [f"configuration {i}, seed {s}" for i, s in zip(x["configuration"], x["seed"], strict=True)]
+        for x in (rows, found)
+    ]
+    with naming_damage(directory / "results.csv"):
+        counted = dict(zip(named[0], rows["nonfinite"], strict=True))
+        return found | {"nonfinite": np.array([counted[name] for name in named[1]], np.int64)}
+
+
+def read_metrics(path: Path, first: int = 0) -> dict[str, np.ndarray]:
+    """Returns the columns ``env_steps`` and ``eval_return`` of a metrics.csv, and ``seed`` [S].
+
+    The columns are [E, S], of S seeds from ``first`` on.
+
+    A last line or evaluation that is not whole, which a killed run may leave, is left out.
+
+    Raises:
+      ValueError: the file cannot be read, a column is missing, an entry is no number, or the rows
+        are not in the order of the seeds.
+    """
+    columns = read_columns(path, _METRICS)
+    seed = columns["seed"]
+    if not len(seed):
+        raise ValueError(f"{path} has no evaluation yet; wait for the first, or train again")
+    num_seeds = max(int(seed.max()) - first, 0) + 1
+    whole = len(seed) // num_seeds * num_seeds
+    wrong = np.flatnonzero(seed != first + np.arange(len(seed)) % num_seeds)
+    if len(wrong) or not whole:
+        row = int(wrong[0]) if len(wrong) else len(seed)
+        expected = first + row % num_seeds
+        raise ValueError(f"{path} is damaged: line {row + 2} is not of seed {expected}")
+    shape = (-1, num_seeds)
+    found = {name: columns[name][:whole].reshape(shape) for name in ("env_steps", "eval_return")}
+    return found | {"seed": seed[:num_seeds]}
+
+
+def read_columns(path: Path, kinds: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Returns columns of a CSV file by name; a last line that is not whole is left out.
+
+    Args:
+      path: of the file, whose first line has the names of the columns.
+      kinds: the type of each column that is wanted.
+
+    Raises:
+      ValueError: the file cannot be read, a column is missing, a row too short or long, or an entry
+        not of its type.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"cannot read {path} ({reason})") from error
+    header, *rows = list(csv.reader(text[: text.rfind("\n") + 1].splitlines())) or [[]]
+    for name in kinds:
+        if name not in header:
+            raise ValueError(f"{path} is damaged: it has no column {name}")
+    for line, row in enumerate(rows, start=2):
+        if len(row) != len(header):
+            raise ValueError(
+                f"{path} is damaged: line {line} has {len(row)} entries, not {len(header)}"
+            )
+    found = {}
+    for name, kind in kinds.items():
+        column = header.index(name)
+        try:
+            found[name] = np.array([row[column] for row in rows], dtype=kind)
+        except ValueError as error:  # it has the text
+            raise ValueError(f"{path} is damaged: in the column {name}, {error}") from None
+    return found

@@ -26,10 +26,9 @@ from mjx_reinforce.reports.curves import load_libraries
 from mjx_reinforce.runs.directory import own_directory
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.observers import Callbacks, RunFiles
-from mjx_reinforce.runs.plan import make_plan
+from mjx_reinforce.runs.plan import check_memory, make_plan
 from mjx_reinforce.runs.sinks import check_installed
 from mjx_reinforce.settings.config import MAX_COUNT, Config, check
-from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.statistics import worst_if_not_finite
 from mjx_reinforce.store.ready import get_ready
 from mjx_reinforce.training.driver import Driver, Evaluation, Observer, first_best

@@ -1,15 +1,16 @@
 """Where the rows of evaluations go besides metrics.csv: charts of many seeds.
 
 They show statistics over the seeds, and a few seeds one by one. RUN/tensorboard has events,
-written here and not by tensorboardX's ``SummaryWriter``, whose thread dies on a full disk and then
-keeps the program from ending. RUN/wandb has a run of Weights & Biases, offline unless WANDB_MODE
-says otherwise.
+written here: on a full disk tensorboardX leaves half of one, behind which nothing is read, and the
+thread of its ``SummaryWriter`` dies and keeps the program from ending. RUN/wandb has a run of
+Weights & Biases, offline unless WANDB_MODE says otherwise.
 """
 
 import contextlib
 import importlib
 import importlib.util
 import os
+import secrets
 import socket
 import struct
 import time
@@ -37,7 +38,7 @@ class Sink(Protocol):
     name: str
 
     def write(self, rows: Cells) -> None:
-        """Adds the rows of one evaluation; raises OSError, and adds nothing, if that fails."""
+        """Adds the rows of one evaluation, or raises OSError."""
         ...
 
     def close(self) -> None:
@@ -130,7 +131,6 @@ def _summary(values: np.ndarray) -> dict[str, float]:
     return {"iqm": float(iqm(values))} | dict(zip(names, quantiles.tolist(), strict=True))
 
 
-TENSORBOARD = "tensorboard"
 EVENTS = "events.out.tfevents.*"
 
 
@@ -147,114 +147,83 @@ class TensorBoard:
           updates: after how many a resumed run goes on: TensorBoard drops what older files have
             of later ones. None drops everything.
         """
-        folder = directory / TENSORBOARD
+        folder = directory / "tensorboard"
         folder.mkdir(exist_ok=True)
         # Readers sort the files by name.
-        place = f"{int(time.time()):010}.{socket.gethostname()}"
-        count = len(list(folder.glob(EVENTS)))
-        self._path = folder / f"events.out.tfevents.{place}.{count:04}"
-        first = 0 if updates is None else updates + 1
-        start = _message("event", "SessionLog")(status="START")
-        event, now = _message("event", "Event"), time.time()
-        header = event(wall_time=now, file_version="brain.Event:2")
-        purge = event(wall_time=now, step=first, session_log=start)
-        append(self._path, _record(header) + _record(purge))
+        place = f"{int(time.time()):010}.{socket.gethostname()}.{len([*folder.glob(EVENTS)]):04}"
+        self._path = folder / f"events.out.tfevents.{place}"
+        self._add(file_version="brain.Event:2")
+        self._add(step=0 if updates is None else updates + 1, session_log={"status": "START"})
 
     def write(self, rows: Cells) -> None:
         """Adds an event, or raises OSError and adds none."""
-        event, summary = _message("event", "Event"), _message("summary", "Summary")
         # Not by ``summary.scalar``, which prints a line for every NaN.
-        shown = [summary.Value(tag=tag, simple_value=x) for tag, x in scalars(rows).items()]
-        step, now = chart_step(rows), time.time()
-        append(self._path, _record(event(wall_time=now, step=step, summary=summary(value=shown))))
+        shown = [{"tag": name, "simple_value": x} for name, x in scalars(rows).items()]
+        self._add(step=chart_step(rows), summary={"value": shown})
 
     def close(self) -> None:
         """Does nothing: every event is written."""
 
+    def _add(self, **fields: Any) -> None:
+        """Adds an event in TensorFlow's record format: length, its checksum, event, checksum."""
+        from tensorboardX.record_writer import masked_crc32c
 
-def _message(file: str, name: str) -> Any:
-    """Returns a class of tensorboardX's protocol; type checkers do not see what is in its files."""
-    return getattr(importlib.import_module(f"tensorboardX.proto.{file}_pb2"), name)
-
-
-def _record(event: Any) -> bytes:
-    """Returns an event in TensorFlow's record format: length, its checksum, event, checksum."""
-    from tensorboardX.record_writer import masked_crc32c
-
-    data = event.SerializeToString()
-    length = struct.pack("<Q", len(data))
-    checksums = [struct.pack("<I", masked_crc32c(part)) for part in (length, data)]
-    return length + checksums[0] + data + checksums[1]
+        proto: Any = importlib.import_module("tensorboardX.proto.event_pb2")
+        data = proto.Event(wall_time=time.time(), **fields).SerializeToString()
+        parts = (struct.pack("<Q", len(data)), data)
+        append(self._path, b"".join(x + struct.pack("<I", masked_crc32c(x)) for x in parts))
 
 
-#: Which run it is, and up to which update it has rows.
+#: Has the id of the run.
 WANDB_RUN = "wandb/mjx_reinforce.json"
-_TO_BE_ONLINE = "; run wandb login, or unset WANDB_MODE and send the run later by wandb sync"
 
 
 class WeightsAndBiases:
-    """Logs the statistics over seeds, and the first seeds; the step is the number of updates.
+    """Logs to a run of W&B; the step is the number of updates, and a resumed run has the same id.
 
-    A resumed run goes on under the same id. Rows that it has already are not logged again: they
-    are the same.
+    W&B drops rows of steps that the run has already.
     """
 
     name = "to W&B"
 
     def __init__(self, directory: Path):
-        """Begins the run, or goes on with it.
-
-        Args:
-          directory: of ours.
-
-        Raises:
-          OSError: W&B cannot be started.
-        """
+        """Begins the run in a directory of ours, or goes on with it; raises OSError."""
         import wandb
 
-        self._path = directory / WANDB_RUN
-        self._path.parent.mkdir(exist_ok=True)  # without it W&B writes elsewhere
-        known = read_json(self._path) if self._path.exists() else {}
-        self._logged = int(known.get("updates", -1))
-        mode: Any = os.environ.get("WANDB_MODE", "offline")
-        with _errors_as_os_errors(_TO_BE_ONLINE if mode == "online" else ""):
+        path, mode = directory / WANDB_RUN, os.environ.get("WANDB_MODE", "offline")
+        path.parent.mkdir(exist_ok=True)  # without it W&B writes elsewhere
+        if not path.exists():
+            write_json(path, {"id": secrets.token_hex(4)})
+        with _errors_as_os_errors():
             self._run = wandb.init(
                 project=os.environ.get("WANDB_PROJECT", "mjx_reinforce"),
                 name=os.environ.get("WANDB_NAME", directory.resolve().name),
-                id=known.get("id"),
-                resume="allow" if known and mode == "online" else None,
+                id=read_json(path)["id"],
+                resume="allow",
                 config=read_json(directory / "config.json"),
                 dir=directory,
-                mode=mode,
+                mode=mode,  # pyright: ignore[reportArgumentType]
                 settings=wandb.Settings(silent=True, console="off", x_disable_stats=True),
             )
-        self._save()
 
     def write(self, rows: Cells) -> None:
         """Logs the rows of one evaluation, or raises OSError."""
-        step = chart_step(rows)
-        if step <= self._logged:
-            return
         with _errors_as_os_errors():
-            self._run.log(scalars(rows), step=step)
-        self._logged = step
-        self._save()
+            self._run.log(scalars(rows), step=chart_step(rows))
 
     def close(self) -> None:
         """Ends the run, once all of it is written or sent."""
         with _errors_as_os_errors():
             self._run.finish()
 
-    def _save(self) -> None:
-        write_json(self._path, {"id": self._run.id, "updates": self._logged})
-
 
 @contextlib.contextmanager
-def _errors_as_os_errors(remedy: str = "") -> Iterator[None]:
+def _errors_as_os_errors() -> Iterator[None]:
     """Raises W&B's own errors as OSError: a run warns of an OSError and continues."""
     import wandb
 
     try:
         yield
     except wandb.Error as error:
-        raise OSError(str(error).rstrip(".") + remedy) from error
+        remedy = "run wandb login, or unset WANDB_MODE and send the run later by wandb sync"
+        raise OSError(f"{str(error).rstrip('.')}; {remedy}") from error

@@ -5,14 +5,16 @@ them, and all that comes later sees plain settings. Presets have their own.
 """
 
 import dataclasses
+import importlib.util
 import itertools
+import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 from mjx_reinforce.engine.checks import whole_number
 from mjx_reinforce.settings import tables
 from mjx_reinforce.settings.config import CODE, Config, spoken
-from mjx_reinforce.settings.memory import cpu_factor, has_gpu
 
 #: Where a budget is large, it has about so many evaluations.
 _EVALUATIONS = 50
@@ -21,6 +23,8 @@ _BETWEEN = 20.0
 #: A default run trains for about so long (s) with as many seeds as a default run has, and never
 #: less than the task's settings in ``tuned`` say.
 _DEFAULT_SECONDS = 60.0
+#: CPU cores that make a run faster; it was not tried with more.
+_USEFUL_CORES = 4
 
 
 def of_task(
@@ -105,12 +109,33 @@ def expected_env_steps(seconds: float, config: Config) -> int:
     machine = tables.GPU if has_gpu() else tables.CPU
     if config.env not in machine:
         return config.env_steps or 0
-    speed, task = machine[config.env], tables.TASKS[config.env]
-    useful = 1.0 if speed.engine == "native" else task.useful
     episodes = config.num_seeds * config.episodes_per_update
-    each = speed.seconds(config.num_seeds, episodes)  # an env step of every seed
-    steps = useful * seconds * (1.0 if has_gpu() else cpu_factor()) / each
+    each = machine[config.env].seconds(config.num_seeds, episodes)  # an env step of every seed
+    steps = seconds * (1.0 if has_gpu() else cpu_factor()) / each
     return int(float(f"{steps:.2g}"))
+
+
+def num_cores() -> int:
+    """Returns how many CPU cores this process may use."""
+    affinity = getattr(os, "sched_getaffinity", None)  # not on every system
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
+def has_gpu() -> bool:
+    """Returns whether JAX is likely to find an NVIDIA GPU; JAX is not imported."""
+    return may_have_accelerator() and any(Path("/dev").glob("nvidia[0-9]*"))
+
+
+def cpu_factor() -> float:
+    """Returns how many times as fast as two cores this machine's are together."""
+    return min(num_cores(), _USEFUL_CORES) / 2
+
+
+def may_have_accelerator() -> bool:
+    """Returns whether JAX may find a GPU: without a plugin it has the CPU alone."""
+    if os.environ.get("JAX_PLATFORMS") == "cpu":
+        return False
+    return importlib.util.find_spec("jax_plugins") is not None
 
 
 def named_code(arguments: Sequence[str]) -> dict[str, str | None]:

@@ -45,26 +45,22 @@ class Task(NamedTuple):
     observation: O, entries of an observation
     action: A, entries of an action
     horizon: the task's time limit (env steps)
-    useful: the part of the simulated env steps that belongs to an episode that still runs
     base_memory: what a small run takes on a CPU, mostly for compiling (bytes)
     """
 
     observation: int
     action: int
     horizon: int
-    useful: float
     base_memory: float
 
 
 class Speed(NamedTuple):
-    """How fast an engine plays and trains on a task.
+    """How fast machine code plays and trains on a task.
 
-    engine: its name
     latency: one env step of however few episodes (s)
     rate: env steps a second of however many
     """
 
-    engine: str
     latency: float
     rate: float
 

@@ -16,7 +16,7 @@ def provenance() -> dict[str, Any]:
     import jax
 
     from mjx_reinforce.engine.play import available
-    from mjx_reinforce.settings.memory import num_cores
+    from mjx_reinforce.settings.defaults import num_cores
 
     return {
         "python": platform.python_version(),

@@ -14,6 +14,7 @@ import tyro
 from mjx_reinforce.console.commands import command
 from mjx_reinforce.engine.checks import alternatives, check_name, nearest, read_as
 from mjx_reinforce.engine.memory import gigabytes, host_memory
+from mjx_reinforce.runs.plan import check_memory
 from mjx_reinforce.settings.config import (
     Config,
     check,
@@ -23,7 +24,6 @@ from mjx_reinforce.settings.config import (
     spoken,
 )
 from mjx_reinforce.settings.groups import LogSettings
-from mjx_reinforce.settings.memory import check_memory
 from mjx_reinforce.training.resume import PLACES, as_config, read_record
 
 #: What writing results.csv and curves.npz needs for a run with two evaluations (bytes).

@@ -16,11 +16,11 @@ from mjx_reinforce.engine.devices import Devices
 from mjx_reinforce.engine.memory import gigabytes
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.reports.experiment import counted
-from mjx_reinforce.runs.plan import devices_in_words, task_of, this_hardware
+from mjx_reinforce.runs.plan import devices_in_words, needed, task_of, this_hardware
 from mjx_reinforce.settings.config import Config, marked
 from mjx_reinforce.settings.declare import Mark
+from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.settings.groups import Reader
-from mjx_reinforce.settings.memory import needed, num_cores
 from mjx_reinforce.settings.tables import Task
 from mjx_reinforce.store.build import build, policy_settings
 from mjx_reinforce.sweeps.design import Design, configure

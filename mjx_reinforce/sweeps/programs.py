@@ -17,7 +17,7 @@ from mjx_reinforce.engine.devices import NONE, RUNS, Devices
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import MAX_COUNT, Config
-from mjx_reinforce.settings.memory import num_cores
+from mjx_reinforce.settings.defaults import num_cores
 from mjx_reinforce.sweeps.layout import StateRows, pack_slots
 from mjx_reinforce.training.block import BuildLearner
 from mjx_reinforce.training.programs import Programs, compiling, programs_of

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from mjx_reinforce.reports import document
 from mjx_reinforce.reports.experiment import Experiment
-from mjx_reinforce.reports.page import document
 
 
 def experiment(**changes):

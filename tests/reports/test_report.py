@@ -15,9 +15,8 @@ from measured_runs import ONE, make_measured_run
 from pages import CUT, change_curves, content, findings_of, run_report, visible
 
 from mjx_reinforce import report
-from mjx_reinforce.reports import findings, sources
-from mjx_reinforce.reports.page import document, vega, words
-from mjx_reinforce.reports.page.over_time import worst_seeds
+from mjx_reinforce.reports import document, findings, sources, vega, words
+from mjx_reinforce.reports.findings import worst_seeds
 
 HOSTILE = "x</script><script>alert(1)</script>\"'&"
 

@@ -10,7 +10,7 @@ from measured_runs import make_measured_run
 from pages import change_curves, content, findings_of, visible
 
 from mjx_reinforce import report
-from mjx_reinforce.reports.page import listings, words
+from mjx_reinforce.reports import listings, words
 
 RATES = {"learning_rate": [1e-3, 3e-3, 1e-2]}
 

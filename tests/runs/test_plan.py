@@ -12,8 +12,9 @@ import pytest
 from toys import Survive
 
 from mjx_reinforce import envs
+from mjx_reinforce.engine.memory import gigabytes
 from mjx_reinforce.runs import command_line, plan
-from mjx_reinforce.settings import memory, tables
+from mjx_reinforce.settings import tables
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.defaults import of_task
 from mjx_reinforce.settings.tables import PRESETS, Task
@@ -66,6 +67,53 @@ def test_what_was_measured_are_our_tasks():
 
 # Memory.
 
+TASK = Task(3, 2, 100, 0.0)
+CONFIG = Config(num_seeds=2, hidden_sizes=(4,), num_episodes=8)
+
+
+def needed_by(**changes):
+    return plan.needed(dataclasses.replace(CONFIG, **changes), TASK)
+
+
+def test_a_network_has_a_weight_for_every_pair_and_a_bias():
+    assert (TASK.observation, TASK.action) == (3, 2)
+    assert plan.num_parameters(CONFIG, TASK) == (3 + 1) * 4 + (4 + 1) * 4
+    assert plan.critic_parameters(CONFIG, TASK) == 0
+    critic = dataclasses.replace(CONFIG, estimator="value-baseline", value_hidden_sizes=(5,))
+    assert plan.critic_parameters(critic, TASK) == (3 + 1) * 5 + (5 + 1)
+    ars = dataclasses.replace(critic, algorithm="ars")
+    assert plan.critic_parameters(ars, TASK) == 0
+
+
+def test_seeds_side_by_side_need_as_much_each():
+    assert needed_by(num_seeds=200) == pytest.approx(100 * needed_by())
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"num_episodes": 16},
+        {"horizon": 200},
+        {"hidden_sizes": (64, 64)},
+        {"eval_episodes": 100},
+        {"estimator": "value-baseline"},
+    ],
+)
+def test_more_of_anything_needs_more(more):
+    assert needed_by(**more) > needed_by()
+
+
+def test_what_a_program_needs_besides_counts():
+    total = needed_by()
+    plan.check_fits(CONFIG, TASK, total + 10, 10)
+    with pytest.raises(ValueError, match="does not fit"):
+        plan.check_fits(CONFIG, TASK, total + 9, 10)
+
+
+def test_sizes_are_for_people():
+    said = {1: "1 MB", 3e6: "3 MB", 6e7: "0.1 GB", 1.24e9: "1.2 GB", 1.24e12: "1,240 GB"}
+    assert {size: gigabytes(size) for size in said} == said
+
 
 @pytest.mark.parametrize(
     ("settings", "remedy"),
@@ -89,18 +137,18 @@ def test_what_was_measured_are_our_tasks():
     ],
 )
 def test_what_cannot_be_is_refused(monkeypatch, settings, remedy):
-    monkeypatch.setattr(memory, "host_memory", lambda: 24e9)
-    monkeypatch.setattr(memory, "_may_have_accelerator", lambda: False)
+    monkeypatch.setattr(plan, "host_memory", lambda: 24e9)
+    monkeypatch.setattr(plan, "may_have_accelerator", lambda: False)
     with pytest.raises(ValueError, match=r".") as refusal:
-        memory.check_memory(Config(**settings))
+        plan.check_memory(Config(**settings))
     assert remedy in str(refusal.value)
     assert str(refusal.value).count("\n") <= 1
 
 
 def test_a_laptop_holds_every_tasks_defaults(monkeypatch):
-    monkeypatch.setattr(memory, "host_memory", lambda: 8e9)
+    monkeypatch.setattr(plan, "host_memory", lambda: 8e9)
     for id in tables.TASKS:
-        memory.check_memory(of_task(id))
+        plan.check_memory(of_task(id))
 
 
 def test_the_memory_is_what_xla_says():
@@ -108,15 +156,15 @@ def test_the_memory_is_what_xla_says():
     pendulum = of_task("InvertedPendulum-v5")
     many = dataclasses.replace(pendulum, num_seeds=1000, max_updates=3, num_episodes=16)
     value = {"algorithm": "baseline-truncated-normal"}
-    for config, settings, gigabytes, factor in (
+    for config, settings, size, factor in (
         (many, {}, 1.16, 1.7),
         (Config(), {"hidden_sizes": (20_000,)}, 1.28, 1.25),
         (pendulum, value | {"value_hidden_sizes": (20_000,), "num_episodes": 16}, 10.25, 1.2),
         (pendulum, value | {"value_hidden_sizes": (3000, 3000), "num_episodes": 4}, 1.25, 1.2),
     ):
         config = dataclasses.replace(config, **settings)
-        needed = memory.needed(config, tables.TASKS[config.env])
-        assert gigabytes * 1e9 < needed < factor * gigabytes * 1e9, settings
+        needed = plan.needed(config, tables.TASKS[config.env])
+        assert size * 1e9 < needed < factor * size * 1e9, settings
 
 
 def test_a_refusal_comes_before_jax(tmp_path):
@@ -140,9 +188,9 @@ def test_a_refusal_comes_before_jax(tmp_path):
 
 
 def test_an_accelerators_memory_counts_where_there_is_one(monkeypatch):
-    monkeypatch.setattr(memory, "_may_have_accelerator", lambda: True)
+    monkeypatch.setattr(plan, "may_have_accelerator", lambda: True)
     config = Config(env="Survive-v0", num_seeds=10**5, max_updates=1)
-    memory.check_memory(config)  # it is not known before JAX is imported
+    plan.check_memory(config)  # it is not known before JAX is imported
     machine = plan.Hardware("a GPU", 1e8, shared=False)
     monkeypatch.setattr(plan, "this_hardware", lambda: machine)
     env = Survive()
@@ -153,7 +201,7 @@ def test_an_accelerators_memory_counts_where_there_is_one(monkeypatch):
 
 def test_a_plan_says_what_is_known(monkeypatch):
     monkeypatch.setattr(plan, "this_hardware", lambda: plan.Hardware("3 mills", 1e9, True))
-    monkeypatch.setitem(tables.TASKS, "Survive-v0", Task(1, 1, 20, 0.5, 5e8))
+    monkeypatch.setitem(tables.TASKS, "Survive-v0", Task(1, 1, 20, 5e8))
     config = Config(env="Survive-v0", env_steps=1600, engine="vmap")
     made = ready.made(Survive(), config)
     text = plan.make_plan(made, config)

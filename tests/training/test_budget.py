@@ -106,8 +106,8 @@ def test_the_env_steps_of_a_time_by_hand(monkeypatch):
     """A thousand of both seeds, 10 episodes at a time, each step of which takes 0.02 s."""
     monkeypatch.setattr(defaults, "has_gpu", lambda: False)
     monkeypatch.setattr(defaults, "cpu_factor", lambda: 2.0)
-    monkeypatch.setitem(tables.TASKS, "Survive-v0", Task(4, 1, 100, 0.5, 0.0))
-    monkeypatch.setitem(tables.CPU, "Survive-v0", Speed("native", 0.01, 1000.0))
+    monkeypatch.setitem(tables.TASKS, "Survive-v0", Task(4, 1, 100, 0.0))
+    monkeypatch.setitem(tables.CPU, "Survive-v0", Speed(0.01, 1000.0))
     config = Config(env="Survive-v0", num_seeds=2, num_episodes=5, env_steps=7)
     assert defaults.expected_env_steps(2000 / 10 * 0.02 / 2, config) == 1000
     assert defaults.expected_env_steps(2.0, dataclasses.replace(config, env="own:Task")) == 7

@@ -19,7 +19,7 @@ from experiments.kit.rows import read
 from experiments.studies.results.runs import ended
 from experiments.studies.results.tasks import Task
 from mjx_reinforce.files import csv_text, read_json, write_bytes, write_json
-from mjx_reinforce.reports.directories import PROVENANCE, read_columns, read_metrics
+from mjx_reinforce.reports.sources import PROVENANCE, read_columns, read_metrics
 from mjx_reinforce.statistics import steps_to_solve
 from mjx_reinforce.statistics.aggregates import interval
 

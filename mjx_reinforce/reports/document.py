@@ -10,15 +10,17 @@ from typing import Any, NamedTuple
 import jinja2
 from markupsafe import Markup
 
-from mjx_reinforce.reports.experiment import COMPARED, Experiment, counted, say, setting_in_words
-from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.page import at_the_end, over_time, vega, words
-from mjx_reinforce.reports.page.columns import short
-from mjx_reinforce.reports.page.listings import Listing, key_figures, listings
-from mjx_reinforce.reports.page.listings import matrix as pairs_matrix
-from mjx_reinforce.reports.page.words import steps
+from mjx_reinforce.reports import vega, words
+from mjx_reinforce.reports.charts import curves, distribution, final, profile, sensitivity, solved
+from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
+from mjx_reinforce.reports.findings import COMPARED, Findings
+from mjx_reinforce.reports.listings import Listing, key_figures, listings
+from mjx_reinforce.reports.listings import matrix as pairs_matrix
+from mjx_reinforce.reports.words import steps
 
-_TEMPLATES = resources.files("mjx_reinforce.reports.page") / "files"
+#: The charts in the order of the page.
+_CHARTS = (final, curves, solved, distribution, profile, sensitivity)
+_TEMPLATES = resources.files("mjx_reinforce.reports") / "files"
 
 
 class Watch(NamedTuple):
@@ -29,14 +31,13 @@ class Watch(NamedTuple):
 
 
 def charts(findings: Findings) -> list[vega.Chart]:
-    """Returns the charts in the order of the page, numbered; those of all settings as one."""
+    """Returns the charts that show something, numbered; those of all settings as one."""
     made: list[vega.Chart] = []
-    for build in (
-        *(at_the_end.final, over_time.curves, over_time.solved, at_the_end.distribution),
-        *(at_the_end.profile, at_the_end.sensitivity),
-    ):
+    for chart in _CHARTS:
         place = made[-1].number + 1 if made else 1
-        made += [each._replace(number=place) for each in build(findings)]
+        for each in chart.draw(findings):
+            if any(table["configuration"] for table in each.data.values()):
+                made.append(each._replace(number=place))
     return made
 
 
@@ -60,14 +61,14 @@ def render(
     """
     import vl_convert
 
-    stops = short(findings.grid[vega.slider_stops(findings)], 7)
+    stops = vega.short(findings.grid[vega.slider_stops(findings)], 7)
     content = {
         "labels": findings.labels,
         "specs": {figure.name: figure.spec for figure in drawn},
-        "tables": {name: x for each in drawn for name, x in each.data.items()} | vega.ONE,
+        "tables": {name: x for each in drawn for name, x in each.data.items()},
         "moments": stops,
         "results": results,
-        "row": at_the_end.ROW,
+        "row": distribution.ROW,
         "light": vega.LIGHT,
     }
     loader = jinja2.Environment(

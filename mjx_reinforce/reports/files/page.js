@@ -101,7 +101,7 @@
     link.click();
     setTimeout(() => URL.revokeObjectURL(link.href), 10000);
   };
-  // A name that a spreadsheet would take for a formula gets an apostrophe, as in columns.py.
+  // A name that a spreadsheet would take for a formula gets an apostrophe, as in report.py.
   const noFormula = (text) =>
     /^[=+\-@\t\r\n]/.test(text) && !Number.isFinite(Number(text)) ? `'${text}` : text;
   const quoted = (value) => {

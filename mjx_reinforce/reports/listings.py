@@ -6,11 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import COMPARED, Result, counted
-from mjx_reinforce.reports.findings import Findings, SpeedTest
-from mjx_reinforce.reports.page import words
-from mjx_reinforce.reports.page.over_time import worst_seeds
-from mjx_reinforce.reports.page.words import interval_in_words, number, percent, short_p, steps
+from mjx_reinforce.reports import words
+from mjx_reinforce.reports.experiment import counted
+from mjx_reinforce.reports.findings import COMPARED, Findings, Result, SpeedTest, worst_seeds
+from mjx_reinforce.reports.words import interval_in_words, number, percent, short_p, steps
 from mjx_reinforce.statistics import Estimate
 from mjx_reinforce.statistics.comparisons import Comparison
 

@@ -5,15 +5,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from mjx_reinforce.reports.experiment import (
-    COMPARED,
-    counted,
-    ordered,
-    say,
-    setting_in_words,
-    shared_seeds,
-)
-from mjx_reinforce.reports.findings import Findings, fastest
+from mjx_reinforce.reports.experiment import counted, ordered, say, setting_in_words
+from mjx_reinforce.reports.findings import COMPARED, Findings, fastest, shared_seeds
 from mjx_reinforce.settings.tables import OF_TASKS
 from mjx_reinforce.statistics import Estimate, enough
 from mjx_reinforce.statistics.comparisons import Comparison

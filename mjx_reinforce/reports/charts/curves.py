@@ -1,0 +1,111 @@
+"""Learning curves: the interquartile mean and its band; of one configuration, its seeds too."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.reports import vega
+from mjx_reinforce.reports.findings import Findings, Result, from_the_worst
+from mjx_reinforce.reports.vega import Table, short, stacked
+from mjx_reinforce.reports.words import number
+
+#: Seeds that are drawn one by one: of one configuration, and of all together.
+_DRAWN_OF_ONE = 40
+_DRAWN_OF_ALL = 480
+
+
+def draw(findings: Findings) -> Iterator[vega.Chart]:
+    """Yields the chart."""
+    threshold, beyond = findings.experiment.threshold, ""
+    if threshold is not None and vega.drawn_threshold(findings) is None:
+        beyond = f" The return that counts as solved, {number(threshold)}, lies above the figure."
+    layers = [
+        {
+            "encoding": {"x": vega.STEPS, "color": vega.series(findings.labels)},
+            "layer": [_lines_of_seeds(), _band_and_line(findings)],
+        },
+        vega.moment_line(findings),
+        *vega.threshold_line(findings, "y"),
+    ]
+    yield vega.make_chart(
+        findings,
+        layers,
+        320,
+        name="curves",
+        title="Learning curves",
+        caption=(
+            "The interquartile mean over seeds of the return without exploration, and its 95 % "
+            "bootstrap interval; with one configuration shown, thin lines are single seeds, from "
+            "worst to best. The dotted line is the slider's time below. Point at a curve to read "
+            f"it.{beyond}"
+        ),
+        alt="Return over env steps, a line and a band for each configuration that is shown.",
+        data={"curves": _bands(findings), "seeds": _seeds(findings)},
+        listed="curves",
+    )
+
+
+def _return(field: str) -> vega.Spec:
+    title = "return of the deterministic policy"
+    return vega.quantity(field, title=title, scale={"zero": False})
+
+
+def _lines_of_seeds() -> vega.Spec:
+    encoding = {"y": _return("value"), "detail": {"field": "seed"}}
+    return {
+        **vega.shown_rows("seeds", {"filter": "length(shown) == 1"}),
+        **vega.layer("line", encoding, strokeWidth=0.8, opacity=0.35, clip=True),
+    }
+
+
+def _band_and_line(findings: Findings) -> vega.Spec:
+    """Returns the interval, the mean, and its point nearest to the pointer, which says itself."""
+    band = {"y": _return("low"), "y2": {"field": "high"}}
+    mean = {"y": _return("value"), "strokeDash": vega.dashes(findings.labels)}
+    near = {"type": "point", "on": "pointerover", "fields": ["env_steps"], "nearest": True}
+    seen = {"condition": {"param": "near", "empty": False, "value": 1}, "value": 0}
+    # Vega-Lite leaves words out of a nearest point's tooltip, unless all data are in it.
+    said = {"size": 70, "filled": True, "tooltip": {"content": "data"}}
+    return vega.shown_rows("curves") | {
+        "layer": [
+            vega.layer("area", band, opacity=0.18, clip=True),
+            vega.layer("line", mean, strokeWidth=2.2, clip=True),
+            {
+                **vega.layer("point", {"y": _return("value"), "opacity": seen}, **said),
+                "params": [{"name": "near", "select": near}],
+            },
+        ]
+    }
+
+
+def _bands(findings: Findings) -> Table:
+    def part(place: int, result: Result) -> dict[str, Any]:
+        known = np.isfinite(result.band.value)
+        return {
+            "configuration": place,
+            "env_steps": short(findings.grid[known], 7),
+            **{name: short(getattr(result.band, name)[known]) for name in result.band._fields},
+        }
+
+    return stacked(part(place, result) for place, result in enumerate(findings.results))
+
+
+def _seeds(findings: Findings) -> Table:
+    """Returns some curves of each configuration: from the worst seed to the best, evenly."""
+    most = max(5, min(_DRAWN_OF_ONE, _DRAWN_OF_ALL // len(findings.results)))
+
+    def parts() -> Iterator[dict[str, Any]]:
+        for place, result in enumerate(findings.results):
+            ranked = from_the_worst(result)
+            chosen = np.unique(np.linspace(0, len(ranked) - 1, min(most, len(ranked))).round())
+            for s in ranked[chosen.astype(int)]:
+                known = np.isfinite(result.seeds[:, s])
+                yield {
+                    "configuration": place,
+                    "seed": int(result.configuration.seed[s]),
+                    "env_steps": short(findings.grid[known], 7),
+                    "value": short(result.seeds[known, s], 4),
+                }
+
+    return stacked(parts())

@@ -1,0 +1,78 @@
+"""The final return of each configuration: a row each, best first."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from mjx_reinforce.reports import vega
+from mjx_reinforce.reports.experiment import counted
+from mjx_reinforce.reports.findings import Findings
+from mjx_reinforce.reports.vega import means, short
+from mjx_reinforce.reports.words import number, within
+
+
+def draw(findings: Findings) -> Iterator[vega.Chart]:
+    """Yields the chart; none of one configuration alone."""
+    results, best = findings.results, findings.results[0]
+    if len(results) == 1:
+        return
+    places = list(range(len(results)))
+    tenths = np.transpose([np.quantile(each.scores, [0.1, 0.9]) for each in results])
+    yield vega.make_chart(
+        findings,
+        [_rows(findings), *vega.threshold_line(findings, "x")],
+        42 * len(results) + 10,
+        name="final",
+        title="The return at the end",
+        caption=(
+            "Points are means over seeds, thick lines their 95 % intervals, and pale bars the "
+            "middle eight tenths of the seeds."
+        ),
+        alt=(
+            f"{counted(len(results), 'row')}, best first. The best, {best.configuration.label}, is "
+            f"at {number(best.mean.value)}, {within(best.mean)}. Table 1 has every number."
+        ),
+        data={
+            "final": {
+                "configuration": places,
+                "place": places,
+                **means(results),
+                "tenth": short(tenths[0]),
+                "ninetieth": short(tenths[1]),
+            }
+        },
+    )
+
+
+def _rows(findings: Findings) -> vega.Spec:
+    said = {
+        "value": "mean over seeds",
+        "low": "95 % from",
+        "high": "to",
+        "tenth": "a tenth of the seeds below",
+        "ninetieth": "a tenth above",
+    }
+    tips = vega.tooltip(**{field: (name, ",.4~g") for field, name in said.items()})
+    color = vega.series(findings.labels, legend=False)
+    scale = {"zero": False, "padding": 12}
+    mean = vega.quantity("value", title="return at the end", scale=scale)
+    y = {"axis": None, "scale": {"domain": [len(findings.results) - 0.4, -0.6]}}
+    tenths = {"x": vega.quantity("tenth"), "x2": {"field": "ninetieth"}}
+    interval = {"x": vega.quantity("low"), "x2": {"field": "high"}}
+    label = {"x": {"value": 2}, "text": {"field": "configuration"}}
+    above = {"align": "left", "baseline": "bottom", "dy": -9, "limit": {"expr": "width"}}
+    return {
+        "data": {"name": "final"},
+        "encoding": {"y": vega.quantity("place", **y)},
+        "layer": [
+            {
+                "encoding": {"color": color, "tooltip": tips},
+                "layer": [
+                    vega.layer("rule", tenths, strokeWidth=9, opacity=0.22, strokeCap="butt"),
+                    vega.layer("rule", interval, strokeWidth=2.5),
+                    vega.layer("point", {"x": mean}, filled=True, size=75, opacity=1),
+                ],
+            },
+            vega.layer("text", label, **above),
+        ],
+    }

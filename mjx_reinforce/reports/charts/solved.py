@@ -1,0 +1,57 @@
+"""The share of seeds that have solved the task, over the env steps."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from mjx_reinforce.reports import vega
+from mjx_reinforce.reports.findings import Findings, Result
+from mjx_reinforce.reports.vega import Table, short, stacked
+from mjx_reinforce.reports.words import number
+from mjx_reinforce.statistics.survival import kaplan_meier
+
+
+def draw(findings: Findings) -> Iterator[vega.Chart]:
+    """Yields the chart; none where no seed solved the task."""
+    if not any(each.solving and each.solving.ever for each in findings.results):
+        return
+    said = {"env_steps": ("env steps", ",.0f"), "share": ("have solved", ".1%")}
+    title = "seeds that have solved the task"
+    lines = vega.share_layers(findings, "solved", vega.STEPS, title, "step-after", **said)
+    yield vega.make_chart(
+        findings,
+        [lines, vega.moment_line(findings)],
+        320,
+        name="solved",
+        title="How many have solved it",
+        caption=(
+            f"The share of seeds that have reached {number(findings.experiment.threshold or 0.0)} "
+            "at least once, after Kaplan and Meier, with its pointwise 95 % interval. A seed that "
+            "fell back later still counts here; table 1 says how many did. The curve's last "
+            "point is the end of each seed's training."
+        ),
+        alt="Share of seeds over env steps, a rising line for each configuration shown.",
+        data={"solved": _shares(findings)},
+        listed="solved",
+    )
+
+
+def _shares(findings: Findings) -> Table:
+    """Returns the share of seeds that have solved the task, until the first seed's end.
+
+    There all that came until a seed's own end counts, so that the last share is that of the seeds
+    who ever did.
+    """
+
+    def part(place: int, result: Result) -> dict[str, Any]:
+        steps = findings.grid[findings.grid <= result.configuration.env_steps[-1].min()]
+        assert result.solving is not None
+        curve = kaplan_meier(np.minimum(result.solving.steps, steps[-1]), result.solving.solved)
+        at = np.searchsorted(curve.steps, steps, side="right")
+        # Kaplan and Meier's is the share that has not.
+        left = {"share": curve.probability, "low": curve.high, "high": curve.low}
+        shares = {n: short(1 - np.concatenate([[1.0], x])[at], 4) for n, x in left.items()}
+        return {"configuration": place, "env_steps": short(steps, 7), **shares}
+
+    return stacked(part(place, result) for place, result in enumerate(findings.results))
