@@ -14,10 +14,10 @@ import tyro
 from mjx_reinforce.export.run_files import seeds_in
 from mjx_reinforce.files import check_output, csv_text, write_bytes
 from mjx_reinforce.reports import document, sources, words
+from mjx_reinforce.reports.charts import Table, render_chart, rows, short
 from mjx_reinforce.reports.document import Watch, encoded
 from mjx_reinforce.reports.experiment import Experiment, relabel, say
 from mjx_reinforce.reports.findings import Findings, compute_findings, swept, worst_seeds
-from mjx_reinforce.reports.vega import Table, render_chart, rows, short
 from mjx_reinforce.settings.config import env_flag
 from mjx_reinforce.settings.flags import run_command
 from mjx_reinforce.store.provenance import version
@@ -120,7 +120,7 @@ def write_report(chosen: Sequence[Path], output: Path) -> WrittenReport:
 def _write(experiment: Experiment, output: Path) -> WrittenReport:
     started = time.perf_counter()
     findings = compute_findings(experiment)
-    drawn, labels, beside = document.charts(findings), findings.labels, _beside(output)
+    drawn, labels, beside = document.draw_charts(findings), findings.labels, _beside(output)
     beside.mkdir(exist_ok=True)
     results = results_csv(findings)
     write_bytes(beside / "results.csv", encoded(results))

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jinja2
 from markupsafe import Markup
 
-from mjx_reinforce.reports import vega, words
+from mjx_reinforce.reports import charts, words
 from mjx_reinforce.reports.charts import curves, distribution, final, profile, sensitivity, solved
 from mjx_reinforce.reports.experiment import Experiment, counted, say, setting_in_words
 from mjx_reinforce.reports.findings import COMPARED, Findings
@@ -30,9 +30,9 @@ class Watch(NamedTuple):
     command: str
 
 
-def charts(findings: Findings) -> list[vega.Chart]:
+def draw_charts(findings: Findings) -> list[charts.Chart]:
     """Returns the charts that show something, numbered; those of all settings as one."""
-    made: list[vega.Chart] = []
+    made: list[charts.Chart] = []
     for chart in _CHARTS:
         place = made[-1].number + 1 if made else 1
         for each in chart.draw(findings):
@@ -43,7 +43,7 @@ def charts(findings: Findings) -> list[vega.Chart]:
 
 def render(
     findings: Findings,
-    drawn: list[vega.Chart],
+    drawn: list[charts.Chart],
     results: str,
     watch: Watch,
     version: str,
@@ -53,7 +53,7 @@ def render(
 
     Args:
       findings: the figures.
-      drawn: its ``charts``.
+      drawn: its charts.
       results: ``results.csv``.
       watch: how to see the worst seed.
       version: of this program.
@@ -61,7 +61,7 @@ def render(
     """
     import vl_convert
 
-    stops = vega.short(findings.grid[vega.slider_stops(findings)], 7)
+    stops = charts.short(findings.grid[charts.slider_stops(findings)], 7)
     content = {
         "labels": findings.labels,
         "specs": {figure.name: figure.spec for figure in drawn},
@@ -69,7 +69,7 @@ def render(
         "moments": stops,
         "results": results,
         "row": distribution.ROW,
-        "light": vega.LIGHT,
+        "light": charts.LIGHT,
     }
     loader = jinja2.Environment(
         loader=jinja2.FunctionLoader(_read_template),
@@ -89,7 +89,7 @@ def render(
         version=version,
         seconds=f"{seconds:.1f} s",
         findings=findings,
-        vega=vega,
+        charts=charts,
         words=words,
         css=Markup(_read_template("page.css")),
         script=Markup(_read_template("page.js")),
@@ -127,7 +127,7 @@ def _size_in_words(text: str) -> str:
     return f"{size / 1e6:.1f} MB" if size >= 1e6 else f"{max(1, round(size / 1e3))} kB"
 
 
-def _text(findings: Findings, drawn: list[vega.Chart]) -> dict[str, Any]:
+def _text(findings: Findings, drawn: list[charts.Chart]) -> dict[str, Any]:
     """Returns the text of the page, without the provenance of its numbers."""
     figures = {figure.name: figure for figure in drawn}
     sensitivity = [figure for figure in drawn if figure.name.startswith("sensitivity-")]

@@ -241,7 +241,9 @@ def read_run(directory: Path) -> Source:
     """Reads a run; raises as ``read_directory``."""
     path, summary_path = directory / "config.json", directory / "summary.json"
     config = read_json(path)
-    summary = read_json(summary_path) if summary_path.exists() else {"status": "running"}
+    summary: dict[str, Any] = {"status": "running"}
+    if summary_path.exists():
+        summary = read_json(summary_path)
     seeds = config.get("seeds")
     first = read_seeds(seeds).start if isinstance(seeds, str) else 0
     columns = read_metrics(directory / "metrics.csv", first)

@@ -6,9 +6,9 @@ import pytest
 from fake_sweeps import make_sweep
 from pages import findings_of
 
-from mjx_reinforce.reports import findings, vega, words
+from mjx_reinforce.reports import charts, findings, words
 from mjx_reinforce.reports.charts import distribution
-from mjx_reinforce.reports.document import charts
+from mjx_reinforce.reports.document import draw_charts
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def found(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def drawn(found):
-    return {each.name: each for each in charts(found)}
+    return {each.name: each for each in draw_charts(found)}
 
 
 def parts(spec, key):
@@ -41,7 +41,7 @@ def marks(spec):
 
 
 def numbers(found):
-    return [(each.number, each.name) for each in charts(found)]
+    return [(each.number, each.name) for each in draw_charts(found)]
 
 
 @pytest.mark.slow
@@ -58,13 +58,13 @@ def test_without_a_threshold_nothing_is_solved(found):
     experiment = found.experiment._replace(threshold=None)
     without = findings.compute_findings(experiment)
     assert [name for _, name in numbers(without)][:3] == ["final", "curves", "distribution"]
-    assert all("solved" not in json.dumps(each.spec) for each in charts(without))
-    assert vega.threshold_line(without, "x") == []
+    assert all("solved" not in json.dumps(each.spec) for each in draw_charts(without))
+    assert charts.threshold_line(without, "x") == []
 
 
 def test_a_threshold_far_above_all_returns_squeezes_no_figure(found, drawn):
     far = findings.compute_findings(found.experiment._replace(threshold=123_456.0))
-    made = {each.name: each for each in charts(far)}
+    made = {each.name: each for each in draw_charts(far)}
     assert "solved" not in made
     assert "123456" not in json.dumps([each.spec for each in made.values()])
     assert "123,456.0, lies above the figure" in made["curves"].caption
@@ -94,12 +94,12 @@ def test_a_chart_draws_what_it_names(found, drawn):
         assert named == {*each.data}, each.name
         assert each.listed is None or each.listed in each.data
         assert each.spec["description"] == each.alt
-        assert each.spec["config"] == vega.CONFIG
+        assert each.spec["config"] == charts.CONFIG
         assert each.spec["width"] == "container"
         assert {x["name"]: x["value"] for x in each.spec["params"] if "value" in x} == {
             "shown": found.labels[:4],
             "at": found.grid[-1],
-            "moment": len(vega.slider_stops(found)) - 1,
+            "moment": len(charts.slider_stops(found)) - 1,
             "logarithmic": False,
         }
 
@@ -122,14 +122,14 @@ def test_the_threshold_is_a_line_with_its_name(drawn):
 
 def test_configurations_keep_their_colours_and_dashes(found, drawn):
     """Whichever are shown, in every chart; one alone needs no legend."""
-    colours = [vega.colour(place) for place in range(6)]
+    colours = [charts.colour(place) for place in range(6)]
     for name in ("curves", "final", "solved", "distribution", "profile"):
         scales = [x["scale"] for x in parts(drawn[name].spec, "color") if "scale" in x]
         assert scales, name
         assert all(x["domain"] == found.labels and x["range"] == colours for x in scales), name
     (dashes,) = [x["scale"] for x in parts(drawn["curves"].spec, "strokeDash") if "scale" in x]
-    assert dashes["range"] == [vega.dash(place) for place in range(6)]
-    assert vega.series(["a"])["legend"] is None
+    assert dashes["range"] == [charts.dash(place) for place in range(6)]
+    assert charts.series(["a"])["legend"] is None
 
 
 def test_the_final_returns_are_rows_from_the_best_down(drawn):
@@ -152,7 +152,7 @@ def test_a_distribution_is_of_the_moment_and_within_its_ends(found, drawn):
 
 
 def test_a_chart_becomes_a_file_of_each_kind(found, drawn):
-    files = vega.render_chart(drawn["final"], found.labels, "Final returns")
+    files = charts.render_chart(drawn["final"], found.labels, "Final returns")
     assert files["png"].startswith(b"\x89PNG")
     assert files.keys() == {"png", "svg"}
     assert b"Final returns" in files["svg"]

@@ -15,7 +15,7 @@ from measured_runs import ONE, make_measured_run
 from pages import CUT, change_curves, content, findings_of, run_report, visible
 
 from mjx_reinforce import report
-from mjx_reinforce.reports import document, findings, sources, vega, words
+from mjx_reinforce.reports import charts, document, findings, sources, words
 from mjx_reinforce.reports.findings import worst_seeds
 
 HOSTILE = "x</script><script>alert(1)</script>\"'&"
@@ -93,12 +93,14 @@ def test_the_figures_are_those_of_the_curves(found):
 
 def tables_of(found):
     """The data of all charts."""
-    return {name: table for each in document.charts(found) for name, table in each.data.items()}
+    return {
+        name: table for each in document.draw_charts(found) for name, table in each.data.items()
+    }
 
 
 def test_a_histogram_has_every_seed(found):
     data = tables_of(found)["histogram"]
-    last = len(vega.slider_stops(found)) - 1
+    last = len(charts.slider_stops(found)) - 1
     for place, result in enumerate(found.results):
         rows = zip(data["configuration"], data["moment"], data["share"], strict=True)
         share = sum(share for c, m, share in rows if (c, m) == (place, last))
@@ -268,7 +270,7 @@ def test_command_line(tmp_path):
 
 def said_by_main(monkeypatch, capsys, *arguments):
     """What the command says, or how it refuses; nothing is drawn."""
-    monkeypatch.setattr(report.document, "charts", lambda findings: [])
+    monkeypatch.setattr(report.document, "draw_charts", lambda findings: [])
     monkeypatch.setattr(report.document, "render", lambda *arguments: "a page")
     monkeypatch.setattr(sys, "argv", ["report", *map(str, arguments)])
     status = 0
@@ -342,7 +344,7 @@ def test_a_configuration_that_ended_earlier_stays_at_its_end(tmp_path):
     shown = findings_of(directory)
     place = shown.order.index(0)
     drawn = tables_of(shown)
-    last = len(vega.slider_stops(shown)) - 1
+    last = len(charts.slider_stops(shown)) - 1
     said = drawn["moments"]["said"][place * (last + 1) : (place + 1) * (last + 1)]
     assert "its end: " in said[last]
     assert "its end: " not in said[0]

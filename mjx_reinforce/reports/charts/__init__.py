@@ -1,1 +1,304 @@
-"""The charts of the report's page, a file each; ``draw`` yields a chart, or none without rows."""
+"""The charts of the report, a file each, and what all share: look, scales, how they are drawn.
+
+``draw`` of a file yields a chart, or none where there is nothing to show. Charts are in Vega-Lite,
+see https://vega.github.io/vega-lite/docs/. They show the configurations whose labels are in the
+parameter ``shown``; the page's check boxes set it. ``at`` is the env step, and ``moment`` its
+number, that the page's slider sets. They name a colour as a CSS variable, so that one drawing fits
+both grounds and print.
+"""
+
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from mjx_reinforce.reports.findings import Findings, Result
+from mjx_reinforce.statistics import Estimate
+
+#: A part of a specification.
+Spec = dict[str, Any]
+#: Columns by name, all of one length. ``configuration`` holds places among the results.
+Table = dict[str, list[Any]]
+
+#: So many configurations are shown at first, the best.
+SHOWN = 4
+#: Moments that the page's slider stops at, at most.
+_MOMENTS = 30
+
+#: Okabe and Ito's colours, told apart by colour-blind people (https://jfly.uni-koeln.de/color/);
+#: without their yellow, which is lost on white.
+_SERIES_LIGHT = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#b87a00", "#56b4e9", "#4d4d4d")
+_SERIES_DARK = ("#4aa8e0", "#f2803a", "#2cc79a", "#e39cc4", "#e69f00", "#8fd0f7", "#c8c8c8")
+_GROUND = {
+    "light": {"paper": "#ffffff", "ink": "#1b1b1b", "soft": "#5c5c5c", "line": "#d9d9d6"},
+    "dark": {"paper": "#16181b", "ink": "#ececea", "soft": "#a9abae", "line": "#3a3d42"},
+}
+LIGHT = _GROUND["light"] | {f"series-{i}": colour for i, colour in enumerate(_SERIES_LIGHT)}
+DARK = _GROUND["dark"] | {f"series-{i}": colour for i, colour in enumerate(_SERIES_DARK)}
+#: Dashes, as lengths of strokes and gaps; not as many as colours, so that pairs repeat late.
+_DASHES = ([1, 0], [7, 3], [2, 2], [9, 3, 2, 3])
+
+
+def colour(place: int) -> str:
+    """Returns the colour of the configuration at a place."""
+    return f"var(--series-{place % len(_SERIES_LIGHT)})"
+
+
+def dash(place: int) -> list[int]:
+    """Returns its dashes."""
+    return _DASHES[place % len(_DASHES)]
+
+
+def in_light(text: str) -> str:
+    """Returns a text with light colours in place of the variables, for what does not know CSS."""
+    return re.sub(r"var\(--([\w-]+)\)", lambda name: LIGHT[name[1]], text)
+
+
+def quantity(field: str, **more: Any) -> Spec:
+    """Returns a channel that shows a number."""
+    return {"field": field, "type": "quantitative", **more}
+
+
+def layer(mark: str, encoding: Spec, **look: Any) -> Spec:
+    """Returns a layer of marks of a kind, how they look, and what they show."""
+    return {"mark": {"type": mark, **look}, "encoding": encoding}
+
+
+#: The env steps of a seed, along the bottom.
+STEPS = quantity(
+    "env_steps",
+    title="env steps of a seed",
+    axis={"labelExpr": "datum.value ? format(datum.value, '~s') : '0'"},
+    scale={"nice": False},
+)
+_CONFIGURATION = {"field": "configuration", "type": "nominal"}
+#: Data of one row, of what is drawn once.
+_ONCE = {"values": [{}]}
+#: Pixels of a configuration's name in a legend, at most.
+_LABEL_LIMIT = 420
+_TEXT = {"labelColor": "var(--ink)", "titleColor": "var(--soft)", "titleFontWeight": "normal"}
+_SIZES = {"labelFontSize": 12, "titleFontSize": 12}
+_AXIS = {"gridColor": "var(--line)", "domainColor": "var(--soft)", "tickColor": "var(--soft)"}
+_ABOVE = {"titleAlign": "left", "titleAngle": 0, "titleAnchor": "start", "titleX": 0, "titleY": -12}
+_SYMBOLS = {"symbolStrokeWidth": 2.5, "symbolSize": 300, "labelLimit": _LABEL_LIMIT}
+#: How all charts look.
+CONFIG = {
+    "font": "ui-sans-serif, system-ui, 'Helvetica Neue', Arial, 'Liberation Sans', sans-serif",
+    "background": None,
+    "view": {"stroke": None},
+    "axis": {**_TEXT, **_SIZES, **_AXIS, "gridOpacity": 0.7, "labelOverlap": True},
+    "axisX": {"grid": False, "tickCount": 6},
+    "axisY": {"domain": False, "ticks": False, "tickCount": 5, **_ABOVE},
+    "legend": {**_TEXT, **_SIZES, **_SYMBOLS},
+    "text": {"color": "var(--ink)", "fontSize": 12},
+    "rule": {"color": "var(--soft)"},
+}
+
+
+def rows(table: Table, labels: Sequence[str]) -> list[dict[str, Any]]:
+    """Returns a table row by row, with the labels of its configurations."""
+    names = list(table)
+    listed = [dict(zip(names, row, strict=True)) for row in zip(*table.values(), strict=True)]
+    if "configuration" in table:
+        return [row | {"configuration": labels[row["configuration"]]} for row in listed]
+    return listed
+
+
+def short(values: ArrayLike, digits: int = 5) -> list[Any]:
+    """Returns numbers with a few digits, None where they are not finite."""
+    flat = np.asarray(values, float).ravel().tolist()
+    return [_integer(float(f"{x:.{digits}g}")) if math.isfinite(x) else None for x in flat]
+
+
+def _integer(value: float) -> float | int:
+    return int(value) if value.is_integer() else value
+
+
+def means(results: Sequence[Result]) -> Table:
+    """Returns the mean final return of results, and the ends of its interval."""
+    return {x: short([getattr(each.mean, x) for each in results]) for x in Estimate._fields}
+
+
+def stacked(parts: Iterable[Mapping[str, Any]]) -> Table:
+    """Returns tables below each other; what is no list in one is the same in all of its rows."""
+    table: Table = {}
+    for part in parts:
+        length = next(len(x) for x in part.values() if isinstance(x, list))
+        for name, values in part.items():
+            table.setdefault(name, []).extend(
+                values if isinstance(values, list) else [values] * length
+            )
+    return table
+
+
+class Chart(NamedTuple):
+    """A chart, what is said of it, and what it is drawn from.
+
+    name: of its file
+    number: on the page
+    alt: for who cannot see it
+    spec: in Vega-Lite, without data
+    data: tables by name
+    listed: the name of the table that the page can show, if any
+    """
+
+    name: str
+    title: str
+    caption: str
+    alt: str
+    spec: Spec
+    data: dict[str, Table]
+    listed: str | None = None
+    number: int = 0
+
+
+def make_chart(findings: Findings, layers: Sequence[Spec], height: int, **fields: Any) -> Chart:
+    """Returns a chart of layers over one another.
+
+    Args:
+      findings: what it is of.
+      layers: the lowest first.
+      height: in pixels.
+      **fields: of ``Chart``, but for ``spec``.
+    """
+    at_first = {
+        "shown": findings.labels[:SHOWN],
+        "at": float(findings.grid[-1]),
+        "moment": len(slider_stops(findings)) - 1,
+        "logarithmic": False,
+    }
+    spec = {
+        "$schema": "https://vega.github.io/schema/vega-lite/v6.json",
+        "description": fields["alt"],
+        "config": CONFIG,
+        "params": [{"name": name, "value": value} for name, value in at_first.items()],
+        "width": "container",
+        "height": height,
+        "autosize": {"type": "fit-x", "contains": "padding"},
+        "layer": layers,
+    }
+    return Chart(spec=spec, **fields)
+
+
+def render_chart(chart: Chart, labels: Sequence[str], title: str) -> dict[str, bytes]:
+    """Returns a chart of configurations with these labels as pictures, by their files' endings."""
+    import vl_convert
+
+    datasets = {name: rows(table, labels) for name, table in chart.data.items()}
+    whole = chart.spec | {"datasets": datasets, "width": 720, "background": "var(--paper)"}
+    whole["title"] = {"text": title, "anchor": "start", "color": "var(--ink)", "offset": 14}
+    svg = vl_convert.vegalite_to_svg(json.loads(in_light(json.dumps(whole))))
+    return {"png": vl_convert.svg_to_png(svg, scale=2), "svg": svg.encode()}
+
+
+def slider_stops(findings: Findings) -> list[int]:
+    """Returns the points of the grid that the slider stops at."""
+    last = len(findings.grid) - 1
+    return np.unique(np.linspace(0, last, min(_MOMENTS, last + 1)).round().astype(int)).tolist()
+
+
+def tooltip(**fields: tuple[str, str]) -> list[Spec]:
+    """Returns what is said where one points: the configuration, and fields by name and format."""
+    said = fields.items()
+    return [_CONFIGURATION, *(quantity(x, title=name, format=form) for x, (name, form) in said)]
+
+
+def shown_rows(data: str, *more: Spec) -> Spec:
+    """Returns the rows that are shown, after ``more`` transforms; a log axis has no place for 0."""
+    filters = (
+        "indexof(shown, datum.configuration) >= 0",
+        "!logarithmic || !(datum.env_steps <= 0)",
+    )
+    return {"data": {"name": data}, "transform": [*({"filter": test} for test in filters), *more]}
+
+
+def series(labels: Sequence[str], *, legend: bool = True) -> Spec:
+    """Returns the colours of configurations."""
+    return _by_place(labels, [colour(i) for i in range(len(labels))], legend=legend)
+
+
+def dashes(labels: Sequence[str]) -> Spec:
+    """Returns the dashes of configurations."""
+    return _by_place(labels, [dash(i) for i in range(len(labels))])
+
+
+def _by_place(labels: Sequence[str], looks: Sequence[Any], *, legend: bool = True) -> Spec:
+    """Returns how configurations look, each by its place, and a legend of several.
+
+    It has as many columns as the page has room for. Not as the chart has: that is narrowed to leave
+    room for the axis once the legend is laid out.
+    """
+    column = min(7 * max(map(len, labels)), _LABEL_LIMIT) + 50
+    columns = f"max(1, floor((width && containerSize()[0] || width) / {column}))"
+    place = {"title": None, "orient": "top", "direction": "horizontal", "offset": 36}
+    place |= {"columns": {"expr": columns}, "values": {"expr": "shown"}}
+    look = {"symbolType": "stroke", "symbolOpacity": 1, "labelFontSize": 12}
+    return {
+        **_CONFIGURATION,
+        "scale": {"domain": list(labels), "range": list(looks)},
+        "legend": place | look if legend and len(labels) > 1 else None,
+    }
+
+
+def share_layers(
+    findings: Findings,
+    data: str,
+    x: Spec,
+    title: str,
+    said: Mapping[str, tuple[str, str]],
+    interpolate: str = "linear",
+) -> Spec:
+    """Returns the band and the line of a share of the seeds over ``x``; ``said`` of a point."""
+    tips = tooltip(**said, low=("95 % from", ".1%"), high=("to", ".1%"))
+    band = {"y": quantity("low", title=title), "y2": {"field": "high"}}
+    share = quantity("share", title=title, scale={"domain": [0, 1]}, axis={"format": ".0%"})
+    line = {"y": share, "strokeDash": dashes(findings.labels), "tooltip": tips}
+    return shown_rows(data) | {
+        "encoding": {"x": x, "color": series(findings.labels)},
+        "layer": [
+            layer("area", band, opacity=0.18, interpolate=interpolate),
+            layer("line", line, strokeWidth=2.2, interpolate=interpolate),
+        ],
+    }
+
+
+def moment_line(findings: Findings) -> Spec:
+    """Returns a line at the slider's env step, without one at the end of the axis."""
+    end = float(findings.grid[-1])
+    return {
+        "data": _ONCE,
+        "transform": [
+            {"calculate": "at", "as": "env_steps"},
+            {"filter": f"datum.env_steps < {end} && datum.env_steps > 0"},
+        ],
+        **layer("rule", {"x": quantity("env_steps")}, strokeDash=[2, 3]),
+    }
+
+
+def drawn_threshold(findings: Findings) -> float | None:
+    """Returns the return that counts as solved, None where it would squeeze all that is drawn."""
+    threshold = findings.experiment.threshold
+    returns = np.concatenate([each.configuration.eval_return.ravel() for each in findings.results])
+    known = returns[np.isfinite(returns)]
+    if threshold is None or not known.size or threshold - known.max() > 0.5 * np.ptp(known):
+        return None
+    return threshold
+
+
+def threshold_line(findings: Findings, axis: str) -> list[Spec]:
+    """Returns the line at the return that counts as solved, and its name."""
+    threshold = drawn_threshold(findings)
+    if threshold is None:
+        return []
+    # Below the line, at its end: curves come from below and end above.
+    at_end, look = {"x": {"value": {"expr": "width - 4"}}}, {"baseline": "top", "dy": 5}
+    if axis == "x":
+        at_end, look = {"y": {"value": {"expr": "height - 5"}}}, {"baseline": "bottom", "dx": -5}
+    rule = {"mark": {"type": "rule", "strokeDash": [6, 4], "opacity": 0.8}}
+    name = {**at_end, "text": {"value": "solved"}}
+    said = layer("text", name, align="right", color="var(--soft)", **look)
+    return [{"data": _ONCE, "encoding": {axis: {"datum": threshold}}, "layer": [rule, said]}]

@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.reports import vega
+from mjx_reinforce.reports import charts
+from mjx_reinforce.reports.charts import Table, short, stacked
 from mjx_reinforce.reports.findings import Findings, Result, from_the_worst
-from mjx_reinforce.reports.vega import Table, short, stacked
 from mjx_reinforce.reports.words import number
 
 #: Seeds that are drawn one by one: of one configuration, and of all together.
@@ -15,20 +15,20 @@ _DRAWN_OF_ONE = 40
 _DRAWN_OF_ALL = 480
 
 
-def draw(findings: Findings) -> Iterator[vega.Chart]:
+def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart."""
     threshold, beyond = findings.experiment.threshold, ""
-    if threshold is not None and vega.drawn_threshold(findings) is None:
+    if threshold is not None and charts.drawn_threshold(findings) is None:
         beyond = f" The return that counts as solved, {number(threshold)}, lies above the figure."
     layers = [
         {
-            "encoding": {"x": vega.STEPS, "color": vega.series(findings.labels)},
+            "encoding": {"x": charts.STEPS, "color": charts.series(findings.labels)},
             "layer": [_lines_of_seeds(), _band_and_line(findings)],
         },
-        vega.moment_line(findings),
-        *vega.threshold_line(findings, "y"),
+        charts.moment_line(findings),
+        *charts.threshold_line(findings, "y"),
     ]
-    yield vega.make_chart(
+    yield charts.make_chart(
         findings,
         layers,
         320,
@@ -46,33 +46,33 @@ def draw(findings: Findings) -> Iterator[vega.Chart]:
     )
 
 
-def _return(field: str) -> vega.Spec:
+def _return(field: str) -> charts.Spec:
     title = "return of the deterministic policy"
-    return vega.quantity(field, title=title, scale={"zero": False})
+    return charts.quantity(field, title=title, scale={"zero": False})
 
 
-def _lines_of_seeds() -> vega.Spec:
+def _lines_of_seeds() -> charts.Spec:
     encoding = {"y": _return("value"), "detail": {"field": "seed"}}
     return {
-        **vega.shown_rows("seeds", {"filter": "length(shown) == 1"}),
-        **vega.layer("line", encoding, strokeWidth=0.8, opacity=0.35, clip=True),
+        **charts.shown_rows("seeds", {"filter": "length(shown) == 1"}),
+        **charts.layer("line", encoding, strokeWidth=0.8, opacity=0.35, clip=True),
     }
 
 
-def _band_and_line(findings: Findings) -> vega.Spec:
+def _band_and_line(findings: Findings) -> charts.Spec:
     """Returns the interval, the mean, and its point nearest to the pointer, which says itself."""
     band = {"y": _return("low"), "y2": {"field": "high"}}
-    mean = {"y": _return("value"), "strokeDash": vega.dashes(findings.labels)}
+    mean = {"y": _return("value"), "strokeDash": charts.dashes(findings.labels)}
     near = {"type": "point", "on": "pointerover", "fields": ["env_steps"], "nearest": True}
     seen = {"condition": {"param": "near", "empty": False, "value": 1}, "value": 0}
     # Vega-Lite leaves words out of a nearest point's tooltip, unless all data are in it.
     said = {"size": 70, "filled": True, "tooltip": {"content": "data"}}
-    return vega.shown_rows("curves") | {
+    return charts.shown_rows("curves") | {
         "layer": [
-            vega.layer("area", band, opacity=0.18, clip=True),
-            vega.layer("line", mean, strokeWidth=2.2, clip=True),
+            charts.layer("area", band, opacity=0.18, clip=True),
+            charts.layer("line", mean, strokeWidth=2.2, clip=True),
             {
-                **vega.layer("point", {"y": _return("value"), "opacity": seen}, **said),
+                **charts.layer("point", {"y": _return("value"), "opacity": seen}, **said),
                 "params": [{"name": "near", "select": near}],
             },
         ]

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mjx_reinforce.reports import vega
+from mjx_reinforce.reports import charts
+from mjx_reinforce.reports.charts import Table, short, stacked
 from mjx_reinforce.reports.findings import Findings, Result
-from mjx_reinforce.reports.vega import Table, short, stacked
 
 #: Height of a configuration's row, in pixels.
 ROW = 66
@@ -14,13 +14,13 @@ ROW = 66
 _BARS = 36
 
 
-def draw(findings: Findings) -> Iterator[vega.Chart]:
+def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart."""
     borders = _borders(findings)
-    yield vega.make_chart(
+    yield charts.make_chart(
         findings,
         [_labels(), _bars(findings, borders)],
-        ROW * len(findings.labels[: vega.SHOWN]),
+        ROW * len(findings.labels[: charts.SHOWN]),
         name="distribution",
         title="Where the seeds are",
         caption=(
@@ -38,10 +38,10 @@ def draw(findings: Findings) -> Iterator[vega.Chart]:
 _Y = {"axis": None, "scale": {"domain": [0, {"expr": "length(shown)"}], "nice": False}}
 
 
-def _at_the_moment(data: str, top: str) -> vega.Spec:
+def _at_the_moment(data: str, top: str) -> charts.Spec:
     """Returns the rows of a moment, with the ground of each one's row and how high it reaches."""
     base = "length(shown) - 1 - indexof(shown, datum.configuration)"
-    return vega.shown_rows(
+    return charts.shown_rows(
         data,
         {"filter": "datum.moment == moment"},
         {"calculate": base, "as": "base"},
@@ -49,33 +49,33 @@ def _at_the_moment(data: str, top: str) -> vega.Spec:
     )
 
 
-def _labels() -> vega.Spec:
+def _labels() -> charts.Spec:
     """Returns the ground of each row and, at its top, what is said of it."""
-    ground = {"x": {"value": 0}, "x2": {"value": "width"}, "y": vega.quantity("base", **_Y)}
-    said = {"x": {"value": 2}, "y": vega.quantity("top", **_Y), "text": {"field": "said"}}
+    ground = {"x": {"value": 0}, "x2": {"value": "width"}, "y": charts.quantity("base", **_Y)}
+    said = {"x": {"value": 2}, "y": charts.quantity("top", **_Y), "text": {"field": "said"}}
     look = {"align": "left", "baseline": "top", "lineBreak": "\n", "lineHeight": 15}
     return _at_the_moment("moments", "0.92") | {
         "layer": [
-            vega.layer("rule", ground, opacity=0.6),
-            vega.layer("text", said, limit={"expr": "width"}, **look),
+            charts.layer("rule", ground, opacity=0.6),
+            charts.layer("text", said, limit={"expr": "width"}, **look),
         ]
     }
 
 
-def _bars(findings: Findings, borders: np.ndarray) -> vega.Spec:
+def _bars(findings: Findings, borders: np.ndarray) -> charts.Spec:
     ends = {"domain": [float(borders[0]), float(borders[-1])], "nice": False}
     said = {"low": ("return from", ",.0f"), "high": ("to", ",.0f")}
     encoding = {
-        "x": vega.quantity("low", title="return", scale=ends),
+        "x": charts.quantity("low", title="return", scale=ends),
         "x2": {"field": "high"},
-        "y": vega.quantity("base", **_Y),
+        "y": charts.quantity("base", **_Y),
         "y2": {"field": "top"},
-        "color": vega.series(findings.labels, legend=False),
-        "tooltip": vega.tooltip(**said, share=("share of seeds", ".1%")),
+        "color": charts.series(findings.labels, legend=False),
+        "tooltip": charts.tooltip(**said, share=("share of seeds", ".1%")),
     }
     return {
         **_at_the_moment("histogram", "0.5 * datum.height"),
-        **vega.layer("bar", encoding, opacity=0.85, binSpacing=0),
+        **charts.layer("bar", encoding, opacity=0.85, binSpacing=0),
     }
 
 
@@ -95,7 +95,7 @@ def _histograms(findings: Findings, borders: np.ndarray) -> dict[str, Table]:
     The last moment is the end: each seed's last evaluation, which tables are of. The grid ends
     where the first seed did, when some may not have solved the task that do.
     """
-    bars, said, stops = [], [], vega.slider_stops(findings)
+    bars, said, stops = [], [], charts.slider_stops(findings)
     for place, result in enumerate(findings.results):
         end = result.configuration.env_steps[-1].min()
         for moment, k in enumerate(stops):

@@ -4,23 +4,23 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mjx_reinforce.reports import vega
+from mjx_reinforce.reports import charts
+from mjx_reinforce.reports.charts import means, short
 from mjx_reinforce.reports.experiment import counted
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.vega import means, short
 from mjx_reinforce.reports.words import number, within
 
 
-def draw(findings: Findings) -> Iterator[vega.Chart]:
+def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart; none of one configuration alone."""
     results, best = findings.results, findings.results[0]
     if len(results) == 1:
         return
     places = list(range(len(results)))
     tenths = np.transpose([np.quantile(each.scores, [0.1, 0.9]) for each in results])
-    yield vega.make_chart(
+    yield charts.make_chart(
         findings,
-        [_rows(findings), *vega.threshold_line(findings, "x")],
+        [_rows(findings), *charts.threshold_line(findings, "x")],
         42 * len(results) + 10,
         name="final",
         title="The return at the end",
@@ -44,7 +44,7 @@ def draw(findings: Findings) -> Iterator[vega.Chart]:
     )
 
 
-def _rows(findings: Findings) -> vega.Spec:
+def _rows(findings: Findings) -> charts.Spec:
     said = {
         "value": "mean over seeds",
         "low": "95 % from",
@@ -52,27 +52,27 @@ def _rows(findings: Findings) -> vega.Spec:
         "tenth": "a tenth of the seeds below",
         "ninetieth": "a tenth above",
     }
-    tips = vega.tooltip(**{field: (name, ",.4~g") for field, name in said.items()})
-    color = vega.series(findings.labels, legend=False)
+    tips = charts.tooltip(**{field: (name, ",.4~g") for field, name in said.items()})
+    color = charts.series(findings.labels, legend=False)
     scale = {"zero": False, "padding": 12}
-    mean = vega.quantity("value", title="return at the end", scale=scale)
+    mean = charts.quantity("value", title="return at the end", scale=scale)
     y = {"axis": None, "scale": {"domain": [len(findings.results) - 0.4, -0.6]}}
-    tenths = {"x": vega.quantity("tenth"), "x2": {"field": "ninetieth"}}
-    interval = {"x": vega.quantity("low"), "x2": {"field": "high"}}
+    tenths = {"x": charts.quantity("tenth"), "x2": {"field": "ninetieth"}}
+    interval = {"x": charts.quantity("low"), "x2": {"field": "high"}}
     label = {"x": {"value": 2}, "text": {"field": "configuration"}}
     above = {"align": "left", "baseline": "bottom", "dy": -9, "limit": {"expr": "width"}}
     return {
         "data": {"name": "final"},
-        "encoding": {"y": vega.quantity("place", **y)},
+        "encoding": {"y": charts.quantity("place", **y)},
         "layer": [
             {
                 "encoding": {"color": color, "tooltip": tips},
                 "layer": [
-                    vega.layer("rule", tenths, strokeWidth=9, opacity=0.22, strokeCap="butt"),
-                    vega.layer("rule", interval, strokeWidth=2.5),
-                    vega.layer("point", {"x": mean}, filled=True, size=75, opacity=1),
+                    charts.layer("rule", tenths, strokeWidth=9, opacity=0.22, strokeCap="butt"),
+                    charts.layer("rule", interval, strokeWidth=2.5),
+                    charts.layer("point", {"x": mean}, filled=True, size=75, opacity=1),
                 ],
             },
-            vega.layer("text", label, **above),
+            charts.layer("text", label, **above),
         ],
     }

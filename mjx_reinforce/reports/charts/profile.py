@@ -4,16 +4,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mjx_reinforce.reports import vega
+from mjx_reinforce.reports import charts
+from mjx_reinforce.reports.charts import short, stacked
 from mjx_reinforce.reports.findings import Findings
-from mjx_reinforce.reports.vega import short, stacked
 from mjx_reinforce.statistics.aggregates import performance_profile
 
 #: Points of a profile, at most.
 _MOST_POINTS = 80
 
 
-def draw(findings: Findings) -> Iterator[vega.Chart]:
+def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart; none where no seed ended with a finite return."""
     finals = np.concatenate([each.final for each in findings.results])
     finals = finals[np.isfinite(finals)]
@@ -21,12 +21,12 @@ def draw(findings: Findings) -> Iterator[vega.Chart]:
         return
     returns = np.linspace(finals.min(), finals.max(), _MOST_POINTS)
     shares = [performance_profile(each.final, returns) for each in findings.results]
-    x = vega.quantity("threshold", title="return at the end", scale={"nice": False})
+    x = charts.quantity("threshold", title="return at the end", scale={"nice": False})
     said = {"threshold": ("return", ",.1f"), "share": ("seeds above", ".1%")}
-    lines = vega.share_layers(findings, "profile", x, "seeds above it", **said)
-    yield vega.make_chart(
+    lines = charts.share_layers(findings, "profile", x, "seeds above it", said)
+    yield charts.make_chart(
         findings,
-        [lines, *vega.threshold_line(findings, "x")],
+        [lines, *charts.threshold_line(findings, "x")],
         320,
         name="profile",
         title="Performance profiles",

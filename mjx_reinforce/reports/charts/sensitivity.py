@@ -6,17 +6,17 @@ Configurations that differ in this setting alone are joined by a line.
 from collections.abc import Iterator
 from typing import Literal
 
-from mjx_reinforce.reports import vega
+from mjx_reinforce.reports import charts
+from mjx_reinforce.reports.charts import Table, means
 from mjx_reinforce.reports.experiment import ordered, say, setting_in_words
 from mjx_reinforce.reports.findings import Findings, swept, values_of
-from mjx_reinforce.reports.vega import Table, means
 
 
-def draw(findings: Findings) -> Iterator[vega.Chart]:
+def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields a chart of each setting that differs."""
     for n, name in enumerate(swept(findings)):
         data, said = f"sensitivity-{n}", setting_in_words(name)
-        yield vega.make_chart(
+        yield charts.make_chart(
             findings,
             [_lines(data, _axis(findings, name))],
             220,
@@ -28,26 +28,26 @@ def draw(findings: Findings) -> Iterator[vega.Chart]:
         )
 
 
-def _lines(data: str, x: vega.Spec) -> vega.Spec:
+def _lines(data: str, x: charts.Spec) -> charts.Spec:
     """Returns the means and their intervals; those that agree with the best stand out."""
 
-    def if_best(one: object, other: object) -> vega.Spec:
+    def if_best(one: object, other: object) -> charts.Spec:
         return {"condition": {"test": "datum.best", "value": one}, "value": other}
 
     title = "mean return at the end"
-    value = vega.quantity("value", title=title, scale={"zero": False, "padding": 8})
-    interval = {"y": vega.quantity("low", title=title), "y2": {"field": "high"}}
+    value = charts.quantity("value", title=title, scale={"zero": False, "padding": 8})
+    interval = {"y": charts.quantity("low", title=title), "y2": {"field": "high"}}
     said = {"value": "mean return", "low": "95 % from", "high": "to"}
-    tips = vega.tooltip(**{field: (name, ",.1f") for field, name in said.items()})
+    tips = charts.tooltip(**{field: (name, ",.1f") for field, name in said.items()})
     joined = {"y": value, "detail": {"field": "others"}, "strokeWidth": if_best(2.6, 1)}
     paint = if_best("var(--series-0)", "var(--soft)")
     return {
         "data": {"name": data},
         "encoding": {"x": x, "color": paint, "opacity": if_best(1, 0.55)},
         "layer": [
-            vega.layer("line", joined),
-            vega.layer("rule", interval, strokeWidth=2),
-            vega.layer("point", {"y": value, "tooltip": tips}, filled=True, size=60),
+            charts.layer("line", joined),
+            charts.layer("rule", interval, strokeWidth=2),
+            charts.layer("point", {"y": value, "tooltip": tips}, filled=True, size=60),
         ],
     }
 
@@ -60,7 +60,7 @@ def _kind_of_axis(findings: Findings, name: str) -> Literal["log", "linear", "or
     return "log" if low > 0 and high / low >= 8 else "linear"
 
 
-def _axis(findings: Findings, name: str) -> vega.Spec:
+def _axis(findings: Findings, name: str) -> charts.Spec:
     """Returns the axis for a setting, with its name in words."""
     kind, values = _kind_of_axis(findings, name), ordered(values_of(findings, name))
     title = setting_in_words(name)
@@ -70,7 +70,7 @@ def _axis(findings: Findings, name: str) -> vega.Spec:
     axis = {"values": values, "format": "~g"} if len(values) <= 8 else {}
     zero = {} if kind == "log" else {"zero": False}
     scale = {"type": kind, "padding": 14, "nice": False, **zero}
-    return vega.quantity("setting", title=title, scale=scale, axis=axis)
+    return charts.quantity("setting", title=title, scale=scale, axis=axis)
 
 
 def _means_by_setting(findings: Findings, name: str) -> Table:

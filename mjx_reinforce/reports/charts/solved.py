@@ -5,23 +5,23 @@ from typing import Any
 
 import numpy as np
 
-from mjx_reinforce.reports import vega
+from mjx_reinforce.reports import charts
+from mjx_reinforce.reports.charts import Table, short, stacked
 from mjx_reinforce.reports.findings import Findings, Result
-from mjx_reinforce.reports.vega import Table, short, stacked
 from mjx_reinforce.reports.words import number
 from mjx_reinforce.statistics.survival import kaplan_meier
 
 
-def draw(findings: Findings) -> Iterator[vega.Chart]:
+def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart; none where no seed solved the task."""
     if not any(each.solving and each.solving.ever for each in findings.results):
         return
     said = {"env_steps": ("env steps", ",.0f"), "share": ("have solved", ".1%")}
     title = "seeds that have solved the task"
-    lines = vega.share_layers(findings, "solved", vega.STEPS, title, "step-after", **said)
-    yield vega.make_chart(
+    lines = charts.share_layers(findings, "solved", charts.STEPS, title, said, "step-after")
+    yield charts.make_chart(
         findings,
-        [lines, vega.moment_line(findings)],
+        [lines, charts.moment_line(findings)],
         320,
         name="solved",
         title="How many have solved it",
