@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -131,10 +130,8 @@ def read_policy(
     """
     settings_path, actor_path = Path(directory) / "policy.json", Path(directory) / "actor.npz"
     settings, arrays = read_json(settings_path), read_arrays(actor_path, stored=True)
-    checksum = arrays.pop(_CHECKSUM, None)
-    # Files from before there was a checksum have none. It finds damage, not ill will: who changes
-    # the files can compute it again.
-    if checksum is not None and checksum != _checksum(settings, arrays):
+    # The checksum finds damage, not ill will: who changes the files can compute it again.
+    if arrays.pop(_CHECKSUM, None) != _checksum(settings, arrays):
         raise ValueError(
             f"{settings_path} is damaged, or actor.npz beside it: they do not belong together "
             "(their checksum differs), so one of them was changed or is another run's"
@@ -149,9 +146,7 @@ def read_policy(
         )
     with naming_damage(settings_path):
         policy = build_policy(settings)
-        shapes = _array_shapes(policy, settings["observation_size"])
-    with naming_damage(actor_path):
-        num_seeds = _check_arrays(arrays, shapes)
+    num_seeds = len(arrays["normalizer/count"])
     if seed is not None and not 0 <= seed < num_seeds:
         seeds = f"its seeds are 0 to {num_seeds - 1}" if num_seeds > 1 else "it has seed 0 alone"
         raise ValueError(f"{directory} has no seed {seed}: {seeds}")
@@ -159,29 +154,6 @@ def read_policy(
         _check_finite(arrays, seed)
     actor = jax.tree.map(lambda x: jnp.asarray(x if seed is None else x[seed]), actor_of(arrays))
     return SavedPolicy(policy, actor, settings, num_seeds)
-
-
-def _check_arrays(arrays: Arrays, expected: Mapping[str, tuple[int, ...]]) -> int:
-    """Returns the number of seeds S in the arrays of an archive.
-
-    Args:
-      arrays: [S, ...] each.
-      expected: the shapes of what the policy needs, without the seeds' axis.
-
-    Raises:
-      KeyError: there is no count of observations.
-      ValueError: an array is missing, is not of the policy, or has another shape.
-    """
-    num_seeds = len(arrays["normalizer/count"])
-    found = {name: array.shape for name, array in arrays.items()}
-    wanted = {name: (num_seeds, *shape) for name, shape in expected.items()}
-    for name in sorted(found.keys() | wanted.keys()):
-        if found.get(name) != wanted.get(name):
-            raise ValueError(
-                f"{name} has the shape {found.get(name, 'none')}, by policy.json and the "
-                f"{num_seeds} seeds it should be {wanted.get(name, 'none')}"
-            )
-    return num_seeds
 
 
 def _check_finite(arrays: Arrays, seed: int | None) -> None:
@@ -201,16 +173,6 @@ def actor_of(arrays: dict[str, Any]) -> Actor:
     """Returns the actor of ``arrays_of``."""
     tree = traverse_util.unflatten_dict(arrays, sep="/")
     return Actor(params=tree["params"], normalizer=normalize.Normalizer(**tree["normalizer"]))
-
-
-def _array_shapes(policy: Policy, observation_size: int) -> dict[str, tuple[int, ...]]:
-    """Returns the shapes of one seed's arrays, under their names in the archive."""
-
-    def first():
-        params = policy.init(jax.random.key(0))
-        return Actor(params=params, normalizer=normalize.init(observation_size))
-
-    return {name: array.shape for name, array in arrays_of(jax.eval_shape(first)).items()}
 
 
 def _checksum(settings: dict[str, Any], arrays: dict[str, np.ndarray]) -> str:

@@ -28,19 +28,15 @@ Form = TypeVar("Form")
 
 #: Columns that --help is written for at least: of 20 columns tyro makes thousands of lines.
 _LEAST_WIDTH = 60
-#: What tyro says of a value -> what we say, of its first paragraph.
+#: What tyro says of a value -> what we say, where that is clearer.
 _OUR_WORDS = {
     r"\{None\}\||'None', |, 'None'": "",  # who leaves a flag out means that
     r"Error parsing (PATH|\[.*\]): .*": "'' is no path",  # without a flag
-    r"Missing value for argument '(\S+)'.*": r"\1 needs a value after it",
-    r"Error parsing (\S+): Could not find valid parse for arguments: \[(.*)\]": (
-        r"\1 takes numbers with spaces between them, such as 32 32, got \2"
+    r"Could not find valid parse for arguments: \[(.*)\]": (
+        r"takes numbers with spaces between them, such as 32 32, got \1"
     ),
-    r"Error parsing (\S+): no type matching (.+?) could .*?\[(.*?)\]\..*": r"\1 takes \2, got \3",
-    r"invalid choice (\S+) for argument '(\S+)'\. Expected one of \((.*)\)\.": (
-        r"\2 takes one of \3, got \1"
-    ),
-    r"Error parsing (\S+): (takes .*)": r"\1 \2",
+    r"no type matching (.+?) could .*?\[(.*?)\]\..*": r"takes \1, got \2",
+    r"Error parsing (\S+):": r"\1",
 }
 #: How numbers and paths are read, everywhere.
 _READERS = ConstructorRegistry()

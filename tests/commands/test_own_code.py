@@ -37,7 +37,7 @@ def folder(tmp_path, monkeypatch):
     write(tmp_path / "run" / "config.json", recordable(Config(env=ENV, horizon=60)))
     change(tmp_path / "run" / "summary.json", status="interrupted")
     change(tmp_path / "run" / "policy" / "policy.json", env=ENV)
-    change_arrays(tmp_path / "run" / "policy" / "actor.npz", checksum=None)
+    change_arrays(tmp_path / "run")
     rates = {"learning_rate": [1e-3, 3e-3]}
     make_sweep(tmp_path / "rates", num_seeds=2, over=rates, env=ENV)
     record = json.loads(json.dumps(as_record(Design(base=Config(env=ENV), over=rates))))
@@ -107,6 +107,7 @@ def test_other_code_that_only_a_file_names_is_not_run(folder, said, command, nam
 def test_a_distribution_that_only_a_file_names_is_not_run(folder, said):
     change(folder / "run" / "config.json", env="CartPole-v1")
     change(folder / "run" / "policy" / "policy.json", env="CartPole-v1", policy="evil_module:make")
+    change_arrays(folder / "run")
     error, status = said("watch run --seed 0")
     assert status == 2
     assert "add --policy evil_module:make to watch" in error

@@ -6,7 +6,7 @@ import sys
 
 import numpy as np
 import pytest
-from saved_runs import change, change_arrays, make_run
+from saved_runs import change_env, make_run
 
 from mjx_reinforce import load
 from mjx_reinforce.export import __main__ as export
@@ -114,9 +114,7 @@ def test_the_numpy_file_says_that_actions_may_leave_their_range(policy):
 def test_names_in_files_stay_text(tmp_path, monkeypatch):
     run = make_run(tmp_path)
     name = '"""\nraise SystemExit\n{env}'
-    for file in ("config.json", "policy/policy.json"):
-        change(run / file, env=name)
-    change_arrays(run / "policy" / "actor.npz", checksum=None)
+    change_env(run, name)
     run_export(monkeypatch, run)
     assert name == import_file(run / "seed_1.py").ENVIRONMENT
 

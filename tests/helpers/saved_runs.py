@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from experiments.kit.trainings import results
-from mjx_reinforce.export.policy_files import build_policy, save_policy
+from mjx_reinforce.export.policy_files import _checksum, build_policy, save_policy
 from mjx_reinforce.learning.normalize import Normalizer
 from mjx_reinforce.learning.policy import Actor
 
@@ -57,16 +57,28 @@ def change(path, **entries):
     write(path, {name: x for name, x in value.items() if x is not ...})
 
 
-def change_arrays(path, **changes):
-    """Changes arrays of an archive by functions; None takes one out. In names, __ is /."""
+def change_env(run, env):
+    """Changes the environment that the files of a run name."""
+    for path in (run / "config.json", run / "policy" / "policy.json"):
+        change(path, env=env)
+    change_arrays(run)
+
+
+def change_arrays(run, *, sign=True, **changes):
+    """Changes arrays of a run's policies by functions; in names, __ is /.
+
+    sign: with the checksum of what the files are now
+    """
+    path = run / "policy" / "actor.npz"
     with np.load(path) as archive:
         arrays = dict(archive)
     for name, change in changes.items():
         name = name.replace("__", "/")
-        if change is None:
-            del arrays[name]
-        else:
-            arrays[name] = change(arrays.get(name))
+        arrays[name] = change(arrays[name])
+    if sign:
+        del arrays["checksum"]
+        settings = json.loads((run / "policy" / "policy.json").read_text())
+        arrays["checksum"] = np.array(_checksum(settings, arrays))
     np.savez(path, **arrays)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from bad_envs import Pole
 from PIL import Image
-from saved_runs import change, change_arrays, make_run
+from saved_runs import change_env, make_run
 from toys import Survive
 
 from mjx_reinforce import act, envs, load_policy, playing, watch
@@ -164,9 +164,7 @@ def test_bad_input_is_named(tmp_path, monkeypatch, capsys, arguments, message):
 
 def test_a_policy_of_another_environment_is_named(tmp_path, monkeypatch, capsys):
     make_run(tmp_path)
-    for file in ("config.json", "policy/policy.json"):
-        change(tmp_path / file, env="Reacher-v5")
-    change_arrays(tmp_path / "policy" / "actor.npz", checksum=None)
+    change_env(tmp_path, "Reacher-v5")
     with pytest.raises(SystemExit, match="2"):
         watch_run(monkeypatch, tmp_path)
     error = capsys.readouterr().err
@@ -249,11 +247,9 @@ def test_wrapped_environments_are_filmed(tmp_path, monkeypatch):
     for module in (watch, films):
         monkeypatch.setattr(module, "Renderer", Blank)
     run = make_run(tmp_path)
-    change_arrays(run / "policy" / "actor.npz", checksum=None)
     frames = {}
     for name in ("CartPole-v1", "wraps:Plain", "wraps:OfBrax", "wraps:Twice"):
-        for file in ("config.json", "policy/policy.json"):
-            change(run / file, env=name)
+        change_env(run, name)
         size = ["--width", "48", "--height", "32"]
         watch_run(monkeypatch, run, "--env", name, "--overwrite", *size)
         with Image.open(run / "seed-1.gif") as film:
@@ -267,9 +263,7 @@ def test_wrapped_environments_are_filmed(tmp_path, monkeypatch):
 def test_an_environment_without_a_model_is_refused(register, tmp_path, monkeypatch, capsys):
     """Survive has what training needs, and no more."""
     make_run(tmp_path, "InvertedPendulum-v5", observation_size=1)
-    for file in ("config.json", "policy/policy.json"):
-        change(tmp_path / file, env="Survive-v0")
-    change_arrays(tmp_path / "policy" / "actor.npz", checksum=None)
+    change_env(tmp_path, "Survive-v0")
     with pytest.raises(SystemExit, match="2"):
         watch_run(monkeypatch, tmp_path)
     error = capsys.readouterr().err
