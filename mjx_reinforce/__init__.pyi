@@ -9,7 +9,7 @@ from mjx_reinforce.export.player import Player, load
 from mjx_reinforce.export.policy_files import load_policy, save_policy
 from mjx_reinforce.export.run_files import pretrained
 from mjx_reinforce.learning.bounded import clipped_normal, tanh_normal, truncated_normal
-from mjx_reinforce.learning.distributions import Distribution, categorical, deterministic, normal
+from mjx_reinforce.learning.distributions import Distribution, categorical, normal
 from mjx_reinforce.learning.estimators import (
     Estimator,
     discount_weights,
@@ -27,6 +27,7 @@ from mjx_reinforce.learning.updates import full_batch, make_optimizer
 from mjx_reinforce.learning.value import full_batch_value_baseline, value_baseline
 from mjx_reinforce.published.ars import ars
 from mjx_reinforce.published.variants import (
+    deterministic,
     each_step,
     mean_log_prob,
     minibatches,

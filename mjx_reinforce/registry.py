@@ -5,7 +5,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 from mjx_reinforce.engine.checks import check_name, explain
 
@@ -17,7 +17,7 @@ DISTRIBUTIONS = {
     "truncated-normal": "mjx_reinforce.learning.bounded:truncated_normal",
     "clipped-normal": "mjx_reinforce.learning.bounded:clipped_normal",
     "tanh-normal": "mjx_reinforce.learning.bounded:tanh_normal",
-    "deterministic": "mjx_reinforce.learning.distributions:deterministic",
+    "deterministic": "mjx_reinforce.published.variants:deterministic",
     "categorical": "mjx_reinforce.learning.distributions:categorical",
 }
 
@@ -32,26 +32,55 @@ ESTIMATORS = {
     "normalized-returns": "mjx_reinforce.published.variants:normalized_returns",
 }
 
-#: Programs of published documents: name -> "module:function" of an environment and the settings.
-PROGRAMS = {
-    "gymnasium-tutorial": "mjx_reinforce.published.gymnasium_tutorial:reward_to_go",
-    "gymnasium-tutorial-v0.26": "mjx_reinforce.published.gymnasium_tutorial:mean_log_prob",
-    "baseline-truncated-normal": "mjx_reinforce.published.baseline_truncated_normal:make",
-    "continuous-cartpole": "mjx_reinforce.published.continuous_cartpole:reinforce",
-    "continuous-cartpole-ars": "mjx_reinforce.published.continuous_cartpole:random_search",
-    "categorical-cartpole": "mjx_reinforce.published.categorical_cartpole:make",
-}
-#: Those of these and of ``ALGORITHMS`` that follow no gradient -> episodes that an update plays.
-SEARCHES = {"ars": 16, "continuous-cartpole-ars": 20}
-#: Ways to learn: name -> "module:function" of an environment, see ``store.build``.
+
+class Algorithm(NamedTuple):
+    """A way to learn.
+
+    make: "module:function" of an environment, the settings, and what ``store.build`` adds
+    search_episodes: episodes of an update, of one that tries out policies; 0: it follows a gradient
+    policy: what its policies have in place of the usual, see ``store.build.policy_settings``
+    """
+
+    make: str
+    search_episodes: int = 0
+    policy: Mapping[str, Any] = {}
+
+
+#: The documents' programs are written for PyTorch's initial weights, and for means as they are.
+_AS_PUBLISHED = {"initializer": "torch", "rescale": False}
+#: Ways to learn, by name: ours, and programs of published documents.
 ALGORITHMS = {
-    "reinforce": "mjx_reinforce.learning.learner:reinforce",
-    "ars": "mjx_reinforce.published.ars:ars",
-    **PROGRAMS,
+    "reinforce": Algorithm("mjx_reinforce.store.build:build_reinforce"),
+    "ars": Algorithm("mjx_reinforce.published.ars:make", search_episodes=16),
+    "gymnasium-tutorial": Algorithm(
+        "mjx_reinforce.published.gymnasium_tutorial:reward_to_go", policy=_AS_PUBLISHED
+    ),
+    "gymnasium-tutorial-v0.26": Algorithm(
+        "mjx_reinforce.published.gymnasium_tutorial:mean_log_prob", policy=_AS_PUBLISHED
+    ),
+    "baseline-truncated-normal": Algorithm(
+        "mjx_reinforce.published.baseline_truncated_normal:make", policy=_AS_PUBLISHED
+    ),
+    "continuous-cartpole": Algorithm(
+        "mjx_reinforce.published.continuous_cartpole:reinforce", policy=_AS_PUBLISHED
+    ),
+    "continuous-cartpole-ars": Algorithm(
+        "mjx_reinforce.published.continuous_cartpole:random_search",
+        search_episodes=20,
+        policy=_AS_PUBLISHED,
+    ),
+    "categorical-cartpole": Algorithm(
+        "mjx_reinforce.published.categorical_cartpole:make", policy=_AS_PUBLISHED
+    ),
 }
 
 #: What the system's loader says of a library for which there is no memory.
 _NO_MEMORY = ("failed to map segment", "cannot allocate memory", "Cannot allocate memory")
+
+
+def find_algorithm(name: str) -> Algorithm:
+    """Returns a way to learn by its name; that of the user's own, module:name, may be any."""
+    return ALGORITHMS.get(name, Algorithm(name))
 
 
 def is_own(name: str) -> bool:

@@ -21,6 +21,7 @@ Shepherd and Laframboise (1981), "Chebyshev approximation of (1 + 2x) exp(x^2) e
 
 import functools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +32,7 @@ from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.learning.distributions import (
     LOG_SQRT_2PI,
     Distribution,
+    GaussianOutputs,
     gaussian_outputs,
     middle_and_half_range,
     normal_entropy,
@@ -63,7 +65,7 @@ def clipped_normal(
       >>> mr.clipped_normal(mr.Box(-np.ones(2), np.ones(2)))
       Distribution(2 outputs, 2 constants)
     """
-    layout = gaussian_outputs("clipped-normal", space, std, initial_std, rescale, bounded=True)
+    layout = _bounded_outputs("clipped-normal", space, std, initial_std, rescale)
 
     def log_density(action, mean, std):
         low, high = layout.bounds(mean)
@@ -116,7 +118,7 @@ def tanh_normal(
       >>> mr.tanh_normal(mr.Box(-np.ones(2), np.ones(2)))
       Distribution(2 outputs, 2 constants)
     """
-    layout = gaussian_outputs("tanh-normal", space, std, initial_std, rescale, bounded=True)
+    layout = _bounded_outputs("tanh-normal", space, std, initial_std, rescale)
     middle, half = middle_and_half_range(layout.box)
 
     def of_z(mean, std):
@@ -188,7 +190,7 @@ def truncated_normal(
       >>> mr.truncated_normal(mr.Box(-np.ones(2), np.ones(2)))
       Distribution(2 outputs, 2 constants)
     """
-    layout = gaussian_outputs("truncated-normal", space, std, initial_std, rescale, bounded=True)
+    layout = _bounded_outputs("truncated-normal", space, std, initial_std, rescale)
 
     def restricted(function):
         """Returns a function that is given the bounds after its other arguments."""
@@ -211,6 +213,17 @@ def _open_uniform(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     """
     noise = jax.random.uniform(key, shape)
     return noise + 0.5 * jnp.finfo(noise.dtype).eps
+
+
+def _bounded_outputs(name: str, space: Box | Discrete, *settings: Any) -> GaussianOutputs:
+    """Returns ``gaussian_outputs``; raises ValueError besides where an entry is unbounded."""
+    layout = gaussian_outputs(name, space, *settings)
+    if not np.all(np.isfinite(layout.box.low) & np.isfinite(layout.box.high)):
+        raise ValueError(
+            f"{name} needs finite action bounds, got {space}; "
+            "choose normal, or declare bounds in the environment's action_space"
+        )
+    return layout
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from mjx_reinforce.engine.base import Environment, PyTree, Trajectory, null_action
 from mjx_reinforce.engine.checks import check_kind, check_type, explain
@@ -71,11 +70,6 @@ def check_policy(
         )
     if likelihood:
         traced("policy.distribution.log_prob", distribution.log_prob, outputs, action)
-
-
-def check_optimizer(name: str, value: optax.GradientTransformation) -> None:
-    """Raises ValueError for what is no optimiser."""
-    check_kind(name, value, optax.GradientTransformation, "optax.adam(1e-2)")
 
 
 def check_update(update: updates.Update) -> None:

@@ -5,7 +5,6 @@ at most: the policies are compared at a few of the visited steps, and the noise 
 episodes.
 """
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -103,7 +102,7 @@ def within_kl(
     """
     if max_kl is None:
         return params
-    changed = dataclasses.replace(actor, params=params)
+    changed = actor.replace(params=params)
     kl = policy_metrics(policy, actor, changed, visited)["kl"]
     share = jnp.where(kl > max_kl, jnp.sqrt(max_kl / kl), 1.0)
     return jax.tree.map(lambda old, new: old + share * (new - old), actor.params, params)
@@ -129,11 +128,3 @@ def kl_divergence(
         return distribution.kl(old, new)
     log_ratio = distribution.log_prob(new, action) - distribution.log_prob(old, action)
     return jnp.expm1(log_ratio) - log_ratio
-
-
-def nan_unless(finite: jax.Array, metrics: Metrics) -> Metrics:
-    """Returns metrics; those that are no integers are NaN unless ``finite`` [] holds."""
-    return {
-        name: jnp.where(finite, x, jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x
-        for name, x in metrics.items()
-    }

@@ -144,39 +144,6 @@ def normal_sigmoid(
     return normal(space, std="sigmoid", initial_std=initial_std, rescale=rescale)
 
 
-def deterministic(
-    space: Box | Discrete, *, initial_std: float | None = None, rescale: bool = True
-) -> Distribution:
-    """A single point: the action is the network's output, rescaled like the mean of ``normal``.
-
-    It is for methods that need no likelihood, such as ``ars``: ``log_prob`` raises ValueError.
-
-    Examples:
-      >>> import jax.numpy as jnp, numpy as np
-      >>> import mjx_reinforce as mr
-      >>> family = mr.deterministic(mr.Box(-2 * np.ones(1), 2 * np.ones(1)))
-      >>> family.mode(jnp.ones(1)).tolist()  # 1 is the end of the range
-      [2.0]
-    """
-    del initial_std
-    layout = gaussian_outputs("deterministic", space, "parameter", 1.0, rescale)
-
-    def log_prob(outputs, action):
-        raise ValueError(
-            "a deterministic policy has no log-probability; choose a stochastic one for REINFORCE"
-        )
-
-    return Distribution(
-        num_outputs=layout.size,
-        constants=(),
-        noise=lambda key, shape: jnp.zeros((*shape, 1)),
-        sample=lambda outputs, noise: layout.mean(outputs),
-        mode=layout.mean,
-        log_prob=log_prob,
-        entropy=lambda outputs: jnp.zeros(outputs.shape[:-1], outputs.dtype),
-    )
-
-
 def categorical(
     space: Box | Discrete, *, initial_std: float | None = None, rescale: bool = True
 ) -> Distribution:
@@ -309,8 +276,6 @@ def gaussian_outputs(
     std: str,
     initial_std: float | jax.Array,
     rescale: bool,
-    *,
-    bounded: bool = False,
 ) -> GaussianOutputs:
     """Checks the arguments of a Gaussian family and returns the layout of its outputs.
 
@@ -321,23 +286,26 @@ def gaussian_outputs(
       initial_std: the standard deviation before training, in the action's unit; for "parameter"
         it may be traced, and is then taken on trust.
       rescale: False takes the network's output as the mean itself.
-      bounded: whether the family needs finite bounds.
 
     Raises:
-      ValueError: the space is discrete or not bounded, ``std`` is unknown, or ``initial_std`` is
-        not positive or, for "sigmoid", not below 1.
+      ValueError: the space is discrete, ``std`` is unknown, or ``initial_std`` is not positive or,
+        for "sigmoid", not below 1.
     """
-    box = continuous_box(name, space, bounded=bounded)
+    check_space(name, space)
+    if not isinstance(space, Box):
+        raise ValueError(
+            f"{name} needs a continuous action space, this one is discrete; choose categorical"
+        )
     if std not in ("parameter", "softplus", "sigmoid"):
         raise ValueError(f"std must be 'parameter', 'softplus' or 'sigmoid', got {std!r}")
     check_number("initial_std", initial_std, positive=True)
     number = known_number(initial_std)
     if std == "sigmoid" and number is not None and number >= 1:
         raise ValueError(f"a sigmoid std stays below 1, got initial_std={number}")
-    middle, half = middle_and_half_range(box)
+    middle, half = middle_and_half_range(space)
     if not rescale:
         middle, half = np.zeros_like(middle), np.ones_like(half)
-    return GaussianOutputs(box, std, initial_std, middle, half)
+    return GaussianOutputs(space, std, initial_std, middle, half)
 
 
 def _log(x: ArrayLike) -> Any:
@@ -375,30 +343,6 @@ def check_space(name: str, space: Box | Discrete) -> None:
             f"{name} needs an action space, such as env.action_space, or mjx_reinforce.Box(low, "
             f"high) with arrays [A], got a {type(space).__name__}"
         )
-
-
-def continuous_box(name: str, space: Box | Discrete, *, bounded: bool = False) -> Box:
-    """Returns the action space if it is continuous.
-
-    Args:
-      name: the family's name, for the message.
-      space: the action space.
-      bounded: whether all its bounds must be finite.
-
-    Raises:
-      ValueError: the space is discrete, or an entry is unbounded.
-    """
-    check_space(name, space)
-    if not isinstance(space, Box):
-        raise ValueError(
-            f"{name} needs a continuous action space, this one is discrete; choose categorical"
-        )
-    if bounded and not np.all(np.isfinite(space.low) & np.isfinite(space.high)):
-        raise ValueError(
-            f"{name} needs finite action bounds, got {space}; "
-            "choose normal, or declare bounds in the environment's action_space"
-        )
-    return space
 
 
 def middle_and_half_range(space: Box) -> tuple[np.ndarray, np.ndarray]:

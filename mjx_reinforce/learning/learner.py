@@ -14,17 +14,11 @@ import optax
 from flax import struct
 from jax.flatten_util import ravel_pytree
 
-from mjx_reinforce.engine.base import (
-    Environment,
-    PyTree,
-    Trajectory,
-    action_space,
-    observation_size,
-)
+from mjx_reinforce.engine.base import Environment, Trajectory, action_space, observation_size
 from mjx_reinforce.engine.checks import check_count, check_key, check_kind, check_number
 from mjx_reinforce.engine.contract import check_environment
 from mjx_reinforce.engine.play import choice
-from mjx_reinforce.engine.play.choice import Engine
+from mjx_reinforce.engine.play.choice import Engine, Rollout
 from mjx_reinforce.engine.play.episode import check_each, episode_keys
 from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.learning import contract, counts, diagnostics, normalize
@@ -78,7 +72,8 @@ class Learner(NamedTuple):
     Attributes:
       init: (key) -> TrainState; consumes the key
       play: (TrainState, key, active) -> what is played for one update, a ``Trajectory`` of N fresh
-        episodes or a pytree that holds one; nothing where ``active`` [] is False; consumes the key
+        episodes or a pytree that holds one; nothing where ``active`` [] is False; consumes the key.
+        That of ``reinforce`` also takes a rollout in place of the engine's
       learn: (TrainState, what was played, key) -> (TrainState, metrics), with the actor and all
         else that changes by learning; consumes the key
       policy: the policy that is trained
@@ -95,7 +90,7 @@ class Learner(NamedTuple):
     """
 
     init: Callable[[jax.Array], TrainState]
-    play: Callable[[TrainState, jax.Array, Any], Any]
+    play: Callable[..., Any]
     learn: Callable[[TrainState, Any, jax.Array], tuple[TrainState, Metrics]]
     policy: Policy
     engine: Engine
@@ -204,29 +199,28 @@ def reinforce(
         policy = mlp_policy(size, default_distribution(action_space(env)))
     contract.check_policy(policy, env, size, likelihood=True)
     optimizer = make_optimizer() if optimizer is None else optimizer
-    contract.check_optimizer("optimizer", optimizer)
+    check_kind("optimizer", optimizer, optax.GradientTransformation, "optax.adam(1e-2)")
     update = full_batch() if update is None else update
     contract.check_update(update)
     estimator = standardize(leave_one_out(), floor=10.0) if estimator is None else estimator
     contract.check_estimator(estimator, env, size, num_episodes)
 
     example = jax.eval_shape(functools.partial(first_actor, policy, size), jax.random.key(0))
-    player = choice.ActingPolicy(functools.partial(act, policy), example, policy.distribution)
-    plays = choice.choose(engine, env, player, horizon)
-    return Learner(
-        init=_init(policy, optimizer, estimator, size),
-        play=_play(env, policy, plays, num_episodes, horizon),
-        learn=_learn(
-            policy=policy,
-            estimator=estimator,
-            update=update,
-            problem=_problem(policy, optimizer, num_episodes, entropy_cost),
-            max_kl=max_kl,
-            normalize_limits=(normalize_steps, normalize_min_std),
-        ),
+    acting = choice.ActingPolicy(functools.partial(act, policy), example, policy.distribution)
+    parts = _Reinforce(
+        env=env,
         policy=policy,
-        engine=plays,
+        estimator=estimator,
+        optimizer=optimizer,
+        update=update,
+        num_episodes=num_episodes,
+        horizon=horizon,
+        entropy_cost=entropy_cost,
+        max_kl=max_kl,
+        normalize_limits=(normalize_steps, normalize_min_std),
+        engine=choice.choose(engine, env, acting, horizon),
     )
+    return Learner(parts.init, parts.play, parts.learn, policy, parts.engine)
 
 
 def first_actor(policy: Policy, observation_size: int, key: jax.Array) -> Actor:
@@ -234,144 +228,97 @@ def first_actor(policy: Policy, observation_size: int, key: jax.Array) -> Actor:
     return Actor(params=policy.init(key), normalizer=normalize.init(observation_size))
 
 
-def _init(
-    policy: Policy, optimizer: optax.GradientTransformation, estimator: Estimator, size: int
-) -> Callable[[jax.Array], TrainState]:
-    """Returns ``Learner.init``."""
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class _Reinforce:
+    """The functions of a learner; the fields are arguments of ``reinforce``, checked."""
 
-    def init(key: jax.Array) -> TrainState:
+    env: Environment
+    policy: Policy
+    estimator: Estimator
+    optimizer: optax.GradientTransformation
+    update: Update
+    num_episodes: int
+    horizon: int
+    entropy_cost: float | jax.Array
+    max_kl: float | jax.Array | None
+    normalize_limits: tuple[float, float | jax.Array]
+    engine: Engine
+
+    def init(self, key: jax.Array) -> TrainState:
+        """``Learner.init``."""
         check_key(key)
         policy_key, estimator_key, key = jax.random.split(key, 3)
-        actor = first_actor(policy, size, policy_key)
+        size = observation_size(self.env)
+        actor = first_actor(self.policy, size, policy_key)
         return TrainState(
             key=key,
             actor=actor,
-            opt_state=optimizer.init(actor.params),
-            estimator_state=estimator.init(estimator_key, size),
+            opt_state=self.optimizer.init(actor.params),
+            estimator_state=self.estimator.init(estimator_key, size),
         )
 
-    return init
-
-
-def _play(
-    env: Environment, policy: Policy, plays: Engine, num_episodes: int, horizon: int
-) -> Callable[..., Trajectory]:
-    """Returns ``Learner.play``, which takes a ``limit`` [] of an episode's steps besides."""
-
     def play(
+        self,
         state: TrainState,
         key: jax.Array,
         active: bool | jax.Array = True,
-        limit: jax.Array | None = None,
+        rollout: Rollout | None = None,
     ) -> Trajectory:
-        check_each(num_episodes, active=active)
-        return plays.rollout(
-            begins_as(env, state.start_key),
-            functools.partial(act, policy),
+        """``Learner.play``; what is wrapped around it may play by another rollout."""
+        check_each(self.num_episodes, active=active)
+        rollout = self.engine.rollout if rollout is None else rollout
+        return rollout(
+            self.env,
+            functools.partial(act, self.policy),
             state.actor,
-            policy.distribution,
-            episode_keys(key, num_episodes),
-            num_episodes=num_episodes,
-            horizon=horizon,
+            self.policy.distribution,
+            episode_keys(key, self.num_episodes),
+            num_episodes=self.num_episodes,
+            horizon=self.horizon,
             active=active,
-            limit=None if limit is None else jnp.minimum(limit, horizon),
         )
 
-    return play
-
-
-def begins_as(env: Environment, start_key: jax.Array | None) -> Any:
-    """Returns an environment whose every episode starts with a key, if there is one."""
-    return env if start_key is None else _OneStart(env, start_key)
-
-
-class _OneStart:
-    """An environment whose every episode starts with the same key."""
-
-    def __init__(self, env: Environment, key: jax.Array):
-        self._env, self._key = env, key
-
-    def reset(self, rng: jax.Array) -> Any:
-        del rng
-        return self._env.reset(self._key)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._env, name)
-
-
-def _learn(
-    *,
-    policy: Policy,
-    estimator: Estimator,
-    update: Update,
-    problem: Callable[..., Problem],
-    max_kl: float | jax.Array | None,
-    normalize_limits: tuple[float, float | jax.Array],
-) -> Callable[[TrainState, Trajectory, jax.Array], tuple[TrainState, Metrics]]:
-    """Returns ``Learner.learn``: the update, in the order of the formula."""
-
     def learn(
-        state: TrainState, trajectory: Trajectory, key: jax.Array
+        self, state: TrainState, trajectory: Trajectory, key: jax.Array
     ) -> tuple[TrainState, Metrics]:
+        """``Learner.learn``: the update, in the order of the formula."""
         before, visited = state.actor, diagnostics.visited_steps(trajectory)
         # Normalize, weigh, follow the gradient, limit the change, count, keep what is finite.
         seen = normalize.seen(before.normalizer, trajectory)
-        weight, estimator_state, metrics = estimator.update(state.estimator_state, seen)
-        params, opt_state, measured = update(
-            problem(state, seen, weight), key, before.params, state.opt_state
+        weight, estimator_state, metrics = self.estimator.update(state.estimator_state, seen)
+        problem = self._problem(state, seen, weight)
+        params, opt_state, measured = self.update(problem, key, before.params, state.opt_state)
+        params = diagnostics.within_kl(self.policy, before, params, visited, self.max_kl)
+        counted = trajectory.mask & ~trajectory.nonfinite
+        normalizer = normalize.update(
+            before.normalizer, trajectory.observation, counted, *self.normalize_limits
         )
-        params = diagnostics.within_kl(policy, before, params, visited, max_kl)
-        normalizer = normalize.count(before.normalizer, trajectory, *normalize_limits)
-        learned, skipped = keep_finite(
-            (Actor(params=params, normalizer=normalizer), opt_state, estimator_state),
-            (before, state.opt_state, state.estimator_state),
-        )
-        actor, opt_state, estimator_state = learned
-        change = diagnostics.policy_metrics(policy, before, actor, visited)
-        sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
-        measured = diagnostics.nan_unless(sound, metrics | measured | change)
-        state = dataclasses.replace(
-            state, actor=actor, opt_state=opt_state, estimator_state=estimator_state
-        )
-        return state, episode_metrics(trajectory) | measured | {"skipped_update": skipped}
+        actor = Actor(params=params, normalizer=normalizer)
+        after = state.replace(actor=actor, opt_state=opt_state, estimator_state=estimator_state)
+        after, skipped = keep_finite(after, state)
 
-    return learn
+        change = diagnostics.policy_metrics(self.policy, before, after.actor, visited)
+        return after, update_metrics(trajectory, skipped, metrics | measured | change)
 
+    def _problem(self, state: TrainState, seen: Trajectory, weight: jax.Array) -> Problem:
+        """Returns minus the sum in the formula, and all else that an ``Update`` reads."""
+        distribution = self.policy.distribution
 
-def _problem(
-    policy: Policy,
-    optimizer: optax.GradientTransformation,
-    num_episodes: int,
-    entropy_cost: float | jax.Array,
-) -> Callable[[TrainState, Trajectory, jax.Array], Problem]:
-    """Returns (state, trajectory, weight [T, N]) -> the ``Problem`` of an update."""
-    surrogate = _surrogate(policy, entropy_cost)
+        def surrogate(params, samples):
+            observation, action, weight, mask = samples
+            outputs = self.policy.apply(params, observation)
+            entropy = distribution.entropy(outputs)
+            terms = distribution.log_prob(outputs, action) * weight + self.entropy_cost * entropy
+            loss = -jnp.sum(jnp.where(mask, terms, 0.0))
+            return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
 
-    def problem(state: TrainState, seen: Trajectory, weight: jax.Array) -> Problem:
         return Problem(
             surrogate=surrogate,
-            optimizer=optimizer,
+            optimizer=self.optimizer,
             samples=(seen.observation, seen.action, weight, seen.mask),
-            divisor=num_episodes,
+            divisor=self.num_episodes,
             clock=Clock(state.progress, counts.as_float(state.env_steps)),
         )
-
-    return problem
-
-
-def _surrogate(policy: Policy, entropy_cost: float | jax.Array) -> Callable[..., Any]:
-    """Returns (params, samples) -> (minus the sum in the formula, the sum of the entropy)."""
-    distribution = policy.distribution
-
-    def surrogate(params, chunk):
-        observation, action, weight, mask = chunk
-        outputs = policy.apply(params, observation)
-        entropy = distribution.entropy(outputs)
-        terms = distribution.log_prob(outputs, action) * weight + entropy_cost * entropy
-        loss = -jnp.sum(jnp.where(mask, terms, 0.0))
-        return loss, {"entropy": jnp.sum(jnp.where(mask, entropy, 0.0))}
-
-    return surrogate
 
 
 _step = jax.jit(Learner.step, static_argnums=0)
@@ -415,35 +362,42 @@ def train_step(learner: Learner, state: TrainState) -> tuple[TrainState, Metrics
     return _step(learner, state)
 
 
-def keep_finite(learned: PyTree, before: PyTree) -> tuple[Any, jax.Array]:
+def keep_finite(learned: TrainState, before: TrainState) -> tuple[TrainState, jax.Array]:
     """Returns ``learned`` and 0 if all of it is finite, else ``before`` and 1.
 
     So an update that breaks costs its seed that one update.
     """
     # Floats are joined into one vector for the choice. With a choice for each leaf XLA's CPU
     # backend makes a program for each, and each of them computes again what they share.
-    vector, unravel = ravel_pytree(_floats(learned))
-    finite = jnp.all(jnp.isfinite(vector))
-    floats = iter(unravel(jnp.where(finite, vector, ravel_pytree(_floats(before))[0])))
+    new, unravel = ravel_pytree(list(filter(is_float, jax.tree.leaves(learned))))
+    old, _ = ravel_pytree(list(filter(is_float, jax.tree.leaves(before))))
+    finite = jnp.all(jnp.isfinite(new))
+    floats = iter(unravel(jnp.where(finite, new, old)))
 
-    def choose(new, old):
-        return next(floats) if _is_float(new) else jnp.where(finite, new, old)
+    def choose(x: jax.Array, y: jax.Array) -> jax.Array:
+        if is_float(x):
+            return next(floats)
+        return x if x is y else jnp.where(finite, x, y)  # no update touches the key
 
-    kept = jax.tree.map(choose, learned, before)
-    return kept, jnp.where(finite, 0, 1)
-
-
-def _floats(tree: PyTree) -> list[jax.Array]:
-    return [x for x in jax.tree.leaves(tree) if _is_float(x)]
+    return jax.tree.map(choose, learned, before), jnp.where(finite, 0, 1)
 
 
-def _is_float(x: jax.Array) -> bool:
+def is_float(x: jax.Array) -> bool:
+    """Returns whether an array holds floating-point numbers."""
     return jnp.issubdtype(x.dtype, jnp.floating)
 
 
-def episode_metrics(trajectory: Trajectory) -> Metrics:
-    """Returns what a person wants to know of the episodes."""
+def update_metrics(trajectory: Trajectory, skipped: jax.Array, measured: Metrics) -> Metrics:
+    """Returns the metrics of an update, see ``train_step``.
+
+    Args:
+      trajectory: what was played.
+      skipped: [] 1 if the update was not finite, else 0.
+      measured: what else is known of the update; its floats are NaN where that was not finite.
+    """
     returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
+    sound = (skipped == 0) & ~jnp.any(trajectory.nonfinite)
+    floats = {name: jnp.where(sound, x, jnp.nan) for name, x in measured.items() if is_float(x)}
     return {
         "episodes": jnp.int32(trajectory.mask.shape[1]),
         "episode_return": jnp.mean(returns),
@@ -453,4 +407,6 @@ def episode_metrics(trajectory: Trajectory) -> Metrics:
         "env_steps": jnp.sum(lengths),
         "simulated_steps": trajectory.simulated,
         "nonfinite_episodes": jnp.sum(trajectory.nonfinite),
+        **(measured | floats),
+        "skipped_update": skipped,
     }

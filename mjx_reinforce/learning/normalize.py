@@ -1,7 +1,5 @@
 """Observations scaled by the mean and standard deviation of the first ones."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -86,16 +84,7 @@ def apply(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
 
 def seen(normalizer: Normalizer, trajectory: Trajectory) -> Trajectory:
     """Returns a trajectory with scaled observations."""
-    scaled = apply(normalizer, trajectory.observation)
-    return dataclasses.replace(trajectory, observation=scaled)
-
-
-def count(
-    normalizer: Normalizer, trajectory: Trajectory, at_most: float, min_std: float | jax.Array
-) -> Normalizer:
-    """Returns ``update`` by the observations of all episodes that did not break."""
-    counted = trajectory.mask & ~trajectory.nonfinite
-    return update(normalizer, trajectory.observation, counted, at_most, min_std)
+    return trajectory.replace(observation=apply(normalizer, trajectory.observation))
 
 
 def standard_deviation(normalizer: Normalizer) -> jax.Array:

@@ -5,6 +5,7 @@ optimiser of, or by the env steps played. Counted in env steps, a policy whose e
 keeps its rate and its noise, and one that has learned to play long ones settles soon.
 """
 
+import functools
 import inspect
 from typing import Any, NamedTuple
 
@@ -49,16 +50,18 @@ class Cut(NamedTuple):
         Raises:
           ValueError: a number makes no sense, or ``reinforce`` did not make the learner.
         """
-        of_learner: Any = getattr(learner, "play", lambda: None)
-        if "limit" not in inspect.signature(of_learner).parameters:
+        play_whole: Any = getattr(learner, "play", lambda: None)
+        if "rollout" not in inspect.signature(play_whole).parameters:
             raise ValueError(f"a cut takes a learner of mjx_reinforce.reinforce, got {learner!r}")
         check_count("cut.steps", self.steps)
         check_number("cut.until", self.until)
         if self.until > 1:
             raise ValueError(f"cut.until must be a share of the budget in [0, 1], got {self.until}")
 
-        def play(state: Any, key: jax.Array, active: bool | jax.Array = True) -> Any:
-            return of_learner(state, key, active, limit=self.limit(state.progress))
+        def play(state: Any, key: jax.Array, active: Any = True, rollout: Any = None) -> Any:
+            whole = learner.engine.rollout if rollout is None else rollout
+            shorter = functools.partial(whole, limit=self.limit(state.progress))
+            return play_whole(state, key, active, shorter)
 
         return learner._replace(play=play)
 

@@ -4,6 +4,7 @@
 natural gradient is in ``natural_gradient``; ``published.variants`` has updates of several steps.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -16,8 +17,6 @@ from optax import Params
 from mjx_reinforce.engine.checks import check_name, check_number
 from mjx_reinforce.engine.play.episode import largest_divisor, while_any
 
-#: Optimizers by name.
-OPTIMIZERS = ("adam", "adamw", "sgd")
 #: Samples whose activations are held at once; 2**18 of them take 64 MB a 64-unit layer.
 MAX_SAMPLES = 2**18
 #: A GPU holds so many times as many: it made an H200's gradients 1.2 times as fast.
@@ -91,18 +90,14 @@ def whole_rollout(turn: Turn) -> Update:
 
     def update(problem, key, params, opt_state):
         mask = problem.samples[-1]
-        _, grads, sums = accumulate_gradient(problem.surrogate, params, problem.samples)
+        grads, sums = accumulate_gradient(problem.surrogate, params, problem.samples)
         metrics = {}
         if mask.shape[1] > 1:
             metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
         metrics["entropy"] = sums["entropy"] / jnp.maximum(jnp.sum(mask), 1)
+        own_turn = functools.partial(turn, problem, key, params)
         params, opt_state, step = descend(
-            problem,
-            grads,
-            problem.divisor,
-            params,
-            opt_state,
-            turn=lambda gradient: turn(problem, key, params, gradient),
+            problem, grads, problem.divisor, params, opt_state, own_turn
         )
         return params, opt_state, metrics | step
 
@@ -116,7 +111,7 @@ def _signal_to_noise(problem: Problem, params: Params, grads: Params) -> jax.Arr
 
     def alone(episode):
         samples = jax.tree.map(lambda x: x[:, None], episode)
-        return accumulate_gradient(problem.surrogate, params, samples)[1]
+        return accumulate_gradient(problem.surrogate, params, samples)[0]
 
     each = jax.vmap(alone, in_axes=1)(jax.tree.map(lambda x: x[:, :few], problem.samples))
     mean = jax.tree.map(lambda g: g / num_episodes, grads)
@@ -139,10 +134,9 @@ def descend(
     optimizer = optax.with_extra_args_support(problem.optimizer)
     changes, opt_state = optimizer.update(turn(grads), opt_state, params, clock=problem.clock)
     metrics = {"gradient_norm": optax.tree.norm(grads)}
-    parts = jax.tree.leaves(opt_state, is_leaf=lambda x: isinstance(x, ClipState))
-    for part in parts:
-        if isinstance(part, ClipState):
-            metrics["clipped_gradients"] = part.clipped.astype(float)
+    clipped = optax.tree.get(opt_state, "clipped")  # of ``ClipState``
+    if clipped is not None:
+        metrics["clipped_gradients"] = clipped.astype(float)
     return optax.apply_updates(params, changes), opt_state, metrics
 
 
@@ -172,20 +166,16 @@ def make_optimizer(
     name: str = "adam",
     learning_rate: optax.ScalarOrSchedule = 1e-2,
     *,
-    weight_decay: float = 0.0,
     max_grad_norm: float | jax.Array | None = 1.0,
     momentum: float | jax.Array = 0.9,
 ) -> optax.GradientTransformation:
     """Builds an optimiser with the constants that PyTorch and optax share.
 
     Args:
-      name: "adam"; "sgd"; or "adamw", whose weight decay is apart from the gradient (Loshchilov
-        and Hutter 2019, arXiv:1711.05101): the parameters shrink by learning rate times decay.
+      name: "adam" or "sgd".
       learning_rate: a number or an optax schedule over optimiser steps.
-      weight_decay: for the others, times the parameters added to the gradient: an L2 penalty,
-        which Adam then rescales with the rest, as ``torch.optim.Adam(weight_decay=...)`` does.
-      max_grad_norm: the gradient, before the weight decay, is scaled down to at most this
-        Euclidean norm; None leaves it as it is.
+      max_grad_norm: the gradient is scaled down to at most this Euclidean norm; None leaves it as
+        it is.
       momentum: b1 of Adam; sgd has none.
 
     Raises:
@@ -201,22 +191,15 @@ def make_optimizer(
     """
     if not isinstance(name, str):
         raise ValueError(f"the optimizer's name comes first, got {name!r}: write learning_rate=...")
-    check_name("optimizer", name, dict.fromkeys(OPTIMIZERS))
-    rate: Any = learning_rate
-    if not callable(rate):
-        check_number("learning_rate", rate)
-    check_number("weight_decay", weight_decay)
+    if not callable(learning_rate):
+        check_number("learning_rate", learning_rate)
     check_number("momentum", momentum)
-    parts = []
-    if max_grad_norm is not None:
-        check_number("max_grad_norm", max_grad_norm, positive=True, finite=False)
-        parts.append(clip_by_norm(max_grad_norm))
-    if name == "adamw":
-        return optax.chain(*parts, optax.adamw(learning_rate, momentum, weight_decay=weight_decay))
-    if weight_decay:
-        parts.append(optax.add_decayed_weights(weight_decay))
-    last = optax.adam(learning_rate, momentum) if name == "adam" else optax.sgd(learning_rate)
-    return optax.chain(*parts, last)
+    optimizers = {"adam": optax.adam(learning_rate, momentum), "sgd": optax.sgd(learning_rate)}
+    check_name("optimizer", name, optimizers)
+    if max_grad_norm is None:
+        return optimizers[name]
+    check_number("max_grad_norm", max_grad_norm, positive=True, finite=False)
+    return optax.chain(clip_by_norm(max_grad_norm), optimizers[name])
 
 
 def signal_to_noise(mean: Params, each: Params, num_episodes: int) -> jax.Array:
@@ -247,8 +230,8 @@ def accumulate_gradient(
     loss: Callable[[Any, Any], tuple[jax.Array, Any]],
     params: Params,
     data: tuple[Any, ...],
-) -> tuple[jax.Array, Any, Any]:
-    """Sums a loss, its gradient and its metrics over chunks of time.
+) -> tuple[Any, Any]:
+    """Sums the gradient of a loss, and its metrics, over chunks of time.
 
     Args:
       loss: (params, chunk of data) -> (sum over the chunk, sums of metrics).
@@ -257,15 +240,10 @@ def accumulate_gradient(
         the last one with any True are not visited.
 
     Returns:
-      The loss [], its gradient like ``params``, and the metrics, all summed.
+      The gradient, like ``params``, and the metrics, summed.
     """
-    differentiate = jax.value_and_grad(loss, has_aux=True)
-
-    def visit(chunk):
-        (value, metrics), grads = differentiate(params, chunk)
-        return value, grads, metrics
-
-    return accumulate(visit, data)
+    differentiate = jax.grad(loss, has_aux=True)
+    return accumulate(lambda chunk: differentiate(params, chunk), data)
 
 
 def accumulate(function: Callable[[Any], Any], data: tuple[Any, ...]) -> Any:
@@ -275,36 +253,15 @@ def accumulate(function: Callable[[Any], Any], data: tuple[Any, ...]) -> Any:
       function: chunk of data -> a pytree of sums over the chunk, of zeros where its mask is empty.
       data: as for ``accumulate_gradient``.
     """
-    chunks, needed = _in_chunks(data)
-    sums = jax.eval_shape(function, _chunk(chunks, jnp.zeros((), jnp.int32)))
+    chunks, needed = in_chunks(data)
+    sums = jax.eval_shape(function, chunk_at(chunks, jnp.zeros((), jnp.int32)))
 
     def body(carry):
         index, sums = carry
-        return index + 1, jax.tree.map(jnp.add, sums, function(_chunk(chunks, index)))
+        return index + 1, jax.tree.map(jnp.add, sums, function(chunk_at(chunks, index)))
 
     zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), sums)
     return while_any(while_needed(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
-
-
-def map_steps(function: Callable[[Any], jax.Array], data: tuple[Any, ...]) -> jax.Array:
-    """Applies a function of single steps to all of them; returns [T, N], 0 outside the mask.
-
-    Args:
-      function: data [..., *] of any steps -> a number for each, [...].
-      data: as for ``accumulate_gradient``.
-    """
-    chunks, needed = _in_chunks(data)
-
-    def body(carry):
-        index, values = carry
-        chunk = _chunk(chunks, index)
-        own = jnp.where(chunk[-1], function(chunk), 0.0)
-        return index + 1, lax.dynamic_update_index_in_dim(values, own, index, 0)
-
-    one = jax.eval_shape(function, _chunk(chunks, jnp.zeros((), jnp.int32)))
-    zeros = jnp.zeros((needed.size, *one.shape), one.dtype)
-    values = while_any(while_needed(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
-    return values.reshape(data[-1].shape)
 
 
 def draw_steps(key: jax.Array, mask: jax.Array, shape: tuple[int, ...]) -> jax.Array:
@@ -324,7 +281,7 @@ def draw_steps(key: jax.Array, mask: jax.Array, shape: tuple[int, ...]) -> jax.A
     return jnp.searchsorted(ranks, drawn)
 
 
-def _in_chunks(data: tuple[Any, ...]) -> tuple[tuple[Any, ...], jax.Array]:
+def in_chunks(data: tuple[Any, ...]) -> tuple[tuple[Any, ...], jax.Array]:
     """Returns the data [C, length, N, ...], and which of the C chunks have a step to visit."""
     horizon, num_episodes = data[-1].shape
     samples = MAX_SAMPLES * (1 if jax.default_backend() == "cpu" else GPU_FACTOR)
@@ -333,7 +290,8 @@ def _in_chunks(data: tuple[Any, ...]) -> tuple[tuple[Any, ...], jax.Array]:
     return chunks, jnp.any(chunks[-1], axis=(1, 2))
 
 
-def _chunk(chunks: tuple[Any, ...], index: jax.Array) -> tuple[Any, ...]:
+def chunk_at(chunks: tuple[Any, ...], index: jax.Array) -> tuple[Any, ...]:
+    """Returns one of these chunks [length, N, ...]."""
     return jax.tree.map(lambda x: lax.dynamic_index_in_dim(x, index, keepdims=False), chunks)
 
 

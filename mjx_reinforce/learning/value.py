@@ -4,6 +4,7 @@ The network is fitted after its values were used, so that no weight depends on i
 through it, and the gradient stays unbiased (Sutton and Barto 2018, section 13.4).
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -13,9 +14,16 @@ from flax import linen as nn
 from jax import lax
 
 from mjx_reinforce.engine.checks import check_count
+from mjx_reinforce.engine.play.episode import while_any
 from mjx_reinforce.learning.estimators import Estimator, explained_variance, reward_to_go
 from mjx_reinforce.learning.policy import MLP
-from mjx_reinforce.learning.updates import accumulate_gradient, draw_steps, map_steps
+from mjx_reinforce.learning.updates import (
+    accumulate_gradient,
+    chunk_at,
+    draw_steps,
+    in_chunks,
+    while_needed,
+)
 
 #: The share that an update has in the running mean and variance of the returns.
 _UPDATE_SHARE = 0.1
@@ -95,7 +103,7 @@ def value_baseline(
         returns = to_go.update((), trajectory)[0]
         time = jnp.broadcast_to(jnp.arange(len(mask))[:, None], mask.shape)
         data = (trajectory.observation, time, mask)
-        scaled = map_steps(lambda chunk: value(critic.params, *chunk[:2]), data)
+        scaled = _map_steps(lambda chunk: value(critic.params, *chunk[:2]), data)
         values = critic.mean + jnp.sqrt(critic.variance) * scaled
         weight, metrics = _residual(returns, values, mask)
 
@@ -179,7 +187,7 @@ def full_batch_value_baseline(
         data = (trajectory.observation, returns, mask)
 
         def fit(critic, _):
-            _, grads, _ = accumulate_gradient(squared_error, critic.params, data)
+            grads, _ = accumulate_gradient(squared_error, critic.params, data)
             grads = jax.tree.map(lambda g: g / steps, grads)
             changes, opt_state = fitter.update(grads, critic.opt_state, critic.params)
             return FullBatchCritic(optax.apply_updates(critic.params, changes), opt_state), None
@@ -219,6 +227,27 @@ def _residual(
         "explained_variance": explained_variance(weight, returns, mask),
         "value_loss": error,
     }
+
+
+def _map_steps(function: Callable[[Any], jax.Array], data: tuple[Any, ...]) -> jax.Array:
+    """Applies a function of single steps to all of them; returns [T, N], 0 outside the mask.
+
+    Args:
+      function: data [..., *] of any steps -> a number for each, [...].
+      data: as for ``accumulate_gradient``.
+    """
+    chunks, needed = in_chunks(data)
+
+    def body(carry):
+        index, values = carry
+        chunk = chunk_at(chunks, index)
+        own = jnp.where(chunk[-1], function(chunk), 0.0)
+        return index + 1, lax.dynamic_update_index_in_dim(values, own, index, 0)
+
+    one = jax.eval_shape(function, chunk_at(chunks, jnp.zeros((), jnp.int32)))
+    zeros = jnp.zeros((needed.size, *one.shape), one.dtype)
+    values = while_any(while_needed(needed), body, (jnp.zeros((), jnp.int32), zeros))[1]
+    return values.reshape(data[-1].shape)
 
 
 def _moments(

@@ -20,24 +20,16 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from optax import Params
 
-from mjx_reinforce.engine.base import (
-    Discrete,
-    Environment,
-    Trajectory,
-    action_space,
-    observation_size,
-)
+import mjx_reinforce as mr
+from mjx_reinforce.engine import base, choose
 from mjx_reinforce.engine.checks import check_count, check_key, check_number
 from mjx_reinforce.engine.contract import check_environment
-from mjx_reinforce.engine.play import choice
+from mjx_reinforce.engine.play.choice import Engine
 from mjx_reinforce.engine.play.rollouts import episode_returns
-from mjx_reinforce.learning import contract, diagnostics, learner, normalize
-from mjx_reinforce.learning.distributions import categorical, deterministic
+from mjx_reinforce.learning import contract, normalize
 from mjx_reinforce.learning.estimators import replace_broken
-from mjx_reinforce.learning.learner import Learner, Metrics, TrainState
-from mjx_reinforce.learning.policy import Actor, Policy, act, mlp_policy
+from mjx_reinforce.learning.learner import Metrics, first_actor, keep_finite, update_metrics
 from mjx_reinforce.learning.updates import signal_to_noise
 
 #: (directions, like the params with a leading axis [D]; returns [2, D] forwards and backwards;
@@ -53,13 +45,13 @@ class Trial(NamedTuple):
     """
 
     directions: Any
-    trajectory: Trajectory
+    trajectory: mr.Trajectory
 
 
 def ars(
-    env: Environment,
+    env: mr.Environment,
     *,
-    policy: Policy | None = None,
+    policy: mr.Policy | None = None,
     num_directions: int = 8,
     top_directions: int | None = None,
     step_size: float | jax.Array = 0.02,
@@ -69,7 +61,7 @@ def ars(
     normalize_steps: float = math.inf,
     normalize_min_std: float | jax.Array = 0.0,
     engine: str = "auto",
-) -> Learner:
+) -> mr.Learner:
     """Builds augmented random search for an environment.
 
     Args:
@@ -104,7 +96,6 @@ def ars(
       4
     """
     check_environment(env)
-    horizon = contract.check_horizon(env, horizon)
     check_count("num_directions", num_directions)
     top = num_directions if top_directions is None else top_directions
     check_count("top_directions", top)
@@ -114,140 +105,118 @@ def ars(
     check_number("noise_std", noise_std, positive=True)
     check_number("normalize_steps", normalize_steps, finite=False)
     check_number("normalize_min_std", normalize_min_std)
-    size = observation_size(env)
-    policy = _zero_policy(env, size) if policy is None else policy
-    contract.check_policy(policy, env, size)
-    plays = choice.choose(engine, env)
+    policy = _zero_policy(env) if policy is None else policy
+    contract.check_policy(policy, env, base.observation_size(env))
+    search = _Search(
+        env=env,
+        policy=policy,
+        num_directions=num_directions,
+        step_size=step_size,
+        noise_std=noise_std,
+        increment=functools.partial(_of_the_best, top) if increment is None else increment,
+        horizon=contract.check_horizon(env, horizon),
+        normalize_limits=(normalize_steps, normalize_min_std),
+        engine=choose(engine, env),
+    )
+    return mr.Learner(search.init, search.play, search.learn, policy, search.engine)
 
-    make_step = functools.partial(_of_the_best, top) if increment is None else increment
 
-    def init(key: jax.Array) -> TrainState:
+def make(env: mr.Environment, config: Any, **shared: Any) -> mr.Learner:
+    """Returns the learner of ``--algorithm ars``, with the numbers of ``ars``.
+
+    Args:
+      env: what it learns on.
+      config: the settings; it reads none.
+      shared: the policy, the horizon and more, as ``ars`` takes them.
+    """
+    del config
+    return ars(env, **shared)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
+class _Search:
+    """The functions of a learner; the fields are arguments of ``ars``, checked."""
+
+    env: mr.Environment
+    policy: mr.Policy
+    num_directions: int
+    step_size: float | jax.Array
+    noise_std: float | jax.Array
+    increment: Increment
+    horizon: int
+    normalize_limits: tuple[float, float | jax.Array]
+    engine: Engine
+
+    def init(self, key: jax.Array) -> mr.TrainState:
+        """``Learner.init``."""
         check_key(key)
         policy_key, key = jax.random.split(key)
-        return TrainState(key=key, actor=learner.first_actor(policy, size, policy_key))
+        size = base.observation_size(self.env)
+        return mr.TrainState(key=key, actor=first_actor(self.policy, size, policy_key))
 
-    play = _play(env, policy, plays, num_directions, noise_std, horizon)
-    learn = _learn(make_step, step_size, noise_std, (normalize_steps, normalize_min_std))
-    return Learner(init, play, learn, policy, plays)
-
-
-def _play(
-    env: Environment,
-    policy: Policy,
-    plays: choice.Engine,
-    num_directions: int,
-    noise_std: float | jax.Array,
-    horizon: int,
-) -> Callable[..., Trial]:
-    """Returns ``Learner.play``."""
-
-    def play(state: TrainState, key: jax.Array, active: bool | jax.Array = True) -> Trial:
+    def play(self, state: mr.TrainState, key: jax.Array, active: bool | jax.Array = True) -> Trial:
+        """``Learner.play``: draws the directions, and plays an episode each way along each."""
         directions_key, episodes_key = jax.random.split(key)
-        directions = _draw_directions(directions_key, state.actor.params, num_directions)
-        moves = jax.tree.map(lambda d: jnp.stack([noise_std * d, -noise_std * d]), directions)
+        many = jax.tree.map(
+            lambda p: jnp.broadcast_to(p, (self.num_directions, *p.shape)), state.actor.params
+        )
+        directions = optax.tree.random_like(directions_key, many)
+        moves = jax.tree.map(lambda d: self.noise_std * d, directions)
+        tried = jax.tree.map(lambda p, d: jnp.stack([p + d, p - d]), many, moves)
 
-        def one_way(params: Params, key: jax.Array) -> Trajectory:
-            return plays.rollout(
-                env,
-                functools.partial(_act_each, policy),
+        def one_way(params: Any, key: jax.Array) -> mr.Trajectory:
+            return self.engine.rollout(
+                self.env,
+                self._act_each,
                 state.actor.replace(params=params),
-                policy.distribution,
+                self.policy.distribution,
                 key,
-                num_episodes=num_directions,
+                num_episodes=self.num_directions,
                 deterministic=True,
-                horizon=horizon,
+                horizon=self.horizon,
                 active=active,
             )
 
-        params = jax.tree.map(jnp.add, state.actor.params, moves)
-        played = jax.vmap(one_way)(params, jax.random.split(episodes_key))
-        return Trial(directions, _join_rollouts(played))
+        return Trial(directions, _join(jax.vmap(one_way)(tried, jax.random.split(episodes_key))))
 
-    return play
+    def _act_each(self, actor: mr.Actor, observation: jax.Array) -> jax.Array:
+        """Returns the outputs [D, K] of D policies for an observation [D, O] of each."""
+        own_params = actor.replace(params=0, normalizer=None)
+        return jax.vmap(functools.partial(mr.act, self.policy), (own_params, 0))(actor, observation)
 
-
-def _learn(
-    increment: Increment,
-    step_size: float | jax.Array,
-    noise_std: float | jax.Array,
-    normalize_limits: tuple[float, float | jax.Array],
-) -> Callable[[TrainState, Trial, jax.Array], tuple[TrainState, Metrics]]:
-    """Returns ``Learner.learn``."""
-
-    def learn(state: TrainState, trial: Trial, key: jax.Array) -> tuple[TrainState, Metrics]:
+    def learn(
+        self, state: mr.TrainState, trial: Trial, key: jax.Array
+    ) -> tuple[mr.TrainState, Metrics]:
+        """``Learner.learn``: the module's formula."""
         del key
         actor, played = state.actor, trial.trajectory
         returns = replace_broken(episode_returns(played), played.nonfinite).reshape(2, -1)
-        step = increment(trial.directions, returns, noise_std)
-        params = jax.tree.map(lambda p, d: p + step_size * d, actor.params, step)
-        normalizer = normalize.count(actor.normalizer, played, *normalize_limits)
-        kept, skipped = learner.keep_finite(Actor(params=params, normalizer=normalizer), actor)
+        step = self.increment(trial.directions, returns, self.noise_std)
+        params = jax.tree.map(lambda p, d: p + self.step_size * d, actor.params, step)
+        counted = played.mask & ~played.nonfinite
+        normalizer = normalize.update(
+            actor.normalizer, played.observation, counted, *self.normalize_limits
+        )
+        after = state.replace(actor=mr.Actor(params=params, normalizer=normalizer))
+        after, skipped = keep_finite(after, state)
         measured = {
             "entropy": jnp.zeros(()),
             "gradient_norm": optax.tree.norm(step),
             "return_std": jnp.std(returns),
         }
-        if returns.shape[1] > 1:
-            measured["gradient_snr"] = _step_signal_to_noise(trial.directions, returns)
-        sound = (skipped == 0) & ~jnp.any(played.nonfinite)
-        metrics = learner.episode_metrics(played) | diagnostics.nan_unless(sound, measured)
-        return dataclasses.replace(state, actor=kept), metrics | {"skipped_update": skipped}
-
-    return learn
-
-
-def _of_the_best(top: int, directions: Params, returns: jax.Array, noise_std: Any) -> Any:
-    """Returns the sum in the module's formula over b sigma; zero where sigma is."""
-    del noise_std
-    best = jnp.argsort(-jnp.max(returns, axis=0))[:top]
-    gain = over_std(returns[0, best] - returns[1, best], returns[:, best]) / top
-    return jax.tree.map(
-        lambda d: jnp.sum(gain.reshape(-1, *(1,) * (d.ndim - 1)) * d[best], axis=0), directions
-    )
+        if self.num_directions > 1:
+            # Of the mean over all directions, also where the step is of the best alone.
+            each = jax.vmap(optax.tree.scale)(returns[0] - returns[1], trial.directions)
+            mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
+            measured["gradient_snr"] = signal_to_noise(mean, each, self.num_directions)
+        return after, update_metrics(played, skipped, measured)
 
 
-def over_std(x: jax.Array, returns: jax.Array) -> jax.Array:
-    """Returns ``x`` over the standard deviation of all returns, 0 if they are all equal."""
-    std = jnp.std(returns)
-    return jnp.where(std > 0, x / jnp.where(std > 0, std, 1.0), 0.0)
-
-
-def _act_each(policy: Policy, actor: Actor, observation: jax.Array) -> jax.Array:
-    """Returns the outputs [D, K] of D policies for an observation [D, O] of each."""
-    return jax.vmap(lambda params, seen: act(policy, actor.replace(params=params), seen))(
-        actor.params, observation
-    )
-
-
-def _draw_directions(key: jax.Array, params: Params, num_directions: int) -> Any:
-    """Returns standard Normal directions, like the params with a leading axis [D]."""
-    leaves, tree = jax.tree.flatten(params)
-    keys = jax.random.split(key, len(leaves))
-    drawn = [
-        jax.random.normal(k, (num_directions, *x.shape), x.dtype)
-        for k, x in zip(keys, leaves, strict=True)
-    ]
-    return jax.tree.unflatten(tree, drawn)
-
-
-def _step_signal_to_noise(directions: Params, returns: jax.Array) -> jax.Array:
-    """Returns the signal-to-noise ratio [] over all directions [D] of the mean step.
-
-    See ``signal_to_noise``; a direction's share is (r_plus - r_minus) delta. Where only
-    the best directions count, the step is another, of which nothing is said.
-    """
-    difference = returns[0] - returns[1]
-    each = jax.vmap(lambda r, delta: jax.tree.map(lambda x: r * x, delta))(difference, directions)
-    mean = jax.tree.map(lambda x: jnp.mean(x, axis=0), each)
-    return signal_to_noise(mean, each, len(difference))
-
-
-def _join_rollouts(played: Trajectory) -> Trajectory:
+def _join(played: mr.Trajectory) -> mr.Trajectory:
     """Returns [T, 2 D, ...] from two rollouts stacked [2, T, D, ...]."""
 
     def join(x: jax.Array) -> jax.Array:
-        joined = jnp.moveaxis(x, 0, 1)
-        return joined.reshape(joined.shape[0], -1, *joined.shape[3:])
+        return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])
 
     return played.replace(
         observation=join(played.observation),
@@ -259,9 +228,24 @@ def _join_rollouts(played: Trajectory) -> Trajectory:
     )
 
 
-def _zero_policy(env: Environment, size: int) -> Policy:
+def _of_the_best(top: int, directions: Any, returns: jax.Array, noise_std: Any) -> Any:
+    """Returns the sum in the module's formula over b sigma; zero where sigma is."""
+    del noise_std
+    best = jnp.argsort(-jnp.max(returns, axis=0))[:top]
+    gain = over_std(returns[0, best] - returns[1, best], returns[:, best]) / top
+    along = jax.vmap(optax.tree.scale)(gain, jax.tree.map(lambda d: d[best], directions))
+    return jax.tree.map(lambda x: jnp.sum(x, axis=0), along)
+
+
+def over_std(x: jax.Array, returns: jax.Array) -> jax.Array:
+    """Returns ``x`` over the standard deviation of all returns, 0 if they are all equal."""
+    std = jnp.std(returns)
+    return jnp.where(std > 0, x / jnp.where(std > 0, std, 1.0), 0.0)
+
+
+def _zero_policy(env: mr.Environment) -> mr.Policy:
     """A linear policy that starts at zero, as the paper's do."""
-    space = action_space(env)
-    family = categorical if isinstance(space, Discrete) else deterministic
-    policy = mlp_policy(size, family(space), ())
+    space = base.action_space(env)
+    family = mr.categorical if isinstance(space, mr.Discrete) else mr.deterministic
+    policy = mr.mlp_policy(base.observation_size(env), family(space), ())
     return policy._replace(init=lambda key: jax.tree.map(jnp.zeros_like, policy.init(key)))

@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import optax
 
 import mjx_reinforce as mr
 from mjx_reinforce.published.ars import over_std
@@ -25,13 +26,11 @@ def reinforce(
       estimator: in place of the document's.
       shared: the policy, the horizon and more, as ``mjx_reinforce.reinforce`` takes them.
     """
-    optimizer = mr.make_optimizer(
-        "adam", config.learning_rate, weight_decay=1e-4, max_grad_norm=None
-    )
+    adam = optax.adam(config.learning_rate)
     return mr.reinforce(
         env,
         estimator=estimator or mr.normalized_returns(config.discount),
-        optimizer=optimizer,
+        optimizer=optax.chain(optax.add_decayed_weights(1e-4), adam),  # an L2 penalty
         update=mr.minibatches(num_updates=50, batch_size=128),
         num_episodes=config.num_episodes,
         **shared,

@@ -52,4 +52,25 @@ def with_one_start(learner: mr.Learner) -> mr.Learner:
         key, start_key = jax.random.split(state.key)
         return state.replace(key=key, start_key=start_key)
 
-    return learner._replace(init=init)
+    def play(state: mr.TrainState, key: jax.Array, active: Any = True, rollout: Any = None) -> Any:
+        def from_one_start(env: Any, *policy: Any, **options: Any) -> mr.Trajectory:
+            anywhere = learner.engine.rollout if rollout is None else rollout
+            return anywhere(_OneStart(env, state.start_key), *policy, **options)
+
+        return learner.play(state, key, active, from_one_start)
+
+    return learner._replace(init=init, play=play)
+
+
+class _OneStart:
+    """An environment whose every episode starts with the same key."""
+
+    def __init__(self, env: Any, key: Any):
+        self._env, self._key = env, key
+
+    def reset(self, rng: jax.Array) -> Any:
+        del rng
+        return self._env.reset(self._key)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._env, name)

@@ -1,16 +1,18 @@
-"""Estimators and updates of published programs, each with what it follows in place of the gradient.
+"""Estimators, updates and a distribution of published programs, with what they follow instead.
 
-The estimators compare an episode with itself: the weight of one that broke is the least of the
-others'. From its second optimizer step on, an update follows samples of an older policy. It has no
-importance weights, as the programs have none.
+None follows the gradient of ``reinforce``. The estimators compare an episode with itself: the
+weight of one that broke is the least of the others'. From its second optimizer step on, an update
+follows samples of an older policy. It has no importance weights, as the programs have none.
 """
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
+from mjx_reinforce.engine.base import Box, Discrete
 from mjx_reinforce.engine.checks import check_count
 from mjx_reinforce.engine.play.episode import while_any
+from mjx_reinforce.learning.distributions import Distribution, gaussian_outputs
 from mjx_reinforce.learning.estimators import (
     Estimator,
     check_discount,
@@ -177,6 +179,39 @@ def per_step(update: Update) -> Update:
         return update(problem._replace(divisor=steps), key, params, opt_state)
 
     return averaged
+
+
+def deterministic(
+    space: Box | Discrete, *, initial_std: float | None = None, rescale: bool = True
+) -> Distribution:
+    """A single point: the action is the network's output, rescaled like the mean of ``normal``.
+
+    It is for methods that need no likelihood, such as ``ars``: ``log_prob`` raises ValueError.
+
+    Examples:
+      >>> import jax.numpy as jnp, numpy as np
+      >>> import mjx_reinforce as mr
+      >>> family = mr.deterministic(mr.Box(-2 * np.ones(1), 2 * np.ones(1)))
+      >>> family.mode(jnp.ones(1)).tolist()  # 1 is the end of the range
+      [2.0]
+    """
+    del initial_std
+    layout = gaussian_outputs("deterministic", space, "parameter", 1.0, rescale)
+
+    def log_prob(outputs, action):
+        raise ValueError(
+            "a deterministic policy has no log-probability; choose a stochastic one for REINFORCE"
+        )
+
+    return Distribution(
+        num_outputs=layout.size,
+        constants=(),
+        noise=lambda key, shape: jnp.zeros((*shape, 1)),
+        sample=lambda outputs, noise: layout.mean(outputs),
+        mode=layout.mean,
+        log_prob=log_prob,
+        entropy=lambda outputs: jnp.zeros(outputs.shape[:-1], outputs.dtype),
+    )
 
 
 def _episode_mean(x: jax.Array, mask: jax.Array) -> jax.Array:

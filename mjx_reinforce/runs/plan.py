@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from mjx_reinforce.engine.memory import gigabytes, host_memory
-from mjx_reinforce.registry import PROGRAMS, SEARCHES
 from mjx_reinforce.settings.config import MAX_OF_UPDATE, Config, flag, marked
 from mjx_reinforce.settings.declare import Range
 from mjx_reinforce.settings.defaults import may_have_accelerator, num_cores
@@ -153,7 +152,7 @@ def parts(config: Config, task: Task) -> dict[str, float]:
     steps = seeds * horizon * episodes
     values = task.observation + task.action + 3
     evaluated = seeds * (config.horizon or task.horizon) * 2 * config.eval_episodes
-    follows = config.algorithm not in SEARCHES  # a gradient; else it searches with many policies
+    follows = Reader.GRADIENT.holds(config)  # else it tries out many policies
     fewer = "--num-episodes" if follows else "--hidden-sizes"
     held = seeds * (min(horizon, _CHUNK) if follows else 1) * episodes * sum(config.hidden_sizes)
     policies = seeds if follows else seeds * episodes
@@ -161,7 +160,7 @@ def parts(config: Config, task: Task) -> dict[str, float]:
     critic = config.value_hidden_sizes if Reader.VALUE_BASELINE.holds(config) else ()
     critics = _CRITIC_PARAMETERS * seeds * critic_parameters(config, task)
     valued, fitted = steps, 0
-    if critic and config.algorithm not in PROGRAMS:
+    if critic and Reader.REINFORCE.holds(config):
         fitted = seeds * config.value_batch_size
         valued = seeds * min(horizon, _CHUNK) * episodes
     fitting = fitted * (config.value_fits + values + _ACTIVATIONS * sum(critic))
@@ -183,7 +182,7 @@ def num_parameters(config: Config, task: Task) -> int:
 
 def critic_parameters(config: Config, task: Task) -> int:
     """Returns how many parameters the value network has, 0 where there is none."""
-    if config.algorithm in SEARCHES or not Reader.VALUE_BASELINE.holds(config):
+    if not (Reader.GRADIENT.holds(config) and Reader.VALUE_BASELINE.holds(config)):
         return 0
     return _num_weights([task.observation, *config.value_hidden_sizes, 1])
 

@@ -18,8 +18,8 @@ from mjx_reinforce.registry import (
     ALGORITHMS,
     DISTRIBUTIONS,
     ESTIMATORS,
-    SEARCHES,
     check_choice,
+    find_algorithm,
     is_own,
 )
 from mjx_reinforce.settings.declare import MAX_COUNT, MAX_OF_UPDATE, Range
@@ -69,7 +69,7 @@ class Config(
     @property
     def episodes_per_update(self) -> int:
         """Episodes that a seed plays for an update."""
-        return SEARCHES.get(self.algorithm, self.num_episodes)
+        return find_algorithm(self.algorithm).search_episodes or self.num_episodes
 
     def training_horizon(self, horizon: int) -> int:
         """Returns the time limit of a training episode of a task, in env steps.

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-from mjx_reinforce.registry import PROGRAMS, SEARCHES
+from mjx_reinforce.registry import find_algorithm, is_own
 from mjx_reinforce.settings.declare import (
     COUNT,
     LAYERS,
@@ -38,10 +38,13 @@ class Reader(enum.Enum):
         self.said, self.holds = said, holds
 
     # An algorithm of the user's own may read all of them.
-    GRADIENT = "an --algorithm that follows a gradient", lambda c: c.algorithm not in SEARCHES
+    GRADIENT = (
+        "an --algorithm that follows a gradient",
+        lambda c: not find_algorithm(c.algorithm).search_episodes,
+    )
     REINFORCE = (
         "--algorithm reinforce",
-        lambda c: c.algorithm not in SEARCHES and c.algorithm not in PROGRAMS,
+        lambda c: c.algorithm == "reinforce" or is_own(c.algorithm),
     )
     VALUE_BASELINE = (
         "--estimator value-baseline",
@@ -65,7 +68,7 @@ class Reader(enum.Enum):
         "a --policy with a standard deviation",
         lambda c: (
             c.policy not in ("categorical", "deterministic")
-            and not (c.policy == "auto" and c.algorithm in SEARCHES)
+            and not (c.policy == "auto" and find_algorithm(c.algorithm).search_episodes)
         ),
     )
 

@@ -1,14 +1,14 @@
 """From settings to a learner."""
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from mjx_reinforce.engine.checks import check_kind, explain
 from mjx_reinforce.registry import (
     ALGORITHMS,
     ESTIMATORS,
-    PROGRAMS,
-    SEARCHES,
+    find_algorithm,
     is_own,
     load_choice,
     load_definition,
@@ -65,17 +65,13 @@ def build(
     }
     if is_own(config.algorithm):
         return _build_own(env, config, shared), horizon
-    follows = config.algorithm not in SEARCHES
+    algorithm = find_algorithm(config.algorithm)
+    follows = not algorithm.search_episodes
     if follows and config.engine != "vmap" and (said := available.announcement(env)):
         to_screen(said)
-    if config.algorithm == "reinforce":
-        learner = _build_reinforce(env, config, shared)
-    elif config.algorithm in PROGRAMS:
-        learner = load_definition(PROGRAMS[config.algorithm])(env, config, **shared)
-    else:
-        learner = load_definition(ALGORITHMS[config.algorithm])(env, **shared)
+    learner = load_definition(algorithm.make)(env, config, **shared)
     if follows:
-        learner = _for_many_seeds(learner, env, config, shared["horizon"], devices)
+        learner = _for_many_seeds(learner, config, shared["horizon"], devices)
     return learner, horizon
 
 
@@ -83,26 +79,28 @@ def policy_settings(env: "Environment", config: Config) -> dict[str, Any]:
     """Returns what ``policy_files.build_policy`` needs to build the policy without the env."""
     from mjx_reinforce.engine.base import Discrete, action_space, observation_size
 
-    space, published = action_space(env), config.algorithm in PROGRAMS
+    space, algorithm = action_space(env), find_algorithm(config.algorithm)
     if isinstance(space, Discrete):
         family, described = "categorical", {"num_actions": space.num_actions}
     else:
-        family = "deterministic" if config.algorithm in SEARCHES else "normal"
+        family = "deterministic" if algorithm.search_episodes else "normal"
         described = {"action_low": space.low.tolist(), "action_high": space.high.tolist()}
     return {
         "env": config.env,
         "policy": family if config.policy == "auto" else config.policy,
         "hidden_sizes": list(config.hidden_sizes),
         "shared_trunk": True,
-        "initializer": "torch" if published else "orthogonal",
+        "initializer": "orthogonal",
         "initial_std": config.initial_std,
-        "rescale": not published,
+        "rescale": True,
         "observation_size": observation_size(env),
         **described,
+        **algorithm.policy,
     }
 
 
-def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
+def build_reinforce(env: "Environment", config: Config, **shared: Any) -> "Learner":
+    """Returns the learner of ``--algorithm reinforce``; arguments are those of a program."""
     from mjx_reinforce.learning.learner import reinforce
 
     return reinforce(
@@ -118,21 +116,18 @@ def _build_reinforce(env: "Environment", config: Config, shared: dict[str, Any])
 
 
 def _for_many_seeds(
-    learner: "Learner",
-    env: "Environment",
-    config: Config,
-    horizon: int,
-    devices: "Devices | None",
+    learner: "Learner", config: Config, horizon: int, devices: "Devices | None"
 ) -> "Learner":
-    """Returns a learner with what many seeds need, see ``training.hosting``."""
+    """Returns a learner with what many seeds need, see ``training.wrappers``."""
     from mjx_reinforce.learning.schedules import Cut
-    from mjx_reinforce.training import hosting
+    from mjx_reinforce.training import wrappers
 
-    cut = None
+    cut_steps = 0
     if config.train_horizon is not None and config.whole_after < 1:
-        cut = Cut(config.train_horizon, config.whole_after)
-    learner = hosting.hosted(learner, env, config.num_episodes, horizon, cut=cut, devices=devices)
-    return hosting.short_episodes(learner, horizon, config.num_seeds, cut.steps if cut else 0)
+        cut_steps = config.train_horizon
+        learner = Cut(cut_steps, config.whole_after)(learner)
+    learner = wrappers.in_one_launch(learner, devices)
+    return wrappers.short_episodes(learner, horizon, config.num_seeds, cut_steps)
 
 
 def _build_own(env: "Environment", config: Config, shared: dict[str, Any]) -> "Learner":
@@ -140,7 +135,7 @@ def _build_own(env: "Environment", config: Config, shared: dict[str, Any]) -> "L
 
     ``shared`` are the keywords that ``reinforce`` and ``ars`` have in common.
     """
-    from mjx_reinforce.training.hosting import check_learner
+    from mjx_reinforce.training.wrappers import check_learner
 
     learner = _made_by_user("algorithm", config.algorithm, ALGORITHMS, env, config, **shared)
     check_learner(config.algorithm, learner)
@@ -148,7 +143,7 @@ def _build_own(env: "Environment", config: Config, shared: dict[str, Any]) -> "L
 
 
 def _made_by_user(
-    kind: str, name: str, known: dict[str, str], *arguments: object, **more: object
+    kind: str, name: str, known: Mapping[str, Any], *arguments: object, **more: object
 ) -> Any:
     """Returns what the user's own function returns, or raises ValueError with what it raised."""
     make = load_choice(kind, name, known)

@@ -15,8 +15,8 @@ from mjx_reinforce.engine.play.rollouts import episode_lengths, episode_returns
 from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.learner import Learner, TrainState
 from mjx_reinforce.learning.policy import Actor
-from mjx_reinforce.training.hosting import Guests, step_with
 from mjx_reinforce.training.state import Budget, RunState
+from mjx_reinforce.training.wrappers import EvaluationEpisodes, step_with
 
 #: Returns the learner of settings that may be traced, of one run each.
 BuildLearner = Callable[[dict[str, jax.Array]], Learner]
@@ -37,7 +37,7 @@ class Block(NamedTuple):
 
 
 def block_of_updates(
-    build_learner: BuildLearner, length: int, visit: Callable[..., Guests] | None
+    build_learner: BuildLearner, length: int, visit: Callable[..., EvaluationEpisodes] | None
 ) -> Callable[..., tuple[RunState, Block]]:
     """Returns a function that makes ``length`` updates of all runs, or fewer if that is the end.
 
@@ -71,9 +71,9 @@ def block_of_updates(
         eval_key: jax.Array,
         look: jax.Array,
     ) -> Any:
-        guests = None if visit is None else visit(eval_key, look)
-        state, metrics, played = step_with(build_learner(settings), state, going, guests)
-        looked = {} if guests is None or played is None else measure(played, guests)
+        evaluation = None if visit is None else visit(eval_key, look)
+        state, metrics, played = step_with(build_learner(settings), state, going, evaluation)
+        looked = {} if evaluation is None or played is None else measure(played, evaluation)
         return state, metrics | {"active": going}, looked
 
     @functools.partial(jax.jit, inline=True)  # traced once, for its shapes and for the loop
@@ -105,9 +105,9 @@ def block_of_updates(
     return advance
 
 
-def guests_of(
+def evaluation_episodes(
     key: jax.Array, *, num_episodes: int, active: bool | jax.Array = True, sampled: bool = True
-) -> Guests:
+) -> EvaluationEpisodes:
     """Returns the episodes of an evaluation: N with the policy's mode, and N with its samples.
 
     Args:
@@ -118,7 +118,7 @@ def guests_of(
       sampled: whether the second N are played; the first are the same without them.
     """
     keys = episode_keys(key, (1 + sampled) * num_episodes)
-    return Guests(keys, num_episodes, jnp.asarray(active))
+    return EvaluationEpisodes(keys, num_episodes, jnp.asarray(active))
 
 
 def evaluate(
@@ -138,7 +138,7 @@ def evaluate(
       env: what is played.
       learner: whose policy and engine it is.
       actor: the parameters and observation statistics.
-      key: as for ``guests_of``, with the other arguments that are not named here.
+      key: as for ``evaluation_episodes``, with the other arguments that are not named here.
       num_episodes: N, of each kind.
       horizon: T, the time limit in steps.
       active: [] where False nothing is played, and what is returned says nothing.
@@ -154,22 +154,22 @@ def evaluate(
       >>> 1 <= found["eval_return"].item() <= 20
       True
     """
-    guests = guests_of(key, num_episodes=num_episodes, active=active, sampled=sampled)
+    evaluation = evaluation_episodes(key, num_episodes=num_episodes, active=active, sampled=sampled)
     trajectory = learner.engine.rollout(
         env,
         learner.act,
         actor,
         learner.policy.distribution,
-        guests.keys,
-        num_episodes=len(guests.keys),
+        evaluation.keys,
+        num_episodes=len(evaluation.keys),
         horizon=horizon,
-        deterministic=guests.deterministic(),
-        active=guests.active,
+        deterministic=evaluation.deterministic(),
+        active=evaluation.active,
     )
-    return measure(trajectory, guests) | {"simulated_steps": trajectory.simulated}
+    return measure(trajectory, evaluation) | {"simulated_steps": trajectory.simulated}
 
 
-def measure(trajectory: Trajectory, guests: Guests) -> dict[str, jax.Array]:
+def measure(trajectory: Trajectory, evaluation: EvaluationEpisodes) -> dict[str, jax.Array]:
     """Returns what the episodes of an evaluation show.
 
     ``eval_return`` and ``eval_length`` [], means over the deterministic episodes,
@@ -180,8 +180,8 @@ def measure(trajectory: Trajectory, guests: Guests) -> dict[str, jax.Array]:
     """
     returns, lengths = episode_returns(trajectory), episode_lengths(trajectory)
     returns = jnp.where(trajectory.nonfinite | ~jnp.isfinite(returns), jnp.nan, returns)
-    modes = guests.num_modes
-    sampled = len(guests.keys) > modes
+    modes = evaluation.num_modes
+    sampled = len(evaluation.keys) > modes
     stochastic = {"eval_return_stochastic": jnp.mean(returns[modes:])} if sampled else {}
     return stochastic | {
         "eval_return": jnp.mean(returns[:modes]),

@@ -18,7 +18,7 @@ from jax.sharding import PartitionSpec
 from mjx_reinforce.engine.base import PyTree
 from mjx_reinforce.engine.devices import NONE, RUNS, Devices
 from mjx_reinforce.engine.play.episode import largest_divisor
-from mjx_reinforce.registry import SEARCHES, is_own
+from mjx_reinforce.registry import find_algorithm, is_own
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.state import RunState, shape_of_all
 
@@ -146,7 +146,7 @@ def divide_run(config: Config) -> Division:
     here, num_seeds = jax.local_device_count(), config.num_seeds
     width = -(-num_seeds // here)
     by_seeds = Division(seeds=-(-num_seeds // width))
-    if config.algorithm in SEARCHES or is_own(config.algorithm):
+    if find_algorithm(config.algorithm).search_episodes or is_own(config.algorithm):
         return by_seeds
     episodes = largest_divisor(config.num_episodes, here)
     each = num_seeds * config.episodes_per_update / episodes

@@ -25,11 +25,11 @@ from mjx_reinforce.training.block import (
     BuildLearner,
     block_of_updates,
     evaluate,
-    guests_of,
+    evaluation_episodes,
 )
 from mjx_reinforce.training.division import ALONE, Division
-from mjx_reinforce.training.hosting import Guests, Host
 from mjx_reinforce.training.state import Budget, RunState, Seed
+from mjx_reinforce.training.wrappers import EvaluationEpisodes, SharedLaunch
 
 
 class Programs(NamedTuple):
@@ -111,7 +111,7 @@ def programs_of(
       division: among which devices the runs are divided.
     """
     learner = build_learner({})  # policies and engines are those of any
-    rides = isinstance(learner.play, Host) and config.training_horizon(horizon) == horizon
+    rides = isinstance(learner.play, SharedLaunch) and config.training_horizon(horizon) == horizon
 
     def first(key: jax.Array, settings: dict[str, jax.Array]) -> TrainState:
         return build_learner(settings).init(key)
@@ -128,8 +128,10 @@ def programs_of(
         )
         return states, state.last_test_keys(numbers, config)
 
-    def visit(key: jax.Array, active: jax.Array) -> Guests:
-        return guests_of(key, num_episodes=config.eval_episodes, active=active, sampled=sampled)
+    def visit(key: jax.Array, active: jax.Array) -> EvaluationEpisodes:
+        return evaluation_episodes(
+            key, num_episodes=config.eval_episodes, active=active, sampled=sampled
+        )
 
     def look(actor: Actor, key: jax.Array, active: bool | jax.Array = True) -> dict[str, jax.Array]:
         size = {"num_episodes": config.eval_episodes, "horizon": horizon}

@@ -20,7 +20,7 @@ from mjx_reinforce.learning.estimators import discounted_returns
 from mjx_reinforce.learning.value import value_baseline
 from mjx_reinforce.published import variants
 from mjx_reinforce.published.gymnasium_tutorial import with_one_start
-from mjx_reinforce.training import hosting
+from mjx_reinforce.training import wrappers
 
 
 @functools.cache
@@ -116,7 +116,7 @@ def test_no_key_is_used_twice():
             update=variants.minibatches(2, 8),
         )
         learner = with_one_start(learner)
-        learner = hosting.hosted(learner, Survive(), 4, Survive.max_episode_steps)
+        learner = wrappers.in_one_launch(learner)
         state = jax.jit(learner.init)(jax.random.key(0))
         state, _ = train_step(learner, state)
         train_step(learner, state)
@@ -130,12 +130,12 @@ class Scattered(Survive):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("one_start", "hosted"), [(True, True), (True, False), (False, True)])
-def test_one_start_is_a_seeds_own_and_stays(one_start, hosted):
+@pytest.mark.parametrize(("one_start", "shared"), [(True, True), (True, False), (False, True)])
+def test_one_start_is_a_seeds_own_and_stays(one_start, shared):
     learner = reinforce(Scattered(), num_episodes=4)
     learner = with_one_start(learner) if one_start else learner
-    if hosted:
-        learner = hosting.hosted(learner, Scattered(), 4, Scattered.max_episode_steps)
+    if shared:
+        learner = wrappers.in_one_launch(learner)
     states = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 3))
     play = jax.jit(jax.vmap(learner.play))
     played = [play(states, jax.random.split(jax.random.key(update), 3)) for update in (1, 2)]
@@ -210,10 +210,10 @@ def test_short_episodes_are_learned_from_in_short(length, update, monkeypatch):
 
     learned, branches = [], []
     for many in (2 * 3 * 400, 2 * 3 * 400 + 1):
-        monkeypatch.setattr(hosting, "_MANY", many)
+        monkeypatch.setattr(wrappers, "_MANY", many)
         settings = {"update": update, "optimizer": optax.sgd(1.0), "engine": "vmap"}
         learner = reinforce(Ends(), num_episodes=3, **settings)
-        learner = hosting.short_episodes(learner, Ends.max_episode_steps, num_seeds=2)
+        learner = wrappers.short_episodes(learner, Ends.max_episode_steps, num_seeds=2)
         seeds = jax.jit(jax.vmap(learner.init))(jax.random.split(jax.random.key(0), 2))
         program = jax.jit(jax.vmap(learner.step)).lower(seeds)
         branches.append("stablehlo.case" in program.as_text())
@@ -229,10 +229,10 @@ def test_episodes_are_cut_until_a_share_of_the_budget_is_used(engine, short_apar
     """An update learns what one does whose episodes all have that horizon."""
     if engine == "native" and (reason := available.unavailable()):
         pytest.skip(reason)
-    monkeypatch.setattr(hosting, "_MANY", 0 if short_apart else 2**31)
+    monkeypatch.setattr(wrappers, "_MANY", 0 if short_apart else 2**31)
     settings = {"num_episodes": 8, "engine": engine}
     settings["policy"] = mlp_policy(2, normal(Drifting.action_space), ())
-    cut = hosting.short_episodes(reinforce(Drifting(), horizon=100, **settings), 100, 1, 50)
+    cut = wrappers.short_episodes(reinforce(Drifting(), horizon=100, **settings), 100, 1, 50)
     cut = Cut(steps=50, until=0.5)(cut)
     steps = {x: jax.jit(reinforce(Drifting(), horizon=x, **settings).step) for x in (50, 100)}
     first, cut = cut.init(jax.random.key(0)), jax.jit(cut.step)
@@ -256,6 +256,7 @@ def test_episodes_are_cut_until_a_share_of_the_budget_is_used(engine, short_apar
     [
         ({"horizon": 0}, "horizon must be at least one"),
         ({"estimator": lambda used: estimators.reward_to_go()}, "estimator must be of type"),
+        ({"optimizer": jax.nn.relu}, "optimizer must be of type GradientTransformation"),
     ],
 )
 def test_nonsense_is_refused(settings, said):

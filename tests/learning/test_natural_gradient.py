@@ -17,7 +17,6 @@ from mjx_reinforce.learning import natural_gradient as module
 from mjx_reinforce.learning import schedules
 from mjx_reinforce.learning.bounded import tanh_normal
 from mjx_reinforce.learning.distributions import categorical, normal
-from mjx_reinforce.learning.learner import _surrogate
 from mjx_reinforce.learning.updates import Clock, Problem, full_batch
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.store.build import _build_optimizer
@@ -50,7 +49,13 @@ def make(name, seed=0):
     action = distribution.sample(policy.apply(params, observation), noise)
     weight = jnp.where(MASK, jax.random.normal(keys[4], MASK.shape), 0.0)
     samples = (observation, action, weight, jnp.asarray(MASK))
-    return policy, params, Problem(_surrogate(policy, 0.0), optax.sgd(1.0), samples, 4, START)
+
+    def surrogate(params, samples):
+        observation, action, weight, mask = samples
+        log_prob = distribution.log_prob(policy.apply(params, observation), action)
+        return -jnp.sum(jnp.where(mask, log_prob * weight, 0.0)), {"entropy": jnp.zeros(())}
+
+    return policy, params, Problem(surrogate, optax.sgd(1.0), samples, 4, START)
 
 
 def actions_and_probabilities(distribution, outputs):

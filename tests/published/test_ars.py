@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 from toys import Chain, SignedTarget, Survive, Target, Tempting
 
-from mjx_reinforce import evaluate, mlp_policy, rollout, train_step
+from mjx_reinforce import deterministic, evaluate, mlp_policy, rollout, train_step
 from mjx_reinforce.engine.base import Discrete
 from mjx_reinforce.learning import counts, normalize
-from mjx_reinforce.learning.distributions import deterministic
-from mjx_reinforce.published import ars as ars_module
 from mjx_reinforce.published.ars import ars
 from mjx_reinforce.published.continuous_cartpole import increment, random_search
 from mjx_reinforce.settings.config import Config
@@ -36,9 +34,9 @@ def test_one_update_by_hand():
     state, _ = train_step(learner, state)  # Observations are normalised from here on.
     flat, unflatten = jax.flatten_util.ravel_pytree(state.actor.params)
     _, play_key, _ = jax.random.split(state.key, 3)
-    directions_key, episodes_key = jax.random.split(play_key)
-    drawn = ars_module._draw_directions(directions_key, state.actor.params, 5)
-    directions = jax.vmap(lambda d: jax.flatten_util.ravel_pytree(d)[0])(drawn)
+    _, episodes_key = jax.random.split(play_key)
+    tried = learner.play(state, play_key, True)
+    directions = jax.vmap(lambda d: jax.flatten_util.ravel_pytree(d)[0])(tried.directions)
 
     @jax.jit
     def play(sign, key, k):

@@ -26,14 +26,14 @@ class Counter:
     def __init__(self, settings):
         self.each = settings["each"]
 
-    def step_with(self, state, going, guests):
+    def step_with(self, state, going, evaluation):
         steps = jnp.where(going, self.each, 0)
         metrics = {"env_steps": steps, "share": state.progress}
         state = state.replace(
             env_steps=counts.plus(state.env_steps, steps),
             num_updates=counts.plus(state.num_updates, going.astype(jnp.int32)),
         )
-        return state, metrics, guests
+        return state, metrics, evaluation
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def advance(monkeypatch):
     """Runs a block of 4 updates of runs that play so many env steps an update, of a budget."""
 
     def run(each, budget, look=False, visit=None, begun=0):
-        monkeypatch.setattr(block, "measure", lambda played, guests: {"seen": guests})
+        monkeypatch.setattr(block, "measure", lambda played, evaluation: {"seen": evaluation})
         monkeypatch.setattr(block, "step_with", Counter.step_with)
         num = len(each)
         none = jnp.stack([jnp.asarray(counts.from_int(begun))] * num)

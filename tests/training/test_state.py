@@ -136,7 +136,7 @@ def test_a_test_plays_whole_evaluations_from_starts_of_their_own():
 @pytest.mark.slow
 @pytest.mark.parametrize("share", [0.5, 1.0])
 def test_training_is_cut_for_a_share_of_the_budget_and_evaluations_never(share):
-    """Guests, who play to the time limit, ride where training comes to do that, too."""
+    """These play to the time limit, and ride where training comes to do that, too."""
     config = dataclasses.replace(
         CONFIG, num_seeds=1, env_steps=800, train_horizon=8, whole_after=share, eval_every=1
     )

@@ -1,26 +1,26 @@
 """What is wrapped around a learner where many seeds train: none of it changes the algorithm.
 
-Each function takes a learner and returns one. ``hosted`` lets an evaluation ride with the episodes
-of an update, and divides them among devices; ``short_episodes`` makes updates of many seeds cheap
-while all episodes are short.
+Each function takes a learner and returns one. ``in_one_launch`` plays an evaluation with the
+episodes of an update, and divides them among devices; ``short_episodes`` makes updates of many
+seeds cheap while all episodes are short.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from mjx_reinforce.engine.base import Environment, PyTree, Trajectory
+from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, Trajectory
 from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.engine.devices import NONE, RUNS, SECOND, Devices
-from mjx_reinforce.engine.play.episode import CHUNK_STEPS, check_each, episode_keys
+from mjx_reinforce.engine.play.episode import CHUNK_STEPS
 from mjx_reinforce.engine.scalar import any_lane
 from mjx_reinforce.learning.contract import traced
-from mjx_reinforce.learning.learner import Learner, Metrics, TrainState, begins_as
+from mjx_reinforce.learning.learner import Learner, Metrics, TrainState
 from mjx_reinforce.learning.policy import Actor
-from mjx_reinforce.learning.schedules import Cut
 
 #: Episodes are short if none is longer than the horizon divided by this, or than the cut. An update
 #: passes over all steps that there may be: it takes its time from the horizon, not the episodes.
@@ -42,8 +42,8 @@ _METRICS = (
 )
 
 
-class Guests(NamedTuple):
-    """E episodes that are played in one go with those of an update, and from which nothing learns.
+class EvaluationEpisodes(NamedTuple):
+    """E episodes that are played in one launch with an update, and from which nothing learns.
 
     keys: [E] their own keys, as ``engine.play.episode.episode_keys`` makes them
     num_modes: how many of them, the first, take the policy's mode; the others its samples
@@ -60,106 +60,123 @@ class Guests(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Host:
-    """A ``Learner.play`` of ``reinforce`` that can take guests, and divides episodes among devices.
+class SharedLaunch:
+    """A ``Learner.play`` whose launch may play an evaluation too, and is divided among devices.
 
-    env, num_episodes, horizon: those of ``reinforce``
-    learner: which ``reinforce`` made
-    limit: (progress []) -> the most steps [] of an episode that is no guest; None without a cut
+    learner: whose ``play`` takes another rollout, as that of ``reinforce`` does
     devices: among which the episodes of an update are divided; they stay where they are played, and
       XLA divides what is computed from them. Their count divides every number of episodes that an
       update has room for. None plays where ``jax.jit`` computes
     """
 
-    env: Environment
-    num_episodes: int
-    horizon: int
     learner: Learner
-    limit: Callable[[jax.Array], jax.Array] | None = None
     devices: Devices | None = None
 
     def __call__(
         self, state: TrainState, key: jax.Array, active: bool | jax.Array = True
     ) -> Trajectory:
-        """Plays without guests."""
-        return self.with_guests(state, key, active, None)[0]
+        """Plays the episodes of an update alone."""
+        return self.with_evaluation(state, key, active, None)[0]
 
-    def with_guests(
-        self, state: TrainState, key: jax.Array, active: bool | jax.Array, guests: Guests | None
+    def with_evaluation(
+        self,
+        state: TrainState,
+        key: jax.Array,
+        active: bool | jax.Array,
+        evaluation: EvaluationEpisodes | None,
     ) -> tuple[Trajectory, Trajectory | None]:
-        """Plays the episodes of an update, with guests before them if there are any."""
-        check_each(self.num_episodes, active=active)
-        visitors = None if guests is None else (guests.keys, guests.deterministic(), guests.active)
-        chosen = jnp.broadcast_to(active, self.num_episodes)
-        keys = episode_keys(key, self.num_episodes)
-        limit = None
-        if self.limit is not None:
-            limit = jnp.minimum(self.limit(state.progress), self.horizon)
-        play: Any = self._play_part
-        if self.devices is not None:
-            given = NONE, NONE, NONE, NONE, RUNS, RUNS
-            of_guests = None if guests is None else _EPISODES
-            play = self.devices.map(play, given, (_EPISODES, of_guests))
-        own, looked = play(state.actor, state.start_key, visitors, limit, keys, chosen)
-        if self.devices is not None and guests is not None:
+        """Plays the episodes of an update, and before them those of an evaluation, if any."""
+        evaluated = []
+
+        def rollout(
+            env: Environment,
+            act: Act,
+            actor: Actor,
+            distribution: Acts,
+            keys: jax.Array,
+            *,
+            num_episodes: int,
+            horizon: int,
+            active: bool | jax.Array,
+            limit: jax.Array | None = None,
+        ) -> Trajectory:
+            def play(actor: Actor, keys: jax.Array, **options: Any) -> Trajectory:
+                given = env, act, actor, distribution, keys
+                return self.learner.engine.rollout(*given, num_episodes=len(keys), **options)
+
+            part: Any = functools.partial(self._play_part, play, horizon)
+            before, divided = None, None
+            if evaluation is not None:
+                before = evaluation.keys, evaluation.deterministic(), evaluation.active
+                divided = _EPISODES
+            if self.devices is not None:
+                specs = NONE, NONE, NONE, RUNS, RUNS
+                part = self.devices.map(part, specs, (_EPISODES, divided))
+            chosen = jnp.broadcast_to(active, num_episodes)
+            own, its = part(actor, before, limit, keys, chosen)
+            evaluated.append(its)
+            return own
+
+        own, (its,) = self.learner.play(state, key, active, rollout), evaluated
+        if self.devices is not None and evaluation is not None:
             # Those of the first device; the others played none.
-            looked = looked.episodes(slice(len(guests.keys)))
-        return own, looked
+            its = its.episodes(slice(len(evaluation.keys)))
+        return own, its
 
     def _play_part(
-        self, actor: Actor, start_key: Any, visitors: Any, limit: Any, keys: Any, chosen: Any
+        self,
+        play: Callable[..., Trajectory],
+        horizon: int,
+        actor: Actor,
+        evaluation: Any,
+        limit: Any,
+        keys: Any,
+        chosen: Any,
     ) -> tuple[Trajectory, Trajectory | None]:
-        """Plays episodes of these keys, as far as they are chosen, with guests before them.
+        """Plays episodes of these keys, as far as they are chosen, after those of an evaluation.
 
-        They have ``limit`` [] steps at most, guests those of the horizon. ``visitors`` are the keys
-        of the guests, whether each takes the mode, and whether they are played; None without any.
-        Of several devices each plays a part of the episodes, and the first one the guests.
+        They have ``limit`` [] steps at most, an evaluation's those of the horizon. ``evaluation``
+        has the keys of its episodes, whether each takes the mode, and whether they are played; None
+        without one. Of several devices each plays a part of the episodes, and the first one the
+        evaluation's.
         """
         count, modes = 0, False
-        if visitors is not None:
-            guest_keys, guest_modes, guest_active = visitors
+        if evaluation is not None:
+            its_keys, its_modes, its_active = evaluation
             if self.devices is not None:
-                guest_active = guest_active & (self.devices.number() == 0)
-            count = len(guest_keys)
-            modes = jnp.concatenate([guest_modes, jnp.zeros(len(keys), bool)])
-            chosen = jnp.concatenate([jnp.broadcast_to(guest_active, count), chosen])
+                its_active = its_active & (self.devices.number() == 0)
+            count = len(its_keys)
+            modes = jnp.concatenate([its_modes, jnp.zeros(len(keys), bool)])
+            chosen = jnp.concatenate([jnp.broadcast_to(its_active, count), chosen])
             if limit is not None:
                 own = jnp.broadcast_to(limit, len(keys))
-                limit = jnp.concatenate([jnp.full(count, self.horizon), own])
-            keys = jnp.concatenate([guest_keys, keys])
-        played = self.learner.engine.rollout(
-            begins_as(self.env, start_key),
-            self.learner.act,
-            actor,
-            self.learner.policy.distribution,
-            keys,
-            num_episodes=len(keys),
-            horizon=self.horizon,
-            deterministic=modes,
-            active=chosen,
-            limit=limit,
-        )
+                limit = jnp.concatenate([jnp.full(count, horizon), own])
+            keys = jnp.concatenate([its_keys, keys])
+        played = play(actor, keys, horizon=horizon, deterministic=modes, active=chosen, limit=limit)
         if self.devices is not None:
             played = dataclasses.replace(played, simulated=self.devices.sum(played.simulated))
-        if visitors is None:
+        if evaluation is None:
             return played, None
         return played.episodes(slice(count, None)), played.episodes(slice(count))
 
 
 def step_with(
-    learner: Learner, state: TrainState, active: bool | jax.Array, guests: Guests | None
+    learner: Learner,
+    state: TrainState,
+    active: bool | jax.Array,
+    evaluation: EvaluationEpisodes | None,
 ) -> tuple[TrainState, Metrics, Trajectory | None]:
-    """Makes one update as ``Learner.step``; also returns the episodes of guests, if any."""
-    host, looked = learner.play, []
-    if guests is None or not isinstance(host, Host):
+    """Makes one update as ``Learner.step``; also returns the episodes of the evaluation, if any."""
+    launch, evaluated = learner.play, []
+    if evaluation is None or not isinstance(launch, SharedLaunch):
         return *learner.step(state, active), None
 
     def play(state: TrainState, key: jax.Array, active: bool | jax.Array) -> Trajectory:
-        own, theirs = host.with_guests(state, key, active, guests)
-        looked.append(theirs)
+        own, its = launch.with_evaluation(state, key, active, evaluation)
+        evaluated.append(its)
         return own
 
-    return *learner._replace(play=play).step(state, active), *looked
+    return *learner._replace(play=play).step(state, active), *evaluated
 
 
 def short_episodes(learner: Learner, horizon: int, num_seeds: int, cut_steps: int = 0) -> Learner:
@@ -187,32 +204,18 @@ def short_episodes(learner: Learner, horizon: int, num_seeds: int, cut_steps: in
     return learner._replace(learn=learn)
 
 
-def hosted(
-    learner: Learner,
-    env: Environment,
-    num_episodes: int,
-    horizon: int,
-    *,
-    cut: Cut | None = None,
-    devices: Devices | None = None,
-) -> Learner:
-    """Returns a learner of ``reinforce`` that plays as ``Host`` does.
+def in_one_launch(learner: Learner, devices: Devices | None = None) -> Learner:
+    """Returns a learner that plays as ``SharedLaunch`` does.
 
     Args:
-      learner: of ``reinforce``, with the next three arguments.
-      env: what is played.
-      num_episodes: N.
-      horizon: T, in steps.
-      cut: of the episodes of training.
-      devices: see ``Host``.
+      learner: of ``reinforce``, or one that is wrapped around it.
+      devices: see ``SharedLaunch``.
     """
-    limit = None if cut is None else cut.limit
-    host = Host(env, num_episodes, horizon, learner, limit, devices)
-
+    launch = SharedLaunch(learner, devices)
     if jax.eval_shape(learner.init, jax.random.key(0)).start_key is not None:
-        return learner._replace(play=host.__call__)
+        return learner._replace(play=launch.__call__)
     # Elsewhere an episode that is not played still takes its place.
-    return learner._replace(play=host if learner.engine.name == "native" else host.__call__)
+    return learner._replace(play=launch if learner.engine.name == "native" else launch.__call__)
 
 
 def check_learner(name: str, learner: Learner) -> None:
