@@ -9,8 +9,8 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from mjx_reinforce.engine.checks import fits, nearest
-from mjx_reinforce.files import read_json
+from mjx_reinforce.engine.checks import check_type, nearest
+from mjx_reinforce.files import naming_damage, read_json
 from mjx_reinforce.settings.config import read_seeds
 
 #: A seed by its rank in the run's final evaluation, or by its number.
@@ -20,6 +20,8 @@ Which = Literal["last", "best"]
 
 #: Where the policies are in the run directory, and their returns in summary.json.
 _PLACES = {"last": ("policy", "final_returns"), "best": ("policy/best", "best_test_returns")}
+#: The entries of config.json that are read, and their types.
+_KINDS = {"env": str, "horizon": int, "seeds": tuple[int, ...] | None, "env_set": tuple[str, ...]}
 _NOT_YET = "its training goes on, or was killed, and then train --resume goes on with it"
 
 
@@ -72,26 +74,18 @@ def read_run(directory: str | Path) -> Run:
             f"{directory} is no run directory: there is no {path}"
             f"{'' if directory.is_dir() else _packaged(directory.name)}"
         )
-    settings = read_json(path)
-    env_id, horizon = settings.get("env"), settings.get("horizon")
-    if not isinstance(env_id, str):
-        raise ValueError(f"{path} is damaged: env must be text, got {env_id!r}")
-    if type(horizon) is not int or not 1 <= horizon < 2**31:
-        raise ValueError(
-            f"{path} is damaged: horizon must be a whole number from 1 to 2^31 - 1, got {horizon!r}"
-        )
+    found: dict[str, Any] = {"seeds": None, "env_set": []} | read_json(path)
+    with naming_damage(path):
+        if isinstance(found["seeds"], str):  # a share of a run; where a sweep kept a few, a list
+            found["seeds"] = [*read_seeds(found["seeds"])]
+        for name, kind in _KINDS.items():
+            check_type(name, found.get(name), kind)
+        if not 1 <= found["horizon"] < 2**31:
+            raise ValueError(f"horizon must be from 1 to 2^31 - 1, got {found['horizon']}")
     if not (directory / "policy").is_dir():
         raise ValueError(f"{directory} has no policy yet: {_NOT_YET}")
-    seeds = settings.get("seeds")
-    if isinstance(seeds, str):  # a share of a run; where a sweep kept a few it is a list
-        seeds = [*read_seeds(seeds)]
-    if not fits(seeds, tuple[int, ...] | None):
-        raise ValueError(f"{path} is damaged: seeds must be whole numbers, got {seeds!r}")
-    env_set = settings.get("env_set", [])  # runs from before --env-set have none
-    if not fits(env_set, tuple[str, ...]):
-        raise ValueError(f"{path} is damaged: env_set must be a list of texts, got {env_set!r}")
-    kept = None if seeds is None else tuple(seeds)
-    return Run(directory, env_id, horizon, kept, tuple(env_set))
+    seeds = None if found["seeds"] is None else tuple(found["seeds"])
+    return Run(directory, found["env"], found["horizon"], seeds, tuple(found["env_set"]))
 
 
 def _packaged(name: str) -> str:
@@ -163,11 +157,6 @@ def choose_seed(run: Run, seed: SeedChoice, which: Which = "last") -> int:
     return run.seeds[place]
 
 
-def _is_return(value: Any) -> bool:
-    """Returns whether it is a return in a file: a number that float can hold, or None."""
-    return value is None or (type(value) in (int, float) and abs(value) < 1e300)
-
-
 def final_returns(run: Run, which: Which) -> np.ndarray:
     """Returns each seed's return [S] in the final evaluation, -inf where it was not finite.
 
@@ -181,10 +170,9 @@ def final_returns(run: Run, which: Which) -> np.ndarray:
         raise ValueError(f"{run.directory} has no final evaluation: {_NOT_YET}; {remedy}")
     if name not in summary:
         raise ValueError(f"{path} has no {name}; {remedy}")
-    values = summary[name]
-    if not isinstance(values, list) or not all(map(_is_return, values)):
-        raise ValueError(f"{path} is damaged: {name} is not a list of numbers; {remedy}")
-    values = np.array(values, float)  # None becomes nan
+    with naming_damage(path):
+        check_type(name, summary[name], tuple[float | None, ...])
+        values = np.array(summary[name], float)  # None becomes nan
     if not np.any(np.isfinite(values)):
         raise ValueError(f"{path}: none of {name} is finite, so no seed is the best; {remedy}")
     return np.where(np.isfinite(values), values, -np.inf)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mjx_reinforce.engine.checks import check_type
 from mjx_reinforce.files import naming_damage, read_arrays, read_json
 from mjx_reinforce.reports.experiment import (
     Configuration,
@@ -256,14 +257,15 @@ def read_run(directory: Path) -> Source:
     part = Configuration(directory.name, {}, nonfinite=nonfinite, where=where, **columns)
     kept = {name: value for name, value in config.items() if name in PROVENANCE}
     with naming_damage(path):
-        return Source(
-            directory=directory,
-            env=_env(config),
-            configurations=[part],
-            settings={name: value for name, value in config.items() if name not in PROVENANCE},
-            provenance=kept | {"engine": summary.get("engine", config.get("engine"))},
-            **outcome,
-        )
+        check_type("env", config["env"], str)
+    return Source(
+        directory=directory,
+        env=config["env"],
+        configurations=[part],
+        settings={name: value for name, value in config.items() if name not in PROVENANCE},
+        provenance=kept | {"engine": summary.get("engine", config.get("engine"))},
+        **outcome,
+    )
 
 
 def read_sweep(directory: Path) -> Source:
@@ -275,6 +277,7 @@ def read_sweep(directory: Path) -> Source:
         raise ValueError(f"{directory} has no results yet; wait for the first, or --resume it")
     parts = []
     with naming_damage(path):
+        check_type("env", content["env"], str)
         swept = {
             f"configuration {each.pop('configuration')}": each for each in content["configurations"]
         }
@@ -287,19 +290,12 @@ def read_sweep(directory: Path) -> Source:
             )
         return Source(
             directory=directory,
-            env=_env(content),
+            env=content["env"],
             configurations=parts,
             settings=content.get("settings", {}),
             provenance={name: x for name, x in content.items() if name not in _OWN},
             **_outcome(content),
         )
-
-
-def _env(content: Mapping[str, Any]) -> str:
-    """Returns the id of the environment that a file names."""
-    if not isinstance(content["env"], str):
-        raise ValueError(f"env is {content['env']!r}")
-    return content["env"]
 
 
 def _outcome(content: Mapping[str, Any]) -> dict[str, Any]:

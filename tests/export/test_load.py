@@ -163,7 +163,7 @@ DAMAGE = {
     "no summary": (remove("summary.json"), "", "no final evaluation: its training goes on"),
     "running": (entries("summary.json", status="running"), "", "no final evaluation"),
     "no returns": (entries("summary.json", final_returns=...), "summary.json", "has no final_"),
-    "text for returns": (entries("summary.json", final_returns="7"), "summary.json", "not a list"),
+    "text for returns": (entries("summary.json", final_returns="7"), "summary.json", "got '7'"),
     "nothing finite": (entries("summary.json", final_returns=[None] * 3), "summary.json", "none"),
     "another env": (entries("config.json", env="Reacher-v5"), "config.json", "different runs"),
     "no settings": (remove(JSON), "policy.json", "cannot read"),

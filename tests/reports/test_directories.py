@@ -149,7 +149,7 @@ def test_a_sweep_that_was_interrupted(sweep):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"env": 3}, "env is 3"),
+        ({"env": 3}, "env must be text, got 3"),
         ({"configurations": [3]}, "'int' object"),
         ({"configurations": CONTENT["configurations"][:1]}, "configuration 1 is missing"),
         ({"threshold": "high"}, "could not convert string to float: 'high'"),
