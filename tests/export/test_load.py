@@ -181,7 +181,7 @@ DAMAGE = {
     "no archive": (content(NPZ, b"PK"), NPZ, "no whole NumPy archive"),
     "half an archive": (cut, NPZ, "no whole NumPy archive"),
     "objects": (
-        arrays(sign=False, normalizer__mean=lambda x: x.astype(object)),
+        arrays(sign=False, normalizer__mean=as_objects),
         NPZ,
         "no whole NumPy archive",
     ),

@@ -52,20 +52,6 @@ class Signed(Toy):
         return obs[0]
 
 
-class Late(Toy):
-    """Two steps, told apart by the observation; only the second pays."""
-
-    max_episode_steps = 2
-
-    def step(self, state, action):
-        second = state.obs[0] > 0
-        return state.replace(
-            obs=state.obs + 1.0,
-            reward=jnp.where(second, 1.0, 0.0),
-            done=jnp.where(second, 1.0, 0.0),
-        )
-
-
 class Target(Toy):
     """The best action is 0.5."""
 
