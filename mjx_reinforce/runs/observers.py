@@ -156,22 +156,13 @@ class RunFiles(Observer):
 
     def _save_checkpoint(self, driver: Driver) -> None:
         """Writes a checkpoint, which says how long metrics.csv is with all rows in it."""
-        config = driver.config
         self._write_rows()
-        content = Checkpoint(
-            state=(driver.state, driver.best),
-            record=driver.record.arrays(),
-            seconds=driver.seconds(),
-            metrics_bytes=self._metrics.stat().st_size,
-            env_steps=config.env_steps,
-            max_updates=config.max_updates,
-            settings=resume.recordable(config),
-        )
-        checkpoint.save(self._checkpoints, content, even=content.is_even(config.eval_every))
+        content = driver.checkpoint()._replace(metrics_bytes=self._metrics.stat().st_size)
+        checkpoint.save(self._checkpoints, content, even=content.is_even(driver.config.eval_every))
 
     def _save_policies(self, driver: Driver) -> None:
         """Writes the last and the best policies."""
-        last = driver.state.train_states.actor
+        last = driver.states.train_states.actor
         save_policy(self._directory / "policy", last, self._policy)
         save_policy(self._directory / "policy" / "best", driver.best.actor, self._policy)
 

@@ -1,21 +1,17 @@
 """A run from Python: ``mjx_reinforce.run``."""
 
-import contextlib
 import dataclasses
 import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from mjx_reinforce import envs
 from mjx_reinforce.console.interrupt import Interrupt
-from mjx_reinforce.console.jax_setup import configure_jax
 from mjx_reinforce.engine.checks import check_kind
 from mjx_reinforce.export.player import Player
 from mjx_reinforce.export.policy_files import build_policy
@@ -23,54 +19,47 @@ from mjx_reinforce.export.run_files import Which
 from mjx_reinforce.learning import counts
 from mjx_reinforce.learning.policy import Actor, Policy
 from mjx_reinforce.reports.curves import load_libraries
-from mjx_reinforce.runs.directory import own_directory
+from mjx_reinforce.runs.begin import Begun, begun
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.observers import Callbacks, RunFiles
-from mjx_reinforce.runs.plan import check_memory, make_plan
-from mjx_reinforce.runs.sinks import check_installed
-from mjx_reinforce.settings.config import MAX_COUNT, Config, check
+from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.statistics import worst_if_not_finite
-from mjx_reinforce.store.ready import get_ready
-from mjx_reinforce.training.driver import Driver, Evaluation, Observer, first_best
-from mjx_reinforce.training.programs import RunPrograms, compile_run
+from mjx_reinforce.training.driver import Driver, Evaluation, Observer
 from mjx_reinforce.training.progress import HOPELESS
 from mjx_reinforce.training.record import RunRecord
-from mjx_reinforce.training.state import Budget, RunState, begin_with, last_actors
-
-if TYPE_CHECKING:
-    from mjx_reinforce.store.ready import Ready
-    from mjx_reinforce.training.checkpoint import Checkpoint
+from mjx_reinforce.training.slots import Slots, compile_run
+from mjx_reinforce.training.state import Budget, begin_with, budget_of, last_actors
 
 
 def compile_driver(
-    ready: "Ready",
-    config: Config,
-    found: "Checkpoint | None" = None,
+    begun: Begun,
     say: Callable[[str], None] = lambda text: None,
     meanwhile: Callable[[], object] = lambda: None,
 ) -> tuple[Driver, float]:
     """Returns a run before its first update, and how long it took to compile, in seconds.
 
     Args:
-      ready: the run.
-      config: its settings.
-      found: the checkpoint from which it will go on, if any.
+      begun: the run.
       say: shows a line to the user.
       meanwhile: begins other work in Python; called once the rest of the time is XLA's.
     """
+    config, ready, found = begun.config, begun.ready, begun.found
     started = time.perf_counter()
-    state, programs = compile_run(ready.programs, config, meanwhile)
+    slots = compile_run(ready.programs, config, meanwhile)
     seconds = ready.engine_seconds + time.perf_counter() - started
     if config.init_from is not None and found is None:
-        state = begin_with(state, last_actors(config, ready.policy))
+        slots.restore(begin_with(slots.states(), last_actors(config, ready.policy)))
     if config.minutes is not None:
-        first = state if found is None else found.state[0]
-        env_steps = env_steps_in(60 * config.minutes, programs, first, config.max_updates)
+        first = slots.states()
+        if found is not None:
+            slots.restore(found.state[0])
+        env_steps = env_steps_in(60 * config.minutes, slots, config.max_updates)
+        slots.restore(first)
         say(f"{config.minutes:g} min are about {env_steps:,} env steps of a seed in all here")
         config = dataclasses.replace(config, env_steps=env_steps, minutes=None)
-    record, best = RunRecord(config, ready.threshold), first_best(state.train_states)
-    known = dataclasses.replace(config, horizon=ready.horizon)
-    return Driver(known, programs, record, state, best), seconds
+    slots.budget = budget_of(config)
+    config = dataclasses.replace(config, horizon=ready.horizon)
+    return Driver(config, slots, RunRecord(config, ready.threshold)), seconds
 
 
 def summary_of(
@@ -95,26 +84,20 @@ def summary_of(
 
 
 def train_run(
-    ready: "Ready",
-    config: Config,
+    begun: Begun,
     display: Display,
-    directory: Path | None,
     interrupt: Interrupt,
     observers: Sequence[Observer] = (),
     *,
-    found: "Checkpoint | None" = None,
     compiling: AbstractContextManager[None] | None = None,
 ) -> tuple[Driver, dict[str, Any]]:
     """Trains to the budget, a signal, or until nothing is finite, and writes the run's files.
 
     Args:
-      ready: the run.
-      config: its settings.
+      begun: the run.
       display: where it is shown.
-      directory: where its files go, if anywhere.
       interrupt: what listens to signals.
       observers: who sees it, besides its files and the display.
-      found: the checkpoint from which it goes on, if any.
       compiling: a block around all that is compiled.
 
     Returns:
@@ -124,15 +107,16 @@ def train_run(
       OSError: the first or the last files cannot be written.
     """
     loading = threading.Thread(target=load_libraries, daemon=True)
+    display.say(begun.plan)
     with display:
         interrupt.restore_screen(display.console.show_cursor)
         with display.compiling(), compiling or nullcontext():
-            driver, seconds = compile_driver(ready, config, found, display.say, loading.start)
+            driver, seconds = compile_driver(begun, display.say, loading.start)
         # Not before: a run killed while it compiles leaves nothing that would refuse the next.
         interrupt.defer(display.say)
-        if directory is not None:
-            files = RunFiles(directory, ready.policy, display.say)
-            files.begin(driver, found)
+        if begun.directory is not None:
+            files = RunFiles(begun.directory, begun.ready.policy, display.say)
+            files.begin(driver, begun.found)
             driver.observers.append(files)
         driver.observers += [display, *observers]
         display.start(seconds)
@@ -141,7 +125,7 @@ def train_run(
         observer.ended(driver)
     # A signal after that changes nothing: what is left takes a second or two.
     test = driver.test(interrupt.heard)
-    summary = summary_of(driver, ready.engine, seconds, test)
+    summary = summary_of(driver, begun.ready.engine, seconds, test)
     for observer in driver.observers:
         observer.finished(driver, summary)
     return driver, summary
@@ -151,38 +135,33 @@ def train_run(
 _PART = 0.03
 
 
-def env_steps_in(
-    seconds: float, programs: RunPrograms, state: RunState, max_updates: int | None
-) -> int:
+def env_steps_in(seconds: float, slots: Slots, max_updates: int | None) -> int:
     """Returns the env steps that a mean seed will have played in all after a time.
 
-    A copy of the state is trained, and evaluated, for a small part of that time. The speed of the
-    second half of that part counts: the first updates also have what a device does once, and the
-    shortest episodes.
+    The seeds are trained, and evaluated, for a small part of that time. The speed of the second
+    half of that part counts: the first updates also have what a device does once, and the shortest
+    episodes.
 
     Args:
       seconds: the time.
-      programs: of the run.
-      state: from which it goes on.
+      slots: the seeds, where the run goes on.
       max_updates: of the run, if any.
     """
-    budget = Budget.of(None, max_updates)
-    copy = jax.tree.map(jnp.copy, state)
-    began, past = time.perf_counter(), [(0.0, _played(state))]
+    slots.budget = Budget.of(None, max_updates)
+    began, past = time.perf_counter(), [(0.0, _played(slots))]
     going = True
     while going and past[-1][0] < _PART * seconds:
-        copy, metrics, _ = programs.advance(copy, True, budget)
-        past.append((time.perf_counter() - began, _played(copy)))
-        going = bool(metrics["active"].any())
+        going = bool(slots.advance())
+        past.append((time.perf_counter() - began, _played(slots)))
     end, played = past[-1]
     half, before = next((x for x in past[1:-1] if x[0] >= end / 2), past[-2])
     speed = (played - before) / (end - half)
     return min(max(1, round(past[0][1] + speed * max(seconds - end, 0.0))), MAX_COUNT)
 
 
-def _played(state: RunState) -> float:
+def _played(slots: Slots) -> float:
     """Returns the env steps of the mean seed."""
-    return float(counts.to_int(state.train_states.env_steps).mean())
+    return float(counts.to_int(slots.states().train_states.env_steps).mean())
 
 
 class RunResults(NamedTuple):
@@ -294,21 +273,11 @@ def run(
         )
     if output is not None:
         config = dataclasses.replace(config, output=Path(output))
-    check(config)
-    check_memory(config)
-    check_installed(config)
-    configure_jax()
     interrupt = Interrupt()  # that hears nothing: signals are the caller's
-    with contextlib.ExitStack() as held:
-        if config.output is not None:
-            held.enter_context(own_directory(config, None, interrupt))
-        ready = get_ready(config, config, envs.make_set(config.env, config.env_set))
-        if config.init_from is not None:
-            last_actors(config, ready.policy)  # refused before anything is compiled
-        display, functions = Display(quiet=quiet), Callbacks(observers)
-        display.say(make_plan(ready, config))
-        driver, summary = train_run(ready, config, display, config.output, interrupt, [functions])
-    return _results_of(driver, build_policy(ready.policy), summary)
+    display, files = Display(quiet=quiet), config.output is not None
+    with begun(config, config, interrupt, display.say, files=files) as made:
+        driver, summary = train_run(made, display, interrupt, [Callbacks(observers)])
+    return _results_of(driver, build_policy(made.ready.policy), summary)
 
 
 def _results_of(driver: Driver, policy: Policy, summary: dict[str, Any]) -> RunResults:
@@ -322,7 +291,7 @@ def _results_of(driver: Driver, policy: Policy, summary: dict[str, Any]) -> RunR
         test_returns=np.asarray(summary["final_test_returns"]),
         best_test_returns=np.asarray(summary["best_test_returns"]),
         policy=policy,
-        actor=jax.device_get(driver.state.train_states.actor),
+        actor=driver.states.train_states.actor,
         best=driver.best.actor,
         summary=summary,
     )

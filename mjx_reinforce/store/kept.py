@@ -80,10 +80,11 @@ def keep(key: str, facts: dict[str, Any], programs: Programs) -> Programs:
     leaves = jax.tree.leaves(jax.eval_shape(plain, like))
     actor, keys = jax.tree.leaves(like.train_states.actor), jax.eval_shape(plain, like.eval_keys)
     seed, numbers, count = (jax.ShapeDtypeStruct(x, np.uint32) for x in ((), keys.shape[:1], (2,)))
+    which = jax.ShapeDtypeStruct(numbers.shape, bool)
     given = {
         "begin": (seed, numbers),
-        "advance": (leaves, (count,) * len(Budget._fields), jax.ShapeDtypeStruct((), bool)),
-        "evaluate": (actor, keys),
+        "advance": (leaves, (count,) * len(Budget._fields), which),
+        "evaluate": (actor, keys, which),
     }
     flat = _on_leaves(programs)
 
@@ -124,9 +125,11 @@ def _on_leaves(programs: Programs) -> dict[str, Callable[..., Any]]:
         after, block = programs.advance(restored(leaves, like), Budget(*budget), look)
         return jax.tree.leaves(plain(after)), tuple(block)
 
-    def evaluate(leaves: list[jax.Array], keys: jax.Array) -> dict[str, jax.Array]:
+    def evaluate(
+        leaves: list[jax.Array], keys: jax.Array, which: jax.Array
+    ) -> dict[str, jax.Array]:
         actor = restored(leaves, like.train_states.actor)
-        return programs.evaluate(actor, jax.random.wrap_key_data(keys))
+        return programs.evaluate(actor, jax.random.wrap_key_data(keys), which)
 
     return {"begin": begin, "advance": advance, "evaluate": evaluate}
 
@@ -142,8 +145,8 @@ def _on_states(load: Callable[[str], Callable[..., Any]], like: RunState, rides:
         leaves, block = load("advance")(jax.tree.leaves(plain(before)), tuple(budget), look)
         return restored(leaves, like), Block(*block)
 
-    def evaluate(actor: Actor, keys: jax.Array) -> dict[str, jax.Array]:
-        return load("evaluate")(jax.tree.leaves(actor), plain(keys))
+    def evaluate(actor: Actor, keys: jax.Array, which: jax.Array) -> dict[str, jax.Array]:
+        return load("evaluate")(jax.tree.leaves(actor), plain(keys), which)
 
     return Programs(begin, advance, evaluate, rides, like)
 

@@ -1,26 +1,22 @@
 """Chunks: as many runs of a group as are under way at once, and what they have measured."""
 
 import dataclasses
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from mjx_reinforce.files import Arrays
-from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import MAX_COUNT, Config
 from mjx_reinforce.sweeps.plan import Group
-from mjx_reinforce.sweeps.programs import Measured, SlotPrograms
 from mjx_reinforce.training import checkpoint
-from mjx_reinforce.training.checkpoint import Attempts, Checkpoint, SaveDue
-from mjx_reinforce.training.progress import Progress, measure_progress, used
-from mjx_reinforce.training.record import GrowingTable
-
-#: The host need not look at a sweep more often than this. Between short blocks the devices would
-#: wait for it.
-_SECONDS = 0.25
+from mjx_reinforce.training.checkpoint import Attempts, SaveDue
+from mjx_reinforce.training.driver import Training, drive
+from mjx_reinforce.training.progress import Progress, measure_progress
+from mjx_reinforce.training.record import Record
+from mjx_reinforce.training.slots import Compiled, Measured, Slots
+from mjx_reinforce.training.state import shape_of_all
 
 
 class Runs(NamedTuple):
@@ -60,182 +56,143 @@ def split_runs(group: Group, name: str, num_chunks: int) -> list[Runs]:
     ]
 
 
-#: What is kept of every evaluation, and the name of its latest.
-_CURVES = {"eval_return": "eval_return", "env_steps": "eval_env_steps"}
+class ChunkRecord(Record):
+    """What the R runs of a chunk have measured.
 
-
-class History:
-    """What each of R runs has measured.
-
-    now: [R] each, the latest of what ``Measured`` has; ``nonfinite`` since the start, and
-      ``eval_env_steps``, the env steps before the latest evaluation
-    seconds: wall time from the beginning to the last block
+    nonfinite: [R] how many of its updates met numbers that are not finite
+    lengths: [R] the steps of all episodes of each run's latest evaluation
     """
+
+    _kept = ("updates", "env_steps", "seconds", "nonfinite", "lengths")
 
     def __init__(self, config: Config):
         """Begins before the first update; R is ``config.num_seeds``."""
-        self._config = config
-        counts = ("updates", "env_steps", "nonfinite", "eval_steps", "eval_env_steps")
-        self.now: Arrays = {name: np.zeros(config.num_seeds, np.int64) for name in counts}
-        self.now["eval_return"] = np.zeros(config.num_seeds, np.float32)
-        self.seconds = 0.0
-        self._curves = GrowingTable({})
-        self._before = self.now["env_steps"], self.seconds
+        super().__init__(config)
+        self.nonfinite = np.zeros(config.num_seeds, np.int64)
+        self.lengths = np.zeros(config.num_seeds, np.int64)
+        self._before = self.env_steps, self.seconds
 
-    def keep(self, blocks: Sequence[Measured], seconds: float) -> None:
-        """Takes in evaluations and the blocks of updates after them.
+    def add(self, blocks: Sequence[Measured], seconds: float) -> None:
+        """Takes in evaluations and the updates after them.
 
         Args:
-          blocks: one after the other; runs that are not in them stay as they are.
+          blocks: one after the other; runs that made no update in it stay as they are.
           seconds: wall time since the beginning.
         """
-        now = self.now
-        self._before, self.seconds = (now["env_steps"].copy(), self.seconds), seconds
-        for runs, values in blocks:
-            now["eval_env_steps"][runs] = now["env_steps"][runs]
-            for name, measured in values.items():
-                now[name][runs] = measured + (now[name][runs] if name == "nonfinite" else 0)
-            self._curves.append({name: now[own][None].copy() for name, own in _CURVES.items()})
+        self._before, self.seconds = (self.env_steps.copy(), self.seconds), seconds
+        for runs, metrics, looked in blocks:
+            made = np.any(metrics["active"], axis=0) if metrics else np.ones(len(runs), bool)
+            self._add_evaluation(runs[made], {name: x[made] for name, x in looked.items()})
+            if metrics:
+                self._add_updates(runs, metrics)
 
-    def arrays(self) -> Arrays:
-        """Returns all that was measured, by name, for ``restore``."""
-        curves = {f"curves.{name}": x for name, x in self._curves.columns().items()}
-        return {"seconds": np.asarray(self.seconds, np.float64), **self.now, **curves}
+    def _add_evaluation(self, runs: np.ndarray, looked: Arrays) -> None:
+        latest = self.latest()
+        latest["eval_return"][runs] = looked["eval_return"]
+        latest["env_steps"][runs] = self.env_steps[runs]
+        self.lengths[runs] = looked["eval_steps"]
+        self._tables["evaluations"].append({name: x[None] for name, x in latest.items()})
 
-    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Goes back to what a history of the same runs had measured.
+    def _add_updates(self, runs: np.ndarray, metrics: Arrays) -> None:
+        broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
+        self.updates[runs] += metrics["active"].sum(axis=0)
+        self.env_steps[runs] += metrics["env_steps"].sum(axis=0, dtype=np.int64)
+        self.nonfinite[runs] += (broken & metrics["active"]).sum(axis=0)
 
-        Args:
-          arrays: from its ``arrays``.
-        """
-        self.now = {name: arrays[name] for name in self.now}
-        self.seconds = float(arrays["seconds"])
-        self._before = self.now["env_steps"], self.seconds
-        curves = {f"curves.{name}": name for name in _CURVES}  # none before the first evaluation
-        known = {name: arrays[key] for key, name in curves.items() if key in arrays}
-        self._curves = GrowingTable(known)
-
-    def evaluated(self) -> bool:
-        """Returns whether the present policies of all runs have been evaluated."""
-        same = np.array_equal(self.now["eval_env_steps"], self.now["env_steps"])
-        return same and bool(self._curves.latest(1))
+    def latest(self) -> Arrays:
+        """Returns ``eval_return`` of each run's latest evaluation, and ``env_steps`` until then."""
+        if not self.begun():
+            num_runs = len(self.updates)
+            return {
+                "eval_return": np.zeros(num_runs, np.float32),
+                "env_steps": np.zeros(num_runs, np.int64),
+            }
+        return {name: x[0].copy() for name, x in self._tables["evaluations"].latest(1).items()}
 
     def curves(self) -> Arrays:
         """Returns ``eval_return``, and ``env_steps`` until then, [E, R] each."""
-        return self._curves.columns()
+        return self._tables["evaluations"].columns()
 
-    def training(self) -> np.ndarray:
-        """Returns which runs [R] have not used their budget."""
-        return self._used() < 1.0
+    def moved(self) -> tuple[np.ndarray, np.ndarray]:
+        """Returns which runs [R] have not used their budget, and how long their episodes are."""
+        return self.used() < 1.0, self.lengths
 
-    def used(self) -> float:
+    def share(self) -> float:
         """Returns the part of the budgets of all runs that is used."""
-        return float(np.minimum(self._used(), 1.0).mean())
-
-    def _used(self) -> np.ndarray:
-        """Returns the fraction of its budget that each run has used."""
-        return used(self._config, self.now["env_steps"], self.now["updates"])
+        return float(np.minimum(self.used(), 1.0).mean())
 
     def progress(self) -> Progress:
-        """Returns how far the runs are; its fraction is that of all budgets, as ``used``."""
+        """Returns how far the runs are; its fraction is ``share``."""
         steps, seconds = self._before
         past = {
-            "eval_return": self.now["eval_return"][None],
-            "env_steps": np.stack([steps, self.now["env_steps"]]),
-            "updates": self.now["updates"][None],
+            "eval_return": self.latest()["eval_return"][None],
+            "env_steps": np.stack([steps, self.env_steps]),
+            "updates": self.updates[None],
             "seconds": np.array([seconds, self.seconds]),
         }
-        return measure_progress(past, np.array([self.used()] * 2))
+        return measure_progress(past, np.array([self.share()] * 2))
 
 
-class Chunk:
-    """The runs of a chunk as they go on, for ``training.driver.drive``, and its checkpoints.
+class Chunk(Training):
+    """The runs of a chunk as they go on, and its checkpoints."""
 
-    history: what they have measured
-    """
+    record: ChunkRecord
 
     def __init__(
         self,
-        programs: SlotPrograms,
+        compiled: Compiled,
         group: Group,
         runs: Runs,
         folder: Path,
         say: Callable[[str], None],
-        show: Callable[[History], None],
     ):
         """Begins, or goes on from the newest checkpoint that is there.
 
         Args:
-          programs: of the group.
+          compiled: the programs of the group.
           group: of which the runs are.
           runs: the chunk's.
           folder: of its checkpoints.
           say: shows a line to the user.
-          show: shows how far the chunk is, after each block of updates.
         """
         config = dataclasses.replace(group.config, num_seeds=len(runs.seed))
-        self._programs, self._config, self._folder = programs, config, folder
-        self._show, self._attempt = show, Attempts(say).attempt
-        self._due, self.history = SaveDue(config.checkpoint_every), History(config)
-        like = programs.layout.shapes(len(runs.seed))
+        settings = {name: values[runs.place] for name, values in group.settings.items()}
+        super().__init__(config, Slots(compiled, runs.seed, settings), ChunkRecord(config))
+        self._folder, self._attempt = folder, Attempts(say).attempt
+        self._due = SaveDue(config.checkpoint_every)
+        like = shape_of_all(compiled.programs.like, len(runs.seed))
         found = next(checkpoint.read_checkpoints(folder, like, say), None)
-        if found is None:
-            settings = {name: values[runs.place] for name, values in group.settings.items()}
-            self._states = programs.begin(runs.seed, settings)
-        else:
-            self._states = programs.layout.rows(found.state)
-            self.history.restore(found.record)
-            self._due.saved(self._updates())
-        self._began = time.perf_counter() - self.history.seconds
-        #: How many blocks are made before the host looks at the runs again.
-        self._blocks = 1
+        if found is not None:
+            self.restore(found)
+            self._due.saved(self.updates())
 
-    def over(self) -> bool:
-        """Returns whether all runs used their budgets; then evaluates the last policies."""
-        if self.history.training().any():
-            return False
-        if not self.history.evaluated():
-            self._keep([self._programs.evaluate(self._states)])
-        return True
+    def drive(self, interrupted: Callable[[], bool], show: Callable[[ChunkRecord], None]) -> bool:
+        """Trains the runs to their end, or saves them where that is not to be waited for.
 
-    def advance(self) -> None:
-        """Evaluates the runs that still train and makes a block of updates, or several blocks.
+        A checkpoint that is due and cannot be written is a warning; it is tried again when the
+        next one is due.
 
-        A checkpoint that is due then and cannot be written is a warning; it is tried again when
-        the next one is due.
+        Args:
+          interrupted: whether the end is to be soon.
+          show: shows how far the chunk is, after updates.
+
+        Returns:
+          Whether all runs ended.
         """
-        history, last = self.history, self.history.seconds
-        lengths = history.now["eval_steps"]
-        measured = self._programs.advance(self._states, history.training(), lengths, self._blocks)
-        assert measured, "runs that have not used their budgets made no update"
-        self._keep(measured)
-        enough = len(measured) * _SECONDS / (history.seconds - last)
-        most = (self._config.checkpoint_every or MAX_COUNT) // self._config.eval_every
-        self._blocks = max(1, min(int(enough), 2 * len(measured), most))
-        self._show(history)
-        if self._due.is_due(self._updates()):
-            self._attempt("a checkpoint", self.save)
-            self._due.saved(self._updates())
+        config, record = self.config, self.record
+        most = (config.checkpoint_every or MAX_COUNT) // config.eval_every
+        for blocks in drive(self.slots, record, interrupted, most):
+            record.add(blocks, self.seconds())
+            if blocks[0].metrics:
+                show(record)
+            if self._due.is_due(self.updates()):
+                self._attempt("a checkpoint", self.save)
+                self._due.saved(self.updates())
+        if record.finished() and record.is_evaluated():
+            return True
+        self.save()
+        return False
 
     def save(self) -> None:
         """Writes a checkpoint, or raises OSError."""
-        content = Checkpoint(
-            state=self._programs.layout.states(self._states),
-            record=self.history.arrays(),
-            seconds=self.history.seconds,
-            metrics_bytes=0,
-            env_steps=self._config.env_steps,
-            max_updates=self._config.max_updates,
-        )
-        checkpoint.save(self._folder, content, even=False)
-
-    def actors(self) -> Actor:
-        """Returns the present policies [R, ...]."""
-        return self._programs.layout.states(self._states).train_states.actor
-
-    def _keep(self, measured: Sequence[Measured]) -> None:
-        self.history.keep(measured, time.perf_counter() - self._began)
-
-    def _updates(self) -> int:
-        """Returns how many updates the run with the most has made."""
-        return int(self.history.now["updates"].max())
+        checkpoint.save(self._folder, self.checkpoint(), even=False)

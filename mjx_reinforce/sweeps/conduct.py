@@ -2,6 +2,8 @@
 
 import functools
 import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -9,16 +11,28 @@ from mjx_reinforce.console.interrupt import Interrupt
 from mjx_reinforce.reports.experiment import counted, say, setting_in_words
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.sweeps import chunks
-from mjx_reinforce.sweeps.chunks import Chunk, History, Runs
+from mjx_reinforce.sweeps.chunks import Chunk, ChunkRecord, Runs
 from mjx_reinforce.sweeps.plan import Part, Prepared, learner_builder
-from mjx_reinforce.sweeps.programs import SlotPrograms, Stopwatch, compile_programs, one_ahead
 from mjx_reinforce.sweeps.results import SweepFiles
 from mjx_reinforce.training import checkpoint
-from mjx_reinforce.training.driver import drive
+from mjx_reinforce.training.programs import programs_of
 from mjx_reinforce.training.progress import Progress
+from mjx_reinforce.training.slots import Compiled, Stopwatch, compile_slots, started
 
 #: So many values of a setting are named in a line.
 _NAMED = 6
+
+
+def one_ahead(tasks: Sequence[Callable[[], Any]], clock: Stopwatch) -> Iterator[Any]:
+    """Yields the results of tasks in order; each begins when the one before is handed out."""
+    if not tasks:
+        return
+    ahead = started(tasks[0])
+    for task in tasks[1:]:
+        result = clock.wait(ahead)
+        ahead = started(task)
+        yield result
+    yield clock.wait(ahead)
 
 
 class Conductor:
@@ -51,20 +65,20 @@ class Conductor:
         for part, left in self._stages:
             self._total += _cost(part) * sum(len(runs.seed) for runs in left)
         tasks = [functools.partial(self._compile, part) for part, _ in self._stages]
-        self._programs = one_ahead(tasks, self.clock)
-        self._first: SlotPrograms | None = None
+        self._compiled = one_ahead(tasks, self.clock)
+        self._first: Compiled | None = None
 
     def compile_first(self) -> None:
         """Waits for the programs of the first group, if any runs are left."""
-        self._first = next(self._programs, None)
+        self._first = next(self._compiled, None)
 
     def conduct(self) -> bool:
         """Trains all groups; returns whether they ended, or were interrupted."""
         for part, left in self._stages:
-            programs, self._first = self._first or next(self._programs), None
+            compiled, self._first = self._first or next(self._compiled), None
             for runs in left:
                 began, waited = time.perf_counter(), self.clock.compiling
-                ended = self._train(part, programs, runs)
+                ended = self._train(part, compiled, runs)
                 waited = self.clock.compiling - waited
                 self.clock.running += time.perf_counter() - began - waited
                 if not ended:
@@ -72,33 +86,29 @@ class Conductor:
                 self._done += _cost(part) * len(runs.seed)
         return True
 
-    def _compile(self, part: Part) -> SlotPrograms:
+    def _compile(self, part: Part) -> Compiled:
         """Returns the programs of a group."""
-        group = part.group
-        return compile_programs(
-            part.env,
-            learner_builder(part.env, group.config),
-            part.horizon,
-            group.config,
-            tuple(group.settings),
-            part.widths,
-            self._prepared.devices,
-            self.clock,
+        config = part.group.config
+        programs = programs_of(
+            *(part.env, learner_builder(part.env, config), part.horizon, config, 1),
+            tuple(part.group.settings),
+            whole=False,
+            division=self._prepared.division,
         )
+        return compile_slots(programs, config, part.widths, self.clock)
 
-    def _train(self, part: Part, programs: SlotPrograms, runs: Runs) -> bool:
+    def _train(self, part: Part, compiled: Compiled, runs: Runs) -> bool:
         """Trains a chunk, from its last checkpoint if there is one; returns whether it ended."""
 
-        def show(history: History) -> None:
-            self._display.show_progress(self._progress(history, _cost(part)))
+        def show(record: ChunkRecord) -> None:
+            self._display.show_progress(self._progress(record, _cost(part)))
 
         folder, say = self._files.checkpoints(runs.name), self._display.say
-        chunk = Chunk(programs, part.group, runs, folder, say, show)
+        chunk = Chunk(compiled, part.group, runs, folder, say)
         say(self._heading(runs))
-        if not drive(chunk, self._interrupt.heard):
-            chunk.save()
+        if not chunk.drive(self._interrupt.heard, show):
             return False
-        self._files.add(runs, chunk.history, chunk.actors())
+        self._files.add(runs, chunk.record, chunk.slots.states().train_states.actor)
         checkpoint.remove_checkpoints(folder)
         return True
 
@@ -115,16 +125,16 @@ class Conductor:
         count = f"{counted(len(here), 'configuration')} of {len(every):,}"
         return f"{'; '.join(said)} ({count}, {counted(len(runs.seed), 'run')})"
 
-    def _progress(self, history: History, cost: int) -> Progress:
+    def _progress(self, record: ChunkRecord, cost: int) -> Progress:
         """Returns how far the chunk is, but with the fraction and the time left of the sweep.
 
         Args:
-          history: of the chunk's runs.
+          record: of the chunk's runs.
           cost: what a run of the chunk counts for.
         """
-        now = history.progress()
+        now = record.progress()
         done = (self._done + cost * now.num_seeds * now.fraction) / self._total
-        passed = self.clock.running + history.seconds
+        passed = self.clock.running + record.seconds
         left = passed * (1 - done) / done if done > 0 else float("nan")
         return now._replace(fraction=done, seconds_left=left)
 

@@ -175,7 +175,7 @@ def _contents(design: Design, prepared: "Prepared", known: Mapping[str, Any]) ->
             for number, values in enumerate(prepared.configurations)
         ],
         "chunk_runs": [part.limit for part in prepared.parts],
-        "local_devices": prepared.devices.count,
+        "local_devices": prepared.division.count,
         "engine": prepared.engine,
         "compile_seconds": known.get("compile_seconds", 0.0),
         "run_seconds": known.get("run_seconds", 0.0),

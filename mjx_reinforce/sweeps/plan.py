@@ -8,11 +8,11 @@ import dataclasses
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from mjx_reinforce import envs
 from mjx_reinforce.engine.base import Environment
-from mjx_reinforce.engine.devices import Devices
 from mjx_reinforce.engine.memory import gigabytes
 from mjx_reinforce.registry import is_own
 from mjx_reinforce.reports.experiment import counted
@@ -24,6 +24,7 @@ from mjx_reinforce.settings.groups import Reader
 from mjx_reinforce.settings.tables import Task
 from mjx_reinforce.store.build import build, policy_settings
 from mjx_reinforce.sweeps.design import Design, configure
+from mjx_reinforce.training.division import Division
 
 
 class Group(NamedTuple):
@@ -209,7 +210,7 @@ class Prepared(NamedTuple):
     """All that a sweep is made of.
 
     parts: its groups
-    devices: where
+    division: among which devices the runs are divided
     configurations: the values of what is swept, in each
     engine: the name of what plays the episodes
     engine_seconds: wall time that making it took, for all groups
@@ -217,7 +218,7 @@ class Prepared(NamedTuple):
     """
 
     parts: list[Part]
-    devices: Devices
+    division: Division
     configurations: list[dict[str, Any]]
     engine: str
     engine_seconds: float
@@ -237,7 +238,7 @@ def prepare_sweep(design: Design, limits: Sequence[int] | None) -> Prepared:
     configurations = design.configurations()
     configs = configure(design.base, configurations)
     # A program for several devices need not round as the one for a single device does.
-    devices = Devices(1 if design.exact else None)
+    division = Division(seeds=1 if design.exact else jax.local_device_count())
     parts, engines = [], []
     for number, group in enumerate(make_groups(configs, tuple(design.over), exact=design.exact)):
         env = envs.make_set(group.config.env, group.config.env_set)
@@ -245,11 +246,11 @@ def prepare_sweep(design: Design, limits: Sequence[int] | None) -> Prepared:
         engines.append(learner.engine)
         limit = design.chunk_runs if limits is None else limits[number]
         if limit is None:
-            limit = _capacity(group, _task(env, horizon, group.config), devices.count)
+            limit = _capacity(group, _task(env, horizon, group.config), division.count)
         if limits is None:
             limit = min(limit, group.num_runs)
-        division = divide(group, limit, devices.count, exact=design.exact)
-        parts.append(Part(group, env, horizon, limit, *division))
+        chunks = divide(group, limit, division.count, exact=design.exact)
+        parts.append(Part(group, env, horizon, limit, *chunks))
     engine, seconds = engines[0].name, sum(each.seconds for each in engines)
-    plan = _describe(parts, engine, devices.count)
-    return Prepared(parts, devices, configurations, engine, seconds, plan)
+    plan = _describe(parts, engine, division.count)
+    return Prepared(parts, division, configurations, engine, seconds, plan)

@@ -17,7 +17,7 @@ from mjx_reinforce.files import Arrays, read_arrays, write_arrays, write_bytes, 
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.reports.experiment import lengthened
 from mjx_reinforce.statistics import steps_to_solve
-from mjx_reinforce.sweeps.chunks import History, Runs
+from mjx_reinforce.sweeps.chunks import ChunkRecord, Runs
 from mjx_reinforce.training import checkpoint
 
 _MEASURED = (
@@ -80,25 +80,25 @@ class SweepFiles:
         """Returns the folder of a chunk's checkpoints."""
         return self.parts / chunk
 
-    def add(self, runs: Runs, history: History, actors: Actor) -> None:
+    def add(self, runs: Runs, record: ChunkRecord, actors: Actor) -> None:
         """Writes the part of a chunk, after its policies, and appends its rows to results.csv.
 
         Args:
           runs: R of them, the chunk's.
-          history: what they measured.
+          record: what they measured.
           actors: [R, ...] their last policies, of which the best and the worst are kept.
         """
-        final = history.now["eval_return"].astype(np.float64)
+        final = record.latest()["eval_return"].astype(np.float64)
         facts = {"configuration": runs.configuration, "seed": runs.seed, "final_return": final}
         policies = {f"actor/{name}": np.asarray(x) for name, x in arrays_of(actors).items()}
         write_arrays(self.parts / f"policies-{runs.name}.npz", _ends(facts | policies))
-        curves = history.curves()
+        curves = record.curves()
         part = {
             "configuration": runs.configuration.astype(np.int32),
             "seed": runs.seed.astype(np.int32),
             "eval_return": curves["eval_return"].astype(np.float32),
             "env_steps": curves["env_steps"].astype(np.int64),
-            "nonfinite": history.now["nonfinite"].astype(np.int32),
+            "nonfinite": record.nonfinite.astype(np.int32),
         }
         write_arrays(self._path(runs.name), part)
         files.append(self.directory / "results.csv", files.csv_text(self._rows(part)).encode())

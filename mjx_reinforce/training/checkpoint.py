@@ -194,8 +194,7 @@ def _unflatten(arrays: Arrays, like: PyTree) -> Any:
         here, there = (shape.shape, shape.dtype), (arrays[name].shape, arrays[name].dtype)
         if here != there:
             raise ValueError(f"{name} is {there[1]} {there[0]} there, {here[1]} {here[0]} here")
-    # Memory of the device's own, which may be donated.
-    values = [jax.numpy.array(arrays[name]) for name in expected]
+    values = [arrays[name] for name in expected]
     return with_keys(jax.tree.unflatten(structure, values), like)
 
 

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
-import numpy as np
 from jax.sharding import PartitionSpec
 
 from mjx_reinforce.engine.base import PyTree
@@ -20,7 +19,6 @@ from mjx_reinforce.engine.devices import NONE, RUNS, Devices
 from mjx_reinforce.engine.play.episode import largest_divisor
 from mjx_reinforce.registry import find_algorithm, is_own
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.state import RunState, shape_of_all
 
 #: Episodes are divided among GPUs only where each plays so many of an update, of all seeds: fewer
 #: take as long as these. Devices of a CPU are there because the user made them.
@@ -50,6 +48,10 @@ class Division:
     def width(self, num_seeds: int) -> int:
         """Returns how many of the seeds a device has at most."""
         return -(-num_seeds // self.seeds)
+
+    def lanes(self, num_seeds: int) -> int:
+        """Returns how many seeds all devices have room for, of so many; some stay empty."""
+        return self.seeds * self.width(num_seeds)
 
     def of_each(self, config: Config, num_seeds: int) -> Config:
         """Returns the settings of what each device does of so many seeds."""
@@ -87,51 +89,24 @@ class Division:
             return jax.jit(function, **shardings, **options)
         return devices.jit(function, NONE, NONE, **options)
 
-    def shapes(self, like: RunState, num_seeds: int) -> RunState:
-        """Returns the shapes of all seeds' states as ``place`` puts them, from those of some."""
-        total = self.seeds * self.width(num_seeds)
-        shapes = shape_of_all(like, total)
-        if self.count == 1:
-            return shapes
-        return self.devices().shapes(shapes, RUNS if self.seeds > 1 else NONE)
+    def shapes(self, tree: PyTree, spec: PartitionSpec) -> Any:
+        """Returns the shapes of arrays as ``put`` places them."""
+        return tree if self.count == 1 else self.devices().shapes(tree, self._spec(spec))
 
-    def place(self, tree: PyTree, spec: PartitionSpec = RUNS) -> Any:
-        """Returns arrays for a function of ``jit``; the last seed stands where there is no other.
+    def put(self, tree: PyTree, spec: PartitionSpec = RUNS) -> Any:
+        """Returns arrays for a function of ``jit``.
 
         Args:
-          tree: arrays, of which the seeds are the first axis.
-          spec: RUNS, or NONE where no axis is that of seeds.
+          tree: arrays.
+          spec: RUNS where their first axis is that of the seeds, NONE where none is.
         """
-        if self.count == 1:
-            return tree
-        devices = self.devices()
-        if self.seeds == 1 or spec == NONE:
-            return devices.put(tree, NONE)
-        num_seeds = len(jax.tree.leaves(tree)[0])
-        if num_seeds % self.seeds:
-            total = self.seeds * self.width(num_seeds)
-            return _rows(devices, total, RUNS)(devices.put(tree, NONE))
-        return devices.put(tree, RUNS)
+        return tree if self.count == 1 else self.devices().put(tree, self._spec(spec))
 
-    def view(self, tree: PyTree, num_seeds: int) -> Any:
-        """Returns what ``place`` was given, or a function of ``jit`` made of it."""
-        if self.seeds == 1 or num_seeds % self.seeds == 0:
-            return tree
-        return _rows(self.devices(), num_seeds, NONE)(tree)
+    def _spec(self, spec: PartitionSpec) -> PartitionSpec:
+        return spec if self.seeds > 1 else NONE
 
 
 _devices = functools.cache(Devices)
-
-
-@functools.cache
-def _rows(devices: Devices, count: int, spec: PartitionSpec) -> Callable[[PyTree], Any]:
-    """Returns a function to the first rows of arrays, with the last again where there are fewer."""
-
-    def rows(tree: PyTree) -> Any:
-        return jax.tree.map(lambda x: x[np.minimum(np.arange(count), len(x) - 1)], tree)
-
-    return jax.jit(rows, out_shardings=devices.shardings(spec))
-
 
 #: One device trains.
 ALONE = Division()

@@ -1,13 +1,10 @@
 """A run as it goes on: its programs move its state on, and observers see what it measures."""
 
 import time
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from flax import struct
 
 from mjx_reinforce.files import Arrays
 from mjx_reinforce.learning import counts
@@ -15,56 +12,10 @@ from mjx_reinforce.learning.learner import TrainState
 from mjx_reinforce.learning.policy import Actor
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.training.checkpoint import Checkpoint
-from mjx_reinforce.training.programs import Looked, RunPrograms
-from mjx_reinforce.training.record import Cells, RunRecord
-from mjx_reinforce.training.state import RunState, budget_of
-
-
-class Best(struct.PyTreeNode, kw_only=True):
-    """The best policies so far.
-
-    actor: [S, ...] each seed's
-    eval_return: [S] what its evaluation returned; -inf before the first
-    num_updates: [S, 2] how many updates the seed had made then, as ``counts`` has it
-    """
-
-    actor: Actor
-    eval_return: Any
-    num_updates: Any
-
-
-def shape_of_best(train_states: TrainState) -> Best:
-    """Returns the shapes of the best policies of states, or of their shapes."""
-    num_updates = train_states.num_updates
-    returns = jax.ShapeDtypeStruct(num_updates.shape[:1], jnp.result_type(float))
-    return Best(actor=train_states.actor, eval_return=returns, num_updates=num_updates)
-
-
-def first_best(train_states: TrainState) -> Best:
-    """Returns the state before the first evaluation, in memory of its own."""
-    returns = shape_of_best(train_states).eval_return
-    actor, num_updates = jax.tree.map(np.array, (train_states.actor, train_states.num_updates))
-    worst = np.full(returns.shape, -np.inf, returns.dtype)
-    return Best(actor=actor, eval_return=worst, num_updates=num_updates)
-
-
-def keep_best(best: Best, looked: Looked) -> Best:
-    """Takes in an evaluation; of two that are equal, the later is the better.
-
-    Args:
-      best: so far.
-      looked: the evaluation; a return that is not a number is never the best.
-    """
-    eval_return = looked.measured["eval_return"]
-    present = Best(
-        actor=looked.actor, eval_return=eval_return, num_updates=np.asarray(looked.num_updates)
-    )
-    better = eval_return >= np.asarray(best.eval_return)
-
-    def choose(new: np.ndarray, old: np.ndarray) -> np.ndarray:
-        return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-    return jax.tree.map(choose, present, best)
+from mjx_reinforce.training.record import Cells, Record, RunRecord
+from mjx_reinforce.training.resume import recordable
+from mjx_reinforce.training.slots import Measured, Slots
+from mjx_reinforce.training.state import Best, first_best, keep_best
 
 
 class Evaluation(NamedTuple):
@@ -76,8 +27,8 @@ class Evaluation(NamedTuple):
       seconds: wall time since the end of compilation (s)
       measured: [S] each, what ``mjx_reinforce.evaluate`` returns, such as ``eval_return``
       actor: [S, ...] the policies that were evaluated, on the host
-      train_states: [S, ...] the newest states of training, on the device; at most one block of
-        updates further than ``actor``. The next block uses their memory again: copy what stays.
+      train_states: [S, ...] the newest states of training, on the host; at most one block of
+        updates further than ``actor``
 
     Examples:
       >>> import dataclasses
@@ -121,122 +72,155 @@ class Observer:
         """Called after the last test, with the contents of summary.json."""
 
 
-class Training(Protocol):
-    """What goes on block by block: a run, or a chunk of a sweep."""
-
-    def over(self) -> bool:
-        """Returns whether nothing is left to train."""
-        ...
-
-    def advance(self) -> None:
-        """Makes a block of updates."""
-        ...
+#: The host need not look at runs more often than this (s). Between short blocks the devices would
+#: wait for it.
+_SECONDS = 0.25
 
 
-def drive(training: Training, interrupted: Callable[[], bool]) -> bool:
-    """Trains block by block; returns whether that ended, or was interrupted."""
+def drive(
+    slots: Slots, record: Record, interrupted: Callable[[], bool], most: int = 1
+) -> Iterator[list[Measured]]:
+    """Moves runs on until they are over; yields what was measured, for the record to take in.
+
+    Policies are evaluated with the updates that follow, and the last ones alone. A block that was
+    interrupted is not evaluated, which may take minutes: the resumed runs do that.
+
+    Args:
+      slots: the runs.
+      record: of what they measure. It takes in what is yielded before the next is asked for.
+      interrupted: whether the end is to be soon.
+      most: so many blocks of updates may be made at once, where they take no time.
+    """
+    blocks = 1
     while not interrupted():
-        if training.over():
-            return True
-        training.advance()
-    return False
+        if record.over():
+            if not record.is_evaluated():
+                yield [slots.evaluate()]
+            return
+        began = time.perf_counter()
+        measured = slots.advance(*record.moved(), look=not record.is_evaluated(), most=blocks)
+        yield measured
+        enough = len(measured) * _SECONDS / (time.perf_counter() - began)
+        blocks = max(1, min(int(enough), 2 * len(measured), most))
 
 
-class Driver:
-    """Moves a run on, block by block.
+class Training:
+    """Runs as they go on, such as the seeds of one.
+
+    config: the settings; one of those that differ from run to run stands for any value
+    slots: what moves the runs
+    record: what they have measured
+    """
+
+    def __init__(self, config: Config, slots: Slots, record: Record):
+        """Begins before the first update, where the slots are."""
+        self.config, self.slots, self.record = config, slots, record
+        self._began = time.perf_counter()
+
+    def restore(self, found: Checkpoint) -> None:
+        """Goes back to a checkpoint."""
+        self.slots.restore(found.state)
+        self.record.restore(found.record)
+        self._began = time.perf_counter() - found.seconds
+
+    def checkpoint(self) -> Checkpoint:
+        """Returns what ``restore`` takes."""
+        config = self.config
+        return Checkpoint(
+            state=self.slots.states(),
+            record=self.record.arrays(),
+            seconds=self.seconds(),
+            metrics_bytes=0,
+            env_steps=config.env_steps,
+            max_updates=config.max_updates,
+        )
+
+    def seconds(self) -> float:
+        """Returns the wall time since the beginning, without that of compiling."""
+        return time.perf_counter() - self._began
+
+    def updates(self) -> int:
+        """Returns how many updates the run with the most has made."""
+        return int(self.record.updates.max())
+
+
+class Driver(Training):
+    """Moves the seeds of a run on, block by block.
 
     config: the settings of the run, its horizon among them
     record: what it has measured
-    state: of training
+    states: of training, on the host
     best: the best policies so far
     ended: whether an observer asked for the end
     """
 
+    record: RunRecord
+
     def __init__(
-        self,
-        config: Config,
-        programs: RunPrograms,
-        record: RunRecord,
-        state: RunState,
-        best: Best,
-        observers: Sequence[Observer] = (),
+        self, config: Config, slots: Slots, record: RunRecord, observers: Sequence[Observer] = ()
     ):
         """Takes what a run is made of, before its first update.
 
         Args:
           config: its settings.
-          programs: what moves it on.
+          slots: its seeds, and what moves them on.
           record: what it measures.
-          state: of training.
-          best: the best policies so far.
           observers: who sees it go on, in this order.
         """
-        self.config, self.programs, self.record = config, programs, record
-        self.state, self.best, self.observers = state, best, list(observers)
+        super().__init__(config, slots, record)
+        self.observers, self.states = list(observers), slots.states()
+        self.best = first_best(self.states.train_states)
         self.ended = False
-        self._began = time.perf_counter()
-        self._budget = budget_of(config)
         #: Wall time at which the present policies were there (s).
         self._reached = 0.0
 
     def restore(self, found: Checkpoint) -> None:
-        """Goes back to a checkpoint."""
-        self.state, self.best = found.state
-        self.record.restore(found.record)
-        self._began = time.perf_counter() - found.seconds
+        """Goes back to a checkpoint, whose state has the best policies too."""
+        self.states, self.best = found.state
+        super().restore(found._replace(state=self.states))
         self._reached = found.seconds
 
-    def seconds(self) -> float:
-        """Returns the wall time since the run began, without that of compiling."""
-        return time.perf_counter() - self._began
-
-    def updates(self) -> int:
-        """Returns how many updates the seed with the most has made."""
-        return int(self.record.updates.max())
+    def checkpoint(self) -> Checkpoint:
+        """Returns what ``restore`` takes."""
+        whole, settings = super().checkpoint(), recordable(self.config)
+        return whole._replace(state=(whole.state, self.best), settings=settings)
 
     def drive(self, interrupted: Callable[[], bool]) -> None:
         """Trains until the budget is used, nothing is finite, or someone asks for the end.
 
-        Policies are evaluated with the updates that follow. A block that was interrupted is not
-        evaluated, which may take minutes: the resumed run does that.
-
         Args:
           interrupted: whether the run is to end soon.
         """
-        ended = drive(self, interrupted)
-        if not self.record.evaluated() and (ended or not self.record.begun()):
-            self.evaluate()
+        for [measured] in drive(self.slots, self.record, lambda: self.ended or interrupted()):
+            self._take(measured)
+        if not self.record.is_evaluated() and (self.ended or not self.record.begun()):
+            self._take(self.slots.evaluate())
 
-    def over(self) -> bool:
-        """Returns whether the budget is used, nothing is finite, or an observer wants the end."""
-        return self.ended or self.record.finished() or self.record.hopeless()
+    def _take(self, measured: Measured) -> None:
+        """Takes in an evaluation and the updates that followed it."""
+        before, self.states = self.states.train_states, self.slots.states()
+        if measured.looked:
+            self._take_evaluation(before, measured.looked)
+        if measured.metrics:
+            met = self.record.add_updates(measured.metrics)
+            self._reached = self.seconds()
+            for observer in self.observers:
+                observer.updated(self, met)
 
-    def advance(self) -> None:
-        """Evaluates the present policies unless they were, and makes a block of updates."""
-        look = not self.record.evaluated()
-        self.state, metrics, looked = self.programs.advance(self.state, look, self._budget)
-        if looked is not None:
-            self._take(looked)
-        met = self.record.add_updates(metrics)
-        self._reached = self.seconds()
-        for observer in self.observers:
-            observer.updated(self, met)
-
-    def evaluate(self) -> None:
-        """Evaluates the present policies."""
-        self._take(self.programs.evaluate(self.state))
-
-    def _take(self, looked: Looked) -> None:
-        """Takes in an evaluation, and keeps the best policies."""
-        self.best = keep_best(self.best, looked)
-        rows = self.record.add_evaluation(looked.measured, self._reached)
+    def _take_evaluation(self, evaluated: TrainState, measured: Arrays) -> None:
+        """Takes in what the policies of these states return, and keeps the best."""
+        actor, num_updates = evaluated.actor, evaluated.num_updates
+        returns = measured["eval_return"]
+        present = Best(actor=actor, eval_return=returns, num_updates=num_updates)
+        self.best = keep_best(self.best, present)
+        rows = self.record.add_evaluation(measured, self._reached)
         evaluation = Evaluation(
-            updates=counts.to_int(looked.num_updates),
+            updates=counts.to_int(num_updates),
             env_steps=self.record.env_steps,
             seconds=self._reached,
-            measured=looked.measured,
-            actor=looked.actor,
-            train_states=self.state.train_states,
+            measured=measured,
+            actor=actor,
+            train_states=self.states.train_states,
         )
         for observer in self.observers:
             observer.evaluated(self, evaluation, rows)
@@ -253,10 +237,10 @@ class Driver:
           The returns of both, or nothing if it was interrupted.
         """
         returns = {}
-        for name, actor in (("final", self.state.train_states.actor), ("best", self.best.actor)):
+        for name, actor in (("final", self.states.train_states.actor), ("best", self.best.actor)):
             if interrupted():
                 return {}
-            result = self.programs.test(actor)
+            result = self.slots.test(actor)
             self.record.add_test(result)
             returns[f"{name}_test_returns"] = result["eval_return"].tolist()
         return returns

@@ -119,15 +119,92 @@ def _joined(blocks: list[Arrays]) -> Arrays:
     return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
 
 
-class RunRecord:
-    """Everything that a run has measured so far.
+def _of_group(arrays: Mapping[str, np.ndarray], group: str) -> Arrays:
+    """Returns the arrays whose names begin with ``group`` and a dot, without these."""
+    start = f"{group}."
+    return {name.removeprefix(start): x for name, x in arrays.items() if name.startswith(start)}
 
-    updates: [S] int64, how many each seed has made
-    env_steps: [S] int64, how many each seed has played in training
+
+class Record:
+    """What R runs have measured so far, such as the seeds of one run.
+
+    updates: [R] int64, how many each has made
+    env_steps: [R] int64, how many each has played in training
+    seconds: wall time from the end of compilation to what was measured last
+    """
+
+    #: What a checkpoint has besides the tables.
+    _kept: tuple[str, ...] = ("updates", "env_steps", "seconds")
+
+    def __init__(self, config: Config):
+        """Begins before the first update; R is ``config.num_seeds``."""
+        self.config = config
+        self.updates = np.zeros(config.num_seeds, np.int64)
+        self.env_steps = np.zeros(config.num_seeds, np.int64)
+        self.seconds = 0.0
+        self._tables = {"evaluations": GrowingTable({})}
+
+    def arrays(self) -> Arrays:
+        """Returns all that was measured, by name, for ``restore``."""
+        arrays = {name: np.asarray(getattr(self, name)) for name in self._kept}
+        for group, table in self._tables.items():
+            arrays |= {f"{group}.{name}": values for name, values in table.columns().items()}
+        return arrays
+
+    def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Goes back to what a record of the same settings had measured.
+
+        Args:
+          arrays: from its ``arrays``.
+        """
+        for name in self._kept:
+            value = arrays[name]
+            setattr(self, name, value if value.ndim else value.item())
+        for group in self._tables:
+            self._tables[group] = GrowingTable(_of_group(arrays, group))
+
+    def begun(self) -> bool:
+        """Returns whether there is an evaluation."""
+        return bool(self._tables["evaluations"].latest(1))
+
+    def is_evaluated(self) -> bool:
+        """Returns whether the present policies of all runs have been evaluated."""
+        last = self._tables["evaluations"].latest(1, "env_steps")
+        return bool(last) and np.array_equal(last["env_steps"][0], self.env_steps)
+
+    def used(self) -> np.ndarray:
+        """Returns the fraction of its budget that each run has used."""
+        return used(self.config, self.env_steps, self.updates)
+
+    def finished(self) -> bool:
+        """Returns whether the budgets of all runs are used."""
+        return bool(self.used().min() >= 1.0)
+
+    def over(self) -> bool:
+        """Returns whether no run is to go on."""
+        return self.finished()
+
+    def moved(self) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Returns which runs [R] move on, and about how long their episodes are [R].
+
+        None stands for all: a seed of a run whose budget is used is still evaluated.
+        """
+        return None, None
+
+
+class RunRecord(Record):
+    """Everything that the S seeds of a run have measured so far.
+
     episodes: [S] int64, how many each seed has played in training
-    seconds: wall time from the end of compilation to the last evaluation
+    simulated, evaluated: steps that were simulated, and those of evaluations
+    broken_in_a_row: [S] see ``progress.broken_in_a_row``
     threshold: the return that counts as solved, if any
     """
+
+    _kept = (
+        *("updates", "env_steps", "episodes", "seconds"),
+        *("broken_in_a_row", "simulated", "evaluated"),
+    )
 
     def __init__(self, config: Config, threshold: float | None):
         """Begins before the first update.
@@ -136,59 +213,28 @@ class RunRecord:
           config: the settings of the run.
           threshold: the return that counts as solved, if any.
         """
-        self._config, self.threshold = config, threshold
-        self.updates = np.zeros(config.num_seeds, np.int64)
-        self.env_steps = np.zeros(config.num_seeds, np.int64)
-        self.episodes = np.zeros(config.num_seeds, np.int64)
-        self.seconds = 0.0
+        super().__init__(config)
+        self.threshold, num_seeds = threshold, config.num_seeds
+        self.episodes = np.zeros(num_seeds, np.int64)
+        self.broken_in_a_row = np.zeros(num_seeds, np.int64)
+        self.simulated = self.evaluated = 0
         kinds = {"episode_return": np.float32, "env_steps": np.int64, "episodes": np.int64}
-        self._tables = {
-            "evaluations": GrowingTable({}),
-            "training": GrowingTable(
-                {k: np.zeros((0, config.num_seeds), x) for k, x in kinds.items()}
-            ),
+        self._tables |= {
+            "training": GrowingTable({k: np.zeros((0, num_seeds), x) for k, x in kinds.items()}),
             "nonfinite": GrowingTable(
                 {k: np.zeros(0, x) for k, x in progress.EVENT_COLUMNS.items()}
             ),
         }
         self._last: Arrays = {}
-        self._broken_in_a_row = np.zeros(config.num_seeds, np.int64)
-        self._simulated = self._evaluated = 0
 
     def arrays(self) -> Arrays:
         """Returns all that was measured, by name, for ``restore``."""
-        kept = {
-            "updates": self.updates,
-            "env_steps": self.env_steps,
-            "episodes": self.episodes,
-            "seconds": np.asarray(self.seconds, np.float64),
-            "broken_in_a_row": self._broken_in_a_row,
-            "simulated": np.asarray(self._simulated, np.int64),
-            "evaluated": np.asarray(self._evaluated, np.int64),
-        }
-        tables = {name: table.columns() for name, table in self._tables.items()}
-        for group, columns in (tables | {"last": self._last}).items():
-            kept |= {f"{group}.{name}": values for name, values in columns.items()}
-        return kept
+        return super().arrays() | {f"last.{name}": x for name, x in self._last.items()}
 
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Goes back to what a record of the same settings had measured.
-
-        Args:
-          arrays: from its ``arrays``.
-        """
-        groups: dict[str, Arrays] = {"last": {}} | {name: {} for name in self._tables}
-        for key, values in arrays.items():
-            group, _, name = key.rpartition(".")
-            if group:
-                groups[group][name] = values
-        self.updates, self.env_steps = arrays["updates"], arrays["env_steps"]
-        self.episodes = arrays["episodes"]
-        self.seconds, self._simulated = float(arrays["seconds"]), int(arrays["simulated"])
-        self._evaluated = int(arrays["evaluated"])
-        self._broken_in_a_row = arrays["broken_in_a_row"]
-        self._last = groups.pop("last")
-        self._tables = {name: GrowingTable(columns) for name, columns in groups.items()}
+        """Goes back to what a record of the same settings had measured."""
+        super().restore(arrays)
+        self._last = _of_group(arrays, "last")
 
     def add_updates(self, metrics: Arrays) -> Arrays:
         """Takes in a block of updates.
@@ -197,7 +243,7 @@ class RunRecord:
 
         Args:
           metrics: [K, S] each, of K updates: those of ``Learner.step`` and of
-            ``state.Programs.advance``.
+            ``block_of_updates``.
 
         Returns:
           The updates in it that met numbers which are not finite, see
@@ -218,10 +264,10 @@ class RunRecord:
         self._tables["training"].append({name: x[made] for name, x in training.items()})
         self.env_steps, self.updates = env_steps[-1], updates[-1]
         self.episodes = episodes[-1]
-        self._simulated += _sum(metrics["simulated_steps"])
-        self._broken_in_a_row = progress.broken_in_a_row(self._broken_in_a_row, metrics)
+        self.simulated += _sum(metrics["simulated_steps"])
+        self.broken_in_a_row = progress.broken_in_a_row(self.broken_in_a_row, metrics)
         met = progress.nonfinite_updates(metrics, updates)
-        met["seed"] += self._config.first_seed
+        met["seed"] += self.config.first_seed
         self._tables["nonfinite"].append(met)
         self._remember(metrics | {"episode_return": returns})
         return met
@@ -251,7 +297,7 @@ class RunRecord:
         self.seconds = seconds
         return of_evaluation(
             *(result, self._last, self.updates, self.episodes, self.env_steps, seconds),
-            first_seed=self._config.first_seed,
+            first_seed=self.config.first_seed,
         )
 
     def add_test(self, result: Arrays) -> None:
@@ -259,32 +305,22 @@ class RunRecord:
         self._count(result)
 
     def _count(self, result: Arrays) -> None:
-        self._simulated += _sum(result["simulated_steps"])
-        self._evaluated += _sum(result["eval_steps"])
+        self.simulated += _sum(result["simulated_steps"])
+        self.evaluated += _sum(result["eval_steps"])
 
-    def evaluated(self) -> bool:
-        """Returns whether the present policies have been evaluated."""
-        last = self._tables["evaluations"].latest(1)
-        return bool(last) and np.array_equal(last["updates"][0], self.updates)
-
-    def begun(self) -> bool:
-        """Returns whether there is an evaluation."""
-        return bool(self._tables["evaluations"].latest(1))
-
-    def finished(self) -> bool:
-        """Returns whether the budget is used."""
-        return bool(used(self._config, self.env_steps, self.updates).min() >= 1.0)
+    def over(self) -> bool:
+        """Returns whether the budget is used, or nothing is finite any more."""
+        return self.finished() or self.hopeless()
 
     def hopeless(self) -> bool:
         """Returns whether all seeds that still train were broken throughout a block of updates."""
-        share = used(self._config, self.env_steps, self.updates)
-        return progress.hopeless(self._broken_in_a_row, share, self._config.eval_every)
+        return progress.hopeless(self.broken_in_a_row, self.used(), self.config.eval_every)
 
     def progress(self) -> Progress:
         """Returns how far the run is, as of its last evaluation."""
         names = ("eval_return", "env_steps", "updates", "seconds")
         past = self._tables["evaluations"].latest(BLOCKS + 1, *names)
-        fractions = used(self._config, past["env_steps"], past["updates"]).min(axis=-1)
+        fractions = used(self.config, past["env_steps"], past["updates"]).min(axis=-1)
         return measure_progress(past, fractions)
 
     def history(self) -> Arrays:
@@ -309,16 +345,16 @@ class RunRecord:
         """
         env_steps = self.env_steps.sum()
         return {
-            "env": self._config.env,
+            "env": self.config.env,
             "engine": engine,
-            "num_seeds": self._config.num_seeds,
+            "num_seeds": self.config.num_seeds,
             "threshold": self.threshold,
             **summarize(self.history(), self.threshold),
             "env_steps": self.env_steps.tolist(),
             "compile_seconds": compile_seconds,
             "run_seconds": run_seconds,
             "env_steps_per_second": float(env_steps / run_seconds),
-            "useful_step_fraction": float((env_steps + self._evaluated) / max(self._simulated, 1)),
+            "useful_step_fraction": float((env_steps + self.evaluated) / max(self.simulated, 1)),
             "nonfinite": progress.as_events(self._tables["nonfinite"].columns()),
         }
 

@@ -186,7 +186,7 @@ def newest_checkpoint(like: "RunState", config: Config, say: Callable[[str], Non
         a checkpoint is of another version.
     """
     from mjx_reinforce.training import checkpoint
-    from mjx_reinforce.training.driver import shape_of_best
+    from mjx_reinforce.training.state import shape_of_best
 
     assert config.resume is not None
     _check_unchanged(config, checkpoint.settings_of(config.resume / "checkpoint"))

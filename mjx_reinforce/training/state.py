@@ -64,6 +64,49 @@ def restored(leaves: Sequence[jax.Array | np.ndarray], like: PyTree) -> Any:
     return with_keys(jax.tree.unflatten(jax.tree.structure(like), leaves), like)
 
 
+class Best(struct.PyTreeNode, kw_only=True):
+    """The best policies so far.
+
+    actor: [S, ...] each seed's
+    eval_return: [S] what its evaluation returned; -inf before the first
+    num_updates: [S, 2] how many updates the seed had made then, as ``counts`` has it
+    """
+
+    actor: Actor
+    eval_return: Any
+    num_updates: Any
+
+
+def shape_of_best(train_states: TrainState) -> Best:
+    """Returns the shapes of the best policies of states, or of their shapes."""
+    num_updates = train_states.num_updates
+    returns = jax.ShapeDtypeStruct(num_updates.shape[:1], jnp.result_type(float))
+    return Best(actor=train_states.actor, eval_return=returns, num_updates=num_updates)
+
+
+def first_best(train_states: TrainState) -> Best:
+    """Returns the state before the first evaluation, in memory of its own."""
+    returns = shape_of_best(train_states).eval_return
+    actor, num_updates = jax.tree.map(np.array, (train_states.actor, train_states.num_updates))
+    worst = np.full(returns.shape, -np.inf, returns.dtype)
+    return Best(actor=actor, eval_return=worst, num_updates=num_updates)
+
+
+def keep_best(best: Best, present: Best) -> Best:
+    """Returns the better policy of each seed; of two that are equal, the later is the better.
+
+    Args:
+      best: so far.
+      present: those of an evaluation; a return that is not a number is never the best.
+    """
+    better = present.eval_return >= best.eval_return
+
+    def choose(new: np.ndarray, old: np.ndarray) -> np.ndarray:
+        return np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+    return jax.tree.map(choose, present, best)
+
+
 def seed_keys(seed: Seed, numbers: jax.Array | np.ndarray) -> jax.Array:
     """Returns the keys [R] that the seeds numbered so begin with: those of ``jax.random.split``."""
     return _for_each_seed(_root_key(seed, domain=0), numbers)
@@ -142,7 +185,7 @@ def last_actors(config: Config, policy: Mapping[str, Any]) -> Actor:
 def begin_with(state: RunState, actors: Actor) -> RunState:
     """Returns the state of a run before its first update, with actors [S, ...] of another."""
     old = state.train_states.actor
-    actor = jax.tree.map(lambda new, like: jnp.asarray(new, like.dtype), actors, old)
+    actor = jax.tree.map(lambda new, like: np.asarray(new, like.dtype), actors, old)
     return dataclasses.replace(
         state, train_states=dataclasses.replace(state.train_states, actor=actor)
     )

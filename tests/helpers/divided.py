@@ -16,8 +16,7 @@ from mjx_reinforce.engine.base import plain
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store import build, ready
 from mjx_reinforce.training.division import ALONE, Division
-from mjx_reinforce.training.programs import compile_run
-from mjx_reinforce.training.state import budget_of
+from mjx_reinforce.training.slots import compile_run
 
 SMALL = {"num_seeds": 3, "num_episodes": 8, "hidden_sizes": (4,), "eval_episodes": 2}
 SMALL |= {"env_steps": None, "max_updates": 2, "test_episodes": 4}
@@ -39,14 +38,14 @@ def close(one, other):
 def trained(config, division):
     """Returns all that a run comes to, on the host; how much was simulated is each device's own."""
     prepared = ready.made(envs.make(config.env), config, division=division)
-    first, programs = compile_run(prepared.programs, config)
-    before = jax.device_get(plain(first))
-    state, metrics, looked = programs.advance(first, True, budget_of(config))
+    slots = compile_run(prepared.programs, config)
+    before, [(_, metrics, looked)], state = slots.states(), slots.advance(), slots.states()
     assert all(len(x) == config.num_seeds for x in jax.tree.leaves(plain(state)))
-    found = jax.device_get(plain(state)), metrics, programs.test(state.train_states.actor)
-    for measured in (metrics, looked.measured, found[2]):
+    tested = slots.test(state.train_states.actor)
+    for measured in (metrics, looked, tested):
         del measured["simulated_steps"]
-    return before, looked, *found, programs.evaluate(state).measured["eval_return"]
+    again = slots.evaluate().looked["eval_return"]
+    return jax.device_get(plain((before, state))), metrics, looked, tested, again
 
 
 def stepped(config, division):

@@ -10,6 +10,7 @@ from mjx_reinforce.runs import observers
 from mjx_reinforce.runs.display import Display
 from mjx_reinforce.runs.observers import Callbacks, RunFiles
 from mjx_reinforce.settings.config import Config
+from mjx_reinforce.training.checkpoint import Checkpoint
 
 
 class Run:
@@ -18,19 +19,20 @@ class Run:
     def __init__(self):
         self.config = Config(num_seeds=2, checkpoint_every=4)
         self.made, self.finished, self.ended = 0, False, False
-        self.state = SimpleNamespace(train_states=SimpleNamespace(actor="last"))
+        self.states = SimpleNamespace(train_states=SimpleNamespace(actor="last"))
         self.best = SimpleNamespace(actor="best")
         self.record = SimpleNamespace(
             finished=lambda: self.finished,
             env_steps=np.zeros(2, int),
-            arrays=lambda: {"updates": np.array([self.made, self.made])},
             training=dict,
         )
 
     def updates(self):
         return self.made
 
-    seconds = updates
+    def checkpoint(self):
+        record = {"updates": np.full(2, self.made)}
+        return Checkpoint(None, record, self.made, 0, None, None)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import pytest
 
 from mjx_reinforce import envs
 from mjx_reinforce.runs import observers, run
+from mjx_reinforce.runs.begin import Begun
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store.ready import made
 
@@ -24,6 +25,11 @@ CONFIG = Config(
 )
 
 
+def of(ready, config):
+    """A run with these settings, without files."""
+    return Begun(config, None, ready, None, "")
+
+
 @pytest.fixture(scope="module")
 def ready():
     return made(envs.make(CONFIG.env), CONFIG)
@@ -32,7 +38,7 @@ def ready():
 @pytest.fixture(scope="module")
 def driver(ready):
     """Of a whole run, at its end."""
-    driver, seconds = run.compile_driver(ready, CONFIG)
+    driver, seconds = run.compile_driver(of(ready, CONFIG))
     assert seconds > ready.engine_seconds
     driver.drive(lambda: False)
     return driver
@@ -70,17 +76,17 @@ def test_minutes_become_env_steps_before_the_run_begins(ready, monkeypatch):
     said = []
     monkeypatch.setattr(run, "env_steps_in", lambda seconds, *_: int(1000 * seconds))
     timed = dataclasses.replace(CONFIG, minutes=0.5)
-    driver, _ = run.compile_driver(ready, timed, say=said.append)
+    driver, _ = run.compile_driver(of(ready, timed), said.append)
     assert (driver.config.env_steps, driver.config.minutes) == (30_000, None)
     assert said == ["0.5 min are about 30,000 env steps of a seed in all here"]
     assert driver.config.horizon == ready.horizon
 
 
 def test_a_run_begins_with_the_policies_of_another(ready, driver, monkeypatch):
-    learned = driver.state.train_states.actor
+    learned = driver.states.train_states.actor
     monkeypatch.setattr(run, "last_actors", lambda config, policy: learned)
     again = dataclasses.replace(CONFIG, init_from="another run")
-    begun = run.compile_driver(ready, again)[0].state.train_states.actor
+    begun = run.compile_driver(of(ready, again))[0].states.train_states.actor
     mean = learned.normalizer.mean
     np.testing.assert_array_equal(begun.normalizer.mean, mean)
     assert mean.any()  # that of a fresh policy is 0

@@ -25,10 +25,9 @@ from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.play import objects
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store import kept, ready
-from mjx_reinforce.training.programs import compile_run
-from mjx_reinforce.training.state import budget_of
+from mjx_reinforce.training.slots import compile_run
 
-CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
+CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=4000, eval_episodes=2)
 SETTINGS = {
     "all else": {
         "estimator": "value-baseline",
@@ -67,14 +66,13 @@ def numbers(prepared, config):
 
     How much was simulated is left out: threads share the episodes, whichever is first.
     """
-    state, programs = compile_run(prepared.programs, config)
-    measured = []
+    slots, measured = compile_run(prepared.programs, config), []
     for _ in range(2):
-        state, metrics, looked = programs.advance(state, True, budget_of(config))
-        measured += [metrics, looked.measured, programs.evaluate(state).measured]
-    leaves = [jax.random.key_data(state.train_states.key), state.train_states.env_steps]
-    leaves += jax.tree.leaves(state.train_states.actor)
-    measured.append(programs.test(state.train_states.actor))
+        [(_, metrics, looked)] = slots.advance()
+        measured += [metrics, looked, slots.evaluate().looked]
+    state = slots.states().train_states
+    leaves = [jax.random.key_data(state.key), state.env_steps, *jax.tree.leaves(state.actor)]
+    measured.append(slots.test(state.actor))
     for each in measured:
         del each["simulated_steps"]
     return [measured, leaves]
@@ -303,16 +301,14 @@ from mjx_reinforce import envs
 from mjx_reinforce.store import ready
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.console.jax_setup import configure_jax
-from mjx_reinforce.training.programs import compile_run
-from mjx_reinforce.training.state import budget_of
+from mjx_reinforce.training.slots import compile_run
 configure_jax()
 if sys.argv[1] == "second":
     envs.make = None
 config = Config(env="InvertedPendulum-v5", num_seeds=2, num_episodes=2, eval_episodes=2)
 prepared = ready.get_ready(config, config)
-state, programs = compile_run(prepared.programs, config)
-state, metrics, looked = programs.advance(state, True, budget_of(config))
-print(prepared.engine, metrics["episode_return"].tolist(), looked.measured["eval_return"])
+[(_, metrics, looked)] = compile_run(prepared.programs, config).advance()
+print(prepared.engine, metrics["episode_return"].tolist(), looked["eval_return"])
 print("mujoco" in sys.modules)
 """
 

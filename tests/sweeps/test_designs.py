@@ -146,7 +146,7 @@ def test_a_chunk_has_as_many_runs_as_asked_or_as_it_had():
 
 def test_exact_sweeps_have_one_device_and_trace_every_number():
     sweep = prepared(exact=True)
-    assert sweep.devices.count == 1
+    assert sweep.division.count == 1
     assert len(sweep.parts[0].group.settings) > 5
 
 

@@ -25,14 +25,13 @@ from mjx_reinforce.export.run_files import choose_seed, read_run
 from mjx_reinforce.report import WrittenReport
 from mjx_reinforce.settings.config import Config, check
 from mjx_reinforce.store.build import build
-from mjx_reinforce.sweeps import chunks, conduct, perform, plan, programs
+from mjx_reinforce.sweeps import chunks, conduct, perform, plan
 from mjx_reinforce.sweeps import command_line as sweep_command
 from mjx_reinforce.sweeps.design import Design, check_design, configure, grid, read_design
-from mjx_reinforce.sweeps.layout import pack_slots
 from mjx_reinforce.sweeps.perform import read_results
 from mjx_reinforce.sweeps.plan import learner_builder, make_groups
 from mjx_reinforce.sweeps.results import join_parts
-from mjx_reinforce.training import programs as training_programs
+from mjx_reinforce.training import driver, slots
 from mjx_reinforce.training.programs import programs_of
 from mjx_reinforce.training.state import eval_keys
 
@@ -222,21 +221,21 @@ def test_packing_changes_nothing(run, monkeypatch):
     """Neither which runs share a slot, nor how wide it is, nor that those that ended lie aside."""
     # With this seed one run trains last, alone.
     command = f"{STEPS} --num-seeds 4 --seed 2"
-    shapes = []
+    shapes, packing = [], slots.pack_slots
 
     def packed(*arguments):
-        shapes.append(pack_slots(*arguments).shape)
-        return pack_slots(*arguments)
+        shapes.append(packing(*arguments).shape)
+        return packing(*arguments)
 
     monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
-    monkeypatch.setattr(programs, "pack_slots", packed)
+    monkeypatch.setattr(slots, "pack_slots", packed)
     assert run(f"{command} --output packed") == 0
     assert shapes[0] == (3, 4)
     assert shapes[-2] == (1, 1)
     assert shapes[-1] == shapes[0]  # the last policies of all are evaluated together
     assert len(set(shapes)) > 3
     monkeypatch.setattr(plan, "_CPU_EPISODES", (48,))
-    monkeypatch.setattr(programs, "pack_slots", in_place)
+    monkeypatch.setattr(slots, "pack_slots", in_place)
     assert run(f"{command} --output wide") == 0
     one, other = curves(Path("packed")), curves(Path("wide"))
     assert len(set(one["env_steps"][-1])) > 6
@@ -248,19 +247,19 @@ def test_blocks_without_a_pause_change_nothing(run, monkeypatch):
     """Runs that one slot holds make several blocks before the host looks at them."""
     command = f"{STEPS} --num-seeds 2"
     monkeypatch.setattr(plan, "_CPU_EPISODES", (24,))
-    made, advance = [], programs.SlotPrograms.advance
+    made, advance = [], slots.Slots.advance
 
-    def counted(*arguments):
-        blocks = advance(*arguments)
+    def counted(*arguments, **options):
+        blocks = advance(*arguments, **options)
         made.append(len(blocks))
         return blocks
 
-    monkeypatch.setattr(programs.SlotPrograms, "advance", counted)
-    monkeypatch.setattr(chunks, "_SECONDS", 60.0)
+    monkeypatch.setattr(slots.Slots, "advance", counted)
+    monkeypatch.setattr(driver, "_SECONDS", 60.0)
     assert run(f"{command} --output several") == 0
     assert made[:4] == [1, 2, 4, 8]
     several, total = curves(Path("several")), sum(made)
-    monkeypatch.setattr(chunks, "_SECONDS", 0.0)
+    monkeypatch.setattr(driver, "_SECONDS", 0.0)
     made.clear()
     assert run(f"{command} --output each") == 0
     assert set(made) == {1}
@@ -275,16 +274,16 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
     What ended is not trained again, and its report is written if it is not there.
     """
     monkeypatch.setattr(plan, "_CPU_EPISODES", (16, 4))
-    drive, driven, ended, tried = conduct.drive, [], [], []
+    drive, driven, ended, tried = chunks.drive, [], [], []
     add, save, write = conduct.SweepFiles.add, conduct.Chunk.save, chunks.checkpoint.save
 
-    def interrupted(chunk, asked):
+    def interrupted(*arguments):
         driven.append(None)
-        return len(driven) == 1 and drive(chunk, asked)
+        return drive(*arguments) if len(driven) == 1 else iter(())
 
     def crash_among_ended(self):
         save(self)
-        ended.append((self.history.now["env_steps"] >= 300).sum())
+        ended.append((self.record.env_steps >= 300).sum())
         if 0 < ended[-1] < 4:
             raise CrashError
 
@@ -299,7 +298,7 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
         write(*arguments, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(conduct, "drive", interrupted)
+        patch.setattr(chunks, "drive", interrupted)
         assert run(f"{CHUNKS} --output parts") == 0
     assert json.loads(Path("parts/sweep.json").read_text())["status"] == "interrupted"
     for owner, name, crash in (
@@ -335,13 +334,13 @@ def test_a_sweep_goes_on_wherever_it_stops(run, whole, monkeypatch, capsys):
 @pytest.mark.slow
 def test_a_chunk_that_goes_on_saves_when_it_is_due(run, monkeypatch):
     """Not at its first look: the checkpoint that it was found in counts."""
-    monkeypatch.setattr(chunks, "_SECONDS", 0.0)
+    monkeypatch.setattr(driver, "_SECONDS", 0.0)
     command = f"{SMALL} --num-seeds 2 --eval-every 1 --checkpoint-every 2 {RATES}"
     save, saved = conduct.Chunk.save, []
 
     def crash(self):
         save(self)
-        saved.append(int(self.history.now["updates"].max()))
+        saved.append(int(self.record.updates.max()))
         if saved == [2]:
             raise CrashError
 
@@ -383,7 +382,7 @@ def test_a_sweep_whose_first_file_cannot_be_written_was_not_begun(run, monkeypat
         assert run(command) == 1
     Path("out").mkdir(exist_ok=True)
     (Path("out") / ".sweep.json.12ab").write_text("half")
-    monkeypatch.setattr(conduct, "compile_programs", lambda *_: pytest.fail("it begins"))
+    monkeypatch.setattr(conduct, "compile_slots", lambda *_: pytest.fail("it begins"))
     with pytest.raises(pytest.fail.Exception, match="it begins"):
         run(command)
 
@@ -445,7 +444,7 @@ def test_numbers_share_a_program_and_the_rest_does_not():
     ],
 )
 def test_bad_sweeps_are_refused(run, capsys, tmp_path, monkeypatch, arguments, message):
-    monkeypatch.setattr(conduct, "compile_programs", lambda *_: pytest.fail("it was compiled"))
+    monkeypatch.setattr(conduct, "compile_slots", lambda *_: pytest.fail("it was compiled"))
     assert run(f"--env Drift-v0 {arguments}") == 2
     printed = capsys.readouterr()
     assert message in printed.err
@@ -474,29 +473,6 @@ def test_a_flag_that_one_configuration_reads_is_accepted():
     configure(Config(value_fits=3), configurations, given=["value_fits"])
     with pytest.raises(ValueError, match="would do nothing"):
         configure(Config(decay_steps=None), grid({"final_learning_rate": [1e-3, 1e-2]}))
-
-
-@pytest.mark.slow
-def test_programs_have_run_once_for_no_run_before_they_train(run, monkeypatch):
-    """A GPU's driver translates kernels when they first run: that is compiling too."""
-    made, block_of_updates = [], training_programs.block_of_updates
-
-    def counting(*arguments):
-        advance = block_of_updates(*arguments)
-
-        def counted(*arguments):
-            state, block = advance(*arguments)
-            jax.debug.callback(lambda x: made.append(int(x)), block.made)
-            return state, block
-
-        return counted
-
-    monkeypatch.setattr(training_programs, "block_of_updates", counting)
-    over = "--over learning-rate 1e-2 3e-2"
-    assert run(f"{SMALL} --num-seeds 1 --max-updates 3 {over} --output swept") == 0
-    jax.effects_barrier()
-    assert made[0] == 0
-    assert sum(made) >= 3
 
 
 @pytest.mark.slow
@@ -536,12 +512,12 @@ def test_the_policies_of_the_best_and_the_worst_seed_are_kept(run):
         assert choose_seed(known, "best") == best
         config = Config(env="Drift-v0", num_seeds=5, eval_episodes=2, hidden_sizes=(4,))
         learner, horizon = build(env, config)
-        made = programs_of(env, lambda _, x=learner: x, horizon, config, 1, sampled=False)
+        made = programs_of(env, lambda _, x=learner: x, horizon, config, 1, whole=False)
         evaluate = jax.jit(made.evaluate)
         for seed in known.seeds:
             actor = jax.tree.map(lambda x: x[None], load_seed(known, seed)[0].actor)
             keys = eval_keys(np.array([seed], np.uint32))
-            returns = evaluate(actor, keys)["eval_return"]
+            returns = evaluate(actor, keys, np.ones(1, bool))["eval_return"]
             np.testing.assert_array_equal(returns[0], final[seeds == seed][0])
     with pytest.raises(ValueError, match="has the policies of the seeds"):
         load_seed(read_run(Path("swept/policies/000")), 99)

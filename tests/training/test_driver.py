@@ -7,34 +7,40 @@ import numpy as np
 
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
-from mjx_reinforce.training.driver import Best, Driver, first_best, keep_best, shape_of_best
-from mjx_reinforce.training.programs import Looked, RunPrograms
+from mjx_reinforce.training.driver import Driver
 from mjx_reinforce.training.record import RunRecord
+from mjx_reinforce.training.slots import Measured
+from mjx_reinforce.training.state import Best, first_best, keep_best, shape_of_best
 
 BLOCK = 2
 CONFIG = Config(num_seeds=2, env_steps=None, max_updates=3 * BLOCK, eval_every=BLOCK)
 
 
 class Steps:
-    """Programs of a run whose state is a number of updates; policies return ``returns(number)``."""
+    """Slots whose state is a number of updates; policies return ``returns(number)``."""
 
     def __init__(self, returns=lambda updates: [updates, -updates], broken=False):
-        self.returns, self.broken, self.looks = returns, broken, []
+        self.returns, self.broken, self.looks, self.number = returns, broken, [], 0
 
-    def look(self, state):
-        number = state.train_states.actor["w"]
-        measured = {
-            name: np.asarray(self.returns(int(number[0])), np.float32)
-            for name in ("eval_return", "eval_return_stochastic", "eval_length")
-        }
+    def states(self):
+        made = np.stack([np.asarray(counts.from_int(self.number))] * 2)
+        actor = {"w": np.full(2, self.number)}
+        return SimpleNamespace(train_states=SimpleNamespace(actor=actor, num_updates=made))
+
+    def restore(self, states):
+        self.number = int(states.train_states.actor["w"][0])
+
+    def look(self):
+        names = ("eval_return", "eval_return_stochastic", "eval_length")
         zeros = {name: np.zeros(2, np.int32) for name in ("simulated_steps", "eval_steps")}
-        made = np.stack([np.asarray(counts.from_int(int(x))) for x in number])
-        return Looked({"w": number}, made, measured | zeros)
+        return {name: np.asarray(self.returns(self.number), np.float32) for name in names} | zeros
 
-    def advance(self, state, look, budget):
-        del budget
+    def evaluate(self):
+        return Measured(np.arange(2), {}, self.look())
+
+    def advance(self, chosen, lengths, look, most):
         self.looks.append(look)
-        looked = self.look(state) if look else None
+        looked = self.look() if look else {}
         ones = np.ones((BLOCK, 2), np.int32)
         metrics = dict.fromkeys(("env_steps", "episodes", "simulated_steps"), ones)
         metrics |= {
@@ -43,12 +49,11 @@ class Steps:
             "nonfinite_episodes": ones * self.broken,
             "skipped_update": ones * self.broken,
         }
-        return begun(int(state.train_states.actor["w"][0]) + BLOCK), metrics, looked
+        self.number += BLOCK
+        return [Measured(np.arange(2), metrics, looked)]
 
-    def programs(self):
-        return RunPrograms(
-            self.advance, self.look, lambda actor: {"eval_return": actor["w"] * 10.0}
-        )
+    def test(self, actor):
+        return {"eval_return": actor["w"] * 10.0}
 
 
 class Diary:
@@ -65,16 +70,10 @@ class Diary:
         driver.ended = self.notes.count("evaluated 0") + len(self.notes) > self.until
 
 
-def begun(updates=0):
-    return SimpleNamespace(train_states=SimpleNamespace(actor={"w": np.full(2, updates)}))
-
-
 def driver_of(steps, *observers, config=CONFIG, threshold=None):
-    worst = np.full(2, -np.inf, np.float32)
-    best = Best(actor={"w": np.zeros(2, int)}, eval_return=worst, num_updates=np.zeros((2, 2), int))
     record = RunRecord(config, threshold)
     record.add_test = lambda result: None
-    return Driver(config, steps.programs(), record, begun(), best, observers)
+    return Driver(config, steps, record, observers)
 
 
 def never():
@@ -144,9 +143,7 @@ def test_a_restored_run_goes_on_where_it_was():
     half, rest = Steps(), Steps()
     first = driver_of(half)
     first.drive(after(2))
-    found = SimpleNamespace(
-        state=(first.state, first.best), record=first.record.arrays(), seconds=100.0
-    )
+    found = first.checkpoint()._replace(seconds=100.0)
     second = driver_of(rest)
     second.restore(found)
     assert second.updates() == 4
@@ -167,7 +164,7 @@ STATES = SimpleNamespace(
 def looked(number, *returns):
     actor = {"w": np.full((3, 2), float(number)), "b": np.full(3, float(number))}
     made = np.tile([0, number], (3, 1))
-    return Looked(actor, made, {"eval_return": np.array(returns, np.float32)})
+    return Best(actor=actor, eval_return=np.array(returns, np.float32), num_updates=made)
 
 
 def test_before_the_first_evaluation_every_return_is_better():

@@ -101,11 +101,11 @@ def test_a_record_of_two_seeds_by_hand():
     record = RunRecord(config, threshold=8.0)
     first = record.add_evaluation(evaluation(1, 9), 0.5)
     assert first["train_return"] == ["", ""]
-    assert record.evaluated()
+    assert record.is_evaluated()
     assert not record.finished()
     assert record.progress().fraction == 0
     met = record.add_updates(METRICS)
-    assert not record.evaluated()
+    assert not record.is_evaluated()
     assert as_events(met) == [{"seed": 0, "update": 1, "episodes": 2, "skipped": True}]
     second = record.add_evaluation(evaluation(7, 10), 2.00009)
     keys = ("seed", "update", "episodes", "env_steps", "wall_seconds", "train_return")

@@ -19,13 +19,13 @@ from saved_runs import assert_same, change
 
 from mjx_reinforce import files
 from mjx_reinforce import files as export_files
-from mjx_reinforce import train as train_module
 from mjx_reinforce.engine.cpu import machine
+from mjx_reinforce.runs import begin
 from mjx_reinforce.runs.directory import locked, make_directory
 from mjx_reinforce.runs.observers import RunFiles
 from mjx_reinforce.training import checkpoint
-from mjx_reinforce.training.driver import Driver
 from mjx_reinforce.training.record import RunRecord
+from mjx_reinforce.training.slots import Slots
 
 #: One of our tasks, whose programs are kept on disk: only the first run traces and compiles them.
 COMMON = ["--env", "ContinuousCartPole-v0", "--env-steps", "None", "--num-seeds", "3"]
@@ -168,8 +168,8 @@ def signalled(method, when):
     calls = []
 
     @functools.wraps(method)
-    def called(*arguments):
-        result = method(*arguments)
+    def called(*arguments, **options):
+        result = method(*arguments, **options)
         calls.append(None)
         if len(calls) == when:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -184,7 +184,7 @@ def signalled(method, when):
     ("owner", "name", "when", "status", "rows"),
     [
         (RunFiles, "begin", 1, 143, 1),
-        (Driver, "advance", 2, 143, 2),  # whose evaluation is left to the run that goes on
+        (Slots, "advance", 2, 143, 2),  # whose evaluation is left to the run that goes on
         (RunRecord, "add_test", 1, 143, 5),
         (RunRecord, "add_test", 2, 0, 5),  # nothing is left to stop
     ],
@@ -211,7 +211,7 @@ def test_a_full_disk_is_refused_at_once(run, parts, tmp_path, monkeypatch, capsy
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     arguments = ["--resume", "parts"] if resumed else [*COMMON, "--output", "new/out"]
     before = sorted(tmp_path.rglob("*"))
-    monkeypatch.setattr(train_module, "make_plan", pytest.fail)
+    monkeypatch.setattr(begin, "make_plan", pytest.fail)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
     try:
         code = run(*arguments, "--max-updates", 30)

@@ -10,12 +10,12 @@ import pytest
 from toys import Toy
 
 from mjx_reinforce import envs
-from mjx_reinforce.engine.base import plain, with_keys
+from mjx_reinforce.engine.base import plain
 from mjx_reinforce.learning import counts
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.store import ready
-from mjx_reinforce.training.programs import compile_run
-from mjx_reinforce.training.state import budget_of, seed_keys
+from mjx_reinforce.training.slots import compile_run
+from mjx_reinforce.training.state import seed_keys
 
 CONFIG = Config(env="CartPole-v1", num_seeds=2, num_episodes=4, env_steps=400, eval_episodes=2)
 
@@ -44,11 +44,11 @@ def test_they_have_run_once_without_an_update(prepared):
         jax.debug.callback(lambda x: made.append(int(x)), block.made)
         return state, block
 
-    state, programs = compile_run(prepared.programs._replace(advance=advance), CONFIG)
+    slots = compile_run(prepared.programs._replace(advance=advance), CONFIG)
     jax.effects_barrier()
     assert made == [0]
-    assert not state.train_states.env_steps.any()
-    programs.advance(state, True, budget_of(CONFIG))
+    assert not slots.states().train_states.env_steps.any()
+    slots.advance()
     jax.effects_barrier()
     assert made[1] > 0
 
@@ -58,22 +58,16 @@ def test_evaluations_ride_with_the_updates_that_follow(prepared):
     """They measure the policies before these, and leave what is trained as it is, to the bit."""
     assert prepared.engine == "native"
     assert prepared.programs.rides
-    first, programs = compile_run(prepared.programs, CONFIG)
-    kept, budget = jax.tree.map(np.asarray, plain(first)), budget_of(CONFIG)
-
-    def again():
-        return with_keys(jax.tree.map(jnp.array, kept), first)
-
-    alone = programs.evaluate(again())
-    one, metrics, looked = programs.advance(again(), True, budget)
-    other, same, none = programs.advance(again(), False, budget)
-    assert none is None
+    slots = compile_run(prepared.programs, CONFIG)
+    first, alone = slots.states(), slots.evaluate().looked
+    [(_, metrics, looked)], one = slots.advance(), slots.states()
+    slots.restore(first)
+    [(_, same, none)], other = slots.advance(look=False), slots.states()
+    assert none == {}
     assert np.all(metrics.pop("simulated_steps")[0] > same.pop("simulated_steps")[0])
-    for tree, like in ((looked.actor, alone.actor), (plain(one), plain(other)), (metrics, same)):
-        jax.tree.map(np.testing.assert_array_equal, tree, like)
+    jax.tree.map(np.testing.assert_array_equal, (plain(one), metrics), (plain(other), same))
     for name in ("eval_return", "eval_return_stochastic", "eval_length", "eval_steps"):
-        np.testing.assert_array_equal(looked.measured[name], alone.measured[name])
-    assert looked.num_updates.tolist() == [[0, 0]] * 2
+        np.testing.assert_array_equal(looked[name], alone[name])
     made = metrics["active"].sum(axis=0)
     assert counts.to_int(one.train_states.num_updates).tolist() == made.tolist()
 
@@ -106,10 +100,9 @@ LUCK = Config(env="Luck-v0", num_seeds=3, hidden_sizes=(), eval_episodes=2, test
 def measure(**changes):
     """Returns what settings evaluate to before and after an update, and what they test to."""
     config = dataclasses.replace(LUCK, **changes)
-    state, programs = compile_run(ready.made(Luck(), config).programs, config)
-    state, _, first = programs.advance(state, True, budget_of(config))
-    later = programs.evaluate(state).measured
-    return first.measured, later, programs.test(state.train_states.actor)
+    slots = compile_run(ready.made(Luck(), config).programs, config)
+    [first], later = slots.advance(), slots.evaluate()
+    return first.looked, later.looked, slots.test(slots.states().train_states.actor)
 
 
 @pytest.mark.slow
@@ -143,13 +136,13 @@ def test_training_is_cut_for_a_share_of_the_budget_and_evaluations_never(share):
     prepared = ready.made(envs.make(config.env), config)
     assert prepared.horizon == 500
     assert prepared.programs.rides == (share < 1)
-    state, programs = compile_run(prepared.programs, config)
-    budget, cut, whole = budget_of(config), [], []
-    while (steps := int(counts.to_int(state.train_states.env_steps)[0])) < config.env_steps:
-        state, metrics, looked = programs.advance(state, True, budget)
+    slots, steps, cut, whole = compile_run(prepared.programs, config), 0, [], []
+    while steps < config.env_steps:
+        [(_, metrics, looked)] = slots.advance()
         lengths = cut if steps < share * config.env_steps else whole
         lengths.append(float(metrics["episode_length"].max()))
-        assert np.all(looked.measured["eval_length"] > 8)
+        assert np.all(looked["eval_length"] > 8)
+        steps = int(counts.to_int(slots.states().train_states.env_steps)[0])
     assert max(cut) == 8
     assert bool(whole) == (share < 1)
     assert all(length > 8 for length in whole)

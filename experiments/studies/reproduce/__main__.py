@@ -23,8 +23,8 @@ from mjx_reinforce.export.policy_files import build_policy
 from mjx_reinforce.settings.config import Config
 from mjx_reinforce.settings.tables import PRESETS
 from mjx_reinforce.store.build import build, policy_settings
-from mjx_reinforce.training.programs import compile_run, programs_of
-from mjx_reinforce.training.state import budget_of
+from mjx_reinforce.training.programs import programs_of
+from mjx_reinforce.training.slots import compile_run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,14 +102,13 @@ def train(case: Case, config: Config, *, stale: bool = False) -> np.ndarray:
     if stale:
         learner = stale_starts(lambda env: build(env, config, policy)[0], env)
     traced = programs_of(env, lambda _: learner, horizon, config, config.num_seeds)
-    state, programs = compile_run(traced, config)
-    scores, budget = [], budget_of(config)
+    slots, scores = compile_run(traced, config), []
     for _ in range(-(-config.max_updates // config.eval_every)):
-        state, metrics, _ = programs.advance(state, False, budget)
+        [measured] = slots.advance(look=False)
         if case.score == "eval_return":
-            scores.append(programs.evaluate(state).measured[case.score][None])
+            scores.append(slots.evaluate().looked[case.score][None])
         else:
-            scores.append(np.asarray(metrics[case.score]))
+            scores.append(measured.metrics[case.score])
     return np.concatenate(scores)[: config.max_updates]
 
 
