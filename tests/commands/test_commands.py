@@ -225,7 +225,7 @@ MISTAKES = {
     "train --num-seeds 3 gymnasium-tutorial": "a preset comes before all flags",
     "train --env-steps 1M": "--env-steps takes INT, got '1M'",
     "train --hidden-sizes 64,64": "takes numbers with spaces between them, such as 32 32",
-    "train --engine kernel": "invalid choice 'kernel' for argument '--engine'. Expected one",
+    "train --engine kernel": "invalid choice 'kernel' for argument '--engine'",
     "watch --output film.avi runs/first": "runs/first is no run directory",
     "sweep": "nothing is swept: give --over a setting and its values, such as --over learning-rate",
     "sweep --over learning-rat 1 2": "Did you mean 'learning-rate'?",
