@@ -29,6 +29,8 @@ def draw_learning_curve(
 ) -> bytes:
     """Draws every seed thin, their interquartile mean with a 95 % band, and the threshold.
 
+    A threshold that lies far above all returns is in the legend alone.
+
     Seeds may reach different numbers of env steps at an evaluation, so all curves are
     read off, by linear interpolation, in the range of the slowest seed.
 
@@ -56,8 +58,10 @@ def draw_learning_curve(
     alpha = max(0.03, min(0.5, 4 / num_seeds))
     axes.plot(steps, returns, color="tab:blue", linewidth=0.7, alpha=alpha)
     _draw_mean(axes, grid, steps, returns, "tab:blue", "deterministic policy")
-    if threshold is not None:
-        axes.axhline(threshold, color="0.3", linestyle="--", linewidth=1, label="solved")
+    if (drawn := drawn_threshold(threshold, returns)) is not None:
+        axes.axhline(drawn, color="0.3", linestyle="--", linewidth=1, label="solved")
+    elif threshold is not None:
+        axes.plot([], [], " ", label=f"solved at {threshold:,g}, above the picture")
     seeds = f"interquartile mean of {num_seeds} seeds" if num_seeds > 1 else "1 seed"
     seeds += ", 95 % interval" if enough(num_seeds) else ""
     failed = int(np.sum(~np.isfinite(returns[-1])))
@@ -96,6 +100,14 @@ def _draw_mean(
     if len(grid) and curves.shape[1] > 1:
         low, high = iqm_interval(curves)
         axes.fill_between(grid, low, high, color=color, alpha=0.25, linewidth=0)
+
+
+def drawn_threshold(threshold: float | None, returns: np.ndarray) -> float | None:
+    """Returns a threshold that is drawn over returns; None where it would squeeze all of them."""
+    known = returns[np.isfinite(returns)]
+    if threshold is None or not known.size or threshold - known.max() > 0.5 * np.ptp(known):
+        return None
+    return threshold
 
 
 def on_grid(grid: np.ndarray, steps: np.ndarray, returns: np.ndarray) -> np.ndarray:

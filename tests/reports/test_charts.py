@@ -2,12 +2,14 @@
 
 import json
 
+import numpy as np
 import pytest
 from fake_sweeps import make_sweep
 from pages import findings_of
 
 from mjx_reinforce.reports import charts, findings, words
 from mjx_reinforce.reports.charts import distribution
+from mjx_reinforce.reports.curves import drawn_threshold
 from mjx_reinforce.reports.document import draw_charts
 
 
@@ -69,6 +71,15 @@ def test_a_threshold_far_above_all_returns_squeezes_no_figure(found, drawn):
     assert "123456" not in json.dumps([each.spec for each in made.values()])
     assert "123,456.0, lies above the figure" in made["curves"].caption
     assert "lies above" not in drawn["curves"].caption
+
+
+@pytest.mark.parametrize(
+    ("threshold", "drawn"), [(-9.0, -9.0), (150.0, 150.0), (151.0, None), (None, None)]
+)
+def test_a_threshold_is_drawn_where_it_leaves_returns_two_thirds_of_the_height(threshold, drawn):
+    returns = np.array([0.0, np.nan, 100.0])
+    assert drawn_threshold(threshold, returns) == drawn
+    assert drawn_threshold(threshold, returns[1:2]) is None
 
 
 def test_defaults_are_named_where_settings_are_compared(found):

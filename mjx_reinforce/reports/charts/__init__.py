@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from mjx_reinforce.reports.curves import drawn_threshold
 from mjx_reinforce.reports.findings import Findings, Result
 from mjx_reinforce.statistics import Estimate
 
@@ -279,19 +280,15 @@ def moment_line(findings: Findings) -> Spec:
     }
 
 
-def drawn_threshold(findings: Findings) -> float | None:
+def threshold_of(findings: Findings) -> float | None:
     """Returns the return that counts as solved, None where it would squeeze all that is drawn."""
-    threshold = findings.experiment.threshold
-    returns = np.concatenate([each.configuration.eval_return.ravel() for each in findings.results])
-    known = returns[np.isfinite(returns)]
-    if threshold is None or not known.size or threshold - known.max() > 0.5 * np.ptp(known):
-        return None
-    return threshold
+    returns = [each.configuration.eval_return.ravel() for each in findings.results]
+    return drawn_threshold(findings.experiment.threshold, np.concatenate(returns))
 
 
 def threshold_line(findings: Findings, axis: str) -> list[Spec]:
     """Returns the line at the return that counts as solved, and its name."""
-    threshold = drawn_threshold(findings)
+    threshold = threshold_of(findings)
     if threshold is None:
         return []
     # Below the line, at its end: curves come from below and end above.

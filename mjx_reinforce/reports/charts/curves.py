@@ -18,7 +18,7 @@ _DRAWN_OF_ALL = 480
 def draw(findings: Findings) -> Iterator[charts.Chart]:
     """Yields the chart."""
     threshold, beyond = findings.experiment.threshold, ""
-    if threshold is not None and charts.drawn_threshold(findings) is None:
+    if threshold is not None and charts.threshold_of(findings) is None:
         beyond = f" The return that counts as solved, {number(threshold)}, lies above the figure."
     layers = [
         {
