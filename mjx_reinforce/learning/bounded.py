@@ -68,16 +68,16 @@ def clipped_normal(
     layout = _bounded_outputs("clipped-normal", space, std, initial_std, rescale)
 
     def log_density(action, mean, std):
-        low, high = layout.bounds(mean)
+        low, high = _bounds(layout, mean)
         inside = normal_log_density(action, mean, std)
         below, above = log_tail((mean - low) / std), log_tail((high - mean) / std)
         return jnp.where(action <= low, below, jnp.where(action >= high, above, inside))
 
     return layout.family(
-        sample=lambda noise, mean, std: jnp.clip(mean + std * noise, *layout.bounds(mean)),
-        mode=lambda mean: jnp.clip(mean, *layout.bounds(mean)),
+        sample=lambda noise, mean, std: jnp.clip(mean + std * noise, *_bounds(layout, mean)),
+        mode=lambda mean: jnp.clip(mean, *_bounds(layout, mean)),
         log_density=log_density,
-        entropy=lambda mean, std: _clipped_entropy(mean, std, *layout.bounds(mean)),
+        entropy=lambda mean, std: _clipped_entropy(mean, std, *_bounds(layout, mean)),
     )
 
 
@@ -194,7 +194,7 @@ def truncated_normal(
 
     def restricted(function):
         """Returns a function that is given the bounds after its other arguments."""
-        return lambda *given: function(*given, *layout.bounds(given[-1]))
+        return lambda *given: function(*given, *_bounds(layout, given[-1]))
 
     return layout.family(
         sample=restricted(truncated_sample),
@@ -224,6 +224,11 @@ def _bounded_outputs(name: str, space: Box | Discrete, *settings: Any) -> Gaussi
             "choose normal, or declare bounds in the environment's action_space"
         )
     return layout
+
+
+def _bounds(layout: GaussianOutputs, like: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Returns the lower and upper bounds, [A] each, in the dtype of ``like``."""
+    return jnp.asarray(layout.box.low, like.dtype), jnp.asarray(layout.box.high, like.dtype)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

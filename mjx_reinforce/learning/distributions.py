@@ -216,10 +216,6 @@ class GaussianOutputs(NamedTuple):
         """A."""
         return len(self.middle)
 
-    def bounds(self, like: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Returns the lower and upper bounds, [A] each, in the dtype of ``like``."""
-        return jnp.asarray(self.box.low, like.dtype), jnp.asarray(self.box.high, like.dtype)
-
     def mean(self, outputs: jax.Array) -> jax.Array:
         """Returns the means [..., A]."""
         return outputs[..., : self.size] * self.half + self.middle

@@ -90,7 +90,7 @@ def whole_rollout(turn: Turn) -> Update:
 
     def update(problem, key, params, opt_state):
         mask = problem.samples[-1]
-        grads, sums = accumulate_gradient(problem.surrogate, params, problem.samples)
+        _, grads, sums = accumulate_gradient(problem.surrogate, params, problem.samples)
         metrics = {}
         if mask.shape[1] > 1:
             metrics["gradient_snr"] = _signal_to_noise(problem, params, grads)
@@ -111,7 +111,7 @@ def _signal_to_noise(problem: Problem, params: Params, grads: Params) -> jax.Arr
 
     def alone(episode):
         samples = jax.tree.map(lambda x: x[:, None], episode)
-        return accumulate_gradient(problem.surrogate, params, samples)[0]
+        return accumulate_gradient(problem.surrogate, params, samples)[1]
 
     each = jax.vmap(alone, in_axes=1)(jax.tree.map(lambda x: x[:, :few], problem.samples))
     mean = jax.tree.map(lambda g: g / num_episodes, grads)
@@ -230,8 +230,8 @@ def accumulate_gradient(
     loss: Callable[[Any, Any], tuple[jax.Array, Any]],
     params: Params,
     data: tuple[Any, ...],
-) -> tuple[Any, Any]:
-    """Sums the gradient of a loss, and its metrics, over chunks of time.
+) -> tuple[jax.Array, Any, Any]:
+    """Sums a loss, its gradient and its metrics over chunks of time.
 
     Args:
       loss: (params, chunk of data) -> (sum over the chunk, sums of metrics).
@@ -240,10 +240,15 @@ def accumulate_gradient(
         the last one with any True are not visited.
 
     Returns:
-      The gradient, like ``params``, and the metrics, summed.
+      The loss [] (without it XLA rounds the rest otherwise), its gradient, the metrics: all summed.
     """
-    differentiate = jax.grad(loss, has_aux=True)
-    return accumulate(lambda chunk: differentiate(params, chunk), data)
+    differentiate = jax.value_and_grad(loss, has_aux=True)
+
+    def visit(chunk):
+        (value, metrics), grads = differentiate(params, chunk)
+        return value, grads, metrics
+
+    return accumulate(visit, data)
 
 
 def accumulate(function: Callable[[Any], Any], data: tuple[Any, ...]) -> Any:

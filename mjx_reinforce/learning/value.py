@@ -187,7 +187,7 @@ def full_batch_value_baseline(
         data = (trajectory.observation, returns, mask)
 
         def fit(critic, _):
-            grads, _ = accumulate_gradient(squared_error, critic.params, data)
+            _, grads, _ = accumulate_gradient(squared_error, critic.params, data)
             grads = jax.tree.map(lambda g: g / steps, grads)
             changes, opt_state = fitter.update(grads, critic.opt_state, critic.params)
             return FullBatchCritic(optax.apply_updates(critic.params, changes), opt_state), None

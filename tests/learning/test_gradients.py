@@ -11,7 +11,7 @@ from mjx_reinforce.learning.updates import accumulate_gradient
 def loss(params, chunk):
     x, factor, mask = chunk
     total = jnp.sum(jnp.where(mask, jnp.tanh(params["w"] * factor[..., 0] * x), 0.0))
-    return total, {"total": total, "steps": jnp.sum(mask), "x": jnp.sum(jnp.where(mask, x, 0.0))}
+    return total, {"steps": jnp.sum(mask), "x": jnp.sum(jnp.where(mask, x, 0.0))}
 
 
 PARAMS = {"w": jnp.array(0.7)}
@@ -26,9 +26,9 @@ def test_the_sum_is_over_every_step_and_chunks_after_the_end_are_skipped(longest
     unvisited = np.arange(256) >= (0 if longest == 0 else 128 if longest <= 128 else 256)
     poisoned = np.where(unvisited[:, None], np.nan, x)
     data = tuple(map(jnp.asarray, (poisoned, np.ones((256, 2, 1)), mask)))
-    grads, sums = accumulate_gradient(loss, PARAMS, data)
+    total, grads, sums = accumulate_gradient(loss, PARAMS, data)
     slope = np.sum((x / np.cosh(0.7 * x) ** 2)[mask])
-    assert float(sums["total"]) == pytest.approx(np.sum(np.tanh(0.7 * x)[mask]), rel=1e-5, abs=1e-6)
+    assert float(total) == pytest.approx(np.sum(np.tanh(0.7 * x)[mask]), rel=1e-5, abs=1e-6)
     assert float(grads["w"]) == pytest.approx(slope, rel=1e-5, abs=1e-6)
     assert int(sums["steps"]) == lengths.sum()
     assert float(sums["x"]) == pytest.approx(np.sum(x[mask]), rel=1e-5, abs=1e-5)
@@ -36,7 +36,7 @@ def test_the_sum_is_over_every_step_and_chunks_after_the_end_are_skipped(longest
 
 def test_integers_are_summed_as_integers():
     data = jnp.ones((4, 2)), jnp.ones((4, 2, 1)), jnp.ones((4, 2), bool)
-    _, sums = accumulate_gradient(loss, PARAMS, data)
+    _, _, sums = accumulate_gradient(loss, PARAMS, data)
     assert jnp.issubdtype(sums["steps"].dtype, jnp.integer)
 
 
