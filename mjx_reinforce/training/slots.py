@@ -253,13 +253,14 @@ class Slots:
         budget = self._division.put(self.budget, NONE)
 
         def move(runs: np.ndarray) -> Any:
-            blocks = []
             slot, which = self._division.put((self._rows[runs], runs >= 0))
-            for looks in (look, *[True] * (count - 1)):  # the host does not wait for any
-                seen = programs.evaluate(slot, which) if looks and not self._rides else {}
-                looks_now = self._division.put(np.bool_(looks), NONE)
-                slot, metrics, looked = programs.advance(slot, budget, which, looks_now)
-                blocks.append((metrics, seen or (looked if looks else {})))
+            blocks, looks = [], look
+            for _ in range(count):  # the host does not wait for any
+                alone = programs.evaluate(slot, which) if looks and not self._rides else {}
+                asked = self._division.put(np.bool_(looks), NONE)
+                slot, metrics, riding = programs.advance(slot, budget, which, asked)
+                blocks.append((metrics, alone | (riding if looks else {})))
+                looks = True
             return jax.device_get((slot, blocks))
 
         rows, blocks = zip(*_side_by_side(move, lanes), strict=True)
@@ -309,7 +310,7 @@ def _side_by_side(move: Callable[[np.ndarray], Any], lanes: np.ndarray) -> list[
     """Returns the results for all slots [slots, width], as many at once as there are cores.
 
     A slot alone leaves a part of the cores waiting for each other, and its results are fetched
-    without a thread.
+    while the next one is moved.
     """
     return [move(lanes[0])] if len(lanes) == 1 else list(_threads().map(move, lanes))
 

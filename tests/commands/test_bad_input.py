@@ -181,7 +181,8 @@ SURVIVE, POLE = "class Mine(Survive):\n    ", "class Mine(Pole):\n    "
 INIT, STEP = SURVIVE + "def __init__(self{}): {}", SURVIVE + "def step(self, state, action): {}"
 RESET = SURVIVE + "def reset(self, rng): return {}"
 OUTCOME = POLE + "def outcome(self, before, data, action): return {}"
-#: What a module has that is wrong, and what must be said. The rest is in test_contract.py.
+#: What a module has that is wrong, and what must be said; test_contract.py and test_envs.py have
+#: the rest.
 WRONG_MODULES = [
     ("raise RuntimeError('the robot\\n\\nis off')", "RuntimeError: the robot is off"),
     ("class Broken(:", "SyntaxError"),
@@ -198,7 +199,6 @@ WRONG_MODULES = [
     (SURVIVE + "reward_threshold = property(lambda self: {}[0])", "Mine.reward_threshold fails:"),
     (SURVIVE + "action_space = property(lambda self: {}[0])", "Mine.action_space fails: KeyError"),
     (SURVIVE + "max_episode_steps = None", "declares no max_episode_steps: give a horizon"),
-    (SURVIVE + "def observe(self, key): return {}", "whose obs is a vector [O], and it is a dict"),
     (RESET.format("super().reset(rng).replace(reward=None)"), "a scalar [], and there is no rew"),
     (STEP.format("return state.replace(reward=reward)"), "Mine.step fails: NameError: name 'rew"),
     (STEP.format("raise SystemExit(3)"), "Mine.step fails: SystemExit: 3"),
@@ -207,9 +207,7 @@ WRONG_MODULES = [
         "jnp for numpy, math and float()",
     ),
     (STEP.format("return state.obs, 0.0, False, {}"), "with the entries that reset's has"),
-    (OUTCOME.format("data.qpos[0], False"), "Mine.outcome must return three values"),
     (OUTCOME.format("data.qposition[0], False, {}"), "mjx.Data has no field 'qposition'"),
-    (POLE + "def initial(self, rng): return jnp.zeros(2)", "must return qpos and qvel, got the"),
     ("class Mine(MujocoEnv):\n    initial = outcome = None", "needs max_episode_steps, reward_th"),
     (POLE + "def __init__(self): super().__init__(xml_file='./no.xml')", "no model './no.xml'"),
 ]
