@@ -149,7 +149,7 @@ def started(task: Callable[[], Any]) -> Future:
 class Measured(NamedTuple):
     """What an evaluation of runs measured, and the updates that followed it.
 
-    runs: [n] their numbers
+    runs: [n] their numbers, the least first
     metrics: [K, n] each, what ``block_of_updates`` measured in at most K updates; empty without any
     looked: [n] each, what ``block.evaluate`` returns of the policies before; empty without any
     """
@@ -322,13 +322,14 @@ def _threads() -> ThreadPoolExecutor:
 
 
 def _of_slots(lanes: np.ndarray, slots: Sequence[tuple[Arrays, Arrays]]) -> Measured:
-    """Returns a block from the metrics and the evaluations of its slots."""
+    """Returns a block, its runs in order, from the metrics and the evaluations of its slots."""
     runs = lanes.reshape(-1)
+    order = np.argsort(runs, kind="stable")[np.sum(runs < 0) :]
     metrics, looked = (
-        {name: np.concatenate([x[name] for x in each], axis=-1)[..., runs >= 0] for name in each[0]}
+        {name: np.concatenate([x[name] for x in each], axis=-1)[..., order] for name in each[0]}
         for each in zip(*slots, strict=True)
     )
-    return Measured(runs[runs >= 0], metrics, looked)
+    return Measured(runs[order], metrics, looked)
 
 
 def compile_slots(

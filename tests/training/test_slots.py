@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mjx_reinforce.training.slots import StateRows, Stopwatch, pack_slots, started
+from mjx_reinforce.training.slots import StateRows, Stopwatch, _of_slots, pack_slots, started
 
 
 @pytest.mark.parametrize("num_devices", [1, 2, 8])
@@ -30,6 +30,16 @@ def test_runs_of_equal_lengths_stay_in_order():
     """So that a resumed run packs as it would have."""
     lanes = pack_slots(np.ones(40, bool), np.full(40, 3), [16], 1)
     assert lanes[lanes >= 0].tolist() == list(range(40))
+
+
+def test_what_is_measured_is_in_the_order_of_the_runs():
+    """On several devices the lanes are dealt; a run's files have its seeds in order."""
+    lanes = pack_slots(np.ones(7, bool), np.zeros(7), [4], 2)
+    assert lanes.tolist() == [[0, 2, 1, 3], [4, 6, 5, -1]]
+    slots = [({"steps": np.stack([each, -each])}, {"return": each}) for each in lanes]
+    runs, metrics, looked = _of_slots(lanes, slots)
+    assert runs.tolist() == looked["return"].tolist() == list(range(7))
+    assert metrics["steps"].tolist() == [[*range(7)], [*range(0, -7, -1)]]
 
 
 def test_no_bit_of_a_state_changes_on_its_way():
