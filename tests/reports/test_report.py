@@ -5,6 +5,7 @@ import json
 import math
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -364,6 +365,10 @@ def test_the_worst_are_a_quarter_at_most(tmp_path, seeds, worst):
     assert best.scores[places].max() <= np.delete(best.scores, places).min(initial=np.inf)
 
 
+def _script(name):
+    return (Path(__file__).parent / f"{name}.js").read_text("utf-8")
+
+
 #: Charts whose legend, words or axes lie outside their picture, where print cuts them.
 OVERFLOW = """[...document.querySelectorAll('.chart')].filter((chart) => {
   const box = (name) => chart.querySelector(name).getBoundingClientRect();
@@ -381,20 +386,7 @@ def test_charts_are_whole_at_any_width_and_on_paper(tmp_path):
     )
     page = directory / "report.html"
     report.write_report([directory], page)
-    script = """const found = [];
-      const drawn = () => document.querySelector('#chart-curves svg').getAttribute('width');
-      for (const width of [1280, 700, 390]) {
-        await resize(width);
-        found.push(OVERFLOW);
-        dispatchEvent(new Event('beforeprint'));
-        await until(() => drawn() === '780');
-        found.push(OVERFLOW);
-        dispatchEvent(new Event('afterprint'));
-        const whole = String(document.querySelector('figure').clientWidth);
-        await until(() => drawn() === whole);
-      }
-      return found"""
-    assert in_browser(page, script.replace("OVERFLOW", OVERFLOW)) == [[]] * 6
+    assert in_browser(page, _script("printed").replace("OVERFLOW", OVERFLOW)) == [[]] * 6
 
 
 #: Cells of table 1 whose words are not seen.
@@ -453,34 +445,6 @@ def test_tables_of_a_figure_are_no_formulas_either(tmp_path):
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no Chromium here")
 def test_in_a_browser(written):
     """The slider moves the histograms, a curve says what it is, and choices show what is chosen."""
-    script = """const at = (id) => document.getElementById(id);
-      const rows = () =>
-        document.querySelectorAll('#chart-distribution .mark-text.role-mark text').length;
-      const charts = document.querySelectorAll('.chart svg').length;
-      const before = at('chart-distribution').textContent;
-      at('moment').value = 0;
-      at('moment').dispatchEvent(new Event('input', {bubbles: true}));
-      await until(() => at('moment-said').textContent.startsWith('0 env'));
-      await until(() => at('chart-distribution').textContent !== before);
-      const shown = rows(), svg = document.querySelector('#chart-curves svg');
-      svg.scrollIntoView({block: 'center', behavior: 'instant'});
-      const box = svg.getBoundingClientRect();
-      const [x, y] = [box.x + box.width / 2, box.y + box.height / 2];
-      await until(() => {
-        for (const type of ['pointerover', 'pointermove', 'mouseover', 'mousemove'])
-          document.elementFromPoint(x, y).dispatchEvent(
-            new PointerEvent(type, {bubbles: true, clientX: x, clientY: y}));
-        return document.querySelector('#vg-tooltip-element.visible');
-      });
-      const told = at('vg-tooltip-element').innerText;
-      document.querySelector('[data-choose="1"]').click();
-      await until(() => rows() === 1);
-      at('log-x').click();
-      at('log-y').click();
-      document.querySelector('details.data summary').click();
-      await until(() => document.querySelectorAll('details.data[open] tbody tr').length > 20);
-      await resize(390);
-      return [charts, shown, told, document.documentElement.scrollWidth]"""
-    charts, shown, told, width = in_browser(written[1], script)
+    charts, shown, told, width = in_browser(written[1], _script("used"))
     assert (charts, shown, width) == (7, 4, 390)
     assert any(label in told for label in content(written[1])["labels"])

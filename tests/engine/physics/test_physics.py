@@ -2,6 +2,7 @@
 
 import os
 import types
+from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
@@ -24,24 +25,7 @@ ASSETS = os.path.join(os.path.dirname(gymnasium.__file__), "envs", "mujoco", "as
 # time without optimisations, and then associates sums as they are written.
 UNOPTIMIZED = {"xla_backend_optimization_level": 0}
 
-CHAIN = """
-<mujoco>
-  <option timestep="0.01"/>
-  <default>
-    <joint axis="0 1 0" range="-0.5 0.5" limited="true"/>
-    <geom contype="0" conaffinity="0"/>
-  </default>
-  <worldbody>
-    <body><joint/><geom type="sphere" size="0.1" pos="0.3 0 0"/>
-      <body pos="0.5 0 0"><joint/><geom type="sphere" size="0.1" pos="0.3 0 0"/>
-        <body pos="0.5 0 0"><joint/><geom type="sphere" size="0.1" pos="0.3 0 0"/>
-        </body>
-      </body>
-    </body>
-  </worldbody>
-  <compiler angle="radian"/>
-</mujoco>
-"""
+CHAIN = (Path(__file__).parent / "chain.xml").read_text("utf-8")
 
 
 def load(name, **options):
@@ -209,22 +193,7 @@ def test_other_implementations_are_refused():
 
 # ------------------------------------------------------------------ equal to C MuJoCo, not to MJX
 
-TUMBLERS = """
-<mujoco>
-  <option integrator="RK4" timestep="0.02"/>
-  <default><geom type="box" contype="0" conaffinity="0"/></default>
-  <worldbody>
-    <body>
-      <freejoint/>
-      <geom size="0.1 0.2 0.3"/>
-      <body pos="0.1 0 0.3">
-        <joint type="ball"/>
-        <geom size="0.3 0.05 0.1" pos="0.2 0 0"/>
-      </body>
-    </body>
-  </worldbody>
-</mujoco>
-"""
+TUMBLERS = (Path(__file__).parent / "tumblers.xml").read_text("utf-8")
 
 
 def compiled(xml):

@@ -1,0 +1,14 @@
+// What overflows on screens of three widths, and when the page is printed.
+const found = [];
+const drawn = () => document.querySelector('#chart-curves svg').getAttribute('width');
+for (const width of [1280, 700, 390]) {
+  await resize(width);
+  found.push(OVERFLOW);
+  dispatchEvent(new Event('beforeprint'));
+  await until(() => drawn() === '780');
+  found.push(OVERFLOW);
+  dispatchEvent(new Event('afterprint'));
+  const whole = String(document.querySelector('figure').clientWidth);
+  await until(() => drawn() === whole);
+}
+return found
