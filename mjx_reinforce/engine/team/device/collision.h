@@ -1,0 +1,110 @@
+// From geoms to contacts (MuJoCo's mj_collision): pairs that are near are queued, and each W of
+// them are looked at closely.
+#pragma once
+
+// The contact of an item, if its distance is below the margin.
+DEV Touch touch_of(const Model& M, const State& s, int item, real margin) {
+  const int a = M.item[item] & 0xfff, b = M.item[item] >> 12 & 0xfff, part = M.item[item] >> 24 & 7;
+  Touch c;
+  for (int k = 0; k < 3; k++) c.tangent[k] = 0;
+  const int below = M.geom_kind[a], above = M.geom_kind[b];
+  if (HAS_BOX && above == BOX) {
+    if (below == PLANE) {
+      touch_box_on_plane(M, s, a, b, part, margin, c);
+    } else {
+      touch_round_and_box(M, s, a, b, part, c);
+    }
+  } else if (below == PLANE) {
+    const Quad q = s.geom_place[b], axis = s.geom_axis[b];
+    const real half = M.geom_half[b], along = part ? -half : half;
+    real end[3];
+    for (int k = 0; k < 3; k++) {
+      end[k] = q.x[k] + along * axis.x[k];
+      c.tangent[k] = half > 0 ? axis.x[k] : real(0);
+    }
+    touch_plane(c, s.geom_place[a], s.geom_axis[a], end, M.geom_radius[b]);
+  } else {
+    touch_rounds(M, s, a, b, c);
+  }
+  return c;
+}
+
+// The axes of a contact as mju_makeFrame has them.
+DEV void make_frame(real* frame, const Touch& c) {
+  real along[3] = {c.tangent[0], c.tangent[1], c.tangent[2]};
+  if (dot(along, along) < real(.25)) {
+    const bool y = fabs(c.normal[1]) < real(.5);
+    along[0] = 0; along[1] = y; along[2] = !y;
+  }
+  const real across = dot(c.normal, along);
+  for (int k = 0; k < 3; k++) along[k] -= across * c.normal[k];
+  const real scale = inverse_root(dot(along, along));
+  for (int k = 0; k < 3; k++) {
+    frame[k] = c.normal[k];
+    frame[3 + k] = scale * along[k];
+  }
+  cross(frame + 6, frame, frame + 3);
+}
+
+// A contact, what its rows want included (mj_instantiateContact, mj_referenceConstraint).
+DEV Contact contact_of(const Model& M, const State& s, int item, const Touch& touch) {
+  Contact c;
+  make_frame(c.frame, touch);
+  for (int k = 0; k < 3; k++) c.at[k] = touch.at[k] - s.pose[0].origin(k);
+  const int kind = M.item_kind[item];
+  const real distance = touch.distance - M.kind_margin[kind];
+  const real *soft = M.soft + 7 * M.kind_soft[kind], strength = impedance(soft, distance);
+  c.item = item;
+  c.mass = row_mass(strength, M.item_weight[item]);
+  real speed[CD];
+  relative(M, s.velocity, c, speed);
+  relative(M, s.motion, c, c.gap);
+  for (int k = 0; k < CD; k++) c.gap[k] += soft[1] * speed[k];
+  c.gap[0] += soft[0] * strength * distance;
+  return c;
+}
+
+DEV void collide(const Team& t, const Model& M, State& s) {
+  const int lane = t.lane;
+  int waiting = 0, made = 0;
+  LOOP for (int first = 0; first < NI; first += W) {
+    const int item = first + lane;
+    bool near = false;
+    if (item < NI) {
+      const int a = M.item[item] & 0xfff, b = M.item[item] >> 12 & 0xfff;
+      const Quad p = s.geom_place[a], q = s.geom_place[b];
+      const real d[3] = {q.x[0] - p.x[0], q.x[1] - p.x[1], q.x[2] - p.x[2]};
+      const real reach = p.x[3] + q.x[3] + M.kind_margin[M.item_kind[item]];
+      near = M.geom_kind[a] == PLANE ? dot(d, s.geom_axis[a].x) < reach : dot(d, d) < reach * reach;
+    }
+    const unsigned who = t.ballot(near);
+    if (near) s.queue[waiting + count(who & ((1u << lane) - 1))] = item;
+    waiting += count(who);
+    const bool last = first + W >= NI;
+    LOOP while (waiting >= W || (last && waiting > 0)) {
+      t.sync();
+      const bool asked = lane < waiting;
+      const int which = s.queue[lane];
+      bool touches = false;
+      Touch touch;
+      if (asked) {
+        const real margin = M.kind_margin[M.item_kind[which]];
+        touch = touch_of(M, s, which, margin);
+        touches = touch.distance < margin;
+      }
+      const unsigned which_touch = t.ballot(touches);
+      if (touches) {
+        const int at = made + count(which_touch & ((1u << lane) - 1));
+        (!FAR || at < NEAR ? s.contacts[at] : s.far[at - NEAR]) = contact_of(M, s, which, touch);
+      }
+      made += count(which_touch);
+      const int next = s.queue[W + lane];
+      t.sync();
+      waiting -= W;
+      if (lane < waiting) s.queue[lane] = next;
+    }
+    if (waiting < 0) waiting = 0;
+  }
+  if (lane == 0) s.num_contacts = made;
+  t.sync();
+}

@@ -1,0 +1,89 @@
+// Rows of contacts: the edges of friction pyramids, in the basis of normal and tangents.
+#pragma once
+
+// How the second body of a contact moves at the contact, as the first one sees it, in the contact's
+// frame (mj_jacDifPair times a velocity). of: spatial velocities of links.
+DEV void relative(const Model& M, const real (*of)[6], const Contact& c, real* out) {
+  const int item = M.item[c.item];
+  const real *first = of[M.geom_link[item & 0xfff]], *second = of[M.geom_link[item >> 12 & 0xfff]];
+  real v[6], point[3];
+  for (int k = 0; k < 6; k++) v[k] = second[k] - first[k];
+  cross(point, v, c.at);
+  for (int k = 0; k < 3; k++) point[k] += v[3 + k];
+  for (int k = 0; k < CD; k++) out[k] = dot(c.frame + 3 * (k % 3), k < 3 ? point : v);
+}
+// The entries of the basis of a contact that degree of freedom i has.
+DEV void basis(const Model& M, const State& s, const Contact& c, int i, real* out) {
+  const int item = M.item[c.item];
+  const Mask first = M.link_dofs[M.geom_link[item & 0xfff]];
+  const Mask second = M.link_dofs[M.geom_link[item >> 12 & 0xfff]];
+  const real sign = real(int(second >> i & 1) - int(first >> i & 1));
+  const Quad a = s.cdof[i][0], b = s.cdof[i][1];
+  real point[3];
+  cross(point, a.x, c.at);
+  point[0] = sign * (point[0] + a.x[3]);
+  point[1] = sign * (point[1] + b.x[0]);
+  point[2] = sign * (point[2] + b.x[1]);
+  for (int k = 0; k < CD; k++)
+    out[k] = k < 3 ? dot(c.frame + 3 * k, point) : sign * dot(c.frame + 3 * (k - 3), a.x);
+}
+
+// Calls do_edge(friction, k, sign) for the edges of a contact's pyramid; k is 0 for its only row.
+template <class F> DEV void each_edge(const Model& M, const Contact& c, F do_edge) {
+  const int kind = M.item_kind[c.item], dim = M.kind_dim[kind];
+  if (dim == 1) do_edge(real(0), 0, real(1));
+  UNROLL for (int k = 1; k < CD; k++) {
+    if (k < dim) {
+      const real friction = M.kind_friction[5 * kind + k - 1];
+      do_edge(friction, k, real(1));
+      do_edge(-friction, k, real(-1));
+    }
+  }
+}
+// Finds the forces and the stiffness of the edges that push (mj_constraintUpdate).
+DEV void push(const Model& M, Contact& c) {
+  for (int k = 0; k < CD; k++) c.force[k] = 0;
+  for (int k = 0; k < 2 * CD - 1; k++) c.stiffness[k] = 0;
+  each_edge(M, c, [&](real friction, int k, real) {
+    const real gap = c.gap[0] + friction * c.gap[k], mass = gap < 0 ? c.mass : real(0);
+    const real force = -mass * gap;
+    c.force[0] += force;
+    c.stiffness[0] += mass;
+    if (k > 0) {
+      c.force[k] += friction * force;
+      c.stiffness[k] += friction * mass;
+      c.stiffness[CD - 1 + k] += friction * friction * mass;
+    }
+  });
+}
+
+// What a contact's edges add to the derivative of the cost at a length along the step (PrimalEval).
+DEV void bend(const Model& M, const Contact& c, real length, Bend& sum) {
+  each_edge(M, c, [&](real friction, int k, real) {
+    const real gap = c.gap[0] + (k ? friction * c.gap[k] : real(0));
+    const real change = c.change[0] + (k ? friction * c.change[k] : real(0));
+    sum.add(c.mass, gap, change, length);
+  });
+}
+
+// Each contact once, by the lane whose it is.
+template <class F> DEV void each_contact(const Team& t, State& s, F act) {
+  const int lane = t.lane, made = s.num_contacts;
+  EACH(c, made) act(!FAR || c < NEAR ? s.contacts[c] : s.far[c - NEAR]);
+}
+// All contacts, by all lanes together.
+template <class F> DEV void all_contacts(const Team& t, State& s, F act) {
+  const int made = s.num_contacts;
+  LOOP for (int c = 0; c < made; c++) {
+    const Contact* one = s.contacts + c;
+    if (FAR && c >= NEAR) {
+      t.sync();
+      char* to = reinterpret_cast<char*>(&s.guest);
+      const char* from = reinterpret_cast<const char*>(s.far + (c - NEAR));
+      for (int k = 4 * t.lane; k < int(sizeof(Contact)); k += 4 * W) memcpy(to + k, from + k, 4);
+      t.sync();
+      one = &s.guest;
+    }
+    act(*one);
+  }
+}

@@ -1,0 +1,63 @@
+// The Newton step: a symmetric system of equations, a row a lane.
+#pragma once
+
+// Solves H p = right (MuJoCo factors H, mju_cholFactor) by elimination of two columns at a time,
+// for the rows h and, as one row more, the right side. Leaves p in p and in s.step.
+DEV void solve(const Team& t, State& s, real (&h)[ROWS_A_LANE][SIDE], real (&p)[ROWS_A_LANE]) {
+  real* flat = &s.rows[0][0].x[0];
+  UNROLL for (int m = 0; m < SIDE; m += 2) {
+    real *first = &s.columns[m / 2 % 2][0][0].x[0], *second = &s.columns[m / 2 % 2][1][0].x[0];
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      const int i = t.lane + r * W;
+      if (i <= SIDE) {
+        first[i] = h[r][m];
+        second[i] = h[r][m + 1];
+      }
+    }
+    t.sync();
+    const real corner = first[m + 1], inverse = 1 / first[m], ratio = corner * inverse;
+    const real last = 1 / (second[m + 1] - ratio * corner);
+    real u[ROWS_A_LANE], w[ROWS_A_LANE];
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      const int i = t.lane + r * W;
+      w[r] = (h[r][m + 1] - ratio * h[r][m]) * last;
+      u[r] = h[r][m] * inverse - ratio * w[r];
+      if (i > m + 1 && i <= SIDE) {
+        flat[m * STRIDE + i] = u[r];
+        flat[(m + 1) * STRIDE + i] = w[r];
+      }
+    }
+    UNROLL for (int q = (m + 2) / 4; q < (SIDE + 3) / 4; q++) {
+      const Quad a = s.columns[m / 2 % 2][0][q], b = s.columns[m / 2 % 2][1][q];
+      UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+        for (int k = 0; k < 4; k++) {
+          const int j = 4 * q + k;
+          if (j >= m + 2 && j < SIDE) h[r][j] = h[r][j] - u[r] * a.x[k] - w[r] * b.x[k];
+        }
+    }
+  }
+  t.sync();
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+    const int i = t.lane + r * W;
+    p[r] = i < SIDE ? flat[i * STRIDE + SIDE] : real(0);
+  }
+  UNROLL for (int q = (SIDE - 1) / 4; q >= 0; q--) {
+    Quad row[ROWS_A_LANE];
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      const int i = t.lane + r * W;
+      row[r] = s.rows[i < SIDE ? i : 0][q];
+    }
+    UNROLL for (int k = 2; k >= 0; k -= 2) {
+      const int m = 4 * q + k;
+      if (m == 0 || m >= SIDE) continue;
+      const real a = t.from(p[m / W], m % W), b = t.from(p[(m + 1) / W], (m + 1) % W);
+      UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+        if (t.lane + r * W < m) p[r] = p[r] - row[r].x[k] * a - row[r].x[k + 1] * b;
+    }
+  }
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+    const int i = t.lane + r * W;
+    if (i < SIDE) s.step[i / 4].x[i % 4] = p[r];
+  }
+  t.sync();
+}

@@ -1,0 +1,61 @@
+// Where a team is, and what it shares with others: on a GPU, or as the only one in a program for a
+// CPU.
+#pragma once
+typedef unsigned Word;
+typedef decltype(sizeof(0)) size_t;
+static_assert(FAR * sizeof(Contact) <= sizeof(real) * (FAR_WORDS), "no room for far contacts");
+
+#ifdef __CUDACC__
+#define KERNEL __global__ void __launch_bounds__(WARPS * 32, 1)
+constexpr int WHOLE = 32 / W;
+constexpr int FITTING = int((SHARED - sizeof(Model) - 16) / sizeof(State)) / WHOLE * WHOLE;
+constexpr int TEAMS = FITTING < WARPS * WHOLE ? FITTING : WARPS * WHOLE;
+static_assert(TEAMS > 0, "the state of a team does not fit into shared memory");
+__device__ const Model MODEL MODEL_INIT;
+struct Shared { Model m; State s[TEAMS]; };
+extern __shared__ __align__(16) char shared_bytes[];
+
+struct Player : Team {
+  DEV int next(int* counter) const {
+    int k = 0;
+    if (lane == 0) k = atomicAdd(counter, 1);
+    return __shfl_sync(mask, k, 0, W);
+  }
+  DEV bool some(bool flag) const { return __any_sync(0xffffffffu, flag); }  // of the warp
+  DEV void add(int* sum, int x) const { atomicAdd(sum, x); }
+  // The items of a function that is mapped.
+  DEV int stride() const { return gridDim.x * min(TEAMS, int(blockDim.x) / W); }
+  DEV int first() const { return threadIdx.x / W * gridDim.x + blockIdx.x; }
+};
+#define OWN_PLACE                                                                           \
+  Shared& shared = *reinterpret_cast<Shared*>(shared_bytes);                                 \
+  for (int i = threadIdx.x; i < int(sizeof(Model) / 4); i += blockDim.x)                     \
+    reinterpret_cast<int*>(&shared.m)[i] = reinterpret_cast<const int*>(&MODEL)[i];          \
+  __syncthreads();                                                                          \
+  const int team = threadIdx.x / W;                                                         \
+  if (team >= TEAMS) return;                                                                \
+  const Model& M = shared.m;                                                                \
+  State& s = shared.s[team];                                                                \
+  const Player t;                                                                           \
+  const int lane = t.lane;                                                                  \
+  scratch += size_t(blockIdx.x * (blockDim.x / W) + team) * (THREAD_WORDS * W);               \
+  s.far = reinterpret_cast<Contact*>(scratch);                                              \
+  scratch += FAR_WORDS;
+#else
+#define KERNEL void
+static const Model MODEL MODEL_INIT;
+struct Player : Team {
+  int next(int* counter) const { return (*counter)++; }
+  bool some(bool flag) const { return flag; }
+  void add(int* sum, int x) const { *sum += x; }
+  int stride() const { return 1; }
+  int first() const { return 0; }
+};
+#define OWN_PLACE               \
+  const Model& M = MODEL;       \
+  static State s;               \
+  static Contact far[FAR + 1];  \
+  s.far = far;                  \
+  const Player t;               \
+  const int lane = 0;
+#endif

@@ -1,0 +1,248 @@
+// The acceleration under constraints: Newton's method with an exact line search, to the optimum.
+#pragma once
+
+constexpr int MOST_STEPS = SINGLE ? 20 : 100, MOST_LOOKS = 40;
+// A line search ends where the slope is so small a part of that at its start. Less gives the same
+// optimum: the last step is always a whole one that changes no row.
+constexpr real LINE_TOLERANCE = real(.1);
+
+// A lane has the rows lane, lane + W, ... of the degrees of freedom.
+struct Search {
+  real x[ROWS_A_LANE];         // the acceleration
+  real pull[ROWS_A_LANE];      // M x - qfrc_smooth
+  real diagonal[ROWS_A_LANE];  // of M
+  real gradient[ROWS_A_LANE];  // of the cost at x
+  real step[ROWS_A_LANE];
+  Bounds bounds[ROWS_A_LANE];
+
+  DEV Search(const Team& t, const Model& M, const State& s) {
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      const int i = t.lane + r * W;
+      x[r] = pull[r] = diagonal[r] = 0;
+      bounds[r] = Bounds();
+      if (i < NV) {
+        x[r] = s.qacc_warmstart[i];
+        pull[r] = s.pull[i];
+        diagonal[r] = s.rows[i][i / 4].x[i % 4];
+        bounds[r].make(M, s, i);
+      }
+    }
+  }
+};
+
+// Writes the diagonal of H and begins the gradient: all but contacts and general rows. Where
+// damping is implicit and the acceleration has been found, H is M plus the damping, and no row is
+// left.
+DEV void begin_step(const Team& t, const Model& M, State& s, Search& own, bool damps) {
+  real* flat = &s.rows[0][0].x[0];
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+    const int i = t.lane + r * W;
+    real stiffness = 0;
+    own.gradient[r] = own.pull[r];
+    if (damps) {
+      stiffness = i < NV ? M.timestep * s.drag[i] : real(0);
+      own.gradient[r] = stiffness * own.x[r];
+    } else {
+      own.bounds[r].push(own.x[r], own.gradient[r], stiffness);
+    }
+    if (i < NV) flat[i * (STRIDE + 1)] = own.diagonal[r] + stiffness;
+  }
+}
+DEV void load_rows(const Team& t, const State& s, real (&h)[ROWS_A_LANE][SIDE]) {
+  UNROLL for (int q = 0; q < SIDE; q += 4)
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      const int i = t.lane + r * W;
+      const Quad row = s.rows[i < SIDE ? i : 0][q / 4];
+      for (int j = 0; j < 4; j++)
+        if (q + j < SIDE) h[r][q + j] = row.x[j];
+    }
+}
+
+// Adds what contacts and general rows push to the rows of H, and subtracts their forces from the
+// gradient.
+DEV void add_rows(const Team& t, const Model& M, State& s, real (&h)[ROWS_A_LANE][SIDE],
+                  real (&gradient)[ROWS_A_LANE]) {
+  int turn = 0;
+  all_contacts(t, s, [&](const Contact& c) {
+    if (c.stiffness[0] == 0) return;
+    Quad(*const rows)[QUADS] = s.columns[turn];
+    turn ^= 1;
+    real own[ROWS_A_LANE][CD];
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      const int i = t.lane + r * W;
+      for (int k = 0; k < CD; k++) own[r][k] = 0;
+      if (i < NV) {
+        basis(M, s, c, i, own[r]);
+        for (int k = 0; k < CD; k++) {
+          rows[k][i / 4].x[i % 4] = own[r][k];
+          gradient[r] -= own[r][k] * c.force[k];
+        }
+      } else if (i < SIDE) {
+        for (int k = 0; k < CD; k++) rows[k][i / 4].x[i % 4] = 0;
+      }
+    }
+    const int dim = M.kind_dim[M.item_kind[c.item]];
+    t.sync();
+    real weight[ROWS_A_LANE][CD];
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      weight[r][0] = c.stiffness[0] * own[r][0];
+      for (int k = 1; k < CD; k++) {
+        weight[r][0] += c.stiffness[k] * own[r][k];
+        weight[r][k] = c.stiffness[k] * own[r][0] + c.stiffness[CD - 1 + k] * own[r][k];
+      }
+    }
+    UNROLL for (int k = 0; k < CD; k++) {
+      if (k >= dim) break;
+      UNROLL for (int q = 0; q < SIDE; q += 4) {
+        const Quad row = rows[k][q / 4];
+        UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+          for (int j = 0; j < 4; j++)
+            if (q + j < SIDE) h[r][q + j] += weight[r][k] * row.x[j];
+      }
+    }
+  });
+  LOOP for (int e = 0; e < NE; e++) {
+    const real mass = s.general_mass[e], force = -mass * s.general_gap[e];
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      const int i = t.lane + r * W;
+      const real own = i < SIDE ? s.general[e][i / 4].x[i % 4] : real(0);
+      gradient[r] -= own * force;
+      UNROLL for (int j = 0; j < SIDE; j++) h[r][j] += mass * own * s.general[e][j / 4].x[j % 4];
+    }
+  }
+  t.sync();
+}
+
+// Minus the gradient is the row below H, for the elimination.
+DEV void load_right_side(const Team& t, State& s, const Search& own,
+                         real (&h)[ROWS_A_LANE][SIDE]) {
+  real* step = &s.step[0].x[0];
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+    const int i = t.lane + r * W;
+    if (i < SIDE) step[i] = i < NV ? -own.gradient[r] : real(0);
+  }
+  t.sync();
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+    if (t.lane + r * W == SIDE)
+      UNROLL for (int j = 0; j < SIDE; j++) h[r][j] = step[j];
+}
+
+// How the rows change along s.step.
+DEV void change_along(const Team& t, const Model& M, State& s) {
+  const int lane = t.lane;
+  EACH(k, 6) along_tree(&s.cdof[0][0].x[0] + k, s.step, &s.motion[0][k], 6);
+  t.sync();
+  each_contact(t, s, [&](Contact& c) { relative(M, s.motion, c, c.change); });
+  EACH(e, NE) {
+    real sum = 0;
+    for (int q = 0; q < QUADS; q++)
+      for (int k = 0; k < 4; k++)
+        if (4 * q + k < SIDE) sum += s.general[e][q].x[k] * s.step[q].x[k];
+    s.general_change[e] = sum;
+  }
+}
+
+// What this lane's rows add to the derivative of the cost at a length along the step.
+DEV Bend bend_at(const Team& t, const Model& M, State& s, const Search& own, real length) {
+  Bend sum = {0, 0, false};
+  each_contact(t, s, [&](Contact& c) { bend(M, c, length, sum); });
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+    own.bounds[r].bend(own.x[r], own.step[r], length, sum);
+  return sum;
+}
+
+// How far to go along a step whose slope at the start is `along` (MuJoCo's PrimalSearch): Newton's
+// method in one dimension, or halves where that leaves the interval. With no change of rows the
+// slope is zero at length 1.
+DEV real line_search(const Team& t, const Model& M, State& s, const Search& own, Bend sum,
+                     real along) {
+  real length = 1, low = 0, high = real(1e30);
+  LOOP for (int look = 0; look < MOST_LOOKS; look++) {
+    const real slope = (1 - length) * along + t.sum(sum.slope);
+    if (fabs(slope) <= -LINE_TOLERANCE * along) break;
+    const real curvature = t.sum(sum.curvature) - along;
+    if (slope < 0) low = length; else high = length;
+    real next = length - slope / curvature;
+    if (!(next > low && next < high)) next = high < real(1e29) ? (low + high) / 2 : 2 * length;
+    length = next;
+    sum = bend_at(t, M, s, own, length);
+  }
+  return length;
+}
+
+// Adds M step to own.pull: H step is minus the gradient, so M step = -gradient - J' stiffness J
+// step.
+DEV void follow(const Team& t, const Model& M, State& s, Search& own, real length) {
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+    own.pull[r] -= length * (own.gradient[r] + own.bounds[r].stiffness(own.x[r]) * own.step[r]);
+  all_contacts(t, s, [&](const Contact& c) {
+    if (c.stiffness[0] == 0) return;
+    real force[CD];
+    force[0] = c.stiffness[0] * c.change[0];
+    for (int k = 1; k < CD; k++) {
+      force[0] += c.stiffness[k] * c.change[k];
+      force[k] = c.stiffness[k] * c.change[0] + c.stiffness[CD - 1 + k] * c.change[k];
+    }
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      const int i = t.lane + r * W;
+      real moves[CD];
+      if (i < NV) {
+        basis(M, s, c, i, moves);
+        for (int k = 0; k < CD; k++) own.pull[r] -= length * moves[k] * force[k];
+      }
+    }
+  });
+  t.sync();
+  for (int e = 0; e < NE; e++)
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) {
+      const int i = t.lane + r * W;
+      if (i < NV)
+        own.pull[r] -=
+            length * s.general_mass[e] * s.general_change[e] * s.general[e][i / 4].x[i % 4];
+    }
+}
+
+// Replaces s.qacc_warmstart by the acceleration (MuJoCo's mj_solNewton); if damping is implicit,
+// s.step becomes what that adds to it. Returns the number of steps.
+DEV int newton(const Team& t, const Model& M, State& s) {
+  const int lane = t.lane;
+  Search own(t, M, s);
+  bool settled = false;
+  int steps = 0;
+  LOOP for (;; steps++) {
+    const bool damps = IMPLICIT && settled;
+    real h[ROWS_A_LANE][SIDE];
+    begin_step(t, M, s, own, damps);
+    if (!damps) each_contact(t, s, [&](Contact& c) { push(M, c); });
+    t.sync();
+    load_rows(t, s, h);
+    if (!damps) add_rows(t, M, s, h, own.gradient);
+    load_right_side(t, s, own, h);
+    solve(t, s, h, own.step);
+    if (damps) break;
+    change_along(t, M, s);
+    real length = 1;
+    const Bend sum = bend_at(t, M, s, own, length);
+    settled = !t.any(sum.some) || steps >= MOST_STEPS;
+    if (!settled) {  // rows change: another step follows
+      t.sync();
+      real along = 0;
+      UNROLL for (int r = 0; r < ROWS_A_LANE; r++) along += own.gradient[r] * own.step[r];
+      along = t.sum(along);
+      length = line_search(t, M, s, own, sum, along);
+      settled = -along <= M.smallest_gain;
+      follow(t, M, s, own, length);
+    }
+    UNROLL for (int r = 0; r < ROWS_A_LANE; r++) own.x[r] += length * own.step[r];
+    each_contact(t, s, [&](Contact& c) {
+      for (int k = 0; k < CD; k++) c.gap[k] += length * c.change[k];
+    });
+    EACH(e, NE) s.general_gap[e] += length * s.general_change[e];
+    t.sync();
+    if (settled && !IMPLICIT) break;
+  }
+  UNROLL for (int r = 0; r < ROWS_A_LANE; r++)
+    if (lane + r * W < NV) s.qacc_warmstart[lane + r * W] = own.x[r];
+  t.sync();
+  return steps + 1;
+}

@@ -1,0 +1,71 @@
+// What a team has of its episode, in shared memory on a GPU. What is needed at different times of a
+// step shares its place.
+#pragma once
+
+DEV constexpr int padded(int n) { return n < 1 ? 4 : (n + 3) / 4 * 4; }
+// H has an even number of rows, a row of ones on the diagonal is added; the right side is one more.
+constexpr int SIDE = NV + NV % 2;
+constexpr int ROWS_A_LANE = (SIDE + W) / W;
+// Quads of a row: odd, so that lanes that read one row each meet no bank twice.
+constexpr int QUADS = ((SIDE + 4) / 4) | 1;
+constexpr int STRIDE = 4 * QUADS;
+// Contacts that the state has no room for.
+constexpr int FAR = NI > NEAR ? NI - NEAR : 0;
+
+// What a task may read after a step; the program that plays it says what it reads.
+enum Report { XPOS = 1, XIPOS = 2, CINERT = 4, CVEL = 8, CFRC_EXT = 16 };
+#ifndef REPORTS
+#define REPORTS (XPOS | XIPOS | CINERT | CVEL | CFRC_EXT)
+#endif
+DEV constexpr bool reports(int fields) { return (REPORTS) & fields; }
+// The numbers of all bodies, if one of the fields is reported.
+DEV constexpr int room(int fields, int numbers) { return reports(fields) ? numbers * NB : 1; }
+
+// A contact's rows are the edges n + mu t and n - mu t of a pyramid; here they are in the basis of
+// the normal, the tangents and, from condim 4 on, turning about these.
+struct Contact {
+  real at[3];               // from the point of reference (m)
+  real frame[9];            // normal, two tangents
+  real gap[CD];             // J x - reference
+  real change[CD];          // J step
+  real force[CD];           // of the edges that push
+  real stiffness[2 * CD - 1];  // of the same: normal, each tangent with the normal, with itself
+  real mass;                // MuJoCo's D
+  int item;
+};
+
+struct alignas(4 * sizeof(real)) State {
+  real qpos[padded(NQ)], qvel[padded(NV)], qacc_warmstart[padded(NV)];
+  real qfrc_actuator[padded(NV)], ctrl[padded(NU)], act[1], time[1];
+  Quad cdof[NV][2];
+  Pose pose[NL + 1];        // of links; the last is the world
+  Quad step[QUADS];
+  real velocity[NL + 1][6]; // of links, by qvel
+  real motion[NL + 1][6];   // of links, by an acceleration or by a step of it
+  real pull[NV];            // M x - qfrc_smooth
+  real drag[IMPLICIT ? NV : 1];  // what damps implicitly
+  real start_qpos[RK4 ? NQ : 1], start_qvel[RK4 ? NV : 1];
+  real sum_qvel[RK4 ? NV : 1], sum_qacc[RK4 ? NV : 1], turning[RK4 && NTURN ? 3 * NTURN : 1];
+  Quad general[NE ? NE : 1][NE ? QUADS : 1];  // J of rows of no contact and no single dof
+  real general_gap[NE ? NE : 1], general_change[NE ? NE : 1], general_mass[NE ? NE : 1];
+  union {
+    Quad rows[SIDE][QUADS];  // below the diagonal M, above it what eliminates
+    Quad subtree[NL][5];     // inertia [10], force [6]
+    struct {
+      real xpos[room(XPOS, 3)], xipos[room(XIPOS | CINERT | CVEL | CFRC_EXT, 3)];
+      real cinert[room(CINERT, 10)], cvel[room(CVEL, 6)], cfrc_ext[room(CFRC_EXT, 6)];
+    };
+  };
+  union {
+    Contact contacts[NEAR];
+    Quad terms[NV][2];
+  };
+  union {
+    Quad columns[2][CD < 2 ? 2 : CD][QUADS];
+    struct { Quad geom_place[NG]; Quad geom_axis[NG]; };
+  };
+  Contact guest;        // a far contact that is everybody's for a moment
+  Contact* far;         // [FAR], in memory that the launcher gives
+  int num_contacts;
+  int queue[2 * W];
+};
