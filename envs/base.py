@@ -13,13 +13,13 @@ from brax.envs.base import Env, State
 from flax import struct
 from mujoco import mjMAXVAL, mjx  # pyright: ignore[reportAttributeAccessIssue] (a C extension)
 
-from mjx_reinforce.engine.base import Box, MjModel
+from mjx_reinforce.engine.base import Box, MjModel, is_kept_whole, observation_size
 from mjx_reinforce.engine.checks import changed_fields, check_count, check_name, check_number
 from mjx_reinforce.engine.contract import check_shape
 from mjx_reinforce.engine.physics import mjx_internals
 from mjx_reinforce.engine.physics import step as physics
 from mjx_reinforce.engine.physics.mjx_internals import Simulation
-from mjx_reinforce.engine.scalar import prune
+from mjx_reinforce.engine.scalar import prune, whole
 from mjx_reinforce.envs import models
 from mjx_reinforce.envs.outcomes import check_episode, check_outcome, check_start
 from mjx_reinforce.envs.parts import Named, View
@@ -211,7 +211,8 @@ class MujocoEnv(Env):
         """
         check_shape("qpos", qpos, (self.mj_model.nq,))
         check_shape("qvel", qvel, (self.mj_model.nv,))
-        return self._start(qpos, qvel, episode or {})
+        start = self._forward_state if is_kept_whole() else self._start
+        return start(qpos, qvel, episode or {})
 
     def _step_of(self, model: mjx.Model, forward: Callable[..., Any]) -> Any:
         """Returns a physics step of a model, of which ``forward`` is the forward pass."""
@@ -234,8 +235,11 @@ class MujocoEnv(Env):
         """Returns the state at positions and velocities, from one forward pass."""
         start = models.make_data(self.mj_model).replace(qpos=qpos, qvel=qvel)
         # MJX normalises quaternions in qpos itself; MuJoCo does so when it steps.
-        forward, _ = self._physics_of(episode)
-        data = physics.like(forward(start).replace(qpos=qpos), start)
+        if self._stays_whole(episode):
+            data, _ = self._whole("start", start)
+        else:
+            forward, _ = self._physics_of(episode)
+            data = physics.like(forward(start).replace(qpos=qpos), start)
         state, view = self._physics(data, episode), View(data, self.mj_model, episode)
         zero = jnp.zeros((), qpos.dtype)
         action = jnp.zeros(self.action_size, qpos.dtype)
@@ -258,10 +262,14 @@ class MujocoEnv(Env):
             return data, sound & _is_sound(data)
 
         start = start.replace(ctrl=jnp.asarray(action, start.ctrl.dtype))
-        data, sound = jax.lax.fori_loop(0, self.frame_skip, advance, (start, jnp.array(True)))
-        if self.contact_forces:
-            model = self.model.replace(**models.replaced(before.episode))
-            data = mjx.rne_postconstraint(model, data)
+        if self._stays_whole(before.episode):
+            data, sound = self._whole("physics", start)
+        else:
+            start_of_loop = start, jnp.array(True)
+            data, sound = jax.lax.fori_loop(0, self.frame_skip, advance, start_of_loop)
+            if self.contact_forces:
+                model = self.model.replace(**models.replaced(before.episode))
+                data = mjx.rne_postconstraint(model, data)
         view = View(data, self.mj_model, before.episode)
         reward, terminated, terms = self._outcome(before, start, view, action)
         dtype = state.reward.dtype
@@ -273,6 +281,24 @@ class MujocoEnv(Env):
             done=jnp.asarray(terminated, dtype),
             metrics=state.metrics | jax.tree.map(lambda x: jnp.asarray(x, dtype), terms),
         )
+
+    def _stays_whole(self, episode: dict[str, jax.Array]) -> bool:
+        """Returns whether the physics is to stay one operation, which device code computes."""
+        return is_kept_whole() and self.settings.solver == "exact" and not models.replaced(episode)
+
+    def _whole(self, name: str, start: mjx.Data) -> tuple[mjx.Data, jax.Array]:
+        """Returns what an operation of the device code makes of a simulation; whether it is sound.
+
+        Args:
+          name: "physics", the steps of an env step, or "start", a forward pass.
+          start: the simulation before it.
+        """
+        paths, tree = jax.tree_util.tree_flatten_with_path(start)
+        results = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
+        sound = jax.ShapeDtypeStruct((), bool)
+        given = [getattr(start, name) for name in ("ctrl", *models.CARRIED)]
+        *leaves, is_sound = whole(name, results | {"sound": sound}, *given).values()
+        return tree.unflatten(leaves), is_sound
 
     def _outcome(self, state: Physics, start: mjx.Data, data: View, action: jax.Array) -> Any:
         """Returns what ``outcome`` returns, or raises ValueError where it is no outcome."""
@@ -299,7 +325,7 @@ class MujocoEnv(Env):
     @property
     def observation_size(self) -> int:
         """The number O of entries of an observation."""
-        return jax.eval_shape(self.reset, jax.random.key(0)).obs.shape[0]
+        return observation_size(self)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({changed_fields(self.settings)})"

@@ -4,9 +4,11 @@ Axes are named throughout: S seeds, T time steps, N episodes, O observation
 entries, A action entries.
 """
 
+import contextlib
+import contextvars
 import dataclasses
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol, Self, TypeAlias
 
 import jax
@@ -191,13 +193,49 @@ def null_action(env: Environment) -> np.ndarray:
     return np.zeros(env.action_size, np.float32)
 
 
+#: The operations that were called so far, where they are kept whole.
+_WHOLE = contextvars.ContextVar[list[str] | None]("whole", default=None)
+
+
+@contextlib.contextmanager
+def keeping_whole() -> Iterator[list[str]]:
+    """Has an environment that is traced within call ``scalar.whole`` for its physics.
+
+    It yields the names of what was called. JAX keeps what it has traced: give it a new function.
+    """
+    called: list[str] = []
+    token = _WHOLE.set(called)
+    try:
+        yield called
+    finally:
+        _WHOLE.reset(token)
+
+
+def is_kept_whole() -> bool:
+    """Returns whether an operation that a backend may know is to stay whole."""
+    return _WHOLE.get() is not None
+
+
+def note_whole(name: str) -> None:
+    """Notes that an operation stays whole."""
+    called = _WHOLE.get()
+    assert called is not None
+    called.append(name)
+
+
+def shapes_of(function: Callable[..., Any], *examples: PyTree) -> Any:
+    """Returns the shapes of what a method of an environment returns; no physics is traced."""
+    with keeping_whole():
+        return jax.eval_shape(lambda *given: function(*given), *examples)
+
+
 def observation_size(env: Environment) -> int:
     """Returns O, from the shapes alone: nothing is simulated.
 
     Raises:
       ValueError: the observation is not one vector.
     """
-    obs = jax.eval_shape(env.reset, jax.random.key(0)).obs
+    obs = shapes_of(env.reset, jax.random.key(0)).obs
     if not hasattr(obs, "shape") or len(obs.shape) != 1:
         raise ValueError(
             f"the observation must be one vector, this environment's is {obs}; "

@@ -2,20 +2,28 @@
 
 import ctypes
 import re
+import shutil
+import subprocess
+import tempfile
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.special
 
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import ptx, seam
 from mjx_reinforce.engine.gpu.kernel import ENTRY
 from mjx_reinforce.engine.play import available
 
+#: A compiler of C++, if there is one.
+COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
 _SOME = re.compile(r'call i32 asm sideeffect "[^"]*bar.red[^"]*", "=r,r"\(i32 (%\w+)\) convergent')
 _ALL = re.compile(r'call void asm sideeffect "[^"]*bar.sync[^\n]*')
+#: What C++ has on a GPU alone.
+_ERFINV = ctypes.CFUNCTYPE(ctypes.c_float, ctypes.c_float)(lambda x: float(scipy.special.erfinv(x)))
 _THREAD = threading.local()
 #: What a thread asks, in blocks of 32.
 _NUMBERS = {
@@ -84,6 +92,19 @@ def compiled(text, block=None):
     return machine.load_module(text, lambda: text, (ENTRY,), machine.this_machine(), None)
 
 
+def compiled_team(text):
+    """Returns the address of a kernel in CUDA C++, compiled with one lane for this CPU."""
+    with tempfile.TemporaryDirectory() as folder:
+        library = f"{folder}/play.so"
+        options = ("-std=c++17", "-O1", "-shared", "-fPIC", "-w", "-DREAL=float", "-x", "c++", "-")
+        address = ctypes.cast(_ERFINV, ctypes.c_void_p).value
+        text = re.sub(r"#define W \d+", "#define W 1", text)
+        text = f"#define erfinvf(x) ((float (*)(float)){address}ull)(x)\n{text}"
+        done = subprocess.run([COMPILER, *options, "-o", library], input=text, text=True)
+        assert done.returncode == 0
+        return ctypes.cast(ctypes.CDLL(library)[ENTRY], ctypes.c_void_p).value
+
+
 def run_threads(address, threads, arrays):
     """Runs a kernel's code in so many threads, on pointers to arrays."""
     pointers = [ctypes.c_void_p(x.ctypes.data) for x in arrays]
@@ -105,6 +126,10 @@ def emulate(monkeypatch, threads=1, block=None):
         assert capability == "9.0"
         assert folder is None or folder.name == "native"
         text = write()
+        if text.startswith("// teams"):
+            made = ptx.described(source, text, compiled=True)
+            words = made.scratch * made.lanes
+            return made._replace(text=str(compiled_team(text)), scratch=words)
         code = compiled(text, block)
         words = int((re.findall(r"@scratch = constant i32 (\d+)", text) or [0])[0])
         address = str(code.addresses[ENTRY])
@@ -128,7 +153,7 @@ def emulate(monkeypatch, threads=1, block=None):
     monkeypatch.setattr(available, "platform", lambda: "gpu")
     monkeypatch.setattr(seam, "kernels_unavailable", lambda: None)
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
-    monkeypatch.setattr(seam, "_grid", lambda items, most, blocks: (1, threads))
+    monkeypatch.setattr(seam, "_sized", lambda kernel, items: (kernel, (1, threads)))
     monkeypatch.setattr(ptx, "load_kernel", load)
     monkeypatch.setattr(seam, "_call", call)
 
@@ -138,7 +163,7 @@ def lowered(monkeypatch, function, *args, assemblers=()):
     monkeypatch.setattr(available, "platform", lambda: "gpu")
     monkeypatch.setattr(seam, "_assemblers", lambda: (assemblers, None))
     if not assemblers:
-        monkeypatch.setattr(seam, "_handler", lambda kernel, _: seam._target(kernel.key))
+        monkeypatch.setattr(seam, "_handler", lambda kernel: seam._target(kernel.key))
     monkeypatch.setattr(seam, "compute_capability", lambda: "9.0")
     monkeypatch.setattr(seam, "_grid", lambda items, most, blocks: (-(-items // 32), 32))
     traced = jax.jit(function).trace(*jax.tree.map(jnp.asarray, args))

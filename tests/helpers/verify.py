@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from mjx_reinforce.engine.scalar.backend import Backend
-from mjx_reinforce.engine.scalar.nodes import BOOL, FACTS, Captured, Node, Op, Scalar
+from mjx_reinforce.engine.scalar.nodes import BOOL, FACTS, Call, Captured, Node, Op, Scalar
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop
 from mjx_reinforce.engine.scalar.rules.iterate import varies
 from mjx_reinforce.engine.scalar.scalarized import Scalarized
@@ -53,6 +53,14 @@ class _Verify(Backend[np.dtype]):
         """Notes that a scalar is read."""
         self._read.add(scalar)
         return super().value(scalar, values)
+
+    def call(self, call: Call, values: Dtypes) -> list[list[np.dtype]]:
+        """Reads what an operation on arrays reads."""
+        for arg in call.args:
+            _agree(f"an operand of {call.name}", arg[0].dtype if arg else None, arg)
+            for x in arg:
+                self.value(x, values)
+        return [[x.dtype for x in out] for out in call.outs]
 
     def node(self, node: Node, operands: list[np.dtype]) -> np.dtype:
         """Checks an operation."""

@@ -66,7 +66,9 @@ call:
   %kernel.at = getelementptr ptr, ptr %ready, i64 1
   %kernel = load ptr, ptr %kernel.at
   %stream = load ptr, ptr %asking.stream
-  %status = call i32 %run(ptr %kernel, i32 %blocks, i32 1, i32 1, i32 %threads, i32 1, i32 1, i32 0, ptr %stream, ptr %parameters, ptr null)
+  %shared.at = getelementptr ptr, ptr %ready, i64 2
+  %shared = load i32, ptr %shared.at
+  %status = call i32 %run(ptr %kernel, i32 %blocks, i32 1, i32 1, i32 %threads, i32 1, i32 1, i32 %shared, ptr %stream, ptr %parameters, ptr null)
   %fine = icmp eq i32 %status, 0
   br i1 %fine, label %done, label %failed
 done:

@@ -23,6 +23,7 @@ from mjx_reinforce.engine import scalar
 from mjx_reinforce.engine.cpu import handler, machine
 from mjx_reinforce.engine.gpu.kernel import ENTRY
 from mjx_reinforce.engine.play import objects
+from mjx_reinforce.engine.team import nvrtc
 
 #: LLVM's name of NVIDIA's GPUs.
 TRIPLE = "nvptx64-nvidia-cuda"
@@ -30,19 +31,23 @@ TRIPLE = "nvptx64-nvidia-cuda"
 _BOUNDS, _SCRATCH = (r"\.maxntid (\d+)", r"\.minnctapersm (\d+)"), r"\bscratch = (\d+)"
 #: What GPUs of compute capability 7.0 need. For one that it does not know, LLVM writes 3.2.
 _VERSION, _LEAST_VERSION = r"\.version (\d+\.\d+)", 6.0
+#: The first line of CUDA C++: lanes of a team, threads and shared memory of a block, scratch.
+_TEAM = "// teams of {}, {} threads, {} bytes, scratch = {}\n"
 _LOADED: dict[str, "Kernel"] = {}
 _LOCK = threading.Lock()
 
 
 class Kernel(NamedTuple):
-    """A kernel as PTX.
+    """A kernel as PTX, or as CUDA C++ for teams of lanes.
 
     key: a name for all that it depends on
-    text: PTX; its entry is "play"
+    text: its entry is "play"
     threads: of a block, at most
     blocks: on a multiprocessor; its registers are as many as that leaves each thread
     scratch: 4-byte words of a buffer that each thread needs
     compiled: whether it was compiled now, and not read from disk
+    lanes: threads that play an episode together
+    shared: bytes of shared memory of a block
     """
 
     key: str
@@ -51,6 +56,8 @@ class Kernel(NamedTuple):
     blocks: int
     scratch: int
     compiled: bool
+    lanes: int = 1
+    shared: int = 0
 
 
 def load_kernel(
@@ -60,7 +67,7 @@ def load_kernel(
 
     Args:
       source: all that the text of the kernel depends on, or a hash of it.
-      write: returns ``kernel.kernel_text``.
+      write: returns LLVM IR, such as ``kernel.kernel_text``, or CUDA C++ as ``team_text``.
       capability: the compute capability of the GPU, such as "9.0".
       folder: where kernels are kept; None keeps none.
 
@@ -71,14 +78,19 @@ def load_kernel(
     key = objects.key_of(capability, source)
 
     def compile(text: str) -> bytes:
-        return _compile(text, capability).encode()
+        return (text if text.startswith(_TEAM[:8]) else _compile(text, capability)).encode()
 
     with _LOCK:
         if key not in _LOADED:
             found = objects.kept(key, folder)
             made = found or objects.make(key, folder, write(), compile)
-            _LOADED[key] = _kernel(key, made, compiled=not found)
+            _LOADED[key] = described(key, made.decode(), compiled=not found)
         return _LOADED[key]
+
+
+def team_text(text: str, lanes: int, threads: int, shared: int, scratch: int) -> str:
+    """Returns CUDA C++ with what ``Kernel`` says of it."""
+    return _TEAM.format(lanes, threads, shared, scratch) + text
 
 
 def in_memory() -> list[str]:
@@ -89,12 +101,14 @@ def in_memory() -> list[str]:
 def kept(key: str, folder: Path) -> Kernel | None:
     """Returns a kernel by its key; None if it is not on disk."""
     found = objects.read_object(folder, key)
-    return _kernel(key, found, compiled=False) if found else None
+    return described(key, found.decode(), compiled=False) if found else None
 
 
-def _kernel(key: str, data: bytes, *, compiled: bool) -> Kernel:
-    """Returns the kernel that is kept as ``data``."""
-    text = data.decode()
+def described(key: str, text: str, *, compiled: bool) -> Kernel:
+    """Returns the kernel of a text, which says how it is launched."""
+    if found := re.match(_TEAM.format(*[r"(\d+)"] * 4), text):
+        lanes, threads, shared, words = map(int, found.groups())
+        return Kernel(key, text, threads, 1, words, compiled, lanes, shared)
     threads, blocks = (int(re.findall(x, text)[0]) for x in _BOUNDS)
     scratch = int((re.findall(_SCRATCH, text) or [0])[0])
     return Kernel(key, text, threads, blocks, scratch, compiled)
@@ -132,6 +146,8 @@ def _with_xla_divisions(text: str) -> str:
 
 
 _TEXT = Path(__file__).with_name("launcher.ll")
+#: CUDA's number of the attribute of a kernel: bytes of shared memory that a launch may ask for.
+_MOST_SHARED = 8
 #: What slots point to; a launch may read it until the process ends.
 _FILLED: list[ctypes.Array[ctypes.c_void_p]] = []
 
@@ -171,12 +187,12 @@ def fill(slot: int, kernel: Kernel, assemblers: Sequence[Assembler], folder: Pat
     ready = ctypes.c_void_p()
     for assembler in assemblers:
         try:
-            ready = _in_memory(cuda, _machine_code(kernel, assembler, folder))
+            ready = _in_memory(cuda, _machine_code(kernel, assembler, folder), kernel.shared)
             break
         except Exception as error:  # whatever an assembler or a driver raises
             objects.describe(kernel.key, f"not by {assembler.name}: {error}")
     launch = ctypes.cast(cuda.cuLaunchKernel, ctypes.c_void_p)
-    _FILLED.append((ctypes.c_void_p * 2)(launch, ready))
+    _FILLED.append((ctypes.c_void_p * 3)(launch, ready, kernel.shared))
     ctypes.c_void_p.from_address(slot).value = ctypes.addressof(_FILLED[-1])
 
 
@@ -194,14 +210,22 @@ def _machine_code(kernel: Kernel, assembler: Assembler, folder: Path | None) -> 
     return made
 
 
-def _in_memory(cuda: ctypes.CDLL, image: bytes) -> ctypes.c_void_p:
-    """Returns the driver's handle of a kernel, for all GPUs that its machine code is for."""
+def _in_memory(cuda: ctypes.CDLL, image: bytes, shared: int) -> ctypes.c_void_p:
+    """Returns the driver's handle of a kernel, for all GPUs that its machine code is for.
+
+    Args:
+      cuda: the driver.
+      image: machine code, or PTX.
+      shared: bytes of shared memory that a block is launched with.
+    """
     library, kernel = ctypes.c_void_p(), ctypes.c_void_p()
     nothing = None, None, 0
     if status := cuda.cuLibraryLoadData(ctypes.byref(library), image, *nothing, *nothing):
         raise RuntimeError(f"cuLibraryLoadData returned {status}")
     if status := cuda.cuLibraryGetKernel(ctypes.byref(kernel), library, ENTRY.encode()):
         raise RuntimeError(f"cuLibraryGetKernel returned {status}")
+    if shared and (status := cuda.cuKernelSetAttribute(_MOST_SHARED, shared, kernel, 0)):
+        raise RuntimeError(f"cuKernelSetAttribute returned {status}")
     return kernel
 
 
@@ -222,6 +246,11 @@ def assemblers(capability: str) -> tuple[Assembler, ...]:
             assemble = functools.partial(_by_program, path, capability)
             found.append(Assembler(name, assemble))
     return (*found, Assembler("the driver", lambda text: ("", text.encode() + b"\0")))
+
+
+def compiler(capability: str) -> Assembler:
+    """Returns what compiles CUDA C++ for GPUs of a compute capability."""
+    return Assembler(nvrtc.version(), functools.partial(nvrtc.compile, capability))
 
 
 def _programs() -> list[str]:

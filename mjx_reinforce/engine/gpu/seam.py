@@ -18,6 +18,8 @@ import numpy as np
 from mjx_reinforce.engine.gpu import ptx
 from mjx_reinforce.engine.gpu.lockstep import WARP
 from mjx_reinforce.engine.play import objects
+from mjx_reinforce.engine.team import kernel as team
+from mjx_reinforce.engine.team import nvrtc
 
 #: LLVM 22, which llvmlite 0.48 has, is the first that bounds a kernel's threads and blocks.
 _OLDEST = (22,)
@@ -71,10 +73,9 @@ def restore(program: bytes) -> bool:
     folder = objects.folder()
     for key in set(re.findall(rb"mjx_reinforce_gpu_([0-9a-f]{64})", program)):
         kernel = ptx.kept(key.decode(), folder) if folder else None
-        assemblers, _ = _assemblers()
-        if kernel is None or not assemblers:
+        if kernel is None or not _makers(kernel):
             return False
-        _handler(kernel, assemblers)
+        _handler(kernel)
     return True
 
 
@@ -83,7 +84,12 @@ def _target(key: str) -> str:
     return f"mjx_reinforce_gpu_{key}"
 
 
-def _handler(kernel: ptx.Kernel, assemblers: Assemblers) -> str:
+def _makers(kernel: ptx.Kernel) -> Assemblers:
+    """Returns what makes machine code of a kernel's text, what is preferred first."""
+    return _assemblers()[0] if kernel.lanes == 1 else (ptx.compiler(compute_capability()),)
+
+
+def _handler(kernel: ptx.Kernel) -> str:
     """Returns XLA's name of the handler that launches a kernel, which is assembled meanwhile."""
     name = _target(kernel.key)
     with _LOCK:
@@ -91,7 +97,7 @@ def _handler(kernel: ptx.Kernel, assemblers: Assemblers) -> str:
             handler, slot = ptx.launcher(kernel.key)
             address = jax.ffi.pycapsule(ctypes.c_void_p(handler))
             jax.ffi.register_ffi_target(name, address, platform="CUDA")
-            given = (slot, kernel, assemblers, objects.folder())
+            given = (slot, kernel, _makers(kernel), objects.folder())
             threading.Thread(target=ptx.fill, args=given, daemon=True).start()
             _HANDLERS.add(name)
     return name
@@ -105,7 +111,8 @@ def compute_capability() -> str:
 def kernel_dependencies() -> str:
     """Returns what a program with kernels depends on."""
     processors = jax.devices()[0].core_count
-    return f"compute capability {compute_capability()}, {processors} multiprocessors"
+    of_teams = nvrtc.version()
+    return f"compute capability {compute_capability()}, {processors} multiprocessors, {of_teams}"
 
 
 def launch(
@@ -156,7 +163,7 @@ def _launch(
         shape((seeds, horizon, int(np.prod(x.shape, dtype=int)), episodes), x.dtype) for x in record
     ]
     counts = [shape(x, jnp.int32) for x in ((seeds, episodes), (seeds, episodes), (seeds,), (1,))]
-    grid = _grid(seeds * episodes, kernel.threads, kernel.blocks)
+    kernel, grid = _sized(kernel, seeds * episodes)
     sizes = jnp.array([seeds, episodes, horizon], jnp.int32)
     return _fill(kernel, grid, [sizes, *args], [*records, *counts])[:-1]
 
@@ -174,10 +181,10 @@ def launch_map(
 
     def play(*args):
         examples = len(args[0])
-        grid = _grid(examples, kernel.threads, kernel.blocks)
+        sized, grid = _sized(kernel, examples)
         sizes = jnp.array([examples, math.prod(grid)], jnp.int32)
         made = [jax.ShapeDtypeStruct((examples, *x.shape[1:]), x.dtype) for x in results]
-        return _fill(kernel, grid, [sizes, *args], made)
+        return _fill(sized, grid, [sizes, *args], made)
 
     return in_one_launch(play)(*args)
 
@@ -210,9 +217,17 @@ def _call(
     results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in written]
     aliases = {len(given) + k: k for k in range(len(results))}
     blocks, threads = map(np.int32, grid)
-    target = _handler(kernel, _assemblers()[0])
+    target = _handler(kernel)
     call = jax.ffi.ffi_call(target, [*results, *scratch], input_output_aliases=aliases)
     return call(*given, *written, blocks=blocks, threads=threads)
+
+
+def _sized(kernel: ptx.Kernel, items: int) -> tuple[ptx.Kernel, tuple[int, int]]:
+    """Returns the kernel, and how many blocks of how many threads, that play so many items."""
+    if kernel.lanes > 1:
+        processors = jax.devices()[0].core_count
+        kernel = team.for_items(kernel, items, processors, compute_capability())
+    return kernel, _grid(items * kernel.lanes, kernel.threads, kernel.blocks)
 
 
 def _grid(items: int, most: int, blocks: int) -> tuple[int, int]:

@@ -18,6 +18,7 @@ from mjx_reinforce.engine.base import Environment, null_action
 from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.scalar import TooLarge, jaxprs, size
+from mjx_reinforce.engine.team import program as team
 
 #: LLVM 20, which llvmlite 0.45 has, is the first that reads the IR as it is written here.
 _OLDEST = (20,)
@@ -139,7 +140,7 @@ def _seconds(traced: jaxprs.Program, entries: int) -> float:
 
 def announcement(env: Environment) -> str | None:
     """Returns what people must know who wait for machine code; None where nobody waits long."""
-    if unavailable():
+    if unavailable() or (platform() == "gpu" and team.why_not(env) is None):
         return None
     expected, contacts = seconds(env), getattr(env, "num_contacts", 0)
     if not _WORTH_SAYING < expected <= MAX_SECONDS:

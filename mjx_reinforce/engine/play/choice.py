@@ -23,6 +23,7 @@ from mjx_reinforce.engine.contract import check_policy
 from mjx_reinforce.engine.play import available, native, program, rollouts
 from mjx_reinforce.engine.scalar import jaxprs, size
 from mjx_reinforce.engine.scalar.vmap import MAX_OPERATIONS
+from mjx_reinforce.engine.team import program as team
 
 #: This JAX multiplies wrongly on CPUs, in some functions that are mapped over some 16,000 rows and
 #: more, and says nothing (JAX's issue 39103). Where we looked, with 33,000 to 65,000 rows, no
@@ -95,7 +96,10 @@ def choose(
         play = _from_any_key if name == "auto" else native.rollout
         return native.unsupported(env, *policy, horizon) or play
 
-    return Engine(*pick(name, in_machine_code, rollouts.rollout), time.perf_counter() - began)
+    found, why, play = pick(name, in_machine_code, rollouts.rollout)
+    if (found, available.platform()) == ("native", "gpu"):
+        why += f", {team.played_by(env)}"
+    return Engine(found, why, play, time.perf_counter() - began)
 
 
 def pick(
@@ -209,10 +213,9 @@ def machine_code(
     """
     if against := available.unavailable():
         return against
-    check = functools.partial(available.check_seconds, env, entries=base.observation_size(env))
     name = f"{getattr(function, '__name__', 'a function')} of {program.name_of(env)}"
     try:
-        return program.machine_map(function, *examples, check=check, name=name)
+        return program.machine_map(function, *examples, env=env, name=name)
     except Exception as error:  # whatever it is, another engine may play this
         return program.refusal(error)
 
@@ -281,7 +284,7 @@ def rollout(
     check_key(key)
     check_count("num_episodes", num_episodes)
     check_count("horizon", horizon)
-    check_policy(act, actor, distribution, jax.eval_shape(env.reset, jax.random.key(0)).obs)
+    check_policy(act, actor, distribution, base.shapes_of(env.reset, jax.random.key(0)).obs)
     policy = ActingPolicy(act, actor, distribution)
     play = _rollout_of(engine, env, policy, horizon)
     options: dict[str, Any] = {"deterministic": deterministic, "active": active}
@@ -293,7 +296,7 @@ def _rollout_of(engine: str, env: Environment, policy: ActingPolicy, horizon: in
     """Returns the rollout of an engine."""
     large = sum(np.size(x) for x in jax.tree.leaves(policy.actor)) > _MOST_PARAMETERS
     if engine == "auto" and large and available.platform() == "cpu":
-        examples = jax.eval_shape(env.reset, jax.random.key(0)), base.null_action(env)
+        examples = base.shapes_of(env.reset, jax.random.key(0)), base.null_action(env)
         step = machine_code(env, env.step, *examples)
         if not isinstance(step, str):
             return functools.partial(rollouts.rollout, env_step=_episodes_last(step))

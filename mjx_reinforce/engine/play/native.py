@@ -7,6 +7,7 @@ rounding.
 
 import functools
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,15 @@ from mjx_reinforce.engine.cpu import machine
 from mjx_reinforce.engine.cpu import seam as cpu
 from mjx_reinforce.engine.gpu import seam as gpu
 from mjx_reinforce.engine.play import available, episode
-from mjx_reinforce.engine.play.program import NativeProgram, build_program, refusal, stored
+from mjx_reinforce.engine.play.counter import key_of
+from mjx_reinforce.engine.play.program import (
+    NativeProgram,
+    build_program,
+    machine_map,
+    name_of,
+    refusal,
+    stored,
+)
 from mjx_reinforce.engine.scalar import TooLarge, UnsupportedPrimitive
 
 _REMEDY = f'make keys with jax.random.key(seed, impl="{available.GENERATOR}"), or choose auto'
@@ -57,8 +66,7 @@ def rollout(
         program = build_program(env, act, actor, distribution, episode.chunk_length(horizon))
     except (TooLarge, UnsupportedPrimitive) as error:
         raise ValueError(f"the native engine cannot play this: {error}") from error
-    begin = functools.partial(episode.begin, env)
-    state, keys = jax.vmap(begin)(episode.episode_keys(key, num_episodes))
+    state, keys = _begin(env, program, episode.episode_keys(key, num_episodes))
     limits = episode.signed_limits(active, deterministic, jnp.minimum(steps, horizon))
     given = (
         jnp.broadcast_to(limits, num_episodes),
@@ -80,6 +88,20 @@ def rollout(
         nonfinite=broken != 0,
         simulated=simulated,
     )
+
+
+def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[Any, jax.Array]:
+    """Returns the starts of episodes by their keys [N], and the keys [N] of their noise."""
+    if isinstance(program.code, machine.Code) or program.code.lanes == 1:
+        return jax.vmap(functools.partial(episode.begin, env))(keys)
+
+    def begin(words: jax.Array) -> tuple[Any, jax.Array]:
+        state, noise = episode.begin(env, key_of(words))
+        return state, jax.random.key_data(noise)
+
+    words = jax.random.key_data(keys)
+    state, noise = machine_map(begin, words[0], env=env, name=f"the start of {name_of(env)}")(words)
+    return state, jax.random.wrap_key_data(noise)
 
 
 def against_key(key: jax.Array) -> str | None:

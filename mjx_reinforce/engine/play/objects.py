@@ -96,7 +96,7 @@ def source_digest(*packages: str) -> str:
         with resources.as_file(resources.files(name)) as folder:
             for place, _, names in sorted(os.walk(folder, followlinks=True)):
                 for file in sorted(names):
-                    if file.endswith((".py", ".ll", ".xml")):
+                    if file.endswith((".py", ".ll", ".h", ".xml")):
                         digest.update(Path(place, file).read_bytes())
     return digest.hexdigest()
 

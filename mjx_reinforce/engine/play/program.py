@@ -1,6 +1,7 @@
 """From a function written out, such as a step of an episode, to machine code, kept on disk."""
 
 import functools
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -10,7 +11,15 @@ import numpy as np
 from jax import lax
 
 from mjx_reinforce.engine import scalar
-from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, observation_size
+from mjx_reinforce.engine.base import (
+    Act,
+    Acts,
+    Environment,
+    PyTree,
+    keeping_whole,
+    observation_size,
+    shapes_of,
+)
 from mjx_reinforce.engine.cpu import handler, kernel, machine, mapping
 from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import kernel as gpu_kernel
@@ -20,6 +29,8 @@ from mjx_reinforce.engine.play import available, episode, objects, units
 from mjx_reinforce.engine.play.counter import at_counter, split
 from mjx_reinforce.engine.scalar import jaxprs, scalarized
 from mjx_reinforce.engine.scalar.graph import Limits
+from mjx_reinforce.engine.team import kernel as team_kernel
+from mjx_reinforce.engine.team import program as team
 
 #: A branch of more scalar operations is skipped where no lane needs it.
 BRANCH_COST = 40
@@ -68,7 +79,7 @@ def step_function(
       distribution: the family whose parameters the outputs are.
       length: steps whose noise is drawn with one key, as ``chunks.play_chunks`` does.
     """
-    shapes = jax.eval_shape(env.reset, jax.random.key(0))
+    shapes = shapes_of(env.reset, jax.random.key(0))
     leaves, tree = jax.tree.flatten(shapes)
     drawn = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
     words = int(np.prod(drawn.shape, dtype=int))  # random ones that the noise of a step takes
@@ -106,9 +117,7 @@ def stored(x: jax.Array) -> jax.Array:
 def step_shapes(env: Environment, actor: PyTree) -> tuple[Any, ...]:
     """Returns the shapes of the arguments of a step."""
     shape = jax.ShapeDtypeStruct
-    state = jax.eval_shape(
-        lambda: [stored(x) for x in jax.tree.leaves(env.reset(jax.random.key(0)))]
-    )
+    state = shapes_of(lambda: [stored(x) for x in jax.tree.leaves(env.reset(jax.random.key(0)))])
     flag = shape((), jnp.int32)
     actor = jax.tree.map(lambda x: shape(x.shape, x.dtype), actor)
     return actor, Carried(state, shape((2, 2), jnp.uint32)), flag, flag, flag
@@ -146,7 +155,6 @@ def build_program(
     if available.platform() != "cpu":  # a thread without an episode does not play
         function, examples = while_running(function), examples[:-1]
     num_actor = len(jax.tree.leaves(actor))
-    check = functools.partial(available.check_seconds, env, entries=observation_size(env))
 
     def write_cpu(written: scalarized.Scalarized, target: machine.Machine) -> str:
         buffers = [x for x in jax.tree.leaves((actor, examples[1].state)) if np.prod(x.shape)]
@@ -156,21 +164,35 @@ def build_program(
         entry += handler.flush(target.triple)
         return entry + kernel.kernel_text(written, num_actor, target.lanes)
 
-    def write_gpu(written: scalarized.Scalarized) -> str:
-        return gpu_kernel.kernel_text(written, num_actor)
-
-    code, shapes = load("play", name_of(env), function, examples, check, write_cpu, write_gpu)
+    writers = Writers(
+        write_cpu,
+        functools.partial(gpu_kernel.kernel_text, num_actor=num_actor),
+        functools.partial(team_kernel.player_text, num_actor=num_actor),
+    )
+    code, shapes = load("play", env, function, examples, writers, name_of(env))
     return NativeProgram(code, shapes.record)
+
+
+class Writers(NamedTuple):
+    """What writes a kernel around a function that is written out.
+
+    cpu: what is written out, and for which machine -> LLVM IR
+    gpu: what is written out -> LLVM IR, for a thread an episode
+    team: what is written out, and with which physics -> CUDA C++, for several lanes an episode
+    """
+
+    cpu: Callable[[scalarized.Scalarized, machine.Machine], str]
+    gpu: Callable[[scalarized.Scalarized], str]
+    team: Callable[[scalarized.Scalarized, team_kernel.Physics], str]
 
 
 def load(
     use: str,
-    name: str,
+    env: Environment | None,
     function: Callable[..., Any],
     examples: Sequence[PyTree],
-    check: Callable[[jaxprs.Program], None],
-    write_cpu: Callable[[scalarized.Scalarized, machine.Machine], str],
-    write_gpu: Callable[[scalarized.Scalarized], str],
+    writers: Writers,
+    name: str,
 ) -> tuple[machine.Code | ptx.Kernel, Any]:
     """Returns the machine code of a function, compiled unless memory or disk has it, and shapes.
 
@@ -178,24 +200,29 @@ def load(
 
     Args:
       use: what the writers write around the function.
-      name: of the function, for people.
+      env: the environment that the function plays, if it plays one.
       function: what is written out.
       examples: its arguments, or their shapes.
-      check: raises TooLarge for what takes too long to write and compile.
-      write_cpu: what is written out, and for which machine -> LLVM IR.
-      write_gpu: what is written out -> LLVM IR.
+      writers: what is written around it.
+      name: of the function, for people.
+
+    Raises:
+      TooLarge: writing it out and compiling it would take minutes.
+      UnsupportedPrimitive: it has an operation that cannot be written.
     """
     on_cpu = available.platform() == "cpu"
+    if not on_cpu and (found := _by_teams(use, env, function, examples, writers)):
+        return found
     target = machine.this_machine() if on_cpu else None
     traced, shapes = jaxprs.trace(function, *examples)
     source = f"{use} {jaxprs.fingerprint(traced)} {objects.source_digest(*_WRITERS)}"
 
     def write() -> str:
-        check(traced)
-        varying, limits = [True] * len(jax.tree.leaves(examples)), LOOPS if target else GPU_LOOPS
-        written = scalarized.build(function, examples, varying, BRANCH_COST, limits)
+        if env is not None:
+            available.check_seconds(env, traced, observation_size(env))
+        written = _written(function, examples, LOOPS if target else GPU_LOOPS)
         title = f"; {name}, {lockstep.operations(written.schedule):,} scalar operations\n"
-        return title + (write_cpu(written, target) if target else write_gpu(written))
+        return title + (writers.cpu(written, target) if target else writers.gpu(written))
 
     if target:
         return machine.load_module(source, write, handler.NAMES, target, objects.folder()), shapes
@@ -203,10 +230,47 @@ def load(
     return ptx.load_kernel(source, write, capability, objects.folder()), shapes
 
 
+def _written(
+    function: Callable[..., Any], examples: Sequence[PyTree], limits: Limits
+) -> scalarized.Scalarized:
+    varying = [True] * len(jax.tree.leaves(examples))
+    return scalarized.build(function, examples, varying, BRANCH_COST, limits)
+
+
+def _by_teams(
+    use: str, env: Any, function: Callable[..., Any], examples: Sequence[PyTree], writers: Writers
+) -> tuple[ptx.Kernel, Any] | None:
+    """Returns what ``load`` does, for teams of lanes; None if they do not play this."""
+    if team.why_not(env) is not None:
+        return None
+
+    def of_teams(*args: Any) -> Any:  # another function for JAX, which keeps what it has traced
+        return function(*args)
+
+    with keeping_whole() as kept:
+        traced, shapes = jaxprs.trace(of_teams, *examples)
+        if not {"physics", "start"} & {*kept}:
+            return None
+        physics = team.physics_of(env)
+        digest = objects.source_digest(*_WRITERS)
+        source = f"{use} {jaxprs.fingerprint(traced)} {physics} {digest}"
+
+        def write() -> str:
+            return writers.team(_written(of_teams, examples, LOOPS), physics)
+
+        capability = gpu_seam.compute_capability()
+        try:
+            return ptx.load_kernel(source, write, capability, objects.folder()), shapes
+        except scalar.UnsupportedPrimitive as error:
+            slower = "a thread plays an episode, which is slower than a team of lanes"
+            warnings.warn(f"{slower}: {error}", stacklevel=2)
+            return None
+
+
 def machine_map(
     function: Callable[..., Any],
     *examples: PyTree,
-    check: Callable[[jaxprs.Program], None] = lambda traced: None,
+    env: Environment | None = None,
     name: str = "a function",
 ) -> Callable[..., Any]:
     """Returns a function of a batch, compiled unless memory or disk has it.
@@ -218,7 +282,7 @@ def machine_map(
     Args:
       function: of one example; pytrees of numbers of 32 or 64 bits and bools, in and out.
       *examples: its arguments, or their shapes.
-      check: raises TooLarge where writing it out and compiling it takes too long.
+      env: the environment that it plays, if it plays one.
       name: of the function, for people.
 
     Raises:
@@ -239,7 +303,8 @@ def machine_map(
     for leaf in (*kept, *map(jax.eval_shape, [stored] * len(results), results)):
         if np.dtype(leaf.dtype).itemsize not in (4, 8):
             raise TypeError(f"it has numbers of {leaf.dtype}, not of 32 or 64 bits")
-    code, _ = load("map", name, flat, kept, check, _write_cpu, gpu_kernel.mapping_text)
+    writers = Writers(_write_cpu, gpu_kernel.mapping_text, team_kernel.mapping_text)
+    code, _ = load("map", env, flat, kept, writers, name)
 
     def mapped(*args: PyTree) -> Any:
         values = jax.tree.leaves(args)

@@ -14,6 +14,9 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from mjx_reinforce.engine.base import is_kept_whole
+from mjx_reinforce.engine.scalar import whole
+
 #: Units of one iteration. Their activations do not wait for each other, and the sums of the next
 #: layer stay in registers from one to the next.
 _UNITS_AT_ONCE = 4
@@ -46,6 +49,13 @@ def tanh_network(layers: Sequence[Mapping[str, jax.Array]], x: jax.Array) -> jax
       x: [O].
     """
     layers = list(layers)
+    if is_kept_whole():
+        for number, layer in enumerate(layers):
+            name = "tanh_layer" if number + 1 < len(layers) else "layer"
+            weights = layer["kernel"], layer["bias"]
+            shape = jax.ShapeDtypeStruct(weights[1].shape, jnp.result_type(x, *weights))
+            x = whole(name, {"units": shape}, x, *weights)["units"]
+        return x
     while len(layers) > 1:
         first, second, *layers = layers
         size = len(first["bias"])

@@ -4,7 +4,8 @@ import abc
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Generic, TypeVar
 
-from mjx_reinforce.engine.scalar.nodes import Node, Scalar, is_constant
+from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
+from mjx_reinforce.engine.scalar.nodes import Call, Node, Scalar, is_constant
 from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
 
 #: What a backend makes of a scalar: a lane, the name of a variable, ...
@@ -48,6 +49,10 @@ class Backend(abc.ABC, Generic[Value]):
     ) -> tuple[Sequence[Value], Sequence[Sequence[Value]]]:
         """Returns the final value of each carry, and each record's value in each iteration."""
 
+    def call(self, call: Call, values: dict[Node, Value]) -> Sequence[Sequence[Value]]:
+        """Returns the value of each element of each result of an operation that stays whole."""
+        raise UnsupportedPrimitive(f"it has no operation {call.name!r}")
+
     def result(self, outputs: list[list[Value]]) -> Any:
         """Returns what the caller gets: here the value of each element of each output."""
         return outputs
@@ -66,6 +71,9 @@ class Backend(abc.ABC, Generic[Value]):
                 values.update(zip((carry.out for carry in step.carries), carries, strict=True))
                 for record, kept in zip(step.records, records, strict=True):
                     values.update(zip(record.outs, kept, strict=True))
+            elif isinstance(step, Call):
+                for leaves, made in zip(step.outs, self.call(step, values), strict=True):
+                    values.update(zip(leaves, made, strict=False))
             elif isinstance(step, LiveGate):
                 values.update(
                     zip((out.leaf for out in step.outs), self.gate(step, values), strict=True)

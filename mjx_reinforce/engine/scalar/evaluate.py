@@ -23,6 +23,7 @@ _CONTROL = {
     "cond": loops.cond_rule,
     "skippable": loops.skippable_rule,
     "by_engine": loops.by_engine_rule,
+    "whole": loops.whole_rule,
 }
 
 

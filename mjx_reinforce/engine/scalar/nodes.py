@@ -152,7 +152,7 @@ class Node:
     index: int
     op: Op | None = None
     args: tuple[Scalar, ...] = ()
-    owner: "Loop | Gate | Captured | None" = None
+    owner: "Loop | Gate | Call | Captured | None" = None
     position: Any = None
 
 
@@ -176,6 +176,26 @@ class Gate:
     hot: list[Scalar]
     cold: list[Scalar]
     outs: list[Node | None] = dataclasses.field(default_factory=list)
+
+
+@dataclasses.dataclass(eq=False, slots=True)
+class Call:
+    """An operation on arrays that stays whole, for backends that know it by name.
+
+    scope: where the call is.
+    index: its place among the nodes of that scope.
+    name: of the operation.
+    args: the scalars of each operand.
+    fields: the name of each result.
+    outs: the leaves that stand for the elements of each result; none where nothing reads it.
+    """
+
+    scope: Scope
+    index: int
+    name: str
+    args: list[list[Scalar]]
+    fields: tuple[str, ...]
+    outs: list[list[Node]] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(eq=False, slots=True)

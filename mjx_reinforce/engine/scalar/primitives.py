@@ -1,4 +1,4 @@
-"""What a function says to be written out as: ``by_engine``, ``skippable``, ``any_lane``.
+"""What a function says to be written out as: ``by_engine``, ``skippable``, ``whole``, ``any_lane``.
 
 ``by_engine`` has one result computed in two ways. The choice is a primitive of our own, which
 carries both programs. XLA compiles ``many`` and never sees ``one``; ``scalar`` writes ``one`` out.
@@ -11,7 +11,7 @@ lane does not need it.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -21,7 +21,7 @@ import numpy as np
 from jax.extend import core
 from jax.interpreters import ad, batching, mlir
 
-from mjx_reinforce.engine.base import PyTree
+from mjx_reinforce.engine.base import PyTree, note_whole
 from mjx_reinforce.engine.scalar import jaxprs
 
 #: Its operands are those of both programs, which read what they need of them.
@@ -180,6 +180,27 @@ _SKIPPABLE.def_impl(_plain_skippable)
 _SKIPPABLE.def_abstract_eval(lambda *_, computation, **__: computation.out_avals)
 batching.primitive_batchers[_SKIPPABLE] = _batched_skippable
 mlir.register_lowering(_SKIPPABLE, mlir.lower_fun(_plain_skippable, multiple_results=True))
+
+
+#: Its operands are those of the operation; it is traced only for backends that know it.
+_WHOLE = core.Primitive("whole")
+_WHOLE.multiple_results = True
+_WHOLE.def_abstract_eval(
+    lambda *_, results, **__: [jax.core.ShapedArray(shape, dtype) for _, shape, dtype in results]
+)
+
+
+def whole(name: str, results: Mapping[str, Any], *args: jax.Array) -> dict[str, jax.Array]:
+    """Calls an operation that a backend knows by its name, where ``is_kept_whole``.
+
+    Args:
+      name: of the operation.
+      results: of its results by name, their shapes and dtypes.
+      *args: its operands.
+    """
+    note_whole(name)
+    facts = tuple((field, x.shape, np.dtype(x.dtype)) for field, x in results.items())
+    return dict(zip(results, _WHOLE.bind(*args, name=name, results=facts), strict=True))
 
 
 @jax.custom_batching.custom_vmap

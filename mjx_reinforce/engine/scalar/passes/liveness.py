@@ -15,7 +15,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-from mjx_reinforce.engine.scalar.nodes import SELECT, Gate, Loop, Node, Scalar, Scope
+from mjx_reinforce.engine.scalar.nodes import SELECT, Call, Gate, Loop, Node, Scalar, Scope
 
 
 class Out(NamedTuple):
@@ -103,13 +103,22 @@ class LiveLoop:
     records: list[Record]
 
 
-Schedule = list[Node | LiveGate | LiveLoop]
+Schedule = list[Node | LiveGate | LiveLoop | Call]
 
 
 def nodes(body: Schedule) -> Iterator[Node]:
     """Yields the nodes of a schedule, also inside of its loops and gates."""
+    return (step for step in _flat(body) if isinstance(step, Node))
+
+
+def calls(body: Schedule) -> Iterator[Call]:
+    """Yields the operations that stay whole, also inside of loops and gates."""
+    return (step for step in _flat(body) if isinstance(step, Call))
+
+
+def _flat(body: Schedule) -> Iterator[Node | Call]:
     for step in body:
-        yield from [step] if isinstance(step, Node) else nodes(step.body)
+        yield from [step] if isinstance(step, Node | Call) else _flat(step.body)
 
 
 def schedule(root: Scope, results: Iterable[Scalar]) -> Schedule:
@@ -133,7 +142,7 @@ class _Needs:
     """What was found to be needed so far."""
 
     def __init__(self) -> None:
-        self._steps: dict[Scope, set[Node | Gate | Loop]] = defaultdict(set)
+        self._steps: dict[Scope, set[Node | Gate | Loop | Call]] = defaultdict(set)
         self._outs: dict[Gate, set[int]] = defaultdict(set)
         # For each loop the positions of what is needed, by its role.
         self._places: dict[Loop, dict[str, set[int]]] = defaultdict(lambda: defaultdict(set))
@@ -148,6 +157,9 @@ class _Needs:
             self._steps[owner.scope].add(owner)
             self._outs[owner].add(node.position)
             return [owner.predicate, owner.hot[node.position], owner.cold[node.position]]
+        if isinstance(owner, Call):
+            self._steps[owner.scope].add(owner)
+            return [x for arg in owner.args for x in arg]
         if isinstance(owner, Loop):
             self._steps[owner.scope].add(owner)
             return self._note_loop(owner, node.position)
@@ -273,6 +285,8 @@ def _read_in(body: Schedule) -> Iterator[Scalar]:
             yield step.predicate
             yield from _read_in(step.body)
             yield from (x for out in step.outs for x in (out.hot, out.cold))
+        elif isinstance(step, Call):
+            yield from (x for arg in step.args for x in arg)
         else:
             yield from _read_in(step.body)
             yield from (x for carry in step.carries for x in (carry.init, carry.next))

@@ -13,8 +13,17 @@ import numpy as np
 from mjx_reinforce.engine.scalar import arrays, jaxprs
 from mjx_reinforce.engine.scalar.arrays import Array, Results
 from mjx_reinforce.engine.scalar.graph import Graph
-from mjx_reinforce.engine.scalar.jaxprs import Equation
-from mjx_reinforce.engine.scalar.nodes import Gate, Loop, Node, Scalar, Scope, is_constant, same
+from mjx_reinforce.engine.scalar.jaxprs import Equation, num_entries
+from mjx_reinforce.engine.scalar.nodes import (
+    Call,
+    Gate,
+    Loop,
+    Node,
+    Scalar,
+    Scope,
+    is_constant,
+    same,
+)
 from mjx_reinforce.engine.scalar.rules import iterate
 from mjx_reinforce.engine.scalar.rules.iterate import Assumption, Iteration, varies
 
@@ -228,6 +237,23 @@ def by_engine_rule(
     """Takes the program for an engine that writes out; see ``by_engine``."""
     program = jaxprs.program(eqn.params["one"])
     return run(program, list(operands), used, may_unroll=eqn.params["may_unroll"])
+
+
+def whole_rule(
+    graph: Graph, run: Callable, eqn: Equation, used: list[bool], *operands: Array
+) -> Results:
+    """Keeps an operation whole; see ``whole``."""
+    fields = tuple(field for field, *_ in eqn.params["results"])
+    args = [arrays.elements(x) for x in operands]
+    call = Call(graph.scope, graph.number(), eqn.params["name"], args, fields)
+    results = []
+    for number, (out, use) in enumerate(zip(eqn.outvars, used, strict=True)):
+        size = num_entries(out.aval) if use else 0
+        leaves = [graph.leaf(out.aval.dtype, True, call, (number, k)) for k in range(size)]
+        call.outs.append(leaves)
+        packed = arrays.pack(leaves, out.aval.shape, out.aval.dtype) if use else None
+        results.append(arrays.zeros(out.aval) if packed is None else packed)
+    return results
 
 
 def _choose_among(graph: Graph, branches: list[Branch], choice: Node) -> list[Scalar]:

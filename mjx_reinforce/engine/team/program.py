@@ -1,0 +1,61 @@
+"""Which environments teams of lanes play, and their physics."""
+
+import ctypes
+from typing import Any
+
+from mjx_reinforce.engine.team import nvrtc
+from mjx_reinforce.engine.team.kernel import Physics
+
+#: Models of fewer degrees of freedom play faster by a thread an episode.
+_LEAST_DOFS = 14
+#: Models of so many degrees of freedom, or more, are played by 32 lanes, others by 16.
+_WIDE = 16
+#: CUDA's number of the attribute of a GPU: bytes of shared memory that a block may have.
+_SHARED_OF_BLOCK = 97
+
+
+def why_not(env: Any) -> str | None:
+    """Returns in one line why teams do not play an environment; None if they do."""
+    model = getattr(_innermost(env), "mj_model", None)
+    if model is None:
+        return "it simulates no model of MuJoCo's"
+    if model.nv < _LEAST_DOFS:
+        return f"a thread plays a model of fewer than {_LEAST_DOFS} degrees of freedom faster"
+    from mjx_reinforce.engine.team import tables  # imports MuJoCo
+
+    return tables.why(model) or (None if nvrtc.library() else nvrtc.version())
+
+
+def played_by(env: Any) -> str:
+    """Returns what plays an episode of an environment on a GPU, for people."""
+    why = why_not(env)
+    return f"a thread an episode ({why})" if why else f"{_lanes(env)} lanes an episode"
+
+
+def physics_of(env: Any) -> Physics:
+    """Returns the physics of an environment that teams play."""
+    from mjx_reinforce.engine.team import tables
+
+    env = _innermost(env)
+    model, shared = env.mj_model, _shared_memory()
+    text, far = tables.physics_text(model), tables.far_words(model)
+    return Physics(text, far, env.frame_skip, _lanes(env), shared)
+
+
+def _lanes(env: Any) -> int:
+    """Returns how many lanes play an episode."""
+    return 32 if _innermost(env).mj_model.nv >= _WIDE else 16
+
+
+def _innermost(env: Any) -> Any:
+    """Returns the environment that wrappers are around."""
+    while not hasattr(env, "mj_model") and hasattr(env, "env"):
+        env = env.env
+    return env
+
+
+def _shared_memory() -> int:
+    """Returns how many bytes of shared memory a block may have."""
+    cuda, found = ctypes.CDLL("libcuda.so.1"), ctypes.c_int()
+    cuda.cuDeviceGetAttribute(ctypes.byref(found), _SHARED_OF_BLOCK, 0)
+    return found.value

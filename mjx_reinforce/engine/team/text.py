@@ -1,0 +1,502 @@
+"""C++ of a scalar graph, for a team of lanes that plays one episode.
+
+A scalar is written where it is first asked for, so that few wait in registers while the physics is
+computed. All lanes compute a scalar alike. The entries of an array and the terms of a long sum are
+computed by the lanes together, where they are the same formula of other numbers.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from mjx_reinforce.engine.scalar import scalarized
+from mjx_reinforce.engine.scalar.backend import Backend
+from mjx_reinforce.engine.scalar.jaxprs import UnsupportedPrimitive
+from mjx_reinforce.engine.scalar.nodes import Call, Node, Scalar, identity, is_constant, same
+from mjx_reinforce.engine.scalar.passes import liveness
+from mjx_reinforce.engine.scalar.passes.liveness import LiveGate, LiveLoop, Schedule
+from mjx_reinforce.engine.team.operations import expression, literal, type_of
+
+#: Fewer scalars of one formula are computed one by one.
+_FEWEST = 4
+#: A sum of fewer terms is not worth a meeting of the lanes.
+_SHORT_SUM = 12
+
+
+class _Sum(NamedTuple):
+    """How lanes add up what each of them has added: ``start`` is neutral, ``meet`` a template."""
+
+    start: str
+    sign: str
+    meet: str
+
+
+_SUMS = {
+    "and": _Sum("true", "&", "!t.any(!{})"),
+    "or": _Sum("false", "|", "t.any({})"),
+    "add": _Sum("0", "+", "t.sum({})"),
+}
+#: What the physics reads, in the order of the operation's operands.
+_GIVEN = ("ctrl", "time", "qpos", "qvel", "act", "qacc_warmstart")
+#: What it computes for the task alone, where that reads it.
+_REPORTED = ("xpos", "xipos", "cinert", "cvel", "cfrc_ext")
+#: Where the device code has the fields of a simulation, by MuJoCo's names.
+_FIELDS = {field: f"s.{field}" for field in (*_GIVEN, *_REPORTED, "qfrc_actuator")}
+_FIELDS["sound"] = "sound"
+#: The operations that simulate, as the device code has them.
+_SIMULATES = {
+    "physics": "const bool sound[1] = {{physics(t, M, s, {})}};",
+    "start": "const bool sound[1] = {{true}}; start(t, M, s);",
+}
+
+
+class Place(NamedTuple):
+    """An array of scalars in memory, and which of them is meant."""
+
+    array: str
+    entry: int
+
+
+class CText(Backend[str]):
+    """Writes C++ into ``lines``; a value is an expression without side effects.
+
+    words: how many words of 4 bytes ``scratch`` has, so far.
+    read: the numbers of the arguments that were read, so far.
+    reports: what the physics reports, by the names of ``device/state.h``.
+    """
+
+    def __init__(
+        self,
+        written: scalarized.Scalarized,
+        inputs: Callable[[int], str],
+        skip: int,
+    ):
+        """Says where what is not computed here is.
+
+        Args:
+          written: the program.
+          inputs: the array of an argument by its number.
+          skip: physics steps of a call of "physics".
+        """
+        self.lines: list[str] = []
+        self.words = 0
+        self.read: set[int] = set()
+        self.reports: list[str] = []
+        self._inputs, self._skip = inputs, skip
+        self._values: dict[Node, str] = {}
+        self._steps = _owners(written.schedule)
+        ends = [x for leaf in written.outputs for x in leaf]
+        self._uses = liveness.reads(written.schedule, ends)
+        simulates = [x.name in _SIMULATES for x in liveness.calls(written.schedule)]
+        self._simulates_once = sum(simulates) == 1
+        self._prepared: set[Node] = set()
+        self._arrays: dict[tuple[Call, int], str] = {}
+        self._written: dict[Node, Place] = {}
+        self._forms: dict[Any, int] = {}
+        self._form_of: dict[Node, int] = {}
+        self._count = 0
+
+    def line(self, text: str) -> None:
+        """Adds a line."""
+        self.lines.append(text)
+
+    def name(self) -> str:
+        """Returns a new name."""
+        self._count += 1
+        return f"v{self._count}"
+
+    def get(self, scalar: Scalar) -> str:
+        """Returns a scalar of the program."""
+        self._prepare([scalar])
+        return self.value(scalar, self._values)
+
+    def array(self, scalars: Sequence[Scalar]) -> str:
+        """Returns an array of scalars of the program: where they are, or a new one."""
+        places = [self._place(x) for x in scalars]
+        first = places[0]
+        if first and places == [Place(first.array, first.entry + k) for k in range(len(places))]:
+            return f"({first.array} + {first.entry})"
+        array = self._reserve(scalars[0].dtype, len(scalars))
+        self.fill(array, scalars)
+        self.line("t.sync();")
+        self._read_from(array, scalars)
+        return array
+
+    def fill(self, array: str, scalars: Sequence[Scalar]) -> None:
+        """Writes scalars of the program into an array."""
+        self._prepare(scalars)
+        start = 0
+        for run in self._runs(scalars):
+            if len(run) < _FEWEST:
+                for k, x in enumerate(run, start=start):
+                    self.line(f"if (t.lane == 0) {array}[{k}] = {self.value(x, self._values)};")
+            else:
+                self._each(run, f"{array}[{start} + i] = {{}};")
+            start += len(run)
+
+    # ------------------------------------------------------------------- what a Backend makes
+
+    def constant(self, number: Any) -> str:
+        """A literal."""
+        return literal(number)
+
+    def leaf(self, node: Node) -> str:
+        """An input is read where it is used."""
+        place = self._place(node)
+        if place is None:
+            raise UnsupportedPrimitive("it needs an array of an outer transformation")
+        return f"{place.array}[{place.entry}]"
+
+    def value(self, scalar: Scalar, values: dict[Node, str]) -> str:
+        """Writes what a scalar needs and is not known."""
+        waiting = [] if is_constant(scalar) else [scalar]
+        while waiting:
+            node = waiting.pop()
+            if node in values:
+                continue
+            if node.op is None:
+                values[node] = self.leaf(node)
+            elif len(terms := self._terms(node)) >= _SHORT_SUM:
+                values[node] = self._sum(_SUMS[node.op.name], node.dtype, terms, values)
+            elif missing := [x for x in node.args if isinstance(x, Node) and x not in values]:
+                waiting += [node, *missing]
+            else:
+                values[node] = self.node(node, [self.value(x, values) for x in node.args])
+        return super().value(scalar, values)
+
+    def node(self, node: Node, operands: list[str]) -> str:
+        """Writes one operation."""
+        assert node.op is not None
+        name = self.name()
+        made = expression(node.op, node.dtype, [x.dtype for x in node.args], operands)
+        self.line(f"const {type_of(node.dtype)} {name} = {made};")
+        return name
+
+    def gate(self, gate: LiveGate, values: dict[Node, str]) -> Sequence[str]:
+        """Writes a branch; what it leaves is in memory, which the lanes fill together."""
+        groups: dict[np.dtype, list[liveness.Out]] = {}
+        for out in gate.outs:
+            groups.setdefault(out.leaf.dtype, []).append(out)
+        arrays = [(self._reserve(dtype, len(outs)), outs) for dtype, outs in groups.items()]
+        for start, way in (f"if ({self.value(gate.predicate, values)}) {{", 1), ("} else {", 2):
+            self.line(start)
+            with self._inside(gate.body if way == 1 else [], {}):
+                for array, outs in arrays:
+                    self.fill(array, [out[way] for out in outs])
+        self.lines += ["}", "t.sync();"]
+        for array, outs in arrays:
+            self._written.update({out.leaf: Place(array, k) for k, out in enumerate(outs)})
+        return [self.leaf(out.leaf) for out in gate.outs]
+
+    def loop(
+        self, loop: LiveLoop, values: dict[Node, str]
+    ) -> tuple[Sequence[str], Sequence[Sequence[str]]]:
+        """Writes a loop."""
+        known, names, kept, rows = {}, [], [], []
+        for carry in loop.carries:
+            names.append(self.name())
+            init = self.value(carry.init, values)
+            self.line(f"{type_of(carry.leaf.dtype)} {names[-1]} = {init};")
+            known[carry.leaf] = names[-1]
+        for element in loop.elements:
+            rows.append(self._row(element.values, values))
+        for record in loop.records:
+            kept.append(self.name())
+            self.line(f"{type_of(record.value.dtype)} {kept[-1]}[{loop.length}];")
+        count = self.name()
+        conditions = [] if loop.length is None else [f"{count} < {loop.length}"]
+        conditions += [] if loop.active is None else [names[loop.active]]
+        self.line(f"for (int {count} = 0; {' && '.join(conditions)}; {count}++) {{")
+        for element, row in zip(loop.elements, rows, strict=True):
+            known[element.leaf] = row(count)
+        nexts = [self.name() for _ in names]
+        with self._inside(loop.body, known):
+            for record, array in zip(loop.records, kept, strict=True):
+                self.line(f"{array}[{count}] = {self.get(record.value)};")
+            for carry, following in zip(loop.carries, nexts, strict=True):
+                kind = type_of(carry.leaf.dtype)
+                self.line(f"const {kind} {following} = {self.get(carry.next)};")
+        for name, following in zip(names, nexts, strict=True):
+            self.line(f"{name} = {following};")
+        self.line("}")
+        return names, [
+            [f"{array}[{t}]" for t in range(len(record.outs))]
+            for record, array in zip(loop.records, kept, strict=True)
+        ]
+
+    def call(self, call: Call, values: dict[Node, str]) -> Sequence[Sequence[str]]:
+        """Writes an operation of the device code."""
+        if call.name in _SIMULATES:
+            self._simulate(call)
+        elif call.name in ("layer", "tanh_layer"):
+            self._layer(call)
+        else:
+            return super().call(call, values)
+        return [
+            [f"{self._arrays[call, number]}[{k}]" for k in range(len(out))]
+            for number, out in enumerate(call.outs)
+        ]
+
+    # -------------------------------------------------------------------- what is written before
+
+    def _prepare(self, scalars: Sequence[Scalar]) -> None:
+        """Writes the steps, such as a call or a loop, that scalars need and that are not yet."""
+        waiting, seen = list(scalars), set()
+        while waiting:
+            node = waiting.pop()
+            if not isinstance(node, Node) or node in seen or node in self._prepared:
+                continue
+            seen.add(node)
+            waiting += node.args
+            if node in self._steps and node not in self._values:
+                self._write(self._steps[node])
+        self._prepared |= seen
+
+    def _write(self, step: LiveGate | LiveLoop | Call) -> None:
+        depth = _results(step)[0].scope.depth
+        needs = [x for x in liveness.reads([step]) if x.scope.depth <= depth]
+        self._prepare(needs)
+        if isinstance(step, LiveLoop):  # so that no round of it computes them again
+            for node in needs:
+                self.value(node, self._values)
+        self.run([step], self._values)
+
+    @contextlib.contextmanager
+    def _inside(self, body: Schedule, known: Mapping[Node, str]) -> Iterator[None]:
+        """Within this, what is written is known in the body of a loop or a branch alone."""
+        before = self._values, self._written
+        self._values, self._written = {**self._values, **known}, dict(self._written)
+        self._steps |= _owners(body)
+        yield
+        self._values, self._written = before
+        self._form_of.clear()
+
+    def _place(self, scalar: Scalar) -> Place | None:
+        """Returns where an argument, a result of a call or an entry of an array is, or None."""
+        if is_constant(scalar):
+            return None
+        if scalar.op is not None or scalar in self._written:
+            return self._written.get(scalar)
+        if scalar.owner is None:
+            number, k = scalar.position
+            self.read.add(number)
+            return Place(self._inputs(number), k)
+        if isinstance(scalar.owner, Call):
+            self._prepare([scalar])
+            number, k = scalar.position
+            return Place(self._arrays[scalar.owner, number], k)
+        return None
+
+    def _reserve(self, dtype: np.dtype, count: int) -> str:
+        """Returns a new array that all lanes of the team see."""
+        name, kind = self.name(), type_of(dtype)
+        size = -(-np.dtype(dtype).itemsize // 4)
+        self.words += self.words % size
+        self.line(f"{kind}* {name} = reinterpret_cast<{kind}*>(scratch + {self.words});")
+        self.words += count * size
+        return name
+
+    def _read_from(self, array: str, scalars: Sequence[Scalar]) -> None:
+        """Has scalars read from an array from now on."""
+        computed = {x: k for k, x in enumerate(scalars) if isinstance(x, Node) and x.op}
+        self._values.update({x: f"{array}[{k}]" for x, k in computed.items()})
+        self._written.update({x: Place(array, k) for x, k in computed.items()})
+        self._form_of.clear()  # of what is computed from these, too
+
+    def _layer(self, call: Call) -> None:
+        x, kernel, bias = map(self.array, call.args)
+        (units,) = call.outs
+        made = self._arrays[call, 0] = self._reserve(units[0].dtype, len(units))
+        is_tanh = str(call.name == "tanh_layer").lower()
+        sizes = f"{len(call.args[0])}, {len(units)}"
+        self.line(f"layer<{is_tanh}>(t, {x}, {kernel}, {bias}, {sizes}, {made});")
+        self.line("t.sync();")
+
+    def _simulate(self, call: Call) -> None:
+        names = [field.rpartition(".")[2] for field in call.fields]
+        for number, (name, out) in enumerate(zip(names, call.outs, strict=True)):
+            if out and name not in _FIELDS:
+                raise UnsupportedPrimitive(f"the task reads {name} of the simulation")
+            self._arrays[call, number] = _FIELDS.get(name, "")
+            self.reports += [name.upper()] if out and name in _REPORTED else []
+        for field, scalars in zip(_GIVEN, call.args, strict=True):
+            if scalars:
+                self.fill(_FIELDS[field], scalars)
+        if self._simulates_once:
+            self._read_from(_FIELDS["ctrl"], call.args[0])  # which the physics leaves as it is
+        self.line("t.sync();")
+        self.line(_SIMULATES[call.name].format(self._skip))
+        self.line("t.sync();")
+        if not self._simulates_once:  # another operation may overwrite it
+            for number, (name, out) in enumerate(zip(names, call.outs, strict=True)):
+                if out:
+                    made = self._arrays[call, number] = self._reserve(out[0].dtype, len(out))
+                    self.line(f"EACH(i, {len(out)}) {made}[i] = {_FIELDS[name]}[i];")
+            self.line("t.sync();")
+
+    def _row(self, row: list[Scalar], values: dict[Node, str]) -> Callable[[str], str]:
+        """Returns what an element of a loop is in the iteration of a number."""
+        if spaced := self._spaced(row):
+            return spaced
+        name = self.name()
+        given = ", ".join(self.value(x, values) for x in row)
+        fixed = "static const " if all(map(is_constant, row)) else "const "
+        self.line(f"{fixed}{type_of(row[0].dtype)} {name}[] = {{{given}}};")
+        return lambda count: f"{name}[{count}]"
+
+    def _spaced(self, row: Sequence[Scalar]) -> Callable[[str], str] | None:
+        """Returns what the k-th of evenly spaced elements of one array is; None for others."""
+        places = [self._place(x) for x in row]
+        first = places[0]
+        step = places[1].entry - first.entry if first and places[1:] and places[1] else 0
+        if first is None or any(
+            x != Place(first.array, first.entry + k * step) for k, x in enumerate(places)
+        ):
+            return None
+        return lambda count: f"{first.array}[{first.entry} + {step} * {count}]"
+
+    # ------------------------------------------------------------------------- lanes together
+
+    def _terms(self, node: Node) -> list[Scalar]:
+        """Returns what a node adds up, in order, where nothing else reads the sums between."""
+        if node.op is None or node.op.name not in _SUMS or node.dtype.kind not in "bf":
+            return []
+        waiting, terms = list(node.args), []
+        while waiting:
+            x = waiting.pop()
+            if isinstance(x, Node) and x.op == node.op and self._uses[x] == 1:
+                waiting += x.args
+            else:
+                terms.append(x)
+        return terms[::-1]
+
+    def _sum(
+        self, kind: _Sum, dtype: np.dtype, terms: list[Scalar], values: dict[Node, str]
+    ) -> str:
+        """Writes a sum whose terms of one formula the lanes share; returns its name."""
+        groups: dict[int, list[Scalar]] = {}
+        for x in terms:
+            groups.setdefault(self._form(x), []).append(x)
+        name, total = self.name(), self.name()
+        self.line(f"{type_of(dtype)} {name} = {kind.start};")
+        alone = []
+        for group in groups.values():
+            if len(group) < _FEWEST:
+                alone += group
+            else:
+                self._each(group, f"{name} = {name} {kind.sign} {{}};")
+        parts = [kind.meet.format(name), *(self.value(x, values) for x in alone)]
+        self.line(f"const {type_of(dtype)} {total} = {f' {kind.sign} '.join(parts)};")
+        return total
+
+    def _runs(self, scalars: Sequence[Scalar]) -> Iterator[Sequence[Scalar]]:
+        """Yields neighbors of one formula."""
+        forms = [self._form(x) for x in scalars]
+        starts = [k for k, x in enumerate(forms) if k == 0 or x != forms[k - 1]]
+        for start, end in zip(starts, [*starts[1:], len(forms)], strict=True):
+            yield scalars[start:end]
+
+    def _each(self, run: Sequence[Scalar], use: str) -> None:
+        """Writes a loop in which the lanes share scalars of one formula.
+
+        Args:
+          run: the scalars.
+          use: a line that has one of them for its {}, and its number as ``i``.
+        """
+        tables: list[str] = []
+        body: list[str] = []
+        made = self._together(list(run), tables, body)
+        self.lines += [*tables, f"EACH(i, {len(run)}) {{", *body, use.format(made), "}"]
+
+    def _together(self, run: list[Scalar], tables: list[str], body: list[str]) -> str:
+        """Returns scalars of one formula as an expression of their number i.
+
+        Args:
+          run: the scalars.
+          tables: lines before the loop over i, to which those needed are added.
+          body: lines within the loop, likewise.
+        """
+        known: dict[tuple, str] = {}
+        waiting = [run]
+        while waiting:
+            column = waiting.pop()
+            key = tuple(map(identity, column))
+            if key in known:
+                continue
+            if found := self._uniform(column, tables):
+                known[key] = found
+                continue
+            parts = [list(x) for x in zip(*(x.args for x in column), strict=True)]
+            keys = [tuple(map(identity, part)) for part in parts]
+            if missing := [part for part, k in zip(parts, keys, strict=True) if k not in known]:
+                waiting += [column, *missing]
+                continue
+            first, name = column[0], self.name()
+            kinds, operands = [x.dtype for x in first.args], [known[k] for k in keys]
+            made = expression(first.op, first.dtype, kinds, operands)
+            body.append(f"const {type_of(first.dtype)} {name} = {made};")
+            known[key] = name
+        return known[tuple(map(identity, run))]
+
+    def _uniform(self, column: list[Scalar], tables: list[str]) -> str | None:
+        """Returns scalars that are all the same, or not computed here; None for others."""
+        first, name = column[0], self.name()
+        if all(same(x, first) for x in column):
+            before, self.lines = self.lines, tables
+            made = self.value(first, self._values)
+            self.lines = before
+            return made
+        if spaced := self._spaced(column):
+            return spaced("i")
+        if is_constant(first):
+            given = ", ".join(map(literal, column))
+            tables.append(f"static const {type_of(first.dtype)} {name}[] = {{{given}}};")
+            return f"{name}[i]"
+        places = [x for x in map(self._place, column) if x]
+        if places:
+            given = ", ".join(str(x.entry) for x in places)
+            tables.append(f"static const short {name}[] = {{{given}}};")
+            return f"{places[0].array}[{name}[i]]"
+        return None
+
+    def _form(self, scalar: Scalar) -> int:
+        """Returns a number for the form of a scalar: its formula, whatever its numbers are."""
+        if is_constant(scalar):
+            return self._number(("constant", scalar.dtype.name))
+        waiting = [scalar]
+        while waiting:
+            node = waiting.pop()
+            args = () if node in self._written else node.args
+            missing = [x for x in args if isinstance(x, Node) and x not in self._form_of]
+            if missing:
+                waiting += [node, *missing]
+            elif node not in self._form_of:
+                self._form_of[node] = self._number(self._facts(node))
+        return self._form_of[scalar]
+
+    def _facts(self, node: Node) -> tuple:
+        if place := self._place(node):
+            return ("in", place.array)
+        if node.op is None:
+            return ("itself", node.index)
+        return (node.op, node.dtype.name, *(self._form(x) for x in node.args))
+
+    def _number(self, form: tuple) -> int:
+        return self._forms.setdefault(form, len(self._forms))
+
+
+def _owners(body: Schedule) -> dict[Node, LiveGate | LiveLoop | Call]:
+    """Returns the steps of a body by the nodes that stand for their results."""
+    return {leaf: x for x in body if not isinstance(x, Node) for leaf in _results(x)}
+
+
+def _results(step: LiveGate | LiveLoop | Call) -> list[Node]:
+    """Returns the nodes that stand for the results of a step."""
+    if isinstance(step, LiveGate):
+        return [out.leaf for out in step.outs]
+    if isinstance(step, LiveLoop):
+        outs = [carry.out for carry in step.carries]
+        return [*outs, *(x for record in step.records for x in record.outs)]
+    return [x for out in step.outs for x in out]

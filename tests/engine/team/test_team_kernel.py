@@ -1,0 +1,64 @@
+"""Kernels for teams of lanes, compiled with one lane for this CPU, beside its machine code."""
+
+import gpu_on_cpu
+import numpy as np
+import pytest
+from players import actor_and_act, only_active, played
+
+from mjx_reinforce import envs
+from mjx_reinforce.engine.gpu import ptx
+from mjx_reinforce.engine.play import available, native
+from mjx_reinforce.engine.team import nvrtc
+from mjx_reinforce.engine.team import program as team
+
+if reason := available.unavailable():
+    pytest.skip(reason, allow_module_level=True)
+if gpu_on_cpu.COMPILER is None:
+    pytest.skip("there is no C++ compiler", allow_module_level=True)
+
+
+@pytest.fixture
+def teams(monkeypatch):
+    """Returns what lets teams play from now on; that returns the kernels that are made."""
+
+    def emulate():
+        gpu_on_cpu.emulate(monkeypatch)
+        monkeypatch.setattr(nvrtc, "library", lambda: True)
+        monkeypatch.setattr(team, "_LEAST_DOFS", 1)
+        monkeypatch.setattr(team, "_shared_memory", lambda: 232_448)
+        load = ptx.load_kernel
+        monkeypatch.setattr(ptx, "load_kernel", lambda *x: made.append(load(*x)) or made[-1])
+        return made
+
+    made = []
+    return emulate
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["Hopper-v5", "Ant-v5"])
+def test_teams_play_the_same_episodes(teams, name):
+    """Of two seeds, some of which take the mode; two chunks of noise, ends, a limit."""
+    env, horizon = envs.make(name), 4 if name == "Ant-v5" else 120
+    player = actor_and_act(env, (5,))
+    options = {"num_seeds": 2, "horizon": horizon, "deterministic": np.arange(5) % 2 == 1}
+    want = played(native.rollout, env, player, **options)
+    made = teams()
+    got = played(native.rollout, env, player, **options)
+    assert [kernel.lanes for kernel in made] == [16, 16]  # one plays, one begins
+    first = min(horizon, 12)  # steps until rounding has grown
+    for name in ("observation", "action", "reward"):
+        pair = (getattr(x, name)[:, :first] for x in (got, want))
+        np.testing.assert_allclose(*pair, rtol=2e-3, atol=2e-3, err_msg=name)
+    assert np.abs(got.mask.sum(1) - want.mask.sum(1)).max() <= 3
+    np.testing.assert_array_equal(got.simulated, got.mask.sum((1, 2)))
+
+
+@pytest.mark.slow
+def test_teams_play_only_active_episodes(teams):
+    env = envs.make("Hopper-v5")
+    chosen = np.arange(15).reshape(3, 5) % 2 == 1
+    made = teams()
+    player = actor_and_act(env, ())
+    some = only_active(native.rollout, env, player, chosen, horizon=20)
+    assert some.mask.any(1).tolist() == chosen.tolist()
+    assert {kernel.lanes for kernel in made} == {16}

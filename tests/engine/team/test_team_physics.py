@@ -1,0 +1,175 @@
+"""The device code of the physics, compiled with one lane in float64, beside C MuJoCo.
+
+``python tests/engine/team/test_physics.py humanoid 10000`` prints the largest error of an env step
+from so many states of a task's random play.
+"""
+
+import ctypes
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from mjx_reinforce.engine.scalar import UnsupportedPrimitive
+from mjx_reinforce.engine.team import tables
+from mjx_reinforce.envs import models
+
+_C: Any = mujoco
+_COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
+needs_compiler = pytest.mark.skipif(_COMPILER is None, reason="there is no C++ compiler")
+
+#: What a step is compared on, and how many numbers each has of a body.
+_OF_BODIES = {"xpos": 3, "xipos": 3, "cinert": 10, "cvel": 6, "cfrc_ext": 6}
+
+_MODELS = tomllib.loads((Path(__file__).parent / "models.toml").read_text("utf-8"))
+_MANY = '<geom size=".1"/>'
+_REFUSED = {
+    **_MODELS["refused"],
+    "4096 geoms or more": {"rest": f"<worldbody>{_MANY * 4096}</worldbody>"},
+    "more than 4096 possible contacts": {"bodies": [f'size=".1"/>{_MANY * 64}<geom size=".1"'] * 2},
+}
+
+
+def _model(
+    bodies: Sequence[str] | None = None,
+    world: str = "",
+    height: float = 0.12,
+    first: str = "",
+    second: str = 'axis="0 1 0"',
+    actuator: str = "",
+    **parts: str,
+) -> Any:
+    """Returns the model of parts as models.toml has them."""
+    geoms = 'contype="0"' if bodies is None else ""
+    if bodies is None:
+        world = _MODELS["arm"].format(first=first, second=second)
+    for n, geom in enumerate(bodies or ()):
+        at, turned = f"{0.17 * n} {0.03 * n} {height}", f"{20 * n} 25 {40 * n}"
+        world += f'<body pos="{at}" euler="{turned}"><freejoint/><geom {geom}/></body>'
+    rest = f"<actuator>{actuator}</actuator>" if actuator else ""
+    given = {"option": "", "geoms": geoms, "rest": rest, **parts, "world": world}
+    return _C.MjModel.from_xml_string(_MODELS["scene"].format_map(given))
+
+
+def _exact(m: Any) -> Any:
+    """Lets C MuJoCo's solver run to its optimum."""
+    m.opt.tolerance, m.opt.iterations, m.opt.ls_tolerance, m.opt.ls_iterations = 0, 100, 1e-14, 100
+    return m
+
+
+def _compiled(m: Any, folder: Any, near: int, lanes: int) -> Any:
+    """Returns ``play_steps`` of a model; more lanes than one take turns, see turns.h."""
+    text, run = tables.physics_text(m, near).split("// The operations of")[0], "play()"
+    if lanes > 1:
+        turns, run = (Path(__file__).parent / "turns.h").read_text(), "turns.run(play)"
+        text, found = re.subn(
+            r"struct Team {\n  int lane = 0;.*?\n};\n", lambda _: turns, text, flags=re.S
+        )
+        assert found == 1
+    program = (Path(__file__).parent / "play_steps.h").read_text()
+    source, made = folder / "play.cpp", str(folder / "play.so")
+    source.write_text(f"#define W {lanes}\n#define RUN {run}\n{text}{program}")
+    options = ["-O0", "-std=c++17", "-w", "-shared", "-fPIC"]
+    subprocess.run([str(_COMPILER), *options, str(source), "-o", made], check=True)
+    return ctypes.CDLL(made).play_steps
+
+
+def _error(m: Any, play: Any, data: Any, skip: int) -> float:
+    """Plays an env step here and in C; returns the largest error, relative where above 1."""
+    ctrl = np.resize(data.ctrl, max(m.nu, 1)).astype(float)
+    mine = {name: getattr(data, name).copy() for name in ("qpos", "qvel", "qacc_warmstart")}
+    made = np.zeros(sum(_OF_BODIES.values()) * m.nbody + m.nv)
+    given = [*mine.values(), ctrl, skip, made]
+    play(*(x.ctypes.data_as(ctypes.c_void_p) if hasattr(x, "ctypes") else x for x in given))
+    for _ in range(skip):
+        _C.mj_step(m, data)
+    _C.mj_rnePostConstraint(m, data)
+    for name, size in _OF_BODIES.items():
+        mine[name], made = made[: size * m.nbody], made[size * m.nbody :]
+    mine["qfrc_actuator"] = made
+    errors = []
+    for name, x in mine.items():
+        want = np.asarray(getattr(data, name)).ravel()
+        errors.append(np.abs(x - want).max(initial=0) / max(1, np.abs(want).max(initial=0)))
+    return max(errors)
+
+
+def _largest_error(
+    m: Any, folder: Any, skip: int, starts: int, near: int = tables.NEAR, lanes: int = 1
+) -> float:
+    """Returns the largest error of steps along short episodes of random play."""
+    play = _compiled(_exact(m), folder, near, lanes)
+    rng, errors = np.random.default_rng(0), []
+    for _ in range(starts):
+        data = _C.MjData(m)
+        data.qvel[:] = 0.3 * rng.normal(size=m.nv)
+        for _ in range(10):
+            data.ctrl[:] = rng.uniform(-1, 1, m.nu)
+            errors.append(_error(m, play, data, skip))
+            for _ in range(skip * 2):
+                _C.mj_step(m, data)
+    return max(errors)
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["half_cheetah", "ant", "humanoid", "humanoid_standup"])
+def test_tasks(task, tmp_path):
+    m = models.load_model(f"{task}.xml")
+    assert _largest_error(m, tmp_path, skip=5, starts=2) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize("lanes", [1, 8])
+def test_contacts_that_do_not_fit_are_kept(lanes, tmp_path):
+    m = models.load_model("humanoid_standup.xml")
+    assert _largest_error(m, tmp_path, skip=2, starts=1, near=1, lanes=lanes) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.slow
+@pytest.mark.parametrize(("task", "lanes"), [("half_cheetah", 16), ("ant", 16), ("humanoid", 32)])
+def test_lanes_in_any_order_play_alike(task, lanes, tmp_path):
+    m = models.load_model(f"{task}.xml")
+    assert _largest_error(m, tmp_path, skip=2, starts=1, lanes=lanes) < 1e-9
+
+
+@needs_compiler
+@pytest.mark.parametrize("feature", _MODELS["features"])
+def test_features(feature, tmp_path):
+    m = _model(**_MODELS["features"][feature])
+    assert _largest_error(m, tmp_path, skip=3, starts=3) < 1e-9
+
+
+@pytest.mark.parametrize("reason", _REFUSED)
+def test_what_is_not_covered_is_named(reason):
+    m = _model(**_REFUSED[reason])
+    assert str(tables.why(m)).startswith(f"the model has {reason}")
+
+
+def test_actuators_of_several_controls_are_named():
+    m = _model(actuator='<motor joint="a"/>')
+    m.actuator_ctrlnum[0] = 2  # no element of MuJoCo's XML makes one
+    assert "actuators of several controls" in str(tables.why(m))
+
+
+def test_a_model_that_is_not_covered_has_no_device_code():
+    m = _model(**_REFUSED["a box that meets a box"])
+    with pytest.raises(UnsupportedPrimitive, match="a box that meets a box"):
+        tables.physics_text(m)
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as made:
+        task = models.load_model(f"{sys.argv[1]}.xml")
+        print(_largest_error(task, Path(made), skip=5, starts=int(sys.argv[2]) // 10))
