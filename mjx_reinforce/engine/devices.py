@@ -45,14 +45,12 @@ class Devices:
         """Returns the number [] of the device, within what ``map`` runs."""
         return lax.axis_index(_AXIS)
 
-    def jit(
-        self, function: Callable[..., Any], in_specs: Any, out_specs: Any, **options: Any
-    ) -> Any:
-        """Returns ``map`` of a function, compiled; ``options`` are those of ``jax.jit``."""
+    def jit(self, function: Callable[..., Any], in_specs: Any, out_specs: Any) -> Any:
+        """Returns ``map`` of a function, compiled."""
         # Said again: arrays without entries would else be on all devices.
         shardings = self.shardings(out_specs)
         mapped = self.map(function, in_specs, out_specs)
-        return jax.jit(mapped, out_shardings=shardings, **options)
+        return jax.jit(mapped, out_shardings=shardings)
 
     def shardings(self, specs: Any) -> Any:
         """Returns how arrays are divided, for JAX."""

@@ -134,9 +134,8 @@ def descend(
     optimizer = optax.with_extra_args_support(problem.optimizer)
     changes, opt_state = optimizer.update(turn(grads), opt_state, params, clock=problem.clock)
     metrics = {"gradient_norm": optax.tree.norm(grads)}
-    clipped = optax.tree.get(opt_state, "clipped")  # of ``ClipState``
-    if clipped is not None:
-        metrics["clipped_gradients"] = clipped.astype(float)
+    if clips := [x for x in jax.tree.leaves(opt_state, is_leaf=_is_clip) if _is_clip(x)]:
+        metrics["clipped_gradients"] = clips[-1].clipped.astype(float)
     return optax.apply_updates(params, changes), opt_state, metrics
 
 
@@ -144,6 +143,10 @@ class ClipState(NamedTuple):
     """State of ``clip_by_norm``: whether the last gradient was longer than its bound, bool []."""
 
     clipped: jax.Array
+
+
+def _is_clip(state: Any) -> bool:
+    return isinstance(state, ClipState)
 
 
 def clip_by_norm(max_norm: float | jax.Array) -> optax.GradientTransformation:

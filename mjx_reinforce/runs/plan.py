@@ -31,7 +31,7 @@ _ACTIVATIONS = 2
 _PARAMETERS = 8
 #: The same of a value network: parameters, gradient, two moments.
 _CRITIC_PARAMETERS = 4
-#: Steps of an episode whose hidden units are held at once, see ``learners.gradients``.
+#: Steps of an episode whose hidden units are held at once, see ``learning.updates``.
 _CHUNK = 128
 #: Bytes of an env step that an evaluation plays: the reward, the mask, and copies.
 _EVALUATED = 10

@@ -96,7 +96,8 @@ class ChunkRecord(Record):
     def _add_updates(self, runs: np.ndarray, metrics: Arrays) -> None:
         broken = (metrics["nonfinite_episodes"] > 0) | (metrics["skipped_update"] > 0)
         self.updates[runs] += metrics["active"].sum(axis=0)
-        self.env_steps[runs] += metrics["env_steps"].sum(axis=0, dtype=np.int64)
+        steps = np.where(metrics["active"], metrics["env_steps"], 0)
+        self.env_steps[runs] += steps.sum(axis=0, dtype=np.int64)
         self.nonfinite[runs] += (broken & metrics["active"]).sum(axis=0)
 
     def latest(self) -> Arrays:

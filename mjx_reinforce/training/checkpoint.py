@@ -31,7 +31,7 @@ class Checkpoint(NamedTuple):
     """All that a run needs to go on as if it had not stopped.
 
     state: the pytree that its programs move on, every leaf an array
-    record: what ``Record.content`` returns
+    record: what ``Record.arrays`` returns
     seconds: wall time since the run began, without that of compiling
     metrics_bytes: length of metrics.csv
     env_steps: the budget of a seed, or None

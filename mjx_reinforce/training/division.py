@@ -67,7 +67,6 @@ class Division:
         out_specs: Any,
         *,
         by_episodes: bool = False,
-        **options: Any,
     ) -> Any:
         """Returns a compiled function of seeds on these devices.
 
@@ -76,18 +75,17 @@ class Division:
           in_specs: which axis of its arguments is that of the seeds.
           out_specs: the same of its result.
           by_episodes: whether it divides episodes itself.
-          options: of ``jax.jit``.
         """
         if self.count == 1:
-            return jax.jit(function, **options)
+            return jax.jit(function)
         devices = self.devices()
         if self.seeds > 1:
-            return devices.jit(function, in_specs, out_specs, **options)
+            return devices.jit(function, in_specs, out_specs)
         everywhere = devices.shardings(NONE)
         if by_episodes:
             shardings = {"in_shardings": everywhere, "out_shardings": everywhere}
-            return jax.jit(function, **shardings, **options)
-        return devices.jit(function, NONE, NONE, **options)
+            return jax.jit(function, **shardings)
+        return devices.jit(function, NONE, NONE)
 
     def shapes(self, tree: PyTree, spec: PartitionSpec) -> Any:
         """Returns the shapes of arrays as ``put`` places them."""

@@ -59,7 +59,7 @@ class Observer:
         Args:
           driver: of the run.
           met: the updates in it that met numbers which are not finite, as
-            ``Record.add_updates`` returns them.
+            ``RunRecord.add_updates`` returns them.
         """
 
     def evaluated(self, driver: "Driver", evaluation: Evaluation, rows: Cells) -> None:

@@ -103,7 +103,7 @@ def nonfinite_updates(metrics: Arrays, updates: np.ndarray) -> Arrays:
     """Returns the M updates of a block that met numbers which are not finite.
 
     Args:
-      metrics: [K, S] each, as for ``Record.add_updates``.
+      metrics: [K, S] each, as for ``RunRecord.add_updates``.
       updates: [K, S] how many each seed had made after each of them.
 
     Returns:
@@ -131,7 +131,7 @@ def broken_in_a_row(before: np.ndarray, metrics: Arrays) -> np.ndarray:
 
     Args:
       before: [S] the same before this block.
-      metrics: [K, S] each, as for ``Record.add_updates``.
+      metrics: [K, S] each, as for ``RunRecord.add_updates``.
     """
     broken = metrics["nonfinite_episodes"] >= metrics["episodes"]
     broken |= metrics["skipped_update"] > 0

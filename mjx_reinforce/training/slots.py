@@ -190,7 +190,10 @@ class Compiled(NamedTuple):
 
 
 class Slots:
-    """Runs that move on in slots; their states are on the host between blocks of updates.
+    """Runs that move on in slots.
+
+    Between blocks of updates their states are on the host. Those of a slot alone, such as the seeds
+    of a run, are also where they were computed.
 
     budget: of each run
     """
@@ -218,6 +221,8 @@ class Slots:
             begun.append(compiled.begin(seed, placed, own))
         rows, keys = zip(*jax.device_get(begun), strict=True)
         self._rows = np.concatenate(rows)[:count]
+        #: The lanes of a slot alone, and its states after the last block.
+        self._placed: tuple[np.ndarray, jax.Array] | None = None
         self._test_keys = np.concatenate(keys, axis=1)[:, :count]
 
     def states(self) -> RunState:
@@ -226,7 +231,7 @@ class Slots:
 
     def restore(self, states: RunState) -> None:
         """Takes other states of these runs."""
-        self._rows = self._layout.rows(states)
+        self._rows, self._placed = self._layout.rows(states), None
 
     def advance(
         self,
@@ -253,7 +258,7 @@ class Slots:
         budget = self._division.put(self.budget, NONE)
 
         def move(runs: np.ndarray) -> Any:
-            slot, which = self._division.put((self._rows[runs], runs >= 0))
+            slot, which = self._put(runs), self._division.put(runs >= 0)
             blocks, looks = [], look
             for _ in range(count):  # the host does not wait for any
                 alone = programs.evaluate(slot, which) if looks and not self._rides else {}
@@ -261,10 +266,12 @@ class Slots:
                 slot, metrics, riding = programs.advance(slot, budget, which, asked)
                 blocks.append((metrics, alone | (riding if looks else {})))
                 looks = True
-            return jax.device_get((slot, blocks))
+            return slot, *jax.device_get((slot, blocks))
 
-        rows, blocks = zip(*_side_by_side(move, lanes), strict=True)
-        self._rows[lanes[lanes >= 0]] = np.stack(rows)[lanes >= 0]
+        placed, rows, blocks = zip(*_side_by_side(move, lanes), strict=True)
+        for runs, moved in zip(lanes, rows, strict=True):
+            self._rows[runs[runs >= 0]] = moved[runs >= 0]
+        self._placed = (lanes[0], placed[0]) if len(lanes) == 1 else None
         every = [_of_slots(lanes, slots) for slots in zip(*blocks, strict=True)]
         return [measured for measured in every if measured.metrics["active"].any()]
 
@@ -273,8 +280,8 @@ class Slots:
         lanes, programs = self._pack()
 
         def look(runs: np.ndarray) -> Any:
-            slot, which = self._division.put((self._rows[runs], runs >= 0))
-            return {}, jax.device_get(programs.evaluate(slot, which))
+            which = self._division.put(runs >= 0)
+            return {}, jax.device_get(programs.evaluate(self._put(runs), which))
 
         return _of_slots(lanes, _side_by_side(look, lanes))
 
@@ -289,11 +296,17 @@ class Slots:
         for keys in map(jax.random.wrap_key_data, self._test_keys):
             self.restore(dataclasses.replace(states, train_states=tested, eval_keys=keys))
             every.append(self.evaluate().looked)
-        self._rows = kept
+        self._rows, self._placed = kept, None
         return {
             name: (np.sum if name.endswith("steps") else np.mean)([x[name] for x in every], axis=0)
             for name in every[0]
         }
+
+    def _put(self, runs: np.ndarray) -> jax.Array:
+        """Returns the states of a slot's runs, on the device."""
+        if self._placed is not None and np.array_equal(self._placed[0], runs):
+            return self._placed[1]
+        return self._division.put(self._rows[runs])
 
     def _pack(
         self, chosen: np.ndarray | None = None, lengths: np.ndarray | None = None
