@@ -297,7 +297,8 @@ class MujocoEnv(Env):
         results = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
         sound = jax.ShapeDtypeStruct((), bool)
         given = [getattr(start, name) for name in ("ctrl", *models.CARRIED)]
-        *leaves, is_sound = whole(name, results | {"sound": sound}, *given).values()
+        made = whole(name, results | {"sound": sound}, *given, owner=self)
+        *leaves, is_sound = made.values()
         return tree.unflatten(leaves), is_sound
 
     def _outcome(self, state: Physics, start: mjx.Data, data: View, action: jax.Array) -> Any:

@@ -194,16 +194,17 @@ def null_action(env: Environment) -> np.ndarray:
 
 
 #: The operations that were called so far, where they are kept whole.
-_WHOLE = contextvars.ContextVar[list[str] | None]("whole", default=None)
+_WHOLE = contextvars.ContextVar[list[tuple[str, Any]] | None]("whole", default=None)
 
 
 @contextlib.contextmanager
-def keeping_whole() -> Iterator[list[str]]:
+def keeping_whole() -> Iterator[list[tuple[str, Any]]]:
     """Has an environment that is traced within call ``scalar.whole`` for its physics.
 
-    It yields the names of what was called. JAX keeps what it has traced: give it a new function.
+    It yields what was called: names, and the environments whose physics it is. JAX keeps what it
+    has traced: give it a new function.
     """
-    called: list[str] = []
+    called: list[tuple[str, Any]] = []
     token = _WHOLE.set(called)
     try:
         yield called
@@ -216,17 +217,11 @@ def is_kept_whole() -> bool:
     return _WHOLE.get() is not None
 
 
-def note_whole(name: str) -> None:
+def note_whole(name: str, owner: Any) -> None:
     """Notes that an operation stays whole."""
     called = _WHOLE.get()
     assert called is not None
-    called.append(name)
-
-
-def shapes_of(function: Callable[..., Any], *examples: PyTree) -> Any:
-    """Returns the shapes of what a method of an environment returns; no physics is traced."""
-    with keeping_whole():
-        return jax.eval_shape(lambda *given: function(*given), *examples)
+    called.append((name, owner))
 
 
 def observation_size(env: Environment) -> int:
@@ -235,7 +230,7 @@ def observation_size(env: Environment) -> int:
     Raises:
       ValueError: the observation is not one vector.
     """
-    obs = shapes_of(env.reset, jax.random.key(0)).obs
+    obs = jax.eval_shape(env.reset, jax.random.key(0)).obs
     if not hasattr(obs, "shape") or len(obs.shape) != 1:
         raise ValueError(
             f"the observation must be one vector, this environment's is {obs}; "

@@ -9,16 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mjx_reinforce.engine import checks
-from mjx_reinforce.engine.base import (
-    Act,
-    Acts,
-    Box,
-    Discrete,
-    Environment,
-    PyTree,
-    action_space,
-    shapes_of,
-)
+from mjx_reinforce.engine.base import Act, Acts, Box, Discrete, Environment, PyTree, action_space
 from mjx_reinforce.engine.checks import BadEnvironmentError, require
 
 #: What JAX raises where Python or NumPy asks for the value of a traced array.
@@ -117,7 +108,7 @@ def _are_bounds(space: Box, size: int) -> bool:
 def _shapes(name: str, what: str, function: Callable[..., Any], *arguments: PyTree) -> Any:
     """Returns the shapes of what a method returns."""
     try:
-        return shapes_of(function, *arguments)
+        return jax.eval_shape(function, *arguments)
     except BadEnvironmentError:
         raise
     except (Exception, SystemExit) as error:  # it is the user's code, which may raise anything

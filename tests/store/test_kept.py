@@ -135,7 +135,7 @@ def test_programs_depend_on_what_jax_is_told(monkeypatch):
 def test_a_program_that_launches_a_gpus_kernel_is_kept(monkeypatch):
     kernel = ptx.Kernel("0" * 64, "", 1, 1, 0, compiled=True)
     monkeypatch.setattr(ptx, "_LOADED", {kernel.key: kernel})
-    monkeypatch.setattr(gpu, "_handler", lambda kernel, _: gpu._target(kernel.key))
+    monkeypatch.setattr(gpu, "_handler", lambda kernel: gpu._target(kernel.key))
     monkeypatch.setattr(gpu, "_assemblers", lambda: ((), None))
 
     def add(x):

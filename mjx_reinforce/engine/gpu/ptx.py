@@ -224,8 +224,12 @@ def _in_memory(cuda: ctypes.CDLL, image: bytes, shared: int) -> ctypes.c_void_p:
         raise RuntimeError(f"cuLibraryLoadData returned {status}")
     if status := cuda.cuLibraryGetKernel(ctypes.byref(kernel), library, ENTRY.encode()):
         raise RuntimeError(f"cuLibraryGetKernel returned {status}")
-    if shared and (status := cuda.cuKernelSetAttribute(_MOST_SHARED, shared, kernel, 0)):
-        raise RuntimeError(f"cuKernelSetAttribute returned {status}")
+    if shared:
+        count = ctypes.c_int()
+        cuda.cuDeviceGetCount(ctypes.byref(count))
+        for device in range(count.value):
+            if status := cuda.cuKernelSetAttribute(_MOST_SHARED, shared, kernel, device):
+                raise RuntimeError(f"cuKernelSetAttribute returned {status}")
     return kernel
 
 

@@ -100,7 +100,11 @@ def _begin(env: Environment, program: NativeProgram, keys: jax.Array) -> tuple[A
         return state, jax.random.key_data(noise)
 
     words = jax.random.key_data(keys)
-    state, noise = machine_map(begin, words[0], env=env, name=f"the start of {name_of(env)}")(words)
+    try:
+        begins = machine_map(begin, words[0], env=env, name=f"the start of {name_of(env)}")
+    except (TooLarge, UnsupportedPrimitive, TypeError):
+        return jax.vmap(functools.partial(episode.begin, env))(keys)
+    state, noise = begins(words)
     return state, jax.random.wrap_key_data(noise)
 
 

@@ -10,16 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from mjx_reinforce.engine import scalar
-from mjx_reinforce.engine.base import (
-    Act,
-    Acts,
-    Environment,
-    PyTree,
-    keeping_whole,
-    observation_size,
-    shapes_of,
-)
+from mjx_reinforce.engine import base, scalar
+from mjx_reinforce.engine.base import Act, Acts, Environment, PyTree, observation_size
 from mjx_reinforce.engine.cpu import handler, kernel, machine, mapping
 from mjx_reinforce.engine.cpu import seam as cpu_seam
 from mjx_reinforce.engine.gpu import kernel as gpu_kernel
@@ -79,7 +71,7 @@ def step_function(
       distribution: the family whose parameters the outputs are.
       length: steps whose noise is drawn with one key, as ``chunks.play_chunks`` does.
     """
-    shapes = shapes_of(env.reset, jax.random.key(0))
+    shapes = jax.eval_shape(env.reset, jax.random.key(0))
     leaves, tree = jax.tree.flatten(shapes)
     drawn = jax.eval_shape(lambda: distribution.noise(jax.random.key(0), ()))
     words = int(np.prod(drawn.shape, dtype=int))  # random ones that the noise of a step takes
@@ -117,7 +109,9 @@ def stored(x: jax.Array) -> jax.Array:
 def step_shapes(env: Environment, actor: PyTree) -> tuple[Any, ...]:
     """Returns the shapes of the arguments of a step."""
     shape = jax.ShapeDtypeStruct
-    state = shapes_of(lambda: [stored(x) for x in jax.tree.leaves(env.reset(jax.random.key(0)))])
+    state = jax.eval_shape(
+        lambda: [stored(x) for x in jax.tree.leaves(env.reset(jax.random.key(0)))]
+    )
     flag = shape((), jnp.int32)
     actor = jax.tree.map(lambda x: shape(x.shape, x.dtype), actor)
     return actor, Carried(state, shape((2, 2), jnp.uint32)), flag, flag, flag
@@ -247,23 +241,24 @@ def _by_teams(
     def of_teams(*args: Any) -> Any:  # another function for JAX, which keeps what it has traced
         return function(*args)
 
-    with keeping_whole() as kept:
+    with base.keeping_whole() as kept:
         traced, shapes = jaxprs.trace(of_teams, *examples)
-        if not {"physics", "start"} & {*kept}:
+        if any("jit" in x.primitive.name and "whole[" in str(x) for x in traced.jaxpr.eqns):
+            jax.clear_caches()  # a method that is jitted keeps what was traced
+            return None
+        if {id(owner) for _, owner in kept if owner is not None} != {id(team.innermost(env))}:
             return None
         physics = team.physics_of(env)
-        digest = objects.source_digest(*_WRITERS)
-        source = f"{use} {jaxprs.fingerprint(traced)} {physics} {digest}"
+        source = f"{jaxprs.fingerprint(traced)} {physics} {objects.source_digest(*_WRITERS)}"
 
         def write() -> str:
             return writers.team(_written(of_teams, examples, LOOPS), physics)
 
         capability = gpu_seam.compute_capability()
         try:
-            return ptx.load_kernel(source, write, capability, objects.folder()), shapes
-        except scalar.UnsupportedPrimitive as error:
-            slower = "a thread plays an episode, which is slower than a team of lanes"
-            warnings.warn(f"{slower}: {error}", stacklevel=2)
+            return ptx.load_kernel(f"{use} {source}", write, capability, objects.folder()), shapes
+        except (scalar.UnsupportedPrimitive, scalar.TooLarge) as error:
+            warnings.warn(f"a thread plays an episode, slower than lanes: {error}", stacklevel=2)
             return None
 
 

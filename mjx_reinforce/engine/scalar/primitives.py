@@ -190,15 +190,18 @@ _WHOLE.def_abstract_eval(
 )
 
 
-def whole(name: str, results: Mapping[str, Any], *args: jax.Array) -> dict[str, jax.Array]:
+def whole(
+    name: str, results: Mapping[str, Any], *args: jax.Array, owner: Any = None
+) -> dict[str, jax.Array]:
     """Calls an operation that a backend knows by its name, where ``is_kept_whole``.
 
     Args:
       name: of the operation.
       results: of its results by name, their shapes and dtypes.
       *args: its operands.
+      owner: whose operation it is, if it is not everybody's.
     """
-    note_whole(name)
+    note_whole(name, owner)
     facts = tuple((field, x.shape, np.dtype(x.dtype)) for field, x in results.items())
     return dict(zip(results, _WHOLE.bind(*args, name=name, results=facts), strict=True))
 

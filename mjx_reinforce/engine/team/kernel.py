@@ -103,7 +103,7 @@ def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int
     kinds, counts = _kinds(written.in_avals), [*map(num_entries, written.in_avals)]
     keys, at = len(kinds) - 3, len(kinds) - 2
     own = range(num_actor, at)  # the state, and the keys behind it
-    words = [counts[k] * np.dtype(written.in_avals[k].dtype).itemsize // 4 for k in own]
+    words = [-(-counts[k] * np.dtype(written.in_avals[k].dtype).itemsize // 4) for k in own]
     offsets = dict(zip(own, np.cumsum([0, *words]).tolist(), strict=False))
 
     def name(number: int) -> str:
@@ -194,7 +194,7 @@ def _parameters(given: Iterable[tuple[str, str]], made: Sequence[tuple[str, str]
 
 def _kernel(physics: Physics, text: CText, loop: str, words: int) -> str:
     """Returns a kernel whose teams have so many words of scratch each, besides far contacts."""
-    a_thread = -(-(physics.far + words) // physics.lanes)
+    a_thread = max(1, -(-(physics.far + words) // physics.lanes))
     constants: dict[str, object] = {"W": physics.lanes, "SHARED": physics.shared}
     constants |= {"FAR_WORDS": physics.far, "THREAD_WORDS": a_thread}
     constants["REPORTS"] = f"({' | '.join(text.reports) or 0})"

@@ -52,8 +52,6 @@ _OURS = {
     "logistic": "logistic",
     "sign": "sign_of",
     "is_finite": "is_finite",
-    "clz": "zeros_of",
-    "population_count": "ones_of",
     "shift_left": "left",
     "shift_right_logical": "right",
     "shift_right_arithmetic": "right_signed",

@@ -16,7 +16,7 @@ _SHARED_OF_BLOCK = 97
 
 def why_not(env: Any) -> str | None:
     """Returns in one line why teams do not play an environment; None if they do."""
-    model = getattr(_innermost(env), "mj_model", None)
+    model = getattr(innermost(env), "mj_model", None)
     if model is None:
         return "it simulates no model of MuJoCo's"
     if model.nv < _LEAST_DOFS:
@@ -36,7 +36,7 @@ def physics_of(env: Any) -> Physics:
     """Returns the physics of an environment that teams play."""
     from mjx_reinforce.engine.team import tables
 
-    env = _innermost(env)
+    env = innermost(env)
     model, shared = env.mj_model, _shared_memory()
     text, far = tables.physics_text(model), tables.far_words(model)
     return Physics(text, far, env.frame_skip, _lanes(env), shared)
@@ -44,12 +44,12 @@ def physics_of(env: Any) -> Physics:
 
 def _lanes(env: Any) -> int:
     """Returns how many lanes play an episode."""
-    return 32 if _innermost(env).mj_model.nv >= _WIDE else 16
+    return 32 if innermost(env).mj_model.nv >= _WIDE else 16
 
 
-def _innermost(env: Any) -> Any:
+def innermost(env: Any) -> Any:
     """Returns the environment that wrappers are around."""
-    while not hasattr(env, "mj_model") and hasattr(env, "env"):
+    while hasattr(env, "env"):
         env = env.env
     return env
 

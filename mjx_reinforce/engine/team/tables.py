@@ -264,7 +264,8 @@ class _Tables:
             for name, values in fields.items():
                 flat = np.asarray(values).ravel().tolist() or [0]
                 lines.append(f"  {kind} {name}[{len(flat)}];")
-                numbers = (f"real({float(x)!r})" if kind == "real" else str(int(x)) for x in flat)
+                form = {"int": "{:d}", "Mask": "{:d}ull", "real": "real({!r})"}[kind]
+                numbers = (form.format(float(x) if kind == "real" else int(x)) for x in flat)
                 made.append("{" + ",".join(numbers) + "}")
         return "\n".join([*lines, "};", "#define MODEL_INIT {" + ",\\\n".join(made) + "}"])
 

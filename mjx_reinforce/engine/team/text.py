@@ -44,11 +44,10 @@ _GIVEN = ("ctrl", "time", "qpos", "qvel", "act", "qacc_warmstart")
 _REPORTED = ("xpos", "xipos", "cinert", "cvel", "cfrc_ext")
 #: Where the device code has the fields of a simulation, by MuJoCo's names.
 _FIELDS = {field: f"s.{field}" for field in (*_GIVEN, *_REPORTED, "qfrc_actuator")}
-_FIELDS["sound"] = "sound"
 #: The operations that simulate, as the device code has them.
 _SIMULATES = {
-    "physics": "const bool sound[1] = {{physics(t, M, s, {})}};",
-    "start": "const bool sound[1] = {{true}}; start(t, M, s);",
+    "physics": "const bool {}[1] = {{physics(t, M, s, {})}};",
+    "start": "const bool {}[1] = {{true}}; start(t, M, s);",
 }
 
 
@@ -218,9 +217,8 @@ class CText(Backend[str]):
             for carry, following in zip(loop.carries, nexts, strict=True):
                 kind = type_of(carry.leaf.dtype)
                 self.line(f"const {kind} {following} = {self.get(carry.next)};")
-        for name, following in zip(names, nexts, strict=True):
-            self.line(f"{name} = {following};")
-        self.line("}")
+        self.lines += [f"{name} = {x};" for name, x in zip(names, nexts, strict=True)]
+        self.lines += ["t.sync();", "}"]  # the next round may write what this one reads
         return names, [
             [f"{array}[{t}]" for t in range(len(record.outs))]
             for record, array in zip(loop.records, kept, strict=True)
@@ -316,10 +314,12 @@ class CText(Backend[str]):
 
     def _simulate(self, call: Call) -> None:
         names = [field.rpartition(".")[2] for field in call.fields]
+        sound = self.name()
+        fields = {**_FIELDS, "sound": sound}
         for number, (name, out) in enumerate(zip(names, call.outs, strict=True)):
-            if out and name not in _FIELDS:
+            if out and name not in fields:
                 raise UnsupportedPrimitive(f"the task reads {name} of the simulation")
-            self._arrays[call, number] = _FIELDS.get(name, "")
+            self._arrays[call, number] = fields.get(name, "")
             self.reports += [name.upper()] if out and name in _REPORTED else []
         for field, scalars in zip(_GIVEN, call.args, strict=True):
             if scalars:
@@ -327,13 +327,13 @@ class CText(Backend[str]):
         if self._simulates_once:
             self._read_from(_FIELDS["ctrl"], call.args[0])  # which the physics leaves as it is
         self.line("t.sync();")
-        self.line(_SIMULATES[call.name].format(self._skip))
+        self.line(_SIMULATES[call.name].format(sound, self._skip))
         self.line("t.sync();")
         if not self._simulates_once:  # another operation may overwrite it
             for number, (name, out) in enumerate(zip(names, call.outs, strict=True)):
                 if out:
                     made = self._arrays[call, number] = self._reserve(out[0].dtype, len(out))
-                    self.line(f"EACH(i, {len(out)}) {made}[i] = {_FIELDS[name]}[i];")
+                    self.line(f"EACH(i, {len(out)}) {made}[i] = {fields[name]}[i];")
             self.line("t.sync();")
 
     def _row(self, row: list[Scalar], values: dict[Node, str]) -> Callable[[str], str]:
@@ -457,7 +457,7 @@ class CText(Backend[str]):
         places = [x for x in map(self._place, column) if x]
         if places:
             given = ", ".join(str(x.entry) for x in places)
-            tables.append(f"static const short {name}[] = {{{given}}};")
+            tables.append(f"static const int {name}[] = {{{given}}};")
             return f"{places[0].array}[{name}[i]]"
         return None
 

@@ -147,5 +147,6 @@ DEV void start(const Team& t, const Model& M, State& s) {
   forward(t, M, s);
   report(t, M, s);
   if (reports(CFRC_EXT)) EACH(n, 6 * NB) s.cfrc_ext[n] = 0;
+  EACH(i, NV) s.qacc_warmstart[i] = 0;
   t.sync();
 }
