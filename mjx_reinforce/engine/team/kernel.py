@@ -4,7 +4,7 @@ A team whose episode is over takes the next one, of whatever seed. What a team c
 its episode alone: results are the same for any number of teams.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -109,7 +109,7 @@ def player_text(written: scalarized.Scalarized, physics: Physics, num_actor: int
     def name(number: int) -> str:
         return {at: "in_at", at + 1: "in_mode"}.get(number, f"in{number}")
 
-    text = _text(written, physics, name)
+    text = CText(written, name, physics.skip)
     observation, action, (reward,), (goes_on,), (broken,), *carried = written.outputs
     text.line(f"const bool alive = {text.get(goes_on)} != 0;")
     text.line(f"const int is_broken = {text.get(broken)};")
@@ -155,15 +155,11 @@ def mapping_text(written: scalarized.Scalarized, physics: Physics) -> str:
       written: the function, the physics kept whole.
       physics: that of the environment.
     """
-    text = _text(written, physics, lambda number: f"in{number}")
+    text = CText(written, lambda number: f"in{number}", physics.skip)
     given, made = (
-        [
-            (k, kind, num_entries(x))
-            for k, (kind, x) in enumerate(zip(_kinds(avals), avals, strict=True))
-        ]
+        [(k, type_of(x.dtype), num_entries(x)) for k, x in enumerate(avals) if num_entries(x)]
         for avals in (written.in_avals, written.out_avals)
     )
-    given, made = ([x for x in leaves if x[2]] for leaves in (given, made))
     before = [f"const {kind}* in{k} = given{k} + size_t(k) * {n};" for k, kind, n in given]
     for k, kind, size in made:
         before.append(f"{kind}* out{k} = made{k} + size_t(k) * {size};")
@@ -174,10 +170,6 @@ def mapping_text(written: scalarized.Scalarized, physics: Physics) -> str:
     )
     loop = _MAP.format(parameters=parameters, step="\n".join([*before, *text.lines]))
     return _kernel(physics, text, loop, text.words)
-
-
-def _text(written: scalarized.Scalarized, physics: Physics, name: Callable[[int], str]) -> CText:
-    return CText(written, name, physics.skip)
 
 
 def _kinds(avals: Iterable[jax.ShapeDtypeStruct]) -> list[str]:

@@ -149,7 +149,7 @@ class CText(Backend[str]):
         return f"{place.array}[{place.entry}]"
 
     def value(self, scalar: Scalar, values: dict[Node, str]) -> str:
-        """Writes what a scalar needs and is not known."""
+        """Returns a scalar, once what it needs is written."""
         waiting = [] if is_constant(scalar) else [scalar]
         while waiting:
             node = waiting.pop()

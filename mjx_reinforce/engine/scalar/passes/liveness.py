@@ -1,7 +1,7 @@
 """What the results need, in the order in which it is computed.
 
-A *schedule* is a list of steps. A step is a node, a loop or a gate; the latter two have a schedule
-of their own, and keep only the values that something reads.
+A *schedule* is a list of steps. A step is a node, a call, a loop or a gate; the latter two have a
+schedule of their own, and keep only the values that something reads.
 
 ``accumulators`` finds values of a loop that need no copy from one iteration to the next. A
 Humanoid's step carries 1,441 numbers, of which the next stage reads 119; the others are read after
